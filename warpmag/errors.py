@@ -1,0 +1,8 @@
+"""The error that bad input raises."""
+
+
+class InputError(ValueError):
+    """Bad input from the user: one line that names the prim or the argument.
+
+    The command prints it and exits with code 2; at the array and Newton level it is an ordinary ``ValueError``.
+    """

@@ -1,0 +1,108 @@
+"""What a magnet is made of and how a scene is to be solved: plain data, shared by the USD part and the Newton part.
+
+Neither Warp, Newton nor USD is imported here. Each record checks itself, so that a bad value is refused in the same
+words whether it comes from a stage, from the command line or from a script.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from warpmag.errors import InputError
+
+KINDS = ("inducible", "permanent")
+CURVES = ("tanh", "langevin", "clamped")
+FORCES = ("kelvin", "zeeman")
+DYNAMICS = ("theta", "theta-euler")
+
+SATURATION_OF_IRON = 1.7e6
+"""Default saturation magnetization [A/m]."""
+
+
+def check_token(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    """Raise :class:`InputError` unless ``value`` is one of ``allowed``."""
+    if value not in allowed:
+        raise InputError(f"{name}: {value!r} is not one of {', '.join(allowed)}")
+
+
+def check_positive(name: str, value: float, *, infinite: bool = False) -> None:
+    """Raise :class:`InputError` unless ``value`` is positive and finite (or infinite where that is allowed)."""
+    if not value > 0.0 or (math.isinf(value) and not infinite):
+        raise InputError(f"{name}: must be positive{'' if infinite else ' and finite'}, got {value}")
+
+
+def check_finite(name: str, values: tuple[float, ...]) -> None:
+    """Raise :class:`InputError` unless every one of ``values`` is finite."""
+    if not all(math.isfinite(v) for v in values):
+        raise InputError(f"{name}: must be finite, got {tuple(values)}")
+
+
+@dataclass(frozen=True)
+class Magnet:
+    """The magnetic material of one rigid body or collider.
+
+    Attributes:
+        kind: ``inducible`` (magnetized by the field it is in) or ``permanent``.
+        saturation: Saturation magnetization Ms [A/m], inducible only.
+        susceptibility: Susceptibility χ [dimensionless], may be infinite, inducible only.
+        curve: Magnetization curve: ``tanh`` (Eq. 10), ``langevin`` or ``clamped`` (Eq. 7), inducible only.
+        magnetization: Magnetization of a permanent magnet [A/m], in its own frame.
+        moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+    """
+
+    kind: str = "inducible"
+    saturation: float = SATURATION_OF_IRON
+    susceptibility: float = math.inf
+    curve: str = "tanh"
+    magnetization: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    moment_spacing: float = 0.0
+
+    def check(self, name: str) -> None:
+        """Raise :class:`InputError` naming ``name`` (a prim path or body label) if a value is out of range."""
+        check_token(f"{name}: kind", self.kind, KINDS)
+        if self.kind == "inducible":
+            check_positive(f"{name}: saturation magnetization", self.saturation)
+            check_positive(f"{name}: susceptibility", self.susceptibility, infinite=True)
+            check_token(f"{name}: curve", self.curve, CURVES)
+        else:
+            check_finite(f"{name}: magnetization", self.magnetization)
+        if not (self.moment_spacing >= 0.0 and math.isfinite(self.moment_spacing)):
+            raise InputError(f"{name}: moment spacing: must be zero or positive and finite, got {self.moment_spacing}")
+
+
+@dataclass(frozen=True)
+class MagneticSettings:
+    """How the magnetics of a whole scene is solved.
+
+    Attributes:
+        external_field: Uniform applied field H0 [A/m], world frame.
+        force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
+        dynamics: ``theta`` (exact flow, accelerated) or ``theta-euler`` (the paper's explicit step).
+        rtol: Relative magnetization error at which a step's induction ends, the computable form of Eq. 12.
+    """
+
+    external_field: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    force: str = "kelvin"
+    dynamics: str = "theta"
+    rtol: float = 1e-3
+
+    def check(self, name: str) -> None:
+        """Raise :class:`InputError` naming ``name`` if a value is out of range."""
+        check_finite(f"{name}: external field", self.external_field)
+        check_token(f"{name}: force", self.force, FORCES)
+        check_token(f"{name}: dynamics", self.dynamics, DYNAMICS)
+        check_positive(f"{name}: rtol", self.rtol)
+
+
+@dataclass(frozen=True)
+class StageMagnets:
+    """All that a stage says about magnets, keyed by prim path.
+
+    Attributes:
+        magnets: Magnet of each prim that carries one; the prim is a rigid body or a collider.
+        settings: The scene's magnetic settings.
+        initial_moments: Total moment [A·m²], world frame, of prims that carry ``warpmag:moment``, for a warm start.
+    """
+
+    magnets: dict[str, Magnet]
+    settings: MagneticSettings
+    initial_moments: dict[str, tuple[float, float, float]] = field(default_factory=dict)
