@@ -1,0 +1,179 @@
+"""Magnets on a Newton ``ModelBuilder``: custom attributes of its shapes, namespace ``warpmag``.
+
+Shapes carry the magnet, not bodies, so that a static shape can be one and so that magnets survive ``add_builder``,
+``add_world``, ``replicate`` and ``collapse_fixed_joints`` with their shapes.
+"""
+
+import math
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.errors import InputError
+from warpmag.magnets import CURVES, KINDS, SATURATION_OF_IRON, Magnet
+
+NAMESPACE = "warpmag"
+NO_MAGNET = 0
+"""Value of ``warpmag:kind`` on a shape that is no magnet; a magnet has 1 + the index of its kind in ``KINDS``."""
+
+_ATTRIBUTES = {
+    "kind": (wp.int32, NO_MAGNET),
+    "saturation": (wp.float32, SATURATION_OF_IRON),
+    "susceptibility": (wp.float32, math.inf),
+    "curve": (wp.int32, 0),
+    "magnetization": (wp.vec3, wp.vec3(0.0, 0.0, 0.0)),  # [A/m], frame of the shape
+    "moment_spacing": (wp.float32, 0.0),
+}
+_SOLID = (
+    newton.GeoType.SPHERE,
+    newton.GeoType.BOX,
+    newton.GeoType.CAPSULE,
+    newton.GeoType.CYLINDER,
+    newton.GeoType.ELLIPSOID,
+    newton.GeoType.CONE,
+    newton.GeoType.MESH,
+    newton.GeoType.CONVEX_MESH,
+)
+
+
+def register_attributes(builder: newton.ModelBuilder) -> None:
+    """Declare the attributes that magnets are stored in; call it before :func:`add_inducible` and friends.
+
+    Args:
+        builder: The builder; declaring twice does nothing.
+    """
+    for name, (dtype, default) in _ATTRIBUTES.items():
+        builder.add_custom_attribute(
+            newton.ModelBuilder.CustomAttribute(
+                name=name,
+                dtype=dtype,
+                default=default,
+                frequency=newton.Model.AttributeFrequency.SHAPE,
+                assignment=newton.Model.AttributeAssignment.MODEL,
+                namespace=NAMESPACE,
+            )
+        )
+
+
+def add_inducible(
+    builder: newton.ModelBuilder,
+    body: int = -1,
+    *,
+    shape: int | None = None,
+    saturation: float = SATURATION_OF_IRON,
+    susceptibility: float = math.inf,
+    curve: str = "tanh",
+    moment_spacing: float = 0.0,
+) -> None:
+    """Make a body, or one shape, a magnet that the field magnetizes: iron, steel, ferrite.
+
+    Args:
+        builder: The builder, with :func:`register_attributes` called on it.
+        body: The body; all its colliding shapes, which must exist already, become one magnet.
+        shape: Instead of all shapes of the body only this one; the way to make a static shape a magnet.
+        saturation: Saturation magnetization Ms [A/m].
+        susceptibility: Susceptibility χ [dimensionless], may be infinite.
+        curve: Magnetization curve: ``tanh``, ``langevin`` or ``clamped``.
+        moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+
+    Raises:
+        InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
+            of range.
+    """
+    magnet = Magnet("inducible", saturation, susceptibility, curve, moment_spacing=moment_spacing)
+    for index in magnet_shapes(builder, body, shape):
+        mark_shape(builder, index, magnet)
+
+
+def add_permanent(
+    builder: newton.ModelBuilder,
+    body: int = -1,
+    *,
+    shape: int | None = None,
+    magnetization: tuple[float, float, float],
+    moment_spacing: float = 0.0,
+) -> None:
+    """Make a body, or one shape, a permanent magnet.
+
+    Args:
+        builder: The builder, with :func:`register_attributes` called on it.
+        body: The body; all its colliding shapes, which must exist already, become one magnet.
+        shape: Instead of all shapes of the body only this one; the way to make a static shape a magnet.
+        magnetization: Magnetization M [A/m] in the frame of the body, of the shape if that is static.
+        moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+
+    Raises:
+        InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
+            of range.
+    """
+    for index in magnet_shapes(builder, body, shape):
+        in_shape = magnetization
+        if builder.shape_body[index] >= 0:
+            in_shape = wp.quat_rotate_inv(builder.shape_transform[index].q, wp.vec3(*magnetization))
+        mark_shape(builder, index, Magnet("permanent", magnetization=tuple(in_shape), moment_spacing=moment_spacing))
+
+
+def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
+    """Return the shapes that a magnet on ``body``, or on ``shape`` alone, covers."""
+    if f"{NAMESPACE}:kind" not in builder.custom_attributes:
+        raise InputError("builder: call warpmag.register_attributes(builder) before magnets are added")
+    if shape is not None:
+        if not 0 <= shape < builder.shape_count:
+            raise InputError(f"shape: {shape} is out of range, the builder has {builder.shape_count} shapes")
+        if body not in (-1, builder.shape_body[shape]):
+            raise InputError(f"shape: {builder.shape_label[shape]} belongs to body {builder.shape_body[shape]}")
+        if builder.shape_type[shape] not in _SOLID:
+            kind = newton.GeoType(builder.shape_type[shape]).name.lower()
+            raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
+        return [shape]
+    if not 0 <= body < builder.body_count:
+        raise InputError(f"body: {body} is out of range, the builder has {builder.body_count} bodies")
+    shapes = [
+        index
+        for index in builder.body_shapes[body]
+        if builder.shape_flags[index] & newton.ShapeFlags.COLLIDE_SHAPES and builder.shape_type[index] in _SOLID
+    ]
+    if not shapes:
+        raise InputError(f"{builder.body_label[body]}: has no colliding solid shape yet, add its shapes first")
+    return shapes
+
+
+def mark_shape(builder: newton.ModelBuilder, shape: int, magnet: Magnet) -> None:
+    """Store ``magnet``, its magnetization in the frame of the shape, on one shape."""
+    magnet.check(builder.shape_label[shape])
+    values = {
+        "kind": 1 + KINDS.index(magnet.kind),
+        "saturation": float(magnet.saturation),
+        "susceptibility": float(magnet.susceptibility),
+        "curve": CURVES.index(magnet.curve),
+        "magnetization": wp.vec3(*(float(x) for x in magnet.magnetization)),
+        "moment_spacing": float(magnet.moment_spacing),
+    }
+    for name, value in values.items():
+        builder.custom_attributes[f"{NAMESPACE}:{name}"].values[shape] = value
+
+
+def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
+    """Return the magnets of a finished model by shape, magnetizations in the frame of the shape.
+
+    Raises:
+        InputError: The model has none.
+    """
+    attributes = getattr(model, NAMESPACE, None)
+    kinds = attributes.kind.numpy() if attributes is not None else np.zeros(0, int)
+    marked = np.flatnonzero(kinds != NO_MAGNET)
+    if not len(marked):
+        raise InputError("model: has no magnets, add some with add_inducible or add_permanent before finalize()")
+    columns = {name: getattr(attributes, name).numpy() for name in _ATTRIBUTES}
+    return {
+        int(shape): Magnet(
+            kind=KINDS[kinds[shape] - 1],
+            saturation=float(columns["saturation"][shape]),
+            susceptibility=float(columns["susceptibility"][shape]),
+            curve=CURVES[columns["curve"][shape]],
+            magnetization=tuple(columns["magnetization"][shape].tolist()),
+            moment_spacing=float(columns["moment_spacing"][shape]),
+        )
+        for shape in marked
+    }
