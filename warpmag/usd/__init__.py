@@ -1,0 +1,38 @@
+"""USD in and out: the schemas of magnets, the reader, the writer of a run's cache and the checker of stages.
+
+The only part of warpmag that imports ``pxr``. Importing it registers the schemas of warpmag and those of Newton; do so
+before the first stage is opened in a process, for USD takes no new schemas afterwards (warpmag reads its own
+attributes right even then).
+"""
+
+from warpmag.usd.schemas import author_magnet, author_settings  # isort: skip  (registers the schemas first)
+from warpmag.usd.check import StageReport, check
+from warpmag.usd.reader import (
+    Finding,
+    StageClock,
+    StageContents,
+    describe,
+    hold,
+    open_stage,
+    read_magnets,
+    stage_clock,
+    survey,
+)
+from warpmag.usd.writer import CacheWriter
+
+__all__ = [
+    "CacheWriter",
+    "Finding",
+    "StageClock",
+    "StageContents",
+    "StageReport",
+    "author_magnet",
+    "author_settings",
+    "check",
+    "describe",
+    "hold",
+    "open_stage",
+    "read_magnets",
+    "stage_clock",
+    "survey",
+]

@@ -1,0 +1,96 @@
+"""What a stage holds and what is wrong with it, for ``warpmag check``."""
+
+import os
+from dataclasses import dataclass
+
+from pxr import Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
+
+from warpmag.errors import InputError
+from warpmag.usd.reader import Finding, StageClock, StageContents, open_stage, stage_clock, stage_name, survey
+
+_SEVERITIES = {"Error": "error", "Warn": "warning"}
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """What a stage holds and what is wrong with it.
+
+    Attributes:
+        path: File of the stage.
+        metres_per_unit: Unit of length [m].
+        kilograms_per_unit: Unit of mass [kg].
+        up_axis: ``Y`` or ``Z``.
+        clock: How time runs, None where that is wrong.
+        contents: Bodies, colliders, magnets and settings.
+        findings: All that is wrong, the findings of ``UsdValidation`` included; errors before warnings.
+    """
+
+    path: str
+    metres_per_unit: float
+    kilograms_per_unit: float
+    up_axis: str
+    clock: StageClock | None
+    contents: StageContents
+    findings: tuple[Finding, ...]
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """The findings for which a run would refuse the stage, or that break a rule of USD."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    def magnets(self, kind: str) -> list[str]:
+        """Paths of the magnets of one kind, ``inducible`` or ``permanent``."""
+        return [path for path, magnet in self.contents.magnets.items() if magnet.kind == kind]
+
+
+def check(path: str | os.PathLike) -> StageReport:
+    """Find out what a stage holds and everything that is wrong with it.
+
+    Raises:
+        InputError: The file cannot be opened as a stage at all.
+    """
+    stage = open_stage(path)
+    contents = survey(stage)
+    findings = list(contents.findings)
+    try:
+        clock = stage_clock(stage)
+    except InputError as error:
+        clock = None
+        where, _, message = str(error).rpartition(": ")
+        findings.append(Finding(where, message))
+    findings += validate(stage)
+    return StageReport(
+        path=str(path),
+        metres_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
+        kilograms_per_unit=UsdPhysics.GetStageKilogramsPerUnit(stage),
+        up_axis=UsdGeom.GetStageUpAxis(stage),
+        clock=clock,
+        contents=contents,
+        findings=tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")),
+    )
+
+
+def validate(stage: Usd.Stage) -> list[Finding]:
+    """Return the errors and warnings of USD's own validators, those for usdz packages left out."""
+    registry = UsdValidation.ValidationRegistry()
+    packages = {one.name for one in registry.GetValidatorMetadataForKeyword("UsdzValidators")}
+    names = [one.name for one in registry.GetAllValidatorMetadata() if not one.isSuite and one.name not in packages]
+    silencer = UsdUtils.CoalescingDiagnosticDelegate()
+    errors = UsdValidation.ValidationContext(registry.GetOrLoadValidatorsByName(names)).Validate(stage)
+    del silencer
+    findings = []
+    for error in errors:
+        severity = _SEVERITIES.get(error.GetType().name)
+        if severity:
+            message = f"{' '.join(error.GetMessage().split())} [{error.GetIdentifier()}]"
+            findings.append(Finding(_place(error, stage), message, severity))
+    return findings
+
+
+def _place(error, stage) -> str:
+    for site in error.GetSites():
+        if site.IsProperty():
+            return str(site.GetProperty().GetPath())
+        if site.IsPrim():
+            return str(site.GetPrim().GetPath())
+    return stage_name(stage)

@@ -1,0 +1,109 @@
+"""The applied API schemas ``WarpmagMagnetAPI`` and ``WarpmagSceneAPI``: registration, authoring and reading.
+
+The schemas are codeless; their text is ``schema/generatedSchema.usda``. Each attribute stands for one field of
+:class:`warpmag.magnets.Magnet` or :class:`warpmag.magnets.MagneticSettings`.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import newton_usd_schemas  # noqa: F401  (registers Newton's own schemas, which must happen before a stage is opened)
+import numpy as np
+from pxr import Gf, Plug, Sdf, Usd
+
+from warpmag.errors import InputError
+from warpmag.magnets import Magnet, MagneticSettings
+
+Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
+
+MAGNET_API = "WarpmagMagnetAPI"
+SCENE_API = "WarpmagSceneAPI"
+MOMENT = "warpmag:moment"
+
+_TYPES = {str: Sdf.ValueTypeNames.Token, float: Sdf.ValueTypeNames.Float, tuple: Sdf.ValueTypeNames.Vector3f}
+
+_MAGNET_ATTRIBUTES = {
+    "kind": "warpmag:kind",
+    "saturation": "warpmag:saturationMagnetization",
+    "susceptibility": "warpmag:susceptibility",
+    "curve": "warpmag:curve",
+    "magnetization": "warpmag:magnetization",
+    "moment_spacing": "warpmag:momentSpacing",
+}
+_SETTINGS_ATTRIBUTES = {
+    "external_field": "warpmag:externalField",
+    "force": "warpmag:force",
+    "dynamics": "warpmag:dynamics",
+    "rtol": "warpmag:rtol",
+}
+
+
+def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
+    """Make ``prim`` a magnet, with every attribute authored (Newton sees authored values only, no fallbacks)."""
+    magnet.check(str(prim.GetPath()))
+    _author(prim, MAGNET_API, _MAGNET_ATTRIBUTES, magnet)
+
+
+def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
+    """Write the scene's magnetic settings on its PhysicsScene ``prim``, every attribute authored."""
+    settings.check(str(prim.GetPath()))
+    _author(prim, SCENE_API, _SETTINGS_ATTRIBUTES, settings)
+
+
+def magnet_of(prim: Usd.Prim) -> Magnet:
+    """Read and check the magnet that ``prim`` carries; raises :class:`InputError` naming the prim."""
+    magnet = _read(prim, _MAGNET_ATTRIBUTES, Magnet())
+    magnet.check(str(prim.GetPath()))
+    return magnet
+
+
+def settings_of(prim: Usd.Prim) -> MagneticSettings:
+    """Read and check the magnetic settings of a PhysicsScene ``prim``; raises :class:`InputError` naming it."""
+    settings = _read(prim, _SETTINGS_ATTRIBUTES, MagneticSettings())
+    settings.check(str(prim.GetPath()))
+    return settings
+
+
+def has_api(prim: Usd.Prim, name: str) -> bool:
+    """Whether the API schema ``name`` is applied to ``prim``, also if it was registered too late for USD to know it."""
+    return name in prim.GetAppliedSchemas()
+
+
+def _author(prim, api, attributes, record) -> None:
+    prim.AddAppliedSchema(api)
+    for field, name in attributes.items():
+        value = getattr(record, field)
+        kind = type(value) if isinstance(value, (str, tuple)) else float
+        variability = Sdf.VariabilityUniform if kind is str else Sdf.VariabilityVarying
+        attribute = prim.CreateAttribute(name, _TYPES[kind], custom=False, variability=variability)
+        attribute.Set(Gf.Vec3f(*value) if kind is tuple else value)
+
+
+def _read(prim, attributes, defaults):
+    """Return ``defaults`` with each field replaced by the value of its attribute, where it has one."""
+    values = {}
+    for field, name in attributes.items():
+        value = prim.GetAttribute(name).Get()
+        if value is not None:
+            values[field] = _converted(f"{prim.GetPath()}: {name}", value, type(getattr(defaults, field)))
+    return dataclasses.replace(defaults, **values)
+
+
+def _converted(name, value, kind):
+    """Return ``value`` as ``kind`` (str, float or tuple of three floats), whatever type a hand-written file gave it."""
+    try:
+        if kind is tuple:
+            x, y, z = map(_decimal, value)
+            return x, y, z
+        if kind is float:
+            return _decimal(value)
+        if isinstance(value, str):
+            return value
+    except (TypeError, ValueError):
+        pass
+    raise InputError(f"{name}: {value!r} is not a {'vector' if kind is tuple else kind.__name__}")
+
+
+def _decimal(value) -> float:
+    """Return the shortest decimal that a single-precision ``value`` stands for: 0.001, not 0.0010000000475."""
+    return float(str(np.float32(value)))
