@@ -5,15 +5,15 @@ and torque τ on each of them are added to the wrench of its body about the cent
 
     F_body = Σ F_i,    τ_body = Σ τ_i + (x_i − c) × F_i
 
-Sums run in a fixed order and without atomics, so that a run repeats bit by bit: moments of one body are contiguous and
-cut into chunks, one thread sums a chunk, and one thread a body's chunks.
+Sums run in a fixed order and without atomics, so that a run repeats bit by bit: the moments of a body are cut into
+chunks of neighbours, one thread sums a chunk, and one thread a body's chunks.
 
 | variable | shape | dtype | meaning |
 |---|---|---|---|
 | positions, moments | [moment_count] | vec3 | [m], [A·m²], world frame |
 | local_positions, local_moments | [moment_count] | vec3 | the same in the frame of the body |
 | moment_body | [moment_count] | int32 | body, −1 where the magnet is fixed in the world |
-| chunk_start | [chunk_count + 1] | int32 | first moment of each chunk |
+| chunk_range | [chunk_count] | vec2i | first moment of each chunk, and the one after its last; sorted by body |
 | chunk_body | [chunk_count] | int32 | the chunk's body |
 | body_list, body_chunk_start | [n], [n + 1] | int32 | bodies that take forces, first chunk of each |
 """
@@ -61,7 +61,7 @@ def _sum_chunks(
     # inputs:
     body_q_in: wp.array[wp.transform],
     body_com_in: wp.array[wp.vec3],
-    chunk_start_in: wp.array[wp.int32],
+    chunk_range_in: wp.array[wp.vec2i],
     chunk_body_in: wp.array[wp.int32],
     positions_in: wp.array[wp.vec3],
     forces_in: wp.array[wp.vec3],
@@ -75,7 +75,7 @@ def _sum_chunks(
     torque = wp.vec3(0.0)
     if body >= 0:
         center = wp.transform_point(body_q_in[body], body_com_in[body])
-        for i in range(chunk_start_in[chunk], chunk_start_in[chunk + 1]):
+        for i in range(chunk_range_in[chunk][0], chunk_range_in[chunk][1]):
             force += forces_in[i]
             torque += torques_in[i] + wp.cross(positions_in[i] - center, forces_in[i])
     wrenches_out[chunk] = wp.spatial_vector(force, torque)
@@ -107,7 +107,7 @@ def scatter_wrenches(
     body_com,
     body_flags,
     kinematic_flag,
-    chunk_start,
+    chunk_range,
     chunk_body,
     body_list,
     body_chunk_start,
@@ -126,7 +126,7 @@ def scatter_wrenches(
     wp.launch(
         _sum_chunks,
         dim=len(chunk_body),
-        inputs=[body_q, body_com, chunk_start, chunk_body, positions, forces, torques],
+        inputs=[body_q, body_com, chunk_range, chunk_body, positions, forces, torques],
         outputs=[wrenches],
         device=wrenches.device,
     )

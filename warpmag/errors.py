@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     The command prints it and exits with code 2; at the array and Newton level it is an ordinary ``ValueError``.
     """
+
+
+class SimulationError(RuntimeError):
+    """A simulation that cannot go on: one line that names the step and the body."""

@@ -1,0 +1,247 @@
+"""Collision and rigid-body solver, set up for piles of small bodies that strong forces press together.
+
+Newton's defaults are for bodies of a metre. Here contact gaps follow the size of the bodies, contact and pair buffers
+have a fixed size that is checked and grown, and XPBD runs with the settings that let a magnetic pile come to rest.
+"""
+
+import copy
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.errors import InputError
+from warpmag.kernels.monitor import watch_capacity
+
+_NEWTON_GAP = 0.1
+"""``ModelBuilder.rigid_gap`` [m] as Newton sets it: the gap of a shape for which nobody chose one."""
+_GAP = 0.1
+"""Contact gap of a shape over the thickness of its body: contacts are known a tenth of a radius ahead."""
+_CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 12, 40
+"""First sizes of the buffers: a ball in the densest packing has 12 neighbours, each pair is counted once."""
+_GROWTH = 1.5
+
+
+@dataclass(frozen=True)
+class BodySizes:
+    """What the motion of a body is measured by.
+
+    Attributes:
+        thickness: Half of the smallest dimension of the body's colliding shapes [m], a ball's radius; infinite for
+            bodies that forces do not move. Shape [body_count].
+        reach: Farthest point of a colliding shape from the centre of mass [m], zero for a ball about it. Shape
+            [body_count].
+        shape_thickness: Half of the smallest dimension of each shape [m], infinite for planes and height fields.
+            Shape [shape_count].
+    """
+
+    thickness: np.ndarray
+    reach: np.ndarray
+    shape_thickness: np.ndarray
+
+
+def body_sizes(model: newton.Model) -> BodySizes:
+    """Measure the colliding shapes of every body."""
+    shape_body, colliding = model.shape_body.numpy(), model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES
+    types, scales, radii = model.shape_type.numpy(), model.shape_scale.numpy(), model.shape_collision_radius.numpy()
+    shape_thickness = np.array(
+        [_thickness(kind, scale, source) for kind, scale, source in zip(types, scales, model.shape_source, strict=True)]
+    )
+    thickness, reach = np.full(model.body_count, np.inf), np.zeros(model.body_count)
+    moving = model.body_inv_mass.numpy() > 0.0
+    moving &= (model.body_flags.numpy() & newton.BodyFlags.KINEMATIC) == 0
+    centers, frames = model.body_com.numpy(), model.shape_transform.numpy()
+    for shape in np.flatnonzero((shape_body >= 0) & (colliding != 0)):
+        body = shape_body[shape]
+        if moving[body]:
+            arm = np.linalg.norm(frames[shape, :3] - centers[body])
+            thickness[body] = min(thickness[body], shape_thickness[shape])
+            if arm > 1e-3 * radii[shape] or types[shape] != newton.GeoType.SPHERE:
+                reach[body] = max(reach[body], arm + radii[shape])
+    return BodySizes(thickness, reach, shape_thickness)
+
+
+def _thickness(kind: int, scale: np.ndarray, source) -> float:
+    """Return half of the smallest dimension [m] of one shape."""
+    kinds = newton.GeoType
+    if kind in (kinds.SPHERE, kinds.CAPSULE):
+        return float(scale[0])
+    if kind in (kinds.CYLINDER, kinds.CONE):
+        return float(min(scale[0], scale[1]))
+    if kind in (kinds.BOX, kinds.ELLIPSOID):
+        return float(scale.min())
+    if kind in (kinds.MESH, kinds.CONVEX_MESH):
+        vertices = np.asarray(source.vertices) * scale
+        return float(0.5 * np.ptp(vertices, axis=0).min())
+    return float("inf")
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """A buffer of fixed size that can overflow.
+
+    Attributes:
+        kind: ``pair``, ``contact`` or ``triangle``.
+        fill: Entries that were asked for, on the device, shape [1]; more than ``limit`` if some were dropped.
+        limit: Entries that fit.
+    """
+
+    kind: str
+    fill: wp.array
+    limit: int
+
+
+def scale_gaps(model: newton.Model, sizes: BodySizes) -> None:
+    """Give the shapes for which nobody chose a contact gap one that fits their size.
+
+    Static shapes get that of the thickest moving body: gaps of two shapes add up, and a plane has no size.
+    """
+    gaps = model.shape_gap.numpy()
+    unchosen = np.isclose(gaps, _NEWTON_GAP)
+    moving = np.isfinite(sizes.thickness)
+    if not (unchosen.any() and moving.any()):
+        return
+    body = model.shape_body.numpy()
+    scale = np.full(model.shape_count, sizes.thickness[moving].max())
+    on_moving = (body >= 0) & np.isfinite(sizes.thickness[body])
+    scale[on_moving] = sizes.thickness[body[on_moving]]
+    model.shape_gap.assign(np.where(unchosen, np.minimum(gaps, _GAP * scale), gaps).astype(np.float32))
+
+
+def _without_free_joints(model: newton.Model) -> newton.Model:
+    """Return a view of ``model`` without its joints, if all of them are free ones, which constrain nothing.
+
+    XPBD solves maximal coordinates: a free joint only costs it a third of its time, or half on a GPU.
+    """
+    if model.joint_count and (model.joint_type.numpy() == newton.JointType.FREE).all():
+        model = copy.copy(model)
+        model.joint_count = 0
+    return model
+
+
+def _xpbd(model: newton.Model, contact_max: int):
+    return newton.solvers.SolverXPBD(_without_free_joints(model), iterations=60, rigid_contact_con_weighting=False)
+
+
+def _steel(model: newton.Model, contact_max: int):
+    return newton.solvers.SolverSteel(
+        model, iterations=60, free_body_constraint_max=3 * contact_max, warn_constraint_overflow=False
+    )
+
+
+def _mujoco(model: newton.Model, contact_max: int):
+    return newton.solvers.SolverMuJoCo(model, use_mujoco_contacts=False, nconmax=contact_max, njmax=3 * contact_max)
+
+
+SOLVERS: dict[str, Callable] = {
+    "xpbd": _xpbd,
+    "steel": _steel,
+    "mujoco": _mujoco,
+    "semi-implicit": lambda model, contact_max: newton.solvers.SolverSemiImplicit(model),
+    "featherstone": lambda model, contact_max: newton.solvers.SolverFeatherstone(model),
+}
+"""Rigid-body solvers by name; the first is the default and the one that piles are tested with."""
+
+
+class RigidSolver:
+    """One model's collision pipeline and solver.
+
+    Attributes:
+        contacts: Contacts of the last :meth:`collide`.
+        overlaps: Depth of each contact over the thickness of its thinner body, once measured, on the device, shape
+            [rigid_contact_max].
+        buffers: The buffers that can overflow.
+    """
+
+    def __init__(self, model: newton.Model, sizes: BodySizes, *, solver: str = "xpbd", capacity: float = 1.0):
+        """Set up collision and solver.
+
+        Args:
+            model: The model; shapes with Newton's default contact gap get one that fits them.
+            sizes: Sizes of its bodies.
+            solver: One of ``SOLVERS``.
+            capacity: First size of the contact and pair buffers over the usual one.
+
+        Raises:
+            InputError: There is no such solver, or it cannot be had or cannot run this model.
+        """
+        if solver not in SOLVERS:
+            raise InputError(f"solver: {solver!r} is not one of {', '.join(SOLVERS)}")
+        self._model, self._name = model, solver
+        scale_gaps(model, sizes)
+        finite = sizes.thickness[np.isfinite(sizes.thickness)]
+        self._speculation = float(2.0 * finite.max()) if len(finite) else 0.0
+        shapes = int(np.count_nonzero(model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES))
+        self._limits = {
+            "contact": max(16, int(capacity * _CONTACTS_PER_SHAPE * shapes)),
+            "pair": max(16, int(capacity * _PAIRS_PER_SHAPE * shapes)),
+            "triangle": None,  # Newton's estimate
+        }
+        self._allocate()
+
+    def _allocate(self) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self._pipeline = newton.CollisionPipeline(
+                self._model,
+                broad_phase="sap",
+                speculative_contact_gap_max=self._speculation,
+                rigid_contact_max=self._limits["contact"],
+                shape_pairs_max=self._limits["pair"],
+                max_triangle_pairs=self._limits["triangle"],
+                verify_buffers=False,  # would only print; the counters are read instead
+            )
+            self.contacts = self._pipeline.contacts()
+            self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
+            try:
+                self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
+            except (ImportError, NotImplementedError, TypeError, ValueError, RuntimeError) as error:
+                raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None
+        narrow = self._pipeline.narrow_phase
+        self.buffers = [
+            Buffer("pair", self._pipeline.broad_phase_pair_count, self._pipeline.shape_pairs_max),
+            Buffer("contact", self.contacts.rigid_contact_count, self.contacts.rigid_contact_max),
+        ]
+        if narrow.triangle_pairs is not None:
+            self.buffers += [
+                Buffer("triangle", narrow.triangle_pairs_count, narrow.triangle_pairs.shape[0]),
+                Buffer("triangle", self.contacts.contact_counters[2:3], 0),  # contacts lost while they were reduced
+            ]
+
+    def collide(self, state: newton.State, dt: float) -> None:
+        """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""
+        self._pipeline.collide(state, self.contacts, dt=dt)
+
+    def step(self, state_in: newton.State, state_out: newton.State, dt: float) -> None:
+        """Advance by ``dt`` [s] with the contacts of the last :meth:`collide`; capturable in a graph."""
+        self._solver.step(state_in, state_out, None, self.contacts, dt)
+
+    def watch(self, first: int, counts: wp.array) -> None:
+        """Fold how full each buffer is into ``counts``, from index ``first`` on; capturable in a graph."""
+        for index, buffer in enumerate(self.buffers):
+            watch_capacity(buffer.fill, first + index, counts)
+
+    def grow(self, fills: np.ndarray) -> bool:
+        """Enlarge the buffers that overflowed; contacts and graphs are void afterwards.
+
+        Args:
+            fills: How many entries each of ``buffers`` was asked for.
+
+        Returns:
+            Whether any had to grow.
+        """
+        grown = {}
+        for buffer, fill in zip(self.buffers, fills, strict=True):
+            if fill > buffer.limit:
+                size = max(other.limit for other in self.buffers if other.kind == buffer.kind)
+                grown[buffer.kind] = max(int(_GROWTH * max(fill, size)), grown.get(buffer.kind, 0))
+        overflow = getattr(self._solver, "constraint_overflow", None)
+        if overflow is not None and overflow.numpy().any():
+            grown.setdefault("contact", int(_GROWTH * self._limits["contact"]))
+        self._limits |= grown
+        if grown:
+            self._allocate()
+        return bool(grown)

@@ -1,0 +1,272 @@
+"""Magnetic forces on the bodies of a Newton model."""
+
+import itertools
+from dataclasses import dataclass, replace
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.engine.attributes import marked_shapes
+from warpmag.engine.sampling import BodyLattice, ShapeSampler
+from warpmag.errors import InputError
+from warpmag.kernels.bodies import gather_moments, scatter_wrenches, sum_moments
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.system import MomentSystem
+
+_CHUNK = 32
+"""Moments that one thread sums: long enough for the balls' one moment to stay cheap, short enough for a GPU."""
+_KINEMATIC = int(newton.BodyFlags.KINEMATIC)
+
+
+@dataclass(frozen=True)
+class BodyMagnet:
+    """Shapes of one body that are one magnet.
+
+    Attributes:
+        magnet: The material, magnetization in the frame of the body.
+        body: The body, -1 for a magnet fixed in the world.
+        shapes: The shapes, together one volume.
+        world: The world, counted among those that hold magnets.
+        lattice: The sampled moments in the frame of the body, grouped by shape.
+    """
+
+    magnet: Magnet
+    body: int
+    shapes: tuple[int, ...]
+    world: int
+    lattice: BodyLattice
+
+
+class Magnetics:
+    """The magnets of a Newton model: finds the moments, brings the inducible ones to equilibrium, adds the forces.
+
+    A ball is one moment, any other shape a lattice of moments whose total is exact. Moments of one body exert no force
+    on each other, magnets of different worlds none either. Works with any solver that reads ``State.body_f``::
+
+        state.clear_forces()
+        magnetics.apply(state)
+        solver.step(state, state_out, None, contacts, dt)
+
+    Attributes:
+        magnets: The magnets found, in the order of their moments.
+        system: The moments on the device.
+        shapes: The shapes that :meth:`shape_moments` reports, [n].
+        shape_volumes: Magnetic volume of each of them [m³], what it shares with an earlier one left out, [n].
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        *,
+        force: str = "kelvin",
+        dynamics: str = "theta",
+        rtol: float = 1e-3,
+        external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        max_evaluations: int = 1000,
+    ):
+        """Sample the magnets of ``model`` and allocate everything that :meth:`apply` needs.
+
+        Args:
+            model: A finished model with shapes marked by :func:`warpmag.add_inducible`, :func:`warpmag.add_permanent`.
+            force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
+            dynamics: ``theta`` (exact flow, accelerated) or ``theta-euler`` (the paper's explicit step).
+            rtol: Relative magnetization error at which induction ends.
+            external_field: Uniform applied field H0 [A/m], world frame.
+            max_evaluations: Field evaluations after which induction gives up.
+
+        Raises:
+            InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would be
+                felt in several.
+        """
+        settings = MagneticSettings(tuple(external_field), force, dynamics, rtol)
+        settings.check("Magnetics")
+        self.magnets = _find_magnets(model)
+        self._model = model
+        self.system = self._make_system(settings, max_evaluations)
+        self._map_bodies()
+
+    def _make_system(self, settings: MagneticSettings, max_evaluations: int) -> MomentSystem:
+        counts = [len(one.lattice.volumes) for one in self.magnets]
+
+        def spread(values, dtype=float):
+            return np.repeat(np.asarray(values, dtype=dtype), counts)
+
+        magnets = [one.magnet for one in self.magnets]
+        fixed = np.cumsum([one.body < 0 for one in self.magnets]) + self._model.body_count
+        bodies = [one.body if one.body >= 0 else own for one, own in zip(self.magnets, fixed, strict=True)]
+        return MomentSystem(
+            worlds=spread([one.world for one in self.magnets], int),
+            permanent=spread([one.kind == "permanent" for one in magnets], bool),
+            radii=np.concatenate([one.lattice.radii for one in self.magnets]),
+            bodies=spread(bodies, int),
+            saturation=spread([one.saturation for one in magnets]),
+            susceptibility=spread([one.susceptibility for one in magnets]),
+            curve=_only_curve(magnets),
+            external_field=settings.external_field,
+            force=settings.force,
+            dynamics=settings.dynamics,
+            rtol=settings.rtol,
+            max_evaluations=max_evaluations,
+            device=self._model.device,
+        )
+
+    def _map_bodies(self) -> None:
+        """Lay out who belongs to whom for the kernels."""
+        device = self._model.device
+        lattices = [one.lattice for one in self.magnets]
+        counts = [len(one.volumes) for one in lattices]
+        body = np.repeat([one.body for one in self.magnets], counts)
+        permanent = np.repeat([one.magnet.kind == "permanent" for one in self.magnets], counts)
+        self._volumes = np.concatenate([one.volumes for one in lattices])
+        local = self._volumes[:, None] * np.repeat([one.magnet.magnetization for one in self.magnets], counts, axis=0)
+
+        start = np.concatenate([[0], np.cumsum(counts)])
+        chunks = [np.arange(first, last, _CHUNK) for first, last in itertools.pairwise(start)]
+        chunk_body = np.repeat([one.body for one in self.magnets], [len(one) for one in chunks])
+        order = np.argsort(chunk_body, kind="stable")
+        bodies, first = np.unique(chunk_body[order], return_index=True)
+        dynamic = bodies >= 0
+
+        def put(values, dtype):
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        chunk_start = np.concatenate(chunks)
+        chunk_end = np.concatenate([chunk_start[1:], start[-1:]])
+        self._moment_body, self._permanent = put(body, wp.int32), put(permanent, wp.bool)
+        self._local_positions = put(np.concatenate([one.positions for one in lattices]), wp.vec3)
+        self._local_moments = put(local, wp.vec3)
+        self._chunk_range = put(np.stack([chunk_start, chunk_end], axis=1)[order], wp.vec2i)
+        self._chunk_body = put(chunk_body[order], wp.int32)
+        self._body_list = put(bodies[dynamic], wp.int32)
+        self._body_chunk_start = put(np.append(first[dynamic], len(order)), wp.int32)
+        self._wrenches = wp.zeros(len(order), dtype=wp.spatial_vector, device=device)
+
+        self.shapes = np.concatenate([one.shapes for one in self.magnets])
+        self._parts = np.concatenate([[0], np.cumsum(np.concatenate([one.counts for one in lattices]))])
+        volume = np.concatenate([[0.0], np.cumsum(self._volumes)])
+        self.shape_volumes = np.diff(volume[self._parts])
+        self._part_start = put(self._parts, wp.int32)
+        self._totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=device)
+
+    def apply(self, state: newton.State) -> None:
+        """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
+
+        Args:
+            state: State with poses ``body_q``; its ``body_f`` is added to, not cleared.
+        """
+        self.induce(state)
+        self.add_forces(state)
+
+    def induce(self, state: newton.State) -> None:
+        """Bring the inducible magnets to equilibrium at the poses of ``state``, starting from where they were."""
+        gather_moments(
+            state.body_q,
+            self._moment_body,
+            self._permanent,
+            self._local_positions,
+            self._local_moments,
+            self.system.positions,
+            self.system.moments,
+        )
+        self.system.solve()
+
+    def add_forces(self, state: newton.State) -> None:
+        """Add the forces of the present moments to ``state.body_f``: the second half of :meth:`apply`."""
+        self.system.apply_forces()
+        scatter_wrenches(
+            state.body_q,
+            self._model.body_com,
+            self._model.body_flags,
+            _KINEMATIC,
+            self._chunk_range,
+            self._chunk_body,
+            self._body_list,
+            self._body_chunk_start,
+            self.system.positions,
+            self.system.forces,
+            self.system.torques,
+            self._wrenches,
+            state.body_f,
+        )
+
+    def shape_moments(self) -> np.ndarray:
+        """Return the total moment of each magnetic shape [A·m²], world frame, rows as :attr:`shapes`, shape [n, 3].
+
+        Where shapes of one body overlap, the common volume belongs to the first of them.
+        """
+        sum_moments(self._part_start, self.system.moments, self._totals)
+        return self._totals.numpy()
+
+    def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:
+        """Let induction start from given magnetizations.
+
+        Args:
+            magnetizations: Magnetization [A/m], world frame, of inducible shapes.
+        """
+        moments = self.system.moments.numpy()
+        inducible = ~self._permanent.numpy()
+        for part, shape in enumerate(self.shapes.tolist()):
+            rows = slice(self._parts[part], self._parts[part + 1])
+            if shape in magnetizations and inducible[rows].all():
+                moments[rows] = self._volumes[rows, None] * magnetizations[shape]
+        self.system.moments.assign(moments)
+
+
+def _only_curve(magnets: list[Magnet]) -> str:
+    """Return the magnetization curve of all inducible magnets, which must be the same one."""
+    curves = {one.curve for one in magnets if one.kind == "inducible"}
+    if len(curves) > 1:
+        raise InputError(f"model: its magnets have the curves {', '.join(sorted(curves))}; give all the same")
+    return curves.pop() if curves else "tanh"
+
+
+def _find_magnets(model: newton.Model) -> list[BodyMagnet]:
+    """Group the marked shapes of ``model`` into magnets and sample them, in the order that the system wants."""
+    body_of, rotations = model.shape_body.numpy().tolist(), model.shape_transform.numpy()[:, 3:].tolist()
+    groups: list[tuple[Magnet, int, list[int]]] = []
+    of_body: dict[int, list[tuple[Magnet, int, list[int]]]] = {}
+    for shape, magnet in marked_shapes(model).items():
+        body = body_of[shape]
+        turned = wp.quat_rotate(wp.quat(*rotations[shape]), wp.vec3(*magnet.magnetization))
+        magnet = replace(magnet, magnetization=tuple(turned))
+        alike = [group for group in of_body.get(body, []) if body >= 0 and _alike(group[0], magnet)]
+        if alike:
+            alike[0][2].append(shape)
+        else:
+            groups.append((magnet, body, [shape]))
+            of_body.setdefault(body, []).append(groups[-1])
+    worlds = _number_worlds(model, [shapes[0] for _, _, shapes in groups])
+    sampler = ShapeSampler(model)
+    magnets = [
+        BodyMagnet(
+            magnet,
+            body,
+            tuple(shapes),
+            world,
+            sampler.sample(shapes, magnet.moment_spacing, magnet.kind == "permanent"),
+        )
+        for (magnet, body, shapes), world in zip(groups, worlds, strict=True)
+    ]
+    return sorted(magnets, key=lambda one: (one.world, one.magnet.kind == "permanent", one.body, one.shapes))
+
+
+def _alike(a: Magnet, b: Magnet) -> bool:
+    """Return whether two magnets of one body are the same material, magnetized alike up to rounding."""
+    difference = np.subtract(a.magnetization, b.magnetization)
+    return replace(a, magnetization=b.magnetization) == b and np.linalg.norm(difference) <= 1e-5 * np.linalg.norm(
+        a.magnetization
+    )
+
+
+def _number_worlds(model: newton.Model, shapes: list[int]) -> list[int]:
+    """Return the world of each shape, counted among the worlds that hold magnets.
+
+    A magnet outside all worlds belongs to the only one that holds magnets, if there is only one.
+    """
+    worlds = model.shape_world.numpy()[shapes]
+    held = np.unique(worlds[worlds >= 0])
+    if len(held) > 1 and (worlds < 0).any():
+        label = model.shape_label[shapes[int(np.argmax(worlds < 0))]]
+        raise InputError(f"{label}: a magnet outside all worlds, while {len(held)} worlds hold magnets of their own")
+    return [int(np.searchsorted(held, world)) if world >= 0 else 0 for world in worlds]

@@ -1,0 +1,106 @@
+"""From Newton's shapes to the moments that stand for them."""
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+
+from warpmag import lattice
+from warpmag.errors import InputError
+
+
+@dataclass(frozen=True)
+class BodyLattice:
+    """Moments of one magnet in the frame of its body, grouped by shape.
+
+    Attributes:
+        positions: Positions [m], shape [n, 3].
+        volumes: Volumes [m³], shape [n].
+        radii: Radii of the balls that the moments are averaged over [m], shape [n].
+        counts: Moments of each shape, in the order of the shapes.
+    """
+
+    positions: np.ndarray
+    volumes: np.ndarray
+    radii: np.ndarray
+    counts: np.ndarray
+
+
+class ShapeSampler:
+    """Samples shapes of one model; shapes that are alike, in many worlds say, are sampled once."""
+
+    def __init__(self, model: newton.Model):
+        """Read the geometry of ``model``."""
+        self._labels, self._sources = model.shape_label, model.shape_source
+        self._bodies = model.shape_body.numpy()
+        self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
+        self._frames = model.shape_transform.numpy().astype(float)
+        self._known: dict[tuple, BodyLattice] = {}
+
+    def sample(self, shapes: list[int], spacing: float, permanent: bool) -> BodyLattice:
+        """Return the moments of one magnet.
+
+        Balls apart from each other are one moment each if ``spacing`` is 0. Everything else is filled with moments,
+        as one solid: volume that shapes have in common is counted once, for the first of them.
+
+        Args:
+            shapes: Shapes of one body, or one static shape.
+            spacing: Distance between moments [m]; 0 for automatic.
+            permanent: Whether the moments are fixed: their field is not averaged over more than their cells then.
+        """
+        key = (spacing, permanent, *(self._key(shape) for shape in shapes))
+        if key not in self._known:
+            try:
+                self._known[key] = self._sample(shapes, spacing, permanent)
+            except InputError as error:
+                raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
+        return self._known[key]
+
+    def _key(self, shape: int) -> tuple:
+        source = id(self._sources[shape]) if self._sources[shape] is not None else None
+        return (int(self._types[shape]), source, *self._scales[shape].tolist(), *self._frames[shape].tolist())
+
+    def _sample(self, shapes: list[int], spacing: float, permanent: bool) -> BodyLattice:
+        if spacing == 0.0 and self._are_balls_apart(shapes):
+            balls = [lattice.ball(self._scales[shape, 0]) for shape in shapes]
+            return BodyLattice(
+                np.concatenate([self._frames[shape, None, :3] for shape in shapes]),
+                np.concatenate([one.volumes for one in balls]),
+                np.concatenate([one.radii for one in balls]),
+                np.ones(len(shapes), dtype=int),
+            )
+        solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
+        filled = lattice.fill(solids, spacing)
+        owners = np.full(len(filled.volumes), len(solids) - 1)
+        for index in reversed(range(len(solids) - 1)):
+            owners[solids[index].contains(filled.positions)] = index
+        order = np.argsort(owners, kind="stable")
+        radii = filled.inner_radii if permanent else filled.radii
+        counts = np.bincount(owners, minlength=len(solids))
+        return BodyLattice(filled.positions[order], filled.volumes[order], radii[order], counts)
+
+    def _are_balls_apart(self, shapes: list[int]) -> bool:
+        if (self._types[shapes] != newton.GeoType.SPHERE).any():
+            return False
+        centers, radii = self._frames[shapes, :3], self._scales[shapes, 0]
+        distances = np.linalg.norm(centers[:, None] - centers, axis=2) + 3.0 * np.diag(radii)
+        return bool((distances >= (radii[:, None] + radii) * (1.0 - 1e-5)).all())
+
+    def _solid(self, shape: int) -> lattice.Solid:
+        kinds, kind, scale = newton.GeoType, self._types[shape], self._scales[shape]
+        if kind == kinds.SPHERE:
+            return lattice.sphere(scale[0])
+        if kind == kinds.BOX:
+            return lattice.box(scale)
+        if kind == kinds.ELLIPSOID:
+            return lattice.ellipsoid(scale)
+        if kind == kinds.CAPSULE:
+            return lattice.capsule(scale[0], scale[1])
+        if kind == kinds.CYLINDER and scale[2] == 0.0:
+            return lattice.cylinder(scale[0], scale[1])
+        if kind == kinds.CONE:
+            return lattice.cone(scale[0], scale[1])
+        if kind in (kinds.MESH, kinds.CONVEX_MESH):
+            source = self._sources[shape]
+            return lattice.mesh(np.asarray(source.vertices, float) * scale, np.asarray(source.indices).reshape(-1, 3))
+        raise InputError("a cylinder with a barrel side cannot be magnetized")

@@ -1,0 +1,271 @@
+"""Simulates a scene of magnets: a USD stage, or a Newton builder."""
+
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.engine.contacts import RigidSolver, body_sizes
+from warpmag.engine.magnetics import Magnetics
+from warpmag.engine.scene import ImportedScene, import_scene
+from warpmag.engine.statistics import Statistics, find_held
+from warpmag.engine.stepper import Stepper
+from warpmag.errors import InputError
+from warpmag.magnets import MagneticSettings, check_positive
+
+DEFAULT_STEP = 1e-3
+"""Time step [s] where neither the user nor the stage gives one: the paper's."""
+LONGEST_SUBSTEP = 5e-4
+"""Upper limit of a substep [s]: with XPBD's 60 iterations piles of 5 mm balls then come to rest."""
+_OVERLAP = 1e-4
+"""Bodies that overlap at the start by more than this part of their thickness are worth a warning."""
+_TOUCHING = 0.05
+"""Bodies closer than this part of their thickness touch, for the count of held ones."""
+_FRAME_RATE = 60.0
+"""Output frames per second [Hz] of a scene that is no stage."""
+
+
+class Simulation:
+    """A scene of magnets that moves.
+
+    Attributes:
+        model: Newton's model.
+        magnetics: Its magnets.
+        statistics: Figures of the run so far; those of the end are filled in by :meth:`finish`.
+        step_size: Time step [s].
+        frame_rate: Output frames per second [Hz].
+        frame_count: Output frames that the stage asks for, the first excluded; None where it has no time range.
+    """
+
+    def __init__(
+        self,
+        scene: str | os.PathLike | newton.ModelBuilder,
+        *,
+        step: float | None = None,
+        solver: str = "xpbd",
+        force: str | None = None,
+        dynamics: str | None = None,
+        rtol: float | None = None,
+        external_field: tuple[float, float, float] | None = None,
+        device: str | None = None,
+        graphs: bool = True,
+        visuals: bool = False,
+    ):
+        """Import the scene and get ready to step.
+
+        Args:
+            scene: USD file, or a builder with magnets added to it.
+            step: Time step [s]; by default the stage's, else 1 ms. It is split into substeps as motion demands.
+            solver: Newton's solver: ``xpbd``, ``steel``, ...
+            force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
+            dynamics: ``theta`` or ``theta-euler``; by default the stage's, else ``theta``.
+            rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
+            external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
+            device: Warp device; by default Warp's.
+            graphs: Replay captured graphs instead of launching kernels one by one.
+            visuals: Also import what is only seen, for a viewer.
+
+        Raises:
+            InputError: Something about the scene or an argument is wrong; the message names it.
+        """
+        self.device = _device(device)
+        self._scene: ImportedScene | None = None
+        builder, settings = scene, MagneticSettings()
+        self.frame_rate, self.frame_count = _FRAME_RATE, None
+        if not isinstance(scene, newton.ModelBuilder):
+            self._scene = import_scene(scene, visuals=visuals)
+            builder, settings, clock = self._scene.builder, self._scene.magnets.settings, self._scene.clock
+            self.frame_rate, step = clock.frames_per_second, step if step is not None else clock.step
+            seconds = (clock.end - clock.start) / clock.time_codes_per_second
+            self.frame_count = round(seconds * self.frame_rate) or None
+        self.step_size = DEFAULT_STEP if step is None else step
+        check_positive("step", self.step_size)
+        with wp.ScopedDevice(self.device):
+            self.model = builder.finalize(device=self.device)
+        self._check_poses()
+        self.magnetics = Magnetics(
+            self.model,
+            force=settings.force if force is None else force,
+            dynamics=settings.dynamics if dynamics is None else dynamics,
+            rtol=settings.rtol if rtol is None else rtol,
+            external_field=settings.external_field if external_field is None else external_field,
+        )
+        sizes = body_sizes(self.model)
+        self._solver = RigidSolver(self.model, sizes, solver=solver)
+        self._stepper = Stepper(
+            self.model,
+            self.magnetics,
+            self._solver,
+            sizes,
+            step=self.step_size,
+            longest_substep=LONGEST_SUBSTEP,
+            graphs=graphs,
+        )
+        self._sizes = sizes
+        self._moving = np.array(
+            sorted({one.body for one in self.magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int
+        )
+        self.statistics = Statistics(magnets=len(self._moving))
+        if self._scene:
+            self._start_from_stage()
+        self._center = self._positions().mean(axis=0) if len(self._moving) else np.zeros(3)
+        self.statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
+
+    def _moves(self, body: int) -> bool:
+        return math.isfinite(self._sizes.thickness[body])
+
+    def _check_poses(self) -> None:
+        for name in ("body_q", "body_qd"):
+            bad = ~np.isfinite(getattr(self.model, name).numpy()).all(axis=1)
+            if bad.any():
+                what = "position or orientation" if name == "body_q" else "velocity"
+                raise InputError(f"{self.model.body_label[int(np.argmax(bad))]}: {what} is not finite")
+
+    def _start_from_stage(self) -> None:
+        """Let induction start from the moments that the stage holds, of an earlier run say."""
+        given = {}
+        volumes = dict(zip(self.magnetics.shapes.tolist(), self.magnetics.shape_volumes.tolist(), strict=True))
+        for prim, moment in self._scene.magnets.initial_moments.items():
+            shapes = self._scene.magnet_shapes[prim]
+            volume = sum(volumes[shape] for shape in shapes)
+            given |= dict.fromkeys(shapes, np.array(moment) / volume)
+        self.magnetics.start_from(given)
+
+    @property
+    def state(self) -> newton.State:
+        """The present state."""
+        return self._stepper.state
+
+    @property
+    def time(self) -> float:
+        """Time since the start [s]."""
+        return self.statistics.steps * self.step_size
+
+    def step(self) -> None:
+        """Advance by one step.
+
+        Raises:
+            SimulationError: The state is not finite any more.
+        """
+        self.statistics.add_step(self._stepper.advance())
+
+    def _positions(self) -> np.ndarray:
+        return self.state.body_q.numpy()[self._moving, :3].astype(float)
+
+    def run(
+        self,
+        frames: int | None = None,
+        *,
+        output: str | os.PathLike | None = None,
+        copy_scene: bool = False,
+        on_frame: Callable[[int], None] | None = None,
+    ) -> Statistics:
+        """Simulate, and record the frames on a USD stage.
+
+        A frame is taken at the step nearest to its time and stands at the time of that step. Interrupted, the stage
+        has the frames so far.
+
+        Args:
+            frames: Output frames after the first; by default those of the stage, else one second.
+            output: USD file to write; only for a scene that came from a stage.
+            copy_scene: Copy the scene beside the output instead of pointing to it.
+            on_frame: Called after each frame with its number, from 0.
+
+        Returns:
+            The statistics, :meth:`finish` done.
+
+        Raises:
+            InputError: The output cannot be written.
+            SimulationError: The state is not finite any more.
+        """
+        frames = self.frames_of(frames)
+        recorder = self._open_recorder(output, copy_scene)
+        began = time.perf_counter()
+        try:
+            for frame in range(frames + 1):
+                target = round(frame / (self.frame_rate * self.step_size))
+                if frame and target <= self.statistics.steps:
+                    continue  # steps are longer than frames: several would stand at one time
+                while self.statistics.steps < target:
+                    self.step()
+                if recorder:
+                    recorder.add_frame(*self._frame())
+                self._follow()
+                if on_frame:
+                    on_frame(frame)
+        finally:
+            self.statistics.wall_seconds += time.perf_counter() - began
+            if recorder:
+                recorder.close()
+        return self.finish()
+
+    def frames_of(self, frames: int | None) -> int:
+        """Return how many frames a run of ``frames`` has, which may be None for the scene's own number."""
+        if frames is None:
+            frames = self.frame_count if self.frame_count is not None else round(self.frame_rate)
+        if not (isinstance(frames, int) and frames > 0):
+            raise InputError(f"frames: must be a positive whole number, got {frames}")
+        return frames
+
+    def _open_recorder(self, output, copy_scene):
+        if output is None:
+            return None
+        if self._scene is None:
+            raise InputError(f"{Path(output)}: only a scene that came from a stage can be written to one")
+        from warpmag.usd import CacheWriter  # noqa: PLC0415 - a simulation of a builder does without USD
+
+        return CacheWriter(
+            self._scene.stage, output, list(self._scene.bodies), list(self._scene.magnet_shapes), copy_scene=copy_scene
+        )
+
+    def _frame(self) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        rows = list(self._scene.bodies.values())
+        totals = dict(zip(self.magnetics.shapes.tolist(), self.magnetics.shape_moments(), strict=True))
+        moments = [sum(totals[shape] for shape in shapes) for shapes in self._scene.magnet_shapes.values()]
+        return self.time, self.state.body_q.numpy()[rows], self.state.body_qd.numpy()[rows], np.array(moments)
+
+    def _follow(self) -> None:
+        if len(self._moving):
+            distance = np.linalg.norm(self._positions() - self._center, axis=1).max()
+            self.statistics.farthest = max(self.statistics.farthest, float(distance))
+
+    def finish(self) -> Statistics:
+        """Fill in the figures of the end and return the statistics."""
+        figures = self.statistics
+        figures.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
+        figures.overlap, figures.depth = max(figures.overlap, figures.final_overlap), max(figures.depth, depth)
+        speeds = np.linalg.norm(self.state.body_qd.numpy()[:, :3], axis=1)
+        held = np.intersect1d(np.flatnonzero(self._held()), self._moving)
+        figures.held = len(held)
+        figures.held_rms_speed = float(np.sqrt(np.mean(speeds[held] ** 2))) if len(held) else 0.0
+        figures.rms_speed = float(np.sqrt(np.mean(speeds[self._moving] ** 2))) if len(self._moving) else 0.0
+        return figures
+
+    def _held(self) -> np.ndarray:
+        """Return which bodies a fixed magnet holds; behind the bodies stand the static shapes, each for itself."""
+        model, contacts = self.model, self._solver.contacts
+        shape_body = model.shape_body.numpy()
+        node = np.where(shape_body >= 0, shape_body, model.body_count + np.arange(model.shape_count))
+        fixed = np.ones(model.body_count + model.shape_count, dtype=bool)
+        fixed[: model.body_count] = ~np.isfinite(self._sizes.thickness)
+        magnetic = np.zeros_like(fixed)
+        magnetic[node[self.magnetics.shapes]] = True
+
+        count = int(contacts.rigid_contact_count.numpy()[0])
+        sides = [getattr(contacts, f"rigid_contact_shape{k}").numpy()[:count] for k in (0, 1)]
+        pairs = node[np.stack(sides, axis=1)]
+        touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
+        return find_held(pairs[touching], magnetic, fixed)[: model.body_count]
+
+
+def _device(name: str | None) -> wp.Device:
+    try:
+        return wp.get_device(name)
+    except (ValueError, RuntimeError):
+        known = ", ".join(str(one) for one in wp.get_devices())
+        raise InputError(f"device: {name!r} is not there, this machine has {known}") from None

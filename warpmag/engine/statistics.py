@@ -1,0 +1,135 @@
+"""What a run reports about itself."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warpmag.engine.stepper import FORCE, INDUCTION, RIGID, StepReport
+
+
+@dataclass
+class Statistics:
+    """Figures of a run, gathered step by step.
+
+    Attributes:
+        magnets: Bodies with magnets that forces move.
+        steps: Steps done.
+        substeps: Substeps done, repeated ones left out.
+        repeated: Attempts at steps that were thrown away.
+        capped: Steps in which a body moved farther in a substep than allowed.
+        regrown: Steps in which contact or pair buffers had to grow.
+        evaluations: Field evaluations of each step.
+        unconverged: Substeps whose induction did not converge.
+        error: Largest magnetization error of any substep.
+        peak_speed: Highest speed of a body [m/s].
+        overlap: Deepest penetration over the thickness of the thinner body, a ball's radius.
+        depth: Deepest penetration [m].
+        final_overlap: The same as ``overlap``, at the end.
+        rms_speed: Root mean square speed of the magnets at the end [m/s].
+        held: Magnets held by a fixed magnet, off everything else that is fixed, at the end.
+        held_rms_speed: Root mean square speed of those [m/s].
+        farthest: Largest distance of a magnet from the centre of where they all started, in any frame [m].
+        overlapping: Contacts that overlap at the start.
+        wall_seconds: Time that the run took [s].
+    """
+
+    magnets: int = 0
+    steps: int = 0
+    substeps: int = 0
+    repeated: int = 0
+    capped: int = 0
+    regrown: int = 0
+    evaluations: list[int] = field(default_factory=list)
+    unconverged: int = 0
+    error: float = 0.0
+    peak_speed: float = 0.0
+    overlap: float = 0.0
+    depth: float = 0.0
+    final_overlap: float = 0.0
+    rms_speed: float = 0.0
+    held: int = 0
+    held_rms_speed: float = 0.0
+    farthest: float = 0.0
+    overlapping: int = 0
+    wall_seconds: float = 0.0
+    _seconds: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def add_step(self, report: StepReport) -> None:
+        """Take in one step."""
+        self.steps += 1
+        self.substeps += report.substeps
+        self.repeated += report.attempts - 1
+        self.capped += report.capped
+        self.regrown += report.regrown
+        self.evaluations.append(report.evaluations)
+        self.unconverged += report.unconverged
+        self.error = max(self.error, report.error)
+        self.peak_speed = max(self.peak_speed, report.speed)
+        self.overlap = max(self.overlap, report.overlap)
+        self.depth = max(self.depth, report.depth)
+        if report.seconds:
+            self._seconds.append((report.seconds[INDUCTION], report.seconds[FORCE], report.seconds[RIGID]))
+
+    @property
+    def milliseconds(self) -> tuple[float, float, float]:
+        """Mean time per step of induction Ti, magnetic forces Tf and rigid bodies Tr [ms], as the paper's Table 1."""
+        return tuple((1e3 * np.mean(self._seconds, axis=0)).tolist()) if self._seconds else (0.0, 0.0, 0.0)
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know before he trusts the run, a line each."""
+        lines = []
+        if self.overlapping:
+            lines.append(f"{self.overlapping} pairs of bodies overlap at the start")
+        if self.unconverged:
+            lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
+        if self.capped:
+            lines.append(f"bodies moved too fast for the shortest substep in {self.capped} of {self.steps} steps")
+        return lines
+
+    def summary(self) -> list[str]:
+        """Return the run in a few lines."""
+        if not self.steps:
+            return ["no steps"]
+        induction, force, rigid = self.milliseconds
+        evaluations = np.array(self.evaluations)
+        lines = [
+            f"magnets        {self.magnets} moving",
+            f"steps          {self.steps} ({self.substeps / self.steps:.2f} substeps each, {self.repeated} repeated, "
+            f"{self.regrown} buffer growths) in {self.wall_seconds:.1f} s",
+            f"time per step  Ti {induction:.2f} ms, Tf {force:.2f} ms, Tr {rigid:.2f} ms",
+            f"field          {evaluations.mean():.1f} evaluations per step (median {np.median(evaluations):.0f}, "
+            f"max {evaluations.max()}), magnetization error at most {self.error:.1e}",
+            f"speed          RMS {100.0 * self.rms_speed:.2f} cm/s at the end, peak {self.peak_speed:.2f} m/s",
+            f"penetration    {100.0 * self.overlap:.2f} % of the radius at most ({1e3 * self.depth:.4f} mm), "
+            f"{100.0 * self.final_overlap:.2f} % at the end",
+            f"farthest       {self.farthest:.3f} m from the centre of the start",
+        ]
+        if self.held:
+            lines.append(f"held           {self.held} by a fixed magnet, RMS {100.0 * self.held_rms_speed:.2f} cm/s")
+        return lines
+
+
+def find_held(pairs: np.ndarray, magnetic: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """Return which bodies hang on a fixed magnet, directly or through others that do not stand on the ground.
+
+    Args:
+        pairs: Bodies that touch, shape [n, 2].
+        magnetic: Whether each body is a magnet.
+        fixed: Whether each body is fixed in the world; the ground is one that is no magnet.
+
+    Returns:
+        Whether each body is held.
+    """
+    grounded = np.zeros(len(fixed), dtype=bool)
+    for one, other in (pairs.T, pairs.T[::-1]):
+        grounded[other[fixed[one] & ~magnetic[one]]] = True
+    free = ~fixed & ~grounded
+    held = np.zeros(len(fixed), dtype=bool)
+    while True:
+        holds = held | (fixed & magnetic)
+        touched = np.zeros(len(fixed), dtype=bool)
+        touched[pairs[holds[pairs].any(axis=1)]] = True
+        more = touched & free
+        if (more == held).all():
+            return held
+        held = more
