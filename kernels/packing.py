@@ -1,0 +1,53 @@
+"""Packing of moments into the component rows that the pair loops read; see ``pair_loops``."""
+
+from functools import cache
+
+import warp as wp
+
+
+@cache
+def _pack_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pack(
+        # inputs:
+        positions: wp.array[vec3],
+        moments: wp.array[vec3],
+        radii: wp.array[dtype],
+        labels: wp.array[int],
+        # outputs:
+        packed_out: wp.array2d[dtype],
+        points_out: wp.array[wp.vec3],
+    ):
+        i = wp.tid()
+        x = positions[i]
+        m = moments[i]
+        for c in range(3):
+            packed_out[c, i] = x[c]
+            packed_out[c + 4, i] = m[c]
+        packed_out[3, i] = radii[i]
+        packed_out[7, i] = dtype(labels[i])
+        points_out[i] = wp.vec3(float(x[0]), float(x[1]), float(x[2]))
+
+    return pack
+
+
+def launch_pack(positions, moments, radii, labels, packed, points):
+    """Pack moments.
+
+    Args:
+        positions: Positions [m], shape [n].
+        moments: Moments [A·m²], shape [n].
+        radii: Radii [m], shape [n].
+        labels: Body labels, shape [n]; exact in float32 up to 2²⁴.
+        packed: Out, shape [8, n].
+        points: Out, positions in float32 for the neighbour grid [m], shape [n].
+    """
+    wp.launch(
+        _pack_kernel(packed.dtype),
+        dim=packed.shape[1],
+        inputs=[positions, moments, radii, labels],
+        outputs=[packed, points],
+        device=packed.device,
+    )

@@ -1,0 +1,422 @@
+"""All-pairs loops: field, and field with gradient, of packed moments at packed targets.
+
+Moments travel packed, one scalar row per component, so that one layout serves vector loads on a CPU and coalesced
+loads on a GPU:
+
+| packed row | 0 1 2 | 3 | 4 5 6 | 7 |
+|---|---|---|---|---|
+| content | position [m] | radius [m] | moment [A·m²] | body label |
+
+A ``Rows`` object says which target sees which contiguous range of sources. The loops come in two forms behind
+:func:`launch_pair_loop`: the plain Warp loop, readable, exact for overlapping balls, and kept as the reference; and
+native loops, which evaluate the dipole clamped at contact (see ``pair_law``) and leave overlapping pairs to
+``neighbors``. Sums leave in ``partial`` rows, several per target where the sources of few targets are split over
+blocks; the caller's finishing kernel adds them up in a fixed order, so that results do not depend on scheduling.
+
+All sums are 4π times the field [A/m], three numbers, or that and the gradient [A/m²], nine: xx, yy, zz, xy, yz, zx.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+from warpmag.kernels.pair_law import field_of, gradient_of, pair_factors, smoothed_factors
+
+PACKED_ROWS = 8
+EXCLUDE_NOTHING, EXCLUDE_SELF, EXCLUDE_BODY = 0, 1, 2
+"""Sources that a loop leaves out: none, the target itself, or everything with the target's body label."""
+
+_BLOCK = 256
+# Enough blocks in flight to fill 132 multiprocessors about four times over; more only lengthens the final sum.
+_BLOCKS_WANTED = 512
+_MIN_SOURCES_PER_SPLIT = 64
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Which target rows see which sources, on one device.
+
+    Attributes:
+        count: Number of target rows.
+        target: Packed column of each target row, shape [count].
+        begin: First source of each target row, shape [count].
+        end: One past the last source of each target row, shape [count].
+        tiles: CUDA work list: target range, source range, split; shape [tiles, 5]. Empty on a CPU.
+        splits: Partial sums per target row.
+        targets_per_thread: Targets that one CUDA thread holds in registers.
+        pair_count: Pairs that the loop evaluates.
+    """
+
+    count: int
+    target: wp.array
+    begin: wp.array
+    end: wp.array
+    tiles: wp.array
+    splits: int
+    targets_per_thread: int
+    pair_count: int
+
+
+def make_rows(segments, device) -> Rows:
+    """Build the work list of target ranges that each see one source range.
+
+    Args:
+        segments: Integers [k, 4]: target column begin and end, source begin and end.
+        device: Warp device.
+    """
+    segments = np.asarray(segments, np.int64).reshape(-1, 4)
+    sizes = segments[:, 1] - segments[:, 0]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    count = int(starts[-1])
+    within = np.arange(count) - np.repeat(starts[:-1], sizes)
+    target = np.repeat(segments[:, 0], sizes) + within
+    begin, end = np.repeat(segments[:, 2], sizes), np.repeat(segments[:, 3], sizes)
+
+    splits, per_thread, tiles = 1, 1, np.zeros((0, 5), np.int64)
+    if wp.get_device(device).is_cuda and count:
+        per_thread = 2 if count > 32768 else 1
+        width = _BLOCK * per_thread
+        blocks = int(np.sum(-(-sizes // width)))
+        longest = int(np.max(segments[:, 3] - segments[:, 2]))
+        splits = max(1, min(-(-_BLOCKS_WANTED // max(blocks, 1)), longest // _MIN_SOURCES_PER_SPLIT))
+        tiles = np.array(
+            [
+                (
+                    starts[k] + t,
+                    min(starts[k] + t + width, starts[k + 1]),
+                    s0 + (s1 - s0) * split // splits,
+                    s0 + (s1 - s0) * (split + 1) // splits,
+                    split,
+                )
+                for k, (_, _, s0, s1) in enumerate(segments)
+                for t in range(0, int(sizes[k]), width)
+                for split in range(splits)
+            ],
+            np.int64,
+        ).reshape(-1, 5)
+
+    def to_device(a):
+        return wp.array(a.astype(np.int32), dtype=wp.int32, device=device)
+
+    return Rows(
+        count=count,
+        target=to_device(target),
+        begin=to_device(begin),
+        end=to_device(end),
+        tiles=to_device(tiles),
+        splits=splits,
+        targets_per_thread=per_thread,
+        pair_count=int(np.sum(end - begin)),
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Reference loop
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _reference_kernel(dtype, gradient: bool):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pair_loop_reference(
+        # inputs:
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        row_target: wp.array[int],
+        row_begin: wp.array[int],
+        row_end: wp.array[int],
+        exclude: int,
+        epsilon2: dtype,
+        # outputs:
+        partial_out: wp.array3d[dtype],
+    ):
+        row = wp.tid()
+        i = row_target[row]
+        x = vec3(targets[0, i], targets[1, i], targets[2, i])
+        radius = targets[3, i]
+        label = targets[7, i]
+        h = vec3()
+        diagonal = vec3()
+        off_diagonal = vec3()
+        for j in range(row_begin[row], row_end[row]):
+            left_out = (exclude == 1 and i == j) or (exclude == 2 and label == sources[7, j])
+            if not left_out:
+                r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
+                m = vec3(sources[4, j], sources[5, j], sources[6, j])
+                d2 = wp.dot(r, r)
+                g = pair_factors(d2, radius, sources[3, j])
+                if epsilon2 > dtype(0.0):
+                    g = smoothed_factors(d2, epsilon2)
+                h += field_of(g, r, m)
+                if wp.static(gradient):
+                    t = gradient_of(g, r, m)
+                    diagonal += vec3(t[0], t[1], t[2])
+                    off_diagonal += vec3(t[3], t[4], t[5])
+        for c in range(3):
+            partial_out[0, row, c] = h[c]
+            if wp.static(gradient):
+                partial_out[0, row, c + 3] = diagonal[c]
+                partial_out[0, row, c + 6] = off_diagonal[c]
+
+    return pair_loop_reference
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Native loops
+# ---------------------------------------------------------------------------------------------------------------------
+
+# One pair. The products are ordered so that no factor beyond r⁻³ leaves the float32 range before it meets r.
+_PAIR = """
+    const REAL rx = tx{k} - ax, ry = ty{k} - ay, rz = tz{k} - az;
+    const REAL s = tr{k} + ar;
+    const REAL s2 = s * s;
+    const REAL d2 = rx * rx + ry * ry + rz * rz;
+    const REAL c = d2 > s2 ? d2 : s2;
+    const REAL inv = {mask} ? RSQRT(c) : REAL(0);
+    const REAL inv2 = inv * inv;
+    const REAL inv3 = inv2 * inv;
+    const REAL rm = REAL(3) * inv2 * (rx * bx + ry * by + rz * bz);
+    hx{k} += inv3 * (rm * rx - bx);
+    hy{k} += inv3 * (rm * ry - by);
+    hz{k} += inv3 * (rm * rz - bz);
+"""
+_PAIR_GRADIENT = """
+    const REAL w = REAL(3) * inv3 * inv2;
+    const REAL trace = inv3 * rm;
+    const REAL px = w * bx - REAL(2.5) * inv2 * trace * rx;
+    const REAL py = w * by - REAL(2.5) * inv2 * trace * ry;
+    const REAL pz = w * bz - REAL(2.5) * inv2 * trace * rz;
+    xx{k} += REAL(2) * rx * px + trace;
+    yy{k} += REAL(2) * ry * py + trace;
+    zz{k} += REAL(2) * rz * pz + trace;
+    xy{k} += rx * py + ry * px;
+    yz{k} += ry * pz + rz * py;
+    zx{k} += rz * px + rx * pz;
+"""
+_FIELD_SUMS = ("hx", "hy", "hz")
+_GRADIENT_SUMS = ("xx", "yy", "zz", "xy", "yz", "zx")
+
+
+def _pair_code(gradient: bool, k: str = "") -> str:
+    mask = f"(c > REAL(0) && al != tl{k})" if gradient else "c > REAL(0)"
+    return (_PAIR + (_PAIR_GRADIENT if gradient else "")).format(k=k, mask=mask)
+
+
+def _sums(gradient: bool) -> tuple[str, ...]:
+    return _FIELD_SUMS + (_GRADIENT_SUMS if gradient else ())
+
+
+def _cpu_snippet(real: str, gradient: bool) -> str:
+    """One target row over a contiguous range of sources; clang vectorises the loop over sources."""
+    sums = _sums(gradient)
+    stores = "\n".join(f"    out[{c}] = {name};" for c, name in enumerate(sums))
+    return f"""
+    typedef {real} REAL;
+    #define RSQRT(c) (REAL(1) / {"__builtin_sqrtf" if real == "float" else "__builtin_sqrt"}(c))
+    const size_t ns = sources.shape[1], nt = targets.shape[1];
+    const REAL* src = (const REAL*)sources.data;
+    const REAL* tgt = (const REAL*)targets.data;
+    const REAL tx = tgt[column], ty = tgt[nt + column], tz = tgt[2 * nt + column], tr = tgt[3 * nt + column];
+    const REAL tl = tgt[7 * nt + column];
+    REAL {", ".join(f"{name} = 0" for name in sums)};
+    {{
+    // sums may be reordered into lanes; nothing else of fast-math is allowed
+    #pragma clang fp reassociate(on) contract(fast)
+    #pragma clang loop vectorize(enable)
+    for (int j = begin; j < end; ++j) {{
+        const REAL ax = src[j], ay = src[ns + j], az = src[2 * ns + j], ar = src[3 * ns + j];
+        const REAL bx = src[4 * ns + j], by = src[5 * ns + j], bz = src[6 * ns + j];
+        const REAL al = src[7 * ns + j];
+        {_pair_code(gradient)}
+    }}
+    }}
+    REAL* out = (REAL*)partial_out.data + (size_t)row * {len(sums)};
+{stores}
+    #undef RSQRT
+    """
+
+
+def _cuda_snippet(real: str, gradient: bool, targets_per_thread: int) -> str:
+    """One block: a tile of targets in registers, its sources staged through shared memory, double-buffered."""
+    sums = _sums(gradient)
+    ks = [str(k) for k in range(targets_per_thread)]
+    loads = "\n".join(
+        f"""
+    const int row{k} = row_begin + lane + {k} * {_BLOCK};
+    const int column{k} = row{k} < row_end ? row_target.data[row{k}] : -1;
+    const REAL tx{k} = column{k} < 0 ? REAL(0) : tgt[column{k}], ty{k} = column{k} < 0 ? REAL(0) : tgt[nt + column{k}];
+    const REAL tz{k} = column{k} < 0 ? REAL(0) : tgt[2 * nt + column{k}];
+    const REAL tr{k} = column{k} < 0 ? REAL(0) : tgt[3 * nt + column{k}];
+    const REAL tl{k} = column{k} < 0 ? REAL(0) : tgt[7 * nt + column{k}];
+    REAL {", ".join(f"{name}{k} = 0" for name in sums)};"""
+        for k in ks
+    )
+    pairs = "\n".join("        {" + _pair_code(gradient, k) + "}" for k in ks)
+    assigns = {k: " ".join(f"out[{c}] = {name}{k};" for c, name in enumerate(sums)) for k in ks}
+    stores = "\n".join(
+        f"""
+    if (column{k} >= 0) {{
+        REAL* out = (REAL*)partial_out.data + ((size_t)split * rows + row{k}) * {len(sums)};
+        {assigns[k]}
+    }}"""
+        for k in ks
+    )
+    return f"""
+    typedef {real} REAL;
+    #define RSQRT(c) {"rsqrtf" if real == "float" else "rsqrt"}(c)
+    struct alignas(16) Quad {{ REAL x, y, z, w; }};
+    __shared__ Quad shared_a[2][{_BLOCK}];
+    __shared__ Quad shared_b[2][{_BLOCK}];
+    const int lane = thread % {_BLOCK};
+    const int* tile = tiles.data + 5 * (thread / {_BLOCK});
+    const int row_begin = tile[0], row_end = tile[1], source_begin = tile[2], source_end = tile[3], split = tile[4];
+    const size_t ns = sources.shape[1], nt = targets.shape[1], rows = partial_out.shape[1];
+    const REAL* src = (const REAL*)sources.data;
+    const REAL* tgt = (const REAL*)targets.data;
+{loads}
+    // padding beyond the last source: no moment, out of everybody's reach
+    const Quad far_away = {{REAL(1e15), REAL(0), REAL(0), REAL(0)}}, nothing = {{REAL(0), REAL(0), REAL(0), REAL(-1)}};
+    Quad a = far_away, b = nothing;
+    #define STAGE(base) {{ const int j = (base) + lane; a = far_away; b = nothing; if (j < source_end) {{ \\
+        a = Quad{{src[j], src[ns + j], src[2 * ns + j], src[3 * ns + j]}}; \\
+        b = Quad{{src[4 * ns + j], src[5 * ns + j], src[6 * ns + j], src[7 * ns + j]}}; }} }}
+    STAGE(source_begin)
+    int buffer = 0;
+    for (int base = source_begin; base < source_end; base += {_BLOCK}) {{
+        shared_a[buffer][lane] = a;
+        shared_b[buffer][lane] = b;
+        __syncthreads();
+        if (base + {_BLOCK} < source_end) STAGE(base + {_BLOCK})
+        #pragma unroll 8
+        for (int k = 0; k < {_BLOCK}; ++k) {{
+            const Quad sa = shared_a[buffer][k], sb = shared_b[buffer][k];
+            const REAL ax = sa.x, ay = sa.y, az = sa.z, ar = sa.w, bx = sb.x, by = sb.y, bz = sb.z, al = sb.w;
+{pairs}
+        }}
+        buffer ^= 1;
+    }}
+{stores}
+    #undef STAGE
+    #undef RSQRT
+    """
+
+
+@cache
+def _cpu_kernel(dtype, gradient: bool):
+    real = "float" if dtype is wp.float32 else "double"
+
+    @wp.func_native(_cpu_snippet(real, gradient))
+    def pair_row(
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        row: int,
+        column: int,
+        begin: int,
+        end: int,
+        partial_out: wp.array3d[dtype],
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pair_loop_cpu(
+        # inputs:
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        row_target: wp.array[int],
+        row_begin: wp.array[int],
+        row_end: wp.array[int],
+        # outputs:
+        partial_out: wp.array3d[dtype],
+    ):
+        row = wp.tid()
+        pair_row(targets, sources, row, row_target[row], row_begin[row], row_end[row], partial_out)
+
+    return pair_loop_cpu
+
+
+@cache
+def _cuda_kernel(dtype, gradient: bool, targets_per_thread: int):
+    real = "float" if dtype is wp.float32 else "double"
+
+    @wp.func_native(_cuda_snippet(real, gradient, targets_per_thread))
+    def pair_tile(
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        row_target: wp.array[int],
+        tiles: wp.array2d[int],
+        thread: int,
+        partial_out: wp.array3d[dtype],
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pair_loop_cuda(
+        # inputs:
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        row_target: wp.array[int],
+        tiles: wp.array2d[int],
+        # outputs:
+        partial_out: wp.array3d[dtype],
+    ):
+        pair_tile(targets, sources, row_target, tiles, wp.tid(), partial_out)
+
+    return pair_loop_cuda
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Launch
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def partial_shape(rows: Rows, gradient: bool) -> tuple[int, int, int]:
+    """Shape of the ``partial`` array that :func:`launch_pair_loop` fills: splits, target rows, sums."""
+    return rows.splits, max(rows.count, 1), len(_sums(gradient))
+
+
+def launch_pair_loop(rows: Rows, targets, sources, partial, *, gradient=False, reference_exclude=None, epsilon2=0.0):
+    """Sum the field, or the field and its gradient, of packed sources over the target rows.
+
+    The native loops clamp the distance at contact: an ``EXCLUDE_SELF`` target's own moment is *not* left out of the
+    field (it contributes −m/(2a)³, which the finishing kernel takes back), while in the gradient everything with the
+    target's own label is.
+
+    Args:
+        rows: Work list.
+        targets: Packed targets, shape [8, targets].
+        sources: Packed sources, shape [8, sources].
+        partial: Sums, shape as :func:`partial_shape` says.
+        gradient: Whether to sum the gradient too.
+        reference_exclude: One of ``EXCLUDE_...`` to run the reference loop, which leaves those sources out and takes
+            overlapping pairs exactly; None for the native loop.
+        epsilon2: Smoothing ε² [m⁵], reference loop only.
+    """
+    if rows.count == 0:
+        return
+    device, dtype = partial.device, partial.dtype
+    if reference_exclude is not None:
+        wp.launch(
+            _reference_kernel(dtype, gradient),
+            dim=rows.count,
+            inputs=[targets, sources, rows.target, rows.begin, rows.end, reference_exclude, dtype(epsilon2)],
+            outputs=[partial],
+            device=device,
+        )
+    elif device.is_cuda:
+        wp.launch(
+            _cuda_kernel(dtype, gradient, rows.targets_per_thread),
+            dim=rows.tiles.shape[0] * _BLOCK,
+            inputs=[targets, sources, rows.target, rows.tiles],
+            outputs=[partial],
+            device=device,
+            block_dim=_BLOCK,
+        )
+    else:
+        wp.launch(
+            _cpu_kernel(dtype, gradient),
+            dim=rows.count,
+            inputs=[targets, sources, rows.target, rows.begin, rows.end],
+            outputs=[partial],
+            device=device,
+        )

@@ -1,0 +1,185 @@
+"""Field of moments, and forces and torques between them: one-shot calls on arrays."""
+
+import numpy as np
+import warp as wp
+
+from warpmag.arrays import Kind, resolve_kind, vec3_type
+from warpmag.errors import InputError
+from warpmag.kernels import pair_loops
+from warpmag.kernels.field import launch_finish_field
+from warpmag.kernels.wrench import KELVIN, Material, launch_finish_wrench
+from warpmag.packed import PackedMoments
+
+METHODS = ("auto", "vectorized", "reference")
+ACCURACY = {"float32": 2e-6, "float64": 1e-13}
+"""Relative L2 error of the all-pairs sums that tests hold them to."""
+
+
+def h_field(
+    positions,
+    moments,
+    targets=None,
+    *,
+    radii=None,
+    target_radii=None,
+    smoothing=0.0,
+    method="auto",
+    rtol=None,
+    dtype="float32",
+    device=None,
+):
+    """Field H of magnetic moments (Kim and Han 2022, Eq. 1).
+
+    Moments with a radius are uniformly magnetized balls; where a ball overlaps the target's ball the field is the one
+    averaged over the target. Point dipoles at zero distance are left out, as is a moment's own field.
+
+    Args:
+        positions: Moment positions [m], shape [n, 3], NumPy or Warp.
+        moments: Moments [A·m²], shape [n, 3].
+        targets: Where to evaluate [m], shape [t, 3]; None means at the moments themselves, self excluded.
+        radii: Ball radii [m], scalar or [n]; None means point dipoles.
+        target_radii: Radii of the balls over which to average at the targets [m], scalar or [t]; None means points.
+        smoothing: Length ℓ [m] of the paper's smoothing, ε² = ℓ⁵ added to r⁵ (section 5); point dipoles only.
+        method: ``vectorized`` (native loops), ``reference`` (the plain Warp loop) or ``auto``.
+        rtol: Relative error wanted; the all-pairs sums are exact to rounding, so it is only checked against ``dtype``.
+        dtype: ``float32`` or ``float64``.
+        device: Warp device; None means that of the arrays, or Warp's default.
+
+    Returns:
+        H [A/m], shape [t, 3], NumPy or a Warp array of vectors as ``positions`` is.
+
+    Raises:
+        InputError: An argument has a wrong shape, is not finite or is out of range.
+    """
+    kind = resolve_kind(positions, dtype, device)
+    _check_method(method, rtol, dtype)
+    x = kind.vectors("positions", positions)
+    m = kind.vectors("moments", moments, x.shape[0])
+    same_set = targets is None
+    if same_set and target_radii is not None:
+        raise InputError("target_radii: only with targets; the moments' own radii are in radii")
+    _check_smoothing(smoothing, radii)
+    sources = _packed(kind, "radii", radii, x, m)
+    at = sources
+    if not same_set:
+        points = kind.vectors("targets", targets)
+        at = _packed(kind, "target_radii", target_radii, points, wp.zeros_like(points))
+    rows = pair_loops.make_rows([(0, at.count, 0, sources.count)], kind.device)
+    exact = method == "reference" or smoothing > 0.0
+    exclude = pair_loops.EXCLUDE_SELF if same_set else pair_loops.EXCLUDE_NOTHING
+    partial = _pair_sums(rows, at, sources, exclude if exact else None, smoothing, gradient=False)
+    if not exact:
+        at.find_overlaps(None if same_set else sources)
+    base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
+    h = wp.zeros_like(base)
+    # the reference loop leaves the self term out and the overlaps right: nothing of the set is to be corrected then
+    launch_finish_field(rows, partial, at, sources, same_set and not exact, base, h)
+    return kind.finish(h)
+
+
+def wrench(
+    positions,
+    moments,
+    *,
+    radii=None,
+    external_field=None,
+    smoothing=0.0,
+    method="auto",
+    rtol=None,
+    dtype="float32",
+    device=None,
+):
+    """Kelvin force and torque on each of a set of magnetic moments, mutual and from an external field.
+
+    F = μ0 (m·∇)H (Kim and Han 2022, Eqs. 13 and 14) and τ = μ0 m × H. Mutual forces obey Newton's third law, and with
+    the torques angular momentum is conserved.
+
+    Args:
+        positions: Moment positions [m], shape [n, 3], NumPy or Warp.
+        moments: Moments [A·m²], shape [n, 3].
+        radii: Ball radii [m], scalar or [n]; None means point dipoles.
+        external_field: Applied field H0 [A/m], shape [3] or [n, 3]; it turns moments, and, being given without a
+            gradient, does not pull them.
+        smoothing: Length ℓ [m] of the paper's smoothing, ε² = ℓ⁵ added to r⁵ (section 5); point dipoles only.
+        method: ``vectorized`` (native loops), ``reference`` (the plain Warp loop) or ``auto``.
+        rtol: Relative error wanted; only checked against ``dtype``, see :func:`h_field`.
+        dtype: ``float32`` or ``float64``.
+        device: Warp device; None means that of the arrays, or Warp's default.
+
+    Returns:
+        Forces [N] and torques about each moment's position [N·m], each of shape [n, 3], in the kind of ``positions``.
+
+    Raises:
+        InputError: An argument has a wrong shape, is not finite or is out of range.
+    """
+    kind = resolve_kind(positions, dtype, device)
+    _check_method(method, rtol, dtype)
+    _check_smoothing(smoothing, radii)
+    x = kind.vectors("positions", positions)
+    m = kind.vectors("moments", moments, x.shape[0])
+    n = x.shape[0]
+    external = kind.vectors("external_field", np.zeros(3) if external_field is None else external_field, n)
+    packed = _packed(kind, "radii", radii, x, m)
+    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device)
+    exact = method == "reference" or smoothing > 0.0
+    partial = _pair_sums(rows, packed, packed, pair_loops.EXCLUDE_BODY if exact else None, smoothing, gradient=True)
+    if not exact:
+        packed.find_overlaps()
+    forces, torques = wp.zeros_like(x), wp.zeros_like(x)
+    twisted = wp.ones(n, dtype=int, device=kind.device)
+    material = Material.permanent(n, kind.dtype, kind.device)
+    launch_finish_wrench(rows, partial, packed, external, external, material, twisted, KELVIN, forces, torques)
+    return kind.finish(forces), kind.finish(torques)
+
+
+def _packed(kind: Kind, name, radii, positions, moments) -> PackedMoments:
+    """Pack one-shot arrays, radii checked under ``name``."""
+    n = positions.shape[0]
+    array = kind.scalars(name, 0.0 if radii is None else radii, n)
+    packed = PackedMoments(array, largest_radius=_largest_radius(name, radii))
+    packed.pack(positions, moments)
+    return packed
+
+
+def _pair_sums(rows, at, sources, exclude, smoothing, *, gradient):
+    """Sums of the pair loop: the native one, or with ``exclude`` the reference loop, in a fresh array."""
+    shape = pair_loops.partial_shape(rows, gradient)
+    if exclude is not None:
+        shape = (1, *shape[1:])
+    partial = wp.empty(shape, dtype=at.dtype, device=at.device)
+    pair_loops.launch_pair_loop(
+        rows,
+        at.packed,
+        sources.packed,
+        partial,
+        gradient=gradient,
+        reference_exclude=exclude,
+        epsilon2=smoothing**5,
+    )
+    return partial
+
+
+def _largest_radius(name, radii) -> float:
+    """Largest radius [m]; ``InputError`` for a negative one."""
+    if radii is None:
+        return 0.0
+    host = radii.numpy() if isinstance(radii, wp.array) else np.asarray(radii, float)
+    if host.size == 0:
+        return 0.0
+    if not host.min() >= 0.0:
+        raise InputError(f"{name}: must not be negative, got {host.min()}")
+    return float(host.max())
+
+
+def _check_method(method, rtol, dtype):
+    if method not in METHODS:
+        raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
+    if rtol is not None and not rtol >= ACCURACY[dtype]:
+        raise InputError(f"rtol: {dtype} sums are good to {ACCURACY[dtype]:g}, got {rtol}")
+
+
+def _check_smoothing(smoothing, radii):
+    if not (smoothing >= 0.0 and np.isfinite(smoothing)):
+        raise InputError(f"smoothing: must be zero or positive and finite, got {smoothing}")
+    if smoothing > 0.0 and radii is not None:
+        raise InputError("smoothing: only for point dipoles; leave radii out")
