@@ -54,6 +54,9 @@ _CHUNK = 1 << 18
 """Test points, or pairs of point and triangle, evaluated at a time (some tens of MB)."""
 
 
+Values = Sequence[float] | np.ndarray
+
+
 @dataclass(frozen=True)
 class Lattice:
     """Moments that stand for one solid body.
@@ -61,10 +64,12 @@ class Lattice:
     Attributes:
         positions: Positions of the moments [m], body frame, shape [n, 3].
         volumes: Volumes of the moments [m³], shape [n]; their sum is the volume of the body.
+        owners: Index of the shape that each moment belongs to, non-decreasing, shape [n].
     """
 
     positions: np.ndarray
     volumes: np.ndarray
+    owners: np.ndarray
 
     @property
     def radii(self) -> np.ndarray:
@@ -101,7 +106,7 @@ class Solid:
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
-    def posed(self, position: Sequence[float], quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> "Solid":
+    def posed(self, position: Values, quaternion: Values = (0.0, 0.0, 0.0, 1.0)) -> "Solid":
         """The same shape at ``position`` [m], turned by ``quaternion`` (x, y, z, w), both in the body's frame."""
         at, q = np.asarray(position, float), np.asarray(quaternion, float)
         if at.shape != (3,) or not np.isfinite(at).all():
@@ -119,15 +124,16 @@ class Solid:
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of the points [m], body frame, shape [n, 3], lie inside."""
         own = (points - self.position) @ self.rotation
-        result = ((own >= self.lower) & (own <= self.upper)).all(axis=1)
-        result[result] = self.inside(own[result])
+        near = np.flatnonzero(((own >= self.lower) & (own <= self.upper)).all(axis=1))
+        result = np.zeros(len(points), bool)
+        result[near] = self.inside(own[near])
         return result
 
 
-def box(half_extents: Sequence[float]) -> Solid:
+def box(half_extents: Values) -> Solid:
     """A box of half sides ``half_extents`` [m], shape [3], centred at the origin."""
     h = _lengths("box: half_extents", half_extents, 3)
-    return Solid("box", -h, h, float(8.0 * h.prod()), np.zeros(3), lambda p: (np.abs(p) <= h).all(axis=1))
+    return Solid("box", -h, h, float(8.0 * h.prod()), np.zeros(3), lambda p: np.abs(p / h).max(axis=1) <= 1.0)
 
 
 def sphere(radius: float) -> Solid:
@@ -136,7 +142,7 @@ def sphere(radius: float) -> Solid:
     return replace(ellipsoid([r, r, r]), name="sphere")
 
 
-def ellipsoid(semi_axes: Sequence[float]) -> Solid:
+def ellipsoid(semi_axes: Values) -> Solid:
     """An ellipsoid of ``semi_axes`` [m], shape [3], centred at the origin."""
     a = _lengths("ellipsoid: semi_axes", semi_axes, 3)
     volume = 4.0 / 3.0 * np.pi * float(a.prod())
@@ -211,7 +217,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
 def ball(radius: float) -> Lattice:
     """The one moment of a ball of ``radius`` [m]: exact for a uniformly magnetized ball."""
     (r,) = _lengths("ball: radius", [radius], 1)
-    return Lattice(np.zeros((1, 3)), np.array([4.0 / 3.0 * np.pi * r**3]))
+    return Lattice(np.zeros((1, 3)), np.array([4.0 / 3.0 * np.pi * r**3]), np.zeros(1, int))
 
 
 def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
@@ -244,7 +250,8 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
 
 def _fill(parts: Sequence[Solid], spacing: float) -> Lattice:
     filled = [_fill_part(part, parts[:k], spacing) for k, part in enumerate(parts)]
-    return Lattice(np.concatenate([p for p, _ in filled]), np.concatenate([v for _, v in filled]))
+    owners = np.repeat(np.arange(len(parts)), [len(volumes) for _, volumes in filled])
+    return Lattice(np.concatenate([p for p, _ in filled]), np.concatenate([v for _, v in filled]), owners)
 
 
 def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float) -> tuple[np.ndarray, np.ndarray]:
@@ -311,7 +318,7 @@ def _grid(counts: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _lengths(name: str, values: Sequence[float], count: int) -> np.ndarray:
+def _lengths(name: str, values: Values, count: int) -> np.ndarray:
     array = np.asarray(values, float)
     if array.shape != (count,) or not (np.isfinite(array).all() and (array > 0.0).all()):
         got = values if count > 1 else values[0]
