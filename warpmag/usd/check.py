@@ -81,7 +81,9 @@ def validate(stage: Usd.Stage) -> list[Finding]:
     findings = []
     for error in errors:
         severity = _SEVERITIES.get(error.GetType().name)
-        if severity:
+        # This rule also fires for a turned body whose scales differ, by a decomposition that is not unique; survey()
+        # finds the sheared ones.
+        if severity and error.GetName() != "RigidBodyOrientationScale":
             message = f"{' '.join(error.GetMessage().split())} [{error.GetIdentifier()}]"
             findings.append(Finding(_place(error, stage), message, severity))
     return findings
@@ -91,6 +93,6 @@ def _place(error, stage) -> str:
     for site in error.GetSites():
         if site.IsProperty():
             return str(site.GetProperty().GetPath())
-        if site.IsPrim():
+        if site.IsPrim() and not site.GetPrim().IsPseudoRoot():
             return str(site.GetPrim().GetPath())
     return stage_name(stage)

@@ -275,24 +275,38 @@ def _instanced_prims(stage, prims, findings) -> set[str]:
 
 
 class _TransformCheck:
-    """Finds transforms that are not finite or that flatten a prim, each named once, at the prim that causes it."""
+    """Finds transforms that no rigid body can have, those that are not finite once, at the prim that causes it."""
 
     def __init__(self):
         self._cache = UsdGeom.XformCache(Usd.TimeCode.Default())
-        self._known = {}
+        self._sound = {}
 
     def findings(self, prim) -> Iterator[Finding]:
+        yield from self._lineage_findings(prim)
+        if not self._sound[prim.GetPath()]:
+            return
+        matrix = np.array(self._cache.GetLocalToWorldTransform(prim))[:3, :3]
+        gram = matrix @ matrix.T
+        # Rotation and scale leave the axes at right angles. Poses are often single precision: 1e-5.
+        size = np.trace(gram) / 3.0
+        if np.abs(gram - np.diag(np.diag(gram))).max() > 1e-5 * size:
+            yield Finding(str(prim.GetPath()), "transform is sheared, which Newton imports wrong")
+        elif prim.IsA(UsdGeom.Sphere) and np.abs(np.diag(gram) - size).max() > 1e-5 * size:
+            yield Finding(str(prim.GetPath()), "a sphere scaled unevenly would be imported as a ball: make it a mesh")
+
+    def _lineage_findings(self, prim) -> Iterator[Finding]:
         lineage = []
-        while prim and not prim.IsPseudoRoot() and prim.GetPath() not in self._known:
+        while not prim.IsPseudoRoot() and prim.GetPath() not in self._sound:
             lineage.append(prim)
             prim = prim.GetParent()
         for prim in reversed(lineage):
             matrix, _ = self._cache.GetLocalTransformation(prim)
             finite = bool(np.isfinite(np.array(matrix)).all())
-            self._known[prim.GetPath()] = finite
+            flat = finite and matrix.GetDeterminant3() == 0.0
+            self._sound[prim.GetPath()] = finite and not flat and self._sound.get(prim.GetParent().GetPath(), True)
             if not finite:
                 yield Finding(str(prim.GetPath()), "transform is not finite")
-            elif abs(matrix.GetDeterminant3()) == 0.0:
+            elif flat:
                 yield Finding(str(prim.GetPath()), "transform has a scale of zero")
 
 
@@ -317,16 +331,6 @@ def _value_findings(prim) -> Iterator[Finding]:
             yield Finding(path, "mesh has no points")
         elif not np.isfinite(np.array(points)).all():
             yield Finding(path, "points must be finite")
-    if prim.IsA(UsdGeom.Sphere) and not _is_uniformly_scaled(prim):
-        yield Finding(path, "a sphere that is scaled unevenly would be imported as a ball: make it a mesh")
-
-
-def _is_uniformly_scaled(prim) -> bool:
-    matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))[:3, :3]
-    if not np.isfinite(matrix).all():
-        return True  # named already
-    gram = matrix @ matrix.T
-    return bool(np.allclose(gram, np.trace(gram) / 3.0 * np.eye(3), rtol=0.0, atol=2e-6 * np.trace(gram)))
 
 
 def _scenes(stage) -> list[Usd.Prim]:

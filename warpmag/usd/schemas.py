@@ -66,7 +66,7 @@ def settings_of(prim: Usd.Prim) -> MagneticSettings:
 
 def has_api(prim: Usd.Prim, name: str) -> bool:
     """Whether the API schema ``name`` is applied to ``prim``, also if it was registered too late for USD to know it."""
-    return name in prim.GetAppliedSchemas()
+    return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
 
 
 def _author(prim, api, attributes, record) -> None:

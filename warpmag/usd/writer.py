@@ -17,9 +17,7 @@ from warpmag.usd.reader import is_animated, stage_clock
 from warpmag.usd.schemas import MOMENT
 
 _SUFFIXES = (".usd", ".usda", ".usdc")
-_TRANSLATE, _ORIENT, _SCALE, _SHAPE = (
-    f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale", "transform")
-)
+_TRANSLATE, _ORIENT, _SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
 _TYPES = Sdf.ValueTypeNames
 
 
@@ -135,7 +133,7 @@ class CacheWriter:
 
     def _root_layer(self) -> Sdf.Layer:
         scene = self._stage.GetRootLayer()
-        root = Sdf.Layer.CreateAnonymous(self._path.suffix)
+        root = Sdf.Layer.CreateAnonymous()
         for key in scene.pseudoRoot.ListInfoKeys():
             if key not in ("subLayers", "subLayerOffsets"):
                 root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
@@ -148,7 +146,7 @@ class CacheWriter:
         return root
 
     def _cache_layer(self) -> Sdf.Layer:
-        cache = Sdf.Layer.CreateAnonymous(".usdc")
+        cache = Sdf.Layer.CreateAnonymous()
         self._set_metadata(cache)
         codes = self._time_codes()
         body_q, body_qd = np.stack(self._body_q, axis=1), np.stack(self._body_qd, axis=1)  # [n, frames, ...]
@@ -170,16 +168,14 @@ class _Placements:
         self._stage = stage
         self._transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
         moving = set(self.paths)
-        self._parents, self._shapes = [], []
+        self._parents, self._scales = [], []
         for path in self.paths:
             prim = stage.GetPrimAtPath(path)
             world = np.array(self._transforms.GetLocalToWorldTransform(prim))
-            shape = world @ np.linalg.inv(_rigid(world))  # scale and shear of the prim, in its own frame
+            scale = np.diag(world[:3, :3] @ _rigid(world)[:3, :3].T)
             parent = self._parent(prim, moving)
-            if parent is not None:
-                shape = shape @ np.diag([*[1.0 / _scale(parent)] * 3, 1.0])
             self._parents.append(parent)
-            self._shapes.append(shape)
+            self._scales.append(scale if parent is None else scale / _scale(parent))
 
     def _parent(self, prim, moving) -> np.ndarray | None:
         """Return the parent's world transform, None where the prim must leave it behind.
@@ -198,7 +194,7 @@ class _Placements:
 
     def author(self, layer, index, codes, body_q, body_qd) -> None:
         """Author the motion of one body, ``body_q`` [frames, 7] and ``body_qd`` [frames, 6]."""
-        path, parent, shape = self.paths[index], self._parents[index], self._shapes[index]
+        path, parent, scale = self.paths[index], self._parents[index], self._scales[index]
         positions = body_q[:, :3].astype(np.float64)
         turns = body_q[:, 3:].astype(np.float64)
         turns /= np.linalg.norm(turns, axis=1, keepdims=True)
@@ -213,30 +209,17 @@ class _Placements:
         _over(layer, self._stage, path)
         _author(layer, path, _TRANSLATE, _TYPES.Double3, codes, positions, Vt.Vec3dArray)
         _author(layer, path, _ORIENT, _TYPES.Quatf, codes, turns.astype(np.float32), Vt.QuatfArray)
-        order = [_TRANSLATE, _ORIENT, *self._author_shape(layer, path, shape)]
+        order = [_TRANSLATE, _ORIENT]
+        if not np.allclose(scale, 1.0, rtol=0.0, atol=1e-6):
+            _author_default(layer, path, _SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
+            order.append(_SCALE)
         if parent is None:
             order.insert(0, "!resetXformStack!")
-        Sdf.JustCreatePrimAttributeInLayer(
-            layer, f"{path}.xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform, False
-        )
-        layer.GetAttributeAtPath(f"{path}.xformOpOrder").default = Vt.TokenArray(order)
+        _author_default(layer, path, "xformOpOrder", _TYPES.TokenArray, Vt.TokenArray(order), Sdf.VariabilityUniform)
         _author(layer, path, "physics:velocity", _TYPES.Vector3f, codes, linear.astype(np.float32), Vt.Vec3fArray)
         _author(
             layer, path, "physics:angularVelocity", _TYPES.Vector3f, codes, angular.astype(np.float32), Vt.Vec3fArray
         )
-
-    def _author_shape(self, layer, path, shape) -> list[str]:
-        """Author what the prim's transform has beside position and rotation; return the operation's name."""
-        scale = np.diag(shape)[:3]
-        if np.allclose(shape, np.eye(4), rtol=0.0, atol=1e-6):
-            return []
-        if np.allclose(shape, np.diag([*scale, 1.0]), rtol=0.0, atol=1e-6 * np.abs(scale).max()):
-            name, kind, value = _SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist())
-        else:
-            name, kind, value = _SHAPE, _TYPES.Matrix4d, Gf.Matrix4d(shape.tolist())
-        Sdf.JustCreatePrimAttributeInLayer(layer, f"{path}.{name}", kind, Sdf.VariabilityVarying, False)
-        layer.GetAttributeAtPath(f"{path}.{name}").default = value
-        return [name]
 
 
 def _write_all(layers: dict[Path, Sdf.Layer]) -> None:
@@ -275,13 +258,18 @@ def _author(layer, path, name, kind, codes, values, array) -> None:
 
     The samples come with a default, the first of them, for readers that do not ask for a time.
     """
-    place = f"{path}.{name}"
-    Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, Sdf.VariabilityVarying, False)
-    attribute = layer.GetAttributeAtPath(place)
     samples = array.FromNumpy(np.ascontiguousarray(values))
-    attribute.default = samples[0]
+    place = _author_default(layer, path, name, kind, samples[0])
     if (values != values[0]).any():
-        attribute.SetInfo("timeSamples", dict(zip(codes, samples, strict=True)))
+        for code, sample in zip(codes, samples, strict=True):
+            layer.SetTimeSample(place, code, sample)
+
+
+def _author_default(layer, path, name, kind, value, variability=Sdf.VariabilityVarying) -> Sdf.Path:
+    place = Sdf.Path(f"{path}.{name}")  # made once: parsing it for every sample would take half of the time
+    Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, variability, False)
+    layer.GetAttributeAtPath(place).default = value
+    return place
 
 
 def _scale(matrix) -> float:

@@ -1,0 +1,140 @@
+"""The codeless schemas: registration, fallbacks and the round trip of every attribute."""
+
+import dataclasses
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pxr import Plug, Usd, UsdGeom, UsdPhysics
+
+from warpmag import magnets
+from warpmag.errors import InputError
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.usd import author_magnet, author_settings, open_stage, read_magnets, schemas
+
+MAGNETS = {
+    "/Iron": Magnet(saturation=1.2e6, susceptibility=3.5, curve="langevin", moment_spacing=0.001),
+    "/Ideal": Magnet(),
+    "/Steel": Magnet(curve="clamped", susceptibility=1e-3),
+    "/Bar": Magnet(kind="permanent", magnetization=(1e6, -2.5e5, 0.125), moment_spacing=0.02),
+}
+SETTINGS = MagneticSettings(external_field=(1e3, -2e4, 0.5), force="zeeman", dynamics="theta-euler", rtol=1e-4)
+
+
+def author_stage(path):
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    author_settings(UsdPhysics.Scene.Define(stage, "/Scene").GetPrim(), SETTINGS)
+    for name, magnet in MAGNETS.items():
+        prim = UsdGeom.Sphere.Define(stage, name).GetPrim()
+        UsdPhysics.RigidBodyAPI.Apply(prim)
+        UsdPhysics.CollisionAPI.Apply(prim)
+        author_magnet(prim, magnet)
+    stage.Save()
+    return stage
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_every_attribute_survives_the_round_trip(tmp_path, suffix):
+    path = tmp_path / f"magnets.{suffix}"
+    author_stage(path)
+    read = read_magnets(open_stage(path))
+    assert read.magnets == MAGNETS
+    assert read.settings == SETTINGS
+    assert read.initial_moments == {}
+
+
+def test_every_attribute_is_authored(tmp_path):
+    """Newton tests for authored values: a fallback is invisible to it."""
+    stage = author_stage(tmp_path / "magnets.usda")
+    for name in MAGNETS:
+        authored = {a.GetName() for a in stage.GetPrimAtPath(name).GetAuthoredAttributes()}
+        assert {f"warpmag:{n}" for n in ("kind", "curve", "magnetization", "momentSpacing")} <= authored
+        assert {"warpmag:saturationMagnetization", "warpmag:susceptibility"} <= authored
+
+
+def test_fallbacks_are_the_defaults_of_the_records():
+    stage = Usd.Stage.CreateInMemory()
+    ball = UsdGeom.Sphere.Define(stage, "/Ball").GetPrim()
+    scene = UsdPhysics.Scene.Define(stage, "/Scene").GetPrim()
+    assert ball.CanApplyAPI(schemas.MAGNET_API) and scene.CanApplyAPI(schemas.SCENE_API)
+    assert not ball.CanApplyAPI(schemas.SCENE_API)
+    ball.AddAppliedSchema(schemas.MAGNET_API)
+    scene.AddAppliedSchema(schemas.SCENE_API)
+    assert schemas.magnet_of(ball) == Magnet()
+    assert schemas.settings_of(scene) == MagneticSettings()
+    for prim, attributes, record in (
+        (ball, schemas._MAGNET_ATTRIBUTES, Magnet()),
+        (scene, schemas._SETTINGS_ATTRIBUTES, MagneticSettings()),
+    ):
+        assert set(attributes) == {field.name for field in dataclasses.fields(record)}
+        for field, name in attributes.items():
+            # The fallback comes from the schema: nothing is authored. Single precision keeps seven digits.
+            fallback = prim.GetAttribute(name).Get()
+            value = getattr(record, field)
+            assert fallback == value if isinstance(value, str) else np.all(np.float32(value) == np.array(fallback))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "allowed"),
+    [
+        ("warpmag:kind", "token", magnets.KINDS),
+        ("warpmag:saturationMagnetization", "float", None),
+        ("warpmag:susceptibility", "float", None),
+        ("warpmag:magnetization", "vector3f", None),
+        ("warpmag:curve", "token", magnets.CURVES),
+        ("warpmag:momentSpacing", "float", None),
+        ("warpmag:moment", "vector3f", None),
+        ("warpmag:externalField", "vector3f", None),
+        ("warpmag:force", "token", magnets.FORCES),
+        ("warpmag:dynamics", "token", magnets.DYNAMICS),
+        ("warpmag:rtol", "float", None),
+    ],
+)
+def test_types_and_tokens(name, kind, allowed):
+    registry = Usd.SchemaRegistry()
+    definitions = [registry.FindAppliedAPIPrimDefinition(api) for api in (schemas.MAGNET_API, schemas.SCENE_API)]
+    (spec,) = [d.GetSchemaAttributeSpec(name) for d in definitions if d.GetSchemaAttributeSpec(name)]
+    assert str(spec.typeName) == kind
+    assert (tuple(spec.allowedTokens) if allowed else None) == allowed
+    assert spec.documentation
+
+
+def test_registering_twice_is_harmless():
+    folder = schemas.Path(schemas.__file__).parent / "schema"
+    assert Plug.Registry().RegisterPlugins(str(folder)) == []
+
+
+def test_reading_works_even_where_registration_came_too_late(tmp_path):
+    """USD fixes its schemas at the first stage of a process; another library may have opened one already."""
+    author_stage(tmp_path / "magnets.usda")
+    program = (
+        "import sys\nfrom pxr import Usd, UsdGeom\n"
+        "stage = Usd.Stage.CreateInMemory()\nUsdGeom.Sphere.Define(stage, '/A').GetRadiusAttr().Get()\n"
+        "from warpmag.usd import open_stage, read_magnets\n"
+        "print(len(read_magnets(open_stage(sys.argv[1])).magnets))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "magnets.usda")], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == str(len(MAGNETS))
+
+
+def test_import_of_warpmag_needs_no_usd():
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys, warpmag, warpmag.magnets; print('pxr' in sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("magnet", [Magnet(saturation=-1.0), Magnet(saturation=math.nan), Magnet(kind="iron")])
+def test_authoring_refuses_bad_magnets(magnet):
+    stage = Usd.Stage.CreateInMemory()
+    with pytest.raises(InputError, match=r"^/Ball: "):
+        author_magnet(UsdGeom.Sphere.Define(stage, "/Ball").GetPrim(), magnet)
