@@ -161,6 +161,10 @@ REFUSED = {
         BALL + 'def PhysicsScene "Scene" (prepend apiSchemas = ["WarpmagSceneAPI"]) { float warpmag:rtol = 0\n}',
         "/Scene: rtol",
     ),
+    "NaN gravity": (
+        BALL + 'def PhysicsScene "Scene" { float physics:gravityMagnitude = nan\n}',
+        "/Scene: gravity must be finite",
+    ),
     "two scenes": (
         BALL + 'def PhysicsScene "One" { }\ndef PhysicsScene "Two" { }',
         "/Two: one PhysicsScene of several",

@@ -9,7 +9,7 @@ import os
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from warpmag.errors import InputError
 from warpmag.scenes_usd import balls_up
@@ -204,6 +204,13 @@ def test_animation_of_the_scene_keeps_its_time(tmp_path, scene, rates):
     assert stages[0].GetTimeCodesPerSecond() == stages[1].GetTimeCodesPerSecond()
     swings = [stage.GetAttributeAtPath("/World/Swinging.xformOp:translate") for stage in stages]
     assert swings[1].GetTimeSamples() == swings[0].GetTimeSamples() == [10.0, 20.0]
+
+
+def test_scene_in_a_package(tmp_path, scene):
+    package = str(tmp_path / "scene.usdz")
+    assert UsdUtils.CreateNewUsdzPackage(str(scene), package)
+    bodies, magnets, frames = write(package, tmp_path / "run.usda", [0.0, 0.1])
+    assert_equal_to_frame(Usd.Stage.Open(str(tmp_path / "run.usda")), 14.8, bodies, magnets, frames[1])
 
 
 def test_orientations_do_not_flip(tmp_path, scene):

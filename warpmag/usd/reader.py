@@ -345,6 +345,11 @@ def _read_scene(stage, prims, contents) -> None:
             contents.findings.append(Finding(str(prim.GetPath()), f"{SCENE_API} on a prim that is not a PhysicsScene"))
     for prim in scenes[1:]:
         contents.findings.append(Finding(str(prim.GetPath()), "one PhysicsScene of several: only the first is read"))
+    if scenes:
+        gravity = UsdPhysics.Scene(scenes[0])
+        strength = gravity.GetGravityMagnitudeAttr().Get()
+        if not strength < math.inf or not np.isfinite(gravity.GetGravityDirectionAttr().Get()).all():
+            contents.findings.append(Finding(str(scenes[0].GetPath()), "gravity must be finite"))
     if scenes and has_api(scenes[0], SCENE_API):
         try:
             contents.settings = settings_of(scenes[0])

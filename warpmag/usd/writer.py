@@ -17,6 +17,7 @@ from warpmag.usd.reader import is_animated, stage_clock
 from warpmag.usd.schemas import MOMENT
 
 _SUFFIXES = (".usd", ".usda", ".usdc")
+_COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")  # metadata that sublayers do hand up
 _TRANSLATE, _ORIENT, _SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
 _TYPES = Sdf.ValueTypeNames
 
@@ -128,14 +129,12 @@ class CacheWriter:
         layer.framesPerSecond = self._clock.frames_per_second
         layer.startTimeCode = self._clock.start
         layer.endTimeCode = self._time_codes()[-1]
-        if prim := self._stage.GetDefaultPrim():
-            layer.defaultPrim = prim.GetName()
 
     def _root_layer(self) -> Sdf.Layer:
         scene = self._stage.GetRootLayer()
         root = Sdf.Layer.CreateAnonymous()
         for key in scene.pseudoRoot.ListInfoKeys():
-            if key not in ("subLayers", "subLayerOffsets"):
+            if key not in _COMPOSED:
                 root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
         self._set_metadata(root)
         below = f"./{self._scene_path.name}"
@@ -189,7 +188,9 @@ class _Placements:
                 return None
             above = above.GetParent()
         matrix = np.array(self._transforms.GetLocalToWorldTransform(parent))
-        similar = np.allclose(matrix[:3, :3], _scale(matrix) * _rigid(matrix)[:3, :3], rtol=0.0, atol=1e-9)
+        scale = _scale(matrix)
+        # Scales are often authored in single precision.
+        similar = np.allclose(matrix[:3, :3], scale * _rigid(matrix)[:3, :3], rtol=0.0, atol=1e-6 * abs(scale))
         return matrix if similar else None
 
     def author(self, layer, index, codes, body_q, body_qd) -> None:
