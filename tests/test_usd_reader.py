@@ -126,6 +126,10 @@ REFUSED = {
         ),
         "/Ball: transform is sheared",
     ),
+    "mirrored": (
+        ball('float3 xformOp:scale = (1, 1, -1)\nuniform token[] xformOpOrder = ["xformOp:scale"]', kind="Cube"),
+        "/Ball: transform is mirrored",
+    ),
     "NaN velocity": (ball("vector3f physics:velocity = (nan, 0, 0)"), "/Ball: physics:velocity must be finite"),
     "NaN mass": (ball("float physics:mass = nan"), "/Ball: physics:mass"),
     "mesh without points": (ball(kind="Mesh"), "/Ball: mesh has no points"),

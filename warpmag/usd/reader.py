@@ -291,6 +291,10 @@ class _TransformCheck:
         size = np.trace(gram) / 3.0
         if np.abs(gram - np.diag(np.diag(gram))).max() > 1e-5 * size:
             yield Finding(str(prim.GetPath()), "transform is sheared, which Newton imports wrong")
+        elif _is_body(prim) and np.linalg.det(matrix) < 0.0:
+            yield Finding(
+                str(prim.GetPath()), "transform is mirrored, which Newton imports wrong: mirror the mesh instead"
+            )
         elif prim.IsA(UsdGeom.Sphere) and np.abs(np.diag(gram) - size).max() > 1e-5 * size:
             yield Finding(str(prim.GetPath()), "a sphere scaled unevenly would be imported as a ball: make it a mesh")
 
