@@ -176,7 +176,7 @@ def watch_capacity(fill, index, counts):
 @wp.kernel
 def _watch_induction(
     # inputs:
-    error_in: wp.array[float],
+    error_in: wp.array[wp.float64],
     evaluations_in: wp.array[wp.int32],
     converged_in: wp.array[wp.int32],
     # outputs:
@@ -190,7 +190,7 @@ def _watch_induction(
         error = wp.max(error, error_in[world])
         evaluations = wp.max(evaluations, evaluations_in[world])
         converged = wp.min(converged, converged_in[world])
-    peaks_out[PEAK_ERROR] = wp.max(peaks_out[PEAK_ERROR], error)
+    peaks_out[PEAK_ERROR] = wp.max(peaks_out[PEAK_ERROR], float(error))
     counts_out[COUNT_EVALUATIONS] = counts_out[COUNT_EVALUATIONS] + evaluations
     if converged == 0:
         counts_out[COUNT_UNCONVERGED] = counts_out[COUNT_UNCONVERGED] + 1

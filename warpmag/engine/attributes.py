@@ -107,6 +107,8 @@ def add_permanent(
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
             of range.
     """
+    if np.shape(magnetization) != (3,):
+        raise InputError(f"magnetization: must be three numbers, got {magnetization}")
     for index in magnet_shapes(builder, body, shape):
         in_shape = magnetization
         if builder.shape_body[index] >= 0:

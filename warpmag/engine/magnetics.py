@@ -93,6 +93,7 @@ class Magnetics:
             return np.repeat(np.asarray(values, dtype=dtype), counts)
 
         magnets = [one.magnet for one in self.magnets]
+        kinematic = (self._model.body_flags.numpy() & _KINEMATIC) != 0
         fixed = np.cumsum([one.body < 0 for one in self.magnets]) + self._model.body_count
         bodies = [one.body if one.body >= 0 else own for one, own in zip(self.magnets, fixed, strict=True)]
         return MomentSystem(
@@ -100,6 +101,7 @@ class Magnetics:
             permanent=spread([one.kind == "permanent" for one in magnets], bool),
             radii=np.concatenate([one.lattice.radii for one in self.magnets]),
             bodies=spread(bodies, int),
+            movable=spread([one.body >= 0 and not kinematic[one.body] for one in self.magnets], bool),
             saturation=spread([one.saturation for one in magnets]),
             susceptibility=spread([one.susceptibility for one in magnets]),
             curve=_only_curve(magnets),
@@ -202,15 +204,15 @@ class Magnetics:
         """Let induction start from given magnetizations.
 
         Args:
-            magnetizations: Magnetization [A/m], world frame, of inducible shapes.
+            magnetizations: Magnetization [A/m], world frame, of inducible shapes; of the others zero.
         """
-        moments = self.system.moments.numpy()
+        start = np.zeros((len(self._volumes), 3))
         inducible = ~self._permanent.numpy()
         for part, shape in enumerate(self.shapes.tolist()):
             rows = slice(self._parts[part], self._parts[part + 1])
             if shape in magnetizations and inducible[rows].all():
-                moments[rows] = self._volumes[rows, None] * magnetizations[shape]
-        self.system.moments.assign(moments)
+                start[rows] = magnetizations[shape]
+        self.system.start_from(wp.array(start, dtype=wp.vec3, device=self._model.device))
 
 
 def _only_curve(magnets: list[Magnet]) -> str:

@@ -71,13 +71,9 @@ class ShapeSampler:
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
         filled = lattice.fill(solids, spacing)
-        owners = np.full(len(filled.volumes), len(solids) - 1)
-        for index in reversed(range(len(solids) - 1)):
-            owners[solids[index].contains(filled.positions)] = index
-        order = np.argsort(owners, kind="stable")
+        counts = np.bincount(filled.owners, minlength=len(solids))
         radii = filled.inner_radii if permanent else filled.radii
-        counts = np.bincount(owners, minlength=len(solids))
-        return BodyLattice(filled.positions[order], filled.volumes[order], radii[order], counts)
+        return BodyLattice(filled.positions, filled.volumes, radii, counts)
 
     def _are_balls_apart(self, shapes: list[int]) -> bool:
         if (self._types[shapes] != newton.GeoType.SPHERE).any():

@@ -1,9 +1,12 @@
 """Simulates a scene of magnets: a USD stage, or a Newton builder."""
 
+import contextlib
 import math
 import os
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import newton
@@ -12,7 +15,6 @@ import warp as wp
 
 from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.engine.magnetics import Magnetics
-from warpmag.engine.scene import ImportedScene, import_scene
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError
@@ -74,10 +76,12 @@ class Simulation:
             InputError: Something about the scene or an argument is wrong; the message names it.
         """
         self.device = _device(device)
-        self._scene: ImportedScene | None = None
+        self._scene = None
         builder, settings = scene, MagneticSettings()
         self.frame_rate, self.frame_count = _FRAME_RATE, None
         if not isinstance(scene, newton.ModelBuilder):
+            from warpmag.engine.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
+
             self._scene = import_scene(scene, visuals=visuals)
             builder, settings, clock = self._scene.builder, self._scene.magnets.settings, self._scene.clock
             self.frame_rate, step = clock.frames_per_second, step if step is not None else clock.step
@@ -134,7 +138,8 @@ class Simulation:
             shapes = self._scene.magnet_shapes[prim]
             volume = sum(volumes[shape] for shape in shapes)
             given |= dict.fromkeys(shapes, np.array(moment) / volume)
-        self.magnetics.start_from(given)
+        if given:
+            self.magnetics.start_from(given)
 
     @property
     def state(self) -> newton.State:
@@ -163,7 +168,7 @@ class Simulation:
         *,
         output: str | os.PathLike | None = None,
         copy_scene: bool = False,
-        on_frame: Callable[[int], None] | None = None,
+        on_frame: Callable[[int], bool | None] | None = None,
     ) -> Statistics:
         """Simulate, and record the frames on a USD stage.
 
@@ -174,7 +179,7 @@ class Simulation:
             frames: Output frames after the first; by default those of the stage, else one second.
             output: USD file to write; only for a scene that came from a stage.
             copy_scene: Copy the scene beside the output instead of pointing to it.
-            on_frame: Called after each frame with its number, from 0.
+            on_frame: Called after each frame with its number, from 0; returning False ends the run.
 
         Returns:
             The statistics, :meth:`finish` done.
@@ -194,14 +199,16 @@ class Simulation:
                 while self.statistics.steps < target:
                     self.step()
                 if recorder:
-                    recorder.add_frame(*self._frame())
+                    with _interrupts_held():
+                        recorder.add_frame(*self._frame())
                 self._follow()
-                if on_frame:
-                    on_frame(frame)
+                if on_frame and on_frame(frame) is False:
+                    break
         finally:
             self.statistics.wall_seconds += time.perf_counter() - began
             if recorder:
-                recorder.close()
+                with _interrupts_held():
+                    recorder.close()
         return self.finish()
 
     def frames_of(self, frames: int | None) -> int:
@@ -217,7 +224,7 @@ class Simulation:
             return None
         if self._scene is None:
             raise InputError(f"{Path(output)}: only a scene that came from a stage can be written to one")
-        from warpmag.usd import CacheWriter  # noqa: PLC0415 - a simulation of a builder does without USD
+        from warpmag.usd import CacheWriter  # noqa: PLC0415 - a builder can do without USD
 
         return CacheWriter(
             self._scene.stage, output, list(self._scene.bodies), list(self._scene.magnet_shapes), copy_scene=copy_scene
@@ -261,6 +268,22 @@ class Simulation:
         pairs = node[np.stack(sides, axis=1)]
         touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
         return find_held(pairs[touching], magnetic, fixed)[: model.body_count]
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let Ctrl-C wait until what is being recorded is complete."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught = []
+    before = signal.signal(signal.SIGINT, lambda *arguments: caught.append(arguments))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if caught:
+        raise KeyboardInterrupt
 
 
 def _device(name: str | None) -> wp.Device:

@@ -79,7 +79,8 @@ class Statistics:
         """Return what the user should know before he trusts the run, a line each."""
         lines = []
         if self.overlapping:
-            lines.append(f"{self.overlapping} pairs of bodies overlap at the start")
+            many = self.overlapping > 1
+            lines.append(f"{self.overlapping} pair{'s' * many} of bodies overlap{'s' * (not many)} at the start")
         if self.unconverged:
             lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
         if self.capped:

@@ -1,0 +1,245 @@
+"""Steps, substeps, buffers and recorded frames of a simulation."""
+
+import math
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from pxr import Gf, Usd, UsdGeom, UsdPhysics
+from warpmag.scenes_usd import balls_up
+
+import warpmag
+from warpmag.engine.contacts import RigidSolver, body_sizes
+from warpmag.engine.simulation import Simulation
+from warpmag.engine.statistics import find_held
+from warpmag.engine.stepper import TRAVEL_LIMIT, Stepper
+from warpmag.magnets import Magnet
+from warpmag.usd import author_magnet
+
+R = 0.005  # m
+G = 9.81  # m/s²
+
+
+def at(*position):
+    return wp.transform(position, wp.quat_identity())
+
+
+def add_ball(builder, position, velocity=(0.0, 0.0, 0.0), **arguments):
+    body = builder.add_body(xform=at(*position), **arguments)
+    builder.body_qd[body] = wp.spatial_vector(*velocity, 0.0, 0.0, 0.0)
+    builder.add_shape_sphere(body, radius=R)
+    warpmag.add_inducible(builder, body)
+    return body
+
+
+def pile(lift=0.0):
+    """Eight iron balls on the ground below a fixed magnet."""
+    builder = newton.ModelBuilder()
+    builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(density=7874.0, mu=0.0, mu_torsional=0.0)
+    warpmag.register_attributes(builder)
+    builder.add_ground_plane()
+    for x in (0, 1):
+        for y in (0, 1):
+            for z in (0, 1):
+                add_ball(builder, (2.002 * R * x, 2.002 * R * y, R + 2.002 * R * z + lift), label=f"ball_{x}{y}{z}")
+    magnet = builder.add_shape_box(-1, xform=at(R, R, 0.045), hx=0.01, hy=0.01, hz=0.01)
+    warpmag.add_permanent(builder, shape=magnet, magnetization=(0.0, 0.0, 1e6), moment_spacing=0.005)
+    return builder
+
+
+def run(simulation, steps):
+    for _ in range(steps):
+        simulation.step()
+    return simulation.state.body_q.numpy().copy()
+
+
+@pytest.fixture(scope="module")
+def reference(device):
+    """The pile after 30 steps, in which the balls have hit the magnet."""
+    simulation = Simulation(pile(), device=device)
+    return run(simulation, 30), simulation
+
+
+def test_balls_jump_to_the_magnet(reference):
+    poses, simulation = reference
+    assert (poses[:, 2] > 0.02).all()
+    assert simulation.statistics.peak_speed > 0.5
+    assert simulation.time == pytest.approx(0.03)
+    assert simulation.finish().held == 8
+
+
+@pytest.mark.parametrize("graphs", [True, False])
+def test_a_run_repeats_bit_by_bit_with_and_without_graphs(reference, device, graphs):
+    if device != "cpu":
+        pytest.skip("the solver adds up contacts in any order on a GPU")
+    np.testing.assert_array_equal(run(Simulation(pile(), device=device, graphs=graphs), 30), reference[0])
+
+
+def test_penetration_stays_small(reference):
+    assert reference[1].statistics.overlap < 0.01
+
+
+def test_buffers_that_overflow_are_grown_and_the_step_repeated(reference, device):
+    model = pile().finalize(device=device)
+    sizes = body_sizes(model)
+    solver = RigidSolver(model, sizes, capacity=0.0)
+    before = [buffer.limit for buffer in solver.buffers]
+    stepper = Stepper(model, warpmag.Magnetics(model), solver, sizes, step=1e-3, longest_substep=5e-4)
+    reports = [stepper.advance() for _ in range(30)]
+    assert any(report.regrown for report in reports)
+    assert all(after.limit >= limit for after, limit in zip(solver.buffers, before, strict=True))
+    assert solver.buffers[0].limit > before[0]
+    if device == "cpu":  # nothing was lost: the motion is the same
+        np.testing.assert_array_equal(stepper.state.body_q.numpy(), reference[0])
+
+
+def test_substeps_follow_the_speed(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_attributes(builder)
+    add_ball(builder, (0.0, 0.0, 0.0), velocity=(25.0, 0.0, 0.0))  # 2.5 radii in a substep of 0.5 ms
+    builder.add_shape_box(-1, xform=at(0.05, 0.0, 0.0), hx=0.001, hy=0.05, hz=0.05)
+    model = builder.finalize(device=device)
+    sizes = body_sizes(model)
+    stepper = Stepper(
+        model, warpmag.Magnetics(model), RigidSolver(model, sizes), sizes, step=1e-3, longest_substep=5e-4
+    )
+    first = stepper.advance()
+    assert first.substeps == 16  # 25 m/s × 1 ms / 16 is 0.31 radii, with 8 substeps 0.63
+    assert first.travel == pytest.approx(25.0 * 1e-3 / 16 / R, rel=1e-5)
+    assert first.travel < TRAVEL_LIMIT
+    for _ in range(5):
+        report = stepper.advance()
+    assert stepper.state.body_q.numpy()[0, 0] < 0.05  # it did not pass the wall, which is thinner than a step
+    for _ in range(5):
+        report = stepper.advance()
+    assert report.substeps == 2  # at rest again
+
+
+def test_the_step_asked_for_is_the_step_done(device):
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    add_ball(builder, (0.0, 0.0, 1.0))
+    simulation = Simulation(builder, device=device, step=4e-3)
+    fallen = 1.0 - run(simulation, 25)[0, 2]
+    assert simulation.time == pytest.approx(0.1)
+    # Symplectic Euler with substeps h falls g t (t + h) / 2; substeps are at most 0.5 ms.
+    assert fallen == pytest.approx(0.5 * G * 0.1 * (0.1 + 5e-4), rel=1e-4)
+
+
+def test_a_state_that_is_not_finite_stops_the_run(device):
+    simulation = Simulation(pile(), device=device)
+    simulation.step()
+    velocities = simulation.state.body_qd.numpy().copy()
+    velocities[3, 0] = math.nan
+    simulation.state.body_qd.assign(velocities)
+    with pytest.raises(warpmag.SimulationError, match=r"step 2 \(0.002 s\): ball_"):
+        simulation.step()
+
+
+def test_bad_scenes_are_refused(device):
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    add_ball(builder, (math.nan, 0.0, 0.0), label="lost")
+    with pytest.raises(warpmag.InputError, match="lost: position or orientation is not finite"):
+        Simulation(builder, device=device)
+    with pytest.raises(warpmag.InputError, match="solver: 'magic' is not one of xpbd, steel"):
+        Simulation(pile(), device=device, solver="magic")
+    with pytest.raises(warpmag.InputError, match="step: must be positive"):
+        Simulation(pile(), device=device, step=0.0)
+    with pytest.raises(warpmag.InputError, match="device: 'cuda:99' is not there"):
+        Simulation(pile(), device="cuda:99")
+    with pytest.raises(warpmag.InputError, match="only a scene that came from a stage"):
+        Simulation(pile(), device=device).run(1, output="out.usda")
+
+
+def test_overlaps_at_the_start_are_counted(device):
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    for x in (0.0, 1.9 * R, 3.9 * R):
+        add_ball(builder, (x, 0.0, 0.0))
+    simulation = Simulation(builder, device=device)
+    assert simulation.statistics.overlapping == 1
+    assert simulation.statistics.warnings() == ["1 pair of bodies overlaps at the start"]
+
+
+def test_gaps_follow_the_size_of_the_bodies(reference):
+    gaps = reference[1].model.shape_gap.numpy()
+    np.testing.assert_allclose(gaps, 0.1 * R, rtol=1e-6)
+
+
+def test_who_is_held():
+    # 0 ground, 1 magnet, 2 and 3 hang on it in a chain, 4 stands on the ground and touches 3, 5 flies
+    fixed = np.array([True, True, False, False, False, False])
+    magnetic = np.array([False, True, True, True, True, True])
+    pairs = np.array([(1, 2), (3, 2), (3, 4), (0, 4)])
+    assert np.flatnonzero(find_held(pairs, magnetic, fixed)).tolist() == [2, 3]
+    assert not find_held(np.zeros((0, 2), int), magnetic, fixed).any()
+
+
+@pytest.fixture(scope="module")
+def stage_run(device, tmp_path_factory):
+    """A small Balls Up, run for six frames and written."""
+    folder = tmp_path_factory.mktemp("run")
+    balls_up.author(folder / "scene.usda", columns=2, rows=2, layers=1, height=0.05)
+    simulation = Simulation(folder / "scene.usda", device=device)
+    shown = []
+    simulation.run(6, output=folder / "out.usda", on_frame=shown.append)
+    return simulation, folder, shown
+
+
+def test_a_stage_is_imported_with_its_magnets(stage_run):
+    simulation, _, _ = stage_run
+    kinds = [one.magnet.kind for one in simulation.magnetics.magnets]
+    assert kinds == ["inducible"] * 4 + ["permanent"]
+    assert simulation.statistics.magnets == 4
+    assert simulation.step_size == pytest.approx(1e-3)
+    assert simulation.frame_count == 180
+
+
+def test_frames_stand_at_the_steps_nearest_to_them(stage_run):
+    simulation, folder, shown = stage_run
+    assert shown == list(range(7))
+    stage = Usd.Stage.Open(str(folder / "out.usda"))
+    ball = stage.GetPrimAtPath("/World/Balls/Ball_0003")
+    codes = ball.GetAttribute("xformOp:translate:warpmag").GetTimeSamples()
+    steps = [0, 17, 33, 50, 67, 83, 100]  # 1 ms steps at 60 frames per second
+    np.testing.assert_allclose(codes, [60.0 * 1e-3 * step for step in steps], atol=1e-9)
+    last = ball.GetAttribute("xformOp:translate:warpmag").Get(codes[-1])
+    np.testing.assert_allclose(last, simulation.state.body_q.numpy()[-1, :3], atol=1e-7)
+
+
+def test_moments_of_the_stage_are_those_of_the_run(stage_run):
+    simulation, folder, _ = stage_run
+    stage = Usd.Stage.Open(str(folder / "out.usda"))
+    moments = {
+        str(prim.GetPath()): np.array(prim.GetAttribute("warpmag:moment").Get(6.0))
+        for prim in stage.Traverse()
+        if prim.GetAttribute("warpmag:moment")
+    }
+    assert len(moments) == 5
+    np.testing.assert_allclose(moments["/World/Magnet"], (0.0, 0.0, 1e6 * 0.04**3), rtol=1e-6)
+    total = sum(moments.values())
+    np.testing.assert_allclose(total, simulation.magnetics.shape_moments().sum(axis=0), atol=1e-6 * 64.0)
+
+
+def test_magnetization_of_a_collider_prim_is_in_its_own_frame(device, tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "rod.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdPhysics.Scene.Define(stage, "/Scene")
+    body = UsdGeom.Xform.Define(stage, "/Rod")
+    UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())
+    rod = UsdGeom.Cylinder.Define(stage, "/Rod/Shape")
+    rod.CreateAxisAttr("X")
+    rod.CreateRadiusAttr(0.005)
+    rod.CreateHeightAttr(0.04)
+    rod.AddRotateZOp().Set(90.0)
+    UsdPhysics.CollisionAPI.Apply(rod.GetPrim())
+    author_magnet(rod.GetPrim(), Magnet("permanent", magnetization=(1e6, 0.0, 0.0)))
+    body.AddTranslateOp().Set(Gf.Vec3d(0.0, 0.0, 1.0))
+    stage.Save()
+    simulation = Simulation(tmp_path / "rod.usda", device=device)
+    simulation.magnetics.apply(simulation.state)
+    moment = 1e6 * math.pi * 0.005**2 * 0.04
+    np.testing.assert_allclose(simulation.magnetics.shape_moments(), [(0.0, moment, 0.0)], atol=1e-5 * moment)

@@ -1,0 +1,227 @@
+"""The ``warpmag`` command."""
+
+import argparse
+import contextlib
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from warpmag.errors import InputError, SimulationError
+from warpmag.magnets import DYNAMICS, FORCES
+
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+"""Exit codes; 0 where all went well."""
+
+_SOLVERS = ("xpbd", "steel", "mujoco", "semi-implicit", "featherstone")
+_VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
+_OUTPUT_FOLDER = Path("warpmag_out")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong with the arguments."""
+
+    def error(self, message: str):
+        raise InputError(f"{message} (see {self.prog} --help)")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    try:
+        options = _parser().parse_args(arguments)
+        return options.command(options)
+    except InputError as error:
+        print(f"warpmag: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except SimulationError as error:
+        print(f"warpmag: {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("warpmag: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="warpmag", description="Magnets for the Newton physics engine.")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")
+    run.add_argument("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
+    run.add_argument("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
+    run.add_argument("--frames", type=int, metavar="N", help="output frames to simulate (default: those of the stage)")
+    run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
+    run.add_argument("--solver", choices=_SOLVERS, default=_SOLVERS[0], help="rigid-body solver (default: %(default)s)")
+    run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
+    run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
+    run.add_argument("--rtol", type=float, metavar="X", help="magnetization error to reach (default: the stage's)")
+    run.add_argument(
+        "--viewer", choices=("none", *_VIEWERS), default="none", help="watch the run (default: %(default)s)"
+    )
+    run.set_defaults(command=_run)
+
+    scenes = commands.add_parser("scenes", help="list the bundled scenes")
+    scenes.set_defaults(command=_scenes)
+
+    check = commands.add_parser("check", help="tell what a stage holds and what is wrong with it")
+    check.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
+    check.set_defaults(command=_check)
+    return parser
+
+
+def _scenes(options) -> int:
+    from warpmag.scenes_usd import bundled  # noqa: PLC0415 - each command imports what it needs
+    from warpmag.usd import describe  # noqa: PLC0415
+
+    scenes = bundled()
+    width = max(map(len, scenes), default=0)
+    for name, path in scenes.items():
+        print(f"{name:{width}}  {describe(path)}")
+    return 0
+
+
+def _find_scene(name: str) -> tuple[Path, bool]:
+    """Return the file of a scene and whether it is a bundled one."""
+    from warpmag.scenes_usd import bundled  # noqa: PLC0415
+
+    scenes = bundled()
+    if name in scenes and not Path(name).is_file():
+        return scenes[name], True
+    if not Path(name).exists() and not Path(name).suffix:
+        raise InputError(f"{name}: no such file and no bundled scene (there are {', '.join(scenes)})")
+    return Path(name), False
+
+
+def _check(options) -> int:
+    from warpmag.usd import check  # noqa: PLC0415
+
+    report = check(_find_scene(options.stage)[0])
+    contents = report.contents
+    print(f"stage       {report.path}")
+    print(f"units       {report.metres_per_unit:g} m, {report.kilograms_per_unit:g} kg, {report.up_axis} up")
+    if report.clock:
+        clock = report.clock
+        step = "not given" if clock.step is None else f"{1e3 * clock.step:g} ms"
+        seconds = (clock.end - clock.start) / clock.time_codes_per_second
+        print(f"time        {seconds:g} s at {clock.frames_per_second:g} frames per second, physics step {step}")
+    print(
+        f"bodies      {len(contents.bodies)} ({len(contents.kinematic)} kinematic), {len(contents.colliders)} colliders"
+    )
+    print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
+    settings = contents.settings
+    field = ", ".join(f"{value:g}" for value in settings.external_field)
+    print(f"magnetics   {settings.force}, {settings.dynamics}, rtol {settings.rtol:g}, external field ({field}) A/m")
+    for finding in report.findings:
+        print(f"{finding.severity:11} {finding}")
+    return BAD_INPUT if report.errors else 0
+
+
+def _run(options) -> int:
+    if options.frames is not None and options.frames < 1:
+        raise InputError(f"frames: must be positive, got {options.frames}")
+    if options.rtol is not None and not (options.rtol > 0.0 and math.isfinite(options.rtol)):
+        raise InputError(f"rtol: must be positive and finite, got {options.rtol}")
+    path, is_bundled = _find_scene(options.scene)
+    output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
+    _quiet_warp()
+    from warpmag.engine.simulation import Simulation  # noqa: PLC0415
+
+    print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
+    simulation = Simulation(
+        path,
+        solver=options.solver,
+        force=options.force,
+        dynamics=options.dynamics,
+        rtol=options.rtol,
+        device=options.device,
+        visuals=options.viewer != "none",
+    )
+    for line in simulation.statistics.warnings():
+        print(f"warpmag: warning: {line}", file=sys.stderr)
+    viewer = _open_viewer(options.viewer, simulation)
+    frames = simulation.frames_of(options.frames)
+    done = 0
+    with _progress_bar(frames) as bar:
+
+        def show(frame: int) -> bool:
+            nonlocal done
+            done = frame
+            bar.update(frame - bar.n)
+            return _show(viewer, simulation)
+
+        try:
+            statistics = simulation.run(frames, output=output, copy_scene=is_bundled, on_frame=show)
+        except KeyboardInterrupt:
+            bar.close()
+            print(f"warpmag: interrupted at frame {done} of {frames}, {output} has the frames so far", file=sys.stderr)
+            return INTERRUPTED
+    for line in statistics.summary():
+        print(line)
+    print(f"written        {output}")
+    for line in statistics.warnings():
+        print(f"warpmag: warning: {line}", file=sys.stderr)
+    return 0
+
+
+def _progress_bar(frames: int):
+    from tqdm import tqdm  # noqa: PLC0415
+
+    interval = 0.2 if sys.stderr.isatty() else 10.0
+    return tqdm(total=frames, unit="frame", mininterval=interval, file=sys.stderr, dynamic_ncols=True)
+
+
+def _open_viewer(name: str, simulation):
+    if name == "none":
+        return None
+    import newton  # noqa: PLC0415
+
+    try:
+        viewer = getattr(newton.viewer, _VIEWERS[name])()
+    except Exception as error:  # each viewer fails in its own way without its package or without a display
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise InputError(f"viewer: {name} cannot open, it needs the extra 'viewers' ({reason})") from None
+    viewer.set_model(simulation.model)
+    return viewer
+
+
+def _show(viewer, simulation) -> bool:
+    """Show the present state; return whether to go on."""
+    if viewer is None:
+        return True
+    viewer.begin_frame(simulation.time)
+    viewer.log_state(simulation.state)
+    viewer.end_frame()
+    return viewer.is_running()
+
+
+def _quiet_warp() -> None:
+    """Keep Warp's start-up talk off the terminal; must come before the first import of the engine."""
+    import warp  # noqa: PLC0415
+
+    warp.config.log_level = warp.LOG_ERROR
+    warp.config.enable_backward = False  # nothing here is differentiated, and it doubles the time to compile
+    with _without_lines("Could not find or load the NVIDIA CUDA driver"):
+        warp.init()
+
+
+@contextlib.contextmanager
+def _without_lines(text: str) -> Iterator[None]:
+    """Drop the lines with ``text`` from what native code writes to stderr."""
+    sys.stderr.flush()
+    saved = os.dup(2)
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            caught.seek(0)
+            for line in caught.read().decode(errors="replace").splitlines():
+                if text not in line:
+                    print(line, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
