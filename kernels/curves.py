@@ -78,6 +78,22 @@ def curve_ratio(s: Any, curve: int):
 
 
 @wp.func
+def inverse_curve_ratio(c: Any, curve: int):
+    """s/c of the reduced field s that gives reduced magnetization ``c``; a saturated one gets a large finite s."""
+    one = type(c)(1.0)
+    bounded = wp.min(c, type(c)(0.999999))
+    if bounded < type(c)(1.0e-18) or curve == wp.static(CLAMPED):
+        return one
+    if curve == wp.static(LANGEVIN):
+        # Newton on L(3s) = c from Cohen's rational start; the curve is concave, so it converges from any start below
+        x = bounded * (type(c)(3.0) - bounded * bounded) / (one - bounded * bounded)
+        for _ in range(8):
+            x += (bounded - langevin(x)) / langevin_slope(x)
+        return x / (type(c)(3.0) * bounded)
+    return type(c)(0.5) * wp.log((one + bounded) / (one - bounded)) / bounded
+
+
+@wp.func
 def curve_derivative_times(h: Any, v: Any, k: Any, saturation: Any, curve: int):
     """Product f'(H) v of the curve's derivative ∂M/∂H at field ``h`` [A/m] with a vector ``v``; Eq. 4 needs it."""
     norm = wp.length(h)

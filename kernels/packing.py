@@ -51,3 +51,36 @@ def launch_pack(positions, moments, radii, labels, packed, points):
         outputs=[packed, points],
         device=packed.device,
     )
+
+
+@cache
+def _divide_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def divide_by_volume(
+        # inputs:
+        moments: wp.array[vec3],
+        radii: wp.array[dtype],
+        # outputs:
+        magnetizations_out: wp.array[vec3],
+    ):
+        i = wp.tid()
+        volume = dtype(4.18879020478639) * radii[i] * radii[i] * radii[i]
+        m = vec3()
+        if volume > dtype(0.0):
+            m = moments[i] / volume
+        magnetizations_out[i] = m
+
+    return divide_by_volume
+
+
+def launch_divide_by_volume(moments, radii, magnetizations):
+    """Magnetizations M = m/V [A/m] of balls, shape [n]; zero where the radius is."""
+    wp.launch(
+        _divide_kernel(radii.dtype),
+        dim=radii.shape[0],
+        inputs=[moments, radii],
+        outputs=[magnetizations],
+        device=radii.device,
+    )

@@ -1,0 +1,219 @@
+"""All magnetic moments of a simulation on one device: induction and forces, every buffer allocated once."""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from warpmag.arrays import resolve_device, resolve_dtype, vec3_type
+from warpmag.errors import InputError
+from warpmag.fields import ACCURACY
+from warpmag.kernels import induction, pair_loops
+from warpmag.kernels.curves import CURVE_IDS
+from warpmag.kernels.field import launch_finish_field
+from warpmag.kernels.packing import launch_divide_by_volume
+from warpmag.kernels.wrench import FORCE_IDS, Material, launch_finish_wrench
+from warpmag.magnets import DYNAMICS, FORCES, check_token
+from warpmag.packed import PackedMoments
+
+
+class MomentSystem:
+    """Moments that are brought to equilibrium and feel forces, again and again.
+
+    Moments are ordered by world, and within a world inducible ones come first. Moments of different worlds never see
+    each other. The methods only launch kernels: nothing is allocated, and nothing waits for the device, so that they
+    can be captured in a graph; results stay on the device.
+
+    Attributes:
+        positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
+        moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
+        external_field: Applied field [A/m], shape [n]; may be changed by the caller.
+        h: Field at inducible moments [A/m], external and all other moments', shape [n].
+        forces: Forces [N], shape [n], by :meth:`apply_forces`.
+        torques: Torques m × H about each moment's position [N·m], shape [n]; zero for an inducible ball of one moment.
+        error: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world, the computable form of Eq. 12, shape [worlds].
+        evaluations: Field evaluations of the last solve, shape [worlds].
+        converged: 1 where the last solve reached ``rtol``, shape [worlds].
+    """
+
+    def __init__(
+        self,
+        *,
+        radii,
+        worlds=None,
+        permanent=None,
+        bodies=None,
+        movable=None,
+        saturation=1.0,
+        susceptibility=math.inf,
+        curve="tanh",
+        external_field=(0.0, 0.0, 0.0),
+        force="kelvin",
+        dynamics="theta",
+        rtol=1e-3,
+        max_evaluations=1000,
+        lone_torque=False,
+        dtype="float32",
+        device=None,
+    ):
+        """Allocate for n moments.
+
+        Args:
+            radii: Radii of the moments' balls [m], shape [n]. A moment's volume is its ball's.
+            worlds: World of each moment, non-decreasing from 0, shape [n]; None means one world.
+            permanent: Whether a moment is permanent, shape [n]; None means none is.
+            bodies: Body of each moment, shape [n]; moments of one body exert no force on each other. None means each
+                its own.
+            movable: Whether the force on a moment is wanted, shape [n]; None means all.
+            saturation: Saturation magnetization Ms [A/m], scalar or [n].
+            susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
+            curve: ``tanh``, ``langevin`` or ``clamped``, one for all.
+            external_field: Applied field [A/m], shape [3] or [n, 3].
+            force: ``kelvin`` or ``zeeman``.
+            dynamics: ``theta``: the exact flow, accelerated.
+            rtol: Relative residual at which induction ends.
+            max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
+            lone_torque: Whether an inducible body of one moment gets its torque m × H, which only tells how far the
+                solve is from converged: in equilibrium the two are parallel.
+            dtype: ``float32`` or ``float64``.
+            device: Warp device; None means Warp's default.
+
+        Raises:
+            InputError: An argument is out of range.
+        """
+        check_token("force", force, FORCES)
+        check_token("dynamics", dynamics, DYNAMICS)
+        check_token("curve", curve, tuple(CURVE_IDS))
+        self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
+        if not ACCURACY[dtype] <= rtol < math.inf:
+            raise InputError(f"rtol: must be at least {ACCURACY[dtype]:g} in {dtype}, got {rtol}")
+        if max_evaluations < 1:
+            raise InputError(f"max_evaluations: must be at least 1, got {max_evaluations}")
+        n = len(radii)
+        radii = np.asarray(radii, float)
+        worlds = np.zeros(n, int) if worlds is None else np.asarray(worlds)
+        permanent = np.zeros(n, bool) if permanent is None else np.asarray(permanent, bool)
+        bodies = np.arange(n) if bodies is None else np.asarray(bodies)
+        movable = np.ones(n, bool) if movable is None else np.asarray(movable, bool)
+        self.rtol, self.max_evaluations, self._force_law = float(rtol), int(max_evaluations), FORCE_IDS[force]
+
+        vec3 = vec3_type(self.dtype)
+        self.positions = wp.zeros(n, dtype=vec3, device=self.device)
+        self.moments = wp.zeros(n, dtype=vec3, device=self.device)
+        self.forces = wp.zeros(n, dtype=vec3, device=self.device)
+        self.torques = wp.zeros(n, dtype=vec3, device=self.device)
+        self.external_field = wp.array(np.broadcast_to(external_field, (n, 3)), dtype=vec3, device=self.device)
+        self._packed = PackedMoments(
+            wp.array(radii, dtype=self.dtype, device=self.device),
+            largest_radius=float(radii.max(initial=0.0)),
+            labels=bodies,
+            groups=worlds,
+        )
+        self._make_material(permanent, saturation, susceptibility, curve)
+        # the only moment of a body, if inducible, is parallel to the field that turns it
+        _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
+        twisted = permanent | (size[body] > 1) | lone_torque
+        self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
+        self._make_rows(worlds, permanent, movable)
+        self._induction = induction.allocate(worlds, ~permanent, self.dtype, self.device)
+        self.h = self._induction.h
+        self.error = self._induction.error
+        self.evaluations = self._induction.evaluations
+        self.converged = self._induction.converged
+
+    def _make_material(self, permanent, saturation, susceptibility, curve):
+        n = len(permanent)
+        susceptibility = np.broadcast_to(np.asarray(susceptibility, float), n)
+
+        def put(values, dtype):
+            return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=dtype, device=self.device)
+
+        self._material = Material(
+            inducible=put((~permanent).astype(np.int32), wp.int32),
+            saturation=put(np.asarray(saturation, float), self.dtype),
+            slope=put(3.0 / (1.0 + 3.0 / susceptibility), self.dtype),
+            curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
+        )
+
+    def _make_rows(self, worlds, permanent, movable):
+        """Work lists: inducible on inducible, permanent on inducible, everything on whatever moves."""
+        induced, applied, felt = [], [], []
+        for w in range(int(worlds[-1]) + 1 if len(worlds) else 0):
+            first, last = np.searchsorted(worlds, [w, w + 1])
+            middle = first + int(np.count_nonzero(~permanent[first:last]))
+            induced.append((first, middle, first, middle))
+            applied.append((first, middle, middle, last))
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], movable[first:last].astype(int), [0]])))
+            felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
+        self._induced = pair_loops.make_rows(induced, self.device)
+        self._applied = pair_loops.make_rows(applied, self.device)
+        self._felt = pair_loops.make_rows(felt, self.device)
+
+        def partial(rows, gradient):
+            return wp.zeros(pair_loops.partial_shape(rows, gradient), dtype=self.dtype, device=self.device)
+
+        self._induced_partial = partial(self._induced, False)
+        self._applied_partial = partial(self._applied, False)
+        self._felt_partial = partial(self._felt, True)
+
+    @property
+    def count(self) -> int:
+        """Number of moments n."""
+        return self._packed.count
+
+    def forget(self):
+        """Start the next solve cold, from no magnetization, in every world."""
+        self._induction.warm.zero_()
+
+    def start_from(self, magnetizations):
+        """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
+        induction.launch_set_state(self._induced, magnetizations, self._material, self._induction)
+
+    def solve(self):
+        """Launch the induction solve: inducible ``moments`` in equilibrium with the field at ``positions``."""
+        packed, b = self._packed, self._induction
+        packed.pack(self.positions, self.moments)
+        packed.find_overlaps()
+        if self._induced.count == 0:
+            return
+        pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
+        launch_finish_field(self._applied, self._applied_partial, packed, packed, True, self.external_field, b.h0)
+        induction.launch_start(self._induced, packed, self._material, b, self.moments)
+        wp.capture_while(b.condition, self._iterate)
+
+    def _iterate(self):
+        packed = self._packed
+        pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
+        induction.launch_iteration(
+            self._induced,
+            self._induced_partial,
+            packed,
+            self._material,
+            self._induction,
+            self.rtol,
+            self.max_evaluations,
+            self.moments,
+        )
+
+    def magnetizations(self):
+        """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
+        m = wp.empty_like(self.moments)
+        launch_divide_by_volume(self.moments, self._packed.radii, m)
+        return m
+
+    def apply_forces(self, force=None):
+        """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""
+        packed = self._packed
+        pair_loops.launch_pair_loop(self._felt, packed.packed, packed.packed, self._felt_partial, gradient=True)
+        launch_finish_wrench(
+            self._felt,
+            self._felt_partial,
+            packed,
+            self.external_field,
+            self.h,
+            self._material,
+            self._twisted,
+            self._force_law if force is None else FORCE_IDS[force],
+            self.forces,
+            self.torques,
+        )
