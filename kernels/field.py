@@ -1,4 +1,4 @@
-"""Finishing of the field loop: split sums added up, self term taken back, overlapping pairs corrected."""
+"""Finishing of the field loop: split sums added up, overlapping pairs corrected."""
 
 from functools import cache
 
@@ -30,15 +30,7 @@ def finished_field(dtype):
         h = vec3()
         for split in range(partial.shape[0]):
             h += vec3(partial[split, row, 0], partial[split, row, 1], partial[split, row, 2])
-        skip = int(-1)
-        if same_set == 1:
-            skip = i
-            radius = targets[3, i]
-            if i >= begin and i < end and radius > dtype(0.0):
-                # the clamped loop took in the target's own moment, as −m/(2a)³
-                inverse = dtype(0.5) / radius
-                m = vec3(sources[4, i], sources[5, i], sources[6, i])
-                h += (inverse * inverse * inverse) * m
+        skip = wp.where(same_set == 1, i, -1)
         if neighbor_count[i] > 0:
             h += correct_pairs(targets, sources, i, begin, end, skip, neighbor, neighbor_count)
         return dtype(wp.static(INVERSE_4PI)) * h
@@ -84,7 +76,7 @@ def launch_finish_field(rows, partial, targets, sources, same_set, base, h):
         partial: Sums of the native field loop, shape [splits, rows, 3].
         targets: Packed targets with their overlapping sources (``warpmag.packed.PackedMoments``), t of them.
         sources: Packed sources.
-        same_set: Whether targets and sources are the same moments and the sums hold the clamped self terms.
+        same_set: Whether targets and sources are the same moments, none of which is its own neighbour.
         base: Field to start from [A/m], shape [t].
         h: Out, field [A/m], shape [t]; only the targets of ``rows`` are written.
     """

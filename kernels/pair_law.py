@@ -105,9 +105,15 @@ def pair_factors(d2: Any, a: Any, b: Any):
 
 @wp.func
 def overlap_factors(d2: Any, a: Any, b: Any):
-    """What the clamped dipole lacks for an overlapping pair: averaged factors less those at the contact distance."""
+    """What the clamped dipole lacks for an overlapping pair: averaged factors less those at the contact distance.
+
+    The loops leave pairs at zero distance out, so these lack everything.
+    """
     s = a + b
-    return averaged_factors(wp.sqrt(d2), a, b) - dipole_factors(s * s)
+    g = averaged_factors(wp.sqrt(d2), a, b)
+    if d2 > type(d2)(0.0):
+        g -= dipole_factors(s * s)
+    return g
 
 
 @wp.func

@@ -179,9 +179,13 @@ _PAIR = """
     const REAL inv2 = inv * inv;
     const REAL inv3 = inv2 * inv;
     const REAL rm = REAL(3) * inv2 * (rx * bx + ry * by + rz * bz);
-    hx{k} += inv3 * (rm * rx - bx);
-    hy{k} += inv3 * (rm * ry - by);
-    hz{k} += inv3 * (rm * rz - bz);
+    const REAL ux = rm * rx - bx, uy = rm * ry - by, uz = rm * rz - bz;
+    {{
+    REORDER_SUMS
+    hx{k} += inv3 * ux;
+    hy{k} += inv3 * uy;
+    hz{k} += inv3 * uz;
+    }}
 """
 _PAIR_GRADIENT = """
     const REAL w = REAL(3) * inv3 * inv2;
@@ -189,19 +193,25 @@ _PAIR_GRADIENT = """
     const REAL px = w * bx - REAL(2.5) * inv2 * trace * rx;
     const REAL py = w * by - REAL(2.5) * inv2 * trace * ry;
     const REAL pz = w * bz - REAL(2.5) * inv2 * trace * rz;
-    xx{k} += REAL(2) * rx * px + trace;
-    yy{k} += REAL(2) * ry * py + trace;
-    zz{k} += REAL(2) * rz * pz + trace;
-    xy{k} += rx * py + ry * px;
-    yz{k} += ry * pz + rz * py;
-    zx{k} += rz * px + rx * pz;
+    const REAL vxx = REAL(2) * rx * px + trace, vxy = rx * py + ry * px;
+    const REAL vyy = REAL(2) * ry * py + trace, vyz = ry * pz + rz * py;
+    const REAL vzz = REAL(2) * rz * pz + trace, vzx = rz * px + rx * pz;
+    {{
+    REORDER_SUMS
+    xx{k} += vxx;
+    yy{k} += vyy;
+    zz{k} += vzz;
+    xy{k} += vxy;
+    yz{k} += vyz;
+    zx{k} += vzx;
+    }}
 """
 _FIELD_SUMS = ("hx", "hy", "hz")
 _GRADIENT_SUMS = ("xx", "yy", "zz", "xy", "yz", "zx")
 
 
 def _pair_code(gradient: bool, k: str = "") -> str:
-    mask = f"(c > REAL(0) && al != tl{k})" if gradient else "c > REAL(0)"
+    mask = f"(d2 > REAL(0) && al != tl{k})" if gradient else "d2 > REAL(0)"
     return (_PAIR + (_PAIR_GRADIENT if gradient else "")).format(k=k, mask=mask)
 
 
@@ -222,9 +232,10 @@ def _cpu_snippet(real: str, gradient: bool) -> str:
     const REAL tx = tgt[column], ty = tgt[nt + column], tz = tgt[2 * nt + column], tr = tgt[3 * nt + column];
     const REAL tl = tgt[7 * nt + column];
     REAL {", ".join(f"{name} = 0" for name in sums)};
+    // the sums may be split into lanes; reordering more would spread x_i − x_j over them and lose its digits
+    #define REORDER_SUMS _Pragma("clang fp reassociate(on)")
     {{
-    // sums may be reordered into lanes; nothing else of fast-math is allowed
-    #pragma clang fp reassociate(on) contract(fast)
+    #pragma clang fp contract(fast)
     #pragma clang loop vectorize(enable)
     for (int j = begin; j < end; ++j) {{
         const REAL ax = src[j], ay = src[ns + j], az = src[2 * ns + j], ar = src[3 * ns + j];
@@ -235,6 +246,7 @@ def _cpu_snippet(real: str, gradient: bool) -> str:
     }}
     REAL* out = (REAL*)partial_out.data + (size_t)row * {len(sums)};
 {stores}
+    #undef REORDER_SUMS
     #undef RSQRT
     """
 
@@ -267,6 +279,7 @@ def _cuda_snippet(real: str, gradient: bool, targets_per_thread: int) -> str:
     return f"""
     typedef {real} REAL;
     #define RSQRT(c) {"rsqrtf" if real == "float" else "rsqrt"}(c)
+    #define REORDER_SUMS
     struct alignas(16) Quad {{ REAL x, y, z, w; }};
     __shared__ Quad shared_a[2][{_BLOCK}];
     __shared__ Quad shared_b[2][{_BLOCK}];
@@ -300,6 +313,7 @@ def _cuda_snippet(real: str, gradient: bool, targets_per_thread: int) -> str:
     }}
 {stores}
     #undef STAGE
+    #undef REORDER_SUMS
     #undef RSQRT
     """
 
@@ -378,9 +392,8 @@ def partial_shape(rows: Rows, gradient: bool) -> tuple[int, int, int]:
 def launch_pair_loop(rows: Rows, targets, sources, partial, *, gradient=False, reference_exclude=None, epsilon2=0.0):
     """Sum the field, or the field and its gradient, of packed sources over the target rows.
 
-    The native loops clamp the distance at contact: an ``EXCLUDE_SELF`` target's own moment is *not* left out of the
-    field (it contributes −m/(2a)³, which the finishing kernel takes back), while in the gradient everything with the
-    target's own label is.
+    The native loops clamp the distance at contact and leave out pairs at zero distance, a target's own moment among
+    them; with the gradient, also everything that bears the target's own label.
 
     Args:
         rows: Work list.

@@ -1,7 +1,6 @@
 """Arrays in and out: NumPy or Warp, checked once, returned in the kind they came in."""
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import warp as wp
@@ -11,10 +10,9 @@ from warpmag.errors import InputError
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
 
 
-@cache
 def vec3_type(dtype):
-    """Three-vector of a Warp scalar type; ``wp.vec3`` for float32."""
-    return wp.types.vector(3, dtype)
+    """Three-vector of a Warp scalar type."""
+    return wp.vec3 if dtype is wp.float32 else wp.vec3d
 
 
 def resolve_dtype(dtype: str):
@@ -41,8 +39,11 @@ class Kind:
     dtype: type
     warp_out: bool
 
-    def finish(self, array):
-        """Return a Warp array as the caller's kind."""
+    def finish(self, array, count=None):
+        """Return a Warp array, or its first ``count`` entries, as the caller's kind."""
+        if count is not None:
+            # Warp refuses an empty slice
+            array = array[:count] if count else wp.empty(0, dtype=array.dtype, device=array.device)
         return array if self.warp_out else array.numpy()
 
     def vectors(self, name, value, count=None):

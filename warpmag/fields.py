@@ -72,8 +72,7 @@ def h_field(
         at.find_overlaps(None if same_set else sources)
     base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
     h = wp.zeros_like(base)
-    # the reference loop leaves the self term out and the overlaps right: nothing of the set is to be corrected then
-    launch_finish_field(rows, partial, at, sources, same_set and not exact, base, h)
+    launch_finish_field(rows, partial, at, sources, same_set, base, h)
     return kind.finish(h)
 
 

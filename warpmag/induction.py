@@ -52,7 +52,7 @@ class InductionResult:
         check_token("force", force, tuple(FORCE_IDS))
         system = self._system
         system.apply_forces(force)
-        return self._kind.finish(system.forces[: self._count]), self._kind.finish(system.torques[: self._count])
+        return self._kind.finish(system.forces, self._count), self._kind.finish(system.torques, self._count)
 
 
 def solve_induction(
@@ -139,8 +139,8 @@ def solve_induction(
         system.start_from(kind.vectors("initial", initial, n))
     system.solve()
     return InductionResult(
-        magnetizations=kind.finish(system.magnetizations()[:n]),
-        h_field=kind.finish(system.h[:n]),
+        magnetizations=kind.finish(system.magnetizations(), n),
+        h_field=kind.finish(system.h, n),
         error=float(system.error.numpy().max(initial=0.0)),
         evaluations=int(system.evaluations.numpy().max(initial=0)),
         converged=bool(system.converged.numpy().all()),

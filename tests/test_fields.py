@@ -1,0 +1,204 @@
+"""Fields and wrenches on arrays, against the float64 oracle, magpylib and conservation laws."""
+
+import magpylib
+import numpy as np
+import pytest
+import warp as wp
+from arrangements import as_float32, overlapping, pile, relative
+
+import warpmag
+from warpmag import oracle
+
+# Sums of n terms in float32 carry about √n·2⁻²⁴ ≈ 2.7e-6·√(n/2000) in the worst case and 3e-7 in lanes; issue: 1e-6.
+TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
+DTYPES = ("float32", "float64")
+
+
+@pytest.fixture(scope="module")
+def touching():
+    """2,000 touching balls of three radii, and the oracle's answers."""
+    x, radii, m = pile()
+    h, gradient = oracle.h_field(x, m, radii=radii), oracle.field_gradient(x, m, radii=radii)
+    return x, radii, m, h, oracle.kelvin_force(m, gradient), oracle.torque(m, h)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("method", ["vectorized", "reference"])
+def test_touching_balls(touching, dtype, method, device):
+    x, radii, m, h, force, torque = touching
+    found = warpmag.h_field(x, m, radii=radii, method=method, dtype=dtype, device=device)
+    assert relative(found, h) < TOLERANCE[dtype]
+    forces, torques = warpmag.wrench(x, m, radii=radii, method=method, dtype=dtype, device=device)
+    assert relative(forces, force) < TOLERANCE[dtype]
+    assert relative(torques, torque) < TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_overlapping_balls(dtype, device):
+    x, radii, m = overlapping()
+    # deep overlap: terms of both signs cancel to about a tenth of their size
+    tolerance = 10.0 * TOLERANCE[dtype]
+    gradient = oracle.field_gradient(x, m, radii=radii)
+    assert (
+        relative(warpmag.h_field(x, m, radii=radii, dtype=dtype, device=device), oracle.h_field(x, m, radii=radii))
+        < tolerance
+    )
+    forces, _ = warpmag.wrench(x, m, radii=radii, dtype=dtype, device=device)
+    assert relative(forces, oracle.kelvin_force(m, gradient)) < tolerance
+
+
+@pytest.mark.parametrize("extent", [1e-3, 0.0])
+def test_neighbor_lists_that_overflow(extent, device):
+    """More overlapping neighbours than a list holds: everybody walks all sources, nothing is dropped."""
+    x, radii, m = overlapping(count=150, extent=extent)
+    assert relative(warpmag.h_field(x, m, radii=radii, device=device), oracle.h_field(x, m, radii=radii)) < 1e-5
+
+
+def test_radii_of_two_decades(device):
+    rng = np.random.default_rng(5)
+    x, radii = as_float32(rng.uniform(-0.05, 0.05, (300, 3)), 10.0 ** rng.uniform(-4, -2, 300))
+    m = as_float32(rng.normal(size=(300, 3)) * radii[:, None] ** 3)[0]
+    reference = oracle.h_field(x, m, radii=radii)
+    assert relative(warpmag.h_field(x, m, radii=radii, device=device), reference) < 1e-5
+    assert relative(warpmag.h_field(x, m, radii=radii, dtype="float64", device=device), reference) < 1e-12
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("count", [1, 2, 15, 17, 255, 257, 1025])
+def test_any_count_of_sources_and_targets(count, dtype, device):
+    rng = np.random.default_rng(count)
+    x, m = as_float32(rng.uniform(-1, 1, (count, 3)), rng.normal(size=(count, 3)))
+    targets = as_float32(rng.uniform(-1, 1, (count + 3, 3)))[0]
+    found = warpmag.h_field(x, m, targets, dtype=dtype, device=device)
+    # a random target may lie next to a source: its own differences lose up to a digit
+    assert relative(found, oracle.h_field(x, m, targets)) < 10.0 * TOLERANCE[dtype]
+    if count > 1:
+        assert (
+            relative(warpmag.h_field(x, m, dtype=dtype, device=device), oracle.h_field(x, m)) < 10.0 * TOLERANCE[dtype]
+        )
+
+
+def test_nothing_at_all(device):
+    empty = np.zeros((0, 3))
+    assert warpmag.h_field(empty, empty, device=device).shape == (0, 3)
+    assert warpmag.h_field(empty, empty, np.zeros((4, 3)), device=device).tolist() == [[0.0] * 3] * 4
+    forces, torques = warpmag.wrench(empty, empty, device=device)
+    assert forces.shape == torques.shape == (0, 3)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_magpylib_dipoles_and_spheres(dtype, device):
+    rng = np.random.default_rng(7)
+    x, m = as_float32(rng.uniform(-0.1, 0.1, (40, 3)), rng.normal(size=(40, 3)))
+    at = as_float32(rng.uniform(0.15, 0.3, (50, 3)))[0]
+    dipoles = magpylib.Collection([magpylib.misc.Dipole(moment=mi, position=xi) for xi, mi in zip(x, m, strict=True)])
+    assert relative(warpmag.h_field(x, m, at, dtype=dtype, device=device), dipoles.getH(at)) < 1e-6
+    radius = 0.01
+    magnetization = m / (4.0 / 3.0 * np.pi * radius**3)
+    spheres = magpylib.Collection(
+        [
+            magpylib.magnet.Sphere(diameter=2 * radius, magnetization=mi, position=xi)
+            for xi, mi in zip(x, magnetization, strict=True)
+        ]
+    )
+    inside = np.concatenate([at, x[:1] + 0.003, x[1:2]])
+    found = warpmag.h_field(x, m, inside, radii=radius, dtype=dtype, device=device)
+    assert relative(found, spheres.getH(inside)) < 1e-6
+
+
+def test_third_law_and_angular_momentum(touching, device):
+    x, radii, m, *_ = touching
+    forces, torques = warpmag.wrench(x, m, radii=radii, device=device)
+    forces, torques = forces.astype(float), torques.astype(float)
+    centre = x.mean(0)
+    arms = np.cross(x - centre, forces)
+    assert np.linalg.norm(forces.sum(0)) < 1e-6 * np.linalg.norm(forces, axis=1).sum()
+    total = (arms + torques).sum(0)
+    assert np.linalg.norm(total) < 1e-6 * (np.linalg.norm(arms, axis=1) + np.linalg.norm(torques, axis=1)).sum()
+
+
+def test_force_is_the_gradient_of_the_energy(device):
+    """F = −∂E/∂x of E = −½ μ0 Σ m·H at fixed moments, overlaps included; float64 central differences."""
+    x, radii, m = overlapping(count=12, extent=0.03)
+    forces, _ = warpmag.wrench(x, m, radii=radii, dtype="float64", device=device)
+    step = 1e-7
+
+    def energy(y):
+        h = warpmag.h_field(y, m, radii=radii, dtype="float64", device=device)
+        return -0.5 * oracle.MU0 * np.sum(m * h)
+
+    for i, axis in ((0, 0), (3, 1), (7, 2)):
+        high, low = x.copy(), x.copy()
+        high[i, axis] += step
+        low[i, axis] -= step
+        # truncation (step/R)² = 1e-10, rounding eps·E/(step·F) ≈ 1e-8
+        assert forces[i, axis] == pytest.approx(-(energy(high) - energy(low)) / (2 * step), rel=1e-5)
+
+
+def test_external_field_turns_but_does_not_pull(device):
+    m = np.array([[0.0, 0.0, 2.0]])
+    forces, torques = warpmag.wrench(np.zeros((1, 3)), m, external_field=[100.0, 0.0, 0.0], device=device)
+    assert np.abs(forces).max() == 0.0
+    np.testing.assert_allclose(torques, oracle.MU0 * np.array([[0.0, 200.0, 0.0]]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_smoothing(dtype, device):
+    """The paper's ε²: bounded at zero distance, the dipole far away."""
+    x, _, m = overlapping(count=200, extent=0.05)
+    found = warpmag.h_field(x, m, smoothing=0.004, dtype=dtype, device=device)
+    assert relative(found, oracle.h_field(x, m, smoothing=0.004)) < 10.0 * TOLERANCE[dtype]
+    forces, _ = warpmag.wrench(x, m, smoothing=0.004, dtype=dtype, device=device)
+    assert (
+        relative(forces, oracle.kelvin_force(m, oracle.field_gradient(x, m, smoothing=0.004))) < 10.0 * TOLERANCE[dtype]
+    )
+    pair = np.array([[0.0, 0, 0], [0, 0, 0]])
+    assert np.isfinite(warpmag.h_field(pair, m[:2], smoothing=0.004, dtype=dtype, device=device)).all()
+
+
+def test_coincident_point_dipoles_are_left_out(device):
+    x = np.zeros((3, 3))
+    x[2, 0] = 1.0
+    h = warpmag.h_field(x, np.ones((3, 3)), device=device)
+    assert np.isfinite(h).all()
+    assert relative(h, oracle.h_field(x, np.ones((3, 3)))) < 1e-6
+
+
+def test_far_from_the_origin(device):
+    """Offset 1e4 m: only the inputs' own rounding shows."""
+    x, radii, m = pile(count=300)
+    shifted = as_float32(x * 100.0 + 1e4)[0]
+    reference = oracle.h_field(shifted, m, radii=radii)
+    assert relative(warpmag.h_field(shifted, m, radii=radii, device=device), reference) < 1e-6
+
+
+def test_warp_arrays_in_and_out(device):
+    x, radii, m = pile(count=100)
+    arrays = [wp.array(a, dtype=wp.vec3, device=device) for a in (x, m)]
+    h = warpmag.h_field(*arrays, radii=wp.array(radii, dtype=wp.float32, device=device))
+    assert isinstance(h, wp.array) and h.dtype is wp.vec3 and str(h.device) == device
+    assert relative(h.numpy(), oracle.h_field(x, m, radii=radii)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"positions": np.zeros((2, 2))}, r"positions: shape must be \[n, 3\], got \[2, 2\]"),
+        ({"moments": np.zeros((3, 3))}, r"moments: shape must be \[3\] or \[2, 3\]"),
+        ({"positions": [[0, 0, np.nan], [0, 0, 1]]}, "positions: contains NaN"),
+        ({"positions": [[0, 0, 1e300], [0, 0, 1]]}, "positions: not finite in float32"),
+        ({"radii": -1.0}, "radii: must not be negative"),
+        ({"radii": [1.0, 2.0, 3.0]}, r"radii: shape must be \[\] or \[2\]"),
+        ({"target_radii": 1.0}, "target_radii: only with targets"),
+        ({"dtype": "float16"}, "dtype: 'float16' is not one of"),
+        ({"method": "magic"}, "method: 'magic' is not one of"),
+        ({"device": "cuda:97"}, "device: no 'cuda:97' here"),
+        ({"rtol": 1e-9}, "rtol: float32 sums are good to"),
+        ({"smoothing": -1.0}, "smoothing: must be zero or positive"),
+    ],
+)
+def test_bad_arguments(arguments, message, device):
+    good = {"positions": np.array([[0.0, 0, 0], [0, 0, 1]]), "moments": np.ones((2, 3)), "device": device}
+    with pytest.raises(warpmag.InputError, match=message) as caught:
+        warpmag.h_field(**{**good, **arguments})
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,189 @@
+"""Induction against the float64 Newton solution, closed forms and its own residual."""
+
+import numpy as np
+import pytest
+import warp as wp
+from arrangements import as_float32, fcc_block, overlapping, pile, relative
+
+import warpmag
+from warpmag import oracle
+
+MS = 1.7e6
+CURVES = ("tanh", "langevin", "clamped")
+
+
+@pytest.fixture(scope="module")
+def block():
+    """FCC block of 1,008 touching balls under a dipole that saturates its top, and the oracle's equilibrium."""
+    x = as_float32(fcc_block())[0]
+    source = np.append(x[:, :2].mean(0), x[:, 2].max() + 0.03)[None]
+    moment = np.array([[0.0, 0.0, 900.0]])  # top balls see 3‖H‖ = 9 Ms, bottom ones 0.1 Ms
+    radius = float(np.float32(0.005))
+    exact = oracle.equilibrium(x, radius, oracle.h_field(source, moment, x), saturation=MS)
+    assert exact.residual < 1e-12
+    return x, radius, (source, moment), exact
+
+
+@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("susceptibility", [1.0, np.inf])
+@pytest.mark.parametrize("strength", [0.0, 1e-12, 1e-6, 1e-2, 0.3, 1.0, 10.0, 1e6])
+def test_isolated_ball_takes_one_iteration(curve, susceptibility, strength, device):
+    h0 = strength * MS * np.array([[0.6, 0.0, 0.8]])
+    found = warpmag.solve_induction(
+        np.zeros((1, 3)), 0.005, saturation=MS, susceptibility=susceptibility, curve=curve,
+        external_field=h0, rtol=1e-5, device=device,
+    )  # fmt: skip
+    exact, _ = oracle.magnetization(h0, MS, susceptibility, curve)
+    assert found.evaluations == 1 and found.converged
+    # a few float32 roundings of the curve
+    assert np.linalg.norm(found.magnetizations - exact) <= 1e-6 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("evaluations, error", [(7, 1e-2), (11, 1e-3), (15, 1e-4)])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_cold_block_converges_fast(block, evaluations, error, dtype, device):
+    x, radius, sources, exact = block
+    found = warpmag.solve_induction(
+        x, radius, saturation=MS, sources=sources, rtol=2e-6, max_evaluations=evaluations, dtype=dtype, device=device
+    )
+    assert found.evaluations <= evaluations
+    assert relative(found.magnetizations, exact.magnetizations) < error
+
+
+def test_tight_tolerance_reaches_the_newton_solution(block, device):
+    x, radius, sources, exact = block
+    found = warpmag.solve_induction(
+        x, radius, saturation=MS, sources=sources, rtol=1e-11, dtype="float64", device=device
+    )
+    assert found.converged and found.error <= 1e-11
+    # the residual is amplified by the inverse Jacobian, whose norm is below 20 here
+    assert relative(found.magnetizations, exact.magnetizations) < 1e-9
+    assert relative(found.h_field, exact.h) < 1e-9
+
+
+def test_error_is_the_residual(block, device):
+    """``.error`` is ‖M − f(H(M))‖/‖f(H(M))‖ of the magnetizations returned, evaluated independently."""
+    x, radius, sources, _ = block
+    found = warpmag.solve_induction(
+        x, radius, saturation=MS, sources=sources, rtol=1e-2, dtype="float64", device=device
+    )
+    volume = 4.0 / 3.0 * np.pi * radius**3
+    h = oracle.h_field(x, volume * found.magnetizations, radii=radius) + oracle.h_field(*sources, x)
+    goal, _ = oracle.magnetization(h, MS)
+    assert found.error == pytest.approx(relative(found.magnetizations, goal), rel=1e-6)
+
+
+def test_warm_start_and_initial(block, device):
+    x, radius, sources, exact = block
+    settings = {"saturation": MS, "sources": sources, "rtol": 1e-4, "device": device}
+    cold = warpmag.solve_induction(x, radius, **settings)
+    again = warpmag.solve_induction(x, radius, initial=exact.magnetizations, **settings)
+    assert again.evaluations == 1 < cold.evaluations
+
+
+@pytest.mark.parametrize("strength", [0.3, 1.0, 10.0, 1e3])
+@pytest.mark.parametrize("extent", [0.1, 0.05])
+def test_overlapping_at_will_has_one_solution(extent, strength, device):
+    """400 balls with no regard for one another, up to 60 of them at one point, from two different starts."""
+    rng = np.random.default_rng(3)
+    x, radii, _ = overlapping(extent=extent)
+    h0 = as_float32(strength * MS * (np.array([0.3, 0.2, 1.0]) + 0.2 * rng.normal(size=(400, 3))))[0]
+    exact = oracle.equilibrium(x, radii, h0, saturation=MS)
+    assert exact.residual < 1e-12
+    for initial in (None, MS * rng.uniform(-0.5, 0.5, (400, 3))):
+        found = warpmag.solve_induction(
+            x, radii, saturation=MS, external_field=h0, initial=initial, rtol=1e-7, dtype="float64", device=device
+        )
+        assert found.converged
+        # Jacobians of such heaps amplify the residual up to some hundred times
+        assert relative(found.magnetizations, exact.magnetizations) < 1e-4
+
+
+def test_fields_of_eight_decades_in_one_scene(device):
+    rng = np.random.default_rng(4)
+    x, radii, _ = pile(count=300)
+    h0 = as_float32(MS * 10.0 ** rng.uniform(-5, 3, (300, 1)) * rng.normal(size=(300, 3)))[0]
+    exact = oracle.equilibrium(x, radii, h0, saturation=MS)
+    found = warpmag.solve_induction(x, radii, saturation=MS, external_field=h0, rtol=1e-5, device=device)
+    assert found.converged
+    assert relative(found.magnetizations, exact.magnetizations) < 1e-4
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_curves_and_materials(curve, device):
+    rng = np.random.default_rng(5)
+    x, radii, _ = pile(count=200)
+    saturation, susceptibility = rng.uniform(0.3, 2.0, 200) * 1e6, 10.0 ** rng.uniform(-1, 3, 200)
+    material = {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
+    h0 = [2e5, 0.0, 1e5]
+    exact = oracle.equilibrium(x, radii, h0, **material)
+    found = warpmag.solve_induction(x, radii, external_field=h0, rtol=1e-9, dtype="float64", device=device, **material)
+    assert found.converged
+    assert relative(found.magnetizations, exact.magnetizations) < 1e-7
+
+
+def test_not_converging_is_said(block, device):
+    x, radius, sources, _ = block
+    found = warpmag.solve_induction(x, radius, saturation=MS, sources=sources, max_evaluations=2, device=device)
+    assert not found.converged and found.evaluations == 2 and found.error > 1e-3
+
+
+@pytest.mark.parametrize("force", ["kelvin", "zeeman"])
+def test_wrench_of_the_result(block, force, device):
+    x, radius, sources, exact = block
+    found = warpmag.solve_induction(
+        x, radius, saturation=MS, sources=sources, rtol=1e-9, dtype="float64", device=device
+    )
+    volume = 4.0 / 3.0 * np.pi * radius**3
+    everything = np.concatenate([x, sources[0]]), np.concatenate([volume * exact.magnetizations, sources[1]])
+    gradient = oracle.field_gradient(*everything, radii=np.append(np.full(len(x), radius), 0.0))[:-1]
+    if force == "kelvin":
+        expected = oracle.kelvin_force(volume * exact.magnetizations, gradient)
+    else:
+        _, derivative = oracle.magnetization(exact.h, MS)
+        expected = oracle.zeeman_force(np.full(len(x), volume), exact.h, gradient, exact.magnetizations, derivative)
+    forces, torques = found.wrench(force)
+    assert relative(forces, expected) < 1e-6
+    # in equilibrium m is parallel to H: what is left of m × H is the residual
+    assert np.abs(torques).max() < 1e-6 * oracle.MU0 * volume * MS * np.linalg.norm(exact.h, axis=1).max()
+
+
+def test_no_balls_and_no_field(device):
+    none = warpmag.solve_induction(np.zeros((0, 3)), np.zeros(0), saturation=MS, device=device)
+    assert none.converged and none.evaluations == 0 and none.magnetizations.shape == (0, 3)
+    dark = warpmag.solve_induction(fcc_block((1, 1, 1)), 0.005, saturation=MS, device=device)
+    assert dark.converged and np.abs(dark.magnetizations).max() == 0.0 and dark.error == 0.0
+
+
+def test_warp_arrays(device):
+    x, radii, _ = pile(count=50)
+    found = warpmag.solve_induction(
+        wp.array(x, dtype=wp.vec3, device=device), wp.array(radii, dtype=wp.float32, device=device),
+        saturation=MS, external_field=[0.0, 0.0, 1e5],
+    )  # fmt: skip
+    assert isinstance(found.magnetizations, wp.array) and isinstance(found.h_field, wp.array)
+    assert np.isfinite(found.magnetizations.numpy()).all()
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"saturation": -1.0}, "saturation: must be positive"),
+        ({"saturation": np.nan}, "saturation: must be"),
+        ({"susceptibility": 0.0}, "susceptibility: must be positive"),
+        ({"radii": 0.0}, "radii: must be positive"),
+        ({"radii": np.nan}, "radii: must be finite"),
+        ({"curve": "cubic"}, "curve: 'cubic' is not one of"),
+        ({"dynamics": "magic"}, "dynamics: 'magic' is not one of"),
+        ({"contact_model": "magic"}, "contact_model: 'magic' is not one of"),
+        ({"rtol": 0.0}, "rtol: must be at least"),
+        ({"rtol": np.nan}, "rtol: must be at least"),
+        ({"max_evaluations": 0}, "max_evaluations: must be at least 1"),
+        ({"external_field": [np.inf, 0, 0]}, "external_field: not finite"),
+        ({"sources": (np.zeros((2, 3)), np.zeros((3, 3)))}, "sources: moments: shape"),
+    ],
+)
+def test_bad_arguments(arguments, message, device):
+    good = {"positions": np.array([[0.0, 0, 0], [0, 0, 1]]), "radii": 0.1, "saturation": MS, "device": device}
+    with pytest.raises(warpmag.InputError, match=message):
+        warpmag.solve_induction(**{**good, **arguments})

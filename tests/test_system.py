@@ -1,0 +1,167 @@
+"""The moment system over time: worlds, bodies, warm starts, graphs."""
+
+import numpy as np
+import pytest
+import warp as wp
+from arrangements import pile, relative
+
+import warpmag
+from warpmag import oracle
+from warpmag.system import MomentSystem
+
+MS = 1.7e6
+
+
+def two_worlds(device, **settings):
+    """Two worlds at the same place: 60 balls under one permanent magnet, and 90 under another."""
+    x, radii, _ = pile(count=150)
+    positions = np.concatenate([x[:60], [[0.05, 0.05, 0.3]], x[:90] + [0.002, 0, 0], [[0.1, 0.0, 0.25]]])
+    moments = np.zeros((152, 3))
+    moments[60], moments[151] = [0.0, 0.0, 400.0], [300.0, 0.0, 100.0]
+    sizes = np.concatenate([radii[:60], [0.01], radii[:90], [0.01]])
+    system = MomentSystem(
+        radii=sizes, worlds=np.repeat([0, 1], [61, 91]), permanent=np.isin(np.arange(152), [60, 151]),
+        saturation=MS, rtol=1e-5, device=device, **settings,
+    )  # fmt: skip
+    system.positions.assign(positions)
+    system.moments.assign(moments)
+    return system, positions, moments, sizes
+
+
+def test_worlds_never_see_each_other(device):
+    system, positions, moments, radii = two_worlds(device)
+    system.solve()
+    system.apply_forces()
+    assert system.converged.numpy().tolist() == [1, 1]
+    for w, balls, magnet in ((0, slice(0, 60), 60), (1, slice(61, 151), 151)):
+        alone = warpmag.solve_induction(
+            positions[balls], radii[balls], saturation=MS, rtol=1e-5, device=device,
+            external_field=oracle.h_field(
+                positions[[magnet]], moments[[magnet]], positions[balls], radii=0.01, target_radii=radii[balls]
+            ),
+        )  # fmt: skip
+        volume = 4.0 / 3.0 * np.pi * radii[balls, None] ** 3
+        assert relative(system.moments.numpy()[balls] / volume, alone.magnetizations) < 1e-4
+        assert abs(int(system.evaluations.numpy()[w]) - alone.evaluations) <= 1
+    forces = system.forces.numpy().astype(float)
+    for members in (slice(0, 61), slice(61, 152)):
+        assert np.linalg.norm(forces[members].sum(0)) < 1e-6 * np.linalg.norm(forces[members], axis=1).sum()
+
+
+def test_one_world_is_not_moved_by_another(device):
+    """A world's result is bitwise the same, whatever another world holds."""
+    results = []
+    for strength in (1.0, 50.0):
+        system, _, moments, _ = two_worlds(device)
+        moments[151] *= strength
+        system.moments.assign(moments)
+        system.solve()
+        results.append(system.moments.numpy()[:60])
+    assert np.array_equal(*results)
+
+
+def test_moments_of_one_body_exert_no_force_on_each_other(device):
+    x, radii, m = pile(count=40)
+    bodies = np.repeat([0, 1], 20)
+    system = MomentSystem(radii=radii, permanent=np.ones(40, bool), bodies=bodies, device=device)
+    system.positions.assign(x)
+    system.moments.assign(m)
+    system.solve()
+    system.apply_forces()
+    gradient = oracle.field_gradient(x, m, radii=radii, bodies=bodies)
+    assert relative(system.forces.numpy(), oracle.kelvin_force(m, gradient)) < 1e-6
+    assert relative(system.torques.numpy(), oracle.torque(m, oracle.h_field(x, m, radii=radii, bodies=bodies))) < 1e-6
+
+
+def test_only_movable_moments_get_forces(device):
+    x, radii, m = pile(count=30)
+    movable = np.arange(30) % 7 < 4
+    everything, some = (
+        MomentSystem(radii=radii, permanent=np.ones(30, bool), movable=which, device=device)
+        for which in (None, movable)
+    )
+    for system in (everything, some):
+        system.positions.assign(x)
+        system.moments.assign(m)
+        system.solve()
+        system.apply_forces()
+    assert relative(some.forces.numpy()[movable], everything.forces.numpy()[movable]) < 1e-6
+    assert np.abs(some.forces.numpy()[~movable]).max() == 0.0
+
+
+def test_lone_inducible_ball_feels_no_torque(device):
+    system, *_ = two_worlds(device)
+    system.solve()
+    system.apply_forces()
+    torques = np.linalg.norm(system.torques.numpy(), axis=1)
+    assert torques[:60].max() == 0.0 and torques[60] > 0.0
+
+
+def test_warm_start_follows_a_slow_motion(device):
+    system, positions, *_ = two_worlds(device)
+    system.solve()
+    cold = system.evaluations.numpy().max()
+    positions[60, 2] -= 1e-4
+    system.positions.assign(positions)
+    system.solve()
+    warm = system.evaluations.numpy().max()
+    assert warm < cold
+    system.forget()
+    system.solve()
+    assert system.evaluations.numpy().max() >= cold - 1
+
+
+def test_magnet_that_goes_away(device):
+    """Without a field the only solution is no magnetization, from a warm start too."""
+    system, _, moments, _ = two_worlds(device)
+    system.solve()
+    system.moments.assign(0.0 * moments)
+    system.solve()
+    assert np.abs(system.moments.numpy()).max() == 0.0
+    assert system.converged.numpy().tolist() == [1, 1]
+
+
+def test_state_that_is_not_finite(device):
+    """NaN positions are not silent, end at once, and do not poison the solve after."""
+    system, positions, moments, _ = two_worlds(device)
+    broken = positions.copy()
+    broken[3, 0] = np.nan
+    system.positions.assign(broken)
+    system.solve()
+    assert system.converged.numpy().tolist() == [0, 1]
+    assert np.isnan(system.error.numpy()[0]) and system.evaluations.numpy()[0] <= 2
+    system.positions.assign(positions)
+    system.moments.assign(moments)
+    system.solve()
+    assert system.converged.numpy().tolist() == [1, 1]
+
+
+def test_captured_graph_gives_the_same_bits(device):
+    plain, positions, *_ = two_worlds(device)
+    captured, *_ = two_worlds(device)
+    for system in (plain, captured):
+        system.solve()
+        system.apply_forces()
+    with wp.ScopedCapture(device=device) as capture:
+        captured.solve()
+        captured.apply_forces()
+    for step in range(3):
+        positions[:60] *= 1.0 - 1e-4 * step
+        for system in (plain, captured):
+            system.positions.assign(positions)
+        plain.solve()
+        plain.apply_forces()
+        wp.capture_launch(capture.graph)
+        for name in ("moments", "forces", "torques", "evaluations", "error"):
+            assert np.array_equal(getattr(plain, name).numpy(), getattr(captured, name).numpy()), (step, name)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_two_runs_are_bitwise_equal(dtype, device):
+    results = []
+    for _ in range(2):
+        system, *_ = two_worlds(device, dtype=dtype)
+        system.solve()
+        system.apply_forces()
+        results.append((system.moments.numpy(), system.forces.numpy()))
+    assert all(np.array_equal(a, b) for a, b in zip(*results, strict=True))
