@@ -21,7 +21,7 @@ from warpmag.engine.magnetics import Magnetics
 from warpmag.errors import SimulationError
 from warpmag.kernels import monitor
 
-TRAVEL_LIMIT = 0.4
+TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
 _SHORTEST = 16
 """Substeps are at most this many times shorter than the longest allowed."""
