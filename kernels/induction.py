@@ -61,8 +61,8 @@ class InductionBuffers:
         start: Largest field and stiffness of each chunk, shape [c, 2].
         sums, world_sums: Sums of each chunk and world, shape [c, COLUMNS] and [w, COLUMNS].
         omega, best, error: Step length, smallest merit, relative residual of each world, shape [w].
-        warm, active, history, slot, plain_steps, evaluations, converged, mode, improved, used_slot, used_history: Integer
-            state of each world, shape [w].
+        warm, active, converged, evaluations: How each world stands, shape [w].
+        history, slot, plain_steps, mode, improved, used_slot, used_history: What it does next, shape [w].
         alpha: Anderson coefficients, shape [w, DEPTH].
         condition: Whether any world still iterates, shape [1].
     """
@@ -609,16 +609,8 @@ def launch_set_state(rows, magnetizations, material, b: InductionBuffers):
     )
 
 
-def launch_start(rows, moments, material, b: InductionBuffers, moments_out):
-    """Begin a solve from the applied field ``b.h0`` and, in worlds that are warm, from the last solution.
-
-    Args:
-        rows: Work list whose targets are the inducible moments.
-        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
-        material: What they are made of (``kernels.wrench.Material``).
-        b: The buffers.
-        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
-    """
+def launch_start_worlds(moments, material, b: InductionBuffers):
+    """Reset the world state for a solve in the applied field ``b.h0``; arguments as in :func:`launch_start`."""
     device = moments.device
     wp.launch(
         _measure_kernel(moments.dtype),
@@ -646,12 +638,25 @@ def launch_start(rows, moments, material, b: InductionBuffers, moments_out):
         ],
         device=device,
     )
+
+
+def launch_start(rows, moments, material, b: InductionBuffers, moments_out):
+    """Begin a solve from the applied field ``b.h0`` and, in worlds that are warm, from the last solution.
+
+    Args:
+        rows: Work list whose targets are the inducible moments.
+        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
+        material: What they are made of (``kernels.wrench.Material``).
+        b: The buffers.
+        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
+    """
+    launch_start_worlds(moments, material, b)
     wp.launch(
         _start_kernel(moments.dtype),
         dim=rows.count,
         inputs=[rows.target, b.world, b.warm, b.omega, b.h0, material.saturation, material.slope, material.curve],
         outputs=[b.s, moments_out, moments.packed],
-        device=device,
+        device=moments.device,
     )
 
 

@@ -1,5 +1,7 @@
 """The oracle against quadrature, finite differences and closed forms."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,7 @@ def averaged_tensor(distance, a, b, nodes=48):
             # shell of radius ri about the target, at distance d' from the source: d'² = d² + ri² + 2 d ri u
             u_kink = (b * b - distance**2 - ri**2) / (2.0 * distance * ri)
             edges = [-1.0, *([u_kink] if -1.0 < u_kink < 1.0 else []), 1.0]
-            for u0, u1 in zip(edges[:-1], edges[1:], strict=True):
+            for u0, u1 in itertools.pairwise(edges):
                 u, wu = 0.5 * (u1 - u0) * x + 0.5 * (u1 + u0), 0.5 * (u1 - u0) * w
                 d2 = distance**2 + ri**2 + 2.0 * distance * ri * u
                 along = distance + ri * u  # component of the separation on the axis

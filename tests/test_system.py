@@ -15,7 +15,7 @@ MS = 1.7e6
 def two_worlds(device, **settings):
     """Two worlds at the same place: 60 balls under one permanent magnet, and 90 under another."""
     x, radii, _ = pile(count=150)
-    positions = np.concatenate([x[:60], [[0.05, 0.05, 0.3]], x[:90] + [0.002, 0, 0], [[0.1, 0.0, 0.25]]])
+    positions = np.concatenate([x[:60], [[0.05, 0.05, 0.3]], x[:90] + np.array([0.002, 0, 0]), [[0.1, 0.0, 0.25]]])
     moments = np.zeros((152, 3))
     moments[60], moments[151] = [0.0, 0.0, 400.0], [300.0, 0.0, 100.0]
     sizes = np.concatenate([radii[:60], [0.01], radii[:90], [0.01]])
