@@ -84,7 +84,8 @@ def solve_induction(
         curve: Magnetization curve: ``tanh`` (Eq. 10), ``langevin`` or ``clamped`` (Eq. 7).
         external_field: Applied field H0 [A/m], shape [3] or [n, 3].
         sources: Permanent magnets as (positions [m], moments [A·m²]), each of shape [k, 3]; point dipoles.
-        dynamics: ``theta``: the exact flow of Eqs. 8 and 9, accelerated; ``theta-euler``: their explicit step.
+        dynamics: ``theta``: the exact flow of Eqs. 8 and 9, accelerated; ``theta-euler``: their explicit step;
+            ``llg``, ``llg-damping``: Eq. 6 with and without precession.
         contact_model: ``dipole``.
         rtol: Relative residual at which to end.
         max_evaluations: Field evaluations after which to give up; ``converged`` tells.

@@ -12,7 +12,7 @@ from warpmag.errors import InputError
 KINDS = ("inducible", "permanent")
 CURVES = ("tanh", "langevin", "clamped")
 FORCES = ("kelvin", "zeeman")
-DYNAMICS = ("theta", "theta-euler")
+DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
@@ -76,7 +76,8 @@ class MagneticSettings:
     Attributes:
         external_field: Uniform applied field H0 [A/m], world frame.
         force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
-        dynamics: ``theta`` (exact flow, accelerated) or ``theta-euler`` (the paper's explicit step).
+        dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
+            ``llg-damping`` (Eq. 6, with and without precession).
         rtol: Relative magnetization error at which a step's induction ends, the computable form of Eq. 12.
     """
 
@@ -106,3 +107,20 @@ class StageMagnets:
     magnets: dict[str, Magnet]
     settings: MagneticSettings
     initial_moments: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A published way to simulate magnets, as a choice of dynamics, magnetization curve and force law."""
+
+    dynamics: str
+    curve: str
+    force: str
+
+
+METHODS = {
+    "warpmag": Method(dynamics="theta", curve="tanh", force="kelvin"),
+    "paper": Method(dynamics="theta-euler", curve="tanh", force="zeeman"),
+    "kim2018": Method(dynamics="llg", curve="clamped", force="kelvin"),
+}
+"""This library's method; Kim and Han 2022, literally; Kim, Park and Han 2018."""

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import resolve_device, resolve_dtype, vec3_type
+from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
 from warpmag.fields import ACCURACY
 from warpmag.kernels import induction, pair_loops
@@ -13,7 +14,7 @@ from warpmag.kernels.curves import CURVE_IDS
 from warpmag.kernels.field import launch_finish_field
 from warpmag.kernels.packing import launch_divide_by_volume
 from warpmag.kernels.wrench import FORCE_IDS, Material, launch_finish_wrench
-from warpmag.magnets import DYNAMICS, FORCES, check_token
+from warpmag.magnets import FORCES, check_token
 from warpmag.packed import PackedMoments
 
 
@@ -28,6 +29,7 @@ class MomentSystem:
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
+        dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
         h: Field at inducible moments [A/m], external and all other moments', shape [n].
         forces: Forces [N], shape [n], by :meth:`apply_forces`.
         torques: Torques m × H about each moment's position [N·m], shape [n]; zero for an inducible ball of one moment.
@@ -52,6 +54,8 @@ class MomentSystem:
         dynamics="theta",
         rtol=1e-3,
         max_evaluations=1000,
+        step=None,
+        damping=None,
         lone_torque=False,
         dtype="float32",
         device=None,
@@ -70,9 +74,12 @@ class MomentSystem:
             curve: ``tanh``, ``langevin`` or ``clamped``, one for all.
             external_field: Applied field [A/m], shape [3] or [n, 3].
             force: ``kelvin`` or ``zeeman``.
-            dynamics: ``theta``: the exact flow, accelerated.
+            dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
+                submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
             rtol: Relative residual at which induction ends.
             max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
+            step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
+            damping: Damping α [dimensionless] of ``llg``; None means its default.
             lone_torque: Whether an inducible body of one moment gets its torque m × H, which only tells how far the
                 solve is from converged: in equilibrium the two are parallel.
             dtype: ``float32`` or ``float64``.
@@ -82,7 +89,6 @@ class MomentSystem:
             InputError: An argument is out of range.
         """
         check_token("force", force, FORCES)
-        check_token("dynamics", dynamics, DYNAMICS)
         check_token("curve", curve, tuple(CURVE_IDS))
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         if not ACCURACY[dtype] <= rtol < math.inf:
@@ -120,6 +126,17 @@ class MomentSystem:
         self.error = self._induction.error
         self.evaluations = self._induction.evaluations
         self.converged = self._induction.converged
+        target = Inducibles(
+            self._induced,
+            self._induced_partial,
+            self._packed,
+            self._material,
+            self.moments,
+            self._induction,
+            rtol=self.rtol,
+            max_evaluations=self.max_evaluations,
+        )
+        self.dynamics = make_dynamics(dynamics, target, step=step, damping=damping)
 
     def _make_material(self, permanent, saturation, susceptibility, curve):
         n = len(permanent)
@@ -167,33 +184,32 @@ class MomentSystem:
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
-        induction.launch_set_state(self._induced, magnetizations, self._material, self._induction)
+        self.dynamics.start_from(magnetizations)
 
     def solve(self):
         """Launch the induction solve: inducible ``moments`` in equilibrium with the field at ``positions``."""
-        packed, b = self._packed, self._induction
+        self.begin()
+        if self._induced.count:
+            wp.capture_while(self._induction.condition, self.iterate)
+
+    def begin(self):
+        """Launch the start of a solve. Callers of :meth:`solve` do not need it; it serves to watch the iteration."""
+        packed = self._packed
         packed.pack(self.positions, self.moments)
         packed.find_overlaps()
         if self._induced.count == 0:
             return
         pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
-        launch_finish_field(self._applied, self._applied_partial, packed, packed, True, self.external_field, b.h0)
-        induction.launch_start(self._induced, packed, self._material, b, self.moments)
-        wp.capture_while(b.condition, self._iterate)
-
-    def _iterate(self):
-        packed = self._packed
-        pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
-        induction.launch_iteration(
-            self._induced,
-            self._induced_partial,
-            packed,
-            self._material,
-            self._induction,
-            self.rtol,
-            self.max_evaluations,
-            self.moments,
+        launch_finish_field(
+            self._applied, self._applied_partial, packed, packed, True, self.external_field, self._induction.h0
         )
+        self.dynamics.start()
+
+    def iterate(self):
+        """Launch one field evaluation among the inducible moments and the step that follows from it."""
+        packed = self._packed.packed
+        pair_loops.launch_pair_loop(self._induced, packed, packed, self._induced_partial)
+        self.dynamics.iterate()
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""

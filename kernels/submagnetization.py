@@ -1,0 +1,449 @@
+"""Pairs of submagnetizations: the magnetization dynamics that the θ flow of ``induction`` replaces.
+
+Every inducible moment is the mean of two submagnetizations of length Ms, M = (M1 + M2)/2, held here as unit vectors
+u = M_i/Ms. With the reduced effective field h = H_eff/Ms, one explicit step of each dynamics is
+
+| dynamics | step | source |
+|---|---|---|
+| theta-euler | Δθ = −κ‖h‖ Θ(θ), θ in [0, π], Θ = sin θ below π/2, 2 − sin θ above | Kim and Han 2022, Eqs. 8, 9 |
+| llg | Δu = −κ (u × (u × h) + u × h/α) | Eq. 6, after Kim et al. 2018 |
+| llg-damping | Δu = −κ u × (u × h) | the damping term of Eq. 6 as is |
+
+H_eff = H − γM, γ = ‖f⁻¹(M)‖/‖M‖ (Eq. 11; the paper prints the numerator alone, which is not dimensionless), bounded
+near saturation; on the clamped curve γ = 1/k, the constant γ_D = 1/3 of Eq. 5. κ = βΔtMs is dimensionless; for LLG
+β = γ_g α/((1 + α²) Ms) with the gyromagnetic ratio γ_g, where α/Ms is meant where the paper writes α. At one κ all
+three thus damp alike to first order, and LLG precesses κ/α on top.
+
+An angle to H_eff is never negative: a step that would carry M_i past H_eff ends on it. LLG's explicit step leaves the
+sphere ‖M_i‖ = Ms, and M_i is scaled back, as micromagnetics does.
+
+A moment starts demagnetized, M1 = −M2, across its applied field, along the coordinate axis farthest from it. Pairs
+outlive a solve: the next one goes on from them.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio
+from warpmag.kernels.field import finished_field
+from warpmag.kernels.induction import (
+    COLUMNS,
+    GRAM_COLUMNS,
+    InductionBuffers,
+    launch_start_worlds,
+    sum_worlds,
+)
+
+THETA_EULER, LLG, LLG_DAMPING = 0, 1, 2
+LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One step of one submagnetization
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def effective_field(h: Any, m: Any, slope: Any, curve: int):
+    """Reduced effective field H_eff/Ms (Eqs. 5 and 11) of reduced field ``h`` and reduced magnetization ``m``."""
+    return h - (inverse_curve_ratio(wp.length(m), curve) / slope) * m
+
+
+@wp.func
+def across(axis: Any):
+    """Unit vector across a unit ``axis``, along the coordinate axis farthest from it."""
+    x = wp.abs(axis[0])
+    y = wp.abs(axis[1])
+    z = wp.abs(axis[2])
+    far = axis - axis
+    k = wp.where(z <= wp.min(x, y), 2, wp.where(y <= x, 1, 0))
+    far[k] = type(x)(1.0)
+    return wp.normalize(far - axis[k] * axis)
+
+
+@wp.func
+def theta_step(u: Any, h_eff: Any, kappa: Any, side: Any):
+    """Turn ``u`` towards ``h_eff`` in their common plane (Eqs. 8, 9); ``side`` ±1 picks it where they are parallel."""
+    strength = wp.length(h_eff)
+    if not strength > type(strength)(0.0):
+        return u
+    axis = h_eff / strength
+    cosine = wp.dot(u, axis)
+    off = u - cosine * axis
+    sine = wp.length(off)
+    # nearly parallel the plane is rounding; M1 and M2 then part to opposite sides
+    plane = side * across(axis)
+    if sine > type(sine)(1.0e-6):
+        plane = off / sine
+    rate = wp.where(cosine > type(cosine)(0.0), sine, type(sine)(2.0) - sine)
+    theta = wp.max(wp.atan2(sine, cosine) - kappa * strength * rate, type(sine)(0.0))
+    return wp.cos(theta) * axis + wp.sin(theta) * plane
+
+
+@wp.func
+def llg_step(u: Any, h_eff: Any, kappa: Any, precession: Any):
+    """Explicit step of the LLG equation (Eq. 6), not scaled back; ``precession`` is 1/α, or 0 for damping only."""
+    turn = wp.cross(u, h_eff)
+    return u - kappa * (wp.cross(u, turn) + precession * turn)
+
+
+@wp.func
+def step_submagnetization(u: Any, h_eff: Any, kappa: Any, precession: Any, side: Any, law: int):
+    """One step of dynamics ``law``, ending on the unit sphere."""
+    if law == wp.static(THETA_EULER):
+        return theta_step(u, h_eff, kappa, side)
+    return wp.normalize(llg_step(u, h_eff, kappa, precession))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Kernels
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _start_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def start_pairs(
+        # inputs:
+        row_target: wp.array[int],
+        world: wp.array[int],
+        warm: wp.array[int],
+        h0: wp.array[vec3],
+        saturation: wp.array[dtype],
+        # in and out:
+        first: wp.array[vec3],
+        second: wp.array[vec3],
+        # outputs:
+        moments_out: wp.array[vec3],
+        packed_out: wp.array2d[dtype],
+    ):
+        i = row_target[wp.tid()]
+        if warm[world[i]] == 0:
+            u = across(wp.normalize(h0[i]))
+            first[i] = u
+            second[i] = -u
+        radius = packed_out[3, i]
+        volume = dtype(4.18879020478639) * radius * radius * radius
+        m = (dtype(0.5) * volume * saturation[i]) * (first[i] + second[i])
+        moments_out[i] = m
+        for c in range(3):
+            packed_out[c + 4, i] = m[c]
+
+    return start_pairs
+
+
+@cache
+def _split_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def split_magnetizations(
+        # inputs:
+        row_target: wp.array[int],
+        world: wp.array[int],
+        magnetizations: wp.array[vec3],
+        saturation: wp.array[dtype],
+        # outputs:
+        first_out: wp.array[vec3],
+        second_out: wp.array[vec3],
+        warm_out: wp.array[int],
+    ):
+        i = row_target[wp.tid()]
+        m = magnetizations[i] / saturation[i]
+        length = wp.length(m)
+        if length > dtype(1.0):
+            m = m / length
+            length = dtype(1.0)
+        half = wp.sqrt(dtype(1.0) - length * length) * across(wp.normalize(m))
+        first_out[i] = m + half
+        second_out[i] = m - half
+        warm_out[world[i]] = 1
+
+    return split_magnetizations
+
+
+@cache
+def _evaluate_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+    finish = finished_field(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def evaluate_pairs(
+        # inputs:
+        partial: wp.array3d[dtype],
+        packed: wp.array2d[dtype],
+        row_target: wp.array[int],
+        row_begin: wp.array[int],
+        row_end: wp.array[int],
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        h0: wp.array[vec3],
+        first: wp.array[vec3],
+        second: wp.array[vec3],
+        saturation: wp.array[dtype],
+        slope: wp.array[dtype],
+        curve: wp.array[int],
+        world: wp.array[int],
+        active: wp.array[int],
+        # outputs:
+        h_out: wp.array[vec3],
+        terms_out: wp.array[vec3],
+    ):
+        row = wp.tid()
+        i = row_target[row]
+        if active[world[i]] == 0:
+            return
+        h = h0[i] + finish(partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count)
+        h_out[i] = h
+        g = (slope[i] / saturation[i]) * h
+        goal = (saturation[i] * curve_ratio(wp.length(g), curve[i])) * g
+        lack = goal - (dtype(0.5) * saturation[i]) * (first[i] + second[i])
+        terms_out[i] = vec3(wp.length(lack), wp.length(goal), dtype(0.0))
+
+    return evaluate_pairs
+
+
+@cache
+def _sum_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sum_errors(
+        # inputs:
+        chunk: wp.array[wp.vec3i],
+        active: wp.array[int],
+        terms: wp.array[vec3],
+        # outputs:
+        sums_out: wp.array2d[wp.float64],
+    ):
+        c = wp.tid()
+        if active[chunk[c][2]] == 0:
+            return
+        lack = wp.float64(0.0)
+        goal = wp.float64(0.0)
+        for i in range(chunk[c][0], chunk[c][1]):
+            a = wp.float64(terms[i][0])
+            b = wp.float64(terms[i][1])
+            lack += a * a
+            goal += b * b
+        sums_out[c, wp.static(GRAM_COLUMNS)] = lack
+        sums_out[c, wp.static(GRAM_COLUMNS + 1)] = goal
+
+    return sum_errors
+
+
+@wp.kernel(enable_backward=False)
+def judge(
+    # inputs:
+    world_sums: wp.array2d[wp.float64],
+    rtol: wp.float64,
+    max_evaluations: int,
+    # in and out:
+    active: wp.array[int],
+    evaluations: wp.array[int],
+    # outputs:
+    error_out: wp.array[wp.float64],
+    converged_out: wp.array[int],
+    warm_out: wp.array[int],
+    condition_out: wp.array[int],
+):
+    """Tell which worlds have converged, given up or come to nothing; the others step on."""
+    w = wp.tid()
+    if active[w] == 0:
+        return
+    evaluations[w] = evaluations[w] + 1
+    error = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS)])
+    goal = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS + 1)])
+    if goal > wp.float64(0.0):
+        error = error / goal
+    error_out[w] = error
+    lost = not wp.isfinite(error)
+    if error <= rtol or evaluations[w] >= max_evaluations or lost:
+        active[w] = 0
+        converged_out[w] = wp.where(error <= rtol, 1, 0)
+        # a state that is not finite must not be the next start
+        warm_out[w] = wp.where(lost, 0, 1)
+        return
+    condition_out[0] = 1
+
+
+@cache
+def _step_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def step_pairs(
+        # inputs:
+        row_target: wp.array[int],
+        world: wp.array[int],
+        active: wp.array[int],
+        h: wp.array[vec3],
+        saturation: wp.array[dtype],
+        slope: wp.array[dtype],
+        curve: wp.array[int],
+        law: int,
+        kappa: dtype,
+        precession: dtype,
+        # in and out:
+        first: wp.array[vec3],
+        second: wp.array[vec3],
+        # outputs:
+        moments_out: wp.array[vec3],
+        packed_out: wp.array2d[dtype],
+    ):
+        i = row_target[wp.tid()]
+        if active[world[i]] == 0:
+            return
+        u = first[i]
+        v = second[i]
+        h_eff = effective_field(h[i] / saturation[i], dtype(0.5) * (u + v), slope[i], curve[i])
+        u = step_submagnetization(u, h_eff, kappa, precession, dtype(1.0), law)
+        v = step_submagnetization(v, h_eff, kappa, precession, dtype(-1.0), law)
+        first[i] = u
+        second[i] = v
+        radius = packed_out[3, i]
+        volume = dtype(4.18879020478639) * radius * radius * radius
+        m = (dtype(0.5) * volume * saturation[i]) * (u + v)
+        moments_out[i] = m
+        for c in range(3):
+            packed_out[c + 4, i] = m[c]
+
+    return step_pairs
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Launches
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def launch_split_magnetizations(rows, magnetizations, material, b: InductionBuffers, first, second):
+    """Let pairs, symmetric about them, stand for given magnetizations [A/m], shape [n]; ends the worlds' cold start."""
+    if rows.count == 0:
+        return
+    wp.launch(
+        _split_kernel(b.weight.dtype),
+        dim=rows.count,
+        inputs=[rows.target, b.world, magnetizations, material.saturation],
+        outputs=[first, second, b.warm],
+        device=b.weight.device,
+    )
+
+
+def launch_start_pairs(moments, rows, material, b: InductionBuffers, first, second, moments_out):
+    """Begin a solve from the applied field ``b.h0`` and, in worlds that are warm, from the pairs as they are.
+
+    Args:
+        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
+        rows: Work list whose targets are the inducible moments.
+        material: What they are made of (``kernels.wrench.Material``).
+        b: Fields and world state; the iterates and histories in it are not used.
+        first: Directions of M1, shape [n].
+        second: Directions of M2, shape [n].
+        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
+    """
+    launch_start_worlds(moments, material, b)
+    wp.launch(
+        _start_kernel(moments.dtype),
+        dim=rows.count,
+        inputs=[rows.target, b.world, b.warm, b.h0, material.saturation],
+        outputs=[first, second, moments_out, moments.packed],
+        device=moments.device,
+    )
+
+
+def launch_step_pairs(
+    moments,
+    rows,
+    partial,
+    material,
+    b: InductionBuffers,
+    first,
+    second,
+    moments_out,
+    *,
+    law: int,
+    kappa: float,
+    precession: float,
+    rtol: float,
+    max_evaluations: int,
+):
+    """Judge the field just summed into ``partial`` and step the pairs of every world that has not ended.
+
+    Args:
+        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``).
+        rows: Work list whose targets are the inducible moments.
+        partial: Sums of the native field loop over ``rows``.
+        material: What they are made of (``kernels.wrench.Material``).
+        b: Fields and world state; ``b.condition`` tells whether another evaluation is wanted.
+        first: Directions of M1, shape [n].
+        second: Directions of M2, shape [n].
+        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
+        law: ``THETA_EULER``, ``LLG`` or ``LLG_DAMPING``.
+        kappa: Step κ = βΔtMs [dimensionless].
+        precession: Precession over damping, 1/α or 0 [dimensionless].
+        rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
+        max_evaluations: Field evaluations after which a world gives up.
+    """
+    device, dtype, world_count = moments.device, moments.dtype, b.omega.shape[0]
+    wp.launch(
+        _evaluate_kernel(dtype),
+        dim=rows.count,
+        inputs=[
+            partial,
+            moments.packed,
+            rows.target,
+            rows.begin,
+            rows.end,
+            moments.neighbors,
+            moments.neighbor_counts,
+            b.h0,
+            first,
+            second,
+            material.saturation,
+            material.slope,
+            material.curve,
+            b.world,
+            b.active,
+        ],
+        outputs=[b.h, b.terms],
+        device=device,
+    )
+    wp.launch(
+        _sum_kernel(dtype), dim=b.chunk.shape[0], inputs=[b.chunk, b.active, b.terms], outputs=[b.sums], device=device
+    )
+    wp.launch(
+        sum_worlds,
+        dim=(world_count, COLUMNS),
+        inputs=[b.chunk_begin, b.active, b.sums],
+        outputs=[b.world_sums, b.condition],
+        device=device,
+    )
+    wp.launch(
+        judge,
+        dim=world_count,
+        inputs=[b.world_sums, wp.float64(rtol), max_evaluations, b.active, b.evaluations],
+        outputs=[b.error, b.converged, b.warm, b.condition],
+        device=device,
+    )
+    wp.launch(
+        _step_kernel(dtype),
+        dim=rows.count,
+        inputs=[
+            rows.target,
+            b.world,
+            b.active,
+            b.h,
+            material.saturation,
+            material.slope,
+            material.curve,
+            law,
+            dtype(kappa),
+            dtype(precession),
+        ],
+        outputs=[first, second, moments_out, moments.packed],
+        device=device,
+    )
