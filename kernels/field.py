@@ -3,6 +3,7 @@
 from functools import cache
 
 import warp as wp
+
 from warpmag.kernels.neighbors import pair_correction
 
 INVERSE_4PI = 0.07957747154594767

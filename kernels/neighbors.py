@@ -13,6 +13,7 @@ any arrangement.
 from functools import cache
 
 import warp as wp
+
 from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction
 
 CAPACITY = 32

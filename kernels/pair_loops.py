@@ -256,7 +256,8 @@ def _cpu_snippet(real: str, gradient: bool) -> str:
 
 # the library's rsqrtf spends as many slots on denormal distances as the pair law has left
 _CUDA_RSQRT = {
-    "float": """auto RSQRT = [](float c) { float y; asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c)); return y; };""",
+    "float": """
+    auto RSQRT = [](float c) { float y; asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c)); return y; };""",
     "double": "auto RSQRT = [](double c) { return rsqrt(c); };",
 }
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import warp as wp
+
 from warpmag.kernels.curves import curve_derivative_times
 from warpmag.kernels.field import INVERSE_4PI
 from warpmag.kernels.neighbors import pair_correction
