@@ -344,7 +344,10 @@ def _cpu_kernel(dtype, gradient: bool):
         partial_out: wp.array3d[dtype],
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False)
+    # Warp's flags, and registers as wide as there are: clang's default stops at half of AVX-512
+    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def pair_loop_cpu(
         # inputs:
         targets: wp.array2d[dtype],
