@@ -150,14 +150,25 @@ def field_gradient(positions, moments, *, radii=None, bodies=None, smoothing=0.0
     gradients = np.empty((len(targets), 3, 3))
     for start in range(0, len(targets), chunk):
         rows = slice(start, start + chunk)
-        r, _, g2, g3 = _pairs(positions, targets[rows], radii, target_radii[rows], smoothing, exclude[rows])
-        rm = np.einsum("tnk,nk->tn", r, moments)
-        outer = np.einsum("tn,tnk,nl->tkl", g2, r, moments)
-        trace = np.einsum("tn,tn->t", g2, rm)[:, None, None] * np.eye(3)
-        gradients[rows] = (outer + outer.transpose(0, 2, 1) + trace + np.einsum("tn,tnk,tnl->tkl", g3 * rm, r, r)) / (
-            4.0 * np.pi
-        )
+        pairs = _pairs(positions, targets[rows], radii, target_radii[rows], smoothing, exclude[rows])
+        gradients[rows] = _sum_gradients(moments, *pairs)
     return gradients
+
+
+def gradient_at(positions, moments, targets, *, radii=None, target_radii=None):
+    """Gradient ∂H_k/∂x_l [A/m²], shape [t, 3, 3], of the moments' field at targets; see :func:`h_field`."""
+    positions, moments, targets, radii, target_radii, _ = _prepare(
+        positions, moments, targets, radii, target_radii, None
+    )
+    return _sum_gradients(moments, *_pairs(positions, targets, radii, target_radii, 0.0, None))
+
+
+def _sum_gradients(moments, r, _, g2, g3):
+    rm = np.einsum("tnk,nk->tn", r, moments)
+    outer = np.einsum("tn,tnk,nl->tkl", g2, r, moments)
+    trace = np.einsum("tn,tn->t", g2, rm)[:, None, None] * np.eye(3)
+    along = np.einsum("tn,tnk,tnl->tkl", g3 * rm, r, r)
+    return (outer + outer.transpose(0, 2, 1) + trace + along) / (4.0 * np.pi)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -174,6 +174,11 @@ class MomentSystem:
         self._felt_partial = partial(self._felt, True)
 
     @property
+    def radii(self):
+        """Radii of the moments' balls [m], shape [n]."""
+        return self._packed.radii
+
+    @property
     def count(self) -> int:
         """Number of moments n."""
         return self._packed.count
@@ -210,6 +215,12 @@ class MomentSystem:
         packed = self._packed.packed
         pair_loops.launch_pair_loop(self._induced, packed, packed, self._induced_partial)
         self.dynamics.iterate()
+
+    def evaluate(self):
+        """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""
+        packed = self._packed
+        pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
+        launch_finish_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""

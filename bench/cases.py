@@ -1,0 +1,58 @@
+"""What is measured: arrangements of balls and the sizes to run them at, as data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+RADIUS = 0.005
+"""Ball radius of every case [m]."""
+SATURATION = 1.7e6
+"""Saturation magnetization of every case [A/m]."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing to measure.
+
+    Attributes:
+        name: As given on the command line.
+        summary: What is timed.
+        sizes: Numbers of balls on a CPU and on a GPU.
+        dtypes: Precisions.
+    """
+
+    name: str
+    summary: str
+    sizes: dict[str, tuple[int, ...]]
+    dtypes: tuple[str, ...] = ("float32",)
+
+
+CASES = {
+    case.name: case
+    for case in (
+        Case(
+            "field",
+            "one all-pairs field evaluation, overlaps included",
+            {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768, 131072)},
+            ("float32", "float64"),
+        ),
+        Case(
+            "force",
+            "field gradient, forces and torques of all balls",
+            {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768, 131072)},
+        ),
+        Case(
+            "induction",
+            "a cold and a warm induction solve to 1e-3, neighbour search included",
+            {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768)},
+        ),
+    )
+}
+
+
+def touching_pile(count: int, seed: int = 0) -> np.ndarray:
+    """Positions [m] of balls of ``RADIUS`` on a cubic grid that fills a cube, touching to 0.1 %, shape [count, 3]."""
+    side = round(np.ceil(count ** (1.0 / 3.0)))
+    grid = np.stack(np.meshgrid(*[np.arange(float(side))] * 3, indexing="ij"), -1).reshape(-1, 3)[:count]
+    jitter = np.random.default_rng(seed).normal(size=(count, 3))
+    return (2.0 * RADIUS * (grid + 1e-3 * jitter)).astype(np.float32)

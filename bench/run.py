@@ -1,0 +1,145 @@
+"""Check, then time: ``python -m bench.run field|force|induction [--device cuda:0] [--sizes 243 2560]``.
+
+Each size is compared with the float64 oracle on some targets before it is timed. One JSON line a measurement, with
+machine, commit, error and the time of the first call, which compiles.
+"""
+
+import argparse
+import json
+import time
+
+import numpy as np
+import warp as wp
+
+from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
+from bench.machine import describe
+from warpmag import oracle
+from warpmag.system import MomentSystem
+
+_CHECKED = 64
+"""Targets compared with the oracle."""
+
+
+def measure(work, device, *, seconds: float = 1.0, repeats: int = 5) -> float:
+    """Median time [s] of ``work``, which only launches kernels; by events on a captured graph on a GPU."""
+    work()
+    if device.is_cpu:
+        began = time.perf_counter()
+        work()
+        count = max(1, round(seconds / repeats / (time.perf_counter() - began)))
+        laps = []
+        for _ in range(repeats):
+            began = time.perf_counter()
+            for _ in range(count):
+                work()
+            laps.append((time.perf_counter() - began) / count)
+        return float(np.median(laps))
+    with wp.ScopedCapture(device) as capture:
+        work()
+    laps = []
+    for _ in range(4 * repeats):
+        first, last = (wp.Event(device, enable_timing=True) for _ in range(2))
+        wp.record_event(first)
+        wp.capture_launch(capture.graph)
+        wp.record_event(last)
+        laps.append(1e-3 * wp.get_event_elapsed_time(first, last))
+    return float(np.median(laps))
+
+
+def make_system(count: int, dtype: str, device) -> MomentSystem:
+    """A touching pile of iron balls in a field of half their saturation, positions set."""
+    system = MomentSystem(
+        radii=np.full(count, RADIUS), saturation=SATURATION, external_field=[0.0, 0.0, 0.5 * SATURATION],
+        dtype=dtype, device=device,
+    )  # fmt: skip
+    system.positions.assign(touching_pile(count))
+    return system
+
+
+def oracle_at(system: MomentSystem, rows) -> tuple[np.ndarray, np.ndarray]:
+    """The oracle's field [A/m], external field left out, and force [N] on some of a system's moments."""
+    x, m = (a.numpy().astype(float) for a in (system.positions, system.moments))
+    radius = float(system.radii.numpy()[0])
+    h, force = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    for k, i in enumerate(rows):
+        others = np.arange(len(x)) != i
+        near = {"radii": radius, "target_radii": radius}
+        h[k] = oracle.h_field(x[others], m[others], x[i : i + 1], **near)
+        force[k] = oracle.kelvin_force(m[i : i + 1], oracle.gradient_at(x[others], m[others], x[i : i + 1], **near))
+    return h, force
+
+
+def run_field(system, device) -> dict:
+    """Time one field evaluation, and check the field it leaves."""
+    rows = np.linspace(0, system.count - 1, min(_CHECKED, system.count)).astype(int)
+    expected, _ = oracle_at(system, rows)
+    found = system.h.numpy()[rows] - system.external_field.numpy()[rows]
+    seconds = measure(system.evaluate, device)
+    return {"seconds": seconds, "pairs_per_second": system.count**2 / seconds, "error": _relative(found, expected)}
+
+
+def run_force(system, device) -> dict:
+    """Time the forces, and check them."""
+    rows = np.linspace(0, system.count - 1, min(_CHECKED, system.count)).astype(int)
+    _, expected = oracle_at(system, rows)
+    seconds = measure(system.apply_forces, device)
+    error = _relative(system.forces.numpy()[rows], expected)
+    return {"seconds": seconds, "pairs_per_second": system.count**2 / seconds, "error": error}
+
+
+def run_induction(system, device) -> dict:
+    """Time a cold and a warm solve; the error is the solve's own residual."""
+
+    def cold():
+        system.forget()
+        system.solve()
+
+    seconds = measure(cold, device)
+    evaluations = int(system.evaluations.numpy()[0])
+    warm = measure(system.solve, device)
+    return {
+        "seconds": seconds,
+        "evaluations": evaluations,
+        "warm_seconds": warm,
+        "warm_evaluations": int(system.evaluations.numpy()[0]),
+        "error": float(system.error.numpy()[0]),
+        "converged": bool(system.converged.numpy()[0]),
+    }
+
+
+RUNNERS = {"field": run_field, "force": run_force, "induction": run_induction}
+
+
+def _relative(found, expected) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+def run_case(case: Case, device, sizes) -> None:
+    """Print a JSON line for each size and precision of a case."""
+    machine = describe(device)
+    for dtype in case.dtypes:
+        for count in sizes or case.sizes["cpu" if device.is_cpu else "cuda"]:
+            began = time.perf_counter()
+            system = make_system(count, dtype, device)
+            system.solve()
+            system.apply_forces()
+            wp.synchronize_device(device)
+            first = time.perf_counter() - began
+            result = RUNNERS[case.name](system, device)
+            line = {"case": case.name, "dtype": dtype, "count": count, **result, "first_call_seconds": first, **machine}
+            print(json.dumps(line), flush=True)
+
+
+def main() -> None:
+    """Run the case named on the command line."""
+    parser = argparse.ArgumentParser(prog="python -m bench.run", description=__doc__.partition("\n")[0])
+    parser.add_argument("case", choices=sorted(CASES), help="; ".join(f"{c.name}: {c.summary}" for c in CASES.values()))
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--sizes", type=int, nargs="+")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    run_case(CASES[options.case], wp.get_device(options.device), options.sizes)
+
+
+if __name__ == "__main__":
+    main()
