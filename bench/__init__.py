@@ -1,0 +1,1 @@
+"""Measurements: of this library against the paper, its rivals and its peers."""

@@ -1,0 +1,44 @@
+"""Where a measurement was made: what every result line carries."""
+
+import os
+import platform
+import subprocess
+from pathlib import Path
+
+
+def describe(device) -> dict:
+    """Return machine, device, versions and commit of a measurement on a Warp device."""
+    import warp as wp  # noqa: PLC0415 - callers configure Warp before it is imported
+
+    device = wp.get_device(device)
+    return {
+        "commit": _commit(),
+        "device": device.name if device.is_cuda else "cpu",
+        "machine": f"{_processor()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "warp": wp.__version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _commit() -> str:
+    """Short hash of the checkout, with ``+`` where it has changes; empty outside a checkout."""
+    folder = Path(__file__).parent
+
+    def git(*arguments):
+        return subprocess.run(
+            ["git", "-C", folder, *arguments], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", "..")
+        return git("rev-parse", "--short", "HEAD") + "+" * bool(changed)
+    except (OSError, subprocess.CalledProcessError):
+        return ""

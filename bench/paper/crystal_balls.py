@@ -1,0 +1,109 @@
+"""The crystal balls of the paper's Fig. 7: 178 fixed inducible balls around a bar magnet.
+
+The paper gives the count and the picture, neither sizes nor strengths. Here the balls fill a plane grid of 16 × 13
+cells, out of which the bar takes the middle 10 × 3. Two strengths of the bar:
+
+* weak, 1e6 A/m, neodymium: no ball of iron saturates, ‖H‖ is 0.8 to 20 % of Ms;
+* strong, 4e7 A/m, "excessively strong" as in the paper's scenes: ‖H‖ is 0.3 to 8 Ms.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+import warpmag
+from warpmag import lattice
+from warpmag.magnets import SATURATION_OF_IRON
+from warpmag.system import MomentSystem
+
+BALL_RADIUS = 0.005
+"""[m]"""
+PITCH = 0.011
+"""Distance of neighbours [m]; the balls do not touch."""
+BAR_HALF_EXTENTS = (5 * PITCH - 5e-4, 1.5 * PITCH - 5e-4, 1.5 * PITCH - 5e-4)
+"""[m]"""
+STRENGTHS = {"weak": 1e6, "strong": 4e7}
+"""Magnetization of the bar, along its length [A/m]."""
+PAIRS = ("across", "in plane", "random")
+"""Starts M1 = −M2 of the pairs: across the plane of the balls; in it, across the length of the bar; in a random
+direction at each ball."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Positions [m] of the balls, shape [178, 3], and positions, volumes and radii of the bar's moments."""
+
+    balls: np.ndarray
+    bar: lattice.Lattice
+
+
+def layout() -> Layout:
+    """Return where everything is."""
+    cells = [(i - 7.5, j - 6.0, 0.0) for j in range(13) for i in range(16) if abs(i - 7.5) > 5 or abs(j - 6) > 1.5]
+    return Layout(PITCH * np.array(cells), lattice.fill([lattice.box(BAR_HALF_EXTENTS)], 0.5 * PITCH))
+
+
+def make_system(strength: float, dynamics: str, device: str, **settings) -> MomentSystem:
+    """Return the balls, first, and the bar's moments, ready to solve.
+
+    Args:
+        strength: Magnetization of the bar [A/m].
+        dynamics: One of ``warpmag.magnets.DYNAMICS``.
+        device: Warp device.
+        settings: More arguments of :class:`MomentSystem`.
+    """
+    place = layout()
+    balls, bar = place.balls, place.bar
+    count = len(balls) + len(bar.positions)
+    system = MomentSystem(
+        radii=np.concatenate([np.full(len(balls), BALL_RADIUS), bar.radii]),
+        permanent=np.arange(count) >= len(balls),
+        saturation=SATURATION_OF_IRON,
+        dynamics=dynamics,
+        device=device,
+        **settings,
+    )
+    system.positions.assign(np.concatenate([balls, bar.positions]))
+    moments = np.zeros((count, 3))
+    moments[len(balls) :, 0] = strength * bar.volumes
+    system.moments.assign(moments)
+    return system
+
+
+def applied_field(strength: float) -> np.ndarray:
+    """Return the field at the balls [A/m] of a bar of magnetization ``strength`` [A/m], shape [178, 3]."""
+    place = layout()
+    moments = np.outer(place.bar.volumes, [strength, 0.0, 0.0])
+    return warpmag.h_field(
+        place.bar.positions,
+        moments,
+        place.balls,
+        radii=place.bar.radii,
+        target_radii=BALL_RADIUS,
+        dtype="float64",
+        device="cpu",
+    )
+
+
+def set_pairs(system: MomentSystem, start: str, seed: int = 0):
+    """Let the pairs of a system start in one of :data:`PAIRS`."""
+    if start == "random":
+        axis = np.random.default_rng(seed).normal(size=(system.count, 3))
+    else:
+        axis = np.tile([0.0, 0.0, 1.0] if start == "across" else [0.0, 1.0, 0.0], (system.count, 1))
+    axis /= np.linalg.norm(axis, axis=1)[:, None]
+    system.dynamics.set_pairs(axis, -axis)
+
+
+def trace(system: MomentSystem, iterations: int) -> np.ndarray:
+    """Solve, and return the magnetization error e_M (Eq. 12) after each field evaluation, at most ``iterations``."""
+    errors = []
+    system.begin()
+    for _ in range(min(iterations, system.max_evaluations)):
+        system.iterate()
+        errors.append(float(system.error.numpy()[0]))
+        if system.converged.numpy()[0] or not np.isfinite(errors[-1]):
+            break
+    wp.synchronize_device(system.device)
+    return np.array(errors)

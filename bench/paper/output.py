@@ -1,0 +1,75 @@
+"""What an experiment leaves behind: JSON lines, figures and its section of the report."""
+
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bench.machine import describe
+
+ORDER = ("fig7", "fig8", "fig9", "fig10", "uniqueness", "table1")
+"""The experiments, in the order of the report."""
+_MARK = "<!-- section {} -->"
+_HEAD = """# The paper's experiments, run again
+
+Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation". Each section gives what the paper shows, in its
+words or numbers (its images are not redistributed here), beside what was measured. Written by `python -m bench.paper`.
+"""
+
+
+@dataclass
+class Output:
+    """One experiment's results.
+
+    Attributes:
+        name: The experiment.
+        folder: Where files go.
+        device: Name of the Warp device.
+        small: Whether to run the small version, for continuous integration.
+    """
+
+    name: str
+    folder: Path
+    device: str
+    small: bool
+    _machine: dict = field(default_factory=dict)
+    _started: bool = False
+
+    def record(self, **values):
+        """Append a JSON line; print it without the machine and without long lists."""
+        self._machine = self._machine or describe(self.device)
+        line = {"experiment": self.name, "small": self.small, **values}
+        print(json.dumps({key: value for key, value in line.items() if not isinstance(value, list)}))
+        with open(self.folder / f"{self.name}.jsonl", "a" if self._started else "w", encoding="utf-8") as file:
+            file.write(json.dumps(line | self._machine) + "\n")
+        self._started = True
+
+    def save(self, figure, suffix=""):
+        """Write a Matplotlib figure and return the Markdown that shows it."""
+        path = self.folder / f"{self.name}{suffix}.png"
+        figure.savefig(path, dpi=110, bbox_inches="tight")
+        return f"![{self.name}]({path.name})"
+
+    def report(self, text: str):
+        """Set this experiment's section of the report; the others stay."""
+        self._machine = self._machine or describe(self.device)
+        path = self.folder / "report.md"
+        sections = _read_sections(path)
+        where = ", ".join(f"{self._machine[key]}" for key in ("device", "machine", "commit") if self._machine[key])
+        size = " Small version." if self.small else ""
+        sections[self.name] = f"{text.strip()}\n\n*Measured on {where}.{size}*"
+        body = "\n\n".join(f"{_MARK.format(name)}\n{sections[name]}" for name in ORDER if name in sections)
+        path.write_text(f"{_HEAD}\n{body}\n", encoding="utf-8")
+
+
+def _read_sections(path: Path) -> dict[str, str]:
+    if not path.exists():
+        return {}
+    parts = re.split(_MARK.format(r"(\w+)"), path.read_text(encoding="utf-8"))
+    return {name: text.strip() for name, text in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+def table(head: list[str], rows: list[list]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
