@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from warpmag.errors import InputError, SimulationError
-from warpmag.magnets import DYNAMICS, FORCES
+from warpmag.magnets import DYNAMICS, FORCES, METHODS
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 """Exit codes; 0 where all went well."""
@@ -53,6 +53,11 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--frames", type=int, metavar="N", help="output frames to simulate (default: those of the stage)")
     run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     run.add_argument("--solver", choices=_SOLVERS, default=_SOLVERS[0], help="rigid-body solver (default: %(default)s)")
+    run.add_argument(
+        "--method",
+        choices=METHODS,
+        help="preset of force law, dynamics and curve: this library's, Kim and Han 2022, Kim et al. 2018",
+    )
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
     run.add_argument("--rtol", type=float, metavar="X", help="magnetization error to reach (default: the stage's)")
@@ -128,11 +133,13 @@ def _run(options) -> int:
     from warpmag.engine.simulation import Simulation  # noqa: PLC0415
 
     print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
+    method = METHODS[options.method] if options.method else None
     simulation = Simulation(
         path,
         solver=options.solver,
-        force=options.force,
-        dynamics=options.dynamics,
+        force=options.force or (method and method.force),
+        dynamics=options.dynamics or (method and method.dynamics),
+        curve=method and method.curve,
         rtol=options.rtol,
         device=options.device,
         visuals=options.viewer != "none",

@@ -11,7 +11,7 @@ from warpmag.engine.attributes import marked_shapes
 from warpmag.engine.sampling import BodyLattice, ShapeSampler
 from warpmag.errors import InputError
 from warpmag.kernels.bodies import gather_moments, scatter_wrenches, sum_moments
-from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_token
 from warpmag.system import MomentSystem
 
 _CHUNK = 32
@@ -64,16 +64,19 @@ class Magnetics:
         rtol: float = 1e-3,
         external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
         max_evaluations: int = 1000,
+        curve: str | None = None,
     ):
         """Sample the magnets of ``model`` and allocate everything that :meth:`apply` needs.
 
         Args:
             model: A finished model with shapes marked by :func:`warpmag.add_inducible`, :func:`warpmag.add_permanent`.
             force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
-            dynamics: ``theta`` (exact flow, accelerated) or ``theta-euler`` (the paper's explicit step).
+            dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
+                ``llg-damping`` (Eq. 6, with and without precession).
             rtol: Relative magnetization error at which induction ends.
             external_field: Uniform applied field H0 [A/m], world frame.
             max_evaluations: Field evaluations after which induction gives up.
+            curve: Magnetization curve of all magnets; by default their own.
 
         Raises:
             InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would be
@@ -81,12 +84,14 @@ class Magnetics:
         """
         settings = MagneticSettings(tuple(external_field), force, dynamics, rtol)
         settings.check("Magnetics")
+        if curve is not None:
+            check_token("Magnetics: curve", curve, CURVES)
         self.magnets = _find_magnets(model)
         self._model = model
-        self.system = self._make_system(settings, max_evaluations)
+        self.system = self._make_system(settings, max_evaluations, curve)
         self._map_bodies()
 
-    def _make_system(self, settings: MagneticSettings, max_evaluations: int) -> MomentSystem:
+    def _make_system(self, settings: MagneticSettings, max_evaluations: int, curve: str | None) -> MomentSystem:
         counts = [len(one.lattice.volumes) for one in self.magnets]
 
         def spread(values, dtype=float):
@@ -104,7 +109,7 @@ class Magnetics:
             movable=spread([one.body >= 0 and not kinematic[one.body] for one in self.magnets], bool),
             saturation=spread([one.saturation for one in magnets]),
             susceptibility=spread([one.susceptibility for one in magnets]),
-            curve=_only_curve(magnets),
+            curve=_only_curve(magnets) if curve is None else curve,
             external_field=settings.external_field,
             force=settings.force,
             dynamics=settings.dynamics,

@@ -54,6 +54,7 @@ class Simulation:
         dynamics: str | None = None,
         rtol: float | None = None,
         external_field: tuple[float, float, float] | None = None,
+        curve: str | None = None,
         device: str | None = None,
         graphs: bool = True,
         visuals: bool = False,
@@ -65,9 +66,10 @@ class Simulation:
             step: Time step [s]; by default the stage's, else 1 ms. It is split into substeps as motion demands.
             solver: Newton's solver: ``xpbd``, ``steel``, ...
             force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
-            dynamics: ``theta`` or ``theta-euler``; by default the stage's, else ``theta``.
+            dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
+            curve: ``tanh``, ``langevin`` or ``clamped`` for all magnets; by default each magnet's own.
             device: Warp device; by default Warp's.
             graphs: Replay captured graphs instead of launching kernels one by one.
             visuals: Also import what is only seen, for a viewer.
@@ -98,6 +100,7 @@ class Simulation:
             dynamics=settings.dynamics if dynamics is None else dynamics,
             rtol=settings.rtol if rtol is None else rtol,
             external_field=settings.external_field if external_field is None else external_field,
+            curve=curve,
         )
         sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver)
