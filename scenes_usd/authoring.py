@@ -1,12 +1,18 @@
 """Building blocks of the bundled scenes: SI units, Z up, one prim per body, every attribute authored."""
 
+import argparse
+import inspect
 import math
 import os
-from collections.abc import Sequence
+import re
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
+from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.usd import author_magnet, author_settings
 
@@ -17,6 +23,12 @@ IRON_DENSITY = 7870.0
 STEEL_COLOR = (0.55, 0.57, 0.6)
 MAGNET_COLOR = (0.75, 0.08, 0.06)
 GROUND_COLOR = (0.32, 0.33, 0.35)
+
+BALL_SPACING = 2.002
+"""Distance of neighbouring balls in radii: a gap of a thousandth, so that rounding never makes them overlap."""
+
+DYNAMIC, KINEMATIC, STATIC = "dynamic", "kinematic", "static"
+"""How a shape moves: as a body of its own, as one that is held in place, or with whatever it belongs to."""
 
 _METRICS = {"metersPerUnit": 1.0, "kilogramsPerUnit": 1.0, "upAxis": "Z"}
 
@@ -47,11 +59,13 @@ def save(stage: Usd.Stage, path: str | os.PathLike) -> None:
     stage.GetRootLayer().Export(str(path))
 
 
-def add_scene(stage: Usd.Stage, settings: MagneticSettings, *, step: float) -> Usd.Prim:
-    """Author the physics scene: gravity, time step [s] and magnetic settings."""
+def add_scene(
+    stage: Usd.Stage, settings: MagneticSettings, *, step: float = 1e-3, gravity: float = GRAVITY
+) -> Usd.Prim:
+    """Author the physics scene: time step [s], gravity [m/s²] towards -z and magnetic settings."""
     scene = UsdPhysics.Scene.Define(stage, "/World/PhysicsScene")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))
-    scene.CreateGravityMagnitudeAttr(GRAVITY)
+    scene.CreateGravityMagnitudeAttr(gravity)
     prim = scene.GetPrim()
     prim.AddAppliedSchema("NewtonSceneAPI")
     prim.CreateAttribute("newton:timeStepsPerSecond", Sdf.ValueTypeNames.Int, False, Sdf.VariabilityUniform).Set(
@@ -107,8 +121,15 @@ def add_ground(stage: Usd.Stage, material: UsdShade.Material, *, size: float, co
     plane.CreateAxisAttr(UsdGeom.Tokens.z)
     plane.CreateWidthAttr(size)
     plane.CreateLengthAttr(size)
-    _finish(plane, material, color)
-    return plane.GetPrim()
+    return _finish(plane, material, color, STATIC, None)
+
+
+def add_body(stage: Usd.Stage, path: str, position: Sequence[float], *, kinematic: bool = False) -> UsdGeom.Xform:
+    """Author a rigid body at ``position`` [m] whose shapes are to be prims below it."""
+    body = UsdGeom.Xform.Define(stage, path)
+    _place(body, position)
+    UsdPhysics.RigidBodyAPI.Apply(body.GetPrim()).CreateKinematicEnabledAttr(kinematic)
+    return body
 
 
 def add_ball(
@@ -118,38 +139,57 @@ def add_ball(
     radius: float,
     material: UsdShade.Material,
     *,
+    motion: str = DYNAMIC,
     magnet: Magnet | None = None,
     color: Sequence[float] = STEEL_COLOR,
 ) -> Usd.Prim:
-    """Author a ball: a sphere that is a rigid body and its own collider, with its centre at ``position`` [m]."""
+    """Author a ball: a sphere that is its own collider, with its centre at ``position`` [m]."""
     ball = UsdGeom.Sphere.Define(stage, path)
     ball.CreateRadiusAttr(radius)
-    _make_body(ball, position, kinematic=False)
-    _finish(ball, material, color)
-    if magnet is not None:
-        author_magnet(ball.GetPrim(), magnet)
-    return ball.GetPrim()
+    _place(ball, position)
+    return _finish(ball, material, color, motion, magnet)
 
 
-def add_cube(
+def add_box(
     stage: Usd.Stage,
     path: str,
     position: Sequence[float],
-    size: float,
+    sizes: Sequence[float],
     material: UsdShade.Material,
     *,
+    motion: str = DYNAMIC,
     magnet: Magnet | None = None,
-    kinematic: bool = False,
     color: Sequence[float] = MAGNET_COLOR,
 ) -> Usd.Prim:
-    """Author a cube with edges of ``size`` [m], held in place where it is ``kinematic``."""
-    cube = UsdGeom.Cube.Define(stage, path)
-    cube.CreateSizeAttr(size)
-    _make_body(cube, position, kinematic=kinematic)
-    _finish(cube, material, color)
-    if magnet is not None:
-        author_magnet(cube.GetPrim(), magnet)
-    return cube.GetPrim()
+    """Author a box with edges of ``sizes`` [m] along x, y and z."""
+    box = UsdGeom.Cube.Define(stage, path)
+    box.CreateSizeAttr(sizes[0])
+    _place(box, position)
+    if len(set(sizes)) > 1:
+        box.AddScaleOp().Set(Gf.Vec3f(*(size / sizes[0] for size in sizes)))
+    return _finish(box, material, color, motion, magnet)
+
+
+def add_capsule(
+    stage: Usd.Stage,
+    path: str,
+    start: Sequence[float],
+    end: Sequence[float],
+    radius: float,
+    material: UsdShade.Material,
+    *,
+    color: Sequence[float],
+) -> Usd.Prim:
+    """Author a static capsule whose axis runs from ``start`` to ``end`` [m]."""
+    along = np.subtract(end, start)
+    capsule = UsdGeom.Capsule.Define(stage, path)
+    capsule.CreateAxisAttr(UsdGeom.Tokens.z)
+    capsule.CreateRadiusAttr(radius)
+    capsule.CreateHeightAttr(float(np.linalg.norm(along)))
+    _place(capsule, 0.5 * np.add(start, end))
+    turn = Gf.Rotation(Gf.Vec3d(0.0, 0.0, 1.0), Gf.Vec3d(*along.tolist()))
+    capsule.AddOrientOp().Set(Gf.Quatf(turn.GetQuat()))
+    return _finish(capsule, material, color, STATIC, None)
 
 
 def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], *, field_of_view: float = 35.0) -> None:
@@ -176,15 +216,46 @@ def add_lights(stage: Usd.Stage) -> None:
     sun.AddRotateXYZOp().Set(Gf.Vec3f(40.0, -25.0, 0.0))
 
 
-def _make_body(shape, position, *, kinematic) -> None:
-    shape.AddTranslateOp().Set(Gf.Vec3d(*position))
-    body = UsdPhysics.RigidBodyAPI.Apply(shape.GetPrim())
-    body.CreateKinematicEnabledAttr(kinematic)
+def run(author: Callable) -> None:
+    """Call ``author`` from the command line: ``-o`` is its path, every parameter an option by the same name.
+
+    The options' types, defaults and help texts are those of its signature and its docstring.
+    """
+    summary, _, arguments = inspect.getdoc(inspect.getmodule(author)).partition("\n")
+    arguments = dict(re.findall(r"^ {4}(\w+): (.+?)\.?$", inspect.getdoc(author), re.MULTILINE))
+    parser = argparse.ArgumentParser(description=summary)
+    parser.add_argument("-o", "--output", required=True, help=arguments.pop("path"))
+    for name, parameter in inspect.signature(author).parameters.items():
+        if name != "path":
+            option, kind = f"--{name.replace('_', '-')}", parameter.annotation
+            text = f"{arguments[name]} (default: %(default)s)"
+            parser.add_argument(option, type=kind, default=parameter.default, help=text.replace("%)", "%%)"))
+    options = vars(parser.parse_args())
+    try:
+        author(options.pop("output"), **options)
+    except InputError as error:
+        sys.exit(f"{parser.prog}: {error}")
 
 
-def _finish(shape, material, color) -> None:
-    """Make ``shape`` a collider and give it an extent, a material and a colour."""
+def check_count(name: str, value: int) -> None:
+    """Raise :class:`InputError` naming the parameter ``name`` unless ``value`` is a positive whole number."""
+    if not value > 0:
+        raise InputError(f"{name}: must be positive, got {value}")
+
+
+def _place(shape, position) -> None:
+    shape.AddTranslateOp().Set(Gf.Vec3d(*map(float, position)))
+
+
+def _finish(shape, material, color, motion, magnet) -> Usd.Prim:
+    """Make ``shape`` a collider that moves as told, with an extent, a material, a colour and maybe a magnet."""
+    prim = shape.GetPrim()
+    if motion != STATIC:
+        UsdPhysics.RigidBodyAPI.Apply(prim).CreateKinematicEnabledAttr(motion == KINEMATIC)
     shape.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(shape, Usd.TimeCode.Default()))
-    UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
+    UsdPhysics.CollisionAPI.Apply(prim)
     shape.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*color)]))
-    UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+    if magnet is not None:
+        author_magnet(prim, magnet)
+    return prim

@@ -3,7 +3,6 @@
 ``python -m warpmag.scenes_usd.balls_up -o balls_up.usdc``
 """
 
-import argparse
 import os
 
 from pxr import UsdGeom
@@ -11,10 +10,6 @@ from pxr import UsdGeom
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring
-
-SPACING = 2.002
-"""Distance of neighbouring balls in radii: a gap of a thousandth, so that rounding never makes them overlap."""
-
 
 def author(
     path: str | os.PathLike,
@@ -39,7 +34,7 @@ def author(
         magnetization: Magnetization of the magnet along z [A/m].
         height: Centre of the magnet above the ground [m].
     """
-    pitch = SPACING * radius
+    pitch = authoring.BALL_SPACING * radius
     top = (layers - 1) * pitch + 2.0 * radius
     if height - 0.5 * magnet_size <= top:
         raise InputError(f"height: the magnet must hang above the balls, whose top is at {top:g} m, got {height:g}")
@@ -49,21 +44,21 @@ def author(
         "Kim and Han 2022, Fig. 3. No friction, no restitution, steps of 1 ms.",
         seconds=3.0,
     )
-    authoring.add_scene(stage, MagneticSettings(), step=1e-3)
+    authoring.add_scene(stage, MagneticSettings())
     iron = authoring.add_material(
         stage, "Iron", color=authoring.STEEL_COLOR, metallic=1.0, roughness=0.3, density=authoring.IRON_DENSITY
     )
     magnet = authoring.add_material(stage, "Magnet", color=authoring.MAGNET_COLOR, density=7500.0)
     ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8)
     authoring.add_ground(stage, ground, size=1.0)
-    authoring.add_cube(
+    authoring.add_box(
         stage,
         "/World/Magnet",
         (0.0, 0.0, height),
-        magnet_size,
+        (magnet_size,) * 3,
         magnet,
         magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
-        kinematic=True,
+        motion=authoring.KINEMATIC,
     )
     UsdGeom.Scope.Define(stage, "/World/Balls")
     places = [(x, y, z) for z in range(layers) for y in range(rows) for x in range(columns)]
@@ -75,20 +70,5 @@ def author(
     authoring.save(stage, path)
 
 
-def main() -> None:
-    """Author the stage from the command line."""
-    parser = argparse.ArgumentParser(description="Author the Balls Up stage.")
-    parser.add_argument("-o", "--output", default="balls_up.usdc", help="USD file to write")
-    parser.add_argument("--columns", type=int, default=9, help="balls along x")
-    parser.add_argument("--rows", type=int, default=9, help="balls along y")
-    parser.add_argument("--layers", type=int, default=3, help="layers of balls")
-    parser.add_argument("--radius", type=float, default=0.005, help="radius of the balls [m]")
-    parser.add_argument("--magnet-size", type=float, default=0.04, help="edge of the magnet [m]")
-    parser.add_argument("--magnetization", type=float, default=1e6, help="magnetization of the magnet [A/m]")
-    parser.add_argument("--height", type=float, default=0.08, help="centre of the magnet above the ground [m]")
-    options = vars(parser.parse_args())
-    author(options.pop("output"), **options)
-
-
 if __name__ == "__main__":
-    main()
+    authoring.run(author)

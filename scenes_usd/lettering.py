@@ -1,0 +1,308 @@
+"""Letters as solids: outlines of a font, a mesh that shows them, and boxes along their strokes that stand for them.
+
+Everything is in the plane of the letter, x to the right and y up, in units of the height of a capital. The outlines are
+those of DejaVu Sans Bold, which comes with Matplotlib (the extra ``plots``).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpmag.errors import InputError
+
+_UNITS = 2048
+"""Units per em of the font: its points have whole coordinates, half ones between two control points."""
+_CAPITAL = 1493
+"""Height of its capitals in the same units."""
+_CELLS = 48
+"""Cells across a capital when boxes are fitted."""
+_ANGLES = 12
+"""Directions in which boxes are fitted, over a quarter turn, besides those of the straight strokes."""
+_STRAIGHT = 0.3
+"""Edges of a letter longer than this belong to straight strokes."""
+_COVERED, _WORTH = 0.96, 0.025
+"""Boxes are added until they cover this part of the letter, or until the next would add less than that part."""
+_THINNEST = 0.16
+"""No side of a box is shorter: strokes are 0.19 wide, and a thin box would ask for short time steps."""
+_OUT = 0.015
+"""Boxes may stick out of a letter by this much, and by half a cell: curved strokes need fewer then."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A rectangle in the plane of a letter.
+
+    Attributes:
+        center: Centre, shape [2].
+        half: Half of its sides, shape [2].
+        angle: Turn against the axes, counterclockwise [rad].
+    """
+
+    center: np.ndarray
+    half: np.ndarray
+    angle: float
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Which of the points, shape [n, 2], lie inside."""
+        return (np.abs(_turned(points - self.center, -self.angle)) <= self.half).all(axis=1)
+
+
+def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
+    """Return the closed curves that bound a letter, the material on their left.
+
+    Args:
+        letter: One character.
+        segments: Straight pieces of each curved one.
+
+    Returns:
+        Corners of each curve, shape [n, 2], without the first repeated at the end. The origin is the middle of the
+        bounding box.
+
+    Raises:
+        InputError: Matplotlib is missing, or the letter shows nothing.
+    """
+    try:
+        from matplotlib.font_manager import FontProperties  # noqa: PLC0415 - only authoring letters needs it
+        from matplotlib.textpath import TextPath  # noqa: PLC0415
+    except ImportError:
+        raise InputError("letters: their outlines need Matplotlib, install the extra 'plots'") from None
+    path = TextPath((0.0, 0.0), letter, size=_UNITS, prop=FontProperties(family="DejaVu Sans", weight="bold"))
+    curves, corners = [], []
+    for points, code in path.iter_segments(simplify=False, curves=True):
+        ends = (np.rint(2.0 * points) / 2.0 / _CAPITAL).reshape(-1, 2)  # undoes the rounding of the rasteriser
+        if code == path.CURVE3:
+            t = np.linspace(0.0, 1.0, segments + 1)[1:, None]
+            corners += list((1.0 - t) ** 2 * corners[-1] + 2.0 * t * (1.0 - t) * ends[0] + t**2 * ends[1])
+        elif code in (path.MOVETO, path.LINETO):
+            corners.append(ends[0])
+        if code == path.CLOSEPOLY:
+            curves.append(_cleaned(np.array(corners)))
+            corners = []
+    if not curves:
+        raise InputError(f"letters: {letter!r} has no outline")
+    middle = 0.5 * (np.concatenate(curves).min(axis=0) + np.concatenate(curves).max(axis=0))
+    if sum(map(_area, curves)) < 0.0:  # TrueType goes round the other way
+        curves = [curve[::-1] for curve in curves]
+    return [curve - middle for curve in curves]
+
+
+def area(curves: list[np.ndarray]) -> float:
+    """Return the area that an outline bounds."""
+    return sum(map(_area, curves))
+
+
+def triangles(curves: list[np.ndarray]) -> np.ndarray:
+    """Triangulate the inside of an outline by cutting off ears, each hole joined to what surrounds it by a bridge.
+
+    Returns:
+        Indices into all corners of the curves, one curve after the other, counterclockwise, shape [n, 3].
+    """
+    points = np.concatenate(curves)
+    starts = np.cumsum([0, *map(len, curves)])
+    loops = [list(range(start, end)) for start, end in zip(starts[:-1], starts[1:], strict=True)]
+    outer = [loop for loop, curve in zip(loops, curves, strict=True) if _area(curve) > 0.0]
+    holes = [loop for loop, curve in zip(loops, curves, strict=True) if _area(curve) < 0.0]
+    found = []
+    for loop in outer:
+        inside = [hole for hole in holes if _inside(points[hole[:1]], [points[loop]])[0]]
+        for hole in sorted(inside, key=lambda one: -points[one, 0].max()):
+            loop = _bridged(points, loop, hole)
+        found += _ears(points, loop)
+    return np.array(found)
+
+
+def extruded(curves: list[np.ndarray], depth: float, bevel: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return a closed mesh: the outline with thickness, its edges bevelled.
+
+    Args:
+        curves: The outline.
+        depth: Thickness.
+        bevel: Width of the bevel, small against the strokes.
+
+    Returns:
+        Points, shape [n, 3], z across the letter and zero in its middle; and the faces as indices, counterclockwise
+        seen from outside.
+    """
+    rims, inner = np.concatenate(curves), np.concatenate([_inset(curve, bevel) for curve in curves])
+    count = len(rims)
+    rings = [(inner, 0.5 * depth), (rims, 0.5 * depth - bevel), (rims, bevel - 0.5 * depth), (inner, -0.5 * depth)]
+    points = np.concatenate([np.c_[ring, np.full(count, z)] for ring, z in rings])
+    caps = triangles(curves)
+    following = np.concatenate(
+        [start + np.roll(np.arange(len(curve)), -1) for start, curve in zip(_starts(curves), curves, strict=True)]
+    )
+    here = np.arange(count)
+    faces = [*caps, *(caps[:, ::-1] + 3 * count)]
+    for upper in range(3):
+        low, high = (upper + 1) * count, upper * count
+        faces += list(np.stack([here + low, following + low, following + high, here + high], axis=1))
+    return points, faces
+
+
+def boxes(curves: list[np.ndarray]) -> list[Box]:
+    """Cover a letter with few boxes along its strokes, the one that adds most first; they overlap."""
+    grids = [_Grid(curves, angle) for angle in _directions(curves)]
+    found: list[Box] = []
+    whole = area(curves)
+    covered = 0.0
+    while covered < _COVERED * whole:
+        gain, box = max((grid.best() for grid in grids), key=lambda one: one[0])
+        if gain < _WORTH * whole:
+            break
+        covered += gain
+        found.append(box)
+        for grid in grids:
+            grid.cover(box)
+    return found
+
+
+def _directions(curves) -> np.ndarray:
+    """Return the angles at which boxes may lie, in [0, π/2)."""
+    quarter = 0.5 * np.pi
+    edges = np.concatenate([np.roll(curve, -1, axis=0) - curve for curve in curves])
+    long = edges[np.linalg.norm(edges, axis=1) > _STRAIGHT]
+    strokes = np.round(np.arctan2(long[:, 1], long[:, 0]) % quarter, 4) % quarter
+    return np.unique(np.concatenate([np.arange(_ANGLES) * (quarter / _ANGLES), strokes]))
+
+
+class _Grid:
+    """Cells over a letter in one direction: where boxes may lie, and which cells none of them covers yet."""
+
+    def __init__(self, curves, angle):
+        self._angle = angle
+        self._cell = 1.0 / _CELLS
+        turned = [_turned(curve, -angle) for curve in curves]
+        around = [_inset(curve, -_OUT) for curve in turned]
+        corners = np.concatenate(around)
+        self._lower = corners.min(axis=0)
+        columns, rows = np.ceil(np.ptp(corners, axis=0) / self._cell - 1e-6).astype(int)
+        x, y = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+        centers = self._lower + self._cell * np.stack([x.ravel(), y.ravel()], axis=1)
+        self._inside = _inside(centers, around).reshape(rows, columns)
+        self._open = _inside(centers, turned).reshape(rows, columns)
+        self._centers = _turned(centers, angle)
+
+    def cover(self, box: Box) -> None:
+        self._open &= ~box.contains(self._centers).reshape(self._open.shape)
+
+    def best(self) -> tuple[float, Box]:
+        """Return the box that covers most of what is open, and how much that is.
+
+        All rows from ``first`` to ``last`` are tried at once over ``first``; within them the best run of columns that
+        are inside throughout ends where the open cells since the last column outside are most.
+        """
+        rows, columns = self._inside.shape
+        thinnest = int(_THINNEST / self._cell)
+        whole = np.ones((rows, columns), bool)
+        opened = np.zeros((rows, columns), int)
+        most, corners = 0, (0, 0, 0, 0)
+        for last in range(rows):
+            whole[: last + 1] &= self._inside[last]
+            opened[: last + 1] += self._open[last]
+            runs = _run_sums(np.where(whole, opened, 0), whole)
+            runs[_run_sums(whole, whole) < thinnest] = 0
+            runs[max(0, last + 2 - thinnest) :] = 0
+            first, end = np.unravel_index(np.argmax(runs), runs.shape)
+            if runs[first, end] > most:
+                most = runs[first, end]
+                outside = np.flatnonzero(~whole[first, :end])
+                begin = outside[-1] + 1 if len(outside) else 0
+                after = np.flatnonzero(~whole[first, end:])
+                corners = (begin, first, end + after[0] if len(after) else columns, last + 1)
+        lower, upper = (self._lower + self._cell * np.array(corners[k : k + 2]) for k in (0, 2))
+        box = Box(_turned(0.5 * (lower + upper), self._angle), 0.5 * (upper - lower), float(self._angle))
+        return float(most) * self._cell**2, box
+
+
+def _run_sums(values, whole) -> np.ndarray:
+    """Sum ``values`` along each row since the last place that is not ``whole``."""
+    sums = np.cumsum(values, axis=1)
+    return sums - np.maximum.accumulate(np.where(whole, 0, sums), axis=1)
+
+
+def _starts(curves) -> np.ndarray:
+    return np.cumsum([0, *map(len, curves[:-1])])
+
+
+def _area(curve) -> float:
+    following = np.roll(curve, -1, axis=0)
+    return float(0.5 * np.sum(curve[:, 0] * following[:, 1] - curve[:, 1] * following[:, 0]))
+
+
+def _turned(points, angle) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([[cos, sin], [-sin, cos]])
+
+
+def _cleaned(curve) -> np.ndarray:
+    """Drop corners that repeat the one before, or the first one at the end."""
+    return curve[np.linalg.norm(curve - np.roll(curve, 1, axis=0), axis=1) > 1e-9]
+
+
+def _inset(curve, width) -> np.ndarray:
+    """Move every edge of ``curve`` to its left by ``width``; corners sharper than a right angle are cut short."""
+    before, after = curve - np.roll(curve, 1, axis=0), np.roll(curve, -1, axis=0) - curve
+    normals = [np.stack([-e[:, 1], e[:, 0]], axis=1) / np.linalg.norm(e, axis=1)[:, None] for e in (before, after)]
+    bisector = normals[0] + normals[1]
+    return curve + width * bisector / np.maximum(0.5 * np.sum(bisector**2, axis=1), 1.0)[:, None]
+
+
+def _inside(points, curves) -> np.ndarray:
+    """Which of the points, shape [n, 2], lie inside the curves, by the number of edges that a ray to the right meets."""
+    result = np.zeros(len(points), bool)
+    x, y = points.T
+    for curve in curves:
+        for (ax, ay), (bx, by) in zip(curve, np.roll(curve, -1, axis=0), strict=True):
+            if ay != by:
+                result ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) * (bx - ax) / (by - ay))
+    return result
+
+
+def _cross(o, a, b) -> float:
+    return (a[0] - o[0]) * (b[1] - o[1]) - (a[1] - o[1]) * (b[0] - o[0])
+
+
+def _bridged(points, loop, hole) -> list[int]:
+    """Join ``hole`` to ``loop`` by the shortest bridge that crosses neither."""
+    edges = [(one[k - 1], one[k]) for one in (loop, hole) for k in range(len(one))]
+    distances = np.linalg.norm(points[loop][:, None] - points[hole], axis=2)
+    for place in np.argsort(distances, axis=None, kind="stable"):
+        a, b = np.unravel_index(place, distances.shape)
+        if not any(_crosses(points, loop[a], hole[b], *edge) for edge in edges):
+            return [*loop[: a + 1], *hole[b:], *hole[: b + 1], *loop[a:]]
+    raise ValueError("outline: a hole cannot be reached from the curve around it")
+
+
+def _crosses(points, a, b, c, d) -> bool:
+    if {a, b} & {c, d}:
+        return False
+    a, b, c, d = points[[a, b, c, d]]
+    return _cross(a, b, c) * _cross(a, b, d) <= 0.0 and _cross(c, d, a) * _cross(c, d, b) <= 0.0
+
+
+def _ears(points, loop) -> list[list[int]]:
+    """Cut a simple loop into triangles, always at the ear whose sharpest angle is widest."""
+    loop, found = list(loop), []
+    while len(loop) > 3:
+        ears = [(_quality(points, loop, k), k) for k in range(len(loop))]
+        quality, k = max(ears)
+        if quality <= 0.0:
+            raise ValueError("outline: crosses itself")
+        found.append([loop[k - 1], loop[k], loop[(k + 1) % len(loop)]])
+        del loop[k]
+    return [*found, loop]
+
+
+def _quality(points, loop, k) -> float:
+    """Return twice the area over the longest side squared of the ear at place ``k``, at most zero if it is none."""
+    names = loop[k - 1], loop[k], loop[(k + 1) % len(loop)]
+    a, b, c = points[list(names)]
+    double = _cross(a, b, c)
+    if double <= 1e-12:
+        return 0.0
+    others = points[[one for one in loop if one not in names]]
+    if len(others):
+        sides = np.stack([_cross(p, q, others.T) for p, q in ((a, b), (b, c), (c, a))])
+        if (sides >= -1e-12).all(axis=0).any():
+            return 0.0
+    return double / max(np.sum((p - q) ** 2) for p, q in ((a, b), (b, c), (c, a)))
