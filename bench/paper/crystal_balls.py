@@ -1,7 +1,8 @@
 """The crystal balls of the paper's Fig. 7: 178 fixed inducible balls around a bar magnet.
 
 The paper gives the count and the picture, neither sizes nor strengths. Here the balls fill a plane grid of 16 × 13
-cells, out of which the bar takes the middle 10 × 3. Two strengths of the bar:
+cells, out of which the bar takes the middle 10 × 3; second choice, the 14 × 13 cells and bar of 4 × 1 of the bundled
+scene, where the fields at the balls differ by more. Two strengths of the bar:
 
 * weak, 1e6 A/m, neodymium: no ball of iron saturates, ‖H‖ is 0.8 to 20 % of Ms;
 * strong, 4e7 A/m, "excessively strong" as in the paper's scenes: ‖H‖ is 0.3 to 8 Ms.
@@ -21,8 +22,8 @@ BALL_RADIUS = 0.005
 """[m]"""
 PITCH = 0.011
 """Distance of neighbours [m]; the balls do not touch."""
-BAR_HALF_EXTENTS = (5 * PITCH - 5e-4, 1.5 * PITCH - 5e-4, 1.5 * PITCH - 5e-4)
-"""[m]"""
+CELLS, OTHER_CELLS = (16, 13, 10, 3), (14, 13, 4, 1)
+"""Cells of the grid along x and y, and those of the bar; the other choice."""
 STRENGTHS = {"weak": 1e6, "strong": 4e7}
 """Magnetization of the bar, along its length [A/m]."""
 PAIRS = ("across", "in plane", "random")
@@ -32,28 +33,33 @@ direction at each ball."""
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions [m] of the balls, shape [178, 3], and positions, volumes and radii of the bar's moments."""
+    """Positions [m] of the balls, shape [178, 3], half extents [m] of the bar, and its moments."""
 
     balls: np.ndarray
+    bar_half_extents: tuple[float, float, float]
     bar: lattice.Lattice
 
 
-def layout() -> Layout:
+def layout(cells: tuple[int, int, int, int] = CELLS) -> Layout:
     """Return where everything is."""
-    cells = [(i - 7.5, j - 6.0, 0.0) for j in range(13) for i in range(16) if abs(i - 7.5) > 5 or abs(j - 6) > 1.5]
-    return Layout(PITCH * np.array(cells), lattice.fill([lattice.box(BAR_HALF_EXTENTS)], 0.5 * PITCH))
+    columns, rows, length, width = cells
+    places = [(i - 0.5 * (columns - 1), j - 0.5 * (rows - 1), 0.0) for j in range(rows) for i in range(columns)]
+    balls = [(x, y, z) for x, y, z in places if abs(x) > 0.5 * length or abs(y) > 0.5 * width]
+    half = (0.5 * length * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4)
+    return Layout(PITCH * np.array(balls), half, lattice.fill([lattice.box(half)], 0.5 * PITCH))
 
 
-def make_system(strength: float, dynamics: str, device: str, **settings) -> MomentSystem:
+def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **settings) -> MomentSystem:
     """Return the balls, first, and the bar's moments, ready to solve.
 
     Args:
         strength: Magnetization of the bar [A/m].
         dynamics: One of ``warpmag.magnets.DYNAMICS``.
         device: Warp device.
+        cells: Cells of the grid and of the bar.
         settings: More arguments of :class:`MomentSystem`.
     """
-    place = layout()
+    place = layout(cells)
     balls, bar = place.balls, place.bar
     count = len(balls) + len(bar.positions)
     system = MomentSystem(

@@ -10,7 +10,7 @@ The paper gives neither sizes nor what the force acts on. Two readings are measu
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 
 from bench.paper.output import Output, table
 from warpmag import lattice
@@ -118,7 +118,7 @@ def _draw_row(row, title, points, densities, sizes, pitch):
         some = slice(None, None, max(1, len(points) // 400))
         axis.quiver(*points[some, :2].T, *unit[some, :2].T, scale=45, width=0.002, color="k", alpha=0.6)
         axis.set_title(f"{LAWS[law]}\n{title}", fontsize=9)
-    _draw(row[2], points, sizes["zeeman"] / sizes["kelvin"], pitch, LogNorm(1.0, 8.0), "ratio")
+    _draw(row[2], points, sizes["zeeman"] / sizes["kelvin"], pitch, Normalize(1.0, 8.0), "ratio")
     row[2].set_title(f"Zeeman over Kelvin\n{title}", fontsize=9)
 
 

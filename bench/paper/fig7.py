@@ -70,11 +70,12 @@ def _symmetric_pair(reduced: np.ndarray):
 
 
 def _draw(axis, pairs, title: str):
-    balls = crystal_balls.layout().balls
+    place = crystal_balls.layout()
+    balls = place.balls
     count = len(balls)
     at = 1e3 * balls @ _TILT.T
     length = 1.1e3 * crystal_balls.BALL_RADIUS
-    a, b, _ = 1e3 * np.array(crystal_balls.BAR_HALF_EXTENTS)
+    a, b, _ = 1e3 * np.array(place.bar_half_extents)
     axis.add_patch(plt.Rectangle((-a, -b), a, 2 * b, color="0.35"))
     axis.add_patch(plt.Rectangle((0.0, -b), a, 2 * b, color="0.6"))
     axis.text(0.5 * a, 0.0, "N", ha="center", va="center", color="w", fontsize=16)

@@ -45,10 +45,10 @@ def run(output: Output):
     plt.close(figure)
 
 
-def _make_system(dynamics, curve, bar, device, iterations, *, step=STEP, start="across"):
+def _make_system(dynamics, curve, bar, device, iterations, *, step=STEP, start="across", **layout):
     explicit = {"step": step} if dynamics != "theta" else {}
     system = crystal_balls.make_system(
-        bar, dynamics, device, curve=curve, rtol=TOLERANCE, max_evaluations=iterations, **explicit
+        bar, dynamics, device, curve=curve, rtol=TOLERANCE, max_evaluations=iterations, **explicit, **layout
     )
     if explicit:
         crystal_balls.set_pairs(system, start)
@@ -96,21 +96,30 @@ def _second_choices(output: Output) -> str:
         for name, bar in strengths.items()
     ]
     bars = [[f"`{d}`", *outcomes(d, c, [{"bar": bar} for bar in BARS])] for d, c in methods]
+    layouts = [
+        [f"`{d}`", *outcomes(d, c, [{"bar": bar, "cells": crystal_balls.OTHER_CELLS} for bar in BARS])]
+        for d, c in methods
+    ]
     starts = [
         [f"`{d}`", name, *outcomes(d, c, [{"bar": bar, "start": start} for start in crystal_balls.PAIRS])]
         for d, c in explicit
         for name, bar in strengths.items()
     ]
+    columns, rows, length, width = crystal_balls.OTHER_CELLS
     return f"""**Does it hang on the constants left open?** Iterations, or (error left after {PATIENCE:,}).
 
 Other steps. A step small enough saves damping-only LLG and even LLG under the strong bar, at the price of hundreds and
-thousands of iterations; no step lets LLG do with fewer under both bars:
+thousands of iterations; a step too large loses `theta-euler` there, too:
 
 {table(["dynamics", "bar", *(f"κ = {step:g}" for step in STEPS)], steps)}
 
 Other strengths of the bar, κ = {STEP:g}:
 
 {table(["dynamics", *(f"{bar:g} A/m" for bar in BARS)], bars)}
+
+Another arrangement, {columns} × {rows} cells and a bar of {length} × {width}, κ = {STEP:g}:
+
+{table(["dynamics", *(f"{bar:g} A/m" for bar in BARS)], layouts)}
 
 Other starts of the pairs, κ = {STEP:g}. Where M1 = −M2 lies along the field to come, every dynamics of pairs crawls: a
 submagnetization only ever moves across itself, so M along the pair's axis grows from nothing. `theta` has no pairs:
