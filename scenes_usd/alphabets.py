@@ -40,8 +40,8 @@ def author(
     size: float = 0.02,
     thickness: float = 0.005,
     moment_spacing: float = 0.004,
-    moment: float = 8.0,
-    core: float = 0.02,
+    moment: float = 60.0,
+    core: float = 0.04,
     friction: float = 0.4,
 ) -> None:
     """Write the stage to ``path``.

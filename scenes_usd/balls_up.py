@@ -11,6 +11,7 @@ from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring
 
+
 def author(
     path: str | os.PathLike,
     *,

@@ -44,7 +44,7 @@ class Box:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of the points, shape [n, 2], lie inside."""
-        return (np.abs(_turned(points - self.center, -self.angle)) <= self.half).all(axis=1)
+        return np.max(np.abs(_turned(points - self.center, -self.angle)) - self.half, axis=1) <= 0.0
 
 
 def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
@@ -61,6 +61,8 @@ def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
     Raises:
         InputError: Matplotlib is missing, or the letter shows nothing.
     """
+    if not letter.strip():
+        raise InputError(f"letters: {letter!r} has no outline")
     try:
         from matplotlib.font_manager import FontProperties  # noqa: PLC0415 - only authoring letters needs it
         from matplotlib.textpath import TextPath  # noqa: PLC0415
@@ -78,8 +80,6 @@ def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
         if code == path.CLOSEPOLY:
             curves.append(_cleaned(np.array(corners)))
             corners = []
-    if not curves:
-        raise InputError(f"letters: {letter!r} has no outline")
     middle = 0.5 * (np.concatenate(curves).min(axis=0) + np.concatenate(curves).max(axis=0))
     if sum(map(_area, curves)) < 0.0:  # TrueType goes round the other way
         curves = [curve[::-1] for curve in curves]
@@ -98,8 +98,7 @@ def triangles(curves: list[np.ndarray]) -> np.ndarray:
         Indices into all corners of the curves, one curve after the other, counterclockwise, shape [n, 3].
     """
     points = np.concatenate(curves)
-    starts = np.cumsum([0, *map(len, curves)])
-    loops = [list(range(start, end)) for start, end in zip(starts[:-1], starts[1:], strict=True)]
+    loops = [list(range(start, start + len(curve))) for start, curve in zip(_starts(curves), curves, strict=True)]
     outer = [loop for loop, curve in zip(loops, curves, strict=True) if _area(curve) > 0.0]
     holes = [loop for loop, curve in zip(loops, curves, strict=True) if _area(curve) < 0.0]
     found = []
@@ -248,7 +247,7 @@ def _inset(curve, width) -> np.ndarray:
 
 
 def _inside(points, curves) -> np.ndarray:
-    """Which of the points, shape [n, 2], lie inside the curves, by the number of edges that a ray to the right meets."""
+    """Which of the points, shape [n, 2], lie inside the curves, by the edges that a ray to the right meets."""
     result = np.zeros(len(points), bool)
     x, y = points.T
     for curve in curves:

@@ -1,0 +1,110 @@
+"""Crystal Balls: fixed balls around a bar magnet, magnetized by it and by each other (Kim and Han 2022, Fig. 7).
+
+``python -m warpmag.scenes_usd.crystal_balls -o crystal_balls.usdc``
+
+The variant set ``strength`` of ``/World/Magnet`` has the strong and the weak magnet.
+"""
+
+import os
+
+from pxr import Gf, Usd, UsdGeom
+
+from warpmag.errors import InputError
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.scenes_usd import authoring
+from warpmag.usd import author_magnet
+
+CRYSTAL_COLOR = (0.45, 0.68, 0.8)
+_FILL = 0.8
+"""Thickness of the bar magnet over the width of the row of places that it takes."""
+
+
+def author(
+    path: str | os.PathLike,
+    *,
+    columns: int = 14,
+    rows: int = 13,
+    bar: int = 4,
+    radius: float = 0.01,
+    spacing: float = 0.026,
+    strong: float = 1e7,
+    weak: float = 1e5,
+    strength: str = "strong",
+) -> None:
+    """Write the stage to ``path``.
+
+    Args:
+        path: USD file to write.
+        columns: Places along x; with the number of places for the bar both even or both odd.
+        rows: Places along z, an odd number.
+        bar: Places in the middle row that the bar magnet takes.
+        radius: Radius of the balls [m].
+        spacing: Distance of neighbouring places [m].
+        strong: Magnetization of the strong magnet, along x [A/m].
+        weak: Magnetization of the weak magnet, along x [A/m].
+        strength: The magnet that is selected, strong or weak.
+    """
+    _check(columns, rows, bar, radius, spacing, strength)
+    count = columns * rows - bar
+    stage = authoring.new_stage(
+        f"Crystal Balls: {count} fixed balls show the field of a bar magnet and of each other\n\n"
+        "Kim and Han 2022, Fig. 7. Nothing moves but the magnetizations. Variant set strength: strong, weak.",
+        seconds=1.0,
+    )
+    authoring.add_scene(stage, MagneticSettings(), gravity=0.0)
+    crystal = authoring.add_material(stage, "Crystal", color=CRYSTAL_COLOR, roughness=0.1, density=2650.0)
+    magnet = authoring.add_material(stage, "Magnet", color=authoring.MAGNET_COLOR, density=7500.0)
+    thickness = _FILL * spacing
+    sizes = ((bar - 1) * spacing + thickness, thickness, thickness)
+    prim = authoring.add_box(stage, "/World/Magnet", (0.0, 0.0, 0.0), sizes, magnet, motion=authoring.KINEMATIC)
+    _add_strengths(prim, {"strong": strong, "weak": weak}, strength)
+    UsdGeom.Scope.Define(stage, "/World/Balls")
+    middle_row, first, last = rows // 2, (columns - bar) // 2, (columns + bar) // 2
+    places = [(x, z) for z in range(rows) for x in range(columns) if z != middle_row or not first <= x < last]
+    for number, (x, z) in enumerate(places):
+        position = ((x - 0.5 * (columns - 1)) * spacing, 0.0, (z - middle_row) * spacing)
+        authoring.add_ball(
+            stage,
+            f"/World/Balls/Ball_{number:04d}",
+            position,
+            radius,
+            crystal,
+            motion=authoring.KINEMATIC,
+            magnet=Magnet(),
+            color=CRYSTAL_COLOR,
+        )
+    reach = spacing * max(columns, 1.78 * rows)
+    authoring.add_camera(stage, (0.35 * reach, -1.75 * reach, 0.3 * reach), (0.0, 0.0, 0.0))
+    authoring.add_lights(stage)
+    authoring.save(stage, path)
+
+
+def _check(columns, rows, bar, radius, spacing, strength) -> None:
+    for name, value in (("columns", columns), ("rows", rows), ("bar", bar)):
+        authoring.check_count(name, value)
+    if rows % 2 == 0:
+        raise InputError(f"rows: must be odd, for the bar magnet lies in the middle one, got {rows}")
+    if bar > columns or (columns - bar) % 2:
+        raise InputError(f"bar: must leave as many places on either side in a row of {columns}, got {bar}")
+    if spacing < authoring.BALL_SPACING * radius:
+        raise InputError(f"spacing: balls of radius {radius:g} m would touch, got {spacing:g} m")
+    if strength not in ("strong", "weak"):
+        raise InputError(f"strength: {strength!r} is not one of strong, weak")
+
+
+def _add_strengths(prim: Usd.Prim, magnetizations: dict[str, float], selected: str) -> None:
+    """Author the variant set ``strength`` on a magnet, the magnetization in the variants alone."""
+    author_magnet(prim, Magnet(kind="permanent"))
+    attribute = prim.GetAttribute("warpmag:magnetization")
+    attribute.Clear()  # what the prim itself says would be stronger than its variants
+    variants = prim.GetVariantSets().AddVariantSet("strength")
+    for name, magnetization in magnetizations.items():
+        variants.AddVariant(name)
+        variants.SetVariantSelection(name)
+        with variants.GetVariantEditContext():
+            attribute.Set(Gf.Vec3f(magnetization, 0.0, 0.0))
+    variants.SetVariantSelection(selected)
+
+
+if __name__ == "__main__":
+    authoring.run(author)

@@ -1,0 +1,117 @@
+"""Falling Magnet: a heavy, strong ball magnet falls on a stack of iron balls (Kim and Han 2022, Fig. 5).
+
+``python -m warpmag.scenes_usd.falling_magnet -o falling_magnet.usdc``
+"""
+
+import math
+import os
+
+import numpy as np
+from pxr import UsdGeom
+
+from warpmag.errors import InputError
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.scenes_usd import authoring
+
+
+def author(
+    path: str | os.PathLike,
+    *,
+    balls: int = 1032,
+    layers: int = 6,
+    radius: float = 0.005,
+    magnet_radius: float = 0.02,
+    magnet_density: float = 7500.0,
+    magnetization: float = 1e6,
+    drop: float = 0.1,
+    friction: float = 0.4,
+) -> None:
+    """Write the stage to ``path``.
+
+    Args:
+        path: USD file to write.
+        balls: Number of balls.
+        layers: Layers of the stack, at most.
+        radius: Radius of the balls [m].
+        magnet_radius: Radius of the magnet [m].
+        magnet_density: Density of the magnet [kg/m³].
+        magnetization: Magnetization of the magnet, along z [A/m].
+        drop: Gap between the magnet and the top of the stack [m].
+        friction: Coefficient of friction of everything.
+    """
+    authoring.check_count("balls", balls)
+    authoring.check_count("layers", layers)
+    if not drop > 0.0:
+        raise InputError(f"drop: the magnet must be above the stack, got {drop}")
+    stage = authoring.new_stage(
+        f"Falling Magnet: a heavy, strong magnet falls on a stack of {balls} iron balls, which cling to it\n\n"
+        "Kim and Han 2022, Fig. 5. Ordinary friction, steps of 1 ms.",
+        seconds=5.0,
+    )
+    authoring.add_scene(stage, MagneticSettings())
+    iron = authoring.add_material(
+        stage,
+        "Iron",
+        color=authoring.STEEL_COLOR,
+        metallic=1.0,
+        roughness=0.3,
+        density=authoring.IRON_DENSITY,
+        friction=friction,
+    )
+    magnet = authoring.add_material(
+        stage, "Magnet", color=authoring.MAGNET_COLOR, density=magnet_density, friction=friction
+    )
+    ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8, friction=friction)
+    authoring.add_ground(stage, ground, size=2.0)
+    positions = stack(balls, layers, radius)
+    UsdGeom.Scope.Define(stage, "/World/Balls")
+    for number, position in enumerate(positions):
+        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=Magnet())
+    top = float(positions[:, 2].max()) + radius
+    authoring.add_ball(
+        stage,
+        "/World/Magnet",
+        (0.0, 0.0, top + drop + magnet_radius),
+        magnet_radius,
+        magnet,
+        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
+        color=authoring.MAGNET_COLOR,
+    )
+    reach = max(float(np.ptp(positions[:, 0])), top + drop + 2.0 * magnet_radius)
+    authoring.add_camera(stage, (1.2 * reach, -3.0 * reach, 1.1 * reach), (0.0, 0.0, 0.42 * reach))
+    authoring.add_lights(stage)
+    authoring.save(stage, path)
+
+
+def stack(count: int, layers: int, radius: float) -> np.ndarray:
+    """Return places for the balls of a round stack, each above the gap between four balls of the layer below.
+
+    Of all such places those are taken that lie below a cone with a slope of 45 degrees, as low a cone as holds them:
+    every ball then has the four that it rests on.
+
+    Args:
+        count: Number of balls.
+        layers: Layers, at most.
+        radius: Radius of the balls [m].
+
+    Returns:
+        Centres [m], shape [count, 3], from the ground up.
+    """
+    pitch = authoring.BALL_SPACING * radius
+    rise = pitch / math.sqrt(2.0)
+    side = int(2.0 * math.sqrt(count)) + 4  # more than enough for a disc of all of them
+    places = []
+    for layer in range(layers):
+        line = (np.arange(side) - 0.5 * (side - 1) + 0.5 * (layer % 2)) * pitch
+        x, y = np.meshgrid(line, line)
+        places.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, radius + layer * rise)], axis=1))
+    places = np.concatenate(places)
+    # Ties are settled by height and angle, so that the choice does not hang on rounding.
+    height_of_cone = np.round((np.linalg.norm(places[:, :2], axis=1) + places[:, 2]) / radius, 6)
+    angle = np.round(np.arctan2(places[:, 1], places[:, 0]), 6)
+    chosen = places[np.lexsort((angle, places[:, 2], height_of_cone))[:count]]
+    return chosen[np.lexsort(chosen.T)]
+
+
+if __name__ == "__main__":
+    authoring.run(author)

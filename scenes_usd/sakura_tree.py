@@ -1,0 +1,261 @@
+"""Sakura Tree: iron balls rain on a tree with a magnet at the end of each branch (Kim and Han 2022, Fig. 6).
+
+``python -m warpmag.scenes_usd.sakura_tree -o sakura_tree.usdc``
+
+The tree grows by space colonization (Runions, Lane and Prusinkiewicz 2007): twigs grow a step at a time towards the
+points of a crown that are nearest to them, until they reach them.
+"""
+
+import itertools
+import math
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import UsdGeom
+
+from warpmag.errors import InputError
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.scenes_usd import authoring
+
+BARK_COLOR = (0.14, 0.075, 0.055)
+BUD_COLOR = (0.9, 0.35, 0.5)
+
+_STEP, _REACHED = 0.035, 0.045
+"""Length of a step of growth, and the distance at which a point of the crown is reached, over the tree's height."""
+_UPWARD = 0.15
+"""What draws every twig upward, over the pull of one point."""
+_APART = 0.085
+"""Least distance of the points of the crown over the tree's height."""
+_TWIG = 0.7
+"""Radius of a twig at its end over that of its bud."""
+_PIPES = 2.6
+"""Exponent n of the radii where a branch forks, r^n = Σ r_k^n (da Vinci: 2)."""
+_TAPER = 1.015
+"""Growth of the radius from one segment to the one below it."""
+_BALLS_APART = 0.75
+"""Least distance of the balls in the sky over their mean spacing; beyond 0.9 no such rain would be found."""
+_CROWN_CENTER, _CROWN = (0.0, 0.0, 0.66), (0.56, 0.56, 0.34)
+"""Centre and semi-axes of the ellipsoid that the crown fills, over the tree's height."""
+_TRUNK = ((0.0, 0.0, 0.0), (0.01, -0.006, 0.05), (0.012, -0.014, 0.1), (0.002, -0.018, 0.15), (-0.012, -0.01, 0.2))
+"""The trunk below the first fork, over the tree's height."""
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A tree of straight segments, each from the node above it, in the sense of its growth, to its own node.
+
+    Attributes:
+        nodes: Positions [m], shape [n, 3].
+        parents: The node that each grew from, of smaller index; -1 for the root. Shape [n].
+        radii: Radius of the segment that ends at each node [m], shape [n].
+    """
+
+    nodes: np.ndarray
+    parents: np.ndarray
+    radii: np.ndarray
+
+    @property
+    def tips(self) -> np.ndarray:
+        """The nodes that nothing grew from."""
+        return np.setdiff1d(np.arange(len(self.nodes)), self.parents)
+
+
+def author(
+    path: str | os.PathLike,
+    *,
+    balls: int = 2500,
+    branches: int = 110,
+    radius: float = 0.005,
+    height: float = 0.4,
+    bud_radius: float = 0.004,
+    magnetization: float = 3e6,
+    spacing: float = 0.022,
+    friction: float = 0.4,
+    seed: int = 7,
+) -> None:
+    """Write the stage to ``path``.
+
+    Args:
+        path: USD file to write.
+        balls: Number of balls.
+        branches: Ends of branches, at most: fewer where the crown has no room.
+        radius: Radius of the balls [m].
+        height: Height of the tree [m].
+        bud_radius: Radius of the magnets at the ends of the branches [m].
+        magnetization: Magnetization of these magnets, along the branch [A/m].
+        spacing: Mean distance of neighbouring balls in the sky [m].
+        friction: Coefficient of friction of everything.
+        seed: Seed of the tree and of the rain.
+    """
+    authoring.check_count("balls", balls)
+    authoring.check_count("branches", branches)
+    tree = grow(branches, height, bud_radius, np.random.default_rng(seed))
+    stage = authoring.new_stage(
+        f"Sakura Tree: {balls} iron balls fall from the sky and cling to the magnets at the ends of the branches\n\n"
+        "Kim and Han 2022, Fig. 6. Ordinary friction, steps of 1 ms.",
+        seconds=5.0,
+    )
+    authoring.add_scene(stage, MagneticSettings())
+    bark = authoring.add_material(stage, "Bark", color=BARK_COLOR, roughness=0.9, density=700.0, friction=friction)
+    bud = authoring.add_material(stage, "Bud", color=BUD_COLOR, roughness=0.4, density=7500.0, friction=friction)
+    iron = authoring.add_material(
+        stage,
+        "Iron",
+        color=authoring.STEEL_COLOR,
+        metallic=1.0,
+        roughness=0.3,
+        density=authoring.IRON_DENSITY,
+        friction=friction,
+    )
+    ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8, friction=friction)
+    authoring.add_ground(stage, ground, size=10.0 * height)
+    _add_tree(stage, tree, bark, bud, bud_radius, magnetization)
+    UsdGeom.Scope.Define(stage, "/World/Balls")
+    for number, position in enumerate(rain(balls, radius, spacing, height, np.random.default_rng(seed))):
+        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=Magnet())
+    authoring.add_camera(stage, (1.3 * height, -4.6 * height, 1.2 * height), (0.0, 0.0, 0.8 * height))
+    authoring.add_lights(stage)
+    authoring.save(stage, path)
+
+
+def _add_tree(stage, tree, bark, bud, bud_radius, magnetization) -> None:
+    """Author the tree as one body that is held in place, so that what clings to it clings to a magnet."""
+    authoring.add_body(stage, "/World/Tree", (0.0, 0.0, 0.0), kinematic=True)
+    for node in range(1, len(tree.nodes)):
+        start, end = tree.nodes[tree.parents[node]], tree.nodes[node]
+        authoring.add_capsule(
+            stage, f"/World/Tree/Branch_{node:04d}", start, end, float(tree.radii[node]), bark, color=BARK_COLOR
+        )
+    for number, tip in enumerate(tree.tips):
+        along = tree.nodes[tip] - tree.nodes[tree.parents[tip]]
+        along *= magnetization / np.linalg.norm(along)
+        authoring.add_ball(
+            stage,
+            f"/World/Tree/Bud_{number:04d}",
+            tree.nodes[tip],
+            bud_radius,
+            bud,
+            motion=authoring.STATIC,
+            magnet=Magnet(kind="permanent", magnetization=tuple(along.tolist())),
+            color=BUD_COLOR,
+        )
+
+
+def grow(branches: int, height: float, bud_radius: float, random: np.random.Generator) -> Tree:
+    """Grow a tree.
+
+    Args:
+        branches: Points of the crown to grow to, at most.
+        height: Height [m].
+        bud_radius: Radius of the buds [m]; none of them touch each other.
+        random: Where the points of the crown come from.
+    """
+    if not 0.0 < bud_radius < 0.5 * _STEP * height:
+        raise InputError(f"bud_radius: must be positive and below {0.5 * _STEP * height:g} m, got {bud_radius:g}")
+    goals = _crown(branches, random)
+    nodes, parents = [np.array(node) for node in _TRUNK], list(range(-1, len(_TRUNK) - 1))
+    while len(goals):
+        distances = np.linalg.norm(goals[:, None] - nodes[len(_TRUNK) - 1 :], axis=2)
+        nearest = distances.argmin(axis=1)
+        grown = len(nodes)
+        for place in np.unique(nearest):
+            node = place + len(_TRUNK) - 1
+            pulls = goals[nearest == place] - nodes[node]
+            direction = (pulls / np.linalg.norm(pulls, axis=1, keepdims=True)).sum(axis=0)
+            direction[2] += _UPWARD
+            # Rounded, so that the same tree grows on every machine.
+            new = np.round(nodes[node] + _STEP * direction / np.linalg.norm(direction), 6)
+            if np.linalg.norm(np.array(nodes) - new, axis=1).min() > 0.6 * _STEP:
+                nodes.append(new)
+                parents.append(int(node))
+        if len(nodes) == grown:
+            break  # pulled to and fro between points: those stay without a twig
+        near = np.linalg.norm(goals[:, None] - nodes[grown:], axis=2).min(axis=1)
+        goals = goals[near > _REACHED]
+    nodes, parents = np.array(nodes), np.array(parents)
+    nodes, parents = _without_close_tips(nodes, parents, 2.5 * bud_radius / height)
+    return Tree(height * nodes, parents, _radii(parents, _TWIG * bud_radius))
+
+
+def _crown(count: int, random: np.random.Generator) -> np.ndarray:
+    """Return points in the upper part of the crown's ellipsoid, no two of them close together, shape [n, 3]."""
+    points = np.empty((0, 3))
+    for _ in range(200 * count):
+        point = random.uniform(-1.0, 1.0, 3)
+        if np.linalg.norm(point) > 1.0 or point[2] < -0.55 + 0.3 * np.hypot(*point[:2]):
+            continue
+        point = np.array(_CROWN_CENTER) + np.array(_CROWN) * point
+        if not len(points) or np.linalg.norm(points - point, axis=1).min() > _APART:
+            points = np.vstack([points, point])
+        if len(points) == count:
+            break
+    return points
+
+
+def _without_close_tips(nodes, parents, apart) -> tuple[np.ndarray, np.ndarray]:
+    """Take off twigs, each down to where it forks off, whose ends are closer than ``apart`` to another node's."""
+    while True:
+        forks = np.bincount(parents[1:], minlength=len(nodes))
+        tips = np.flatnonzero(forks == 0)
+        for tip in tips:
+            others = np.delete(np.arange(len(nodes)), [tip, parents[tip]])
+            if np.linalg.norm(nodes[others] - nodes[tip], axis=1).min() < apart:
+                break
+        else:
+            return nodes, parents
+        taken = [tip]
+        while forks[parents[taken[-1]]] == 1:
+            taken.append(parents[taken[-1]])
+        keep = np.setdiff1d(np.arange(len(nodes)), taken)
+        parents = np.concatenate([[-1], np.searchsorted(keep, parents[keep[1:]])])
+        nodes = nodes[keep]
+
+
+def _radii(parents, twig) -> np.ndarray:
+    """Return the radius of each segment: branches are as thick as what grows from them, and taper."""
+    sums = np.zeros(len(parents))
+    radii = np.full(len(parents), twig)
+    for node in reversed(range(len(parents))):
+        if sums[node]:
+            radii[node] = _TAPER * sums[node] ** (1.0 / _PIPES)
+        if node:
+            sums[parents[node]] += radii[node] ** _PIPES
+    return radii
+
+
+def rain(count: int, radius: float, spacing: float, height: float, random: np.random.Generator) -> np.ndarray:
+    """Return random places for the balls above the tree, no two of them close together.
+
+    Args:
+        count: Number of balls.
+        radius: Radius of the balls [m].
+        spacing: Edge of the cube that a ball has for itself on average [m].
+        height: Height of the tree [m].
+        random: Where the places come from.
+
+    Returns:
+        Centres [m], shape [count, 3], from the lowest up.
+    """
+    apart = _BALLS_APART * spacing
+    if apart < authoring.BALL_SPACING * radius:
+        least = authoring.BALL_SPACING * radius / _BALLS_APART
+        raise InputError(f"spacing: balls of radius {radius:g} m need at least {least:g} m, got {spacing:g} m")
+    reach = max(_CROWN[0] * height, spacing)
+    bottom = (_CROWN_CENTER[2] + _CROWN[2] + 0.15) * height
+    depth = count * spacing**3 / (math.pi * reach**2)
+    places: list[np.ndarray] = []
+    cells: dict[tuple[int, ...], list[np.ndarray]] = {}
+    around = list(itertools.product((-1, 0, 1), repeat=3))
+    while len(places) < count:
+        place = np.round(random.uniform((-reach, -reach, bottom), (reach, reach, bottom + depth)), 6)
+        x, y, z = (int(one // apart) for one in place)
+        near = [one for a, b, c in around for one in cells.get((x + a, y + b, z + c), ())]
+        if math.hypot(*place[:2]) <= reach and all(math.dist(one, place) > apart for one in near):
+            places.append(place)
+            cells.setdefault((x, y, z), []).append(place)
+    return np.array(sorted(places, key=lambda place: place[2]))
+
+
+if __name__ == "__main__":
+    authoring.run(author)
