@@ -29,7 +29,7 @@ def _processor() -> str:
 
 
 def _commit() -> str:
-    """Short hash of the checkout, with ``+`` where it has changes; empty outside a checkout."""
+    """Short hash of the checkout, with ``+`` where it has changes; in a copy without one, ``WARPMAG_COMMIT`` or empty."""
     folder = Path(__file__).parent
 
     def git(*arguments):
@@ -41,4 +41,4 @@ def _commit() -> str:
         changed = git("status", "--porcelain", "--untracked-files=no", "--", "..")
         return git("rev-parse", "--short", "HEAD") + "+" * bool(changed)
     except (OSError, subprocess.CalledProcessError):
-        return ""
+        return os.environ.get("WARPMAG_COMMIT", "")
