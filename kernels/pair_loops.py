@@ -16,6 +16,7 @@ blocks; the caller's finishing kernel adds them up in a fixed order, so that res
 All sums are 4π times the field [A/m], three numbers, or that and the gradient [A/m²], nine: xx, yy, zz, xy, yz, zx.
 """
 
+import os
 from dataclasses import dataclass
 from functools import cache
 
@@ -34,6 +35,8 @@ _MANY_TARGETS = 8192
 _FEW = (1, 512)
 _MANY = (4, 1600)
 _MIN_SOURCES_PER_SPLIT = 16
+_PAIRS_PER_THREAD = 100_000
+"""Pairs that are worth a thread on a CPU: about ten times what it costs to start one."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ class Rows:
         target: Packed column of each target row, shape [count].
         begin: First source of each target row, shape [count].
         end: One past the last source of each target row, shape [count].
+        shares: CPU work list: row at which each thread begins, and the end, shape [threads + 1].
         tiles: CUDA work list: target range, source range, split; shape [tiles, 5]. Empty on a CPU.
         splits: Partial sums per target row.
         targets_per_thread: Targets that one CUDA thread holds in registers.
@@ -55,10 +59,16 @@ class Rows:
     target: wp.array
     begin: wp.array
     end: wp.array
+    shares: wp.array
     tiles: wp.array
     splits: int
     targets_per_thread: int
     pair_count: int
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make_rows(segments, device) -> Rows:
@@ -99,6 +109,11 @@ def make_rows(segments, device) -> Rows:
             np.int64,
         ).reshape(-1, 5)
 
+    pairs = np.concatenate([[0], np.cumsum(end - begin)])
+    threads = int(np.clip(pairs[-1] // _PAIRS_PER_THREAD, 1, min(_cores(), _MOST_THREADS)))
+    shares = np.searchsorted(pairs, pairs[-1] * np.arange(threads + 1) // threads)
+    shares[-1] = count
+
     def to_device(a):
         return wp.array(a.astype(np.int32), dtype=wp.int32, device=device)
 
@@ -107,10 +122,11 @@ def make_rows(segments, device) -> Rows:
         target=to_device(target),
         begin=to_device(begin),
         end=to_device(end),
+        shares=to_device(shares),
         tiles=to_device(tiles),
         splits=splits,
         targets_per_thread=per_thread,
-        pair_count=int(np.sum(end - begin)),
+        pair_count=int(pairs[-1]),
     )
 
 
@@ -222,33 +238,81 @@ def _sums(gradient: bool) -> tuple[str, ...]:
     return _FIELD_SUMS + (_GRADIENT_SUMS if gradient else ())
 
 
+_MOST_THREADS = 64
+# Threads of the process's own library: Warp launches serially on a CPU, and a launch may sit inside a graph, where
+# Python's threads cannot help. A thread that cannot be had leaves its rows to this one.
+_RUN_THREADS = """
+#if defined(_WIN32)
+    for (int t = 0; t < threads; ++t) work(&rows[t]);
+#else
+#if defined(__APPLE__)
+    #define SYMBOL(name) "_" name
+#else
+    #define SYMBOL(name) name
+#endif
+    typedef void* (*Start)(void*);
+    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
+    extern int join_thread(unsigned long, void**) __asm__(SYMBOL("pthread_join"));
+    unsigned long ids[64];  // _MOST_THREADS
+    bool started[64];
+    for (int t = 1; t < threads; ++t) started[t] = start_thread(&ids[t], nullptr, work, &rows[t]) == 0;
+    if (threads > 0) work(&rows[0]);
+    for (int t = 1; t < threads; ++t) {
+        if (started[t]) join_thread(ids[t], nullptr);
+        else work(&rows[t]);
+    }
+    #undef SYMBOL
+#endif
+"""
+
+
 def _cpu_snippet(real: str, gradient: bool) -> str:
-    """One target row over a contiguous range of sources; clang vectorises the loop over sources."""
+    """All target rows, shared out to threads; clang vectorises each row's loop over its contiguous sources."""
     sums = _sums(gradient)
-    stores = "\n".join(f"    out[{c}] = {name};" for c, name in enumerate(sums))
+    stores = " ".join(f"out[{c}] = {name};" for c, name in enumerate(sums))
     return f"""
     typedef {real} REAL;
+    struct Rows {{
+        const REAL *src, *tgt;
+        size_t ns, nt;
+        const int *column, *begin, *end;
+        REAL* out;
+        int first, last;
+    }};
     #define RSQRT(c) (REAL(1) / {"__builtin_sqrtf" if real == "float" else "__builtin_sqrt"}(c))
-    const size_t ns = sources.shape[1], nt = targets.shape[1];
-    const REAL* src = (const REAL*)sources.data;
-    const REAL* tgt = (const REAL*)targets.data;
-    const REAL tx = tgt[column], ty = tgt[nt + column], tz = tgt[2 * nt + column], tr = tgt[3 * nt + column];
-    const REAL tl = tgt[7 * nt + column];
-    REAL {", ".join(f"{name} = 0" for name in sums)};
     // the sums may be split into lanes; reordering more would spread x_i − x_j over them and lose its digits
     #define REORDER_SUMS _Pragma("clang fp reassociate(on)")
-    {{
-    #pragma clang fp contract(fast)
-    #pragma clang loop vectorize(enable)
-    for (int j = begin; j < end; ++j) {{
-        const REAL ax = src[j], ay = src[ns + j], az = src[2 * ns + j], ar = src[3 * ns + j];
-        const REAL bx = src[4 * ns + j], by = src[5 * ns + j], bz = src[6 * ns + j];
-        const REAL al = src[7 * ns + j];
-        {_pair_code(gradient)}
-    }}
-    }}
-    REAL* out = (REAL*)partial_out.data + (size_t)row * {len(sums)};
-{stores}
+    auto work = [](void* argument) -> void* {{
+        const Rows& rows = *(const Rows*)argument;
+        const size_t ns = rows.ns, nt = rows.nt;
+        const REAL *src = rows.src, *tgt = rows.tgt;
+        for (int row = rows.first; row < rows.last; ++row) {{
+            const int column = rows.column[row], end = rows.end[row];
+            const REAL tx = tgt[column], ty = tgt[nt + column], tz = tgt[2 * nt + column], tr = tgt[3 * nt + column];
+            const REAL tl = tgt[7 * nt + column];
+            REAL {", ".join(f"{name} = 0" for name in sums)};
+            {{
+            #pragma clang fp contract(fast)
+            #pragma clang loop vectorize(enable)
+            for (int j = rows.begin[row]; j < end; ++j) {{
+                const REAL ax = src[j], ay = src[ns + j], az = src[2 * ns + j], ar = src[3 * ns + j];
+                const REAL bx = src[4 * ns + j], by = src[5 * ns + j], bz = src[6 * ns + j];
+                const REAL al = src[7 * ns + j];
+                {_pair_code(gradient)}
+            }}
+            }}
+            REAL* out = rows.out + (size_t)row * {len(sums)};
+            {stores}
+        }}
+        return nullptr;
+    }};
+    const int threads = (int)shares.shape[0] - 1;
+    Rows rows[{_MOST_THREADS}];
+    for (int t = 0; t < threads; ++t)
+        rows[t] = Rows{{(const REAL*)sources.data, (const REAL*)targets.data, (size_t)sources.shape[1],
+                       (size_t)targets.shape[1], row_target.data, row_begin.data, row_end.data, (REAL*)partial_out.data,
+                       shares.data[t], shares.data[t + 1]}};
+    {_RUN_THREADS}
     #undef REORDER_SUMS
     #undef RSQRT
     """
@@ -334,13 +398,13 @@ def _cpu_kernel(dtype, gradient: bool):
     real = "float" if dtype is wp.float32 else "double"
 
     @wp.func_native(_cpu_snippet(real, gradient))
-    def pair_row(
+    def pair_rows(
         targets: wp.array2d[dtype],
         sources: wp.array2d[dtype],
-        row: int,
-        column: int,
-        begin: int,
-        end: int,
+        row_target: wp.array[int],
+        row_begin: wp.array[int],
+        row_end: wp.array[int],
+        shares: wp.array[int],
         partial_out: wp.array3d[dtype],
     ): ...
 
@@ -355,11 +419,11 @@ def _cpu_kernel(dtype, gradient: bool):
         row_target: wp.array[int],
         row_begin: wp.array[int],
         row_end: wp.array[int],
+        shares: wp.array[int],
         # outputs:
         partial_out: wp.array3d[dtype],
     ):
-        row = wp.tid()
-        pair_row(targets, sources, row, row_target[row], row_begin[row], row_end[row], partial_out)
+        pair_rows(targets, sources, row_target, row_begin, row_end, shares, partial_out)
 
     return pair_loop_cpu
 
@@ -442,8 +506,8 @@ def launch_pair_loop(rows: Rows, targets, sources, partial, *, gradient=False, r
     else:
         wp.launch(
             _cpu_kernel(dtype, gradient),
-            dim=rows.count,
-            inputs=[targets, sources, rows.target, rows.begin, rows.end],
+            dim=1,
+            inputs=[targets, sources, rows.target, rows.begin, rows.end, rows.shares],
             outputs=[partial],
             device=device,
         )
