@@ -29,7 +29,7 @@ def _processor() -> str:
 
 
 def _commit() -> str:
-    """Short hash of the checkout, with ``+`` where it has changes; in a copy without one, ``WARPMAG_COMMIT`` or empty."""
+    """Short hash of the checkout, ``+`` where it has changes; in a copy without one, ``WARPMAG_COMMIT``."""
     folder = Path(__file__).parent
 
     def git(*arguments):
