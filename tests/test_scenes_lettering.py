@@ -1,5 +1,6 @@
 """Letters as solids: outlines with holes, closed meshes, boxes along the strokes."""
 
+import itertools
 import string
 
 import numpy as np
@@ -47,17 +48,17 @@ def test_triangles_fill_the_outline_once(letter):
     assert len(areas) == len(np.concatenate(curves)) + 2 * (len(curves) - 1) - 2
 
 
-@pytest.mark.parametrize("letter", ["A", "B", "S", "W"])
+@pytest.mark.parametrize("letter", string.ascii_uppercase)
 def test_extruded_letters_are_closed_and_have_their_volume(letter):
     curves = lettering.outline(letter)
     depth, bevel = 0.25, 0.02
     points, faces = lettering.extruded(curves, depth, bevel)
-    cut = [(face[0], a, b) for face in faces for a, b in zip(face[1:-1], face[2:], strict=True)]
+    cut = [(face[0], a, b) for face in faces for a, b in itertools.pairwise(face[1:])]
     solid = lattice.mesh(points, np.array(cut))  # refuses what is open or turned inside out
-    whole = depth * lettering.area(curves)
+    missing = depth * lettering.area(curves) - solid.volume
     edge = sum(np.linalg.norm(curve - np.roll(curve, 1, axis=0), axis=1).sum() for curve in curves)
-    # The bevel takes a triangular prism off both edges, shorter inside than outside where corners are sharp.
-    assert whole - solid.volume == pytest.approx(edge * bevel**2, rel=0.2)
+    # The bevel takes a triangular prism off both edges, more along holes, less where corners are sharp.
+    assert 0.6 * edge * bevel**2 < missing < 1.05 * edge * bevel**2
     assert np.ptp(points[:, 2]) == pytest.approx(depth)
 
 

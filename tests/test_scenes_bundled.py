@@ -1,0 +1,308 @@
+"""The bundled scenes beside Balls Up: what they hold, that nothing overlaps, what Newton and a run make of them."""
+
+import importlib
+import importlib.util
+import math
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom
+
+from warpmag.errors import InputError
+from warpmag.magnets import MagneticSettings
+from warpmag.scenes_usd import alphabets, authoring, bundled, crystal_balls, falling_magnet, sakura_tree
+from warpmag.usd import check, open_stage, read_magnets
+
+needs_outlines = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="the letters' outlines")
+MAGNET_ATTRIBUTES = ("kind", "saturationMagnetization", "susceptibility", "curve", "magnetization", "momentSpacing")
+SCENES = ("alphabets", "balls_up", "crystal_balls", "falling_magnet", "sakura_tree")
+CONTENTS = {  # bodies, kinematic bodies, inducible and permanent magnets
+    "alphabets": (100, 0, 100, 1),
+    "balls_up": (244, 1, 243, 1),
+    "crystal_balls": (179, 179, 178, 1),
+    "falling_magnet": (1033, 0, 1032, 1),
+    "sakura_tree": (2501, 1, 2500, 69),
+}
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def report(request):
+    return request.param, check(bundled()[request.param])
+
+
+def test_every_scene_is_bundled():
+    assert sorted(bundled()) == sorted(SCENES)
+
+
+def test_scenes_hold_what_the_paper_names(report):
+    name, found = report
+    contents = found.contents
+    counts = len(contents.bodies), len(contents.kinematic), *(len(found.magnets(k)) for k in ("inducible", "permanent"))
+    assert counts == CONTENTS[name]
+    assert contents.settings == MagneticSettings()
+    assert (found.clock.step, found.clock.frames_per_second, found.up_axis) == (1e-3, 60.0, "Z")
+    assert (found.metres_per_unit, found.kilograms_per_unit) == (1.0, 1.0)
+
+
+def test_every_magnet_says_all_of_itself(report):
+    name, found = report
+    stage = open_stage(bundled()[name])
+    for path in found.contents.magnets:
+        prim = stage.GetPrimAtPath(path)
+        for attribute in (
+            "kind",
+            "saturationMagnetization",
+            "susceptibility",
+            "curve",
+            "magnetization",
+            "momentSpacing",
+        ):
+            assert prim.GetAttribute(f"warpmag:{attribute}").HasAuthoredValue()
+
+
+def test_scenes_can_be_looked_at(report):
+    stage = open_stage(bundled()[report[0]])
+    camera = UsdGeom.Camera.Get(stage, "/World/Camera").GetCamera(0.0)
+    assert stage.GetPrimAtPath("/World/Lights/Sun")
+    boxes = UsdGeom.BBoxCache(0.0, [UsdGeom.Tokens.default_])
+    center = boxes.ComputeWorldBound(stage.GetPrimAtPath("/World")).ComputeCentroid()
+    ground = stage.GetPrimAtPath("/World/Ground")
+    if not ground:
+        assert camera.frustum.Intersects(center)
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Gprim) and UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.default_:
+            middle = boxes.ComputeWorldBound(prim).ComputeCentroid()
+            assert prim == ground or camera.frustum.Intersects(middle), prim.GetPath()
+
+
+def _specs(layer):
+    found = {}
+
+    def visit(path):
+        spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.AttributeSpec):
+            found[str(path)] = spec.default
+        elif isinstance(spec, Sdf.RelationshipSpec):
+            found[str(path)] = [str(target) for target in spec.targetPathList.GetAddedOrExplicitItems()]
+        elif isinstance(spec, Sdf.PrimSpec):
+            found[str(path)] = (spec.typeName, str(spec.GetInfo("apiSchemas")), spec.specifier)
+
+    layer.Traverse("/", visit)
+    return found
+
+
+@pytest.mark.parametrize("name", [pytest.param("alphabets", marks=needs_outlines), *SCENES[1:]])
+def test_bundled_stages_are_what_the_scripts_author(name, tmp_path):
+    importlib.import_module(f"warpmag.scenes_usd.{name}").author(tmp_path / "new.usdc")
+    new = _specs(Sdf.Layer.OpenAsAnonymous(str(tmp_path / "new.usdc")))
+    old = _specs(Sdf.Layer.OpenAsAnonymous(str(bundled()[name])))
+    assert new.keys() == old.keys()
+    for path, value in new.items():
+        if isinstance(value, (float, int)) or (hasattr(value, "__len__") and np.array(value).dtype.kind in "fi"):
+            # single precision, and sums in an order that may differ between machines
+            np.testing.assert_allclose(np.array(value), np.array(old[path]), rtol=1e-6, atol=1e-7, err_msg=path)
+        else:
+            assert str(value) == str(old[path]), path
+
+
+def _balls(stage):
+    """Centres and radii of all spheres."""
+    cache = UsdGeom.XformCache(0.0)
+    spheres = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Sphere)]
+    centers = np.array([cache.GetLocalToWorldTransform(prim).ExtractTranslation() for prim in spheres])
+    return centers, np.array([UsdGeom.Sphere(prim).GetRadiusAttr().Get() for prim in spheres])
+
+
+def _least_gap(centers, radii):
+    """Return the smallest distance between the surfaces of two balls."""
+    least = math.inf
+    for start in range(0, len(centers), 256):
+        rows = slice(start, start + 256)
+        gaps = np.linalg.norm(centers[rows, None] - centers, axis=2) - radii[rows, None] - radii
+        gaps[np.arange(len(gaps)), np.arange(start, start + len(gaps))] = math.inf
+        least = min(least, gaps.min())
+    return least
+
+
+@pytest.mark.parametrize("name", ["balls_up", "crystal_balls", "falling_magnet", "sakura_tree"])
+def test_no_ball_overlaps_another_or_the_ground(name):
+    stage = open_stage(bundled()[name])
+    centers, radii = _balls(stage)
+    assert _least_gap(centers, radii) > 0.0
+    if stage.GetPrimAtPath("/World/Ground"):
+        assert (centers[:, 2] - radii).min() > -1e-9
+
+
+def test_letters_of_the_grid_are_apart():
+    stage = open_stage(bundled()["alphabets"])
+    boxes = UsdGeom.BBoxCache(0.0, [UsdGeom.Tokens.default_, UsdGeom.Tokens.guide])
+    ranges = [
+        boxes.ComputeWorldBound(one).ComputeAlignedRange()
+        for one in stage.GetPrimAtPath("/World/Letters").GetChildren()
+    ]
+    lower, upper = (np.array([pick(one) for one in ranges]) for pick in (lambda r: r.GetMin(), lambda r: r.GetMax()))
+    apart = np.maximum(lower[:, None] - upper, lower - upper[:, None]).max(axis=2)
+    assert apart[~np.eye(100, dtype=bool)].min() > 1e-4
+    np.testing.assert_allclose(lower.min(axis=0) + upper.max(axis=0), 0.0, atol=5e-3)
+
+
+def test_every_ball_of_the_stack_rests_on_four():
+    radius = 0.005
+    for count, layers in ((1032, 6), (333, 20), (50, 1)):
+        places = falling_magnet.stack(count, layers, radius)
+        assert len(np.unique(places.round(9), axis=0)) == count
+        assert len(np.unique(places[:, 2].round(9))) <= layers
+        distances = np.linalg.norm(places[:, None] - places, axis=2)
+        touching = (distances < 1.001 * authoring.BALL_SPACING * radius) & (places[:, None, 2] > places[:, 2] + radius)
+        assert (touching.sum(axis=1)[places[:, 2] > 2.0 * radius] == 4).all()
+
+
+def test_trees_are_whole_tapered_and_reproducible():
+    grown = [sakura_tree.grow(110, 0.4, 0.004, np.random.default_rng(seed)) for seed in (7, 7, 8)]
+    tree = grown[0]
+    np.testing.assert_array_equal(tree.nodes, grown[1].nodes)
+    assert tree.nodes.shape != grown[2].nodes.shape or (tree.nodes != grown[2].nodes).any()
+    assert (tree.parents[1:] < np.arange(1, len(tree.nodes))).all() and tree.parents[0] == -1
+    assert (tree.parents[1:] >= 0).all()
+    thicker = tree.radii[tree.parents[2:]] >= tree.radii[2:]
+    assert thicker.all() and (tree.radii[tree.tips] == tree.radii.min()).all()
+    tips = tree.nodes[tree.tips]
+    assert _least_gap(tips, np.full(len(tips), 0.004)) > 0.0
+    lengths = np.linalg.norm(tree.nodes[1:] - tree.nodes[tree.parents[1:]], axis=1)
+    assert lengths.min() > 0.0 and 0.3 < tree.nodes[:, 2].max() < 0.45
+
+
+@pytest.mark.parametrize("strength,field", [("strong", 1e7), ("weak", 1e5)])
+def test_crystal_balls_have_a_strong_and_a_weak_magnet(tmp_path, strength, field):
+    stage = open_stage(bundled()["crystal_balls"])
+    assert read_magnets(stage).magnets["/World/Magnet"].magnetization == (1e7, 0.0, 0.0)
+    stage.GetPrimAtPath("/World/Magnet").GetVariantSet("strength").SetVariantSelection(strength)
+    assert read_magnets(stage).magnets["/World/Magnet"].magnetization == (field, 0.0, 0.0)
+    crystal_balls.author(tmp_path / "scene.usdc", strength=strength)
+    assert check(tmp_path / "scene.usdc").contents.magnets["/World/Magnet"].magnetization == (field, 0.0, 0.0)
+
+
+def test_other_counts_and_sizes(tmp_path):
+    path = tmp_path / "scene.usdc"
+    falling_magnet.author(path, balls=61, layers=3, radius=0.003, magnet_radius=0.01, friction=0.2)
+    assert len(check(path).magnets("inducible")) == 61 and not check(path).findings
+    sakura_tree.author(path, balls=3000, branches=12, radius=0.002, height=0.3, spacing=0.012, seed=1)
+    assert len(check(path).magnets("inducible")) == 3000 and not check(path).findings
+    assert 3 <= len(check(path).magnets("permanent")) <= 12
+    assert _least_gap(*_balls(open_stage(path))) > 0.0
+    crystal_balls.author(path, columns=5, rows=7, bar=1)
+    assert len(check(path).magnets("inducible")) == 34 and not check(path).findings
+
+
+@needs_outlines
+def test_other_letters(tmp_path):
+    path = tmp_path / "scene.usdc"
+    alphabets.author(path, columns=3, rows=2, layers=1, size=0.05, thickness=0.01)
+    names = [one.rpartition("/")[2] for one in check(path).magnets("inducible")]
+    assert names == ["A_000", "B_001", "C_002", "D_003", "E_004", "F_005"] and not check(path).findings
+
+
+@pytest.mark.parametrize(
+    "author,parameters,word",
+    [
+        (falling_magnet.author, {"balls": 0}, "balls"),
+        (falling_magnet.author, {"drop": 0.0}, "drop"),
+        (sakura_tree.author, {"spacing": 0.01}, "spacing"),
+        (sakura_tree.author, {"bud_radius": 0.1}, "bud_radius"),
+        (crystal_balls.author, {"rows": 4}, "rows"),
+        (crystal_balls.author, {"bar": 3}, "bar"),
+        (crystal_balls.author, {"spacing": 0.02}, "spacing"),
+        (crystal_balls.author, {"strength": "huge"}, "strength"),
+        (alphabets.author, {"layers": 0}, "layers"),
+    ],
+)
+def test_parameters_that_make_no_scene_are_refused(tmp_path, author, parameters, word):
+    with pytest.raises(InputError, match=word):
+        author(tmp_path / "scene.usdc", **parameters)
+    assert not (tmp_path / "scene.usdc").exists()
+
+
+def _imported(name):
+    newton = pytest.importorskip("newton")
+    builder = newton.ModelBuilder()
+    return newton, builder, builder.add_usd(open_stage(bundled()[name]))
+
+
+def _mass(radius, density=7870.0):
+    return density * 4.0 / 3.0 * math.pi * radius**3
+
+
+def test_newton_imports_the_falling_magnet():
+    newton, builder, found = _imported("falling_magnet")
+    assert builder.body_count == 1033 and builder.shape_count == 1034
+    magnet = found["path_body_map"]["/World/Magnet"]
+    masses = np.array(builder.body_mass)
+    assert masses[magnet] == pytest.approx(_mass(0.02, 7500.0), rel=1e-5)
+    np.testing.assert_allclose(np.delete(masses, magnet), _mass(0.005), rtol=1e-5)
+    np.testing.assert_allclose(builder.shape_material_mu, 0.4, rtol=1e-6)
+    assert not any(flags & int(newton.BodyFlags.KINEMATIC) for flags in builder.body_flags)
+
+
+def test_newton_imports_the_sakura_tree():
+    newton, builder, found = _imported("sakura_tree")
+    assert builder.body_count == 2501
+    tree = found["path_body_map"]["/World/Tree"]
+    assert builder.body_flags[tree] & int(newton.BodyFlags.KINEMATIC)
+    types = np.array(builder.shape_type)[builder.body_shapes[tree]]
+    stage = open_stage(bundled()["sakura_tree"])
+    assert np.count_nonzero(types == newton.GeoType.SPHERE) == 69
+    assert np.count_nonzero(types == newton.GeoType.CAPSULE) == len(types) - 69
+    branch = stage.GetPrimAtPath("/World/Tree/Branch_0100")
+    shape = found["path_shape_map"]["/World/Tree/Branch_0100"]
+    frame = builder.shape_transform[shape]
+    matrix = UsdGeom.Xformable(branch).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    np.testing.assert_allclose(np.array(frame.p), matrix.ExtractTranslation(), atol=1e-6)
+    np.testing.assert_allclose(np.delete(np.array(builder.body_mass), tree), _mass(0.005), rtol=1e-5)
+    np.testing.assert_allclose(builder.shape_material_mu, 0.4, rtol=1e-6)
+
+
+def test_newton_imports_the_letters():
+    newton, builder, found = _imported("alphabets")
+    assert builder.body_count == 100
+    assert np.linalg.norm(builder.gravity) == 0.0
+    stage = open_stage(bundled()["alphabets"])
+    center = found["path_shape_map"]["/World/Center"]
+    boxes = [k for k in range(builder.shape_count) if builder.shape_type[k] == newton.GeoType.BOX]
+    filtered = {frozenset(pair) for pair in builder.shape_collision_filter_pairs}
+    assert all(frozenset((center, box)) in filtered for box in boxes)
+    assert not builder.shape_flags[center] & newton.ShapeFlags.VISIBLE
+    np.testing.assert_allclose(np.array(builder.shape_material_mu)[boxes], 0.4, rtol=1e-6)
+    assert all(builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES for k in boxes)
+    assert not any(builder.shape_flags[k] & newton.ShapeFlags.VISIBLE for k in boxes)
+    first = found["path_body_map"]["/World/Letters/I_008"]
+    assert builder.body_mass[first] == pytest.approx(7870.0 * (385.0 / 1493.0) * 0.02**2 * 0.005, rel=1e-5)
+    shells = [k for k in range(builder.shape_count) if builder.shape_type[k] == newton.GeoType.MESH]
+    assert len(shells) == 100 and stage.GetPrimAtPath("/World/Letters/I_008/Shell")
+
+
+def test_newton_imports_the_crystal_balls():
+    newton, builder, found = _imported("crystal_balls")
+    assert builder.body_count == 179
+    assert all(flags & int(newton.BodyFlags.KINEMATIC) for flags in builder.body_flags)
+    bar = found["path_shape_map"]["/World/Magnet"]
+    np.testing.assert_allclose(builder.shape_scale[bar], (0.0494, 0.0104, 0.0104), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_run(name):
+    """A few steps from the bundled stage: nothing overlaps at the start, all stays finite, induction converges."""
+    pytest.importorskip("newton")
+    from warpmag.engine.simulation import Simulation  # noqa: PLC0415 - the other tests do without the engine
+
+    simulation = Simulation(bundled()[name], device="cpu")
+    assert simulation.statistics.overlapping == 0
+    before = simulation.state.body_q.numpy()
+    for _ in range(2):
+        simulation.step()
+    after = simulation.state.body_q.numpy()
+    assert np.isfinite(after).all() and np.isfinite(simulation.state.body_qd.numpy()).all()
+    assert np.array_equal(before, after) == (name == "crystal_balls")
+    moments = simulation.magnetics.shape_moments()
+    assert np.isfinite(moments).all() and (np.linalg.norm(moments, axis=1) > 0.0).all()
+    assert simulation.statistics.error <= 1e-3
+    assert simulation.statistics.unconverged == 0
