@@ -90,14 +90,14 @@ def test_buffers_that_overflow_are_grown_and_the_step_repeated(reference, device
     assert any(report.regrown for report in reports)
     assert all(after.limit >= limit for after, limit in zip(solver.buffers, before, strict=True))
     assert solver.buffers[0].limit > before[0]
-    if device == "cpu":  # nothing was lost: the motion is the same
-        np.testing.assert_array_equal(stepper.state.body_q.numpy(), reference[0])
+    # Nothing was lost: the motion is the same, but for a repeated step's warm start, which differs within rtol.
+    np.testing.assert_allclose(stepper.state.body_q.numpy()[:, :3], reference[0][:, :3], atol=1e-3 * R)
 
 
 def test_substeps_follow_the_speed(device):
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     warpmag.register_attributes(builder)
-    add_ball(builder, (0.0, 0.0, 0.0), velocity=(25.0, 0.0, 0.0))  # 2.5 radii in a substep of 0.5 ms
+    add_ball(builder, (0.0, 0.0, 0.0), velocity=(15.0, 0.0, 0.0))  # 1.5 radii in a substep of 0.5 ms
     builder.add_shape_box(-1, xform=at(0.05, 0.0, 0.0), hx=0.001, hy=0.05, hz=0.05)
     model = builder.finalize(device=device)
     sizes = body_sizes(model)
@@ -105,9 +105,9 @@ def test_substeps_follow_the_speed(device):
         model, warpmag.Magnetics(model), RigidSolver(model, sizes), sizes, step=1e-3, longest_substep=5e-4
     )
     first = stepper.advance()
-    assert first.substeps == 16  # 25 m/s × 1 ms / 16 is 0.31 radii, with 8 substeps 0.63
-    assert first.travel == pytest.approx(25.0 * 1e-3 / 16 / R, rel=1e-5)
-    assert first.travel < TRAVEL_LIMIT
+    assert first.substeps == 16  # 15 m/s × 1 ms / 16 is 0.19 radii, with 8 substeps 0.38
+    assert first.travel == pytest.approx(15.0 * 1e-3 / 16 / R, rel=1e-5)
+    assert first.travel < TRAVEL_LIMIT < 2.0 * first.travel
     for _ in range(5):
         report = stepper.advance()
     assert stepper.state.body_q.numpy()[0, 0] < 0.05  # it did not pass the wall, which is thinner than a step

@@ -132,7 +132,8 @@ def _run(options) -> int:
     _quiet_warp()
     from warpmag.engine.simulation import Simulation  # noqa: PLC0415
 
-    print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
+    if sys.stderr.isatty():
+        print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
     method = METHODS[options.method] if options.method else None
     simulation = Simulation(
         path,
@@ -144,38 +145,58 @@ def _run(options) -> int:
         device=options.device,
         visuals=options.viewer != "none",
     )
-    for line in simulation.statistics.warnings():
-        print(f"warpmag: warning: {line}", file=sys.stderr)
+    known = simulation.statistics.warnings()
+    _warn(known)
     viewer = _open_viewer(options.viewer, simulation)
-    frames = simulation.frames_of(options.frames)
-    done = 0
-    with _progress_bar(frames) as bar:
+    progress = _Progress(simulation.frames_of(options.frames))
 
-        def show(frame: int) -> bool:
-            nonlocal done
-            done = frame
-            bar.update(frame - bar.n)
-            return _show(viewer, simulation)
+    def show(frame: int) -> bool:
+        progress.show(frame)
+        return _show(viewer, simulation)
 
-        try:
-            statistics = simulation.run(frames, output=output, copy_scene=is_bundled, on_frame=show)
-        except KeyboardInterrupt:
-            bar.close()
-            print(f"warpmag: interrupted at frame {done} of {frames}, {output} has the frames so far", file=sys.stderr)
-            return INTERRUPTED
+    try:
+        statistics = simulation.run(progress.frames, output=output, copy_scene=is_bundled, on_frame=show)
+    except KeyboardInterrupt:
+        progress.close()
+        if progress.done is None:
+            raise
+        print(f"warpmag: interrupted, {output} has the frames up to {progress.done}", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        progress.close()
     for line in statistics.summary():
         print(line)
     print(f"written        {output}")
-    for line in statistics.warnings():
-        print(f"warpmag: warning: {line}", file=sys.stderr)
+    _warn([line for line in statistics.warnings() if line not in known])
     return 0
 
 
-def _progress_bar(frames: int):
-    from tqdm import tqdm  # noqa: PLC0415
+def _warn(lines: list[str]) -> None:
+    for line in lines:
+        print(f"warpmag: warning: {line}", file=sys.stderr)
 
-    interval = 0.2 if sys.stderr.isatty() else 10.0
-    return tqdm(total=frames, unit="frame", mininterval=interval, file=sys.stderr, dynamic_ncols=True)
+
+class _Progress:
+    """A progress bar that appears with the first frame, so that bad input is answered by its one line alone."""
+
+    def __init__(self, frames: int):
+        self.frames, self.done = frames, None
+        self._bar = None
+
+    def show(self, frame: int) -> None:
+        """Show that ``frame`` is done."""
+        if self._bar is None:
+            from tqdm import tqdm  # noqa: PLC0415
+
+            interval = 0.2 if sys.stderr.isatty() else 10.0
+            self._bar = tqdm(total=self.frames, unit="frame", mininterval=interval, file=sys.stderr, dynamic_ncols=True)
+        self._bar.update(frame - self._bar.n)
+        self.done = frame
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        if self._bar is not None:
+            self._bar.close()
 
 
 def _open_viewer(name: str, simulation):

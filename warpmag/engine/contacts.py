@@ -123,7 +123,15 @@ def _without_free_joints(model: newton.Model) -> newton.Model:
 
 
 def _xpbd(model: newton.Model, contact_max: int):
-    return newton.solvers.SolverXPBD(_without_free_joints(model), iterations=60, rigid_contact_con_weighting=False)
+    # Contacts are relaxed all at once: beyond a third of each correction the many contacts of a ball in a pile
+    # together overshoot, which keeps the pile hot for good (RMS speed on Balls Up after 1.5 s of 0.15 cm/s at 0.35,
+    # 1.6 at 0.5, 10 at Newton's 0.8). Averaging over a body's contacts instead would need far more iterations.
+    return newton.solvers.SolverXPBD(
+        _without_free_joints(model),
+        iterations=60,
+        rigid_contact_relaxation=0.35,
+        rigid_contact_con_weighting=False,
+    )
 
 
 def _steel(model: newton.Model, contact_max: int):

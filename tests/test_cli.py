@@ -1,0 +1,164 @@
+"""The command: what it prints, what it writes, how it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from pxr import Gf, Usd, UsdGeom, UsdPhysics
+
+from warpmag import cli
+from warpmag.magnets import Magnet
+from warpmag.scenes_usd import balls_up
+from warpmag.usd import author_magnet
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A Balls Up of four balls."""
+    path = tmp_path_factory.mktemp("cli") / "small.usda"
+    balls_up.author(path, columns=2, rows=2, layers=1, height=0.05)
+    return path
+
+
+def edited(scene, path, edit):
+    """Copy ``scene`` to ``path`` with ``edit`` done to the stage."""
+    stage = Usd.Stage.Open(str(scene))
+    edit(stage)
+    stage.GetRootLayer().Export(str(path))
+    stage.GetRootLayer().Reload(force=True)
+    return path
+
+
+def test_run_writes_a_stage_and_a_summary(scene, device, tmp_path, capfd):
+    out = tmp_path / "new" / "out.usda"
+    assert cli.main(["run", str(scene), "-o", str(out), "--frames", "3", "--device", device]) == 0
+    printed = capfd.readouterr()
+    for word in ("4 moving", "Ti ", "Tf ", "Tr ", "evaluations per step", "error", "RMS", "peak", "penetration"):
+        assert word in printed.out
+    assert "3/3" in printed.err  # the progress bar
+    assert "Warp" not in printed.out + printed.err
+    stage = Usd.Stage.Open(str(out))
+    assert stage.GetEndTimeCode() == pytest.approx(3.0)
+    assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").GetNumTimeSamples() == 4
+
+
+def test_scenes_lists_what_is_bundled(capsys):
+    assert cli.main(["scenes"]) == 0
+    assert "balls_up" in capsys.readouterr().out
+
+
+def test_check_tells_what_a_stage_holds(scene, capsys):
+    assert cli.main(["check", str(scene)]) == 0
+    printed = capsys.readouterr().out
+    assert "4 inducible, 1 permanent" in printed
+    assert "1 m, 1 kg, Z up" in printed
+
+
+def set_on_ball(name, value):
+    return lambda stage: stage.GetPrimAtPath("/World/Balls/Ball_0001").GetAttribute(name).Set(value)
+
+
+BAD_STAGES = {
+    "negative saturation": (set_on_ball("warpmag:saturationMagnetization", -1.0), "/World/Balls/Ball_0001: saturation"),
+    "saturation not a number": (
+        set_on_ball("warpmag:saturationMagnetization", float("nan")),
+        "/World/Balls/Ball_0001: saturation",
+    ),
+    "no radius": (set_on_ball("radius", 0.0), "/World/Balls/Ball_0001: radius"),
+    "unknown token": (set_on_ball("warpmag:curve", "cubic"), "/World/Balls/Ball_0001: curve"),
+    "position not a number": (
+        set_on_ball("xformOp:translate", (float("nan"), 0.0, 0.0)),
+        "/World/Balls/Ball_0001: transform is not finite",
+    ),
+    "centimetres": (lambda stage: UsdGeom.SetStageMetersPerUnit(stage, 0.01), "metersPerUnit is 0.01"),
+    "no magnets": (
+        lambda stage: [prim.RemoveAPI("WarpmagMagnetAPI") for prim in stage.Traverse()],
+        "no magnets",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_STAGES)
+def test_a_bad_stage_is_refused_in_one_line(scene, tmp_path, capsys, case):
+    edit, message = BAD_STAGES[case]
+    bad = edited(scene, tmp_path / "bad.usda", edit)
+    check_refused(["run", str(bad), "-o", str(tmp_path / "out" / "out.usda")], message, capsys)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.usda"]  # nothing written, no folder made
+
+
+def check_refused(arguments, message, capsys):
+    assert cli.main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    lines = printed.err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("warpmag: ")
+    assert message in lines[0]
+
+
+def test_bad_arguments_are_refused_in_one_line(scene, tmp_path, capsys):
+    text = tmp_path / "text.usda"
+    text.write_text("hello")
+    for arguments, message in [
+        (["run", "nowhere"], "nowhere: no such file and no bundled scene"),
+        (["run", str(tmp_path / "nowhere.usda")], "no such file"),
+        (["run", str(text)], "not a USD file"),
+        (["check", str(text)], "not a USD file"),
+        (["run", str(scene), "--frames", "0"], "frames: must be positive"),
+        (["run", str(scene), "--frames", "many"], "--frames"),
+        (["run", str(scene), "--rtol", "-1"], "rtol: must be positive"),
+        (["run", str(scene), "--force", "lorentz"], "lorentz"),
+        (["run", str(scene), "--device", "cuda:99"], "device: 'cuda:99' is not there"),
+        (["run", str(scene), "-o", str(tmp_path / "out.txt"), "--device", "cpu"], "the output must end in"),
+        (["fly"], "fly"),
+        ([], "required"),
+    ]:
+        check_refused(arguments, message, capsys)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["text.usda"]
+
+
+def test_a_point_instancer_of_bodies_is_refused(scene, tmp_path, capsys):
+    def instance(stage):
+        instancer = UsdGeom.PointInstancer.Define(stage, "/World/Many")
+        ball = UsdGeom.Sphere.Define(stage, "/World/Many/Ball")
+        UsdPhysics.RigidBodyAPI.Apply(ball.GetPrim())
+        author_magnet(ball.GetPrim(), Magnet())
+        instancer.CreatePrototypesRel().AddTarget(ball.GetPath())
+        instancer.CreatePositionsAttr([(0.0, 0.0, 1.0)])
+        instancer.CreateProtoIndicesAttr([0])
+
+    bad = edited(scene, tmp_path / "bad.usda", instance)
+    check_refused(["run", str(bad)], "/World/Many: a PointInstancer of rigid bodies", capsys)
+
+
+def test_overlapping_balls_are_a_warning(scene, device, tmp_path, capsys):
+    def press(stage):
+        place = stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("xformOp:translate")
+        place.Set(place.Get() + Gf.Vec3d(0.0005, 0.0, 0.0))  # a tenth of the radius into its neighbour
+
+    path = edited(scene, tmp_path / "pressed.usda", press)
+    out = tmp_path / "out.usda"
+    assert cli.main(["run", str(path), "-o", str(out), "--frames", "1", "--device", device]) == 0
+    assert "warpmag: warning: 1 pair of bodies overlaps at the start" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_leaves_the_frames_so_far(scene, device, tmp_path):
+    out = tmp_path / "out.usda"
+    command = [sys.executable, "-m", "warpmag.cli", "run", str(scene), "-o", str(out), "--device", device]
+    process = subprocess.Popen(
+        [*command, "--frames", "100000"], stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+    )
+    deadline = time.monotonic() + 240.0
+    text = ""
+    while "1/100000" not in text and time.monotonic() < deadline:  # the bar has moved: kernels are compiled
+        text += process.stderr.read(1)
+    process.send_signal(signal.SIGINT)
+    _, rest = process.communicate(timeout=60.0)
+    assert process.returncode == 130
+    assert f"warpmag: interrupted, {out} has the frames up to" in rest
+    assert "Traceback" not in rest
+    stage = Usd.Stage.Open(str(out))
+    assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").GetNumTimeSamples() > 1
