@@ -112,6 +112,7 @@ def _text(rows, missing) -> str:
 **Here:** rigid bodies are Newton's XPBD, and all three methods share every line of code but the dynamics, the curve and
 the force law. Induction ends at an error of {RTOL:g} or after 1,000 evaluations.
 The paper does not say at which error it calls a magnetization converged; "until every M converges" may well mean that
-it stopped moving, which a pair that crawls does long before it is right.
+it stopped moving, which a pair that crawls does long before it is right. In weak fields, before a magnet has come near,
+pairs do not reach the relative error at all.
 
 {table(head, rows)}{note}"""
