@@ -187,8 +187,9 @@ grid of 6 × 51 cells and 16 directions:
 999 iterations or a failure", as the field grows.
 
 **Here:** {size}, until e_M ≤ 1e-3,
-at most {MOST_ITERATIONS} iterations. Start: M1 = −M2, demagnetized. `theta` is the exact flow with κ0 = k, accelerated as in the library: one iteration where the multiplier is 1 or the field saturates,
-two elsewhere. The explicit dynamics have the κ0 of Fig. 8. What `theta-euler` fails at are weak fields (below 0.1 Ms).
+at most {MOST_ITERATIONS} iterations. Start: M1 = −M2, demagnetized. `theta` is the exact flow with κ0 = k,
+accelerated as in the library: one iteration where the multiplier is 1 or the field saturates, two elsewhere. The
+explicit dynamics have the κ0 of Fig. 8. What `theta-euler` fails at are weak fields (below 0.1 Ms).
 
 {image}
 
