@@ -78,7 +78,7 @@ def author(
         color=authoring.MAGNET_COLOR,
     )
     reach = max(float(np.ptp(positions[:, 0])), top + drop + 2.0 * magnet_radius)
-    authoring.add_camera(stage, (1.2 * reach, -3.0 * reach, 1.1 * reach), (0.0, 0.0, 0.42 * reach))
+    authoring.add_camera(stage, (1.2 * reach, -3.2 * reach, 1.2 * reach), (0.0, 0.0, 0.46 * reach))
     authoring.add_lights(stage)
     authoring.save(stage, path)
 

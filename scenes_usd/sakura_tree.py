@@ -21,15 +21,15 @@ from warpmag.scenes_usd import authoring
 BARK_COLOR = (0.14, 0.075, 0.055)
 BUD_COLOR = (0.9, 0.35, 0.5)
 
-_STEP, _REACHED = 0.035, 0.045
+_STEP, _REACHED = 0.032, 0.04
 """Length of a step of growth, and the distance at which a point of the crown is reached, over the tree's height."""
 _UPWARD = 0.15
 """What draws every twig upward, over the pull of one point."""
-_APART = 0.085
+_APART = 0.068
 """Least distance of the points of the crown over the tree's height."""
 _TWIG = 0.7
 """Radius of a twig at its end over that of its bud."""
-_PIPES = 2.6
+_PIPES = 2.9
 """Exponent n of the radii where a branch forks, r^n = Σ r_k^n (da Vinci: 2)."""
 _TAPER = 1.015
 """Growth of the radius from one segment to the one below it."""
@@ -65,11 +65,11 @@ def author(
     path: str | os.PathLike,
     *,
     balls: int = 2500,
-    branches: int = 110,
+    branches: int = 180,
     radius: float = 0.005,
     height: float = 0.4,
     bud_radius: float = 0.004,
-    magnetization: float = 3e6,
+    magnetization: float = 6e6,
     spacing: float = 0.022,
     friction: float = 0.4,
     seed: int = 7,
@@ -244,11 +244,11 @@ def rain(count: int, radius: float, spacing: float, height: float, random: np.ra
     reach = max(_CROWN[0] * height, spacing)
     bottom = (_CROWN_CENTER[2] + _CROWN[2] + 0.15) * height
     depth = count * spacing**3 / (math.pi * reach**2)
-    places: list[np.ndarray] = []
-    cells: dict[tuple[int, ...], list[np.ndarray]] = {}
+    places: list[list[float]] = []
+    cells: dict[tuple[int, ...], list[list[float]]] = {}
     around = list(itertools.product((-1, 0, 1), repeat=3))
     while len(places) < count:
-        place = np.round(random.uniform((-reach, -reach, bottom), (reach, reach, bottom + depth)), 6)
+        place = np.round(random.uniform((-reach, -reach, bottom), (reach, reach, bottom + depth)), 6).tolist()
         x, y, z = (int(one // apart) for one in place)
         near = [one for a, b, c in around for one in cells.get((x + a, y + b, z + c), ())]
         if math.hypot(*place[:2]) <= reach and all(math.dist(one, place) > apart for one in near):
