@@ -1,19 +1,9 @@
-"""Induction: the accelerated θ iteration, kept wholly on the device.
+"""Induction: what every magnetization dynamics shares on the device.
 
-Unknown is the dual variable s = k f⁻¹(M)/Ms of every inducible moment, so that M = Ms c(‖s‖) ŝ. One field evaluation
-gives the target g = k H(M)/Ms and the residual r = g − s; the exact θ flow moves s by ω r (``curves.theta_flow``).
-With the n-th iterate's differences Δs_j, Δr_j to the last few, Anderson's step is
+The state of a solve, the start of each world, and the sums over its moments that convergence is judged by. How the
+moments move is another matter: ``theta_flow`` is the product, ``submagnetization`` its rivals.
 
-    s ← s + ω r − Σ_j α_j (Δs_j + ω Δr_j),    α = argmin ‖φ (r − Σ_j α_j Δr_j)‖,
-
-weighted by φ = Ms c(a)/a, a = max(‖s‖, ‖g‖): what a residual is worth in magnetization, so that a saturated moment's
-huge s does not drown the rest. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, convex for the
-ball-averaged kernel; it converges for ω < 2/(1 + k |λmin|), and 1/3 − (1 + max o) ≤ λmin (see ``neighbors``). An
-accelerated step that leaves the merit ‖φ r‖ more than twice the best is taken back, and a few plain steps follow from
-the best iterate.
-
-Each world iterates for itself, with its own step length, history and convergence. Sums go by fixed chunks in a fixed
-order, in float64.
+Each world iterates for itself, with its own convergence. Sums go by fixed chunks in a fixed order, in float64.
 """
 
 from dataclasses import dataclass
@@ -22,25 +12,14 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio, theta_flow
-from warpmag.kernels.field import finished_field
+from warpmag.kernels.anderson import DEPTH, GRAM_COLUMNS, SLOTS, gram_slots
 
-DEPTH = 5
-SLOTS = DEPTH + 1
-PLAIN_STEPS = SLOTS
-"""Plain steps after an accelerated one was taken back, before the next is tried."""
 CHUNK = 64
 """Moments whose sums one thread adds up."""
-
-GRAM_COLUMNS = SLOTS * (SLOTS + 1) // 2
 COLUMNS = GRAM_COLUMNS + 3
 """Sums per chunk: the residuals' Gram matrix, then ‖M − f(H)‖², ‖f(H)‖², ‖φr‖²."""
-
-ADVANCE, RETREAT, REST = 1, 2, 0
 _FLOW_STEP = 0.9
 """Share of the largest convergent step length that is used."""
-_RIDGE = 1.0e-9
-"""Relative ridge of the least squares: below it differences of float32 residuals are rounding."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +96,7 @@ def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
         last = first + int(np.count_nonzero(inducible[worlds == w]))
         chunks += [(a, min(a + CHUNK, last), w) for a in range(first, last, CHUNK)]
         chunk_begin.append(len(chunks))
-    slots = [(a, b) for a in range(SLOTS) for b in range(a, SLOTS)] + [(0, 0)] * (COLUMNS - GRAM_COLUMNS)
+    slots = gram_slots() + [(0, 0)] * (COLUMNS - GRAM_COLUMNS)
     vec3 = wp.types.vector(3, dtype)
 
     def put(values, kind):
@@ -144,11 +123,6 @@ def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
         alpha=zeros((world_count, DEPTH), wp.float64),
         condition=zeros(1, wp.int32),
     )
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Start of a solve
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -218,228 +192,6 @@ def start_worlds(
     error_out[w] = wp.float64(0.0)
 
 
-@cache
-def _start_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def start_moments(
-        # inputs:
-        row_target: wp.array[int],
-        world: wp.array[int],
-        warm: wp.array[int],
-        omega: wp.array[wp.float64],
-        h0: wp.array[vec3],
-        saturation: wp.array[dtype],
-        slope: wp.array[dtype],
-        curve: wp.array[int],
-        # outputs:
-        s_out: wp.array[vec3],
-        moments_out: wp.array[vec3],
-        packed_out: wp.array2d[dtype],
-    ):
-        i = row_target[wp.tid()]
-        s = s_out[i]
-        if warm[world[i]] == 0:
-            # the θ flow with κ = k from no magnetization: exact for a lone ball; shorter where balls overlap deeply
-            step = wp.min(dtype(1.0), dtype(omega[world[i]]) / dtype(0.6))
-            s = (step * slope[i] / saturation[i]) * h0[i]
-            s_out[i] = s
-        radius = packed_out[3, i]
-        volume = dtype(4.18879020478639) * radius * radius * radius
-        m = (volume * saturation[i] * curve_ratio(wp.length(s), curve[i])) * s
-        moments_out[i] = m
-        for c in range(3):
-            packed_out[c + 4, i] = m[c]
-
-    return start_moments
-
-
-@cache
-def _set_state_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def set_state(
-        # inputs:
-        row_target: wp.array[int],
-        world: wp.array[int],
-        magnetizations: wp.array[vec3],
-        saturation: wp.array[dtype],
-        curve: wp.array[int],
-        # outputs:
-        s_out: wp.array[vec3],
-        warm_out: wp.array[int],
-    ):
-        i = row_target[wp.tid()]
-        reduced = magnetizations[i] / saturation[i]
-        s_out[i] = inverse_curve_ratio(wp.length(reduced), curve[i]) * reduced
-        warm_out[world[i]] = 1
-
-    return set_state
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# One iteration
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-@cache
-def _residual_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-    finish = finished_field(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def residuals(
-        # inputs:
-        partial: wp.array3d[dtype],
-        packed: wp.array2d[dtype],
-        row_target: wp.array[int],
-        row_begin: wp.array[int],
-        row_end: wp.array[int],
-        neighbor: wp.array2d[int],
-        neighbor_count: wp.array[int],
-        h0: wp.array[vec3],
-        s_in: wp.array[vec3],
-        saturation: wp.array[dtype],
-        slope: wp.array[dtype],
-        curve: wp.array[int],
-        world: wp.array[int],
-        active: wp.array[int],
-        slot: wp.array[int],
-        # outputs:
-        h_out: wp.array[vec3],
-        history_s_out: wp.array2d[vec3],
-        history_r_out: wp.array2d[vec3],
-        weight_out: wp.array[dtype],
-        terms_out: wp.array[vec3],
-    ):
-        row = wp.tid()
-        i = row_target[row]
-        w = world[i]
-        if active[w] == 0:
-            return
-        h = h0[i] + finish(partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count)
-        h_out[i] = h
-        s = s_in[i]
-        g = (slope[i] / saturation[i]) * h
-        r = g - s
-        history_s_out[slot[w], i] = s
-        history_r_out[slot[w], i] = r
-        length_s = wp.length(s)
-        length_g = wp.length(g)
-        weight = saturation[i] * curve_ratio(wp.max(length_s, length_g), curve[i])
-        weight_out[i] = weight
-        goal = (saturation[i] * curve_ratio(length_g, curve[i])) * g
-        lack = goal - (saturation[i] * curve_ratio(length_s, curve[i])) * s
-        # lengths, not squares: a field of 1e-20 A/m squared is no float32
-        terms_out[i] = vec3(wp.length(lack), wp.length(goal), weight * wp.length(r))
-
-    return residuals
-
-
-@cache
-def _sum_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def sum_chunks(
-        # inputs:
-        chunk: wp.array[wp.vec3i],
-        active: wp.array[int],
-        column_slots: wp.array[wp.vec2i],
-        history_r: wp.array2d[vec3],
-        weight: wp.array[dtype],
-        terms: wp.array[vec3],
-        # outputs:
-        sums_out: wp.array2d[wp.float64],
-    ):
-        c, column = wp.tid()
-        if active[chunk[c][2]] == 0:
-            return
-        total = wp.float64(0.0)
-        if column < wp.static(GRAM_COLUMNS):
-            a = column_slots[column][0]
-            b = column_slots[column][1]
-            for i in range(chunk[c][0], chunk[c][1]):
-                f = wp.float64(weight[i])
-                ra = history_r[a, i]
-                rb = history_r[b, i]
-                product = (
-                    wp.float64(ra[0]) * wp.float64(rb[0])
-                    + wp.float64(ra[1]) * wp.float64(rb[1])
-                    + wp.float64(ra[2]) * wp.float64(rb[2])
-                )
-                total += f * f * product
-        else:
-            for i in range(chunk[c][0], chunk[c][1]):
-                term = wp.float64(terms[i][column - wp.static(GRAM_COLUMNS)])
-                total += term * term
-        sums_out[c, column] = total
-
-    return sum_chunks
-
-
-_matrix = wp.types.matrix((DEPTH, DEPTH), wp.float64)
-_vector = wp.types.vector(DEPTH, wp.float64)
-
-
-@wp.func
-def gram_column(a: int, b: int):
-    """Column that holds the product of slots ``a`` and ``b``."""
-    low = wp.min(a, b)
-    high = wp.max(a, b)
-    return low * wp.static(SLOTS) - (low * (low - 1)) // 2 + high - low
-
-
-@wp.func
-def least_squares(matrix: _matrix, right: _vector, size: int):
-    """Solve a symmetric positive definite system of ``size`` rows by elimination; zeros where it is singular."""
-    m = matrix
-    x = right
-    for p in range(size):
-        pivot = m[p, p]
-        if not pivot > wp.float64(0.0):
-            return _vector()
-        for row in range(p + 1, size):
-            factor = m[row, p] / pivot
-            for column in range(p, size):
-                m[row, column] = m[row, column] - factor * m[p, column]
-            x[row] = x[row] - factor * x[p]
-    for back in range(size):
-        p = size - 1 - back
-        value = x[p]
-        for column in range(p + 1, size):
-            value -= m[p, column] * x[column]
-        x[p] = value / m[p, p]
-    return x
-
-
-@wp.func
-def anderson_coefficients(world_sums: wp.array2d[wp.float64], w: int, current: int, history: int):
-    """Coefficients α_j of the last ``history`` iterates, latest first; zeros if they are of no use."""
-    matrix = _matrix()
-    right = _vector()
-    own = world_sums[w, gram_column(current, current)]
-    for a in range(history):
-        slot_a = (current - 1 - a + wp.static(2 * SLOTS)) % wp.static(SLOTS)
-        with_a = world_sums[w, gram_column(current, slot_a)]
-        right[a] = own - with_a
-        for b in range(history):
-            slot_b = (current - 1 - b + wp.static(2 * SLOTS)) % wp.static(SLOTS)
-            with_b = world_sums[w, gram_column(current, slot_b)]
-            matrix[a, b] = own - with_a - with_b + world_sums[w, gram_column(slot_a, slot_b)]
-    for a in range(history):
-        matrix[a, a] = matrix[a, a] * wp.float64(wp.static(1.0 + _RIDGE))
-    alpha = least_squares(matrix, right, history)
-    size = wp.float64(0.0)
-    for a in range(history):
-        size += wp.abs(alpha[a])
-    if not size < wp.float64(1.0e4):
-        return _vector()
-    return alpha
-
-
 @wp.kernel(enable_backward=False)
 def sum_worlds(
     # inputs:
@@ -462,155 +214,8 @@ def sum_worlds(
     world_sums_out[w, column] = total
 
 
-@wp.kernel(enable_backward=False)
-def decide(
-    # inputs:
-    world_sums: wp.array2d[wp.float64],
-    rtol: wp.float64,
-    max_evaluations: int,
-    # in and out:
-    active: wp.array[int],
-    history: wp.array[int],
-    slot: wp.array[int],
-    plain_steps: wp.array[int],
-    best: wp.array[wp.float64],
-    evaluations: wp.array[int],
-    # outputs:
-    error_out: wp.array[wp.float64],
-    converged_out: wp.array[int],
-    warm_out: wp.array[int],
-    mode_out: wp.array[int],
-    improved_out: wp.array[int],
-    used_slot_out: wp.array[int],
-    used_history_out: wp.array[int],
-    alpha_out: wp.array2d[wp.float64],
-    condition_out: wp.array[int],
-):
-    """Judge each world's iterate and choose its next step."""
-    w = wp.tid()
-    mode_out[w] = wp.static(REST)
-    if active[w] == 0:
-        return
-    evaluations[w] = evaluations[w] + 1
-    lack = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS)])
-    goal = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS + 1)])
-    merit = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS + 2)])
-    error = lack
-    if goal > wp.float64(0.0):
-        error = lack / goal
-    error_out[w] = error
-    lost = not wp.isfinite(merit)
-    first = best[w] < wp.float64(0.0)
-    if error <= rtol or evaluations[w] >= max_evaluations or (first and lost):
-        active[w] = 0
-        converged_out[w] = wp.where(error <= rtol, 1, 0)
-        # a state that is not finite must not be the next start
-        warm_out[w] = wp.where(lost, 0, 1)
-        return
-    condition_out[0] = 1
-    current = slot[w]
-    used_slot_out[w] = current
-    improved_out[w] = 0
-    # plain steps descend in energy whatever the merit does on the way, so only accelerated ones are judged by it
-    if lost or (not first and plain_steps[w] == 0 and merit > wp.float64(2.0) * best[w]):
-        mode_out[w] = wp.static(RETREAT)
-        plain_steps[w] = wp.static(PLAIN_STEPS)
-        history[w] = 0
-        return
-    mode_out[w] = wp.static(ADVANCE)
-    plain_steps[w] = wp.max(plain_steps[w] - 1, 0)
-    descended = plain_steps[w] == 0 and history[w] == wp.static(DEPTH) and used_history_out[w] == 0
-    if first or merit < best[w] or descended:
-        best[w] = merit
-        improved_out[w] = 1
-        plain_steps[w] = 0
-    used = wp.where(plain_steps[w] > 0, 0, history[w])
-    alpha = anderson_coefficients(world_sums, w, current, used)
-    for a in range(wp.static(DEPTH)):
-        alpha_out[w, a] = alpha[a]
-    used_history_out[w] = used
-    history[w] = wp.min(history[w] + 1, wp.static(DEPTH))
-    slot[w] = (current + 1) % wp.static(SLOTS)
-
-
-@cache
-def _advance_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def advance(
-        # inputs:
-        row_target: wp.array[int],
-        world: wp.array[int],
-        mode: wp.array[int],
-        improved: wp.array[int],
-        used_slot: wp.array[int],
-        used_history: wp.array[int],
-        alpha: wp.array2d[wp.float64],
-        omega: wp.array[wp.float64],
-        history_s: wp.array2d[vec3],
-        history_r: wp.array2d[vec3],
-        saturation: wp.array[dtype],
-        curve: wp.array[int],
-        # in and out:
-        best_s: wp.array[vec3],
-        best_r: wp.array[vec3],
-        # outputs:
-        s_out: wp.array[vec3],
-        moments_out: wp.array[vec3],
-        packed_out: wp.array2d[dtype],
-    ):
-        i = row_target[wp.tid()]
-        w = world[i]
-        if mode[w] == wp.static(REST):
-            return
-        step = dtype(omega[w])
-        s = vec3()
-        if mode[w] == wp.static(RETREAT):
-            s = theta_flow(best_s[i], best_s[i] + best_r[i], step)
-        else:
-            current = used_slot[w]
-            s_now = history_s[current, i]
-            r_now = history_r[current, i]
-            if improved[w] == 1:
-                best_s[i] = s_now
-                best_r[i] = r_now
-            s = theta_flow(s_now, s_now + r_now, step)
-            for a in range(used_history[w]):
-                old = (current - 1 - a + wp.static(2 * SLOTS)) % wp.static(SLOTS)
-                difference = (s_now - history_s[old, i]) + step * (r_now - history_r[old, i])
-                s -= dtype(alpha[w, a]) * difference
-        s_out[i] = s
-        radius = packed_out[3, i]
-        volume = dtype(4.18879020478639) * radius * radius * radius
-        m = (volume * saturation[i] * curve_ratio(wp.length(s), curve[i])) * s
-        moments_out[i] = m
-        for c in range(3):
-            packed_out[c + 4, i] = m[c]
-
-    return advance
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Launches
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def launch_set_state(rows, magnetizations, material, b: InductionBuffers):
-    """Take given magnetizations [A/m], shape [n], for the last solution of all worlds; ``rows`` as in launch_start."""
-    if rows.count == 0:
-        return
-    wp.launch(
-        _set_state_kernel(b.weight.dtype),
-        dim=rows.count,
-        inputs=[rows.target, b.world, magnetizations, material.saturation, material.curve],
-        outputs=[b.s, b.warm],
-        device=b.weight.device,
-    )
-
-
 def launch_start_worlds(moments, material, b: InductionBuffers):
-    """Reset the world state for a solve in the applied field ``b.h0``; arguments as in :func:`launch_start`."""
+    """Reset the world state for a solve in the applied field ``b.h0``; see ``theta_flow.launch_start``."""
     device = moments.device
     wp.launch(
         _measure_kernel(moments.dtype),
@@ -640,123 +245,12 @@ def launch_start_worlds(moments, material, b: InductionBuffers):
     )
 
 
-def launch_start(rows, moments, material, b: InductionBuffers, moments_out):
-    """Begin a solve from the applied field ``b.h0`` and, in worlds that are warm, from the last solution.
-
-    Args:
-        rows: Work list whose targets are the inducible moments.
-        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
-        material: What they are made of (``kernels.wrench.Material``).
-        b: The buffers.
-        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
-    """
-    launch_start_worlds(moments, material, b)
-    wp.launch(
-        _start_kernel(moments.dtype),
-        dim=rows.count,
-        inputs=[rows.target, b.world, b.warm, b.omega, b.h0, material.saturation, material.slope, material.curve],
-        outputs=[b.s, moments_out, moments.packed],
-        device=moments.device,
-    )
-
-
-def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol, max_evaluations, moments_out):
-    """Judge the field just summed into ``partial`` and move every world that has not ended; see the module.
-
-    Args:
-        rows: Work list whose targets are the inducible moments.
-        partial: Sums of the native field loop over ``rows``.
-        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``).
-        material: What they are made of (``kernels.wrench.Material``).
-        b: The buffers; ``b.condition`` tells whether another evaluation is wanted.
-        rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
-        max_evaluations: Field evaluations after which a world gives up.
-        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
-    """
-    device, dtype, world_count = moments.device, moments.dtype, b.omega.shape[0]
-    wp.launch(
-        _residual_kernel(dtype),
-        dim=rows.count,
-        inputs=[
-            partial,
-            moments.packed,
-            rows.target,
-            rows.begin,
-            rows.end,
-            moments.neighbors,
-            moments.neighbor_counts,
-            b.h0,
-            b.s,
-            material.saturation,
-            material.slope,
-            material.curve,
-            b.world,
-            b.active,
-            b.slot,
-        ],
-        outputs=[b.h, b.history_s, b.history_r, b.weight, b.terms],
-        device=device,
-    )
-    wp.launch(
-        _sum_kernel(dtype),
-        dim=(b.chunk.shape[0], COLUMNS),
-        inputs=[b.chunk, b.active, b.column_slots, b.history_r, b.weight, b.terms],
-        outputs=[b.sums],
-        device=device,
-    )
+def launch_sum_worlds(b: InductionBuffers):
+    """Add up the chunks' sums of each world that still iterates."""
     wp.launch(
         sum_worlds,
-        dim=(world_count, COLUMNS),
+        dim=(b.omega.shape[0], COLUMNS),
         inputs=[b.chunk_begin, b.active, b.sums],
         outputs=[b.world_sums, b.condition],
-        device=device,
-    )
-    wp.launch(
-        decide,
-        dim=world_count,
-        inputs=[
-            b.world_sums,
-            wp.float64(rtol),
-            max_evaluations,
-            b.active,
-            b.history,
-            b.slot,
-            b.plain_steps,
-            b.best,
-            b.evaluations,
-        ],
-        outputs=[
-            b.error,
-            b.converged,
-            b.warm,
-            b.mode,
-            b.improved,
-            b.used_slot,
-            b.used_history,
-            b.alpha,
-            b.condition,
-        ],
-        device=device,
-    )
-    wp.launch(
-        _advance_kernel(dtype),
-        dim=rows.count,
-        inputs=[
-            rows.target,
-            b.world,
-            b.mode,
-            b.improved,
-            b.used_slot,
-            b.used_history,
-            b.alpha,
-            b.omega,
-            b.history_s,
-            b.history_r,
-            material.saturation,
-            material.curve,
-            b.best_s,
-            b.best_r,
-        ],
-        outputs=[b.s, moments_out, moments.packed],
-        device=device,
+        device=b.omega.device,
     )

@@ -1,4 +1,4 @@
-"""Pairs of submagnetizations: the magnetization dynamics that the θ flow of ``induction`` replaces.
+"""Pairs of submagnetizations: the magnetization dynamics that ``theta_flow`` replaces.
 
 Every inducible moment is the mean of two submagnetizations of length Ms, M = (M1 + M2)/2, held here as unit vectors
 u = M_i/Ms. With the reduced effective field h = H_eff/Ms, one explicit step of each dynamics is
@@ -26,15 +26,10 @@ from typing import Any
 
 import warp as wp
 
+from warpmag.kernels.anderson import GRAM_COLUMNS
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio
 from warpmag.kernels.field import finished_field
-from warpmag.kernels.induction import (
-    COLUMNS,
-    GRAM_COLUMNS,
-    InductionBuffers,
-    launch_start_worlds,
-    sum_worlds,
-)
+from warpmag.kernels.induction import InductionBuffers, launch_start_worlds, launch_sum_worlds
 
 THETA_EULER, LLG, LLG_DAMPING = 0, 1, 2
 LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
@@ -388,7 +383,7 @@ def launch_step_pairs(
         rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
         max_evaluations: Field evaluations after which a world gives up.
     """
-    device, dtype, world_count = moments.device, moments.dtype, b.omega.shape[0]
+    device, dtype = moments.device, moments.dtype
     wp.launch(
         _evaluate_kernel(dtype),
         dim=rows.count,
@@ -415,16 +410,10 @@ def launch_step_pairs(
     wp.launch(
         _sum_kernel(dtype), dim=b.chunk.shape[0], inputs=[b.chunk, b.active, b.terms], outputs=[b.sums], device=device
     )
-    wp.launch(
-        sum_worlds,
-        dim=(world_count, COLUMNS),
-        inputs=[b.chunk_begin, b.active, b.sums],
-        outputs=[b.world_sums, b.condition],
-        device=device,
-    )
+    launch_sum_worlds(b)
     wp.launch(
         judge,
-        dim=world_count,
+        dim=b.omega.shape[0],
         inputs=[b.world_sums, wp.float64(rtol), max_evaluations, b.active, b.evaluations],
         outputs=[b.error, b.converged, b.warm, b.condition],
         device=device,

@@ -11,7 +11,8 @@ import numpy as np
 import warp as wp
 
 from warpmag.errors import InputError
-from warpmag.kernels import induction, submagnetization
+from warpmag.kernels import submagnetization, theta_flow
+from warpmag.kernels.induction import InductionBuffers
 from warpmag.kernels.pair_loops import Rows
 from warpmag.kernels.wrench import Material
 from warpmag.magnets import DYNAMICS, check_positive, check_token
@@ -44,7 +45,7 @@ class Inducibles:
     packed: PackedMoments
     material: Material
     moments: wp.array
-    state: induction.InductionBuffers
+    state: InductionBuffers
     rtol: float
     max_evaluations: int
 
@@ -59,17 +60,17 @@ class ThetaFlow:
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
         t = self._target
-        induction.launch_set_state(t.rows, magnetizations, t.material, t.state)
+        theta_flow.launch_set_state(t.rows, magnetizations, t.material, t.state)
 
     def start(self):
         """Begin a solve."""
         t = self._target
-        induction.launch_start(t.rows, t.packed, t.material, t.state, t.moments)
+        theta_flow.launch_start(t.rows, t.packed, t.material, t.state, t.moments)
 
     def iterate(self):
         """Judge the field just summed and move."""
         t = self._target
-        induction.launch_iteration(
+        theta_flow.launch_iteration(
             t.rows, t.partial, t.packed, t.material, t.state, t.rtol, t.max_evaluations, t.moments
         )
 
