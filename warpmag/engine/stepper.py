@@ -3,8 +3,9 @@
 A substep is: clear forces, induction, magnetic forces, collision, solver. Each of these stages is captured once in a
 graph, on the CPU too, where replaying it is three times as fast as launching it from Python.
 
-A step is tried and then judged by what the device reports about it: if a body would have moved too far in a substep, or
-a buffer overflowed, the state is put back and the step done again with shorter substeps or larger buffers.
+A step is tried and then judged by what the device reports about it: if a body would have moved too far in a substep, if
+bodies were pressed into each other, or if a buffer overflowed, the state is put back and the step done again with
+shorter substeps or larger buffers.
 """
 
 import math
@@ -23,10 +24,12 @@ from warpmag.kernels import monitor
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
+OVERLAP_LIMIT = 0.008
+"""How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
 _SHORTEST = 16
 """Substeps are at most this many times shorter than the longest allowed."""
 _EASE = 0.2
-"""Substeps double in length when the motion, four times as long then, would still stay within the limit."""
+"""Substeps double in length once the motion, up to four times as long then, would stay well within the limit."""
 _EVENTS_EVERY = 8
 """On a GPU every so manieth step is timed."""
 _NO_BODY = np.iinfo(np.int32).max
@@ -113,6 +116,7 @@ class Stepper:
         self._capture = graphs
         self._settled = False
         self._steps = 0
+        self._overlap = 0.0
 
     def _count_start(self) -> None:
         counts = np.zeros(monitor.COUNT_CAPACITIES + len(self._solver.buffers), dtype=np.int32)
@@ -135,11 +139,12 @@ class Stepper:
             attempts += 1
             peaks, counts = self._attempt(watch)
             travel, bad = float(peaks[monitor.PEAK_TRAVEL]), counts[monitor.COUNT_BAD_BODY] != _NO_BODY
+            pressed = peaks[monitor.PEAK_OVERLAP] > max(OVERLAP_LIMIT, self._overlap)
             if self._solver.grow(counts[monitor.COUNT_CAPACITIES :]):
                 regrown = True
                 self._count_start()
                 self._graphs = {}
-            elif (travel > TRAVEL_LIMIT or bad) and self.substeps < _SHORTEST * self._fewest:
+            elif (travel > TRAVEL_LIMIT or pressed or bad) and self.substeps < _SHORTEST * self._fewest:
                 self.substeps *= 2
             else:
                 break
@@ -152,7 +157,9 @@ class Stepper:
             )
         report = self._report(attempts, regrown, peaks, counts, watch.seconds() if watch and self._settled else None)
         self._steps += 1
-        if self.substeps > self._fewest and travel < _EASE * TRAVEL_LIMIT:
+        self._overlap = report.overlap
+        calm = travel < _EASE * TRAVEL_LIMIT and report.overlap < 0.5 * OVERLAP_LIMIT
+        if calm and self.substeps > self._fewest:
             self.substeps //= 2
         return report
 
@@ -189,7 +196,11 @@ class Stepper:
                 if watch:
                     watch.stop()
             now, then = then, now
-        monitor.watch_finite(self.state, self._counts)
+        if watch:
+            watch.start(RIGID)
+        self._run(("end", self.substeps), self._look, now, then)
+        if watch:
+            watch.stop()
         return self._peaks.numpy().copy(), self._counts.numpy().copy()
 
     def _clear(self) -> None:
@@ -210,6 +221,10 @@ class Stepper:
         monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, self._peaks)
         self._find_contacts(now, dt, 0.0)
         self._solver.step(now, then, dt)
+
+    def _look(self, now, then) -> None:
+        self._find_contacts(now, self._step / self.substeps, 0.0)
+        monitor.watch_finite(now, self._counts)
 
     def _find_contacts(self, state, dt, overlap_threshold) -> None:
         solver = self._solver
@@ -241,11 +256,8 @@ class Stepper:
                 break
             self._count_start()
             self._graphs = {}
-        return (
-            float(peaks[monitor.PEAK_OVERLAP]),
-            float(peaks[monitor.PEAK_DEPTH]),
-            int(counts[monitor.COUNT_OVERLAPS]),
-        )
+        self._overlap = float(peaks[monitor.PEAK_OVERLAP])
+        return self._overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])
 
     def _run(self, key: tuple, stage: Callable, now: newton.State, then: newton.State) -> None:
         """Run a stage: launched from Python the first time, which compiles its kernels, then captured and replayed."""
