@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import warp as wp
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
-from warpmag.scenes_usd import balls_up
 
 import warpmag
 from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.statistics import find_held
-from warpmag.engine.stepper import TRAVEL_LIMIT, Stepper
+from warpmag.engine.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
 from warpmag.magnets import Magnet
+from warpmag.scenes_usd import balls_up
 from warpmag.usd import author_magnet
 
 R = 0.005  # m
@@ -114,6 +114,24 @@ def test_substeps_follow_the_speed(device):
     for _ in range(5):
         report = stepper.advance()
     assert report.substeps == 2  # at rest again
+
+
+def test_substeps_follow_the_pressure(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -4000.0))  # as strong as a magnet's pull on a ball
+    builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(density=7874.0, mu=0.0)
+    warpmag.register_attributes(builder)
+    builder.add_ground_plane()
+    for layer in range(20):
+        add_ball(builder, (0.0, 0.0, R + 2.0 * R * layer))
+    model = builder.finalize(device=device)
+    sizes = body_sizes(model)
+    stepper = Stepper(
+        model, warpmag.Magnetics(model), RigidSolver(model, sizes), sizes, step=1e-3, longest_substep=5e-4
+    )
+    reports = [stepper.advance() for _ in range(20)]
+    assert max(report.substeps for report in reports) > 2
+    assert max(report.overlap for report in reports) < OVERLAP_LIMIT
+    assert max(report.travel for report in reports) < TRAVEL_LIMIT
 
 
 def test_the_step_asked_for_is_the_step_done(device):

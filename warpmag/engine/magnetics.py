@@ -260,10 +260,10 @@ def _find_magnets(model: newton.Model) -> list[BodyMagnet]:
 
 def _alike(a: Magnet, b: Magnet) -> bool:
     """Return whether two magnets of one body are the same material, magnetized alike up to rounding."""
-    difference = np.subtract(a.magnetization, b.magnetization)
-    return replace(a, magnetization=b.magnetization) == b and np.linalg.norm(difference) <= 1e-5 * np.linalg.norm(
-        a.magnetization
-    )
+    if replace(a, magnetization=b.magnetization) != b:
+        return False
+    difference = np.linalg.norm(np.subtract(a.magnetization, b.magnetization))
+    return bool(difference <= 1e-5 * np.linalg.norm(a.magnetization))
 
 
 def _number_worlds(model: newton.Model, shapes: list[int]) -> list[int]:

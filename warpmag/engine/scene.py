@@ -82,7 +82,7 @@ def _in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:
     return Magnet(magnet.kind, magnetization=tuple(turned), moment_spacing=magnet.moment_spacing)
 
 
-def _axis_turn(stage, prim: str) -> wp.quat:
+def _axis_turn(stage, prim: str):
     """Return how Newton turns the frame of a capsule, cylinder or cone prim, whose axis it puts along z."""
     axis = stage.GetPrimAtPath(prim).GetAttribute("axis")
     value = axis.Get() if axis else None

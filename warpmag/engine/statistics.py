@@ -6,6 +6,9 @@ import numpy as np
 
 from warpmag.engine.stepper import FORCE, INDUCTION, RIGID, StepReport
 
+_DEEP = 0.05
+"""Penetration over the thickness that no user takes for contact."""
+
 
 @dataclass
 class Statistics:
@@ -83,6 +86,8 @@ class Statistics:
             lines.append(f"{self.overlapping} pair{'s' * many} of bodies overlap{'s' * (not many)} at the start")
         if self.unconverged:
             lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
+        if self.final_overlap > _DEEP:
+            lines.append(f"bodies end {100.0 * self.final_overlap:.0f} % of their radius deep in each other")
         if self.capped:
             lines.append(f"bodies moved too fast for the shortest substep in {self.capped} of {self.steps} steps")
         return lines

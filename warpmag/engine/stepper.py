@@ -297,7 +297,7 @@ class _Stopwatch:
         self._laps.append((self._stage, self._begin, self._now()))
 
     def seconds(self) -> dict[str, float]:
-        totals = dict.fromkeys((INDUCTION, FORCE, RIGID), 0.0)
+        totals: dict[str, float] = dict.fromkeys((INDUCTION, FORCE, RIGID), 0.0)
         for stage, begin, end in self._laps:
             lap = end - begin if self._device.is_cpu else 1e-3 * wp.get_event_elapsed_time(begin, end)
             totals[stage] += lap
