@@ -21,7 +21,7 @@ def author(
     radius: float = 0.005,
     magnet_size: float = 0.04,
     magnetization: float = 1e6,
-    height: float = 0.08,
+    height: float = 0.051,
 ) -> None:
     """Write the stage to ``path``.
 

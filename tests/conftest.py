@@ -30,4 +30,5 @@ def device(request):
 
     wp.config.log_level = wp.LOG_WARNING
     wp.config.verbose_warnings = False
+    wp.config.enable_backward = False  # as the command does, so that both find the same compiled kernels
     return str(wp.get_device(request.config.getoption("--device")))

@@ -94,7 +94,7 @@ def test_newton_imports_balls_up():
 def test_newton_takes_y_up_stages_as_they_are(tmp_path):
     """With the stage's own up axis Newton's world is the stage's world, so that results go back unturned."""
     newton = pytest.importorskip("newton")
-    balls_up.author(tmp_path / "scene.usda", columns=2, rows=1, layers=1)
+    balls_up.author(tmp_path / "scene.usda", columns=2, rows=1, layers=1, height=0.08)
     text = (tmp_path / "scene.usda").read_text().replace('upAxis = "Z"', 'upAxis = "Y"')
     (tmp_path / "turned.usda").write_text(text.replace("gravityDirection = (0, 0, -1)", "gravityDirection = (0, 0, 0)"))
     builder = newton.ModelBuilder()
