@@ -1,8 +1,24 @@
 """Packing of moments into the component rows that the pair loops read; see ``pair_loops``."""
 
 from functools import cache
+from typing import Any
 
 import warp as wp
+
+
+@wp.func
+def ball_volume(radius: Any):
+    """Volume 4π/3 R³ [m³] of a ball."""
+    return type(radius)(4.18879020478639) * radius * radius * radius
+
+
+@wp.func
+def store_magnetization(i: int, magnetization: Any, moments: wp.array(dtype=Any), packed: wp.array2d(dtype=Any)):
+    """Set the moment of ball ``i`` to its volume times a magnetization [A/m], plain and packed."""
+    m = ball_volume(packed[3, i]) * magnetization
+    moments[i] = m
+    for c in range(3):
+        packed[c + 4, i] = m[c]
 
 
 @cache
@@ -66,7 +82,7 @@ def _divide_kernel(dtype):
         magnetizations_out: wp.array[vec3],
     ):
         i = wp.tid()
-        volume = dtype(4.18879020478639) * radii[i] * radii[i] * radii[i]
+        volume = ball_volume(radii[i])
         m = vec3()
         if volume > dtype(0.0):
             m = moments[i] / volume

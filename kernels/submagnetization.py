@@ -30,6 +30,7 @@ from warpmag.kernels.anderson import GRAM_COLUMNS
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio
 from warpmag.kernels.field import finished_field
 from warpmag.kernels.induction import InductionBuffers, launch_start_worlds, launch_sum_worlds
+from warpmag.kernels.packing import store_magnetization
 
 THETA_EULER, LLG, LLG_DAMPING = 0, 1, 2
 LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
@@ -121,12 +122,7 @@ def _start_kernel(dtype):
             u = across(wp.normalize(h0[i]))
             first[i] = u
             second[i] = -u
-        radius = packed_out[3, i]
-        volume = dtype(4.18879020478639) * radius * radius * radius
-        m = (dtype(0.5) * volume * saturation[i]) * (first[i] + second[i])
-        moments_out[i] = m
-        for c in range(3):
-            packed_out[c + 4, i] = m[c]
+        store_magnetization(i, (dtype(0.5) * saturation[i]) * (first[i] + second[i]), moments_out, packed_out)
 
     return start_pairs
 
@@ -300,12 +296,7 @@ def _step_kernel(dtype):
         v = step_submagnetization(v, h_eff, kappa, precession, dtype(-1.0), law)
         first[i] = u
         second[i] = v
-        radius = packed_out[3, i]
-        volume = dtype(4.18879020478639) * radius * radius * radius
-        m = (dtype(0.5) * volume * saturation[i]) * (u + v)
-        moments_out[i] = m
-        for c in range(3):
-            packed_out[c + 4, i] = m[c]
+        store_magnetization(i, (dtype(0.5) * saturation[i]) * (u + v), moments_out, packed_out)
 
     return step_pairs
 

@@ -21,6 +21,7 @@ from warpmag.kernels.anderson import DEPTH, GRAM_COLUMNS, SLOTS, anderson_coeffi
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio, theta_flow
 from warpmag.kernels.field import finished_field
 from warpmag.kernels.induction import COLUMNS, InductionBuffers, launch_start_worlds, launch_sum_worlds
+from warpmag.kernels.packing import store_magnetization
 
 PLAIN_STEPS = SLOTS
 """Plain steps after an accelerated one was taken back, before the next is tried."""
@@ -54,12 +55,7 @@ def _start_kernel(dtype):
             step = wp.min(dtype(1.0), dtype(omega[world[i]]) / dtype(0.6))
             s = (step * slope[i] / saturation[i]) * h0[i]
             s_out[i] = s
-        radius = packed_out[3, i]
-        volume = dtype(4.18879020478639) * radius * radius * radius
-        m = (volume * saturation[i] * curve_ratio(wp.length(s), curve[i])) * s
-        moments_out[i] = m
-        for c in range(3):
-            packed_out[c + 4, i] = m[c]
+        store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
 
     return start_moments
 
@@ -303,12 +299,7 @@ def _advance_kernel(dtype):
                 difference = (s_now - history_s[old, i]) + step * (r_now - history_r[old, i])
                 s -= dtype(alpha[w, a]) * difference
         s_out[i] = s
-        radius = packed_out[3, i]
-        volume = dtype(4.18879020478639) * radius * radius * radius
-        m = (volume * saturation[i] * curve_ratio(wp.length(s), curve[i])) * s
-        moments_out[i] = m
-        for c in range(3):
-            packed_out[c + 4, i] = m[c]
+        store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
 
     return advance
 

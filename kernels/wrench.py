@@ -17,6 +17,7 @@ import warp as wp
 from warpmag.kernels.curves import curve_derivative_times
 from warpmag.kernels.field import INVERSE_4PI
 from warpmag.kernels.neighbors import pair_correction
+from warpmag.kernels.packing import ball_volume
 
 MU0 = 1.2566370614359173e-06
 """Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
@@ -91,8 +92,7 @@ def _wrench_kernel(dtype):
         m = vec3(packed[4, i], packed[5, i], packed[6, i])
         effective = m
         if force_law == wp.static(ZEEMAN) and inducible[i] == 1:
-            volume = dtype(4.18879020478639) * packed[3, i] * packed[3, i] * packed[3, i]
-            v = dtype(2.0) * m + volume * h[i]
+            v = dtype(2.0) * m + ball_volume(packed[3, i]) * h[i]
             effective += curve_derivative_times(h[i], v, slope[i], saturation[i], curve[i])
         force_out[i] = dtype(wp.static(MU0)) * (gradient * effective)
         torque = vec3()

@@ -111,7 +111,7 @@ def test_bad_arguments_are_refused_in_one_line(scene, tmp_path, capsys):
         (["run", str(scene), "--frames", "many"], "--frames"),
         (["run", str(scene), "--rtol", "-1"], "rtol: must be positive"),
         (["run", str(scene), "--force", "lorentz"], "lorentz"),
-        (["run", str(scene), "--device", "cuda:99"], "device: 'cuda:99' is not there"),
+        (["run", str(scene), "--device", "cuda:99"], "device: no 'cuda:99' here"),
         (["run", str(scene), "-o", str(tmp_path / "out.txt"), "--device", "cpu"], "the output must end in"),
         (["fly"], "fly"),
         ([], "required"),

@@ -165,7 +165,7 @@ def test_bad_scenes_are_refused(device):
         Simulation(pile(), device=device, solver="magic")
     with pytest.raises(warpmag.InputError, match="step: must be positive"):
         Simulation(pile(), device=device, step=0.0)
-    with pytest.raises(warpmag.InputError, match="device: 'cuda:99' is not there"):
+    with pytest.raises(warpmag.InputError, match="device: no 'cuda:99' here"):
         Simulation(pile(), device="cuda:99")
     with pytest.raises(warpmag.InputError, match="only a scene that came from a stage"):
         Simulation(pile(), device=device).run(1, output="out.usda")

@@ -13,6 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.arrays import resolve_device
 from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
@@ -77,7 +78,7 @@ class Simulation:
         Raises:
             InputError: Something about the scene or an argument is wrong; the message names it.
         """
-        self.device = _device(device)
+        self.device = resolve_device(device)
         self._scene = None
         builder, settings = scene, MagneticSettings()
         self.frame_rate, self.frame_count = _FRAME_RATE, None
@@ -287,11 +288,3 @@ def _interrupts_held() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if caught:
         raise KeyboardInterrupt
-
-
-def _device(name: str | None) -> wp.Device:
-    try:
-        return wp.get_device(name)
-    except (ValueError, RuntimeError):
-        known = ", ".join(str(one) for one in wp.get_devices())
-        raise InputError(f"device: {name!r} is not there, this machine has {known}") from None
