@@ -45,6 +45,14 @@ def test_run_writes_a_stage_and_a_summary(scene, device, tmp_path, capfd):
     assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").GetNumTimeSamples() == 4
 
 
+@pytest.mark.parametrize("method", ["warpmag", "paper", "kim2018"])
+def test_published_methods_run_by_name(scene, device, method, tmp_path, capfd):
+    out = tmp_path / "out.usda"
+    command = ["run", str(scene), "-o", str(out), "--frames", "1", "--device", device, "--method", method]
+    assert cli.main(command) == 0
+    assert "magnetization error" in capfd.readouterr().out
+
+
 def test_scenes_lists_what_is_bundled(capsys):
     assert cli.main(["scenes"]) == 0
     assert "balls_up" in capsys.readouterr().out
