@@ -8,9 +8,9 @@ With the n-th iterate's differences Δs_j, Δr_j to the last few, Anderson's ste
 
 weighted by φ = Ms c(a)/a, a = max(‖s‖, ‖g‖): what a residual is worth in magnetization, so that a saturated moment's
 huge s does not drown the rest. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, convex for the
-ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω ≤ 1/L, and close to the solution converges for
-ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``neighbors``). An accelerated step that leaves the merit ‖φ r‖
-more than twice the best is taken back, and a few plain steps follow from the best iterate.
+ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω ≤ 1/L, and close to the solution converges
+for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``neighbors``). An accelerated step that leaves the merit
+‖φ r‖ more than twice the best is taken back, and a few plain steps follow from the best iterate.
 """
 
 from functools import cache
