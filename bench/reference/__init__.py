@@ -1,0 +1,1 @@
+"""Independent references: exact solutions that share no code and no approximation with the library."""

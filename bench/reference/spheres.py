@@ -1,0 +1,254 @@
+"""Permeable balls in a uniform field, exactly: multipole expansions in plain NumPy, float64.
+
+The scalar potential around ball i (H = −∇ψ) is a sum of its own irregular solid harmonics and of regular ones from
+everything else,
+
+    ψ = Σ_lm a_lm C_lm(r̂)/r^(l+1) + b_lm r^l C_lm(r̂),    a_lm = −p_l b_lm,    p_l = R^(2l+1) l(μr−1)/(l μr + l+1),
+
+C_lm in Racah's normalisation. Harmonics about one centre are translated to another by the addition theorem,
+b = b0 + T a, which leaves the symmetric positive definite system (1/p + T) a = −b0. Moments are m = 4π a_1, and since
+the free energy is U = −½ μ0 Σ m·H0, forces are F = −∂U/∂x = −2π μ0 aᵀ (∂T/∂x) a, exact for the truncated system too.
+
+Cutting the expansions at order L leaves an error of about exp(−2ξL), cosh ξ = 1 + gap/2R for equal balls: images
+converge to the foci of the bispherical coordinates, exp(−ξ) of a radius off the centres. Near contact L must grow as
+√(R/gap); :func:`sufficient_order` gives it.
+
+References: Jackson, Classical Electrodynamics, 3rd ed., sections 3.6 and 4.1; Steinborn and Ruedenberg 1973, "Rotation
+and translation of regular and irregular solid spherical harmonics"; Jones 1995, Electromechanics of Particles, ch. 6.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
+from scipy.special import gammaln
+
+MU0 = 4e-7 * math.pi
+"""Vacuum permeability [T·m/A]."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Balls in equilibrium.
+
+    Attributes:
+        moments: Moments [A·m²], shape [n, 3].
+        forces: Forces [N], shape [n, 3].
+        multipoles: Coefficients of the real irregular harmonics around each ball [A m^(l+1)], l = 1..L, m = −l..l,
+            sines where m < 0, cosines where m > 0, shape [n, L (L + 2)]; the potential they make is ψ.
+        energy: Free energy −½ μ0 Σ m·H0 [J], whose gradient the forces are.
+        truncation: Relative change of the forces against two thirds of the order: an upper bound of their error.
+        order: Order L that the expansions were cut at.
+    """
+
+    moments: np.ndarray
+    forces: np.ndarray
+    multipoles: np.ndarray
+    energy: float
+    truncation: float
+    order: int
+
+
+def log_polarizabilities(order: int, radius: float, permeability: float) -> np.ndarray:
+    """Logarithms of a ball's multipole polarizabilities p_l [m^(2l+1)], l = 1..order; μr > 1, may be infinite."""
+    degree = np.arange(1, order + 1)
+    response = (
+        1.0 if math.isinf(permeability) else degree * (permeability - 1.0) / (degree * (permeability + 1.0) + 1.0)
+    )
+    return (2.0 * degree + 1.0) * np.log(radius) + np.log(response)
+
+
+def sufficient_order(distance: float, radius_i: float, radius_j: float, tolerance: float) -> int:
+    """Order L that cuts two balls' expansions at about a relative ``tolerance``."""
+    xi = min(
+        math.acosh(max((distance**2 + a**2 - b**2) / (2.0 * distance * a), 1.0 + 1e-9))
+        for a, b in ((radius_i, radius_j), (radius_j, radius_i))
+    )
+    return max(6, math.ceil(-0.5 * math.log(tolerance) / xi) + 4)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Two balls: on their axis the orders m decouple
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two balls in fields that are uniform over each ball: H_i = Σ_j R_ij m_j, along the axis and across it.
+
+    Attributes:
+        resistance: R [1/m³], shape [2, 2, 2]: along ([0]) and across ([1]), ball, ball.
+        slope: ∂R/∂d [1/m⁴] at given moments, same shape.
+        order: Order L of the expansions.
+    """
+
+    resistance: np.ndarray
+    slope: np.ndarray
+    order: int
+
+
+def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pair:
+    """Solve two balls.
+
+    Args:
+        distance: Distance d of the centres [m].
+        radii: The two radii [m].
+        permeabilities: The two relative permeabilities μr > 1, may be infinite.
+        order: Order of the expansions; None chooses it by ``tolerance``.
+        tolerance: Relative truncation error aimed at.
+    """
+    unit = math.sqrt(radii[0] * radii[1])
+    d, a, b = distance / unit, radii[0] / unit, radii[1] / unit
+    order = order or sufficient_order(d, a, b, tolerance)
+    p, q = (log_polarizabilities(order, r, mu) for r, mu in zip((a, b), permeabilities, strict=True))
+    degree = np.arange(1, order + 1)
+    rows, columns = degree[:, None], degree[None, :]
+    resistance, slope = np.empty((2, 2, 2)), np.empty((2, 2, 2))
+    for m in (0, 1):
+        norm = -0.5 * (gammaln(degree + m + 1.0) + gammaln(degree - m + 1.0))
+        size = gammaln(rows + columns + 1.0) + norm[:, None] + norm[None, :] - (rows + columns + 1.0) * np.log(d)
+        # target second ball, source first: t = +d ẑ, scaled so that a ball alone has the unit matrix
+        coupling = (-1.0) ** (rows + m) * np.exp(size + 0.5 * q[:, None] + 0.5 * p[None, :])
+        system = np.block([[np.eye(order), coupling.T], [coupling, np.eye(order)]])
+        change = -(rows + columns + 1.0) / d * coupling
+        change = np.block([[np.zeros_like(change), change.T], [change, np.zeros_like(change)]])
+        y = cho_solve(cho_factor(system), np.eye(2 * order)[:, [0, order]])
+        root = np.exp(0.5 * np.array([p[0], q[0]]))
+        inverse = np.linalg.inv(y[[0, order]])
+        resistance[m] = inverse / np.outer(root, root) / (4.0 * np.pi * unit**3)
+        # at given moments the energy changes by that of the coupling alone
+        slope[m] = inverse @ (y.T @ change @ y) @ inverse / np.outer(root, root) / (4.0 * np.pi * unit**4)
+    return Pair(resistance, slope, order)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Any number of balls
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def spheres(positions, radii, permeability, field, *, order=None, tolerance=1e-4, estimate=True) -> Solution:
+    """Solve n balls that do not touch.
+
+    Args:
+        positions: Centres [m], shape [n, 3].
+        radii: Radii [m], scalar or [n].
+        permeability: Relative permeability μr > 1, scalar or [n], may be infinite.
+        field: Applied field H0 [A/m], shape [3].
+        order: Order of the expansions; None chooses it for the narrowest gap by ``tolerance``. Memory and time are
+            those of a dense system of n L (L + 2) unknowns.
+        tolerance: Relative truncation error aimed at.
+        estimate: Whether to estimate the truncation error, by a second solution.
+    """
+    x = np.asarray(positions, float)
+    n = len(x)
+    radii = np.broadcast_to(np.asarray(radii, float), n)
+    mu = np.broadcast_to(np.asarray(permeability, float), n)
+    field = np.asarray(field, float)
+    if order is None:
+        order = max(
+            [sufficient_order(math.dist(x[i], x[j]), radii[i], radii[j], tolerance) for i in range(n) for j in range(i)]
+            or [1]
+        )
+    a, forces = _solve(x, radii, mu, field, order)
+    truncation = math.nan
+    if estimate and order > 1:
+        _, coarse = _solve(x, radii, mu, field, max(1, 2 * order // 3))
+        truncation = float(np.linalg.norm(coarse - forces) / max(np.linalg.norm(forces), np.finfo(float).tiny))
+    moments = 4.0 * np.pi * a[:, [2, 0, 1]]
+    return Solution(moments, forces, a, float(-0.5 * MU0 * np.sum(moments @ field)), truncation, order)
+
+
+def _solve(x, radii, mu, field, order):
+    """Multipoles and forces of balls, expansions cut at ``order``."""
+    n, degrees = len(x), _Degrees(order)
+    size = len(degrees.l)
+    unit = float(np.exp(np.mean(np.log(radii))))
+    x, radii = x / unit, radii / unit
+    scale = [np.exp(0.5 * log_polarizabilities(order, r, m)[degrees.l - 1]) for r, m in zip(radii, mu, strict=True)]
+    system = np.eye(n * size)
+    for i in range(n):
+        for j in range(i):
+            block = scale[i][:, None] * degrees.translation(x[i] - x[j]) * scale[j][None, :]
+            system[i * size : (i + 1) * size, j * size : (j + 1) * size] = block
+    right = np.zeros((n, size))
+    for i in range(n):
+        right[i, :3] = scale[i][:3] * field[[1, 2, 0]]  # real harmonics of degree 1 in the order y, z, x
+    y = cho_solve(cho_factor(system, lower=True, overwrite_a=True), right.ravel()).reshape(n, size)
+    a = np.array([s * v for s, v in zip(scale, y, strict=True)])
+    forces = np.zeros((n, 3))
+    for i in range(n):
+        for j in range(i):
+            gradient = degrees.translation_gradient(x[i] - x[j])
+            pull = -4.0 * np.pi * MU0 * unit**2 * np.array([a[i] @ g @ a[j] for g in gradient])
+            forces[i] += pull
+            forces[j] -= pull
+    return a * unit ** (degrees.l + 2.0), forces
+
+
+def _irregular(t, order):
+    """Irregular solid harmonics S_lm = (l−m)! P_lm(cos θ) e^(imφ)/t^(l+1) up to an order, and the column of m = 0.
+
+    Rows are degrees l; one more row and two more columns than harmonics are zero.
+    """
+    x, y, z = t
+    t2 = x * x + y * y + z * z
+    s = np.zeros((order + 2, 2 * order + 3), complex)
+    zero = order + 1  # column of m = 0; one spare on each side
+    diagonal = 1.0 / math.sqrt(t2)
+    for m in range(order + 1):
+        s[m, zero + m] = diagonal
+        for l in range(m, order):  # noqa: E741
+            s[l + 1, zero + m] = ((2 * l + 1) * z * s[l, zero + m] - (l * l - m * m) * s[l - 1, zero + m]) / t2
+        diagonal = -(2 * m + 1) * (x + 1j * y) * diagonal / t2
+    signs = (-1.0) ** np.arange(1, order + 2)
+    s[:, zero - 1 :: -1] = signs * np.conj(s[:, zero + 1 :])
+    return s, zero
+
+
+class _Degrees:
+    """Indices of the harmonics up to an order, in the sequence (l, m = −l..l), and the passage to real ones."""
+
+    def __init__(self, order):
+        self.order = order
+        self.l = np.concatenate([np.full(2 * k + 1, k) for k in range(1, order + 1)])
+        self.m = np.concatenate([np.arange(-k, k + 1) for k in range(1, order + 1)])
+        norm = np.exp(-0.5 * (gammaln(self.l + self.m + 1.0) + gammaln(self.l - self.m + 1.0)))
+        self.left = norm * (-1.0) ** (self.l + self.m)
+        self.right = norm
+        size = len(self.l)
+        index = np.arange(size)
+        mirror = index - 2 * self.m
+        sign = (-1.0) ** np.abs(self.m)
+        # columns: cosine harmonics where m > 0, sine harmonics where m < 0
+        own = np.where(self.m > 0, sign / math.sqrt(2.0), np.where(self.m < 0, 1j / math.sqrt(2.0), 1.0))
+        other = np.where(self.m > 0, 1.0 / math.sqrt(2.0), -1j * sign / math.sqrt(2.0))
+        paired = self.m != 0
+        self.real = csr_array(
+            (
+                np.concatenate([own, other[paired]]),
+                (np.concatenate([index, mirror[paired]]), np.concatenate([index, index[paired]])),
+            ),
+            shape=(size, size),
+        )
+
+    def translation(self, t, ladder=((0, 0, 1.0),)):
+        """Matrix T from irregular real harmonics at a source to regular ones at a target, t = x_target − x_source.
+
+        ``ladder`` lists (degrees added, orders added, factor): a combination of harmonics in place of the plain one.
+        """
+        s, zero = _irregular(t, 2 * self.order + 1)
+        degree = self.l[:, None] + self.l[None, :]
+        order = self.m[None, :] - self.m[:, None]
+        block = sum(factor * s[degree + up, zero + order + turn] for up, turn, factor in ladder)
+        block = self.left[:, None] * block * self.right[None, :]
+        return (self.real.conj().T @ (self.real.T @ block.T).T).real
+
+    def translation_gradient(self, t):
+        """Derivatives ∂T/∂t, shape [3, size, size]."""
+        return [
+            self.translation(t, ((1, 1, 0.5), (1, -1, -0.5))),
+            self.translation(t, ((1, 1, -0.5j), (1, -1, -0.5j))),
+            self.translation(t, ((1, 0, -1.0),)),
+        ]
