@@ -34,13 +34,15 @@ class InductionBuffers:
         h0: Applied field [A/m]: external and from permanent magnets, shape [n].
         h: Whole field [A/m], shape [n].
         s: Dual variable [dimensionless], shape [n].
+        last_s, last_change: Solution of the last solve, and how it differs from that of the one before, shape [n].
         history_s, history_r: Last iterates and residuals, shape [SLOTS, n].
         best_s, best_r: Those of the smallest merit, shape [n].
         weight, terms: Weight φ, and the lengths whose squares are summed, shape [n].
         start: Largest field and stiffness of each chunk, shape [c, 2].
         sums, world_sums: Sums of each chunk and world, shape [c, COLUMNS] and [w, COLUMNS].
         omega, best, error: Step length, smallest merit, relative residual of each world, shape [w].
-        warm, active, converged, evaluations: How each world stands, shape [w].
+        warm: Solves of each world since it began cold, as far as it matters, shape [w].
+        active, converged, evaluations: How each world stands, shape [w].
         history, slot, plain_steps, mode, improved, used_slot, used_history: What it does next, shape [w].
         alpha: Anderson coefficients, shape [w, DEPTH].
         condition: Whether any world still iterates, shape [1].
@@ -53,6 +55,8 @@ class InductionBuffers:
     h0: wp.array
     h: wp.array
     s: wp.array
+    last_s: wp.array
+    last_change: wp.array
     history_s: wp.array
     history_r: wp.array
     best_s: wp.array
@@ -112,7 +116,7 @@ def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
         chunk=put(np.reshape(chunks, (-1, 3)), wp.vec3i),
         chunk_begin=put(chunk_begin, wp.int32),
         column_slots=put(slots, wp.vec2i),
-        **{name: zeros(n, vec3) for name in ("h0", "h", "s", "best_s", "best_r", "terms")},
+        **{name: zeros(n, vec3) for name in ("h0", "h", "s", "last_s", "last_change", "best_s", "best_r", "terms")},
         **{name: zeros((SLOTS, n), vec3) for name in ("history_s", "history_r")},
         weight=zeros(n, dtype),
         start=zeros((len(chunks), 2), wp.float64),

@@ -11,6 +11,11 @@ huge s does not drown the rest. The plain step is mirror descent on the energy �
 ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω ≤ 1/L, and close to the solution converges
 for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``neighbors``). An accelerated step that leaves the merit
 ‖φ r‖ more than twice the best is taken back, and a few plain steps follow from the best iterate.
+
+The residual that ends a solve is good for one more step: with that polished s, and its change β Δs to come, the next
+solve starts, Δs the change since the solve before it. β is what would have predicted Δs from the change before it,
+β = Δs·Δs'/‖Δs'‖² within [0, 1], for each moment by itself: smooth motion is followed, a jump is not repeated. A start
+is only a start, and whatever it is worth the solve converges to the one solution.
 """
 
 from functools import cache
@@ -25,7 +30,9 @@ from warpmag.kernels.packing import store_magnetization
 
 PLAIN_STEPS = SLOTS
 """Plain steps after an accelerated one was taken back, before the next is tried."""
-ADVANCE, RETREAT, REST = 1, 2, 0
+REST, ADVANCE, RETREAT = 0, 1, 2
+STEADY = 3
+"""Solves in a row that make two changes to extrapolate from."""
 
 
 @cache
@@ -43,18 +50,31 @@ def _start_kernel(dtype):
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
+        # in and out:
+        s_inout: wp.array[vec3],
+        last_s: wp.array[vec3],
+        last_change: wp.array[vec3],
         # outputs:
-        s_out: wp.array[vec3],
         moments_out: wp.array[vec3],
         packed_out: wp.array2d[dtype],
     ):
         i = row_target[wp.tid()]
-        s = s_out[i]
-        if warm[world[i]] == 0:
+        w = world[i]
+        s = s_inout[i]
+        if warm[w] == 0:
             # the θ flow with κ = k from no magnetization: exact for a lone ball; shorter where balls overlap deeply
-            step = wp.min(dtype(1.0), dtype(omega[world[i]]) / dtype(0.6))
+            step = wp.min(dtype(1.0), dtype(omega[w]) / dtype(0.6))
             s = (step * slope[i] / saturation[i]) * h0[i]
-            s_out[i] = s
+            s_inout[i] = s
+        else:
+            change = s - last_s[i]
+            earlier = last_change[i]
+            last_s[i] = s
+            last_change[i] = change
+            square = wp.dot(earlier, earlier)
+            if warm[w] == wp.static(STEADY) and square > dtype(0.0):
+                s += wp.clamp(wp.dot(change, earlier) / square, dtype(0.0), dtype(1.0)) * change
+                s_inout[i] = s
         store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
 
     return start_moments
@@ -193,10 +213,10 @@ def decide(
     plain_steps: wp.array[int],
     best: wp.array[wp.float64],
     evaluations: wp.array[int],
+    warm: wp.array[int],
     # outputs:
     error_out: wp.array[wp.float64],
     converged_out: wp.array[int],
-    warm_out: wp.array[int],
     mode_out: wp.array[int],
     improved_out: wp.array[int],
     used_slot_out: wp.array[int],
@@ -223,9 +243,11 @@ def decide(
         active[w] = 0
         converged_out[w] = wp.where(error <= rtol, 1, 0)
         # a state that is not finite must not be the next start
-        warm_out[w] = wp.where(lost, 0, 1)
-        return
-    condition_out[0] = 1
+        warm[w] = wp.where(lost, 0, wp.min(warm[w] + 1, wp.static(STEADY)))
+        if lost:
+            return
+    else:
+        condition_out[0] = 1
     current = slot[w]
     used_slot_out[w] = current
     improved_out[w] = 0
@@ -264,6 +286,7 @@ def _advance_kernel(dtype):
         improved: wp.array[int],
         used_slot: wp.array[int],
         used_history: wp.array[int],
+        active: wp.array[int],
         alpha: wp.array2d[wp.float64],
         omega: wp.array[wp.float64],
         history_s: wp.array2d[vec3],
@@ -299,7 +322,9 @@ def _advance_kernel(dtype):
                 difference = (s_now - history_s[old, i]) + step * (r_now - history_r[old, i])
                 s -= dtype(alpha[w, a]) * difference
         s_out[i] = s
-        store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
+        # what has ended keeps the moments that its error was measured at, and s is the next solve's start
+        if active[w] == 1:
+            store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
 
     return advance
 
@@ -332,7 +357,7 @@ def launch_start(rows, moments, material, b: InductionBuffers, moments_out):
         _start_kernel(moments.dtype),
         dim=rows.count,
         inputs=[rows.target, b.world, b.warm, b.omega, b.h0, material.saturation, material.slope, material.curve],
-        outputs=[b.s, moments_out, moments.packed],
+        outputs=[b.s, b.last_s, b.last_change, moments_out, moments.packed],
         device=moments.device,
     )
 
@@ -395,11 +420,11 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             b.plain_steps,
             b.best,
             b.evaluations,
+            b.warm,
         ],
         outputs=[
             b.error,
             b.converged,
-            b.warm,
             b.mode,
             b.improved,
             b.used_slot,
@@ -419,6 +444,7 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             b.improved,
             b.used_slot,
             b.used_history,
+            b.active,
             b.alpha,
             b.omega,
             b.history_s,

@@ -111,6 +111,52 @@ def test_warm_start_follows_a_slow_motion(device):
     assert system.evaluations.numpy().max() >= cold - 1
 
 
+def test_extrapolation_follows_a_steady_motion(device):
+    """A field that turns steadily costs one evaluation a solve, which no earlier solution would be good enough for."""
+    x, radii, _ = pile(count=150)
+    evaluations, errors = [], []
+    for remembering in (True, False):
+        system = MomentSystem(radii=radii, saturation=MS, rtol=1e-3, device=device)
+        system.positions.assign(x)
+        for angle in 0.01 * np.arange(12.0):
+            field = 0.5 * MS * np.array([np.sin(angle), 0.0, np.cos(angle)])
+            system.external_field.assign(np.tile(field, (150, 1)))
+            if not remembering:
+                system.start_from(system.magnetizations())
+            system.solve()
+            errors.append(system.error.numpy()[0])
+            evaluations.append(system.evaluations.numpy()[0])
+    # two changes are known from the fourth solve on
+    assert max(evaluations[4:12]) == 1 and min(evaluations[13:]) > 1
+    assert max(errors) <= 1e-3
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_starts_never_decide_the_solution(dtype, device):
+    """Whatever was extrapolated before it, a jump, a restored state or a reversed field ends in the one solution."""
+    rng = np.random.default_rng(8)
+    x, radii, _ = pile(count=100)
+    rtol = 1e-5 if dtype == "float32" else 1e-10
+    system = MomentSystem(radii=radii, saturation=MS, rtol=rtol, dtype=dtype, device=device)
+    up, across = MS * np.array([0.1, 0.0, 0.5]), MS * np.array([0.5, -0.2, 0.0])
+    moving = [((1.0 + 0.002 * step) * x, (1.0 + 0.01 * step) * up) for step in range(5)]
+    scattered = x + 0.004 * rng.normal(size=x.shape)
+    states = [
+        *moving, (x[::-1], up), *moving[3:], moving[-1], moving[0], (scattered, up), (x, up), (x, -up), (x, up),
+        (x, 1e3 * up), (x, -1e3 * up), (x, 1e-6 * up), (x, 0.0 * up), (x, 0.0 * up), (x, -up), (scattered, across),
+    ]  # fmt: skip
+    for step, (positions, field) in enumerate(states):
+        positions, field = positions.astype(np.float32).astype(float), field.astype(np.float32).astype(float)
+        system.positions.assign(positions)
+        system.external_field.assign(np.tile(field, (100, 1)))
+        system.solve()
+        exact = oracle.equilibrium(positions, radii, field, saturation=MS).magnetizations
+        found = system.magnetizations().numpy()
+        assert system.converged.numpy()[0] == 1, step
+        # the residual is amplified by the inverse Jacobian, some ten times in a pile
+        assert np.linalg.norm(found - exact) <= 100.0 * rtol * np.linalg.norm(exact), step
+
+
 def test_magnet_that_goes_away(device):
     """Without a field the only solution is no magnetization, from a warm start too."""
     system, _, moments, _ = two_worlds(device)
