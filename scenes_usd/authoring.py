@@ -24,6 +24,10 @@ STEEL_COLOR = (0.55, 0.57, 0.6)
 MAGNET_COLOR = (0.75, 0.08, 0.06)
 GROUND_COLOR = (0.32, 0.33, 0.35)
 
+CONTACT_PATCH = 1e-4
+"""Depth and width of what gives way where two bodies touch [m]: what rolling and spinning cost where there is friction
+(Newton's default for rolling; without it balls circle a magnet for good)."""
+
 BALL_SPACING = 2.002
 """Distance of neighbouring balls in radii: a gap of a thousandth, so that rounding never makes them overlap."""
 
@@ -95,7 +99,7 @@ def add_material(
         metallic: Metalness, 0 to 1.
         roughness: Roughness, 0 to 1.
         density: Mass density [kg/m³] of the bodies that it is bound to.
-        friction: Coefficient of static and dynamic friction.
+        friction: Coefficient of static and dynamic friction; if there is any, rolling and spinning meet some too.
         restitution: Coefficient of restitution.
     """
     UsdGeom.Scope.Define(stage, "/World/Materials")
@@ -106,6 +110,10 @@ def add_material(
     physics.CreateRestitutionAttr(restitution)
     if density is not None:
         physics.CreateDensityAttr(density)
+    material.GetPrim().AddAppliedSchema("NewtonMaterialAPI")
+    for name in ("newton:rollingFriction", "newton:torsionalFriction"):
+        attribute = material.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False)
+        attribute.Set(CONTACT_PATCH if friction else 0.0)
     shader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
     shader.CreateIdAttr("UsdPreviewSurface")
     shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*color))

@@ -15,37 +15,37 @@ from warpmag.scenes_usd import authoring
 from warpmag.usd import author_magnet
 
 CRYSTAL_COLOR = (0.45, 0.68, 0.8)
-_FILL = 0.8
-"""Thickness of the bar magnet over the width of the row of places that it takes."""
 
 
 def author(
     path: str | os.PathLike,
     *,
-    columns: int = 14,
+    columns: int = 16,
     rows: int = 13,
-    bar: int = 4,
-    radius: float = 0.01,
-    spacing: float = 0.026,
-    strong: float = 1e7,
-    weak: float = 1e5,
+    bar: int = 10,
+    bar_rows: int = 3,
+    radius: float = 0.005,
+    spacing: float = 0.011,
+    strong: float = 4e7,
+    weak: float = 1e6,
     strength: str = "strong",
 ) -> None:
     """Write the stage to ``path``.
 
     Args:
         path: USD file to write.
-        columns: Places along x; with the number of places for the bar both even or both odd.
-        rows: Places along z, an odd number.
-        bar: Places in the middle row that the bar magnet takes.
+        columns: Places along x.
+        rows: Places along z.
+        bar: Places along x, in the middle, that the bar magnet takes.
+        bar_rows: Places along z that it takes.
         radius: Radius of the balls [m].
         spacing: Distance of neighbouring places [m].
         strong: Magnetization of the strong magnet, along x [A/m].
         weak: Magnetization of the weak magnet, along x [A/m].
         strength: The magnet that is selected, strong or weak.
     """
-    _check(columns, rows, bar, radius, spacing, strength)
-    count = columns * rows - bar
+    _check(columns, rows, bar, bar_rows, radius, spacing, strength)
+    count = columns * rows - bar * bar_rows
     stage = authoring.new_stage(
         f"Crystal Balls: {count} fixed balls show the field of a bar magnet and of each other\n\n"
         "Kim and Han 2022, Fig. 7. Nothing moves but the magnetizations. Variant set strength: strong, weak.",
@@ -54,15 +54,15 @@ def author(
     authoring.add_scene(stage, MagneticSettings(), gravity=0.0)
     crystal = authoring.add_material(stage, "Crystal", color=CRYSTAL_COLOR, roughness=0.1, density=2650.0)
     magnet = authoring.add_material(stage, "Magnet", color=authoring.MAGNET_COLOR, density=7500.0)
-    thickness = _FILL * spacing
-    sizes = ((bar - 1) * spacing + thickness, thickness, thickness)
+    gap = spacing - 2.0 * radius
+    sizes = (bar * spacing - gap, bar_rows * spacing - gap, bar_rows * spacing - gap)
     prim = authoring.add_box(stage, "/World/Magnet", (0.0, 0.0, 0.0), sizes, magnet, motion=authoring.KINEMATIC)
     _add_strengths(prim, {"strong": strong, "weak": weak}, strength)
     UsdGeom.Scope.Define(stage, "/World/Balls")
-    middle_row, first, last = rows // 2, (columns - bar) // 2, (columns + bar) // 2
-    places = [(x, z) for z in range(rows) for x in range(columns) if z != middle_row or not first <= x < last]
-    for number, (x, z) in enumerate(places):
-        position = ((x - 0.5 * (columns - 1)) * spacing, 0.0, (z - middle_row) * spacing)
+    places = [(x - 0.5 * (columns - 1), z - 0.5 * (rows - 1)) for z in range(rows) for x in range(columns)]
+    around = [(x, z) for x, z in places if abs(x) > 0.5 * bar or abs(z) > 0.5 * bar_rows]
+    for number, (x, z) in enumerate(around):
+        position = (x * spacing, 0.0, z * spacing)
         authoring.add_ball(
             stage,
             f"/World/Balls/Ball_{number:04d}",
@@ -79,13 +79,12 @@ def author(
     authoring.save(stage, path)
 
 
-def _check(columns, rows, bar, radius, spacing, strength) -> None:
-    for name, value in (("columns", columns), ("rows", rows), ("bar", bar)):
+def _check(columns, rows, bar, bar_rows, radius, spacing, strength) -> None:
+    for name, value in (("columns", columns), ("rows", rows), ("bar", bar), ("bar_rows", bar_rows)):
         authoring.check_count(name, value)
-    if rows % 2 == 0:
-        raise InputError(f"rows: must be odd, for the bar magnet lies in the middle one, got {rows}")
-    if bar > columns or (columns - bar) % 2:
-        raise InputError(f"bar: must leave as many places on either side in a row of {columns}, got {bar}")
+    for name, value, whole in (("bar", bar, columns), ("bar_rows", bar_rows, rows)):
+        if value > whole or (whole - value) % 2:
+            raise InputError(f"{name}: must leave as many places on either side of {whole}, got {value}")
     if spacing < authoring.BALL_SPACING * radius:
         raise InputError(f"spacing: balls of radius {radius:g} m would touch, got {spacing:g} m")
     if strength not in ("strong", "weak"):

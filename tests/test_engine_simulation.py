@@ -13,8 +13,8 @@ from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.statistics import find_held
 from warpmag.engine.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
-from warpmag.magnets import Magnet
-from warpmag.scenes_usd import balls_up
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.scenes_usd import authoring, balls_up
 from warpmag.usd import author_magnet
 
 R = 0.005  # m
@@ -189,10 +189,37 @@ def test_gaps_follow_the_size_of_the_bodies(reference):
 def test_who_is_held():
     # 0 ground, 1 magnet, 2 and 3 hang on it in a chain, 4 stands on the ground and touches 3, 5 flies
     fixed = np.array([True, True, False, False, False, False])
-    magnetic = np.array([False, True, True, True, True, True])
+    holders = np.array([False, True, False, False, False, False])
     pairs = np.array([(1, 2), (3, 2), (3, 4), (0, 4)])
-    assert np.flatnonzero(find_held(pairs, magnetic, fixed)).tolist() == [2, 3]
-    assert not find_held(np.zeros((0, 2), int), magnetic, fixed).any()
+    assert np.flatnonzero(find_held(pairs, holders, fixed)).tolist() == [2, 3]
+    assert not find_held(np.zeros((0, 2), int), holders, fixed).any()
+
+
+def test_a_magnet_that_lies_on_the_ground_holds_what_touches_it():
+    # 0 ground, 1 magnet on it, 2 touches both, 3 hangs on 1, 4 hangs on 3, 5 touches 2 and the ground, 6 touches 2
+    fixed = np.array([True, False, False, False, False, False, False])
+    holders = np.array([False, True, False, False, False, False, False])
+    pairs = np.array([(0, 1), (1, 2), (0, 2), (3, 1), (4, 3), (2, 5), (5, 0), (2, 6)])
+    assert np.flatnonzero(find_held(pairs, holders, fixed)).tolist() == [2, 3, 4]
+
+
+def test_only_what_has_friction_resists_rolling(device, tmp_path):
+    path = tmp_path / "materials.usda"
+    stage = authoring.new_stage("Three materials", seconds=1.0)
+    authoring.add_scene(stage, MagneticSettings())
+    for number, friction in enumerate((0.0, 0.4, 0.4)):
+        material = authoring.add_material(stage, f"Material_{number}", color=(1.0, 1.0, 1.0), friction=friction)
+        authoring.add_ball(stage, f"/World/Ball_{number}", (0.1 * number, 0.0, 0.0), R, material, magnet=Magnet())
+        if number != 1:  # as another tool would write it, who knows nothing of Newton's attributes
+            for name in ("newton:rollingFriction", "newton:torsionalFriction"):
+                material.GetPrim().RemoveProperty(name)
+    authoring.save(stage, path)
+    model = Simulation(path, device=device).model
+    default = newton.ModelBuilder.ShapeConfig()
+    rolling, spinning = model.shape_material_mu_rolling.numpy(), model.shape_material_mu_torsional.numpy()
+    patch = authoring.CONTACT_PATCH
+    np.testing.assert_allclose(rolling, [0.0, patch, default.mu_rolling], rtol=1e-6)
+    np.testing.assert_allclose(spinning, [0.0, patch, default.mu_torsional], rtol=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -172,10 +172,10 @@ def test_trees_are_whole_tapered_and_reproducible():
     assert lengths.min() > 0.0 and 0.3 < tree.nodes[:, 2].max() < 0.45
 
 
-@pytest.mark.parametrize("strength,field", [("strong", 1e7), ("weak", 1e5)])
+@pytest.mark.parametrize("strength,field", [("strong", 4e7), ("weak", 1e6)])
 def test_crystal_balls_have_a_strong_and_a_weak_magnet(tmp_path, strength, field):
     stage = open_stage(bundled()["crystal_balls"])
-    assert read_magnets(stage).magnets["/World/Magnet"].magnetization == (1e7, 0.0, 0.0)
+    assert read_magnets(stage).magnets["/World/Magnet"].magnetization == (4e7, 0.0, 0.0)
     stage.GetPrimAtPath("/World/Magnet").GetVariantSet("strength").SetVariantSelection(strength)
     assert read_magnets(stage).magnets["/World/Magnet"].magnetization == (field, 0.0, 0.0)
     crystal_balls.author(tmp_path / "scene.usdc", strength=strength)
@@ -190,7 +190,7 @@ def test_other_counts_and_sizes(tmp_path):
     assert len(check(path).magnets("inducible")) == 3000 and not check(path).findings
     assert 3 <= len(check(path).magnets("permanent")) <= 12
     assert _least_gap(*_balls(open_stage(path))) > 0.0
-    crystal_balls.author(path, columns=5, rows=7, bar=1)
+    crystal_balls.author(path, columns=5, rows=7, bar=1, bar_rows=1)
     assert len(check(path).magnets("inducible")) == 34 and not check(path).findings
 
 
@@ -209,9 +209,9 @@ def test_other_letters(tmp_path):
         (falling_magnet.author, {"drop": 0.0}, "drop"),
         (sakura_tree.author, {"spacing": 0.01}, "spacing"),
         (sakura_tree.author, {"bud_radius": 0.1}, "bud_radius"),
-        (crystal_balls.author, {"rows": 4}, "rows"),
+        (crystal_balls.author, {"rows": 4}, "bar_rows"),
         (crystal_balls.author, {"bar": 3}, "bar"),
-        (crystal_balls.author, {"spacing": 0.02}, "spacing"),
+        (crystal_balls.author, {"spacing": 0.01}, "spacing"),
         (crystal_balls.author, {"strength": "huge"}, "strength"),
         (alphabets.author, {"layers": 0}, "layers"),
     ],
@@ -285,7 +285,7 @@ def test_newton_imports_the_crystal_balls():
     assert builder.body_count == 179
     assert all(flags & int(newton.BodyFlags.KINEMATIC) for flags in builder.body_flags)
     bar = found["path_shape_map"]["/World/Magnet"]
-    np.testing.assert_allclose(builder.shape_scale[bar], (0.0494, 0.0104, 0.0104), rtol=1e-5)
+    np.testing.assert_allclose(builder.shape_scale[bar], (0.0545, 0.016, 0.016), rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", SCENES)

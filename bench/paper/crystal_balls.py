@@ -1,8 +1,8 @@
 """The crystal balls of the paper's Fig. 7: 178 fixed inducible balls around a bar magnet.
 
 The paper gives the count and the picture, neither sizes nor strengths. Here the balls fill a plane grid of 16 × 13
-cells, out of which the bar takes the middle 10 × 3; second choice, the 14 × 13 cells and bar of 4 × 1 of the bundled
-scene, where the fields at the balls differ by more. Two strengths of the bar:
+cells, out of which the bar takes the middle 10 × 3, as in the bundled scene; second choice, 14 × 13 cells and a bar of
+4 × 1, where the fields at the balls differ by more. Two strengths of the bar:
 
 * weak, 1e6 A/m, neodymium: no ball of iron saturates, ‖H‖ is 0.8 to 20 % of Ms;
 * strong, 4e7 A/m, "excessively strong" as in the paper's scenes: ‖H‖ is 0.3 to 8 Ms.

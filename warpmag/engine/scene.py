@@ -49,9 +49,6 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False) -> ImportedS
     magnets = read_magnets(stage)
     clock = stage_clock(stage)
     builder = newton.ModelBuilder()
-    # USD knows no torsional and no rolling friction: a stage that says "no friction" must not get Newton's.
-    builder.default_shape_cfg.mu_torsional = 0.0
-    builder.default_shape_cfg.mu_rolling = 0.0
     register_attributes(builder)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -59,6 +56,7 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False) -> ImportedS
             found = builder.add_usd(stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals)
         except (ValueError, RuntimeError, NotImplementedError) as error:
             raise InputError(f"{path}: Newton cannot import it ({' '.join(str(error).split())})") from None
+    _let_frictionless_roll(builder)
     bodies, shapes = found["path_body_map"], found["path_shape_map"]
     covered = {}
     for prim, magnet in magnets.magnets.items():
@@ -87,3 +85,15 @@ def _axis_turn(stage, prim: str):
     axis = stage.GetPrimAtPath(prim).GetAttribute("axis")
     value = axis.Get() if axis else None
     return newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.from_any(value)) if value else wp.quat_identity()
+
+
+def _let_frictionless_roll(builder: newton.ModelBuilder) -> None:
+    """Take Newton's default torsional and rolling friction, which USD does not know, from shapes without friction."""
+    default = builder.default_shape_cfg
+    for values, given in (
+        (builder.shape_material_mu_torsional, default.mu_torsional),
+        (builder.shape_material_mu_rolling, default.mu_rolling),
+    ):
+        for shape, mu in enumerate(builder.shape_material_mu):
+            if mu == 0.0 and values[shape] == given:
+                values[shape] = 0.0

@@ -258,20 +258,21 @@ class Simulation:
         return figures
 
     def _held(self) -> np.ndarray:
-        """Return which bodies a fixed magnet holds; behind the bodies stand the static shapes, each for itself."""
+        """Return which bodies a magnet holds; behind the bodies stand the static shapes, each for itself."""
         model, contacts = self.model, self._solver.contacts
         shape_body = model.shape_body.numpy()
         node = np.where(shape_body >= 0, shape_body, model.body_count + np.arange(model.shape_count))
         fixed = np.ones(model.body_count + model.shape_count, dtype=bool)
         fixed[: model.body_count] = ~np.isfinite(self._sizes.thickness)
-        magnetic = np.zeros_like(fixed)
-        magnetic[node[self.magnetics.shapes]] = True
+        permanent = [one.magnet.kind == "permanent" for one in self.magnetics.magnets for _ in one.shapes]
+        holds = np.zeros_like(fixed)
+        holds[node[self.magnetics.shapes[fixed[node[self.magnetics.shapes]] | permanent]]] = True
 
         count = int(contacts.rigid_contact_count.numpy()[0])
         sides = [getattr(contacts, f"rigid_contact_shape{k}").numpy()[:count] for k in (0, 1)]
         pairs = node[np.stack(sides, axis=1)]
         touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
-        return find_held(pairs[touching], magnetic, fixed)[: model.body_count]
+        return find_held(pairs[touching], holds, fixed)[: model.body_count]
 
 
 @contextlib.contextmanager

@@ -29,7 +29,7 @@ class Statistics:
         depth: Deepest penetration [m].
         final_overlap: The same as ``overlap``, at the end.
         rms_speed: Root mean square speed of the magnets at the end [m/s].
-        held: Magnets held by a fixed magnet, off everything else that is fixed, at the end.
+        held: Magnets held by a permanent or fixed magnet at the end, see :func:`find_held`.
         held_rms_speed: Root mean square speed of those [m/s].
         farthest: Largest distance of a magnet from the centre of where they all started, in any frame [m].
         overlapping: Contacts that overlap at the start.
@@ -111,31 +111,33 @@ class Statistics:
             f"farthest       {self.farthest:.3f} m from the centre of the start",
         ]
         if self.held:
-            lines.append(f"held           {self.held} by a fixed magnet, RMS {100.0 * self.held_rms_speed:.2f} cm/s")
+            lines.append(f"held           {self.held} by a magnet, RMS {100.0 * self.held_rms_speed:.2f} cm/s")
         return lines
 
 
-def find_held(pairs: np.ndarray, magnetic: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Return which bodies hang on a fixed magnet, directly or through others that do not stand on the ground.
+def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """Return which bodies a magnet holds: those that touch it, and what hangs on them and does not stand on the ground.
 
     Args:
         pairs: Bodies that touch, shape [n, 2].
-        magnetic: Whether each body is a magnet.
+        holders: Whether each body is a magnet that holds others, by being permanent or by being fixed.
         fixed: Whether each body is fixed in the world; the ground is one that is no magnet.
 
     Returns:
         Whether each body is held.
     """
-    grounded = np.zeros(len(fixed), dtype=bool)
-    for one, other in (pairs.T, pairs.T[::-1]):
-        grounded[other[fixed[one] & ~magnetic[one]]] = True
-    free = ~fixed & ~grounded
-    held = np.zeros(len(fixed), dtype=bool)
-    while True:
-        holds = held | (fixed & magnetic)
+
+    def neighbors(of: np.ndarray) -> np.ndarray:
         touched = np.zeros(len(fixed), dtype=bool)
-        touched[pairs[holds[pairs].any(axis=1)]] = True
-        more = touched & free
+        for one, other in (pairs.T, pairs.T[::-1]):
+            touched[other[of[one]]] = True
+        return touched
+
+    grounded = neighbors(fixed & ~holders)
+    touching = neighbors(holders) & ~fixed & ~holders
+    held = touching
+    while True:
+        more = touching | (neighbors(held & ~grounded) & ~grounded & ~fixed & ~holders)
         if (more == held).all():
             return held
         held = more
