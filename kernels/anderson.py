@@ -1,7 +1,8 @@
 """Anderson acceleration: the small least squares that mixes the last few iterates.
 
-Residuals are kept in a ring of slots. Given the sums ⟨φr_a, φr_b⟩ over all pairs of slots, the coefficients are
-α = argmin ‖φ (r − Σ_j α_j Δr_j)‖, Δr_j the difference of the present residual to the j-th last.
+With the differences Δr_j of the present residual r to the last few, the coefficients are
+α = argmin ‖φ (r − Σ_j α_j Δr_j)‖, j = 0 the latest. Their normal equations are summed over all moments in float64, in
+columns: the right side ⟨φΔr_a, φr⟩, then the upper triangle of the matrix ⟨φΔr_a, φΔr_b⟩, row by row.
 """
 
 import warp as wp
@@ -9,29 +10,30 @@ import warp as wp
 DEPTH = 5
 """Earlier iterates that are mixed."""
 SLOTS = DEPTH + 1
-GRAM_COLUMNS = SLOTS * (SLOTS + 1) // 2
-"""Products of two slots, the lower one first."""
+"""Iterates that are kept, in a ring: the earlier ones and the present one."""
+COLUMNS = DEPTH + DEPTH * (DEPTH + 1) // 2
+"""Sums that the normal equations take."""
 _RIDGE = 1.0e-9
 """Relative ridge of the least squares: below it differences of float32 residuals are rounding."""
 _LARGEST = 1.0e4
 """Sum of |α_j| beyond which the iterates are as good as dependent."""
-
-
-def gram_slots() -> list[tuple[int, int]]:
-    """Return the two slots whose product each Gram column holds."""
-    return [(a, b) for a in range(SLOTS) for b in range(a, SLOTS)]
-
 
 _matrix = wp.types.matrix((DEPTH, DEPTH), wp.float64)
 _vector = wp.types.vector(DEPTH, wp.float64)
 
 
 @wp.func
-def gram_column(a: int, b: int):
-    """Column that holds the product of slots ``a`` and ``b``."""
+def slot_of(current: int, age: int):
+    """Slot of the iterate ``age`` before the one in slot ``current``."""
+    return (current - age + wp.static(SLOTS)) % wp.static(SLOTS)
+
+
+@wp.func
+def matrix_column(a: int, b: int):
+    """Column that holds the product of differences ``a`` and ``b``."""
     low = wp.min(a, b)
     high = wp.max(a, b)
-    return low * wp.static(SLOTS) - (low * (low - 1)) // 2 + high - low
+    return wp.static(DEPTH) + low * wp.static(DEPTH) - (low * (low - 1)) // 2 + high - low
 
 
 @wp.func
@@ -58,20 +60,17 @@ def least_squares(matrix: _matrix, right: _vector, size: int):
 
 
 @wp.func
-def anderson_coefficients(world_sums: wp.array2d[wp.float64], w: int, current: int, history: int):
-    """Coefficients α_j of the last ``history`` iterates, latest first; zeros if they are of no use."""
+def anderson_coefficients(sums: wp.array2d[wp.float64], w: int, first: int, history: int):
+    """Coefficients α_j of the last ``history`` iterates; zeros if they are of no use.
+
+    The normal equations are those of world ``w``, in the columns of ``sums`` from ``first`` on.
+    """
     matrix = _matrix()
     right = _vector()
-    own = world_sums[w, gram_column(current, current)]
     for a in range(history):
-        slot_a = (current - 1 - a + wp.static(2 * SLOTS)) % wp.static(SLOTS)
-        with_a = world_sums[w, gram_column(current, slot_a)]
-        right[a] = own - with_a
+        right[a] = sums[w, first + a]
         for b in range(history):
-            slot_b = (current - 1 - b + wp.static(2 * SLOTS)) % wp.static(SLOTS)
-            with_b = world_sums[w, gram_column(current, slot_b)]
-            matrix[a, b] = own - with_a - with_b + world_sums[w, gram_column(slot_a, slot_b)]
-    for a in range(history):
+            matrix[a, b] = sums[w, first + matrix_column(a, b)]
         matrix[a, a] = matrix[a, a] * wp.float64(wp.static(1.0 + _RIDGE))
     alpha = least_squares(matrix, right, history)
     size = wp.float64(0.0)

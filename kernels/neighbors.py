@@ -1,96 +1,292 @@
 """Overlapping pairs: found once per arrangement, corrected in every pass over the pairs.
 
 The all-pairs loops clamp the dipole at contact. What an overlapping pair lacks is added here, from a short list of
-neighbours per moment. A list that is full is no error: its target walks all its sources instead.
+neighbours per moment, in the order of their indices. A list that is full is no error: its target walks all its sources
+instead.
 
-While the pairs are at hand, the volume that a ball shares with its neighbours is summed:
-o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
-Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie above
-1/3 − (1 + max o_i), which is −2/3 without overlap. From it the induction solver takes a step length that converges for
-any arrangement.
+Lists hold everything nearer than (1 + ``SKIN``) times contact, and are made anew once a moment has moved by ``SKIN``
+times its radius: what was farther apart is until then farther than contact.
+
+The search sorts moments into cubic cells as wide as the farthest pair of a list. A hash table holds for each cell the
+last moment that was put in, and each moment knows the one before it; as the lists are sorted, the order in which
+threads came does not show. A target meets its neighbours in its own cell and the 26 around it.
 """
 
+import math
+from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction
 
 CAPACITY = 32
 """Neighbours a list can hold before its target falls back to walking all its sources."""
+SKIN = 0.1
+"""Part of its radius that a moment may move before the lists are made anew."""
+_BUCKETS_PER_MOMENT = 4
+_FARTHEST_CELL = 1.0e9
+"""Cells from the origin beyond which a moment is left out: its cell would be no integer."""
+
+
+@wp.func
+def bucket_of(cell: wp.vec4i, bucket_count: int):
+    """Place of a cell (x, y, z, group) in a hash table of 2ᵏ buckets, after Teschner et al. 2003."""
+    x = wp.uint32(cell[0]) * wp.uint32(73856093)
+    y = wp.uint32(cell[1]) * wp.uint32(19349663)
+    z = wp.uint32(cell[2]) * wp.uint32(83492791)
+    mixed = x ^ y ^ z ^ (wp.uint32(cell[3]) * wp.uint32(49979687))
+    return int(mixed & wp.uint32(bucket_count - 1))
+
+
+@wp.func
+def find_cell(packed: wp.array2d(dtype=Any), i: int, group: int, width: wp.float64):
+    """Cell (x, y, z, group) of moment ``i``, and whether it has one."""
+    x = wp.float64(packed[0, i]) / width
+    y = wp.float64(packed[1, i]) / width
+    z = wp.float64(packed[2, i]) / width
+    farthest = wp.max(wp.abs(x), wp.max(wp.abs(y), wp.abs(z)))
+    inside = farthest < wp.float64(wp.static(_FARTHEST_CELL)) and wp.isfinite(x + y + z)
+    cell = wp.vec4i(0, 0, 0, group)
+    if inside:
+        cell = wp.vec4i(int(wp.floor(x)), int(wp.floor(y)), int(wp.floor(z)), group)
+    return cell, inside
+
+
+@wp.kernel(enable_backward=False)
+def empty_buckets(
+    # inputs:
+    moved: wp.array[int],
+    # outputs:
+    searching_out: wp.array[int],
+    last_out: wp.array[int],
+):
+    """Empty the hash table if lists are to be made anew."""
+    k = wp.tid()
+    if k == 0:
+        searching_out[0] = moved[0]
+    if moved[0] == 1:
+        last_out[k] = -1
 
 
 @cache
-def _find_kernel(dtype):
+def _fill_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def fill_cells(
+        # inputs:
+        sources: wp.array2d[dtype],
+        group: wp.array[int],
+        width: wp.float64,
+        searching: wp.array[int],
+        # outputs:
+        cell_out: wp.array[wp.vec4i],
+        last_out: wp.array[int],
+        before_out: wp.array[int],
+        moved_out: wp.array[int],
+    ):
+        j = wp.tid()
+        if j == 0:
+            moved_out[0] = 0
+        if searching[0] == 0:
+            return
+        cell, inside = find_cell(sources, j, group[j], width)
+        cell_out[j] = cell
+        if inside:
+            before_out[j] = wp.atomic_exch(last_out, bucket_of(cell, last_out.shape[0]), j)
+
+    return fill_cells
+
+
+@cache
+def _search_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def find_neighbors(
+    def search_cells(
         # inputs:
-        grid: wp.uint64,
         targets: wp.array2d[dtype],
         sources: wp.array2d[dtype],
         group: wp.array[int],
-        largest_radius: dtype,
+        width: wp.float64,
+        searching: wp.array[int],
+        cell: wp.array[wp.vec4i],
+        last: wp.array[int],
+        before: wp.array[int],
         same_set: int,
         # outputs:
         neighbor_out: wp.array2d[int],
         neighbor_count_out: wp.array[int],
-        overlap_out: wp.array[dtype],
+        found_at_out: wp.array[vec3],
     ):
+        if searching[0] == 0:
+            return
         i = wp.tid()
         x = vec3(targets[0, i], targets[1, i], targets[2, i])
-        radius = targets[3, i]
+        found_at_out[i] = x
+        own, inside = find_cell(targets, i, group[i], width)
         count = int(0)
-        overlap = dtype(0.0)
-        reach = radius + largest_radius
-        if not (wp.length(x) < dtype(1.0e9) * reach):
-            # not finite, or so far out that its cell index overflows: no neighbours
-            neighbor_count_out[i] = 0
-            overlap_out[i] = dtype(0.0)
-            return
-        point = wp.vec3(float(x[0]), float(x[1]), float(x[2]))
-        query = wp.hash_grid_query(grid, point, float(reach), group[i])
-        j = int(0)
-        while wp.hash_grid_query_next(query, j):
-            r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
-            d2 = wp.dot(r, r)
-            s = radius + sources[3, j]
-            if d2 < s * s and not (same_set == 1 and i == j):
-                if count < wp.static(CAPACITY):
-                    neighbor_out[i, count] = j
-                count += 1
-                if radius > dtype(0.0) and sources[3, j] > dtype(0.0):
-                    overlap += overlap_fraction(wp.sqrt(d2), radius, sources[3, j])
+        if inside:
+            for k in range(27):
+                sought = own + wp.vec4i(k // 9 - 1, (k // 3) % 3 - 1, k % 3 - 1, 0)
+                j = last[bucket_of(sought, last.shape[0])]
+                while j >= 0:
+                    # a bucket may hold several cells
+                    if cell[j] == sought and not (same_set == 1 and i == j):
+                        r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
+                        s = dtype(wp.static(1.0 + SKIN)) * (targets[3, i] + sources[3, j])
+                        if wp.dot(r, r) < s * s:
+                            if count < wp.static(CAPACITY):
+                                place = count
+                                for back in range(count):
+                                    other = neighbor_out[i, count - 1 - back]
+                                    if other < j:
+                                        break
+                                    place = count - 1 - back
+                                    neighbor_out[i, place + 1] = other
+                                neighbor_out[i, place] = j
+                            count += 1
+                    j = before[j]
         neighbor_count_out[i] = count
-        overlap_out[i] = overlap
 
-    return find_neighbors
+    return search_cells
 
 
-def launch_find_neighbors(
-    grid, targets, sources, group, largest_radius, same_set, neighbors, neighbor_counts, overlaps
-):
-    """List the sources that overlap each target.
+@dataclass(frozen=True)
+class NeighborLists:
+    """Neighbours of n moments, and what their search keeps.
+
+    Attributes:
+        neighbor: Indices of the neighbours, ascending, shape [n, CAPACITY].
+        count: How many there are, also beyond the capacity, shape [n].
+        found_at: Where each moment was when the lists were made [m], shape [n].
+        moved: Whether one has moved too far since, shape [1]; set by ``packing``.
+        searching: Whether the search that runs makes lists, shape [1].
+        cell: Cell (x, y, z, group) of each moment, shape [n].
+        last: Moment that was last put into each bucket, shape [2ᵏ].
+        before: Moment that was put into its bucket before each, shape [n].
+    """
+
+    neighbor: wp.array
+    count: wp.array
+    found_at: wp.array
+    moved: wp.array
+    searching: wp.array
+    cell: wp.array
+    last: wp.array
+    before: wp.array
+
+
+def allocate(count: int, dtype, device) -> NeighborLists:
+    """Allocate the lists of ``count`` moments, empty."""
+    buckets = 2 ** int(np.ceil(np.log2(_BUCKETS_PER_MOMENT * max(count, 1))))
+    return NeighborLists(
+        neighbor=wp.zeros((count, CAPACITY), dtype=int, device=device),
+        count=wp.zeros(count, dtype=int, device=device),
+        found_at=wp.full(count, math.inf, dtype=wp.types.vector(3, dtype), device=device),
+        moved=wp.ones(1, dtype=int, device=device),
+        searching=wp.zeros(1, dtype=int, device=device),
+        cell=wp.zeros(count, dtype=wp.vec4i, device=device),
+        last=wp.zeros(buckets, dtype=int, device=device),
+        before=wp.zeros(count, dtype=int, device=device),
+    )
+
+
+def launch_find_neighbors(targets, sources, target_group, source_group, reach, lists, source_lists):
+    """List the sources near each target, if moments have moved since the last time.
 
     Args:
-        grid: Hash grid built over the sources' positions, grouped.
         targets: Packed targets, shape [8, t].
         sources: Packed sources, shape [8, n].
-        group: Group of each target; it sees sources of its own group only.
-        largest_radius: Largest source radius [m].
-        same_set: Whether targets and sources are the same moments, so that a moment is not its own neighbour.
-        neighbors: Out, indices of overlapping sources, shape [t, CAPACITY].
-        neighbor_counts: Out, how many there are, also beyond the capacity, shape [t].
-        overlaps: Out, shared volume o_i [dimensionless], shape [t].
+        target_group: Group of each target, shape [t]; it sees sources of its own group only.
+        source_group: Group of each source, shape [n].
+        reach: Distance of the farthest contact [m].
+        lists: The targets' lists.
+        source_lists: The sources' lists, whose cells are used; the targets' own if both are the same moments, none of
+            which is its own neighbour.
     """
+    device, dtype = targets.device, targets.dtype
+    # what is near is nearer than a cell is wide, however the quotient is rounded
+    width = wp.float64((1.0 + SKIN + 1e-6) * reach)
     wp.launch(
-        _find_kernel(targets.dtype),
-        dim=targets.shape[1],
-        inputs=[grid.id, targets, sources, group, targets.dtype(largest_radius), int(same_set)],
-        outputs=[neighbors, neighbor_counts, overlaps],
-        device=targets.device,
+        empty_buckets,
+        dim=source_lists.last.shape[0],
+        inputs=[lists.moved],
+        outputs=[lists.searching, source_lists.last],
+        device=device,
     )
+    wp.launch(
+        _fill_kernel(dtype),
+        dim=sources.shape[1],
+        inputs=[sources, source_group, width, lists.searching],
+        outputs=[source_lists.cell, source_lists.last, source_lists.before, lists.moved],
+        device=device,
+    )
+    wp.launch(
+        _search_kernel(dtype),
+        dim=targets.shape[1],
+        inputs=[
+            targets,
+            sources,
+            target_group,
+            width,
+            lists.searching,
+            source_lists.cell,
+            source_lists.last,
+            source_lists.before,
+            int(lists is source_lists),
+        ],
+        outputs=[lists.neighbor, lists.count, lists.found_at],
+        device=device,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is done with the lists
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def shared_volume(
+    packed: wp.array2d(dtype=Any),
+    i: int,
+    begin: int,
+    end: int,
+    neighbor: wp.array2d[int],
+    neighbor_count: wp.array[int],
+):
+    """Volume that ball ``i`` shares with balls ``begin`` to ``end``, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
+
+    Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
+    above 1/3 − (1 + max o_i), which is −2/3 without overlap. From it the induction solver takes a step length that
+    converges for any arrangement.
+    """
+    total = packed[3, i] - packed[3, i]
+    count = neighbor_count[i]
+    if count <= wp.static(CAPACITY):
+        for n in range(count):
+            j = neighbor[i, n]
+            if j >= begin and j < end:
+                total += pair_overlap(packed, i, j)
+    else:
+        for j in range(begin, end):
+            if j != i:
+                total += pair_overlap(packed, i, j)
+    return total
+
+
+@wp.func
+def pair_overlap(packed: wp.array2d(dtype=Any), i: int, j: int):
+    """Share of their volume that two balls have in common; zero where one has none."""
+    x = packed[0, i] - packed[0, j]
+    y = packed[1, i] - packed[1, j]
+    z = packed[2, i] - packed[2, j]
+    d2 = x * x + y * y + z * z
+    s = packed[3, i] + packed[3, j]
+    if d2 < s * s and packed[3, i] * packed[3, j] > type(s)(0.0):
+        return overlap_fraction(wp.sqrt(d2), packed[3, i], packed[3, j])
+    return type(s)(0.0)
 
 
 @cache

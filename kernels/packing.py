@@ -5,6 +5,8 @@ from typing import Any
 
 import warp as wp
 
+from warpmag.kernels.neighbors import SKIN
+
 
 @wp.func
 def ball_volume(radius: Any):
@@ -32,9 +34,10 @@ def _pack_kernel(dtype):
         moments: wp.array[vec3],
         radii: wp.array[dtype],
         labels: wp.array[int],
+        found_at: wp.array[vec3],
         # outputs:
         packed_out: wp.array2d[dtype],
-        points_out: wp.array[wp.vec3],
+        moved_out: wp.array[int],
     ):
         i = wp.tid()
         x = positions[i]
@@ -44,27 +47,28 @@ def _pack_kernel(dtype):
             packed_out[c + 4, i] = m[c]
         packed_out[3, i] = radii[i]
         packed_out[7, i] = dtype(labels[i])
-        points_out[i] = wp.vec3(float(x[0]), float(x[1]), float(x[2]))
+        if not wp.length(x - found_at[i]) <= dtype(wp.static(SKIN)) * radii[i]:
+            moved_out[0] = 1
 
     return pack
 
 
-def launch_pack(positions, moments, radii, labels, packed, points):
-    """Pack moments.
+def launch_pack(positions, moments, radii, labels, lists, packed):
+    """Pack moments, and tell whether they have moved so far that their neighbours must be sought anew.
 
     Args:
         positions: Positions [m], shape [n].
         moments: Moments [A·m²], shape [n].
         radii: Radii [m], shape [n].
         labels: Body labels, shape [n]; exact in float32 up to 2²⁴.
+        lists: Their neighbours (``neighbors.NeighborLists``); its ``moved`` is set.
         packed: Out, shape [8, n].
-        points: Out, positions in float32 for the neighbour grid [m], shape [n].
     """
     wp.launch(
         _pack_kernel(packed.dtype),
         dim=packed.shape[1],
-        inputs=[positions, moments, radii, labels],
-        outputs=[packed, points],
+        inputs=[positions, moments, radii, labels, lists.found_at],
+        outputs=[packed, lists.moved],
         device=packed.device,
     )
 

@@ -26,10 +26,19 @@ from typing import Any
 
 import warp as wp
 
-from warpmag.kernels.anderson import GRAM_COLUMNS
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio
 from warpmag.kernels.field import finished_field
-from warpmag.kernels.induction import InductionBuffers, launch_start_worlds, launch_sum_worlds
+from warpmag.kernels.induction import (
+    CHUNK,
+    FIELD,
+    GOAL,
+    LACK,
+    STIFFNESS,
+    InductionBuffers,
+    block_sum,
+    relative_error,
+    world_summation,
+)
 from warpmag.kernels.packing import store_magnetization
 
 THETA_EULER, LLG, LLG_DAMPING = 0, 1, 2
@@ -108,6 +117,7 @@ def _start_kernel(dtype):
         row_target: wp.array[int],
         world: wp.array[int],
         warm: wp.array[int],
+        start: wp.array2d[wp.float64],
         h0: wp.array[vec3],
         saturation: wp.array[dtype],
         # in and out:
@@ -118,7 +128,8 @@ def _start_kernel(dtype):
         packed_out: wp.array2d[dtype],
     ):
         i = row_target[wp.tid()]
-        if warm[world[i]] == 0:
+        # without a field the one solution is no magnetization, which a cold start hits
+        if warm[world[i]] == 0 or start[world[i], wp.static(FIELD)] == wp.float64(0.0):
             u = across(wp.normalize(h0[i]))
             first[i] = u
             second[i] = -u
@@ -165,6 +176,7 @@ def _evaluate_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False)
     def evaluate_pairs(
         # inputs:
+        chunk: wp.array[wp.vec3i],
         partial: wp.array3d[dtype],
         packed: wp.array2d[dtype],
         row_target: wp.array[int],
@@ -178,80 +190,72 @@ def _evaluate_kernel(dtype):
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
-        world: wp.array[int],
         active: wp.array[int],
         # outputs:
         h_out: wp.array[vec3],
-        terms_out: wp.array[vec3],
+        sums_out: wp.array2d[wp.float64],
+        condition_out: wp.array[int],
     ):
-        row = wp.tid()
-        i = row_target[row]
-        if active[world[i]] == 0:
+        c, lane = wp.tid()
+        if c == 0 and lane == 0:
+            condition_out[0] = 0
+        if active[chunk[c][2]] == 0:
             return
-        h = h0[i] + finish(partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count)
-        h_out[i] = h
-        g = (slope[i] / saturation[i]) * h
-        goal = (saturation[i] * curve_ratio(wp.length(g), curve[i])) * g
-        lack = goal - (dtype(0.5) * saturation[i]) * (first[i] + second[i])
-        terms_out[i] = vec3(wp.length(lack), wp.length(goal), dtype(0.0))
+        mine = wp.vec2d()
+        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
+            i = row_target[row]
+            h = h0[i] + finish(
+                partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count
+            )
+            h_out[i] = h
+            g = (slope[i] / saturation[i]) * h
+            goal = (saturation[i] * curve_ratio(wp.length(g), curve[i])) * g
+            # lengths, not squares: a field of 1e-20 A/m squared is no float32
+            goal_length = wp.float64(wp.length(goal))
+            lack_length = wp.float64(wp.length(goal - (dtype(0.5) * saturation[i]) * (first[i] + second[i])))
+            mine[wp.static(LACK)] += lack_length * lack_length
+            mine[wp.static(GOAL)] += goal_length * goal_length
+        total = block_sum(mine)
+        if lane == 0:
+            for column in range(2):
+                sums_out[c, column] = total[column]
 
     return evaluate_pairs
 
 
-@cache
-def _sum_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def sum_errors(
-        # inputs:
-        chunk: wp.array[wp.vec3i],
-        active: wp.array[int],
-        terms: wp.array[vec3],
-        # outputs:
-        sums_out: wp.array2d[wp.float64],
-    ):
-        c = wp.tid()
-        if active[chunk[c][2]] == 0:
-            return
-        lack = wp.float64(0.0)
-        goal = wp.float64(0.0)
-        for i in range(chunk[c][0], chunk[c][1]):
-            a = wp.float64(terms[i][0])
-            b = wp.float64(terms[i][1])
-            lack += a * a
-            goal += b * b
-        sums_out[c, wp.static(GRAM_COLUMNS)] = lack
-        sums_out[c, wp.static(GRAM_COLUMNS + 1)] = goal
-
-    return sum_errors
+_sum_world = world_summation(2)
 
 
 @wp.kernel(enable_backward=False)
 def judge(
     # inputs:
-    world_sums: wp.array2d[wp.float64],
+    chunk_begin: wp.array[int],
+    sums: wp.array2d[wp.float64],
     rtol: wp.float64,
     max_evaluations: int,
     # in and out:
     active: wp.array[int],
     evaluations: wp.array[int],
     # outputs:
+    world_sums_out: wp.array2d[wp.float64],
+    start_out: wp.array2d[wp.float64],
     error_out: wp.array[wp.float64],
     converged_out: wp.array[int],
     warm_out: wp.array[int],
     condition_out: wp.array[int],
 ):
     """Tell which worlds have converged, given up or come to nothing; the others step on."""
-    w = wp.tid()
+    w, lane = wp.tid()
     if active[w] == 0:
         return
+    _sum_world(w, lane, chunk_begin[w], chunk_begin[w + 1], sums, world_sums_out)
+    if lane > 0:
+        return
     evaluations[w] = evaluations[w] + 1
-    error = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS)])
-    goal = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS + 1)])
-    if goal > wp.float64(0.0):
-        error = error / goal
+    error = relative_error(world_sums_out, w)
     error_out[w] = error
+    start_out[w, wp.static(FIELD)] = wp.float64(0.0)
+    start_out[w, wp.static(STIFFNESS)] = wp.float64(0.0)
     lost = not wp.isfinite(error)
     if error <= rtol or evaluations[w] >= max_evaluations or lost:
         active[w] = 0
@@ -311,11 +315,11 @@ def launch_split_magnetizations(rows, magnetizations, material, b: InductionBuff
     if rows.count == 0:
         return
     wp.launch(
-        _split_kernel(b.weight.dtype),
+        _split_kernel(material.saturation.dtype),
         dim=rows.count,
         inputs=[rows.target, b.world, magnetizations, material.saturation],
         outputs=[first, second, b.warm],
-        device=b.weight.device,
+        device=b.h.device,
     )
 
 
@@ -326,16 +330,15 @@ def launch_start_pairs(moments, rows, material, b: InductionBuffers, first, seco
         moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
         rows: Work list whose targets are the inducible moments.
         material: What they are made of (``kernels.wrench.Material``).
-        b: Fields and world state; the iterates and histories in it are not used.
+        b: Fields and world state, as ``induction.launch_begin`` left them.
         first: Directions of M1, shape [n].
         second: Directions of M2, shape [n].
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
-    launch_start_worlds(moments, material, b)
     wp.launch(
         _start_kernel(moments.dtype),
         dim=rows.count,
-        inputs=[rows.target, b.world, b.warm, b.h0, material.saturation],
+        inputs=[rows.target, b.world, b.warm, b.start, b.h0, material.saturation],
         outputs=[first, second, moments_out, moments.packed],
         device=moments.device,
     )
@@ -375,10 +378,11 @@ def launch_step_pairs(
         max_evaluations: Field evaluations after which a world gives up.
     """
     device, dtype = moments.device, moments.dtype
-    wp.launch(
+    wp.launch_tiled(
         _evaluate_kernel(dtype),
-        dim=rows.count,
+        dim=[b.chunk.shape[0]],
         inputs=[
+            b.chunk,
             partial,
             moments.packed,
             rows.target,
@@ -392,21 +396,18 @@ def launch_step_pairs(
             material.saturation,
             material.slope,
             material.curve,
-            b.world,
             b.active,
         ],
-        outputs=[b.h, b.terms],
+        outputs=[b.h, b.sums, b.condition],
+        block_dim=CHUNK,
         device=device,
     )
-    wp.launch(
-        _sum_kernel(dtype), dim=b.chunk.shape[0], inputs=[b.chunk, b.active, b.terms], outputs=[b.sums], device=device
-    )
-    launch_sum_worlds(b)
-    wp.launch(
+    wp.launch_tiled(
         judge,
-        dim=b.omega.shape[0],
-        inputs=[b.world_sums, wp.float64(rtol), max_evaluations, b.active, b.evaluations],
-        outputs=[b.error, b.converged, b.warm, b.condition],
+        dim=[b.error.shape[0]],
+        inputs=[b.chunk_begin, b.sums, wp.float64(rtol), max_evaluations, b.active, b.evaluations],
+        outputs=[b.world_sums, b.start, b.error, b.converged, b.warm, b.condition],
+        block_dim=CHUNK,
         device=device,
     )
     wp.launch(

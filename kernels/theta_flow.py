@@ -19,13 +19,28 @@ is only a start, and whatever it is worth the solve converges to the one solutio
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from warpmag.kernels.anderson import DEPTH, GRAM_COLUMNS, SLOTS, anderson_coefficients
+from warpmag.kernels.anderson import DEPTH, SLOTS, anderson_coefficients, matrix_column, slot_of
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio, theta_flow
 from warpmag.kernels.field import finished_field
-from warpmag.kernels.induction import COLUMNS, InductionBuffers, launch_start_worlds, launch_sum_worlds
+from warpmag.kernels.induction import (
+    CHUNK,
+    COLUMNS,
+    FIELD,
+    GOAL,
+    LACK,
+    MERIT,
+    STIFFNESS,
+    TERMS,
+    InductionBuffers,
+    block_sum,
+    relative_error,
+    step_length,
+    world_summation,
+)
 from warpmag.kernels.packing import store_magnetization
 
 PLAIN_STEPS = SLOTS
@@ -45,7 +60,7 @@ def _start_kernel(dtype):
         row_target: wp.array[int],
         world: wp.array[int],
         warm: wp.array[int],
-        omega: wp.array[wp.float64],
+        start: wp.array2d[wp.float64],
         h0: wp.array[vec3],
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
@@ -61,20 +76,21 @@ def _start_kernel(dtype):
         i = row_target[wp.tid()]
         w = world[i]
         s = s_inout[i]
-        if warm[w] == 0:
+        change = s - last_s[i]
+        earlier = last_change[i]
+        # without a field the one solution is no magnetization, which a cold start hits
+        cold = warm[w] == 0 or start[w, wp.static(FIELD)] == wp.float64(0.0)
+        if cold:
             # the θ flow with κ = k from no magnetization: exact for a lone ball; shorter where balls overlap deeply
-            step = wp.min(dtype(1.0), dtype(omega[w]) / dtype(0.6))
+            step = wp.min(dtype(1.0), dtype(step_length(start[w, wp.static(STIFFNESS)])) / dtype(0.6))
             s = (step * slope[i] / saturation[i]) * h0[i]
-            s_inout[i] = s
-        else:
-            change = s - last_s[i]
-            earlier = last_change[i]
-            last_s[i] = s
-            last_change[i] = change
-            square = wp.dot(earlier, earlier)
-            if warm[w] == wp.static(STEADY) and square > dtype(0.0):
-                s += wp.clamp(wp.dot(change, earlier) / square, dtype(0.0), dtype(1.0)) * change
-                s_inout[i] = s
+            change = vec3()
+        last_s[i] = s
+        last_change[i] = change
+        square = wp.dot(earlier, earlier)
+        if warm[w] == wp.static(STEADY) and square > dtype(0.0):
+            s += wp.clamp(wp.dot(change, earlier) / square, dtype(0.0), dtype(1.0)) * change
+        s_inout[i] = s
         store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
 
     return start_moments
@@ -104,14 +120,26 @@ def _set_state_kernel(dtype):
     return set_state
 
 
+@wp.func
+def product(a: Any, b: Any):
+    """Product of two vectors in float64."""
+    total = wp.float64(0.0)
+    for k in range(3):
+        total += wp.float64(a[k]) * wp.float64(b[k])
+    return total
+
+
 @cache
 def _residual_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
+    differences = wp.types.matrix((DEPTH, 3), dtype)
+    columns = wp.types.vector(COLUMNS, wp.float64)
     finish = finished_field(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def residuals(
         # inputs:
+        chunk: wp.array[wp.vec3i],
         partial: wp.array3d[dtype],
         packed: wp.array2d[dtype],
         row_target: wp.array[int],
@@ -124,89 +152,75 @@ def _residual_kernel(dtype):
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
-        world: wp.array[int],
         active: wp.array[int],
+        history: wp.array[int],
         slot: wp.array[int],
         # outputs:
         h_out: wp.array[vec3],
         history_s_out: wp.array2d[vec3],
         history_r_out: wp.array2d[vec3],
-        weight_out: wp.array[dtype],
-        terms_out: wp.array[vec3],
+        sums_out: wp.array2d[wp.float64],
+        condition_out: wp.array[int],
     ):
-        row = wp.tid()
-        i = row_target[row]
-        w = world[i]
+        c, lane = wp.tid()
+        if c == 0 and lane == 0:
+            condition_out[0] = 0
+        w = chunk[c][2]
         if active[w] == 0:
             return
-        h = h0[i] + finish(partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count)
-        h_out[i] = h
-        s = s_in[i]
-        g = (slope[i] / saturation[i]) * h
-        r = g - s
-        history_s_out[slot[w], i] = s
-        history_r_out[slot[w], i] = r
-        length_s = wp.length(s)
-        length_g = wp.length(g)
-        weight = saturation[i] * curve_ratio(wp.max(length_s, length_g), curve[i])
-        weight_out[i] = weight
-        goal = (saturation[i] * curve_ratio(length_g, curve[i])) * g
-        lack = goal - (saturation[i] * curve_ratio(length_s, curve[i])) * s
-        # lengths, not squares: a field of 1e-20 A/m squared is no float32
-        terms_out[i] = vec3(wp.length(lack), wp.length(goal), weight * wp.length(r))
+        current = slot[w]
+        mine = columns()
+        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
+            i = row_target[row]
+            h = h0[i] + finish(
+                partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count
+            )
+            h_out[i] = h
+            s = s_in[i]
+            g = (slope[i] / saturation[i]) * h
+            r = g - s
+            history_s_out[current, i] = s
+            history_r_out[current, i] = r
+            length_s = wp.length(s)
+            length_g = wp.length(g)
+            goal = (saturation[i] * curve_ratio(length_g, curve[i])) * g
+            # lengths, not squares: a field of 1e-20 A/m squared is no float32
+            goal_length = wp.float64(wp.length(goal))
+            lack_length = wp.float64(wp.length(goal - (saturation[i] * curve_ratio(length_s, curve[i])) * s))
+            weight = wp.float64(saturation[i] * curve_ratio(wp.max(length_s, length_g), curve[i]))
+            merit = weight * wp.float64(wp.length(r))
+            mine[wp.static(LACK)] += lack_length * lack_length
+            mine[wp.static(GOAL)] += goal_length * goal_length
+            mine[wp.static(MERIT)] += merit * merit
+            change = differences()
+            for a in range(wp.static(DEPTH)):
+                if a < history[w]:
+                    old = history_r_out[slot_of(current, a + 1), i]
+                    for k in range(3):
+                        change[a, k] = r[k] - old[k]
+                    mine[wp.static(TERMS) + a] += weight * weight * product(change[a], r)
+                    for b in range(a + 1):
+                        mine[wp.static(TERMS) + matrix_column(b, a)] += weight * weight * product(change[b], change[a])
+        total = block_sum(mine)
+        if lane == 0:
+            for column in range(wp.static(COLUMNS)):
+                sums_out[c, column] = total[column]
 
     return residuals
 
 
-@cache
-def _sum_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def sum_chunks(
-        # inputs:
-        chunk: wp.array[wp.vec3i],
-        active: wp.array[int],
-        column_slots: wp.array[wp.vec2i],
-        history_r: wp.array2d[vec3],
-        weight: wp.array[dtype],
-        terms: wp.array[vec3],
-        # outputs:
-        sums_out: wp.array2d[wp.float64],
-    ):
-        c, column = wp.tid()
-        if active[chunk[c][2]] == 0:
-            return
-        total = wp.float64(0.0)
-        if column < wp.static(GRAM_COLUMNS):
-            a = column_slots[column][0]
-            b = column_slots[column][1]
-            for i in range(chunk[c][0], chunk[c][1]):
-                f = wp.float64(weight[i])
-                ra = history_r[a, i]
-                rb = history_r[b, i]
-                product = (
-                    wp.float64(ra[0]) * wp.float64(rb[0])
-                    + wp.float64(ra[1]) * wp.float64(rb[1])
-                    + wp.float64(ra[2]) * wp.float64(rb[2])
-                )
-                total += f * f * product
-        else:
-            for i in range(chunk[c][0], chunk[c][1]):
-                term = wp.float64(terms[i][column - wp.static(GRAM_COLUMNS)])
-                total += term * term
-        sums_out[c, column] = total
-
-    return sum_chunks
+_sum_world = world_summation(COLUMNS)
 
 
 @wp.kernel(enable_backward=False)
 def decide(
     # inputs:
-    world_sums: wp.array2d[wp.float64],
+    chunk_begin: wp.array[int],
+    sums: wp.array2d[wp.float64],
     rtol: wp.float64,
     max_evaluations: int,
     # in and out:
+    start: wp.array2d[wp.float64],
     active: wp.array[int],
     history: wp.array[int],
     slot: wp.array[int],
@@ -215,6 +229,8 @@ def decide(
     evaluations: wp.array[int],
     warm: wp.array[int],
     # outputs:
+    world_sums_out: wp.array2d[wp.float64],
+    omega_out: wp.array[wp.float64],
     error_out: wp.array[wp.float64],
     converged_out: wp.array[int],
     mode_out: wp.array[int],
@@ -224,21 +240,26 @@ def decide(
     alpha_out: wp.array2d[wp.float64],
     condition_out: wp.array[int],
 ):
-    """Judge each world's iterate and choose its next step."""
-    w = wp.tid()
-    mode_out[w] = wp.static(REST)
+    """Judge each world's iterate and choose its next step; a block sums a world, its first thread judges."""
+    w, lane = wp.tid()
     if active[w] == 0:
+        if lane == 0:
+            mode_out[w] = wp.static(REST)
         return
+    _sum_world(w, lane, chunk_begin[w], chunk_begin[w + 1], sums, world_sums_out)
+    if lane > 0:
+        return
+    mode_out[w] = wp.static(REST)
     evaluations[w] = evaluations[w] + 1
-    lack = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS)])
-    goal = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS + 1)])
-    merit = wp.sqrt(world_sums[w, wp.static(GRAM_COLUMNS + 2)])
-    error = lack
-    if goal > wp.float64(0.0):
-        error = lack / goal
+    merit = wp.sqrt(world_sums_out[w, wp.static(MERIT)])
+    error = relative_error(world_sums_out, w)
     error_out[w] = error
     lost = not wp.isfinite(merit)
     first = best[w] < wp.float64(0.0)
+    if evaluations[w] == 1:
+        omega_out[w] = step_length(start[w, wp.static(STIFFNESS)])
+        start[w, wp.static(STIFFNESS)] = wp.float64(0.0)
+        start[w, wp.static(FIELD)] = wp.float64(0.0)
     if error <= rtol or evaluations[w] >= max_evaluations or (first and lost):
         active[w] = 0
         converged_out[w] = wp.where(error <= rtol, 1, 0)
@@ -265,7 +286,7 @@ def decide(
         improved_out[w] = 1
         plain_steps[w] = 0
     used = wp.where(plain_steps[w] > 0, 0, history[w])
-    alpha = anderson_coefficients(world_sums, w, current, used)
+    alpha = anderson_coefficients(world_sums_out, w, wp.static(TERMS), used)
     for a in range(wp.static(DEPTH)):
         alpha_out[w, a] = alpha[a]
     used_history_out[w] = used
@@ -318,7 +339,7 @@ def _advance_kernel(dtype):
                 best_r[i] = r_now
             s = theta_flow(s_now, s_now + r_now, step)
             for a in range(used_history[w]):
-                old = (current - 1 - a + wp.static(2 * SLOTS)) % wp.static(SLOTS)
+                old = slot_of(current, a + 1)
                 difference = (s_now - history_s[old, i]) + step * (r_now - history_r[old, i])
                 s -= dtype(alpha[w, a]) * difference
         s_out[i] = s
@@ -334,29 +355,28 @@ def launch_set_state(rows, magnetizations, material, b: InductionBuffers):
     if rows.count == 0:
         return
     wp.launch(
-        _set_state_kernel(b.weight.dtype),
+        _set_state_kernel(material.saturation.dtype),
         dim=rows.count,
         inputs=[rows.target, b.world, magnetizations, material.saturation, material.curve],
         outputs=[b.s, b.warm],
-        device=b.weight.device,
+        device=b.h.device,
     )
 
 
 def launch_start(rows, moments, material, b: InductionBuffers, moments_out):
-    """Begin a solve from the applied field ``b.h0`` and, in worlds that are warm, from the last solution.
+    """Set the moments that a solve starts from: in worlds that are warm what is left of the last solves.
 
     Args:
         rows: Work list whose targets are the inducible moments.
-        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
+        moments: Packed moments (``warpmag.packed.PackedMoments``); gets the starting moments.
         material: What they are made of (``kernels.wrench.Material``).
-        b: The buffers.
+        b: The buffers, as ``induction.launch_begin`` left them.
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
-    launch_start_worlds(moments, material, b)
     wp.launch(
         _start_kernel(moments.dtype),
         dim=rows.count,
-        inputs=[rows.target, b.world, b.warm, b.omega, b.h0, material.saturation, material.slope, material.curve],
+        inputs=[rows.target, b.world, b.warm, b.start, b.h0, material.saturation, material.slope, material.curve],
         outputs=[b.s, b.last_s, b.last_change, moments_out, moments.packed],
         device=moments.device,
     )
@@ -368,7 +388,7 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
     Args:
         rows: Work list whose targets are the inducible moments.
         partial: Sums of the native field loop over ``rows``.
-        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``).
+        moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``).
         material: What they are made of (``kernels.wrench.Material``).
         b: The buffers; ``b.condition`` tells whether another evaluation is wanted.
         rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
@@ -376,10 +396,11 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
     device, dtype = moments.device, moments.dtype
-    wp.launch(
+    wp.launch_tiled(
         _residual_kernel(dtype),
-        dim=rows.count,
+        dim=[b.chunk.shape[0]],
         inputs=[
+            b.chunk,
             partial,
             moments.packed,
             rows.target,
@@ -392,28 +413,23 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             material.saturation,
             material.slope,
             material.curve,
-            b.world,
             b.active,
+            b.history,
             b.slot,
         ],
-        outputs=[b.h, b.history_s, b.history_r, b.weight, b.terms],
+        outputs=[b.h, b.history_s, b.history_r, b.sums, b.condition],
+        block_dim=CHUNK,
         device=device,
     )
-    wp.launch(
-        _sum_kernel(dtype),
-        dim=(b.chunk.shape[0], COLUMNS),
-        inputs=[b.chunk, b.active, b.column_slots, b.history_r, b.weight, b.terms],
-        outputs=[b.sums],
-        device=device,
-    )
-    launch_sum_worlds(b)
-    wp.launch(
+    wp.launch_tiled(
         decide,
-        dim=b.omega.shape[0],
+        dim=[b.omega.shape[0]],
         inputs=[
-            b.world_sums,
+            b.chunk_begin,
+            b.sums,
             wp.float64(rtol),
             max_evaluations,
+            b.start,
             b.active,
             b.history,
             b.slot,
@@ -423,6 +439,8 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             b.warm,
         ],
         outputs=[
+            b.world_sums,
+            b.omega,
             b.error,
             b.converged,
             b.mode,
@@ -432,6 +450,7 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             b.alpha,
             b.condition,
         ],
+        block_dim=CHUNK,
         device=device,
     )
     wp.launch(

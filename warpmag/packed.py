@@ -3,11 +3,8 @@
 import numpy as np
 import warp as wp
 
-from warpmag.kernels import pair_loops
-from warpmag.kernels.neighbors import CAPACITY, launch_find_neighbors
+from warpmag.kernels import neighbors, pair_loops
 from warpmag.kernels.packing import launch_pack
-
-_MOST_GRID_CELLS = 64
 
 
 class PackedMoments:
@@ -16,9 +13,8 @@ class PackedMoments:
     Attributes:
         count: Number of moments n.
         packed: Packed moments, shape [8, n], see ``kernels.pair_loops``.
-        neighbors: Moments that overlap each, shape [n, capacity], valid after :meth:`find_overlaps`.
+        neighbors: Moments that overlap each, or nearly do, shape [n, capacity], valid after :meth:`find_overlaps`.
         neighbor_counts: How many they are, shape [n]; zero until then.
-        overlaps: Volume shared with neighbours [dimensionless], shape [n].
     """
 
     def __init__(self, radii, *, largest_radius: float, labels=None, groups=None):
@@ -43,36 +39,23 @@ class PackedMoments:
         self.labels = integers(np.arange(n) if labels is None else labels)
         self.groups = integers(np.zeros(n) if groups is None else groups)
         self.packed = wp.zeros((pair_loops.PACKED_ROWS, n), dtype=dtype, device=device)
-        self.points = wp.zeros(n, dtype=wp.vec3, device=device)
-        self.neighbors = wp.zeros((n, CAPACITY), dtype=int, device=device)
-        self.neighbor_counts = wp.zeros(n, dtype=int, device=device)
-        self.overlaps = wp.zeros(n, dtype=dtype, device=device)
-        # about one ball per cell of a compact pile; a larger grid only costs time to clear
-        cells = int(np.clip(2 ** np.ceil(np.log2(max(n, 1)) / 3.0), 8, _MOST_GRID_CELLS))
-        self._grid = wp.HashGrid(cells, cells, cells, device=device)
-        self._grid.reserve(max(n, 1), with_groups=True)
+        self._lists = neighbors.allocate(n, dtype, device)
+        self.neighbors, self.neighbor_counts = self._lists.neighbor, self._lists.count
 
     def pack(self, positions, moments):
         """Launch the packing of positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
         if self.count:
-            launch_pack(positions, moments, self.radii, self.labels, self.packed, self.points)
+            launch_pack(positions, moments, self.radii, self.labels, self._lists, self.packed)
 
     def find_overlaps(self, sources: "PackedMoments | None" = None):
         """Launch the search for the ``sources`` that overlap these moments; None means these moments themselves."""
-        same_set = sources is None
-        sources = self if sources is None else sources
-        cell = sources.largest_radius + self.largest_radius
-        if cell == 0.0 or self.count == 0 or sources.count == 0:
+        if sources is None:
+            sources = self
+        else:
+            self._lists.moved.fill_(1)  # only the motion of these moments is watched
+        reach = sources.largest_radius + self.largest_radius
+        if reach == 0.0 or self.count == 0 or sources.count == 0:
             return
-        sources._grid.build(sources.points, cell, sources.groups)
-        launch_find_neighbors(
-            sources._grid,
-            self.packed,
-            sources.packed,
-            self.groups,
-            sources.largest_radius,
-            same_set,
-            self.neighbors,
-            self.neighbor_counts,
-            self.overlaps,
+        neighbors.launch_find_neighbors(
+            self.packed, sources.packed, self.groups, sources.groups, reach, self._lists, sources._lists
         )

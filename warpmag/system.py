@@ -204,9 +204,16 @@ class MomentSystem:
         packed.find_overlaps()
         if self._induced.count == 0:
             return
-        pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
-        launch_finish_field(
-            self._applied, self._applied_partial, packed, packed, True, self.external_field, self._induction.h0
+        if self._applied.pair_count:
+            pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
+        induction.launch_begin(
+            self._applied,
+            self._applied_partial,
+            self._induced,
+            packed,
+            self.external_field,
+            self._material,
+            self._induction,
         )
         self.dynamics.start()
 
