@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import Kind, resolve_kind, vec3_type
+from warpmag.arrays import ACCURACY, Kind, resolve_kind, vec3_type
 from warpmag.errors import InputError
 from warpmag.kernels import pair_loops
 from warpmag.kernels.field import launch_finish_field
@@ -11,8 +11,6 @@ from warpmag.kernels.wrench import KELVIN, Material, launch_finish_wrench
 from warpmag.packed import PackedMoments
 
 METHODS = ("auto", "vectorized", "reference")
-ACCURACY = {"float32": 2e-6, "float64": 1e-13}
-"""Relative L2 error of the all-pairs sums that tests hold them to."""
 
 
 def h_field(

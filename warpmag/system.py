@@ -5,10 +5,9 @@ import math
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import resolve_device, resolve_dtype, vec3_type
+from warpmag.arrays import ACCURACY, resolve_device, resolve_dtype, vec3_type
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
-from warpmag.fields import ACCURACY
 from warpmag.kernels import induction, pair_loops
 from warpmag.kernels.curves import CURVE_IDS
 from warpmag.kernels.field import launch_finish_field
