@@ -8,8 +8,9 @@ Lists hold everything nearer than (1 + ``SKIN``) times contact, and are made ane
 times its radius: what was farther apart is until then farther than contact.
 
 The search sorts moments into cubic cells as wide as the farthest pair of a list. A hash table holds for each cell the
-last moment that was put in, and each moment knows the one before it; as the lists are sorted, the order in which
-threads came does not show. A target meets its neighbours in its own cell and the 26 around it.
+last moment that was put in, and each moment knows the one before it. A target meets its neighbours in its own cell and
+the 26 around it, a thread in three of them. The lists are then sorted, so that the order in which threads came does not
+show.
 """
 
 import math
@@ -41,34 +42,36 @@ def bucket_of(cell: wp.vec4i, bucket_count: int):
     return int(mixed & wp.uint32(bucket_count - 1))
 
 
-@wp.func
-def find_cell(packed: wp.array2d(dtype=Any), i: int, group: int, width: wp.float64):
-    """Cell (x, y, z, group) of moment ``i``, and whether it has one."""
-    x = wp.float64(packed[0, i]) / width
-    y = wp.float64(packed[1, i]) / width
-    z = wp.float64(packed[2, i]) / width
-    farthest = wp.max(wp.abs(x), wp.max(wp.abs(y), wp.abs(z)))
-    inside = farthest < wp.float64(wp.static(_FARTHEST_CELL)) and wp.isfinite(x + y + z)
-    cell = wp.vec4i(0, 0, 0, group)
-    if inside:
-        cell = wp.vec4i(int(wp.floor(x)), int(wp.floor(y)), int(wp.floor(z)), group)
-    return cell, inside
-
-
 @wp.kernel(enable_backward=False)
-def empty_buckets(
+def empty_lists(
     # inputs:
     moved: wp.array[int],
     # outputs:
     searching_out: wp.array[int],
     last_out: wp.array[int],
+    neighbor_count_out: wp.array[int],
 ):
-    """Empty the hash table if lists are to be made anew."""
+    """Empty the hash table and the lists if they are to be made anew."""
     k = wp.tid()
     if k == 0:
         searching_out[0] = moved[0]
     if moved[0] == 1:
-        last_out[k] = -1
+        if k < last_out.shape[0]:
+            last_out[k] = -1
+        if k < neighbor_count_out.shape[0]:
+            neighbor_count_out[k] = 0
+
+
+@wp.func
+def find_cell(packed: wp.array2d(dtype=Any), i: int, group: int, width: wp.float64):
+    """Cell (x, y, z, group) of moment ``i``; of no group where it has none."""
+    x = wp.float64(packed[0, i]) / width
+    y = wp.float64(packed[1, i]) / width
+    z = wp.float64(packed[2, i]) / width
+    farthest = wp.max(wp.abs(x), wp.max(wp.abs(y), wp.abs(z)))
+    if wp.isfinite(x + y + z) and farthest < wp.float64(wp.static(_FARTHEST_CELL)):
+        return wp.vec4i(int(wp.floor(x)), int(wp.floor(y)), int(wp.floor(z)), group)
+    return wp.vec4i(0, 0, 0, -1)
 
 
 @cache
@@ -91,9 +94,9 @@ def _fill_kernel(dtype):
             moved_out[0] = 0
         if searching[0] == 0:
             return
-        cell, inside = find_cell(sources, j, group[j], width)
+        cell = find_cell(sources, j, group[j], width)
         cell_out[j] = cell
-        if inside:
+        if cell[3] >= 0:
             before_out[j] = wp.atomic_exch(last_out, bucket_of(cell, last_out.shape[0]), j)
 
     return fill_cells
@@ -118,39 +121,66 @@ def _search_kernel(dtype):
         # outputs:
         neighbor_out: wp.array2d[int],
         neighbor_count_out: wp.array[int],
+    ):
+        if searching[0] == 0:
+            return
+        k, i = wp.tid()
+        own = wp.vec4i()
+        if same_set == 1:
+            own = cell[i]
+        else:
+            own = find_cell(targets, i, group[i], width)
+        if own[3] < 0:
+            return
+        x = vec3(targets[0, i], targets[1, i], targets[2, i])
+        radius = targets[3, i]
+        for z in range(-1, 2):
+            sought = own + wp.vec4i(k // 3 - 1, k % 3 - 1, z, 0)
+            j = last[bucket_of(sought, last.shape[0])]
+            while j >= 0:
+                # a bucket may hold several cells
+                if cell[j] == sought and not (same_set == 1 and i == j):
+                    r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
+                    s = dtype(wp.static(1.0 + SKIN)) * (radius + sources[3, j])
+                    if wp.dot(r, r) < s * s:
+                        place = wp.atomic_add(neighbor_count_out, i, 1)
+                        if place < wp.static(CAPACITY):
+                            neighbor_out[i, place] = j
+                j = before[j]
+
+    return search_cells
+
+
+@cache
+def _sort_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sort_lists(
+        # inputs:
+        targets: wp.array2d[dtype],
+        searching: wp.array[int],
+        neighbor_count: wp.array[int],
+        # outputs:
+        neighbor_out: wp.array2d[int],
         found_at_out: wp.array[vec3],
     ):
         if searching[0] == 0:
             return
         i = wp.tid()
-        x = vec3(targets[0, i], targets[1, i], targets[2, i])
-        found_at_out[i] = x
-        own, inside = find_cell(targets, i, group[i], width)
-        count = int(0)
-        if inside:
-            for k in range(27):
-                sought = own + wp.vec4i(k // 9 - 1, (k // 3) % 3 - 1, k % 3 - 1, 0)
-                j = last[bucket_of(sought, last.shape[0])]
-                while j >= 0:
-                    # a bucket may hold several cells
-                    if cell[j] == sought and not (same_set == 1 and i == j):
-                        r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
-                        s = dtype(wp.static(1.0 + SKIN)) * (targets[3, i] + sources[3, j])
-                        if wp.dot(r, r) < s * s:
-                            if count < wp.static(CAPACITY):
-                                place = count
-                                for back in range(count):
-                                    other = neighbor_out[i, count - 1 - back]
-                                    if other < j:
-                                        break
-                                    place = count - 1 - back
-                                    neighbor_out[i, place + 1] = other
-                                neighbor_out[i, place] = j
-                            count += 1
-                    j = before[j]
-        neighbor_count_out[i] = count
+        found_at_out[i] = vec3(targets[0, i], targets[1, i], targets[2, i])
+        for sorted in range(1, wp.min(neighbor_count[i], wp.static(CAPACITY))):
+            j = neighbor_out[i, sorted]
+            place = sorted
+            for back in range(sorted):
+                other = neighbor_out[i, sorted - 1 - back]
+                if other < j:
+                    break
+                place = sorted - 1 - back
+                neighbor_out[i, place + 1] = other
+            neighbor_out[i, place] = j
 
-    return search_cells
+    return sort_lists
 
 
 @dataclass(frozen=True)
@@ -210,10 +240,10 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
     # what is near is nearer than a cell is wide, however the quotient is rounded
     width = wp.float64((1.0 + SKIN + 1e-6) * reach)
     wp.launch(
-        empty_buckets,
-        dim=source_lists.last.shape[0],
+        empty_lists,
+        dim=max(source_lists.last.shape[0], targets.shape[1]),
         inputs=[lists.moved],
-        outputs=[lists.searching, source_lists.last],
+        outputs=[lists.searching, source_lists.last, lists.count],
         device=device,
     )
     wp.launch(
@@ -225,7 +255,7 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
     )
     wp.launch(
         _search_kernel(dtype),
-        dim=targets.shape[1],
+        dim=(9, targets.shape[1]),
         inputs=[
             targets,
             sources,
@@ -237,7 +267,14 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
             source_lists.before,
             int(lists is source_lists),
         ],
-        outputs=[lists.neighbor, lists.count, lists.found_at],
+        outputs=[lists.neighbor, lists.count],
+        device=device,
+    )
+    wp.launch(
+        _sort_kernel(dtype),
+        dim=targets.shape[1],
+        inputs=[targets, lists.searching, lists.count],
+        outputs=[lists.neighbor, lists.found_at],
         device=device,
     )
 
