@@ -264,7 +264,16 @@ def coupling_matrix(positions, radii):
 
 
 def equilibrium(
-    positions, radii, h0, *, saturation, susceptibility=math.inf, curve="tanh", tolerance=1e-13, iterations=200
+    positions,
+    radii,
+    h0,
+    *,
+    saturation,
+    susceptibility=math.inf,
+    curve="tanh",
+    extra_coupling=None,
+    tolerance=1e-13,
+    iterations=200,
 ):
     """Magnetic equilibrium M = f(H0 + G M) by damped Newton iterations on the dense system.
 
@@ -277,13 +286,14 @@ def equilibrium(
         saturation: Saturation magnetization Ms [A/m], scalar or [n].
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
         curve: ``tanh``, ``langevin`` or ``clamped``.
+        extra_coupling: Added to the dipoles' coupling G, shape [3n, 3n]; None adds nothing.
         tolerance: Relative residual at which to stop.
         iterations: Newton iterations at the most.
 
     Returns:
         The equilibrium. ``residual`` tells how far it was reached.
     """
-    g = coupling_matrix(positions, radii)
+    g = coupling_matrix(positions, radii) + (0.0 if extra_coupling is None else extra_coupling)
     n = len(g) // 3
     h0 = np.broadcast_to(np.asarray(h0, float), (n, 3)).copy()
     h = h0.copy()

@@ -1,0 +1,183 @@
+"""The near-contact model against the exact solution of two, three and thirteen balls, and against its own energy."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warpmag import near_contact, oracle
+from warpmag.near_contact import NearContacts
+
+sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
+from bench.reference.near_contact_table import pair_conductance
+from bench.reference.spheres import MU0, pair, spheres
+
+ALONG, ACROSS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+PERMEABILITIES = [2.0, 4.0, 10.0, 1000.0, np.inf]
+
+
+def linear(positions, radii, permeability, field, near=True):
+    """Moments [A·m²] and forces [N] of linear balls with the near-contact model, or of dipoles alone."""
+    n = len(positions)
+    volumes = 4.0 / 3.0 * np.pi * np.broadcast_to(np.asarray(radii, float), n) ** 3
+    slope = np.broadcast_to(oracle.curve_slope(np.asarray(permeability) - 1.0), n)
+    contacts = NearContacts(positions, radii, np.asarray(permeability) - 1.0)
+    coupling = oracle.coupling_matrix(positions, radii) / np.repeat(volumes, 3)
+    stiffness = np.diag(np.repeat(1.0 / (slope * volumes), 3)) - coupling
+    if near:
+        stiffness -= contacts.coupling()
+    moments = np.linalg.solve(stiffness, np.tile(field, n)).reshape(n, 3)
+    forces = oracle.kelvin_force(moments, oracle.field_gradient(positions, moments, radii=radii))
+    return moments, forces + contacts.forces(moments) if near else forces
+
+
+def cluster(name, gap):
+    """Balls of unit radius: three in a row, or one and its twelve neighbours in face-centred cubic packing."""
+    if name == "chain":
+        return (2.0 + gap) * np.outer(np.arange(3.0), ALONG)
+    corners = np.array([[a, b, 0.0] for a in (1.0, -1.0) for b in (1.0, -1.0)])
+    turned = [np.zeros((1, 3)), corners, corners[:, [0, 2, 1]], corners[:, [2, 0, 1]]]
+    return (2.0 + gap) / np.sqrt(2.0) * np.concatenate(turned)
+
+
+@pytest.mark.parametrize("own, other", [(np.inf, np.inf), (1000.0, 1000.0), (4.0, 4.0), (2.0, np.inf), (50.0, 3.0)])
+@pytest.mark.parametrize("gap", [0.0113, 0.07, 0.4, 0.93])
+def test_table_is_the_exact_solution(own, other, gap):
+    y = [np.atleast_1d(near_contact.hardness(mu - 1.0)) for mu in (own, other)]
+    value, slope = near_contact.conductances(np.array([gap]), *y)
+    exact = pair_conductance(2.0 + gap, [min(mu, 1e12) for mu in (own, other)])
+    # cubic splines of 28 and 11 nodes
+    np.testing.assert_allclose(value[0], exact, atol=2e-3 * np.abs(exact).max())
+    step = 1e-5 * gap
+    high, low = (near_contact.conductances(np.array([gap + s * step]), *y)[0][0] for s in (1.0, -1.0))
+    np.testing.assert_allclose((high - low) / (2.0 * step), slope[0], rtol=1e-6, atol=1e-8 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("permeability", PERMEABILITIES)
+@pytest.mark.parametrize("field", [ALONG, ACROSS])
+def test_two_balls_are_exact_to_five_percent(permeability, field):
+    """Force and moment at gaps from 1 % of the radius up; 1 % of error up to one radius, where the model fades out."""
+    for gap in (0.01, 0.02, 0.05, 0.1, 0.3, 0.6, 0.95, 1.1, 1.2, 1.3, 1.5, 2.0, 5.0):
+        two = pair(2.0 + gap, (1.0, 1.0), (permeability, permeability), tolerance=1e-8)
+        direction = 0 if field is ALONG else 1
+        exact = np.linalg.solve(two.resistance[direction], np.ones(2))
+        force = -0.5 * MU0 * exact @ two.slope[direction] @ exact
+        moments, forces = linear(np.array([0 * ALONG, (2.0 + gap) * ALONG]), 1.0, permeability, field)
+        assert abs(forces[1, 2] / force - 1.0) < (0.01 if gap < 1.0 else 0.05)
+        assert np.abs(moments @ field / exact - 1.0).max() < 1e-3
+
+
+@pytest.mark.parametrize("permeabilities", [(2.0, np.inf), (4.0, 100.0)])
+def test_unlike_materials(permeabilities):
+    for gap in (0.01, 0.2):
+        x = np.array([0 * ALONG, (2.0 + gap) * ALONG])
+        for direction, field in ((0, ALONG), (1, ACROSS)):
+            two = pair(2.0 + gap, (1.0, 1.0), permeabilities)
+            exact = np.linalg.solve(two.resistance[direction], np.ones(2))
+            moments, forces = linear(x, 1.0, np.array(permeabilities), field)
+            assert forces[1, 2] == pytest.approx(-0.5 * MU0 * exact @ two.slope[direction] @ exact, rel=2e-3)
+            np.testing.assert_allclose(moments @ field, exact, rtol=2e-3)
+
+
+def test_unlike_radii():
+    """Balls of 4:5 keep 90 % of the force that the dipoles miss by 94 %; from 1:2 on they are dipoles."""
+    for ratio, error in ((0.8, 0.12), (0.5, 0.96)):
+        two = pair(1.0 + ratio + 0.01 * ratio, (1.0, ratio), (np.inf, np.inf))
+        exact = np.linalg.solve(two.resistance[0], np.ones(2))
+        x = np.array([0 * ALONG, (1.0 + ratio + 0.01 * ratio) * ALONG])
+        _, forces = linear(x, np.array([1.0, ratio]), np.inf, ALONG)
+        assert abs(forces[1, 2] / (-0.5 * MU0 * exact @ two.slope[0] @ exact) - 1.0) < error
+    _, dipoles = linear(x, np.array([1.0, ratio]), np.inf, ALONG, near=False)
+    np.testing.assert_allclose(forces, dipoles, atol=1e-12 * np.abs(dipoles).max())
+
+
+@pytest.mark.parametrize(
+    "name, gap, permeability, order, error",
+    [
+        ("chain", 0.02, np.inf, 30, 0.08),
+        ("chain", 0.02, 10.0, 24, 0.09),
+        ("chain", 0.1, 4.0, 16, 0.04),
+        ("fcc", 0.1, np.inf, 10, 0.16),
+        ("fcc", 0.1, 10.0, 9, 0.09),
+        ("fcc", 0.1, 4.0, 9, 0.07),
+    ],
+)
+def test_clusters(name, gap, permeability, order, error):
+    """Relative L2 error of all forces; dipoles are off by at least twice as much."""
+    x = cluster(name, gap)
+    for field in (ALONG, ACROSS):
+        exact = spheres(x, 1.0, permeability, field, order=order, estimate=False)
+        moments, forces = linear(x, 1.0, permeability, field)
+        assert np.linalg.norm(forces - exact.forces) < error * np.linalg.norm(exact.forces)
+        assert np.linalg.norm(moments - exact.moments) < 0.06 * np.linalg.norm(exact.moments)
+        _, dipoles = linear(x, 1.0, permeability, field, near=False)
+        assert np.linalg.norm(dipoles - exact.forces) > 2.0 * np.linalg.norm(forces - exact.forces)
+
+
+def test_forces_are_the_gradient_of_the_energy():
+    x = np.array([[0.0, 0.0, 0.0], [2.08, 0.1, 0.2], [0.4, 2.2, 0.3], [1.5, 1.6, 1.3]])
+    radii, mu = np.array([1.0, 1.0, 1.1, 0.9]), np.array([5.0, np.inf, 50.0, 10.0])
+    field = np.array([0.4, -0.3, 0.9])
+    moments, forces = linear(x, radii, mu, field)
+
+    def energy(positions):
+        return -0.5 * MU0 * np.sum(linear(positions, radii, mu, field)[0] @ field)
+
+    size, step = np.abs(forces).max(), 1e-5
+    for ball in range(4):
+        for axis in range(3):
+            shift = np.zeros((4, 3))
+            shift[ball, axis] = step
+            derivative = (energy(x + shift) - energy(x - shift)) / (2.0 * step)
+            # central differences: step² of truncation, eps/step of rounding
+            assert abs(derivative + forces[ball, axis]) < 1e-7 * size
+    assert np.abs(forces.sum(0)).max() < 1e-13 * size
+    torque = MU0 * np.cross(moments, field).sum(0)
+    assert np.abs(np.cross(x, forces).sum(0) - torque).max() < 1e-13 * size
+
+
+@pytest.mark.parametrize("field", [ALONG, ACROSS])
+def test_force_is_continuous_and_bounded(field):
+    """From beyond the cut-off through contact to coincident centres: steps half as long jump half as far."""
+
+    def force(distances):
+        pairs = (np.array([0 * ALONG, d * ALONG]) for d in distances)
+        return np.array([linear(x, 1.0, np.inf, field)[1][1, 2] for x in pairs]) / MU0
+
+    everywhere = force(np.linspace(1e-6, 3.6, 400))
+    assert np.isfinite(everywhere).all() and np.abs(everywhere).max() < 150.0  # 14 times two dipoles in line
+    jumps = [np.abs(np.diff(force(np.linspace(1.65, 2.05, points)))).max() for points in (400, 800)]
+    assert jumps[1] < 0.6 * jumps[0]
+
+
+def test_cut_off_is_smooth():
+    for d in (near_contact.RANGE - 1e-6, near_contact.RANGE + 1e-6):
+        x = np.array([0 * ALONG, d * ALONG])
+        difference = linear(x, 1.0, np.inf, ALONG)[1] - linear(x, 1.0, np.inf, ALONG, near=False)[1]
+        assert np.abs(difference).max() < 1e-6 * MU0  # a smooth step 1e-6 R before its end
+
+
+@pytest.mark.parametrize("strength, dipole", [(1e-4, False), (0.1, False), (3.0, True), (1e3, True)])
+def test_saturated_balls_are_dipoles(strength, dipole):
+    x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.05], [1.9, 0.0, 1.0]])
+    h0 = strength * np.array([0.3, 0.0, 1.0])
+    found, forces = near_contact.equilibrium(x, 1.0, h0, saturation=1.0)
+    assert found.residual < 1e-12
+    alone = oracle.equilibrium(x, 1.0, h0, saturation=1.0)
+    moments = 4.0 / 3.0 * np.pi * alone.magnetizations
+    dipoles = oracle.kelvin_force(moments, oracle.field_gradient(x, moments, radii=1.0))
+    ratio = np.linalg.norm(forces) / np.linalg.norm(dipoles)
+    assert abs(ratio - 1.0) < 1e-6 if dipole else ratio > 3.0
+    assert np.abs(forces.sum(0)).max() < 1e-13 * np.abs(forces).max()
+
+
+@pytest.mark.parametrize("extent", [4.0, 8.0, 20.0])
+def test_any_arrangement_has_one_solution(extent):
+    """1 + ΔC M has positive eigenvalues and the whole Jacobian too, also where balls overlap at will."""
+    x = np.random.default_rng(0).uniform(-0.5, 0.5, (80, 3)) * extent
+    near = NearContacts(x, 1.0, np.inf)
+    eigenvalues = np.linalg.eigvals(np.eye(320) + near.conductance @ near.short_range)
+    assert eigenvalues.real.min() > 0.5
+    coupling = oracle.coupling_matrix(x, 1.0) + near.coupling() * 4.0 / 3.0 * np.pi
+    assert np.linalg.eigvalsh(0.5 * (coupling + coupling.T)).max() < 1.0 / 3.0
