@@ -27,6 +27,10 @@ PAINTS = {
 
 _GAP = 1.12
 """Distance of neighbouring letters over their largest size along that axis."""
+_SKIN = 0.03
+"""Rounding of what collides over the thickness of the letters. It keeps the boxes themselves apart, so that the
+direction of a contact is that between their nearest points, which never jumps: boxes that overlap may be pushed apart
+along another axis all at once, which shoots letters out."""
 _BEVEL = 0.02
 """Width of the bevel over the size of a capital."""
 
@@ -40,9 +44,9 @@ def author(
     size: float = 0.02,
     thickness: float = 0.005,
     moment_spacing: float = 0.004,
-    moment: float = 60.0,
-    core: float = 0.04,
-    friction: float = 0.4,
+    moment: float = 12.0,
+    core: float = 0.03,
+    friction: float = 0.5,
 ) -> None:
     """Write the stage to ``path``.
 
@@ -125,6 +129,9 @@ def _define_letter(
         sides = 2.0 * size * box.half
         cube.AddScaleOp().Set(Gf.Vec3f(float(sides[0]), thickness, float(sides[1])))
         UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
+        cube.GetPrim().AddAppliedSchema("NewtonCollisionAPI")
+        skin = cube.GetPrim().CreateAttribute("newton:contactMargin", Sdf.ValueTypeNames.Float, custom=False)
+        skin.Set(_SKIN * thickness)
         UsdShade.MaterialBindingAPI.Apply(cube.GetPrim()).Bind(material)
     return size * np.ptp(np.concatenate(curves), axis=0), lettering.area(curves) * size**2 * thickness
 

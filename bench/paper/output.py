@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bench.machine import describe
 
-ORDER = ("fig7", "fig8", "fig9", "fig10", "uniqueness", "table1")
+ORDER = ("fig7", "fig8", "fig9", "fig10", "uniqueness", "stability", "table1")
 """The experiments, in the order of the report."""
 _MARK = "<!-- section {} -->"
 _HEAD = """# The paper's experiments, run again

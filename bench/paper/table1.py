@@ -1,22 +1,17 @@
-"""Table 1: times per step of induction Ti, magnetic forces Tf and rigid bodies Tr, and what becomes of each scene.
+"""Table 1: times per step of induction Ti, magnetic forces Tf and rigid bodies Tr.
 
 The paper measures "frames" of one 1 ms step each, over 1,000 of them. A step here may hold several substeps, each with
 its own induction and forces; the times are those of the whole step.
 """
 
-import time
-
-import warpmag
 from bench.paper.output import Output, table
-from warpmag.errors import SimulationError
+from bench.paper.trials import SCENES, Trial, outcome_cells, outcome_head, run_trials
 from warpmag.magnets import METHODS
-from warpmag.scenes_usd import bundled
 
-SCENES = ("balls_up", "alphabets", "falling_magnet", "sakura_tree")
-STEPS, SMALL_STEPS = 1000, 20
+SECONDS, SMALL_SECONDS = 1.0, 0.05
 RTOL = 1e-2
 """Magnetization error at which induction ends: below it the pairs of ``theta-euler`` crawl in a pile of balls."""
-PATIENCE = 300.0
+PATIENCE = {"cpu": 150.0, "cuda": 25.0}
 """Time after which a run is ended [s]."""
 PAPERS_TIMES = {
     ("balls_up", "kim2018"): (20, 3.5, 14),
@@ -32,87 +27,38 @@ PAPERS_TIMES = {
 
 
 def run(output: Output):
-    """Run the experiment on the scenes that are bundled."""
-    stages = bundled()
+    """Run the experiment on the bundled scenes."""
+    seconds = SMALL_SECONDS if output.small else SECONDS
+    patience = PATIENCE["cpu" if output.device == "cpu" else "cuda"]
+    trials = [
+        Trial(scene, method, seconds, output.device, patience, rtol=RTOL) for scene in SCENES for method in METHODS
+    ]
     rows = []
-    for scene in SCENES:
-        for name in METHODS if scene in stages else ():
-            values = _measure(stages[scene], name, SMALL_STEPS if output.small else STEPS, output.device)
-            output.record(scene=scene, method=name, **values)
-            rows.append(_row(scene, name, values))
-    missing = [scene for scene in SCENES if scene not in stages]
-    output.report(_text(rows, missing))
+    for trial, values in run_trials(trials):
+        output.record(**values)
+        rows.append([trial.scene, trial.method, *_times(trial, values), *outcome_cells(values)])
+    output.report(_text(rows))
 
 
-def _measure(stage, name: str, steps: int, device: str) -> dict:
-    """Simulate ``steps`` steps of a scene, or as many as it lives through."""
-    method = METHODS[name]
-    simulation = warpmag.Simulation(
-        stage, dynamics=method.dynamics, curve=method.curve, force=method.force, rtol=RTOL, device=device
-    )
-    ended, began = "", time.perf_counter()
-    try:
-        for _ in range(steps):
-            simulation.step()
-            if time.perf_counter() - began > PATIENCE:
-                break
-    except SimulationError as error:
-        ended = str(error)
-    figures = simulation.finish()
-    induction, force, rigid = figures.milliseconds
-    done = max(figures.steps, 1)
-    return {
-        "steps": figures.steps,
-        "ended": ended,
-        "substeps": figures.substeps / done,
-        "ti_ms": induction,
-        "tf_ms": force,
-        "tr_ms": rigid,
-        "evaluations_per_substep": sum(figures.evaluations) / max(figures.substeps, 1),
-        "unconverged": figures.unconverged / max(figures.substeps, 1),
-        "held": figures.held,
-        "held_rms_speed": figures.held_rms_speed,
-        "rms_speed": figures.rms_speed,
-        "peak_speed": figures.peak_speed,
-        "overlap": figures.overlap,
-    }
-
-
-def _row(scene: str, name: str, values: dict) -> list:
-    def times(numbers):
+def _times(trial: Trial, values: dict) -> list[str]:
+    def three_digits(numbers):
         return [f"{number:.3g}" for number in numbers]
 
-    papers = PAPERS_TIMES.get((scene, name))
-    return [
-        scene,
-        name,
-        *times(values[key] for key in ("ti_ms", "tf_ms", "tr_ms")),
-        " / ".join(times(papers)) if papers else "",
-        f"{values['substeps']:.1f}",
-        f"{values['evaluations_per_substep']:.1f}",
-        f"{100.0 * values['unconverged']:.0f} %",
-        values["held"],
-        f"{100.0 * values['held_rms_speed']:.2f}",
-        f"{100.0 * values['rms_speed']:.2f}",
-        f"{values['peak_speed']:.2f}",
-        f"{100.0 * values['overlap']:.1f} %",
-        values["ended"] or f"{values['steps']} steps",
-    ]
+    papers = PAPERS_TIMES.get((trial.scene, trial.method))
+    own = three_digits(values[key] for key in ("ti_ms", "tf_ms", "tr_ms"))
+    return [*own, " / ".join(three_digits(papers)) if papers else ""]
 
 
-def _text(rows, missing) -> str:
-    head = ["scene", "method", "Ti [ms]", "Tf [ms]", "Tr [ms]", "paper's Ti / Tf / Tr", "substeps per step"]
-    head += ["field evaluations per substep", "substeps not converged", "held"]
-    head += ["RMS speed of these [cm/s]", "of all [cm/s]", "peak [m/s]", "penetration", "end"]
-    note = f"\n\nNot bundled, so not run: {', '.join(missing)}." if missing else ""
+def _text(rows) -> str:
+    head = ["scene", "method", "Ti [ms]", "Tf [ms]", "Tr [ms]", "paper's Ti / Tf / Tr", *outcome_head()]
     return f"""## Table 1: time per step
 
 **Paper:** milliseconds per 1 ms step on an Intel i7-8700, 1,000 steps; its rigid bodies are Bullet's.
 
 **Here:** rigid bodies are Newton's XPBD, and all three methods share every line of code but the dynamics, the curve and
-the force law. Induction ends at an error of {RTOL:g} or after 1,000 evaluations.
+the force law. On a CPU each run has two cores. Induction ends at an error of {RTOL:g} or after 1,000 evaluations.
 The paper does not say at which error it calls a magnetization converged; "until every M converges" may well mean that
 it stopped moving, which a pair that crawls does long before it is right. In weak fields, before a magnet has come near,
 pairs do not reach the relative error at all.
 
-{table(head, rows)}{note}"""
+{table(head, rows)}"""
