@@ -46,7 +46,7 @@ def author(
     moment_spacing: float = 0.004,
     moment: float = 12.0,
     core: float = 0.03,
-    friction: float = 0.5,
+    friction: float = 0.4,
 ) -> None:
     """Write the stage to ``path``.
 

@@ -271,7 +271,7 @@ def test_newton_imports_the_letters():
     filtered = {frozenset(pair) for pair in builder.shape_collision_filter_pairs}
     assert all(frozenset((center, box)) in filtered for box in boxes)
     assert not builder.shape_flags[center] & newton.ShapeFlags.VISIBLE
-    np.testing.assert_allclose(np.array(builder.shape_material_mu)[boxes], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(np.array(builder.shape_material_mu)[boxes], 0.4, rtol=1e-6)
     np.testing.assert_allclose(np.array(builder.shape_margin)[boxes], 0.03 * 0.005, rtol=1e-6)
     assert all(builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES for k in boxes)
     assert not any(builder.shape_flags[k] & newton.ShapeFlags.VISIBLE for k in boxes)
