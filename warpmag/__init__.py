@@ -15,6 +15,7 @@ _HOMES = {
     "wrench": "warpmag.fields",
     "solve_induction": "warpmag.induction",
     "InductionResult": "warpmag.induction",
+    "material": "warpmag.materials",
     "register_attributes": "warpmag.engine.attributes",
     "add_inducible": "warpmag.engine.attributes",
     "add_permanent": "warpmag.engine.attributes",

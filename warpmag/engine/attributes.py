@@ -10,6 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag import materials
 from warpmag.errors import InputError
 from warpmag.magnets import CURVES, KINDS, SATURATION_OF_IRON, Magnet
 
@@ -61,8 +62,9 @@ def add_inducible(
     body: int = -1,
     *,
     shape: int | None = None,
-    saturation: float = SATURATION_OF_IRON,
-    susceptibility: float = math.inf,
+    material: str | None = None,
+    saturation: float | None = None,
+    susceptibility: float | None = None,
     curve: str = "tanh",
     moment_spacing: float = 0.0,
 ) -> None:
@@ -72,8 +74,9 @@ def add_inducible(
         builder: The builder, with :func:`register_attributes` called on it.
         body: The body; all its colliding shapes, which must exist already, become one magnet.
         shape: Instead of all shapes of the body only this one; the way to make a static shape a magnet.
-        saturation: Saturation magnetization Ms [A/m].
-        susceptibility: Susceptibility χ [dimensionless], may be infinite.
+        material: Name of an inducible material of :mod:`warpmag.materials`, in place of the next two.
+        saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
+        susceptibility: Susceptibility χ [dimensionless], infinite by default.
         curve: Magnetization curve: ``tanh``, ``langevin`` or ``clamped``.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
 
@@ -81,7 +84,13 @@ def add_inducible(
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
             of range.
     """
-    magnet = Magnet("inducible", saturation, susceptibility, curve, moment_spacing=moment_spacing)
+    given = {"saturation": saturation, "susceptibility": susceptibility}
+    values = {name: value for name, value in given.items() if value is not None}
+    if material is not None:
+        if values:
+            raise InputError(f"material: {material!r} says what {' and '.join(values)} are, give one or the other")
+        values = materials.inducible("material", material)
+    magnet = Magnet("inducible", **values, curve=curve, moment_spacing=moment_spacing)
     for index in magnet_shapes(builder, body, shape):
         mark_shape(builder, index, magnet)
 
@@ -91,6 +100,7 @@ def add_permanent(
     body: int = -1,
     *,
     shape: int | None = None,
+    material: str | None = None,
     magnetization: tuple[float, float, float],
     moment_spacing: float = 0.0,
 ) -> None:
@@ -100,7 +110,9 @@ def add_permanent(
         builder: The builder, with :func:`register_attributes` called on it.
         body: The body; all its colliding shapes, which must exist already, become one magnet.
         shape: Instead of all shapes of the body only this one; the way to make a static shape a magnet.
-        magnetization: Magnetization M [A/m] in the frame of the body, of the shape if that is static.
+        material: Name of a permanent material of :mod:`warpmag.materials`, which says how strong the magnet is.
+        magnetization: Magnetization M [A/m] in the frame of the body, of the shape if that is static; with
+            ``material`` only its direction counts.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
 
     Raises:
@@ -109,6 +121,8 @@ def add_permanent(
     """
     if np.shape(magnetization) != (3,):
         raise InputError(f"magnetization: must be three numbers, got {magnetization}")
+    if material is not None:
+        magnetization = materials.permanent("material", material, magnetization)
     for index in magnet_shapes(builder, body, shape):
         in_shape = magnetization
         if builder.shape_body[index] >= 0:

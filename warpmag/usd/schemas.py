@@ -11,6 +11,7 @@ import newton_usd_schemas  # noqa: F401  (registers Newton's own schemas, which 
 import numpy as np
 from pxr import Gf, Plug, Sdf, Usd
 
+from warpmag import materials
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
 
@@ -19,6 +20,7 @@ Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema")
 MAGNET_API = "WarpmagMagnetAPI"
 SCENE_API = "WarpmagSceneAPI"
 MOMENT = "warpmag:moment"
+MATERIAL = "warpmag:material"
 
 _TYPES = {str: Sdf.ValueTypeNames.Token, float: Sdf.ValueTypeNames.Float, tuple: Sdf.ValueTypeNames.Vector3f}
 
@@ -53,8 +55,23 @@ def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
 def magnet_of(prim: Usd.Prim) -> Magnet:
     """Read and check the magnet that ``prim`` carries; raises :class:`InputError` naming the prim."""
     magnet = _read(prim, _MAGNET_ATTRIBUTES, Magnet())
+    material = prim.GetAttribute(MATERIAL).Get()
+    if material:
+        magnet = dataclasses.replace(magnet, **_of_material(prim, material, magnet))
     magnet.check(str(prim.GetPath()))
     return magnet
+
+
+def _of_material(prim: Usd.Prim, material: str, magnet: Magnet) -> dict:
+    """Return what a named material says about a magnet, which the prim must not say again."""
+    owner = f"{prim.GetPath()}: {MATERIAL}"
+    if magnet.kind == "permanent":
+        return {"magnetization": materials.permanent(owner, material, magnet.magnetization)}
+    values = materials.inducible(owner, material)
+    for field in values:
+        if prim.GetAttribute(_MAGNET_ATTRIBUTES[field]).HasAuthoredValue():
+            raise InputError(f"{owner}: {material} says what {_MAGNET_ATTRIBUTES[field]} is, author one or the other")
+    return values
 
 
 def settings_of(prim: Usd.Prim) -> MagneticSettings:
