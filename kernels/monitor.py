@@ -1,7 +1,7 @@
 """Watches a simulation from the device: what a substep must report before the next one may rely on it.
 
-Every kernel folds its findings into two small arrays that the host clears before a step and reads after it. Maxima and
-minima do not depend on the order of threads, so a run repeats bit by bit.
+Every kernel folds its findings into two small arrays that are cleared before a step is tried and judged after it
+(``kernels.stepping``). Maxima and minima do not depend on the order of threads, so a run repeats bit by bit.
 
 ``peaks`` [float32], each the largest since the arrays were cleared: see the ``PEAK_*`` indices.
 ``counts`` [int32]: see the ``COUNT_*`` indices; from ``COUNT_CAPACITIES`` on, the fill of each capacity watched.
@@ -21,11 +21,13 @@ PEAK_DEPTH = wp.constant(3)  # penetration [m]
 PEAK_ERROR = wp.constant(4)  # magnetization error [1]
 PEAKS = 5
 
-COUNT_BAD_BODY = wp.constant(0)  # lowest body whose state is not finite; the host clears it to a large number
+COUNT_BAD_BODY = wp.constant(0)  # lowest body whose state is not finite, NO_BODY if there is none
 COUNT_EVALUATIONS = wp.constant(1)  # field evaluations, summed over substeps
 COUNT_UNCONVERGED = wp.constant(2)  # substeps whose induction did not converge
 COUNT_OVERLAPS = wp.constant(3)  # contacts deeper than a threshold, last substep
 COUNT_CAPACITIES = wp.constant(4)
+
+NO_BODY = wp.constant(2**31 - 1)
 
 
 @wp.kernel
@@ -171,6 +173,25 @@ def _watch_capacity(
 def watch_capacity(fill, index, counts):
     """Fold the fill of one buffer, ``fill`` [1], into ``counts[index]``."""
     wp.launch(_watch_capacity, dim=1, inputs=[fill, index], outputs=[counts], device=counts.device)
+
+
+@wp.kernel
+def _watch_flags(
+    # inputs:
+    flags_in: wp.array[wp.bool],
+    index: int,
+    # outputs:
+    counts_out: wp.array[wp.int32],
+):
+    if flags_in[wp.tid()]:
+        counts_out[index] = 1
+
+
+def watch_flags(flags, index, counts):
+    """Set ``counts[index]`` to 1 if any of ``flags`` [n] stands."""
+    wp.launch(
+        _watch_flags, dim=flags.shape[0], inputs=[flags, index], outputs=[counts], device=counts.device
+    )
 
 
 @wp.kernel

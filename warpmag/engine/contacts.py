@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.errors import InputError
-from warpmag.kernels.monitor import watch_capacity
+from warpmag.kernels.monitor import watch_capacity, watch_flags
 
 _NEWTON_GAP = 0.1
 """``ModelBuilder.rigid_gap`` [m] as Newton sets it: the gap of a shape for which nobody chose one."""
@@ -85,8 +85,9 @@ class Buffer:
 
     Attributes:
         kind: ``pair``, ``contact`` or ``triangle``.
-        fill: Entries that were asked for, on the device, shape [1]; more than ``limit`` if some were dropped.
-        limit: Entries that fit.
+        fill: Entries that were asked for, on the device, shape [1]; more than ``limit`` if some were dropped. Or
+            whether any were, shape [n].
+        limit: Entries that fit; 0 where only whether any were dropped is known.
     """
 
     kind: str
@@ -218,6 +219,9 @@ class RigidSolver:
                 Buffer("triangle", narrow.triangle_pairs_count, narrow.triangle_pairs.shape[0]),
                 Buffer("triangle", self.contacts.contact_counters[2:3], 0),  # contacts lost while they were reduced
             ]
+        lost = getattr(self._solver, "constraint_overflow", None)
+        if lost is not None:
+            self.buffers.append(Buffer("contact", lost, 0))
 
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""
@@ -230,7 +234,8 @@ class RigidSolver:
     def watch(self, first: int, counts: wp.array) -> None:
         """Fold how full each buffer is into ``counts``, from index ``first`` on; capturable in a graph."""
         for index, buffer in enumerate(self.buffers):
-            watch_capacity(buffer.fill, first + index, counts)
+            watch = watch_flags if buffer.fill.dtype is wp.bool else watch_capacity
+            watch(buffer.fill, first + index, counts)
 
     def grow(self, fills: np.ndarray) -> bool:
         """Enlarge the buffers that overflowed; contacts and graphs are void afterwards.
@@ -246,9 +251,6 @@ class RigidSolver:
             if fill > buffer.limit:
                 size = max(other.limit for other in self.buffers if other.kind == buffer.kind)
                 grown[buffer.kind] = max(int(_GROWTH * max(fill, size)), grown.get(buffer.kind, 0))
-        overflow = getattr(self._solver, "constraint_overflow", None)
-        if overflow is not None and overflow.numpy().any():
-            grown.setdefault("contact", int(_GROWTH * self._limits["contact"]))
         self._limits |= grown
         if grown:
             self._allocate()

@@ -39,7 +39,6 @@ class Simulation:
     Attributes:
         model: Newton's model.
         magnetics: Its magnets.
-        statistics: Figures of the run so far; those of the end are filled in by :meth:`finish`.
         step_size: Time step [s].
         frame_rate: Output frames per second [Hz].
         frame_count: Output frames that the stage asks for, the first excluded; None where it has no time range.
@@ -118,11 +117,11 @@ class Simulation:
         self._moving = np.array(
             sorted({one.body for one in self.magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int
         )
-        self.statistics = Statistics(magnets=len(self._moving))
+        self._statistics = Statistics(magnets=len(self._moving))
         if self._scene:
             self._start_from_stage()
         self._center = self._positions().mean(axis=0) if len(self._moving) else np.zeros(3)
-        self.statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
+        self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
 
     def _moves(self, body: int) -> bool:
         return math.isfinite(self._sizes.thickness[body])
@@ -147,21 +146,38 @@ class Simulation:
 
     @property
     def state(self) -> newton.State:
-        """The present state."""
+        """The present state; waits for the device.
+
+        Raises:
+            SimulationError: The state was not finite any more; it is that of the last step that held.
+        """
+        self._look()
         return self._stepper.state
+
+    @property
+    def statistics(self) -> Statistics:
+        """Figures of the run so far, those of the end filled in by :meth:`finish`; waits as :attr:`state` does."""
+        self._look()
+        return self._statistics
 
     @property
     def time(self) -> float:
         """Time since the start [s]."""
-        return self.statistics.steps * self.step_size
+        return self._stepper.steps * self.step_size
 
     def step(self) -> None:
-        """Advance by one step.
+        """Advance by one step; on a GPU without waiting for it.
 
         Raises:
-            SimulationError: The state is not finite any more.
+            SimulationError: The state is not finite any more; on a GPU up to 64 steps later.
         """
-        self.statistics.add_step(self._stepper.advance())
+        self._stepper.advance()
+        if self._stepper.due:
+            self._look()
+
+    def _look(self) -> None:
+        for report in self._stepper.look():
+            self._statistics.add_step(report)
 
     def _positions(self) -> np.ndarray:
         return self.state.body_q.numpy()[self._moving, :3].astype(float)
@@ -198,9 +214,9 @@ class Simulation:
         try:
             for frame in range(frames + 1):
                 target = round(frame / (self.frame_rate * self.step_size))
-                if frame and target <= self.statistics.steps:
+                if frame and target <= self._stepper.steps:
                     continue  # steps are longer than frames: several would stand at one time
-                while self.statistics.steps < target:
+                while self._stepper.steps < target:
                     self.step()
                 if recorder:
                     with _interrupts_held():
@@ -209,7 +225,7 @@ class Simulation:
                 if on_frame and on_frame(frame) is False:
                     break
         finally:
-            self.statistics.wall_seconds += time.perf_counter() - began
+            self._statistics.wall_seconds += time.perf_counter() - began
             if recorder:
                 with _interrupts_held():
                     recorder.close()
@@ -243,7 +259,7 @@ class Simulation:
     def _follow(self) -> None:
         if len(self._moving):
             distance = np.linalg.norm(self._positions() - self._center, axis=1).max()
-            self.statistics.farthest = max(self.statistics.farthest, float(distance))
+            self._statistics.farthest = max(self._statistics.farthest, float(distance))
 
     def finish(self) -> Statistics:
         """Fill in the figures of the end and return the statistics."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warpmag.engine.stepper import FORCE, INDUCTION, RIGID, StepReport
+from warpmag.engine.stepper import StepReport
 
 _DEEP = 0.05
 """Penetration over the thickness that no user takes for contact."""
@@ -71,7 +71,7 @@ class Statistics:
         self.overlap = max(self.overlap, report.overlap)
         self.depth = max(self.depth, report.depth)
         if report.seconds:
-            self._seconds.append((report.seconds[INDUCTION], report.seconds[FORCE], report.seconds[RIGID]))
+            self._seconds.append(report.seconds)
 
     @property
     def milliseconds(self) -> tuple[float, float, float]:

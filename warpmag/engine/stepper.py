@@ -1,40 +1,39 @@
 """Advances a model by the step that the user asked for, in as many substeps as its motion needs.
 
-A substep is: clear forces, induction, magnetic forces, collision, solver. Each of these stages is captured once in a
-graph, on the CPU too, where replaying it is three times as fast as launching it from Python.
+A substep is: clear forces, induction, magnetic forces, collision, solver. A step is tried and then judged: if a body
+moved too far in a substep, or bodies were pressed into each other, the state is put back and the step done again with
+shorter substeps. All of that is decided on the device (``kernels.stepping``), so that a step is one graph that the host
+launches and does not wait for. The host looks every so many steps. Where it has to act, because a buffer overflowed or
+the state is not finite any more, the device has halted, and steps launched since did nothing.
 
-A step is tried and then judged by what the device reports about it: if a body would have moved too far in a substep, if
-bodies were pressed into each other, or if a buffer overflowed, the state is put back and the step done again with
-shorter substeps or larger buffers.
+What cannot be captured in a graph is launched from Python, by the same code.
 """
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.capture import Workspace, without_allocations
 from warpmag.engine.contacts import BodySizes, RigidSolver
 from warpmag.engine.magnetics import Magnetics
 from warpmag.errors import SimulationError
-from warpmag.kernels import monitor
+from warpmag.kernels import monitor, stepping
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
-_SHORTEST = 16
-"""Substeps are at most this many times shorter than the longest allowed."""
 _EASE = 0.2
 """Substeps double in length once the motion, up to four times as long then, would stay well within the limit."""
-_EVENTS_EVERY = 8
-"""On a GPU every so manieth step is timed."""
-_NO_BODY = np.iinfo(np.int32).max
+_RECORDS = 64
+"""Steps that may be done before the host looks; on a CPU, which it waits for anyway, it looks after each."""
 
-INDUCTION, FORCE, RIGID = "induction", "force", "rigid"
+INDUCTION, FORCE, RIGID = range(int(stepping.STAGES))
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,8 @@ class StepReport:
         error: Largest magnetization error of a substep.
         evaluations: Field evaluations of all substeps.
         unconverged: Substeps whose induction did not converge.
-        seconds: Time spent in each stage [s]; None where it was not taken, or not worth it, because kernels were
-            compiled or captured.
+        seconds: Time spent in induction, forces and rigid bodies [s], all attempts together; None where kernels were
+            compiled meanwhile.
     """
 
     substeps: int
@@ -68,15 +67,15 @@ class StepReport:
     error: float
     evaluations: int
     unconverged: int
-    seconds: dict[str, float] | None
+    seconds: tuple[float, float, float] | None
 
 
 class Stepper:
     """Steps one model with its magnets.
 
     Attributes:
-        state: The present state.
-        substeps: Substeps of the next step.
+        state: The present state, once :meth:`look` has been called.
+        steps: Steps asked for so far.
     """
 
     def __init__(
@@ -99,206 +98,225 @@ class Stepper:
             sizes: Sizes of its bodies.
             step: Time step [s].
             longest_substep: Upper limit of a substep [s].
-            graphs: Capture the stages in graphs where the device and the solver allow it.
+            graphs: Capture a step in a graph where the device and the solver allow it.
         """
         self._model, self._magnetics, self._solver = model, magnetics, solver
         self._device = wp.get_device(model.device)
         self._step = step
         # An even number, so that a step ends in the state that it began in; powers of two, so that few graphs do.
         self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
-        self.substeps = self._fewest
         self.state, self._other, self._saved = model.state(), model.state(), model.state()
         self._thickness = wp.array(sizes.thickness, dtype=float, device=self._device)
         self._reach = wp.array(sizes.reach, dtype=float, device=self._device)
-        self._peaks = wp.zeros(monitor.PEAKS, dtype=float, device=self._device)
-        self._count_start()
-        self._graphs: dict[tuple, wp.Graph | None] = {}
-        self._capture = graphs
-        self._settled = False
-        self._steps = 0
-        self._overlap = 0.0
+        self._buffers = stepping.allocate(_RECORDS, len(solver.buffers), self._device)
+        self._clock = _Clock(self._device)
+        self._workspace = Workspace(self._device) if self._device.is_cuda else None
+        self._capture, self._graph = graphs, None
+        self._cold: set[int] = set()
+        self.steps = self._reported = 0
+        self._prepare()
 
-    def _count_start(self) -> None:
-        counts = np.zeros(monitor.COUNT_CAPACITIES + len(self._solver.buffers), dtype=np.int32)
-        counts[monitor.COUNT_BAD_BODY] = _NO_BODY
-        self._no_counts = wp.array(counts, dtype=wp.int32, device=self._device)
-        self._counts = wp.clone(self._no_counts)
+    def _prepare(self) -> None:
+        """Fit everything to the solver's buffers, whose number does not change."""
+        sizes = [buffer.limit for buffer in self._solver.buffers]
+        capacities = wp.array(sizes, dtype=wp.int32, device=self._device)
+        self._limits = stepping.Limits(TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, self._fewest, capacities)
+        self._graph, self._warm = None, False
 
-    def advance(self) -> StepReport:
-        """Advance :attr:`state` by one step.
+    # -----------------------------------------------------------------------------------------------------------------
+    # What the host does
+    # -----------------------------------------------------------------------------------------------------------------
+
+    @property
+    def due(self) -> bool:
+        """Whether :meth:`look` has to be called before the next step."""
+        return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
+
+    def advance(self) -> None:
+        """Advance :attr:`state` by one step; on a GPU without waiting for it."""
+        self.steps += 1
+        self._launch()
+
+    def look(self) -> Iterator[StepReport]:
+        """Wait for the steps asked for.
+
+        Yields:
+            A report of each step since the last look.
 
         Raises:
-            SimulationError: The state is not finite any more.
+            SimulationError: The state is not finite any more; it is that of the last step that held.
         """
-        timed = self._device.is_cpu or self._steps % _EVENTS_EVERY == 0
-        watch = _Stopwatch(self._device) if timed else None
-        self._saved.assign(self.state)
-        self._settled = True
-        attempts, regrown = 0, False
-        while True:
-            attempts += 1
-            peaks, counts = self._attempt(watch)
-            travel, bad = float(peaks[monitor.PEAK_TRAVEL]), counts[monitor.COUNT_BAD_BODY] != _NO_BODY
-            pressed = peaks[monitor.PEAK_OVERLAP] > max(OVERLAP_LIMIT, self._overlap)
-            if self._solver.grow(counts[monitor.COUNT_CAPACITIES :]):
-                regrown = True
-                self._count_start()
-                self._graphs = {}
-            elif (travel > TRAVEL_LIMIT or pressed or bad) and self.substeps < _SHORTEST * self._fewest:
-                self.substeps *= 2
-            else:
-                break
-            self.state.assign(self._saved)
-        if bad:
-            body = int(counts[monitor.COUNT_BAD_BODY])
-            raise SimulationError(
-                f"step {self._steps + 1} ({(self._steps + 1) * self._step:g} s): "
-                f"{self._model.body_label[body]} has left all finite numbers"
-            )
-        report = self._report(attempts, regrown, peaks, counts, watch.seconds() if watch and self._settled else None)
-        self._steps += 1
-        self._overlap = report.overlap
-        calm = travel < _EASE * TRAVEL_LIMIT and report.overlap < 0.5 * OVERLAP_LIMIT
-        if calm and self.substeps > self._fewest:
-            self.substeps //= 2
-        return report
+        while self.steps > self._reported:
+            status = self._buffers.status.numpy()
+            yield from self._reports(int(status[stepping.STATUS_DONE]))
+            if status[stepping.STATUS_HALT] == stepping.NOT_FINITE:
+                self._give_up()
+            if status[stepping.STATUS_HALT] == stepping.OVERFLOW:
+                self._solver.grow(self._fills())
+                self._prepare()
+                status[[stepping.STATUS_HALT, stepping.STATUS_REGROWN]] = stepping.RUNNING, 1
+                self._buffers.status.assign(status)
+                for _ in range(self.steps - self._reported):
+                    self._launch()
 
-    def _report(self, attempts, regrown, peaks, counts, seconds) -> StepReport:
+    def _reports(self, done: int) -> list[StepReport]:
+        """Read what the steps up to ``done`` logged."""
+        self._clock.look()
+        log = self._buffers.log.numpy()
+        numbers = range(self._reported, done)
+        self._reported = done
+        return [self._report(log[number % _RECORDS], number not in self._cold) for number in numbers]
+
+    def _report(self, record: np.ndarray, timed: bool) -> StepReport:
+        peaks = record[int(stepping.LOG_PEAKS) :]
+        ticks = record[int(stepping.LOG_TICKS) :]
         return StepReport(
-            substeps=self.substeps,
-            attempts=attempts,
-            capped=bool(peaks[monitor.PEAK_TRAVEL] > TRAVEL_LIMIT),
-            regrown=regrown,
+            substeps=int(record[stepping.LOG_SUBSTEPS]),
+            attempts=int(record[stepping.LOG_ATTEMPTS]),
+            capped=bool(record[stepping.LOG_CAPPED]),
+            regrown=bool(record[stepping.LOG_REGROWN]),
             travel=float(peaks[monitor.PEAK_TRAVEL]),
             speed=float(peaks[monitor.PEAK_SPEED]),
             overlap=float(peaks[monitor.PEAK_OVERLAP]),
             depth=float(peaks[monitor.PEAK_DEPTH]),
             error=float(peaks[monitor.PEAK_ERROR]),
-            evaluations=int(counts[monitor.COUNT_EVALUATIONS]),
-            unconverged=int(counts[monitor.COUNT_UNCONVERGED]),
-            seconds=seconds,
+            evaluations=int(record[stepping.LOG_EVALUATIONS]),
+            unconverged=int(record[stepping.LOG_UNCONVERGED]),
+            seconds=tuple((self._clock.seconds_per_tick * ticks).tolist()) if timed else None,
         )
 
-    def _attempt(self, watch) -> tuple[np.ndarray, np.ndarray]:
-        """Do one step from :attr:`state` and return what the device reports about it."""
-        self._clear()
-        now, then = self.state, self._other
-        for parity in range(self.substeps):
-            odd = parity % 2
-            for stage, key, run in (
-                (INDUCTION, (odd,), self._induce),
-                (FORCE, (odd,), self._add_forces),
-                (RIGID, (odd, self.substeps), self._move),
-            ):
-                if watch:
-                    watch.start(stage)
-                self._run((stage, *key), run, now, then)
-                if watch:
-                    watch.stop()
-            now, then = then, now
-        if watch:
-            watch.start(RIGID)
-        self._run(("end", self.substeps), self._look, now, then)
-        if watch:
-            watch.stop()
-        return self._peaks.numpy().copy(), self._counts.numpy().copy()
-
-    def _clear(self) -> None:
-        self._peaks.zero_()
-        wp.copy(self._counts, self._no_counts)
-
-    def _induce(self, now, then) -> None:
-        now.clear_forces()
-        self._magnetics.induce(now)
-        system = self._magnetics.system
-        monitor.watch_induction(system.error, system.evaluations, system.converged, self._peaks, self._counts)
-
-    def _add_forces(self, now, then) -> None:
-        self._magnetics.add_forces(now)
-
-    def _move(self, now, then) -> None:
-        dt = self._step / self.substeps
-        monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, self._peaks)
-        self._find_contacts(now, dt, 0.0)
-        self._solver.step(now, then, dt)
-
-    def _look(self, now, then) -> None:
-        self._find_contacts(now, self._step / self.substeps, 0.0)
-        monitor.watch_finite(now, self._counts)
-
-    def _find_contacts(self, state, dt, overlap_threshold) -> None:
-        solver = self._solver
-        solver.collide(state, dt)
-        solver.watch(monitor.COUNT_CAPACITIES, self._counts)
-        monitor.watch_contacts(
-            self._model,
-            state,
-            solver.contacts,
-            self._thickness,
-            overlap_threshold,
-            solver.overlaps,
-            self._peaks,
-            self._counts,
+    def _give_up(self) -> None:
+        body = int(self._buffers.counts.numpy()[monitor.COUNT_BAD_BODY])
+        self.steps, number = self._reported, self._reported + 1
+        raise SimulationError(
+            f"step {number} ({number * self._step:g} s): {self._model.body_label[body]} has left all finite numbers"
         )
+
+    def _fills(self) -> np.ndarray:
+        return self._buffers.counts.numpy()[int(monitor.COUNT_CAPACITIES) :]
+
+    def _launch(self) -> None:
+        """Launch a step: from Python at first, which compiles its kernels, then, if it can be captured, as a graph."""
+        if self._graph:
+            wp.capture_launch(self._graph)
+            return
+        with without_allocations(self._device, self._workspace):
+            self._run_step()
+            if not self._warm:
+                self._warm = True
+                self._cold.add(self._reported)
+                if self._capture and self._buffers.status.numpy()[stepping.STATUS_HALT] == stepping.RUNNING:
+                    self._capture_step()
+
+    def _capture_step(self) -> None:
+        try:
+            with wp.ScopedCapture(self._device) as capture:
+                self._run_step()
+            self._graph = capture.graph
+        except Exception:  # whatever a solver does that cannot be captured, it can still be launched
+            self._capture = False
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
-        """Find the contacts of the present state.
+        """Find the contacts of the present state; :meth:`look` first.
 
         Returns:
             Deepest penetration over the thickness of the thinner body, the same [m], and the number of contacts deeper
             than ``overlap_threshold`` of the thickness.
         """
+        b = self._buffers
         while True:
-            self._clear()
+            b.peaks.zero_()
+            b.counts.zero_()
             self._find_contacts(self.state, 0.0, overlap_threshold)
-            peaks, counts = self._peaks.numpy(), self._counts.numpy()
-            if not self._solver.grow(counts[monitor.COUNT_CAPACITIES :]):
+            if not self._solver.grow(self._fills()):
                 break
-            self._count_start()
-            self._graphs = {}
-        self._overlap = float(peaks[monitor.PEAK_OVERLAP])
-        return self._overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])
+            self._prepare()
+        peaks, counts = b.peaks.numpy(), b.counts.numpy()
+        overlap = float(peaks[monitor.PEAK_OVERLAP])
+        b.last_overlap.fill_(overlap)
+        return overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])
 
-    def _run(self, key: tuple, stage: Callable, now: newton.State, then: newton.State) -> None:
-        """Run a stage: launched from Python the first time, which compiles its kernels, then captured and replayed."""
-        if key not in self._graphs:
-            self._graphs[key] = None
-            self._settled = False
-        elif self._graphs[key] is None and self._capture:
-            self._settled = False
-            try:
-                with wp.ScopedCapture(self._device) as capture:
-                    stage(now, then)
-                self._graphs[key] = capture.graph
-            except Exception:  # whatever a solver does that cannot be captured, it can still be launched
-                self._capture = False
-        if self._graphs[key] is None:
-            stage(now, then)
-        else:
-            wp.capture_launch(self._graphs[key])
+    # -----------------------------------------------------------------------------------------------------------------
+    # What the device does: all of the following only launches kernels
+    # -----------------------------------------------------------------------------------------------------------------
+
+    def _run_step(self) -> None:
+        stepping.launch_begin_step(self._buffers)
+        self._copy_state(stepping.FLAG_ATTEMPT, self.state, self._saved)
+        wp.capture_while(self._buffers.attempting, self._attempt)
+
+    def _attempt(self) -> None:
+        stepping.launch_begin_attempt(self._limits, self._buffers)
+        for level in range(int(stepping.LEVELS)):
+            wp.capture_while(self._buffers.remaining(level), self._advance_twice, level=level)
+        self._find_contacts(self.state, 0.0, 0.0)
+        monitor.watch_finite(self.state, self._buffers.counts)
+        stepping.launch_mark(RIGID, self._buffers)
+        stepping.launch_judge(self._limits, self._buffers)
+        self._copy_state(stepping.FLAG_REJECTED, self._saved, self.state)
+
+    def _advance_twice(self, level: int) -> None:
+        dt = self._step / (self._fewest << level)
+        self._substep(self.state, self._other, dt)
+        self._substep(self._other, self.state, dt)
+        stepping.launch_end_pair(level, self._buffers)
+
+    def _substep(self, now: newton.State, then: newton.State, dt: float) -> None:
+        b, system = self._buffers, self._magnetics.system
+        now.clear_forces()
+        self._magnetics.induce(now)
+        monitor.watch_induction(system.error, system.evaluations, system.converged, b.peaks, b.counts)
+        stepping.launch_mark(INDUCTION, b)
+        self._magnetics.add_forces(now)
+        stepping.launch_mark(FORCE, b)
+        monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, b.peaks)
+        self._find_contacts(now, dt, 0.0)
+        self._solver.step(now, then, dt)
+        stepping.launch_mark(RIGID, b)
+
+    def _find_contacts(self, state: newton.State, dt: float, overlap_threshold: float) -> None:
+        solver, b = self._solver, self._buffers
+        solver.collide(state, dt)
+        solver.watch(int(monitor.COUNT_CAPACITIES), b.counts)
+        monitor.watch_contacts(
+            self._model, state, solver.contacts, self._thickness, overlap_threshold, solver.overlaps, b.peaks, b.counts
+        )
+
+    def _copy_state(self, flag: int, source: newton.State, target: newton.State) -> None:
+        for one, other in zip(_arrays(source), _arrays(target), strict=True):
+            stepping.launch_copy_where(flag, one, other, self._buffers)
 
 
-class _Stopwatch:
-    """Adds up the time spent in stages: by the clock on the CPU, by events on a GPU."""
+def _arrays(state: newton.State) -> list[wp.array]:
+    """Return what a state remembers, flat; forces are cleared before each substep."""
+    found = []
+    for name, value in vars(state).items():
+        if isinstance(value, newton.Model.AttributeNamespace):
+            found += _arrays(value)
+        elif isinstance(value, wp.array) and value.size and name not in ("body_f", "particle_f"):
+            found.append(value.flatten())
+    return found
+
+
+class _Clock:
+    """Tells how long a tick of the device's clock is.
+
+    Attributes:
+        seconds_per_tick: Known after a :meth:`look`.
+    """
 
     def __init__(self, device):
-        self._device = device
-        self._laps: list[tuple] = []
+        self._time = wp.zeros(1, dtype=wp.uint64, device=device)
+        self._fixed = device.is_cuda
+        self.seconds_per_tick = 1e-9
+        self._began = None if self._fixed else self._read()
 
-    def _now(self):
-        if self._device.is_cpu:
-            return time.perf_counter()
-        return self._device.stream.record_event(wp.Event(self._device, enable_timing=True))
+    def _read(self) -> tuple[int, float]:
+        stepping.launch_read_clock(self._time)
+        return int(self._time.numpy()[0]), time.perf_counter()
 
-    def start(self, stage: str) -> None:
-        self._stage, self._begin = stage, self._now()
-
-    def stop(self) -> None:
-        self._laps.append((self._stage, self._begin, self._now()))
-
-    def seconds(self) -> dict[str, float]:
-        totals: dict[str, float] = dict.fromkeys((INDUCTION, FORCE, RIGID), 0.0)
-        for stage, begin, end in self._laps:
-            lap = end - begin if self._device.is_cpu else 1e-3 * wp.get_event_elapsed_time(begin, end)
-            totals[stage] += lap
-        return totals
+    def look(self) -> None:
+        """Compare the device's clock with the host's; that of a GPU counts nanoseconds."""
+        if not self._fixed:
+            ticks, seconds = np.subtract(self._read(), self._began)
+            self.seconds_per_tick = float(seconds / ticks)

@@ -1,0 +1,42 @@
+"""Prefix sums that allocate nothing, for the conditional nodes of CUDA graphs (see ``warpmag.engine.capture``)."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+_TILE = wp.constant(2048)
+_BLOCK = 256
+
+
+@wp.kernel
+def _scan(
+    # inputs:
+    values_in: wp.array[wp.int32],
+    inclusive: int,
+    # outputs:
+    sums_out: wp.array[wp.int32],
+):
+    """One block walks through the tiles; loads beyond the end give zeros, stores there do nothing."""
+    before = int(0)
+    for tile in range((values_in.shape[0] + _TILE - 1) // _TILE):
+        values = wp.tile_load(values_in, shape=_TILE, offset=tile * _TILE)
+        sums = wp.tile_scan_inclusive(values)
+        base = wp.tile_full(shape=_TILE, value=before, dtype=int)
+        if inclusive != 0:
+            wp.tile_store(sums_out, sums + base, offset=tile * _TILE)
+        else:
+            wp.tile_store(sums_out, sums - values + base, offset=tile * _TILE)
+        before += wp.tile_extract(sums, _TILE - 1)
+
+
+def launch_scan(values, sums, inclusive: bool = True):
+    """Add up integers from the first on; the same as ``wp.utils.array_scan``.
+
+    Args:
+        values: Integers, shape [n].
+        sums: Out, sum of the values up to each one, shape [n]; may be ``values``.
+        inclusive: Whether the value itself is counted.
+    """
+    wp.launch_tiled(
+        _scan, dim=1, inputs=[values, int(inclusive)], outputs=[sums], block_dim=_BLOCK, device=values.device
+    )
