@@ -189,9 +189,7 @@ def _watch_flags(
 
 def watch_flags(flags, index, counts):
     """Set ``counts[index]`` to 1 if any of ``flags`` [n] stands."""
-    wp.launch(
-        _watch_flags, dim=flags.shape[0], inputs=[flags, index], outputs=[counts], device=counts.device
-    )
+    wp.launch(_watch_flags, dim=flags.shape[0], inputs=[flags, index], outputs=[counts], device=counts.device)
 
 
 @wp.kernel

@@ -17,9 +17,16 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels import monitor
-from warpmag.kernels.monitor import COUNT_BAD_BODY, COUNT_CAPACITIES, COUNT_EVALUATIONS, COUNT_UNCONVERGED, NO_BODY
-from warpmag.kernels.monitor import PEAK_DEPTH, PEAK_ERROR, PEAK_OVERLAP, PEAK_SPEED, PEAK_TRAVEL
+from warpmag.kernels.monitor import (
+    COUNT_BAD_BODY,
+    COUNT_CAPACITIES,
+    COUNT_EVALUATIONS,
+    COUNT_UNCONVERGED,
+    NO_BODY,
+    PEAK_OVERLAP,
+    PEAK_TRAVEL,
+    PEAKS,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -107,7 +114,7 @@ def allocate(records: int, capacities: int, device) -> StepBuffers:
     return StepBuffers(
         flags=zeros(FLAGS, wp.int32),
         status=zeros(STATUSES, wp.int32),
-        peaks=zeros(monitor.PEAKS, wp.float32),
+        peaks=zeros(PEAKS, wp.float32),
         counts=zeros(int(COUNT_CAPACITIES) + capacities, wp.int32),
         last_overlap=zeros(1, wp.float32),
         ticks=zeros(int(STAGES) + 1, wp.uint64),

@@ -1,9 +1,9 @@
 """Lets what Newton launches in a substep stand inside conditional nodes of a CUDA graph.
 
-The body of such a node may hold kernels, copies and further conditional nodes, but nothing that allocates memory. Newton
-allocates in two places: solvers make temporary arrays, and collision adds up counts with Warp's ``array_scan``, which
-takes its scratch memory from the device's pool. While a step is launched or captured, temporary arrays therefore come
-from a :class:`Workspace`, and integer scans are done by a kernel that needs no scratch.
+The body of such a node may hold kernels, copies and further conditional nodes, but nothing that allocates memory.
+Newton allocates in two places: solvers make temporary arrays, and collision adds up counts with Warp's ``array_scan``,
+which takes its scratch memory from the device's pool. While a step is launched or captured, temporary arrays therefore
+come from a :class:`Workspace`, and integer scans are done by a kernel that needs no scratch.
 """
 
 import contextlib
