@@ -46,8 +46,20 @@ CASES = {
             "a cold and a warm induction solve to 1e-3, neighbour search included",
             {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768)},
         ),
+        Case(
+            "scene",
+            "steps of Balls Up while it runs: induction, forces, rigid bodies, host",
+            {"cpu": (243, 2500), "cuda": (243, 2500, 10000)},
+        ),
     )
 }
+
+PILES = {
+    243: {"columns": 9, "rows": 9, "layers": 3, "height": 0.051},
+    2500: {"columns": 25, "rows": 25, "layers": 4, "height": 0.0611},
+    10000: {"columns": 50, "rows": 50, "layers": 4, "height": 0.0611},
+}
+"""Balls Up by its number of balls: the bundled scene, and wider piles with the magnet as high above their top."""
 
 
 def touching_pile(count: int, seed: int = 0) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Check, then time: ``python -m bench.run field|force|induction [--device cuda:0] [--sizes 243 2560]``.
+"""Check, then time: ``python -m bench.run field|force|induction|scene [--device cuda:0] [--sizes 243 2560]``.
 
-Each size is compared with the float64 oracle on some targets before it is timed. One JSON line a measurement, with
-machine, commit, error and the time of the first call, which compiles.
+Each size is compared with the float64 oracle on some targets before it is timed; induction and scenes give the error
+of the solve itself. One JSON line a measurement, with machine, commit, error and the time of the first call, which
+compiles.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import warp as wp
 
 from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
 from bench.machine import describe
+from bench.scene import run_scene
 from warpmag import oracle
 from warpmag.system import MomentSystem
 
@@ -110,6 +112,17 @@ def run_induction(system, device) -> dict:
 RUNNERS = {"field": run_field, "force": run_force, "induction": run_induction}
 
 
+def run_system(case: Case, count: int, dtype: str, device) -> dict:
+    """Measure a case that is one part of a step, alone."""
+    began = time.perf_counter()
+    system = make_system(count, dtype, device)
+    system.solve()
+    system.apply_forces()
+    wp.synchronize_device(device)
+    first = time.perf_counter() - began
+    return {**RUNNERS[case.name](system, device), "first_call_seconds": first}
+
+
 def _relative(found, expected) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
@@ -119,15 +132,8 @@ def run_case(case: Case, device, sizes) -> None:
     machine = describe(device)
     for dtype in case.dtypes:
         for count in sizes or case.sizes["cpu" if device.is_cpu else "cuda"]:
-            began = time.perf_counter()
-            system = make_system(count, dtype, device)
-            system.solve()
-            system.apply_forces()
-            wp.synchronize_device(device)
-            first = time.perf_counter() - began
-            result = RUNNERS[case.name](system, device)
-            line = {"case": case.name, "dtype": dtype, "count": count, **result, "first_call_seconds": first, **machine}
-            print(json.dumps(line), flush=True)
+            result = run_system(case, count, dtype, device) if case.name in RUNNERS else run_scene(count, device)
+            print(json.dumps({"case": case.name, "dtype": dtype, "count": count, **result, **machine}), flush=True)
 
 
 def main() -> None:

@@ -55,7 +55,7 @@ class Statistics:
     farthest: float = 0.0
     overlapping: int = 0
     wall_seconds: float = 0.0
-    _seconds: list[tuple[float, float, float]] = field(default_factory=list)
+    _seconds: list[tuple[float, float, float] | None] = field(default_factory=list)
 
     def add_step(self, report: StepReport) -> None:
         """Take in one step."""
@@ -70,13 +70,17 @@ class Statistics:
         self.peak_speed = max(self.peak_speed, report.speed)
         self.overlap = max(self.overlap, report.overlap)
         self.depth = max(self.depth, report.depth)
-        if report.seconds:
-            self._seconds.append(report.seconds)
+        self._seconds.append(report.seconds)
 
     @property
     def milliseconds(self) -> tuple[float, float, float]:
         """Mean time per step of induction Ti, magnetic forces Tf and rigid bodies Tr [ms], as the paper's Table 1."""
-        return tuple((1e3 * np.mean(self._seconds, axis=0)).tolist()) if self._seconds else (0.0, 0.0, 0.0)
+        return self.milliseconds_since(0)
+
+    def milliseconds_since(self, step: int) -> tuple[float, float, float]:
+        """Mean times of the steps after the first ``step``; see :attr:`milliseconds`."""
+        timed = [seconds for seconds in self._seconds[step:] if seconds]
+        return tuple((1e3 * np.mean(timed, axis=0)).tolist()) if timed else (0.0, 0.0, 0.0)
 
     def warnings(self) -> list[str]:
         """Return what the user should know before he trusts the run, a line each."""

@@ -109,6 +109,10 @@ class Stepper:
         self._thickness = wp.array(sizes.thickness, dtype=float, device=self._device)
         self._reach = wp.array(sizes.reach, dtype=float, device=self._device)
         self._buffers = stepping.allocate(_RECORDS, len(solver.buffers), self._device)
+        self._mirrors = {
+            name: array if self._device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
+            for name, array in vars(self._buffers).items()
+        }
         self._clock = _Clock(self._device)
         self._workspace = Workspace(self._device) if self._device.is_cuda else None
         self._capture, self._graph = graphs, None
@@ -147,7 +151,7 @@ class Stepper:
             SimulationError: The state is not finite any more; it is that of the last step that held.
         """
         while self.steps > self._reported:
-            status = self._buffers.status.numpy()
+            status = self._read("status")
             yield from self._reports(int(status[stepping.STATUS_DONE]))
             if status[stepping.STATUS_HALT] == stepping.NOT_FINITE:
                 self._give_up()
@@ -162,7 +166,7 @@ class Stepper:
     def _reports(self, done: int) -> list[StepReport]:
         """Read what the steps up to ``done`` logged."""
         self._clock.look()
-        log = self._buffers.log.numpy()
+        log = self._read("log")
         numbers = range(self._reported, done)
         self._reported = done
         return [self._report(log[number % _RECORDS], number not in self._cold) for number in numbers]
@@ -186,14 +190,22 @@ class Stepper:
         )
 
     def _give_up(self) -> None:
-        body = int(self._buffers.counts.numpy()[monitor.COUNT_BAD_BODY])
+        body = int(self._read("counts")[monitor.COUNT_BAD_BODY])
         self.steps, number = self._reported, self._reported + 1
         raise SimulationError(
             f"step {number} ({number * self._step:g} s): {self._model.body_label[body]} has left all finite numbers"
         )
 
     def _fills(self) -> np.ndarray:
-        return self._buffers.counts.numpy()[int(monitor.COUNT_CAPACITIES) :]
+        return self._read("counts")[int(monitor.COUNT_CAPACITIES) :]
+
+    def _read(self, name: str) -> np.ndarray:
+        """Wait for the device and return one of the state machine's buffers."""
+        source, mirror = getattr(self._buffers, name), self._mirrors[name]
+        if mirror is not source:
+            wp.copy(mirror, source)
+            wp.synchronize_stream(self._device.stream)
+        return mirror.numpy()
 
     def _launch(self) -> None:
         """Launch a step: from Python at first, which compiles its kernels, then, if it can be captured, as a graph."""
@@ -205,7 +217,7 @@ class Stepper:
             if not self._warm:
                 self._warm = True
                 self._cold.add(self._reported)
-                if self._capture and self._buffers.status.numpy()[stepping.STATUS_HALT] == stepping.RUNNING:
+                if self._capture and self._read("status")[stepping.STATUS_HALT] == stepping.RUNNING:
                     self._capture_step()
 
     def _capture_step(self) -> None:
@@ -231,7 +243,7 @@ class Stepper:
             if not self._solver.grow(self._fills()):
                 break
             self._prepare()
-        peaks, counts = b.peaks.numpy(), b.counts.numpy()
+        peaks, counts = self._read("peaks"), self._read("counts")
         overlap = float(peaks[monitor.PEAK_OVERLAP])
         b.last_overlap.fill_(overlap)
         return overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])

@@ -1,0 +1,62 @@
+"""A running scene: what its steps cost on the device and on the host, and what they did."""
+
+import copy
+import re
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from bench.cases import PILES
+from warpmag import Simulation
+from warpmag.scenes_usd import balls_up
+
+_SETTLING, _STEPS = 32, 60
+"""Steps before the measurement, in which the balls start to move, and steps measured."""
+
+
+def run_scene(count: int, device) -> dict:
+    """Run Balls Up with ``count`` balls and measure its steps."""
+    with tempfile.TemporaryDirectory() as folder:
+        stage = Path(folder) / "pile.usdc"
+        balls_up.author(stage, **PILES[count])
+        began = time.perf_counter()
+        simulation = Simulation(stage, device=str(device))
+    simulation.step()
+    wp.synchronize_device(device)
+    first = time.perf_counter() - began
+    for _ in range(_SETTLING - 1):
+        simulation.step()
+    before = copy.deepcopy(simulation.statistics)
+
+    host, reports = [], []
+    with wp.ScopedMemoryTracker("steps", report_func=reports.append) as tracker:
+        tracker.clear()
+        began = time.perf_counter()
+        for _ in range(_STEPS):
+            called = time.perf_counter()
+            simulation.step()
+            host.append(time.perf_counter() - called)
+        wp.synchronize_device(device)
+        seconds = (time.perf_counter() - began) / _STEPS
+    after = simulation.statistics
+    induction, force, rigid = after.milliseconds_since(before.steps)
+    return {
+        "seconds": seconds,
+        "ti_ms": induction,
+        "tf_ms": force,
+        "tr_ms": rigid,
+        "magnetics_share": (induction + force) / rigid,
+        "host_us": 1e6 * float(np.median(host)),
+        "host_us_max": 1e6 * max(host),
+        "allocations": sum(int(n) for n in re.findall(r"^\s+(?:cpu|pinned|cuda:\d+)\s+(\d+) \(", reports[0], re.M)),
+        "substeps": (after.substeps - before.substeps) / _STEPS,
+        "repeated": after.repeated - before.repeated,
+        "evaluations": float(np.median(after.evaluations[before.steps :])),
+        "error": after.error,
+        "unconverged": after.unconverged,
+        "overlap": after.overlap,
+        "first_call_seconds": first,
+    }
