@@ -49,6 +49,7 @@ STATUSES = 6
 RUNNING = wp.constant(0)
 OVERFLOW = wp.constant(1)
 NOT_FINITE = wp.constant(2)
+PAUSED = wp.constant(3)  # by the host
 
 STAGES = wp.constant(3)
 """Stages whose time is taken."""
@@ -146,6 +147,22 @@ def _begin_step(
     flags_out: wp.array[wp.int32],
 ):
     flags_out[FLAG_ATTEMPT] = wp.where(status_in[STATUS_HALT] == RUNNING, 1, 0)
+
+
+@wp.kernel
+def _set_status(
+    # inputs:
+    index: int,
+    value: int,
+    # outputs:
+    status_out: wp.array[wp.int32],
+):
+    status_out[index] = value
+
+
+def launch_set_status(index: int, value: int, b: StepBuffers):
+    """Let the host change one of the ``STATUS_*`` entries."""
+    wp.launch(_set_status, dim=1, inputs=[index, value], outputs=[b.status], device=b.status.device)
 
 
 def launch_begin_step(b: StepBuffers):

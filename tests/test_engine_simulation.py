@@ -1,6 +1,8 @@
 """Steps, substeps, buffers and recorded frames of a simulation."""
 
+import functools
 import math
+import time
 
 import newton
 import numpy as np
@@ -10,9 +12,11 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 import warpmag
 from warpmag.engine.contacts import RigidSolver, body_sizes
+from warpmag.engine.deterministic import OrderedXPBD
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.statistics import find_held
 from warpmag.engine.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
+from warpmag.kernels.scan import launch_scan
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, balls_up
 from warpmag.usd import author_magnet
@@ -78,24 +82,70 @@ def test_balls_jump_to_the_magnet(reference):
     assert simulation.finish().held == 8
 
 
-@pytest.mark.parametrize("graphs", [True, False])
-def test_a_run_repeats_bit_by_bit_with_and_without_graphs(reference, device, graphs):
-    if device != "cpu":
+def test_a_deterministic_run_repeats_bit_by_bit_with_and_without_graphs(device):
+    simulations = [
+        Simulation(pile(), device=device, graphs=graphs, deterministic=True) for graphs in (True, True, False)
+    ]
+    first, *others = [(run(one, 30), one.state.body_qd.numpy()) for one in simulations]
+    for other in others:
+        np.testing.assert_array_equal(other[0], first[0])
+        np.testing.assert_array_equal(other[1], first[1])
+
+
+def test_on_a_cpu_every_run_is_deterministic(reference):
+    if reference[1].device != "cpu":
         pytest.skip("the solver adds up contacts in any order on a GPU")
-    np.testing.assert_array_equal(run(Simulation(pile(), device=device, graphs=graphs), 30), reference[0])
+    np.testing.assert_array_equal(run(Simulation(pile(), device="cpu"), 30), reference[0])
+
+
+def test_the_deterministic_solver_is_newtons(device):
+    """Contacts added up side by side, in their order, give the bits of Newton's serial loop."""
+    end = []
+    for kind in (newton.solvers.SolverXPBD, functools.partial(OrderedXPBD, contact_max=100)):
+        builder = pile()
+        builder.default_shape_cfg.mu = 0.5  # friction turns the balls
+        model = builder.finalize(device="cpu")
+        model.joint_count = 0
+        solver = kind(model, iterations=20, rigid_contact_con_weighting=False)
+        pipeline = newton.CollisionPipeline(model, rigid_contact_max=100)
+        contacts, now, then = pipeline.contacts(), model.state(), model.state()
+        now.body_qd.assign(np.random.default_rng(3).normal(scale=0.1, size=(8, 6)))
+        for _ in range(40):
+            pipeline.collide(now, contacts)
+            solver.step(now, then, None, contacts, 5e-4)
+            now, then = then, now
+        end.append((contacts.rigid_contact_count.numpy()[0], now.body_q.numpy(), now.body_qd.numpy()))
+    assert end[0][0] > 8
+    for newtons, ours in zip(*end, strict=True):
+        np.testing.assert_array_equal(ours, newtons)
+
+
+@pytest.mark.cuda
+def test_only_xpbd_without_joints_is_deterministic_on_a_gpu(device):
+    with pytest.raises(warpmag.InputError, match="solver steel: its runs on a GPU are not deterministic"):
+        Simulation(pile(), device=device, solver="steel", deterministic=True)
+    builder = pile()
+    builder.add_joint_revolute(-1, 0)
+    with pytest.raises(warpmag.InputError, match="solver xpbd: with joints or particles"):
+        Simulation(builder, device=device, deterministic=True)
 
 
 def test_penetration_stays_small(reference):
     assert reference[1].statistics.overlap < 0.01
 
 
-def test_buffers_that_overflow_are_grown_and_the_step_repeated(reference, device):
+@pytest.mark.parametrize("ahead", [1, 15])
+def test_buffers_that_overflow_are_grown_and_the_step_repeated(reference, device, ahead):
     model = pile().finalize(device=device)
     sizes = body_sizes(model)
     solver = RigidSolver(model, sizes, capacity=0.0)
     before = [buffer.limit for buffer in solver.buffers]
     stepper = Stepper(model, warpmag.Magnetics(model), solver, sizes, step=1e-3, longest_substep=5e-4)
-    reports = advance(stepper, 30)
+    reports = []
+    for _ in range(30 // ahead):
+        for _ in range(ahead):
+            stepper.advance()
+        reports += stepper.look()
     assert len(reports) == 30
     assert any(report.regrown for report in reports)
     assert all(after.limit >= limit for after, limit in zip(solver.buffers, before, strict=True))
@@ -165,6 +215,44 @@ def test_a_state_that_is_not_finite_stops_the_run(device):
     assert simulation.time == pytest.approx(0.001)
     assert simulation.statistics.steps == 1
     np.testing.assert_array_equal(simulation.state.body_q.numpy(), held)
+
+
+def test_steps_that_cannot_be_captured_are_launched(reference, device):
+    simulation = Simulation(pile(), device=device)
+    step = simulation._solver.step
+
+    def refuse(*arguments):
+        assert not wp.get_device(device).is_capturing
+        step(*arguments)
+
+    simulation._solver.step = refuse
+    poses = run(simulation, 30)
+    assert simulation.statistics.steps == 30
+    if device == "cpu":
+        np.testing.assert_array_equal(poses, reference[0])
+
+
+def test_times_of_the_stages_add_up_to_that_of_the_step(device):
+    simulation = Simulation(pile(), device=device)
+    run(simulation, 5)
+    began = time.perf_counter()
+    run(simulation, 20)
+    seconds = time.perf_counter() - began
+    stages = 20 * 1e-3 * np.array(simulation.statistics.milliseconds_since(5))
+    assert (stages > 0.0).all()
+    assert stages.sum() < 2.0 * seconds  # the right unit; what is left is the host's
+
+
+@pytest.mark.parametrize("count", [1, 2047, 2048, 2049, 10000])
+@pytest.mark.parametrize("inclusive", [True, False])
+def test_scan(device, count, inclusive):
+    numbers = np.random.default_rng(count).integers(0, 1000, count).astype(np.int32)
+    expected = np.cumsum(numbers) - (0 if inclusive else numbers)
+    values, sums = wp.array(numbers, device=device), wp.zeros(count, dtype=wp.int32, device=device)
+    launch_scan(values, sums, inclusive)
+    np.testing.assert_array_equal(sums.numpy(), expected)
+    launch_scan(values, values, inclusive)
+    np.testing.assert_array_equal(values.numpy(), expected)
 
 
 def test_bad_scenes_are_refused(device):

@@ -13,6 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.deterministic import OrderedXPBD
 from warpmag.errors import InputError
 from warpmag.kernels.monitor import watch_capacity, watch_flags
 
@@ -123,16 +124,17 @@ def _without_free_joints(model: newton.Model) -> newton.Model:
     return model
 
 
-def _xpbd(model: newton.Model, contact_max: int):
+def _xpbd(model: newton.Model, contact_max: int, ordered: bool = False):
     # Contacts are relaxed all at once: beyond a third of each correction the many contacts of a ball in a pile
     # together overshoot, which keeps the pile hot for good (RMS speed on Balls Up after 1.5 s of 0.15 cm/s at 0.35,
     # 1.6 at 0.5, 10 at Newton's 0.8). Averaging over a body's contacts instead would need far more iterations.
-    return newton.solvers.SolverXPBD(
-        _without_free_joints(model),
-        iterations=60,
-        rigid_contact_relaxation=0.35,
-        rigid_contact_con_weighting=False,
-    )
+    settings = {"iterations": 60, "rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
+    model = _without_free_joints(model)
+    if not ordered:
+        return newton.solvers.SolverXPBD(model, **settings)
+    if model.joint_count or model.particle_count:
+        raise ValueError("with joints or particles its runs on a GPU are not deterministic")
+    return OrderedXPBD(model, contact_max, **settings)
 
 
 def _steel(model: newton.Model, contact_max: int):
@@ -165,7 +167,15 @@ class RigidSolver:
         buffers: The buffers that can overflow.
     """
 
-    def __init__(self, model: newton.Model, sizes: BodySizes, *, solver: str = "xpbd", capacity: float = 1.0):
+    def __init__(
+        self,
+        model: newton.Model,
+        sizes: BodySizes,
+        *,
+        solver: str = "xpbd",
+        capacity: float = 1.0,
+        deterministic: bool = False,
+    ):
         """Set up collision and solver.
 
         Args:
@@ -173,6 +183,7 @@ class RigidSolver:
             sizes: Sizes of its bodies.
             solver: One of ``SOLVERS``.
             capacity: First size of the contact and pair buffers over the usual one.
+            deterministic: Whether every run must give the same bits. On a CPU it does anyway.
 
         Raises:
             InputError: There is no such solver, or it cannot be had or cannot run this model.
@@ -180,6 +191,9 @@ class RigidSolver:
         if solver not in SOLVERS:
             raise InputError(f"solver: {solver!r} is not one of {', '.join(SOLVERS)}")
         self._model, self._name = model, solver
+        self._ordered = deterministic and wp.get_device(model.device).is_cuda
+        if self._ordered and solver != "xpbd":
+            raise InputError(f"solver {solver}: its runs on a GPU are not deterministic, those of xpbd can be")
         scale_gaps(model, sizes)
         finite = sizes.thickness[np.isfinite(sizes.thickness)]
         self._speculation = float(2.0 * finite.max()) if len(finite) else 0.0
@@ -201,12 +215,14 @@ class RigidSolver:
                 rigid_contact_max=self._limits["contact"],
                 shape_pairs_max=self._limits["pair"],
                 max_triangle_pairs=self._limits["triangle"],
+                deterministic=self._ordered,
                 verify_buffers=False,  # would only print; the counters are read instead
             )
             self.contacts = self._pipeline.contacts()
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:
-                self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
+                options = {"ordered": True} if self._ordered else {}
+                self._solver = SOLVERS[self._name](self._model, self._limits["contact"], **options)
             except (ImportError, NotImplementedError, TypeError, ValueError, RuntimeError) as error:
                 raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None
         narrow = self._pipeline.narrow_phase

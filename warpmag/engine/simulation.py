@@ -57,6 +57,7 @@ class Simulation:
         curve: str | None = None,
         device: str | None = None,
         graphs: bool = True,
+        deterministic: bool = False,
         visuals: bool = False,
     ):
         """Import the scene and get ready to step.
@@ -72,6 +73,7 @@ class Simulation:
             curve: ``tanh``, ``langevin`` or ``clamped`` for all magnets; by default each magnet's own.
             device: Warp device; by default Warp's.
             graphs: Replay captured graphs instead of launching kernels one by one.
+            deterministic: Give the same bits in every run on a GPU too, at some cost; on a CPU every run does.
             visuals: Also import what is only seen, for a viewer.
 
         Raises:
@@ -103,7 +105,7 @@ class Simulation:
             curve=curve,
         )
         sizes = body_sizes(self.model)
-        self._solver = RigidSolver(self.model, sizes, solver=solver)
+        self._solver = RigidSolver(self.model, sizes, solver=solver, deterministic=deterministic)
         self._stepper = Stepper(
             self.model,
             self.magnetics,

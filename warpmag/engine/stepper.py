@@ -158,8 +158,8 @@ class Stepper:
             if status[stepping.STATUS_HALT] == stepping.OVERFLOW:
                 self._solver.grow(self._fills())
                 self._prepare()
-                status[[stepping.STATUS_HALT, stepping.STATUS_REGROWN]] = stepping.RUNNING, 1
-                self._buffers.status.assign(status)
+                stepping.launch_set_status(stepping.STATUS_REGROWN, 1, self._buffers)
+                stepping.launch_set_status(stepping.STATUS_HALT, stepping.RUNNING, self._buffers)
                 for _ in range(self.steps - self._reported):
                     self._launch()
 
@@ -224,9 +224,13 @@ class Stepper:
         try:
             with wp.ScopedCapture(self._device) as capture:
                 self._run_step()
+            # the first launch makes the graph executable, or fails to; paused, it does nothing else
+            stepping.launch_set_status(stepping.STATUS_HALT, stepping.PAUSED, self._buffers)
+            wp.capture_launch(capture.graph)
             self._graph = capture.graph
         except Exception:  # whatever a solver does that cannot be captured, it can still be launched
             self._capture = False
+        stepping.launch_set_status(stepping.STATUS_HALT, stepping.RUNNING, self._buffers)
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
         """Find the contacts of the present state; :meth:`look` first.
