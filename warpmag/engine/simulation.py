@@ -38,7 +38,6 @@ class Simulation:
 
     Attributes:
         model: Newton's model.
-        magnetics: Its magnets.
         step_size: Time step [s].
         frame_rate: Output frames per second [Hz].
         frame_count: Output frames that the stage asks for, the first excluded; None where it has no time range.
@@ -96,7 +95,7 @@ class Simulation:
         with wp.ScopedDevice(self.device):
             self.model = builder.finalize(device=self.device)
         self._check_poses()
-        self.magnetics = Magnetics(
+        self._magnetics = Magnetics(
             self.model,
             force=settings.force if force is None else force,
             dynamics=settings.dynamics if dynamics is None else dynamics,
@@ -108,7 +107,7 @@ class Simulation:
         self._solver = RigidSolver(self.model, sizes, solver=solver, deterministic=deterministic)
         self._stepper = Stepper(
             self.model,
-            self.magnetics,
+            self._magnetics,
             self._solver,
             sizes,
             step=self.step_size,
@@ -117,7 +116,7 @@ class Simulation:
         )
         self._sizes = sizes
         self._moving = np.array(
-            sorted({one.body for one in self.magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int
+            sorted({one.body for one in self._magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int
         )
         self._statistics = Statistics(magnets=len(self._moving))
         if self._scene:
@@ -138,13 +137,13 @@ class Simulation:
     def _start_from_stage(self) -> None:
         """Let induction start from the moments that the stage holds, of an earlier run say."""
         given = {}
-        volumes = dict(zip(self.magnetics.shapes.tolist(), self.magnetics.shape_volumes.tolist(), strict=True))
+        volumes = dict(zip(self._magnetics.shapes.tolist(), self._magnetics.shape_volumes.tolist(), strict=True))
         for prim, moment in self._scene.magnets.initial_moments.items():
             shapes = self._scene.magnet_shapes[prim]
             volume = sum(volumes[shape] for shape in shapes)
             given |= dict.fromkeys(shapes, np.array(moment) / volume)
         if given:
-            self.magnetics.start_from(given)
+            self._magnetics.start_from(given)
 
     @property
     def state(self) -> newton.State:
@@ -155,6 +154,12 @@ class Simulation:
         """
         self._look()
         return self._stepper.state
+
+    @property
+    def magnetics(self) -> Magnetics:
+        """Its magnets, as of the present state; waits as :attr:`state` does."""
+        self._look()
+        return self._magnetics
 
     @property
     def statistics(self) -> Statistics:
