@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 import time
 
 import newton
@@ -241,6 +242,18 @@ def test_times_of_the_stages_add_up_to_that_of_the_step(device):
     stages = 20 * 1e-3 * np.array(simulation.statistics.milliseconds_since(5))
     assert (stages > 0.0).all()
     assert stages.sum() < 2.0 * seconds  # the right unit; what is left is the host's
+
+
+def test_steps_allocate_nothing(device):
+    simulation = Simulation(pile(), device=device)
+    run(simulation, 1)
+    texts = []
+    with wp.ScopedMemoryTracker("steps", report_func=texts.append) as tracker:
+        tracker.clear()
+        for _ in range(20):
+            simulation.step()
+        assert simulation.statistics.repeated > 0  # nor do steps that are done again
+    assert re.search(r"Total allocations:\s+Peak usage:", texts[0]), texts[0]
 
 
 @pytest.mark.parametrize("count", [1, 2047, 2048, 2049, 10000])

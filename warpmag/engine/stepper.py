@@ -137,7 +137,13 @@ class Stepper:
         return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
 
     def advance(self) -> None:
-        """Advance :attr:`state` by one step; on a GPU without waiting for it."""
+        """Advance :attr:`state` by one step; on a GPU without waiting for it.
+
+        Raises:
+            RuntimeError: More steps are asked for than can be reported at the next look.
+        """
+        if self.steps - self._reported >= _RECORDS:
+            raise RuntimeError(f"look() must be called every {_RECORDS} steps")
         self.steps += 1
         self._launch()
 
