@@ -161,7 +161,8 @@ class Stepper:
             yield from self._reports(int(status[stepping.STATUS_DONE]))
             if status[stepping.STATUS_HALT] == stepping.NOT_FINITE:
                 self._give_up()
-            if status[stepping.STATUS_HALT] == stepping.OVERFLOW:
+            if self.steps > self._reported:
+                assert status[stepping.STATUS_HALT] == stepping.OVERFLOW, "the device left steps undone"
                 self._solver.grow(self._fills())
                 self._prepare()
                 stepping.launch_set_status(stepping.STATUS_REGROWN, 1, self._buffers)
@@ -236,6 +237,7 @@ class Stepper:
             self._graph = capture.graph
         except Exception:  # whatever a solver does that cannot be captured, it can still be launched
             self._capture = False
+            _clear_error(self._device)
         stepping.launch_set_status(stepping.STATUS_HALT, stepping.RUNNING, self._buffers)
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
@@ -307,6 +309,13 @@ class Stepper:
     def _copy_state(self, flag: int, source: newton.State, target: newton.State) -> None:
         for one, other in zip(_arrays(source), _arrays(target), strict=True):
             stepping.launch_copy_where(flag, one, other, self._buffers)
+
+
+def _clear_error(device) -> None:
+    """Let a sort of nothing meet the error that a failed graph leaves behind: the next sort on a GPU does nothing."""
+    if device.is_cuda:
+        nothing = wp.zeros(2, dtype=wp.int32, device=device)
+        wp.utils.radix_sort_pairs(nothing, wp.zeros_like(nothing), 1)
 
 
 def _arrays(state: newton.State) -> list[wp.array]:
