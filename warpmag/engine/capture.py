@@ -34,8 +34,10 @@ class Workspace:
         if self._device.is_capturing:
             raise RuntimeError(f"{size_in_bytes} bytes are wanted that the step did not need when it ran")
         with wp.ScopedAllocator(self._device, None):
-            self._blocks.append(wp.empty(size_in_bytes, dtype=wp.uint8, device=self._device))
-        return self._blocks[-1].ptr
+            block = wp.empty(size_in_bytes, dtype=wp.uint8, device=self._device)
+        self._blocks.append(block)
+        assert block.ptr is not None
+        return block.ptr
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
         """Take a block back."""
