@@ -202,6 +202,38 @@ def test_captured_graph_gives_the_same_bits(device):
             assert np.array_equal(getattr(plain, name).numpy(), getattr(captured, name).numpy()), (step, name)
 
 
+def test_solves_inside_a_loop_of_a_graph(device):
+    """What a solve launches may stand in the body of a conditional node, whole substeps in a loop on the device."""
+
+    @wp.kernel(module="unique")
+    def shrink(positions: wp.array[wp.vec3], left: wp.array[int]):
+        i = wp.tid()
+        positions[i] = 0.999 * positions[i]
+        if i == 0:
+            left[0] = left[0] - 1
+
+    def substep(system, left):
+        system.solve()
+        system.apply_forces()
+        wp.launch(shrink, dim=60, outputs=[system.positions, left], device=device)
+
+    plain, looped = (two_worlds(device)[0] for _ in range(2))
+    left = wp.zeros(1, dtype=int, device=device)
+    for system in (plain, looped):
+        substep(system, left)
+    left.fill_(0)
+    with wp.ScopedCapture(device=device) as capture:
+        wp.capture_while(left, substep, system=looped, left=left)
+    left.fill_(5)
+    wp.capture_launch(capture.graph)
+    other = wp.zeros(1, dtype=int, device=device)
+    for _ in range(5):
+        substep(plain, other)
+    for name in ("positions", "moments", "forces", "evaluations", "error"):
+        assert np.array_equal(getattr(plain, name).numpy(), getattr(looped, name).numpy()), name
+    assert left.numpy()[0] == 0
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_two_runs_are_bitwise_equal(dtype, device):
     results = []
