@@ -44,6 +44,9 @@ class InductionBuffers:
         last_s, last_change: Solution of the last solve, and how it differs from that of the one before, shape [n].
         history_s, history_r: Last iterates and residuals, shape [SLOTS, n].
         best_s, best_r: Those of the smallest merit, shape [n].
+        mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
+        mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
+        change, next_change: What a step adds to them [A·m²], shape [n].
         start: Largest applied field [A/m] and stiffness k (2/3 + o_i) of each world until it is judged, shape [w, 2].
         sums, world_sums: Sums of each chunk and world, shape [c, COLUMNS] and [w, COLUMNS].
         omega, best, error: Step length, smallest merit, relative residual of each world, shape [w].
@@ -66,6 +69,10 @@ class InductionBuffers:
     history_r: wp.array
     best_s: wp.array
     best_r: wp.array
+    mixed_g: wp.array
+    mixed_moment: wp.array
+    change: wp.array
+    next_change: wp.array
     start: wp.array
     sums: wp.array
     world_sums: wp.array
@@ -118,6 +125,7 @@ def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
         chunk=put(np.reshape(chunks, (-1, 3)), wp.vec3i),
         chunk_begin=put(chunk_begin, wp.int32),
         **{name: zeros(n, vec3) for name in ("h0", "h", "s", "last_s", "last_change", "best_s", "best_r")},
+        **{name: zeros(n, vec3) for name in ("mixed_g", "mixed_moment", "change", "next_change")},
         **{name: zeros((SLOTS, n), vec3) for name in ("history_s", "history_r")},
         start=zeros((world_count, 2), wp.float64),
         sums=zeros((len(chunks), COLUMNS), wp.float64),

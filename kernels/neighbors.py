@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction
+from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction, pair_factors
 
 CAPACITY = 32
 """Neighbours a list can hold before its target falls back to walking all its sources."""
@@ -324,6 +324,32 @@ def pair_overlap(packed: wp.array2d(dtype=Any), i: int, j: int):
     if d2 < s * s and packed[3, i] * packed[3, j] > type(s)(0.0):
         return overlap_fraction(wp.sqrt(d2), packed[3, i], packed[3, j])
     return type(s)(0.0)
+
+
+@wp.func
+def near_field(
+    packed: wp.array2d(dtype=Any),
+    moments: wp.array(dtype=Any),
+    i: int,
+    begin: int,
+    end: int,
+    neighbor: wp.array2d[int],
+    neighbor_count: wp.array[int],
+):
+    """4π times the field [A/m] at ball ``i`` of other ``moments`` [A·m²] on its neighbours among ``begin`` to ``end``.
+
+    It serves to guess: a ball whose list is full gets none.
+    """
+    h = moments[i] - moments[i]
+    count = neighbor_count[i]
+    if count <= wp.static(CAPACITY):
+        x = type(h)(packed[0, i], packed[1, i], packed[2, i])
+        for n in range(count):
+            j = neighbor[i, n]
+            if j >= begin and j < end:
+                r = x - type(h)(packed[0, j], packed[1, j], packed[2, j])
+                h += field_of(pair_factors(wp.dot(r, r), packed[3, i], packed[3, j]), r, moments[j])
+    return h
 
 
 @cache

@@ -2,15 +2,22 @@
 
 Unknown is the dual variable s = k f⁻¹(M)/Ms of every inducible moment, so that M = Ms c(‖s‖) ŝ. One field evaluation
 gives the target g = k H(M)/Ms and the residual r = g − s; the exact θ flow moves s by ω r (``curves.theta_flow``).
-With the n-th iterate's differences Δs_j, Δr_j to the last few, Anderson's step is
+With the iterate's differences Δs_j, Δr_j to the last few, Anderson's step is
 
-    s ← s + ω r − Σ_j α_j (Δs_j + ω Δr_j),    α = argmin ‖φ (r − Σ_j α_j Δr_j)‖,
+    s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖,
 
 weighted by φ = Ms c(a)/a, a = max(‖s‖, ‖g‖): what a residual is worth in magnetization, so that a saturated moment's
 huge s does not drown the rest. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, convex for the
 ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω ≤ 1/L, and close to the solution converges
-for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``neighbors``). An accelerated step that leaves the merit
-‖φ r‖ more than twice the best is taken back, and a few plain steps follow from the best iterate.
+for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``neighbors``).
+
+What a step changes is felt most by neighbours. Their part of it is known without another field evaluation: with the
+coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s) follow,
+ḡ = s̄ + r̄. From cold they spare a pile of touching balls 1 or 2 of 8 to 10 evaluations to 1e-3, and more where balls
+overlap.
+
+An accelerated step or a swept one that leaves the merit ‖φ r‖ more than twice the best is taken back, and a few plain
+steps follow from the best iterate.
 
 The residual that ends a solve is good for one more step: with that polished s, and its change β Δs to come, the next
 solve starts, Δs the change since the solve before it. β is what would have predicted Δs from the change before it,
@@ -25,7 +32,7 @@ import warp as wp
 
 from warpmag.kernels.anderson import DEPTH, SLOTS, anderson_coefficients, matrix_column, slot_of
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio, theta_flow
-from warpmag.kernels.field import finished_field
+from warpmag.kernels.field import INVERSE_4PI, finished_field
 from warpmag.kernels.induction import (
     CHUNK,
     COLUMNS,
@@ -41,11 +48,12 @@ from warpmag.kernels.induction import (
     step_length,
     world_summation,
 )
-from warpmag.kernels.packing import store_magnetization
+from warpmag.kernels.neighbors import near_field
+from warpmag.kernels.packing import ball_volume, store_magnetization
 
 PLAIN_STEPS = SLOTS
 """Plain steps after an accelerated one was taken back, before the next is tried."""
-REST, ADVANCE, RETREAT = 0, 1, 2
+REST, RETREAT, ADVANCE, SWEEP = 0, 1, 2, 3
 STEADY = 3
 """Solves in a row that make two changes to extrapolate from."""
 
@@ -286,6 +294,8 @@ def decide(
         improved_out[w] = 1
         plain_steps[w] = 0
     used = wp.where(plain_steps[w] > 0, 0, history[w])
+    if active[w] == 1 and plain_steps[w] == 0:
+        mode_out[w] = wp.static(SWEEP)
     alpha = anderson_coefficients(world_sums_out, w, wp.static(TERMS), used)
     for a in range(wp.static(DEPTH)):
         alpha_out[w, a] = alpha[a]
@@ -319,6 +329,9 @@ def _advance_kernel(dtype):
         best_r: wp.array[vec3],
         # outputs:
         s_out: wp.array[vec3],
+        mixed_g_out: wp.array[vec3],
+        mixed_moment_out: wp.array[vec3],
+        change_out: wp.array[vec3],
         moments_out: wp.array[vec3],
         packed_out: wp.array2d[dtype],
     ):
@@ -326,28 +339,77 @@ def _advance_kernel(dtype):
         w = world[i]
         if mode[w] == wp.static(REST):
             return
-        step = dtype(omega[w])
-        s = vec3()
-        if mode[w] == wp.static(RETREAT):
-            s = theta_flow(best_s[i], best_s[i] + best_r[i], step)
-        else:
+        s = best_s[i]
+        r = best_r[i]
+        if mode[w] != wp.static(RETREAT):
             current = used_slot[w]
             s_now = history_s[current, i]
             r_now = history_r[current, i]
             if improved[w] == 1:
                 best_s[i] = s_now
                 best_r[i] = r_now
-            s = theta_flow(s_now, s_now + r_now, step)
+            s = s_now
+            r = r_now
             for a in range(used_history[w]):
                 old = slot_of(current, a + 1)
-                difference = (s_now - history_s[old, i]) + step * (r_now - history_r[old, i])
-                s -= dtype(alpha[w, a]) * difference
+                s -= dtype(alpha[w, a]) * (s_now - history_s[old, i])
+                r -= dtype(alpha[w, a]) * (r_now - history_r[old, i])
+        mixed = s
+        s = theta_flow(mixed, mixed + r, dtype(omega[w]))
         s_out[i] = s
         # what has ended keeps the moments that its error was measured at, and s is the next solve's start
         if active[w] == 1:
-            store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
+            magnetization = (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s
+            store_magnetization(i, magnetization, moments_out, packed_out)
+            if mode[w] == wp.static(SWEEP):
+                before = (saturation[i] * curve_ratio(wp.length(mixed), curve[i])) * mixed
+                mixed_g_out[i] = mixed + r
+                mixed_moment_out[i] = ball_volume(packed_out[3, i]) * before
+                change_out[i] = ball_volume(packed_out[3, i]) * (magnetization - before)
 
     return advance
+
+
+@cache
+def _sweep_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sweep(
+        # inputs:
+        row_target: wp.array[int],
+        row_begin: wp.array[int],
+        row_end: wp.array[int],
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        world: wp.array[int],
+        mode: wp.array[int],
+        omega: wp.array[wp.float64],
+        mixed_g: wp.array[vec3],
+        mixed_moment: wp.array[vec3],
+        change: wp.array[vec3],
+        saturation: wp.array[dtype],
+        slope: wp.array[dtype],
+        curve: wp.array[int],
+        # outputs:
+        s_out: wp.array[vec3],
+        change_out: wp.array[vec3],
+        moments_out: wp.array[vec3],
+        packed_out: wp.array2d[dtype],
+    ):
+        row = wp.tid()
+        i = row_target[row]
+        w = world[i]
+        if mode[w] != wp.static(SWEEP):
+            return
+        h = near_field(packed_out, change, i, row_begin[row], row_end[row], neighbor, neighbor_count)
+        g = mixed_g[i] + (dtype(wp.static(INVERSE_4PI)) * slope[i] / saturation[i]) * h
+        s = theta_flow(s_out[i], g, dtype(omega[w]))
+        s_out[i] = s
+        store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
+        change_out[i] = moments_out[i] - mixed_moment[i]
+
+    return sweep
 
 
 def launch_set_state(rows, magnetizations, material, b: InductionBuffers):
@@ -473,6 +535,29 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             b.best_s,
             b.best_r,
         ],
-        outputs=[b.s, moments_out, moments.packed],
+        outputs=[b.s, b.mixed_g, b.mixed_moment, b.change, moments_out, moments.packed],
         device=device,
     )
+    for change, next_change in ((b.change, b.next_change), (b.next_change, b.change)):  # two sweeps
+        wp.launch(
+            _sweep_kernel(dtype),
+            dim=rows.count,
+            inputs=[
+                rows.target,
+                rows.begin,
+                rows.end,
+                moments.neighbors,
+                moments.neighbor_counts,
+                b.world,
+                b.mode,
+                b.omega,
+                b.mixed_g,
+                b.mixed_moment,
+                change,
+                material.saturation,
+                material.slope,
+                material.curve,
+            ],
+            outputs=[b.s, next_change, moments_out, moments.packed],
+            device=device,
+        )
