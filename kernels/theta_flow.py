@@ -457,6 +457,12 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
         max_evaluations: Field evaluations after which a world gives up.
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
+    _launch_judgement(rows, partial, moments, material, b, rtol, max_evaluations)
+    _launch_step(rows, moments, material, b, moments_out)
+
+
+def _launch_judgement(rows, partial, moments, material, b, rtol, max_evaluations):
+    """Residuals and their sums, and what they make of each world."""
     device, dtype = moments.device, moments.dtype
     wp.launch_tiled(
         _residual_kernel(dtype),
@@ -515,6 +521,11 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
         block_dim=CHUNK,
         device=device,
     )
+
+
+def _launch_step(rows, moments, material, b, moments_out):
+    """The step that was decided on, and two sweeps over neighbours."""
+    device, dtype = moments.device, moments.dtype
     wp.launch(
         _advance_kernel(dtype),
         dim=rows.count,
@@ -538,7 +549,7 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
         outputs=[b.s, b.mixed_g, b.mixed_moment, b.change, moments_out, moments.packed],
         device=device,
     )
-    for change, next_change in ((b.change, b.next_change), (b.next_change, b.change)):  # two sweeps
+    for change, next_change in ((b.change, b.next_change), (b.next_change, b.change)):
         wp.launch(
             _sweep_kernel(dtype),
             dim=rows.count,
