@@ -5,7 +5,7 @@ a copy of the body for every side of every contact, nothing is added there: each
 :func:`launch_sum_sides` adds the sides of each body in the order of the contacts.
 
 Side 2c and 2c + 1 are those of contact c. Sides of what is fixed in the world, and of contacts that there are not,
-belong to no body.
+belong to no body. Those of a body that forces do not move are not added up: there may be very many.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,8 @@ class ContactSides:
         q, qd, com, inv_mass, inv_inertia, flags: Copies of the body, shape [2c].
         mu, mu_torsional, mu_rolling: Friction of the side's shape, shape [2c].
         deltas: What the contact does to the side, shape [2c].
-        keys, order: Sides sorted by body: bodies and sides, shape [4c], of which the second half is scratch.
+        keys, order: Sides sorted by the body they are added up for, b if for none: bodies and sides, shape [4c], of
+            which the second half is scratch.
         start: First of each body's sides in ``order``, shape [b + 1].
         key_bits: Bits that tell bodies apart.
     """
@@ -120,7 +121,8 @@ def _split(
     mu_rolling_out[side] = shape_mu_rolling_in[shape]
     body = shape_body_in[shape]
     if body >= 0:
-        keys_out[side] = body
+        if body_inv_mass_in[body] > 0.0:
+            keys_out[side] = body
         body_out[side] = body
         side_body_out[side] = side
         com_out[side] = body_com_in[body]
