@@ -53,6 +53,19 @@ def test_published_methods_run_by_name(scene, device, method, tmp_path, capfd):
     assert "magnetization error" in capfd.readouterr().out
 
 
+def test_a_deterministic_run_repeats(scene, device, tmp_path, capfd):
+    ends = []
+    for name in ("one", "other"):
+        out = tmp_path / name / "out.usda"
+        command = ["run", str(scene), "-o", str(out), "--frames", "12", "--device", device, "--deterministic"]
+        assert cli.main(command) == 0
+        stage = Usd.Stage.Open(str(out))
+        balls = [stage.GetPrimAtPath(f"/World/Balls/Ball_{k:04d}") for k in range(4)]
+        ends.append([ball.GetAttribute("warpmag:moment").Get(12.0) for ball in balls])
+        ends.append([UsdGeom.Xformable(ball).ComputeLocalToWorldTransform(12.0) for ball in balls])
+    assert ends[:2] == ends[2:]
+
+
 def test_scenes_lists_what_is_bundled(capsys):
     assert cli.main(["scenes"]) == 0
     assert "balls_up" in capsys.readouterr().out
