@@ -191,11 +191,12 @@ def _residual_kernel(dtype):
             history_r_out[current, i] = r
             length_s = wp.length(s)
             length_g = wp.length(g)
-            goal = (saturation[i] * curve_ratio(length_g, curve[i])) * g
+            worth_s = saturation[i] * curve_ratio(length_s, curve[i])
+            worth_g = saturation[i] * curve_ratio(length_g, curve[i])
             # lengths, not squares: a field of 1e-20 A/m squared is no float32
-            goal_length = wp.float64(wp.length(goal))
-            lack_length = wp.float64(wp.length(goal - (saturation[i] * curve_ratio(length_s, curve[i])) * s))
-            weight = wp.float64(saturation[i] * curve_ratio(wp.max(length_s, length_g), curve[i]))
+            goal_length = wp.float64(worth_g * length_g)
+            lack_length = wp.float64(wp.length(worth_g * g - worth_s * s))
+            weight = wp.float64(wp.where(length_s > length_g, worth_s, worth_g))
             merit = weight * wp.float64(wp.length(r))
             mine[wp.static(LACK)] += lack_length * lack_length
             mine[wp.static(GOAL)] += goal_length * goal_length
