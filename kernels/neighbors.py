@@ -169,14 +169,14 @@ def _sort_kernel(dtype):
             return
         i = wp.tid()
         found_at_out[i] = vec3(targets[0, i], targets[1, i], targets[2, i])
-        for sorted in range(1, wp.min(neighbor_count[i], wp.static(CAPACITY))):
-            j = neighbor_out[i, sorted]
-            place = sorted
-            for back in range(sorted):
-                other = neighbor_out[i, sorted - 1 - back]
+        for n in range(1, wp.min(neighbor_count[i], wp.static(CAPACITY))):
+            j = neighbor_out[i, n]
+            place = n
+            for back in range(n):
+                other = neighbor_out[i, n - 1 - back]
                 if other < j:
                     break
-                place = sorted - 1 - back
+                place = n - 1 - back
                 neighbor_out[i, place + 1] = other
             neighbor_out[i, place] = j
 

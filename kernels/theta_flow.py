@@ -54,6 +54,7 @@ from warpmag.kernels.packing import ball_volume, store_magnetization
 PLAIN_STEPS = SLOTS
 """Plain steps after an accelerated one was taken back, before the next is tried."""
 REST, RETREAT, ADVANCE, SWEEP = 0, 1, 2, 3
+"""What a world does next: nothing, a plain step from the best iterate, a step, a step and sweeps over neighbours."""
 STEADY = 3
 """Solves in a row that make two changes to extrapolate from."""
 
