@@ -105,15 +105,9 @@ def pair_factors(d2: Any, a: Any, b: Any):
 
 @wp.func
 def overlap_factors(d2: Any, a: Any, b: Any):
-    """What the clamped dipole lacks for an overlapping pair: averaged factors less those at the contact distance.
-
-    The loops leave pairs at zero distance out, so these lack everything.
-    """
+    """What the clamped dipole lacks for an overlapping pair: averaged factors less those at the contact distance."""
     s = a + b
-    g = averaged_factors(wp.sqrt(d2), a, b)
-    if d2 > type(d2)(0.0):
-        g -= dipole_factors(s * s)
-    return g
+    return averaged_factors(wp.sqrt(d2), a, b) - dipole_factors(s * s)
 
 
 @wp.func
@@ -155,3 +149,12 @@ def gradient_of(g: Any, r: Any, m: Any):
         g[1] * (r[2] * m[0] + r[0] * m[2]) + t * r[2] * r[0],
         length=6,
     )
+
+
+@wp.func
+def gradient_times(t: Any, e: Any):
+    """The vector e_k ∂H_k/∂x_l for a gradient ``t`` as :func:`gradient_of` gives it, or sums of such."""
+    x = t[0] * e[0] + t[3] * e[1] + t[5] * e[2]
+    y = t[3] * e[0] + t[1] * e[1] + t[4] * e[2]
+    z = t[5] * e[0] + t[4] * e[1] + t[2] * e[2]
+    return wp.vector(x, y, z, length=3)

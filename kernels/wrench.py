@@ -5,6 +5,7 @@
 | kelvin | F = μ0 (m·∇)H | Kim and Han 2022, Eqs. 13 and 14 (both r⁴ of Eq. 14 are r⁵) |
 | zeeman | F = μ0 V [f'(H) ∇H (2M + H) + ∇H M] | Eq. 4 |
 
+Both are μ0 (e·∇)H for an effective moment e, m or m + f'(H)(2m + V H), which the pair loop contracts with as it sums.
 The torque on a moment is τ = μ0 m × H. The moments of one body make neither force nor torque on each other: what they
 would add up to is zero, and rounding must not make it otherwise.
 """
@@ -18,6 +19,8 @@ from warpmag.kernels.curves import curve_derivative_times
 from warpmag.kernels.field import INVERSE_4PI
 from warpmag.kernels.neighbors import pair_correction
 from warpmag.kernels.packing import ball_volume
+from warpmag.kernels.pair_code import WRENCH
+from warpmag.kernels.pair_law import gradient_times
 
 MU0 = 1.2566370614359173e-06
 """Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
@@ -42,19 +45,57 @@ class Material:
     slope: wp.array
     curve: wp.array
 
-    @classmethod
-    def permanent(cls, count: int, dtype, device) -> "Material":
-        """Material of ``count`` permanent moments."""
-        integers = wp.zeros(count, dtype=int, device=device)
-        ones = wp.ones(count, dtype=dtype, device=device)
-        return cls(integers, ones, ones, integers)
+
+@cache
+def _effective_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def zeeman_moments(
+        # inputs:
+        packed: wp.array2d[dtype],
+        h: wp.array[vec3],
+        inducible: wp.array[int],
+        saturation: wp.array[dtype],
+        slope: wp.array[dtype],
+        curve: wp.array[int],
+        # outputs:
+        effective_out: wp.array2d[dtype],
+    ):
+        i = wp.tid()
+        m = vec3(packed[4, i], packed[5, i], packed[6, i])
+        e = m
+        if inducible[i] == 1:
+            v = dtype(2.0) * m + ball_volume(packed[3, i]) * h[i]
+            e += curve_derivative_times(h[i], v, slope[i], saturation[i], curve[i])
+        for c in range(3):
+            effective_out[c, i] = e[c]
+
+    return zeeman_moments
+
+
+def launch_zeeman_moments(moments, h, material: Material, effective):
+    """Write the effective moments of the Zeeman law.
+
+    Args:
+        moments: Packed moments (``warpmag.packed.PackedMoments``).
+        h: Whole field at inducible moments [A/m], shape [n].
+        material: What the moments are made of.
+        effective: Out, effective moments [A·m²], shape [3, n].
+    """
+    wp.launch(
+        _effective_kernel(effective.dtype),
+        dim=moments.count,
+        inputs=[moments.packed, h, material.inducible, material.saturation, material.slope, material.curve],
+        outputs=[effective],
+        device=effective.device,
+    )
 
 
 @cache
-def _wrench_kernel(dtype):
+def _wrench_kernel(dtype, quantity: str):
     vec3 = wp.types.vector(3, dtype)
-    mat33 = wp.types.matrix((3, 3), dtype)
-    sums = wp.types.vector(9, dtype)
+    summed_field = quantity == WRENCH
     correct_pairs = pair_correction(dtype, gradient=True, exclude_body=True)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -62,85 +103,71 @@ def _wrench_kernel(dtype):
         # inputs:
         partial: wp.array3d[dtype],
         packed: wp.array2d[dtype],
+        effective: wp.array2d[dtype],
         row_target: wp.array[int],
         row_begin: wp.array[int],
         row_end: wp.array[int],
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
         external_field: wp.array[vec3],
-        h: wp.array[vec3],
-        inducible: wp.array[int],
-        saturation: wp.array[dtype],
-        slope: wp.array[dtype],
-        curve: wp.array[int],
         twisted: wp.array[int],
-        force_law: int,
         # outputs:
         force_out: wp.array[vec3],
         torque_out: wp.array[vec3],
     ):
         row = wp.tid()
         i = row_target[row]
-        t = sums()
+        f = vec3()
+        h = vec3()
         for split in range(partial.shape[0]):
-            for c in range(9):
-                t[c] += partial[split, row, c]
+            f += vec3(partial[split, row, 0], partial[split, row, 1], partial[split, row, 2])
+            if wp.static(summed_field):
+                h += vec3(partial[split, row, 3], partial[split, row, 4], partial[split, row, 5])
         if neighbor_count[i] > 0:
-            t += correct_pairs(packed, packed, i, row_begin[row], row_end[row], i, neighbor, neighbor_count)
-        t *= dtype(wp.static(INVERSE_4PI))
-        gradient = mat33(t[3], t[6], t[8], t[6], t[4], t[7], t[8], t[7], t[5])
-        m = vec3(packed[4, i], packed[5, i], packed[6, i])
-        effective = m
-        if force_law == wp.static(ZEEMAN) and inducible[i] == 1:
-            v = dtype(2.0) * m + ball_volume(packed[3, i]) * h[i]
-            effective += curve_derivative_times(h[i], v, slope[i], saturation[i], curve[i])
-        force_out[i] = dtype(wp.static(MU0)) * (gradient * effective)
+            c = correct_pairs(packed, packed, i, row_begin[row], row_end[row], i, neighbor, neighbor_count)
+            h += vec3(c[0], c[1], c[2])
+            e = vec3(effective[0, i], effective[1, i], effective[2, i])
+            f += gradient_times(wp.vector(c[3], c[4], c[5], c[6], c[7], c[8], length=6), e)
+        force_out[i] = dtype(wp.static(MU0 * INVERSE_4PI)) * f
         torque = vec3()
-        if twisted[i] == 1:
-            torque = dtype(wp.static(MU0)) * wp.cross(m, vec3(t[0], t[1], t[2]) + external_field[i])
+        if wp.static(summed_field):
+            if twisted[i] == 1:
+                m = vec3(packed[4, i], packed[5, i], packed[6, i])
+                torque = dtype(wp.static(MU0)) * wp.cross(m, dtype(wp.static(INVERSE_4PI)) * h + external_field[i])
         torque_out[i] = torque
 
     return finish_wrench
 
 
-def launch_finish_wrench(
-    rows, partial, moments, external_field, h, material: Material, twisted, force_law: int, forces, torques
-):
+def launch_finish_wrench(rows, partial, moments, effective, external_field, twisted, forces, torques):
     """Write the force and the torque on each moment.
 
     Args:
-        rows: Work list that ``partial`` was summed over.
-        partial: Sums of the native gradient loop, shape [splits, rows, 9].
+        rows: Work list that ``partial`` was summed over, of forces or of wrenches; without fields there is no torque.
+        partial: Sums of the native loop, shape as ``pair_loops.partial_shape`` says.
         moments: Packed moments with their overlapping neighbours (``warpmag.packed.PackedMoments``).
+        effective: Effective moments that the loop summed with [A·m²], shape [3, n].
         external_field: Applied field [A/m], shape [n].
-        h: Whole field at inducible moments [A/m], shape [n]; used by the Zeeman law.
-        material: What the moments are made of.
         twisted: Whether a moment feels its torque m × H, shape [n]; a lone inducible ball's is parallel to H.
-        force_law: ``KELVIN`` or ``ZEEMAN``.
         forces: Out, forces [N], shape [n].
         torques: Out, torques about each moment [N·m], shape [n].
     """
     if rows.count == 0:
         return
     wp.launch(
-        _wrench_kernel(partial.dtype),
+        _wrench_kernel(partial.dtype, rows.quantity),
         dim=rows.count,
         inputs=[
             partial,
             moments.packed,
+            effective,
             rows.target,
             rows.begin,
             rows.end,
             moments.neighbors,
             moments.neighbor_counts,
             external_field,
-            h,
-            material.inducible,
-            material.saturation,
-            material.slope,
-            material.curve,
             twisted,
-            force_law,
         ],
         outputs=[forces, torques],
         device=partial.device,

@@ -7,7 +7,8 @@ from warpmag.arrays import ACCURACY, Kind, resolve_kind, vec3_type
 from warpmag.errors import InputError
 from warpmag.kernels import pair_loops
 from warpmag.kernels.field import launch_finish_field
-from warpmag.kernels.wrench import KELVIN, Material, launch_finish_wrench
+from warpmag.kernels.pair_code import WRENCH
+from warpmag.kernels.wrench import launch_finish_wrench
 from warpmag.packed import PackedMoments
 
 METHODS = ("auto", "vectorized", "reference")
@@ -65,7 +66,7 @@ def h_field(
     rows = pair_loops.make_rows([(0, at.count, 0, sources.count)], kind.device)
     exact = method == "reference" or smoothing > 0.0
     exclude = pair_loops.EXCLUDE_SELF if same_set else pair_loops.EXCLUDE_NOTHING
-    partial = _pair_sums(rows, at, sources, exclude if exact else None, smoothing, gradient=False)
+    partial = _pair_sums(rows, at, sources, exclude if exact else None, smoothing)
     if not exact:
         at.find_overlaps(None if same_set else sources)
     base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
@@ -117,15 +118,14 @@ def wrench(
     n = x.shape[0]
     external = kind.vectors("external_field", np.zeros(3) if external_field is None else external_field, n)
     packed = _packed(kind, "radii", radii, x, m)
-    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device)
+    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, WRENCH)
     exact = method == "reference" or smoothing > 0.0
-    partial = _pair_sums(rows, packed, packed, pair_loops.EXCLUDE_BODY if exact else None, smoothing, gradient=True)
+    partial = _pair_sums(rows, packed, packed, pair_loops.EXCLUDE_BODY if exact else None, smoothing)
     if not exact:
         packed.find_overlaps()
     forces, torques = wp.zeros_like(x), wp.zeros_like(x)
     twisted = wp.ones(n, dtype=int, device=kind.device)
-    material = Material.permanent(n, kind.dtype, kind.device)
-    launch_finish_wrench(rows, partial, packed, external, external, material, twisted, KELVIN, forces, torques)
+    launch_finish_wrench(rows, partial, packed, packed.moments, external, twisted, forces, torques)
     return kind.finish(forces), kind.finish(torques)
 
 
@@ -138,9 +138,9 @@ def _packed(kind: Kind, name, radii, positions, moments) -> PackedMoments:
     return packed
 
 
-def _pair_sums(rows, at, sources, exclude, smoothing, *, gradient):
+def _pair_sums(rows, at, sources, exclude, smoothing):
     """Sums of the pair loop: the native one, or with ``exclude`` the reference loop, in a fresh array."""
-    shape = pair_loops.partial_shape(rows, gradient)
+    shape = pair_loops.partial_shape(rows)
     if exclude is not None:
         shape = (1, *shape[1:])
     partial = wp.empty(shape, dtype=at.dtype, device=at.device)
@@ -149,7 +149,7 @@ def _pair_sums(rows, at, sources, exclude, smoothing, *, gradient):
         at.packed,
         sources.packed,
         partial,
-        gradient=gradient,
+        effective=at.moments,
         reference_exclude=exclude,
         epsilon2=smoothing**5,
     )

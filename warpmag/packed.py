@@ -13,6 +13,7 @@ class PackedMoments:
     Attributes:
         count: Number of moments n.
         packed: Packed moments, shape [8, n], see ``kernels.pair_loops``.
+        moments: The moments among them, a view, shape [3, n].
         neighbors: Moments that overlap each, or nearly do, shape [n, capacity], valid after :meth:`find_overlaps`.
         neighbor_counts: How many they are, shape [n]; zero until then.
     """
@@ -39,6 +40,7 @@ class PackedMoments:
         self.labels = integers(np.arange(n) if labels is None else labels)
         self.groups = integers(np.zeros(n) if groups is None else groups)
         self.packed = wp.zeros((pair_loops.PACKED_ROWS, n), dtype=dtype, device=device)
+        self.moments = self.packed[4:7] if n else self.packed
         self._lists = neighbors.allocate(n, dtype, device)
         self.neighbors, self.neighbor_counts = self._lists.neighbor, self._lists.count
 

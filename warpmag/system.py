@@ -12,7 +12,8 @@ from warpmag.kernels import induction, pair_loops
 from warpmag.kernels.curves import CURVE_IDS
 from warpmag.kernels.field import launch_finish_field
 from warpmag.kernels.packing import launch_divide_by_volume
-from warpmag.kernels.wrench import FORCE_IDS, Material, launch_finish_wrench
+from warpmag.kernels.pair_code import FORCE, WRENCH
+from warpmag.kernels.wrench import FORCE_IDS, ZEEMAN, Material, launch_finish_wrench, launch_zeeman_moments
 from warpmag.magnets import FORCES, check_token
 from warpmag.packed import PackedMoments
 
@@ -119,7 +120,8 @@ class MomentSystem:
         _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
         twisted = permanent | (size[body] > 1) | lone_torque
         self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
-        self._make_rows(worlds, permanent, movable)
+        self._make_rows(worlds, permanent, movable, WRENCH if twisted.any() else FORCE)
+        self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
         self._induction = induction.allocate(worlds, ~permanent, self.dtype, self.device)
         self.h = self._induction.h
         self.error = self._induction.error
@@ -151,7 +153,7 @@ class MomentSystem:
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
 
-    def _make_rows(self, worlds, permanent, movable):
+    def _make_rows(self, worlds, permanent, movable, felt_quantity):
         """Work lists: inducible on inducible, permanent on inducible, everything on whatever moves."""
         induced, applied, felt = [], [], []
         for w in range(int(worlds[-1]) + 1 if len(worlds) else 0):
@@ -163,14 +165,14 @@ class MomentSystem:
             felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
         self._induced = pair_loops.make_rows(induced, self.device)
         self._applied = pair_loops.make_rows(applied, self.device)
-        self._felt = pair_loops.make_rows(felt, self.device)
+        self._felt = pair_loops.make_rows(felt, self.device, felt_quantity)
 
-        def partial(rows, gradient):
-            return wp.zeros(pair_loops.partial_shape(rows, gradient), dtype=self.dtype, device=self.device)
+        def partial(rows):
+            return wp.zeros(pair_loops.partial_shape(rows), dtype=self.dtype, device=self.device)
 
-        self._induced_partial = partial(self._induced, False)
-        self._applied_partial = partial(self._applied, False)
-        self._felt_partial = partial(self._felt, True)
+        self._induced_partial = partial(self._induced)
+        self._applied_partial = partial(self._applied)
+        self._felt_partial = partial(self._felt)
 
     @property
     def radii(self):
@@ -237,16 +239,18 @@ class MomentSystem:
     def apply_forces(self, force=None):
         """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""
         packed = self._packed
-        pair_loops.launch_pair_loop(self._felt, packed.packed, packed.packed, self._felt_partial, gradient=True)
+        effective = packed.moments
+        if (self._force_law if force is None else FORCE_IDS[force]) == ZEEMAN:
+            effective = self._effective
+            launch_zeeman_moments(packed, self.h, self._material, effective)
+        pair_loops.launch_pair_loop(self._felt, packed.packed, packed.packed, self._felt_partial, effective=effective)
         launch_finish_wrench(
             self._felt,
             self._felt_partial,
             packed,
+            effective,
             self.external_field,
-            self.h,
-            self._material,
             self._twisted,
-            self._force_law if force is None else FORCE_IDS[force],
             self.forces,
             self.torques,
         )

@@ -1,0 +1,336 @@
+"""The native pair loop on a CPU: vectors as wide as the machine has them, tile by tile, shared out to threads.
+
+A tile holds up to ``STRIPE`` sources in the first-level cache, for a range of target rows to meet. There are two ways
+through it:
+
+* ``add_row`` sums one target row, whatever the radii.
+* ``add_both_ways`` is for the field among moments of one radius: a separation and its powers serve the field at both
+  ends of the pair, which takes 35 vector operations for the two of them, where ``add_row`` takes 28 for one.
+
+Every thread has sums of its own, which the finishing kernel adds up in order, so that nothing depends on scheduling.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpmag.kernels.pair_code import FIELD, SUMS, TILE_COLUMNS, WIDTHS, pair, results, scaled_moment
+
+STRIPE = 512
+"""Most sources, and most targets, of a tile."""
+MOST_THREADS = 64
+"""Threads that a loop may start."""
+
+_W = 2.0  # see pair_code: W/√c is cheapest for W = 2
+
+_VECTORS = """
+    #if defined(__AVX512F__)
+    constexpr int BYTES = 64;
+    #elif defined(__AVX__)
+    constexpr int BYTES = 32;
+    #else
+    constexpr int BYTES = 16;
+    #endif
+    constexpr int LANES = BYTES / (int)sizeof(REAL), VECTORS = STRIPE / LANES;
+    typedef REAL NUMBER __attribute__((ext_vector_type(LANES)));
+
+    auto inverse_root = [](NUMBER c) -> NUMBER {
+    #if defined(__AVX512F__)
+        if constexpr (sizeof(REAL) == 4) {
+            // y, good to 2⁻¹⁴, and one Newton step from it; the machine's root and quotient would take twice the time
+            const NUMBER y = __builtin_ia32_rsqrt14ps512_mask(c, c, (unsigned short)-1);
+            return y * (REAL(3) - c * (y * y));
+        } else
+    #endif
+        return REAL(2) / __builtin_elementwise_sqrt(c);
+    };
+    auto total = [](NUMBER lanes) {
+        #pragma clang fp reassociate(on)
+        REAL sum = 0;
+        for (int l = 0; l < LANES; ++l) sum += lanes[l];
+        return sum;
+    };
+
+    struct Tile {
+        NUMBER packed[8][VECTORS];  // rows of the packed sources
+        NUMBER u[3][VECTORS];       // their scaled moments
+        NUMBER h[3][VECTORS];       // what is summed at the sources themselves
+        int begin, count, vectors;
+        REAL radius;                // the one radius of all of them, or 0
+    };
+    auto number = [](NUMBER* row, int i) -> REAL& { return ((REAL*)row)[i]; };
+    auto fill = [number](Tile& tile, const REAL* packed, size_t stride, int begin, int end) {
+        tile.begin = begin;
+        tile.count = end - begin;
+        tile.vectors = (tile.count + LANES - 1) / LANES;
+        for (int c = 0; c < 8; ++c) {
+            const REAL* row = packed + c * stride + begin;
+            __builtin_memcpy(tile.packed[c], row, tile.count * sizeof(REAL));
+            // the lanes beyond the last source stand where it stands, without a moment
+            for (int i = tile.count; i < tile.vectors * LANES; ++i)
+                number(tile.packed[c], i) = c >= 4 && c < 7 ? REAL(0) : row[tile.count - 1];
+        }
+        for (int c = 0; c < 3; ++c)
+            for (int v = 0; v < tile.vectors; ++v) {
+                tile.u[c][v] = SCALE * tile.packed[4 + c][v];
+                tile.h[c][v] = 0;
+            }
+        tile.radius = number(tile.packed[3], 0);
+        for (int i = 1; i < tile.count; ++i)
+            if (number(tile.packed[3], i) != tile.radius) tile.radius = 0;
+    };
+"""
+
+_SOURCES = """
+            const NUMBER ax = tile.packed[0][v], ay = tile.packed[1][v], az = tile.packed[2][v];
+            const NUMBER bx = tile.packed[4][v], by = tile.packed[5][v], bz = tile.packed[6][v];
+            const NUMBER ux = tile.u[0][v], uy = tile.u[1][v], uz = tile.u[2][v];
+"""
+
+
+def _add_rows(quantity: str) -> str:
+    """Text of ``add`` for a target's sums, and of ``add_rows`` for those of some target rows over a tile."""
+    sums = SUMS[quantity]
+    field = quantity == FIELD
+    effective = "" if field else "REAL ex, REAL ey, REAL ez, "
+    target = {"tx": 0, "ty": 1, "tz": 2, "radius": 3, "label": 7}
+    loads = ", ".join(f"{name} = share.targets[{row} * share.target_stride + column]" for name, row in target.items())
+    if not field:
+        loads += "".join(
+            f", e{c} = share.effective[{k} * share.effective_stride + column]" for k, c in enumerate("xyz")
+        )
+    mask = "c > 0" if field else "(c > 0) & (label != tile.packed[7][v])"
+    return f"""
+    auto add = [](REAL* out, {effective}{", ".join(f"REAL {name}" for name in sums)}) {{
+        {" ".join(f"out[{c}] += {text};" for c, text in enumerate(results(quantity, _W)))}
+    }};
+    auto add_rows = [=](const Share& share, int row_begin, int row_end, int column_begin, Tile& tile) {{
+        for (int row = row_begin; row < row_end; ++row) {{
+            const int column = column_begin + row - row_begin, own = column - tile.begin;
+            // a moment makes no field at its own place: while its row is summed, it rests
+            const bool rests = {"share.targets == share.sources && own >= 0 && own < tile.count" if field else "false"};
+            REAL kept[6];
+            for (int c = 0; c < 6 && rests; ++c) {{
+                REAL& moment = number(c < 3 ? tile.packed[4 + c] : tile.u[c - 3], own);
+                kept[c] = moment;
+                moment = 0;
+            }}
+            const REAL {loads};
+            NUMBER {", ".join(f"{name} = 0" for name in sums)};
+            for (int v = 0; v < tile.vectors; ++v) {{
+                {_SOURCES}
+                const NUMBER s = radius + tile.packed[3][v], s2 = s * s;
+                auto inverse = [=, &tile](NUMBER d2) -> NUMBER {{
+                    const NUMBER c = d2 > s2 ? d2 : s2;
+                    return {mask} ? inverse_root(c) : 0;
+                }};
+                {pair(quantity, "inverse(d2)")}
+            }}
+            add(share.out + (size_t)row * {WIDTHS[quantity]}, {"" if field else "ex, ey, ez, "}
+                {", ".join(f"total({name})" for name in sums)});
+            for (int c = 0; c < 6 && rests; ++c) number(c < 3 ? tile.packed[4 + c] : tile.u[c - 3], own) = kept[c];
+        }}
+    }};
+    """
+
+
+_ADD_BOTH_WAYS = f"""
+    auto add_both_ways = [=](Tile& home, NUMBER (&lanes)[3][STRIPE], Tile& tile) {{
+        const NUMBER contact = home.radius + tile.radius, clamp = contact * contact;
+        const bool diagonal = &home == &tile;
+        for (int i = 0; i < home.count; ++i) {{
+            const NUMBER tx = number(home.packed[0], i), ty = number(home.packed[1], i), tz = number(home.packed[2], i);
+            const NUMBER mx = number(home.packed[4], i), my = number(home.packed[5], i), mz = number(home.packed[6], i);
+            const NUMBER nx = number(home.u[0], i), ny = number(home.u[1], i), nz = number(home.u[2], i);
+            NUMBER hx = 0, hy = 0, hz = 0;
+            int v = 0;
+            if (diagonal) {{  // vectors before the target's own have met it; its own it meets one way, without itself
+                v = i / LANES;
+                auto others = clamp > 0;
+                others[i % LANES] = 0;
+                {_SOURCES}
+                {pair(FIELD, "others ? inverse_root(d2 > clamp ? d2 : clamp) : 0")}
+                ++v;
+            }}
+            for (; v < tile.vectors; ++v) {{
+                {_SOURCES}
+                {pair(FIELD, "inverse_root(d2 > clamp ? d2 : clamp)")}
+                const NUMBER back = inv2 * (rx * mx + ry * my + rz * mz);
+                tile.h[0][v] += inv3 * (back * rx - nx);
+                tile.h[1][v] += inv3 * (back * ry - ny);
+                tile.h[2][v] += inv3 * (back * rz - nz);
+            }}
+            lanes[0][i] += hx;
+            lanes[1][i] += hy;
+            lanes[2][i] += hz;
+        }}
+    }};
+"""
+
+_ENTER_HOME = """
+    Tile home;  // the targets of mirrored tiles, and what is summed for them, by lanes
+    NUMBER lanes[3][STRIPE];
+    int home_row = 0;
+    home.begin = -1;
+    auto leave_home = [&]() {
+        for (int i = 0; i < home.count && home.begin >= 0; ++i)
+            add(share.out + 3 * (size_t)(home_row + i), total(lanes[0][i]) + number(home.h[0], i),
+                total(lanes[1][i]) + number(home.h[1], i), total(lanes[2][i]) + number(home.h[2], i));
+        home.begin = -1;
+    };
+    auto enter_home = [&](int row, int begin, int end) {
+        leave_home();
+        home_row = row;
+        fill(home, share.sources, share.source_stride, begin, end);
+        __builtin_memset(lanes, 0, sizeof(lanes));
+    };
+"""
+
+_WALK_HOME = """
+        if (mirrored && share.targets == share.sources) {
+            if (home.begin != column_begin) enter_home(row_begin, column_begin, column_begin + row_end - row_begin);
+            const bool diagonal = source_begin == column_begin;
+            Tile& other = diagonal ? home : tile;
+            if (!diagonal) fill(tile, share.sources, share.source_stride, source_begin, source_end);
+            if (home.radius > 0 && other.radius > 0) {
+                add_both_ways(home, lanes, other);
+                for (int j = 0; j < other.count && !diagonal; ++j)
+                    add(share.out + 3 * (size_t)(mirror_begin + j), number(other.h[0], j), number(other.h[1], j),
+                        number(other.h[2], j));
+            } else {
+                add_rows(share, row_begin, row_end, column_begin, other);
+                if (!diagonal) add_rows(share, mirror_begin, mirror_end, source_begin, home);
+            }
+            continue;
+        }
+"""
+
+
+def _walk(quantity: str) -> str:
+    """Text that sums the tiles of a thread."""
+    field = quantity == FIELD
+    return f"""
+    __builtin_memset(share.out, 0, share.rows * {WIDTHS[quantity]} * sizeof(REAL));
+    Tile tile;
+    {_ENTER_HOME if field else ""}
+    for (int t = share.first; t < share.last; ++t) {{
+        const int* p = share.tiles + {TILE_COLUMNS} * t;
+        const int row_begin = p[0], row_end = p[1], column_begin = p[2], source_begin = p[3], source_end = p[4];
+        // the sources of a mirrored tile are targets too, in these rows
+        const bool mirrored = p[6];
+        const int mirror_begin = row_begin + source_begin - column_begin;
+        const int mirror_end = mirror_begin + source_end - source_begin;
+        {_WALK_HOME if field else ""}
+        fill(tile, share.sources, share.source_stride, source_begin, source_end);
+        add_rows(share, row_begin, row_end, column_begin, tile);
+        if (mirrored && source_begin != column_begin) {{
+            fill(tile, share.sources, share.source_stride, column_begin, column_begin + row_end - row_begin);
+            add_rows(share, mirror_begin, mirror_end, source_begin, tile);
+        }}
+    }}
+    {"leave_home();" if field else ""}
+    """
+
+
+# Threads of the process's own library: Warp launches serially on a CPU, and a launch may sit inside a graph, where
+# Python's threads cannot help. A thread that cannot be had leaves its tiles to this one.
+_RUN_THREADS = """
+#if defined(_WIN32)
+    for (int t = 0; t < threads; ++t) work(&shared[t]);
+#else
+#if defined(__APPLE__)
+    #define SYMBOL(name) "_" name
+#else
+    #define SYMBOL(name) name
+#endif
+    typedef void* (*Start)(void*);
+    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
+    extern int join_thread(unsigned long, void**) __asm__(SYMBOL("pthread_join"));
+    unsigned long ids[MOST_THREADS];
+    bool started[MOST_THREADS];
+    for (int t = 1; t < threads; ++t) started[t] = start_thread(&ids[t], nullptr, work, &shared[t]) == 0;
+    if (threads > 0) work(&shared[0]);
+    for (int t = 1; t < threads; ++t) {
+        if (started[t]) join_thread(ids[t], nullptr);
+        else work(&shared[t]);
+    }
+    #undef SYMBOL
+#endif
+"""
+
+
+def _snippet(real: str, quantity: str) -> str:
+    """All tiles of a work list, shared out to threads."""
+    return f"""
+    typedef {real} REAL;
+    constexpr int STRIPE = {STRIPE}, MOST_THREADS = {MOST_THREADS};
+    struct Share {{
+        const REAL *targets, *sources, *effective;
+        size_t target_stride, source_stride, effective_stride;
+        const int* tiles;
+        int first, last;
+        REAL* out;
+        size_t rows;
+    }};
+    auto work = [](void* argument) -> void* {{
+        #pragma clang fp contract(fast)
+        const Share& share = *(const Share*)argument;
+        constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
+        {_VECTORS}
+        {_add_rows(quantity)}
+        {_ADD_BOTH_WAYS if quantity == FIELD else ""}
+        {_walk(quantity)}
+        return nullptr;
+    }};
+    const int threads = (int)shares.shape[0] - 1;
+    const size_t rows = partial_out.shape[1];
+    Share shared[MOST_THREADS];
+    for (int t = 0; t < threads; ++t)
+        shared[t] = Share{{(const REAL*)targets.data, (const REAL*)sources.data, (const REAL*)effective.data,
+                          (size_t)targets.shape[1], (size_t)sources.shape[1], (size_t)effective.shape[1],
+                          tiles.data, shares.data[t], shares.data[t + 1],
+                          (REAL*)partial_out.data + t * rows * {WIDTHS[quantity]}, rows}};
+    {_RUN_THREADS}
+    """
+
+
+@cache
+def _kernel(dtype, quantity: str):
+    @wp.func_native(_snippet("float" if dtype is wp.float32 else "double", quantity))
+    def sum_tiles(
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        effective: wp.array2d[dtype],
+        tiles: wp.array2d[int],
+        shares: wp.array[int],
+        partial_out: wp.array3d[dtype],
+    ): ...
+
+    # Warp's flags, and registers as wide as there are: clang's default stops at half of AVX-512
+    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    def pair_loop_cpu(
+        # inputs:
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        effective: wp.array2d[dtype],
+        tiles: wp.array2d[int],
+        shares: wp.array[int],
+        # outputs:
+        partial_out: wp.array3d[dtype],
+    ):
+        sum_tiles(targets, sources, effective, tiles, shares, partial_out)
+
+    return pair_loop_cpu
+
+
+def launch_pair_loop_cpu(quantity: str, targets, sources, effective, tiles, shares, partial):
+    """Sum a quantity over all tiles; see ``pair_loops.launch_pair_loop``."""
+    wp.launch(
+        _kernel(partial.dtype, quantity),
+        dim=1,
+        inputs=[targets, sources, effective, tiles, shares],
+        outputs=[partial],
+        device=partial.device,
+    )
