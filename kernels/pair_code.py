@@ -11,8 +11,9 @@ of its choice (a Newton step for 1/√c is an operation shorter if it ends at 2/
 | quantity | u | sums over the pairs | worth |
 |---|---|---|---|
 | field | W²b/3 | h = (Wi)³ [(Wi)² (r·b) r − u] | 4πH = 3 W⁻⁵ h |
-| force | W²b/5 | f = (Wi)⁵ [(r·e) u + (u·e) r − (Wi)² (r·e)(r·b) r], a = (Wi)⁵ (r·b) | 4π(e·∇)H = 15 W⁻⁷ f + 3 W⁻⁵ a e |
-| wrench | W²b/5 | those of the force, and h = (Wi)⁵ (r·b) r, g = (Wi)³ b | and 4πH = 3 W⁻⁵ h − W⁻³ g |
+| force | W²b/5 | f = (Wi)⁵ [(r·e) u + (u·e) r − (Wi)² (r·e)(r·b) r], | |
+| | | a = (Wi)⁵ (r·b) | 4π(e·∇)H = 15 W⁻⁷ f + 3 W⁻⁵ a e |
+| wrench | W²b/5 | f and a, and h = (Wi)⁵ (r·b) r, g = (Wi)³ b | also 4πH = 3 W⁻⁵ h − W⁻³ g |
 
 The products are ordered so that no factor beyond r⁻³ leaves the float32 range before it meets r.
 """

@@ -19,6 +19,7 @@ adds them up in a fixed order, so that results do not depend on scheduling.
 import os
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -155,13 +156,13 @@ def _cpu_tiles(segments, starts, threads: int):
 
 def _cut(begin, end, parts):
     """Ranges that cut one into equal parts."""
-    edges = begin + (end - begin) * np.arange(parts + 1) // parts
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(begin + (end - begin) * np.arange(parts + 1) // parts))
 
 
 def _stripes(begin, end, wanted):
-    """Ranges of at most ``STRIPE`` that cut one into about as many parts as wanted."""
-    width = min(STRIPE, max(_LANES, -(-(end - begin) // wanted // _LANES) * _LANES))
+    """Ranges of at most ``STRIPE`` that cut one into about as many equal parts as wanted, or more."""
+    parts = max(wanted, -(-(end - begin) // STRIPE), 1)
+    width = max(-(-(end - begin) // (parts * _LANES)) * _LANES, _LANES)
     return [(a, min(a + width, end)) for a in range(begin, end, width)]
 
 
@@ -234,8 +235,8 @@ def partial_shape(rows: Rows) -> tuple[int, int, int]:
 def launch_pair_loop(rows: Rows, targets, sources, partial, *, effective=None, reference_exclude=None, epsilon2=0.0):
     """Sum the quantity of ``rows`` of packed sources over the target rows.
 
-    The native loops clamp the distance at contact and leave out pairs of points at the same place. The field leaves out
-    the target's own moment, if targets and sources are the same array; a force everything that bears the target's label.
+    The native loops clamp the distance at contact and leave out pairs of points at the same place. The field leaves
+    out the target's own moment, if targets and sources are the same array; a force what bears the target's label.
 
     Args:
         rows: Work list.

@@ -75,9 +75,10 @@ _VECTORS = """
                 tile.u[c][v] = SCALE * tile.packed[4 + c][v];
                 tile.h[c][v] = 0;
             }
-        tile.radius = number(tile.packed[3], 0);
-        for (int i = 1; i < tile.count; ++i)
-            if (number(tile.packed[3], i) != tile.radius) tile.radius = 0;
+        const REAL first = number(tile.packed[3], 0);
+        bool same = true;
+        for (int i = 1; i < tile.count; ++i) same &= number(tile.packed[3], i) == first;
+        tile.radius = same ? first : 0;
     };
 """
 
@@ -115,14 +116,14 @@ def _add_rows(quantity: str) -> str:
                 kept[c] = moment;
                 moment = 0;
             }}
-            const REAL {loads};
+            const REAL {", ".join(loads)};
             NUMBER {", ".join(f"{name} = 0" for name in sums)};
             for (int v = 0; v < tile.vectors; ++v) {{
                 {_SOURCES}
                 const NUMBER s = radius + tile.packed[3][v], s2 = s * s;
                 auto inverse = [=, &tile](NUMBER d2) -> NUMBER {{
                     const NUMBER c = d2 > s2 ? d2 : s2;
-                    return {mask} ? inverse_root(c) : 0;
+                    return ({mask}) ? inverse_root(c) : 0;
                 }};
                 {pair(quantity, "inverse(d2)")}
             }}

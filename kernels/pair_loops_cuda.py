@@ -1,8 +1,8 @@
 """The native pair loop on a GPU: a block of warps holds a tile of targets in registers and walks its sources.
 
-Each lane of a warp holds the tile's targets ``lane``, ``lane + 32``, ...; the block's warps share out the sources of the
-tile, stage them through shared memory, 32 at a time, and at the end add up their sums in order. Sources of few targets
-are also split over blocks, whose sums the finishing kernel adds up in order, so that nothing depends on scheduling.
+Each lane of a warp holds the tile's targets ``lane``, ``lane + 32``, ...; the block's warps share out the tile's sources,
+stage them through shared memory, 32 at a time, and at the end add up their sums in order. Sources of few targets are
+also split over blocks, whose sums the finishing kernel adds up in order, so that nothing depends on scheduling.
 
 Where a stage's sources have one radius, and none of them is left out for one of the targets, the clamp is a constant of
 the target and nothing is masked: 20 instructions a pair for the field and 31 for the force, next to the shared loads.
@@ -21,8 +21,7 @@ class Shape:
     """Shape of the blocks that walk a work list.
 
     Attributes:
-        targets: Targets a lane; a tile has 32 times as many. Their sums, three or six each, share the room that a stage
-            of sources takes, 12 numbers a lane.
+        targets: Targets a lane; a tile has 32 times as many.
         warps: Warps a block.
         blocks: Blocks that a multiprocessor holds at once, in float32.
     """
@@ -34,9 +33,9 @@ class Shape:
 
 # Measured on an H200: the most targets that a shape serves best.
 _SHAPES = {
-    FIELD: ((1536, Shape(1, 8, 4)), (6144, Shape(2, 8, 4)), (None, Shape(4, 8, 2))),
-    FORCE: ((4096, Shape(1, 8, 4)), (16384, Shape(2, 8, 3)), (None, Shape(3, 8, 2))),
-    WRENCH: ((4096, Shape(1, 8, 3)), (None, Shape(2, 8, 2))),
+    FIELD: ((None, Shape(4, 4, 4)),),
+    FORCE: ((None, Shape(3, 8, 2)),),
+    WRENCH: ((None, Shape(2, 8, 2)),),
 }
 _MOST_SPLITS = 32
 _FIXED_COST = 16
@@ -81,10 +80,10 @@ _INVERSE_ROOT = {
 
 _W = 1.0  # see pair_code
 
-_LOAD_SOURCE = """
-            const Quad qa = staged_a[k], qb = staged_b[k], qc = staged_c[k];
-            const REAL ax = qa.x, ay = qa.y, az = qa.z, bx = qa.w, by = qb.x, bz = qb.y;
-            const REAL ux = qb.z, uy = qb.w, uz = qc.x;
+_SOURCE = """
+            const Quad qa = staged_a[k], qb = staged_b[k];
+            const REAL ax = qa.x, ay = qa.y, az = qa.z, bx = qb.x, by = qb.y, bz = qb.z;
+            const REAL ux = SCALE * bx, uy = SCALE * by, uz = SCALE * bz;
 """
 
 
@@ -93,6 +92,7 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
     field = quantity == FIELD
     sums, width, ks = SUMS[quantity], WIDTHS[quantity], [str(k) for k in range(targets)]
     unroll = max(2, 8 // targets)
+    staging = max(64, 8 * targets * width)
 
     def each(text: str) -> str:
         return "".join(text.replace("@", k) for k in ks)
@@ -115,7 +115,7 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
         own = each("const int own@ = same ? column@ : -1;")
     else:
         apart = "label < lowest || label > highest"
-        left_out = "qc.z == tl@"
+        left_out = "qb.w == tl@"
         own = (
             "REAL lowest = tl0, highest = tl0;"
             + "".join(f"lowest = min(lowest, tl{k}); highest = max(highest, tl{k});" for k in ks[1:])
@@ -126,7 +126,7 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
     }"""
         )
     fast_pairs = each("{" + pair(quantity, "inverse_root(max(d2, clamp@))", "@") + "}")
-    careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + qc.y, {left_out})", "@") + "}")
+    careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + qa.w, {left_out})", "@") + "}")
     stores = "".join(
         f"warp_sums[(lane + 32 * {k}) * {width} + {c}] = {text};"
         for k in ks
@@ -135,13 +135,14 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
     return f"""
     typedef {real} REAL;
     typedef REAL NUMBER;
+    constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
     {_INVERSE_ROOT[real]}
     auto careful = [&](REAL d2, REAL s, bool left_out) {{
         const REAL c = max(d2, s * s);
         return c > 0 && !left_out ? inverse_root(c) : REAL(0);
     }};
     struct alignas(16) Quad {{ REAL x, y, z, w; }};
-    __shared__ Quad staging[{warps}][3][32];  // of each warp, for its sources, and at the end for its sums
+    __shared__ Quad staging[{warps}][{staging}];  // of each warp, for its sources, and at the end for its sums
     const int lane = thread % 32, warp = thread / 32 % {warps};
     const int* tile = tiles.data + {TILE_COLUMNS} * (thread / {32 * warps});
     const int row_begin = tile[0], row_end = tile[1], column_begin = tile[2], split = tile[5];
@@ -152,7 +153,7 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
     const bool same = src == tgt;
     {loads}
     {own}
-    Quad *staged_a = staging[warp][0], *staged_b = staging[warp][1], *staged_c = staging[warp][2];
+    Quad *staged_a = staging[warp], *staged_b = staged_a + 32;
     REAL x, y, z, radius, bx, by, bz, label;
     // lanes beyond the last source stand where it stands, without a moment
     auto load = [&](int base) {{
@@ -168,10 +169,8 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
         const REAL one_radius = __shfl_sync(~0u, radius, 0);
         const bool fast = __all_sync(~0u, radius == one_radius && radius > 0 && ({apart}));
         __syncwarp();
-        const REAL scale = {scaled_moment(quantity, _W)!r};
-        staged_a[lane] = Quad{{x, y, z, bx}};
-        staged_b[lane] = Quad{{by, bz, scale * bx, scale * by}};
-        staged_c[lane] = Quad{{scale * bz, radius, label, 0}};
+        staged_a[lane] = Quad{{x, y, z, radius}};
+        staged_b[lane] = Quad{{bx, by, bz, {0 if field else "label"}}};
         __syncwarp();
         const int staged = min(32, source_end - base);
         if (base + 32 < source_end) load(base + 32);
@@ -182,7 +181,7 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
                 #pragma unroll
                 for (int step = 0; step < {unroll}; ++step) {{
                     const int k = first + step;
-                    {_LOAD_SOURCE}
+                    {_SOURCE}
                     {fast_pairs}
                 }}
             }}
@@ -190,7 +189,7 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
             #pragma unroll 1
             for (int k = 0; k < staged; ++k) {{
                 const int j = base + k;
-                {_LOAD_SOURCE}
+                {_SOURCE}
                 {careful_pairs}
             }}
         }}

@@ -1,0 +1,140 @@
+"""warpmag and its peers in one run on the same arrays: ``python -m bench.compare [--device cuda:0] [--sizes 243 2560]``.
+
+What is timed is the field of n dipoles at each other, data in place, results left in place: evaluations one after the
+other and one wait at their end. Each peer's field is compared with the float64 oracle on some targets. One JSON line a
+measurement; a peer whose library is missing, or that fails at a size, gets a line that says so.
+"""
+
+import argparse
+import contextlib
+import importlib
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from bench.cases import touching_pile
+from bench.machine import describe
+from bench.peers import PEERS, Peer
+from warpmag import oracle
+
+SIZES = {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768, 131072, 262144)}
+_CHECKED = 64
+"""Targets compared with the oracle."""
+_LAPS = 7
+
+
+def arrays(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [m] and moments [A·m²] of a pile of balls, alike in every run, float32, shape [count, 3]."""
+    moments = np.random.default_rng(1).normal(size=(count, 3)) * 0.3 + [0.0, 0.0, 1.0]
+    return touching_pile(count), moments.astype(np.float32)
+
+
+def reference(positions, moments) -> tuple[np.ndarray, np.ndarray]:
+    """Some targets, and the oracle's field [A/m] at them."""
+    targets = np.linspace(0, len(positions) - 1, min(_CHECKED, len(positions))).astype(int)
+    x, m = positions.astype(float), moments.astype(float)
+    others = [np.arange(len(x)) != i for i in targets]
+    return targets, np.array(
+        [oracle.h_field(x[o], m[o], x[i : i + 1])[0] for i, o in zip(targets, others, strict=True)]
+    )
+
+
+def measure(peer: Peer, positions, moments, expected, device, seconds: float) -> dict:
+    """Time one evaluation of a peer, and check what it leaves."""
+    began = time.perf_counter()
+    evaluation = importlib.import_module(f"bench.peers.{peer.name}").prepare(positions, moments, device)
+
+    def lap(count):
+        start = time.perf_counter()
+        for _ in range(count):
+            evaluation.run()
+        evaluation.wait()
+        return (time.perf_counter() - start) / count
+
+    lap(1)
+    first = time.perf_counter() - began
+    count = max(1, round(seconds / _LAPS / lap(1)))
+    laps = [lap(count) for _ in range(_LAPS if count > 1 else 2)]
+    targets, fields = expected
+    error = float(np.linalg.norm(evaluation.result()[targets] - fields) / np.linalg.norm(fields))
+    best = min(laps)
+    return {
+        "seconds": best,
+        "median_seconds": float(np.median(laps)),
+        "pairs_per_second": len(positions) ** 2 / best,
+        "error": error,
+        "first_call_seconds": first,
+    }
+
+
+def run(device, sizes, names, seconds: float, slowest: float, emit) -> None:
+    """Measure every peer at every size.
+
+    Args:
+        device: Warp device.
+        sizes: Numbers of dipoles.
+        names: Peers to run; None means all.
+        seconds: Time to spend on laps [s].
+        slowest: A peer that once took longer than this for an evaluation [s] is not run at larger sizes.
+        emit: Takes each result, a dict.
+    """
+    kind = "cpu" if device.is_cpu else "cuda"
+    machine = describe(device)
+    gone = set()
+    for count in sizes:
+        positions, moments = arrays(count)
+        expected = reference(positions, moments)
+        for peer in PEERS:
+            name = peer.name.removeprefix("with_")
+            if kind not in peer.devices or name in gone or (names and name not in names):
+                continue
+            line = {"case": "compare", "peer": name, "count": count}
+            try:
+                with contextlib.redirect_stdout(sys.stderr):  # some libraries talk
+                    line |= measure(peer, positions, moments, expected, str(device), seconds)
+                if line["seconds"] > slowest:
+                    gone.add(name)
+            except Exception as problem:  # a peer's failure is a result: the others go on
+                gone.add(name)
+                line["failed"] = f"{type(problem).__name__}: {problem}".splitlines()[0][:200]
+            emit(line | machine)
+
+
+def main() -> None:
+    """Run the comparison that the command line asks for."""
+    names = [p.name.removeprefix("with_") for p in PEERS]
+    parser = argparse.ArgumentParser(
+        prog="python -m bench.compare",
+        description=__doc__.partition("\n")[0],
+        epilog="peers: " + "; ".join(f"{n} ({p.summary})" for n, p in zip(names, PEERS, strict=True)),
+    )
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--sizes", type=int, nargs="+", help="numbers of dipoles; default by device")
+    parser.add_argument("--peers", nargs="+", choices=names, help="default: all")
+    parser.add_argument("--seconds", type=float, default=1.0, help="time for each measurement (default 1)")
+    parser.add_argument("--slowest", type=float, default=2.0, help="seconds beyond which a peer gets no larger sizes")
+    parser.add_argument("-o", "--output", type=Path, help="file that the lines are added to, besides being printed")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    device = wp.get_device(options.device)
+
+    def emit(line):
+        text = json.dumps(line)
+        print(text, flush=True)
+        if "failed" in line:
+            print(f"{line['peer']} at {line['count']}: {line['failed']}", file=sys.stderr)
+        if options.output:
+            options.output.parent.mkdir(parents=True, exist_ok=True)
+            with options.output.open("a") as file:
+                file.write(text + "\n")
+
+    sizes = options.sizes or SIZES["cpu" if device.is_cpu else "cuda"]
+    run(device, sizes, options.peers, options.seconds, options.slowest, emit)
+
+
+if __name__ == "__main__":
+    main()

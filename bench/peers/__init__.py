@@ -1,0 +1,56 @@
+"""Other ways to the same sum: the field of n dipoles at each other, as one would write it with each library.
+
+Every module has one function ``prepare(positions, moments, device)``, which takes float32 NumPy arrays of shape [n, 3]
+and the name of a Warp device, puts them where the library wants them and returns an :class:`Evaluation`. A module whose
+library is not installed fails to import; ``compare`` skips it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A field evaluation that is ready to run.
+
+    Attributes:
+        run: Starts one evaluation.
+        wait: Returns when all that were started have ended.
+        result: Field [A/m] of the last one, shape [n, 3].
+    """
+
+    run: Callable[[], object]
+    wait: Callable[[], object]
+    result: Callable[[], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A module of this folder.
+
+    Attributes:
+        name: Module name.
+        summary: What it is.
+        devices: Where it runs, ``cpu``, ``cuda`` or both.
+    """
+
+    name: str
+    summary: str
+    devices: tuple[str, ...]
+
+
+PEERS = (
+    Peer("with_warpmag", "warpmag: native loop and overlap pass, captured in a graph", ("cpu", "cuda")),
+    Peer("with_warp_plain", "Warp: one thread a target, the textbook loop, in a graph", ("cpu", "cuda")),
+    Peer("with_warp_tile", "Warp: its tile n-body example turned to dipoles, in a graph", ("cuda",)),
+    Peer("with_torch", "PyTorch: broadcast over blocks of targets, torch.compile", ("cpu", "cuda")),
+    Peer("with_jax", "JAX: broadcast over blocks of targets, jit", ("cpu", "cuda")),
+    Peer("with_numba_cpu", "Numba: parallel, fastmath loop", ("cpu",)),
+    Peer("with_numba_cuda", "Numba CUDA: sources staged in shared memory", ("cuda",)),
+    Peer("with_cupy", "CuPy: broadcast over blocks of targets", ("cuda",)),
+    Peer("with_pykeops", "KeOps: symbolic matrix, reduced without being stored", ("cpu", "cuda")),
+    Peer("with_magpylib", "magpylib: its dipole formula over all pairs, float64", ("cpu",)),
+    Peer("with_fmm3d", "FMM3D: fast multipole method, eps 1e-3, float64", ("cpu",)),
+)
