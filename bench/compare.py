@@ -1,4 +1,4 @@
-"""warpmag and its peers in one run on the same arrays: ``python -m bench.compare [--device cuda:0] [--sizes 243 2560]``.
+"""warpmag and its peers, in one run on the same arrays: ``python -m bench.compare [--device cuda:0] [--sizes 243]``.
 
 What is timed is the field of n dipoles at each other, data in place, results left in place: evaluations one after the
 other and one wait at their end. Each peer's field is compared with the float64 oracle on some targets. One JSON line a

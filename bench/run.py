@@ -27,8 +27,8 @@ _CHAINED = 10
 def measure(work, device, *, seconds: float = 1.0, repeats: int = 5) -> float:
     """Median time [s] of ``work``, which only launches kernels.
 
-    On a GPU it is captured ``_CHAINED`` times in one graph, between two events: a graph's own launch takes 5 µs, which a
-    step in a simulation's graph does not pay.
+    On a GPU it is captured ``_CHAINED`` times in one graph, between two events: a graph's own launch takes 5 µs, which
+    a step in a simulation's graph does not pay.
     """
     work()
     if device.is_cpu:

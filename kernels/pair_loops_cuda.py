@@ -1,6 +1,6 @@
 """The native pair loop on a GPU: a block of warps holds a tile of targets in registers and walks its sources.
 
-Each lane of a warp holds the tile's targets ``lane``, ``lane + 32``, ...; the block's warps share out the tile's sources,
+Each lane of a warp holds the tile's targets ``lane``, ``lane + 32``, ...; the block's warps share out the sources,
 stage them through shared memory, 32 at a time, and at the end add up their sums in order. Sources of few targets are
 also split over blocks, whose sums the finishing kernel adds up in order, so that nothing depends on scheduling.
 

@@ -1,0 +1,142 @@
+"""Draw what was measured: ``python -m bench.report FILE... [-o bench_out/report]``.
+
+Reads the JSON lines of ``bench.compare`` and ``bench.run``. For each device it draws, from the comparison, speed
+against error at every size, and the share of the device's limit against the size; and it writes a Markdown table.
+
+The limit is the rate of pairs at 20 issue slots a pair, what the separations, an inverse root and the sums of one field
+take at the least when every pair is evaluated once for each of its ends.
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+LIMITS = {
+    "NVIDIA H200": 132 * 128 * 1.98e9 / 20.0,
+}
+"""Pairs a second at the issue limit: multiprocessors × lanes × clock [Hz] / 20."""
+
+
+def read(paths) -> list[dict]:
+    """All result lines of some files."""
+    return [json.loads(line) for path in paths for line in Path(path).read_text().splitlines() if line.startswith("{")]
+
+
+def latest(lines) -> list[dict]:
+    """The last line of each measurement, for files that several runs were added to."""
+    kept = {(x["device"], x["case"], x.get("peer", ""), x.get("dtype", ""), x["count"]): x for x in lines}
+    return list(kept.values())
+
+
+def machine_of(line: dict) -> str:
+    """What a line was measured on."""
+    return line["device"] if line["device"] != "cpu" else line["machine"]
+
+
+def draw_pareto(lines, path: Path) -> None:
+    """Draw speed against error of every peer, a panel for each size."""
+    sizes = sorted({x["count"] for x in lines})
+    columns = min(4, len(sizes))
+    rows = -(-len(sizes) // columns)
+    figure, axes = plt.subplots(rows, columns, squeeze=False, sharex=True, sharey=True, layout="constrained")
+    figure.set_size_inches(3.4 * columns, 3.2 * rows)
+    peers = sorted({x["peer"] for x in lines}, key=lambda name: (name != "warpmag", name))
+    colors = dict(zip(peers, plt.get_cmap("tab20").colors, strict=False))
+    for axis in axes.flat[len(sizes) :]:
+        axis.set_visible(False)
+    for axis, size in zip(axes.flat, sizes, strict=False):
+        for x in lines:
+            if x["count"] == size:
+                marker, scale = ("*", 160) if x["peer"] == "warpmag" else ("o", 40)
+                axis.scatter(
+                    max(x["error"], 1e-16), x["pairs_per_second"], scale, color=colors[x["peer"]], marker=marker
+                )
+        axis.set(xscale="log", yscale="log", title=f"{size:,} dipoles")
+        axis.grid(True, alpha=0.3)
+    axes[0, 0].invert_xaxis()
+    figure.supxlabel("relative error of the field (smaller to the right)")
+    figure.supylabel("pairs a second")
+    handles = [plt.Line2D([], [], color=colors[p], marker="o", linestyle="", label=p) for p in peers]
+    figure.legend(handles=handles, loc="outside right upper")
+    figure.suptitle(machine_of(lines[0]))
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def draw_roofline(lines, limit: float, path: Path) -> None:
+    """Draw the share of the limit that each peer reaches against the size."""
+    figure, axis = plt.subplots(figsize=(7.0, 4.5), layout="constrained")
+    series = defaultdict(list)
+    for x in lines:
+        series[x.get("peer") or f"{x['case']} {x['dtype']}"].append((x["count"], x["pairs_per_second"] / limit))
+    for name, points in sorted(series.items()):
+        axis.plot(*zip(*sorted(points), strict=True), marker="o", label=name, linewidth=3 if name == "warpmag" else 1)
+    axis.axhline(1.0, color="black", linewidth=0.8)
+    axis.set(
+        xscale="log", yscale="log", xlabel="dipoles", ylabel="share of the issue limit", title=machine_of(lines[0])
+    )
+    axis.grid(True, alpha=0.3)
+    axis.legend(fontsize="small")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def table(lines) -> str:
+    """A Markdown table of all lines of a device."""
+    limit = LIMITS.get(lines[0]["device"])
+    rows = [
+        "| what | n | time | pairs/s | of the limit | error | first call | commit |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for x in sorted(lines, key=lambda x: (x["case"], x["count"], x.get("seconds", float("inf")))):
+        what = x.get("peer") or f"{x['case']} {x['dtype']}"
+        if "failed" in x:
+            rows.append(f"| {what} | {x['count']:,} | {x['failed']} | | | | | {x['commit']} |")
+            continue
+        rate = x.get("pairs_per_second")
+        share = f"{rate / limit:.1%}" if rate and limit else ""
+        rows.append(
+            f"| {what} | {x['count']:,} | {duration(x['seconds'])} | {f'{rate:.3g}' if rate else ''} | {share} "
+            f"| {x['error']:.1e} | {x['first_call_seconds']:.1f} s | {x['commit']} |"
+        )
+    return "\n".join(rows)
+
+
+def duration(seconds: float) -> str:
+    """A time in a unit that suits it."""
+    scale, unit = next(((s, u) for s, u in ((1.0, "s"), (1e3, "ms")) if seconds * s >= 1.0), (1e6, "µs"))
+    return f"{seconds * scale:.3g} {unit}"
+
+
+def main() -> None:
+    """Write pictures and table of the files on the command line."""
+    parser = argparse.ArgumentParser(prog="python -m bench.report", description=__doc__.partition("\n")[0])
+    parser.add_argument("files", nargs="+", type=Path, help="JSON lines of bench.compare or bench.run")
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench_out/report"), help="folder (bench_out/report)")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    machines = defaultdict(list)
+    for line in latest(read(options.files)):
+        machines[machine_of(line)].append(line)
+    sections = []
+    for machine, lines in machines.items():
+        name = "".join(c if c.isalnum() else "_" for c in machine).strip("_").lower()
+        measured = [x for x in lines if "pairs_per_second" in x]
+        compared = [x for x in measured if x["case"] == "compare"]
+        if compared:
+            draw_pareto(compared, options.output / f"{name}_pareto.png")
+        if measured and lines[0]["device"] in LIMITS:
+            draw_roofline(measured, LIMITS[lines[0]["device"]], options.output / f"{name}_roofline.png")
+        sections.append(f"## {machine}\n\n{table(lines)}\n")
+    (options.output / "report.md").write_text("\n".join(sections))
+    print(f"wrote {options.output}")
+
+
+if __name__ == "__main__":
+    main()
