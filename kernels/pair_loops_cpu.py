@@ -95,11 +95,9 @@ def _add_rows(quantity: str) -> str:
     field = quantity == FIELD
     effective = "" if field else "REAL ex, REAL ey, REAL ez, "
     target = {"tx": 0, "ty": 1, "tz": 2, "radius": 3, "label": 7}
-    loads = ", ".join(f"{name} = share.targets[{row} * share.target_stride + column]" for name, row in target.items())
+    loads = [f"{name} = share.targets[{row} * share.target_stride + column]" for name, row in target.items()]
     if not field:
-        loads += "".join(
-            f", e{c} = share.effective[{k} * share.effective_stride + column]" for k, c in enumerate("xyz")
-        )
+        loads += [f"e{c} = share.effective[{k} * share.effective_stride + column]" for k, c in enumerate("xyz")]
     mask = "c > 0" if field else "(c > 0) & (label != tile.packed[7][v])"
     return f"""
     auto add = [](REAL* out, {effective}{", ".join(f"REAL {name}" for name in sums)}) {{
