@@ -104,7 +104,7 @@ def run(device, sizes, names, seconds: float, slowest: float, emit) -> None:
             emit(line | machine)
 
 
-def main() -> None:
+def main(arguments=None) -> None:
     """Run the comparison that the command line asks for."""
     names = [p.name.removeprefix("with_") for p in PEERS]
     parser = argparse.ArgumentParser(
@@ -118,7 +118,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0, help="time for each measurement (default 1)")
     parser.add_argument("--slowest", type=float, default=2.0, help="seconds beyond which a peer gets no larger sizes")
     parser.add_argument("-o", "--output", type=Path, help="file that the lines are added to, besides being printed")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     device = wp.get_device(options.device)
 

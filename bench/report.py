@@ -114,12 +114,12 @@ def duration(seconds: float) -> str:
     return f"{seconds * scale:.3g} {unit}"
 
 
-def main() -> None:
+def main(arguments=None) -> None:
     """Write pictures and table of the files on the command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.report", description=__doc__.partition("\n")[0])
     parser.add_argument("files", nargs="+", type=Path, help="JSON lines of bench.compare or bench.run")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench_out/report"), help="folder (bench_out/report)")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
     machines = defaultdict(list)
     for line in latest(read(options.files)):

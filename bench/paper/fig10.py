@@ -36,7 +36,8 @@ def run(output: Output):
         points, densities, pitch = reading(LEVELS[level], output)
         sizes = {law: np.linalg.norm(density, axis=1) for law, density in densities.items()}
         _draw_row(row, f"{name}, {level} magnet", points, densities, sizes, pitch)
-        ratio = sizes["zeeman"] / sizes["kelvin"]
+        felt = sizes["kelvin"] > 1e-3 * sizes["kelvin"].mean()  # in the middle there is none, only rounding
+        ratio = sizes["zeeman"][felt] / sizes["kelvin"][felt]
         values = {
             "mean_kelvin": float(sizes["kelvin"].mean()),
             "mean_zeeman": float(sizes["zeeman"].mean()),
