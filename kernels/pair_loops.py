@@ -33,8 +33,8 @@ PACKED_ROWS = 8
 EXCLUDE_NOTHING, EXCLUDE_SELF, EXCLUDE_BODY = 0, 1, 2
 """Sources that a loop leaves out: none, the target itself, or everything with the target's body label."""
 
-_PAIRS_PER_THREAD = 200_000
-"""Pairs that are worth a thread on a CPU: about ten times what it costs to start one."""
+_PAIRS_PER_START = 200_000
+"""Pairs that a CPU sums while another of its threads starts: 50 µs, most of it to wake a core."""
 _TILES_PER_THREAD = 16
 """Tiles that a thread should have, so that they can be shared out evenly."""
 _LANES = 16
@@ -98,7 +98,7 @@ def make_rows(segments, device, quantity=FIELD) -> Rows:
         tiles, splits = _cuda_tiles(segments, starts, shape, device.sm_count)
         shares = np.zeros(0)
     else:
-        splits = int(np.clip(pair_count // _PAIRS_PER_THREAD, 1, min(_cores(), MOST_THREADS)))
+        splits = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(_cores(), MOST_THREADS)))
         tiles, shares = _cpu_tiles(segments, starts, splits)
 
     def to_device(a):
@@ -147,11 +147,13 @@ def _cpu_tiles(segments, starts, threads: int):
             for b, (j0, j1) in enumerate(sources):
                 if not mirrored or a <= b:
                     tiles.append((row + i0 - t0, row + i1 - t0, i0, j0, j1, 0, mirrored))
-                    work.append((i1 - i0) * (j1 - j0) * (0.5 if mirrored and a == b else 1.0))
+                    work.append((i1 - i0) * (j1 - j0) * (2.0 if mirrored and a < b else 1.0))
+    # a tile goes to the thread in whose share its middle lies; the first thread is at work while the others start
     done = np.concatenate([[0.0], np.cumsum(work)])
-    # a tile goes to the thread in whose share its middle lies
-    owner = np.minimum((done[:-1] + done[1:]) / 2 // (done[-1] / threads), threads - 1) if done[-1] else np.zeros(0)
-    return np.array(tiles, np.int64), np.searchsorted(owner, np.arange(threads + 1))
+    share = (done[-1] + _PAIRS_PER_START * (threads - 1)) / threads
+    edges = share + (share - _PAIRS_PER_START) * np.arange(threads - 1)
+    ends = np.searchsorted((done[:-1] + done[1:]) / 2.0, edges)
+    return np.array(tiles, np.int64), np.concatenate([[0], ends, [len(tiles)]])
 
 
 def _cut(begin, end, parts):

@@ -34,16 +34,6 @@ _VECTORS = """
     constexpr int LANES = BYTES / (int)sizeof(REAL), VECTORS = STRIPE / LANES;
     typedef REAL NUMBER __attribute__((ext_vector_type(LANES)));
 
-    auto inverse_root = [](NUMBER c) -> NUMBER {
-    #if defined(__AVX512F__)
-        if constexpr (sizeof(REAL) == 4) {
-            // y, good to 2⁻¹⁴, and one Newton step from it; the machine's root and quotient would take twice the time
-            const NUMBER y = __builtin_ia32_rsqrt14ps512_mask(c, c, (unsigned short)-1);
-            return y * (REAL(3) - c * (y * y));
-        } else
-    #endif
-        return REAL(2) / __builtin_elementwise_sqrt(c);
-    };
     auto total = [](NUMBER lanes) {
         #pragma clang fp reassociate(on)
         REAL sum = 0;
@@ -81,6 +71,31 @@ _VECTORS = """
         tile.radius = same ? first : 0;
     };
 """
+
+# W/√c. On AVX-512 by Newton's steps from an estimate y good to 2⁻¹⁴: root and quotient take the machine twice the time.
+_INVERSE_ROOT = {
+    "float": """
+    auto inverse_root = [](NUMBER c) -> NUMBER {
+    #if defined(__AVX512F__)
+        const NUMBER y = __builtin_ia32_rsqrt14ps512_mask(c, c, (unsigned short)-1);
+        return y * (REAL(3) - c * (y * y));
+    #else
+        return REAL(2) / __builtin_elementwise_sqrt(c);
+    #endif
+    };
+""",
+    "double": """
+    auto inverse_root = [](NUMBER c) -> NUMBER {
+    #if defined(__AVX512F__)
+        NUMBER y = __builtin_ia32_rsqrt14pd512_mask(c, c, (unsigned char)-1);
+        y *= REAL(1.5) - REAL(0.5) * c * (y * y);
+        return y * (REAL(3) - c * (y * y));
+    #else
+        return REAL(2) / __builtin_elementwise_sqrt(c);
+    #endif
+    };
+""",
+}
 
 _SOURCES = """
             const NUMBER ax = tile.packed[0][v], ay = tile.packed[1][v], az = tile.packed[2][v];
@@ -276,6 +291,7 @@ def _snippet(real: str, quantity: str) -> str:
         const Share& share = *(const Share*)argument;
         constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
         {_VECTORS}
+        {_INVERSE_ROOT[real]}
         {_add_rows(quantity)}
         {_ADD_BOTH_WAYS if quantity == FIELD else ""}
         {_walk(quantity)}
