@@ -28,6 +28,8 @@ CAPACITY = 32
 SKIN = 0.1
 """Part of its radius that a moment may move before the lists are made anew."""
 _BUCKETS_PER_MOMENT = 4
+_AT_ONCE = 4
+"""Listed neighbours that are looked at together; a divisor of the capacity."""
 _FARTHEST_CELL = 1.0e9
 """Cells from the origin beyond which a moment is left out: its cell would be no integer."""
 
@@ -396,11 +398,21 @@ def pair_correction(dtype, gradient: bool, exclude_body: bool):
     ):
         total = sums()
         count = neighbor_count[i]
+        x = vec3(targets[0, i], targets[1, i], targets[2, i])
         if count <= wp.static(CAPACITY):
-            for n in range(count):
-                j = neighbor[i, n]
-                if j >= begin and j < end:
-                    total += one_pair(targets, sources, i, j)
+            for first in range(0, count, wp.static(_AT_ONCE)):
+                # several are looked at together, since a GPU would have one wait for the other: bit k for first + k
+                overlapping = int(0)
+                for k in range(wp.static(_AT_ONCE)):
+                    j = neighbor[i, first + k]
+                    listed = first + k < count and j >= begin and j < end
+                    j = wp.where(listed, j, 0)
+                    s = targets[3, i] + sources[3, j]
+                    r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
+                    overlapping += wp.where(listed and wp.dot(r, r) < s * s, 1 << k, 0)
+                for n in range(first, wp.min(first + wp.static(_AT_ONCE), count)):
+                    if (overlapping >> (n - first)) & 1 == 1:
+                        total += one_pair(targets, sources, i, neighbor[i, n])
         else:
             for j in range(begin, end):
                 if j != skip:
