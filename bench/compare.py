@@ -22,7 +22,7 @@ from bench.peers import PEERS, Peer
 from warpmag import oracle
 
 SIZES = {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768, 131072, 262144)}
-_CHECKED = 64
+_CHECKED = 32
 """Targets compared with the oracle."""
 _LAPS = 7
 
@@ -115,8 +115,13 @@ def main(arguments=None) -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--sizes", type=int, nargs="+", help="numbers of dipoles; default by device")
     parser.add_argument("--peers", nargs="+", choices=names, help="default: all")
-    parser.add_argument("--seconds", type=float, default=1.0, help="time for each measurement (default 1)")
-    parser.add_argument("--slowest", type=float, default=2.0, help="seconds beyond which a peer gets no larger sizes")
+    parser.add_argument("--seconds", type=float, default=0.3, help="time for each measurement (default 0.3)")
+    parser.add_argument(
+        "--slowest",
+        type=float,
+        default=0.1,
+        help="seconds for an evaluation beyond which a peer gets no larger sizes (0.1)",
+    )
     parser.add_argument("-o", "--output", type=Path, help="file that the lines are added to, besides being printed")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
