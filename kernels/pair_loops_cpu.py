@@ -49,7 +49,7 @@ _VECTORS = """
         REAL radius;                // the one radius of all of them, or 0
     };
     auto number = [](NUMBER* row, int i) -> REAL& { return ((REAL*)row)[i]; };
-    auto fill = [number](Tile& tile, const REAL* packed, size_t stride, int begin, int end) __attribute__((noinline)) {
+    auto fill = [number](Tile& tile, const REAL* packed, size_t stride, int begin, int end) ONCE {
         tile.begin = begin;
         tile.count = end - begin;
         tile.vectors = (tile.count + LANES - 1) / LANES;
@@ -118,7 +118,7 @@ def _add_rows(quantity: str) -> str:
     auto add = [](REAL* out, {effective}{", ".join(f"REAL {name}" for name in sums)}) {{
         {" ".join(f"out[{c}] += {text};" for c, text in enumerate(results(quantity, _W)))}
     }};
-    auto add_rows = [=](const Share& share, int row_begin, int row_end, int column_begin, Tile& tile) __attribute__((noinline)) {{
+    auto add_rows = [=](const Share& share, int row_begin, int row_end, int column_begin, Tile& tile) ONCE {{
         for (int row = row_begin; row < row_end; ++row) {{
             const int column = column_begin + row - row_begin, own = column - tile.begin;
             // a moment makes no field at its own place: while its row is summed, it rests
@@ -149,7 +149,7 @@ def _add_rows(quantity: str) -> str:
 
 
 _ADD_BOTH_WAYS = f"""
-    auto add_both_ways = [=](Tile& home, NUMBER (&lanes)[3][STRIPE], Tile& tile) __attribute__((noinline)) {{
+    auto add_both_ways = [=](Tile& home, NUMBER (&lanes)[3][STRIPE], Tile& tile) ONCE {{
         const NUMBER contact = home.radius + tile.radius, clamp = contact * contact;
         const bool diagonal = &home == &tile;
         for (int i = 0; i < home.count; ++i) {{
@@ -186,7 +186,7 @@ _ENTER_HOME = """
     NUMBER lanes[3][STRIPE];
     int home_row = 0;
     home.begin = -1;
-    auto leave_home = [&]() __attribute__((noinline)) {
+    auto leave_home = [&]() ONCE {
         for (int i = 0; i < home.count && home.begin >= 0; ++i)
             add(share.out + 3 * (size_t)(home_row + i), total(lanes[0][i]) + number(home.h[0], i),
                 total(lanes[1][i]) + number(home.h[1], i), total(lanes[2][i]) + number(home.h[2], i));
@@ -277,6 +277,7 @@ def _snippet(real: str, quantity: str) -> str:
     """All tiles of a work list, shared out to threads."""
     return f"""
     typedef {real} REAL;
+    #define ONCE __attribute__((noinline))  // compiled once, not wherever it is called
     constexpr int STRIPE = {STRIPE}, MOST_THREADS = {MOST_THREADS};
     struct Share {{
         const REAL *targets, *sources, *effective;
@@ -306,6 +307,7 @@ def _snippet(real: str, quantity: str) -> str:
                           tiles.data, shares.data[t], shares.data[t + 1],
                           (REAL*)partial_out.data + t * rows * {WIDTHS[quantity]}, rows}};
     {_RUN_THREADS}
+    #undef ONCE
     """
 
 
