@@ -17,7 +17,23 @@ def describe(device) -> dict:
         "machine": f"{_processor()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
         "warp": wp.__version__,
+        "operations_per_second": operations_per_second(device),
     }
+
+
+CLOCKS = {"NVIDIA H200": 1.98e9}
+"""Clock of GPUs under load [Hz]."""
+_LANES = 128
+"""Float32 operations that a multiprocessor of them starts in a cycle."""
+
+
+def operations_per_second(device) -> float | None:
+    """Float32 operations a second that a device can start: by its clock on a GPU, by trial on all cores of a CPU."""
+    if device.is_cuda:
+        return device.sm_count * _LANES * CLOCKS[device.name] if device.name in CLOCKS else None
+    from bench.multiply_add import measure  # noqa: PLC0415 - compiles a kernel
+
+    return measure(device) * len(os.sched_getaffinity(0))
 
 
 def _processor() -> str:

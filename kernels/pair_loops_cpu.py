@@ -3,9 +3,9 @@
 A tile holds up to ``STRIPE`` sources in the first-level cache, for a range of target rows to meet. There are two ways
 through it:
 
-* ``add_row`` sums one target row, whatever the radii.
+* ``add_rows`` sums a target at a time, whatever the radii.
 * ``add_both_ways`` is for the field among moments of one radius: a separation and its powers serve the field at both
-  ends of the pair, which takes 35 vector operations for the two of them, where ``add_row`` takes 28 for one.
+  ends of the pair, which takes 35 vector operations for the two of them, where ``add_rows`` takes 28 for one.
 
 Every thread has sums of its own, which the finishing kernel adds up in order, so that nothing depends on scheduling.
 """
@@ -202,7 +202,8 @@ _ENTER_HOME = """
 
 _WALK_HOME = """
         if (mirrored && share.targets == share.sources) {
-            if (home.begin != column_begin) enter_home(row_begin, column_begin, column_begin + row_end - row_begin);
+            if (home.begin != column_begin || home_row != row_begin)
+                enter_home(row_begin, column_begin, column_begin + row_end - row_begin);
             const bool diagonal = source_begin == column_begin;
             Tile& other = diagonal ? home : tile;
             if (!diagonal) fill(tile, share.sources, share.source_stride, source_begin, source_end);

@@ -5,7 +5,8 @@ stage them through shared memory, 32 at a time, and at the end add up their sums
 also split over blocks, whose sums the finishing kernel adds up in order, so that nothing depends on scheduling.
 
 Where a stage's sources have one radius, and none of them is left out for one of the targets, the clamp is a constant of
-the target and nothing is masked: 20 instructions a pair for the field and 31 for the force, next to the shared loads.
+the target and nothing is masked: 20 instructions a pair for the field and 31 for the force, next to the five or so that
+a source takes once for all targets of a lane.
 """
 
 from dataclasses import dataclass

@@ -43,4 +43,6 @@ def test_report(lines, tmp_path):
     text = (tmp_path / "report" / "report.md").read_text()
     assert text.count("| warpmag | 130 |") == 1  # the later of two runs
     assert "| nothing | 70 | ModuleNotFoundError" in text
-    assert any(path.stat().st_size > 10_000 for path in (tmp_path / "report").glob("*_pareto.png"))
+    pictures = ["pareto", "roofline"] if report.limit_of(lines[0]) else ["pareto"]
+    assert [path.stem.rpartition("_")[2] for path in sorted((tmp_path / "report").glob("*.png"))] == pictures
+    assert all(path.stat().st_size > 10_000 for path in (tmp_path / "report").glob("*.png"))
