@@ -21,7 +21,7 @@ PEAK_DEPTH = wp.constant(3)  # penetration [m]
 PEAK_ERROR = wp.constant(4)  # magnetization error [1]
 PEAKS = 5
 
-COUNT_BAD_BODY = wp.constant(0)  # lowest body whose state is not finite, NO_BODY if there is none
+COUNT_BAD_BODY = wp.constant(0)  # the first body whose state was not finite, see kernels.stepping; else NO_BODY
 COUNT_EVALUATIONS = wp.constant(1)  # field evaluations, summed over substeps
 COUNT_UNCONVERGED = wp.constant(2)  # substeps whose induction did not converge
 COUNT_OVERLAPS = wp.constant(3)  # contacts deeper than a threshold, last substep
@@ -223,33 +223,4 @@ def watch_induction(error, evaluations, converged, peaks, counts):
         inputs=[error, evaluations, converged],
         outputs=[peaks, counts],
         device=peaks.device,
-    )
-
-
-@wp.kernel
-def _watch_finite(
-    # inputs:
-    body_q_in: wp.array[wp.transform],
-    body_qd_in: wp.array[wp.spatial_vector],
-    # outputs:
-    counts_out: wp.array[wp.int32],
-):
-    body = wp.tid()
-    total = wp.abs(body_q_in[body][0])
-    for k in range(1, 7):
-        total += wp.abs(body_q_in[body][k])
-    for k in range(6):
-        total += wp.abs(body_qd_in[body][k])
-    if not wp.isfinite(total):
-        wp.atomic_min(counts_out, COUNT_BAD_BODY, body)
-
-
-def watch_finite(state, counts):
-    """Fold the lowest body whose pose or velocity is not finite into ``counts``."""
-    wp.launch(
-        _watch_finite,
-        dim=state.body_q.shape[0],
-        inputs=[state.body_q, state.body_qd],
-        outputs=[counts],
-        device=counts.device,
     )

@@ -253,6 +253,48 @@ def launch_mark(stage: int, b: StepBuffers):
 
 
 @wp.kernel
+def _watch_finite(
+    # inputs:
+    body_q_in: wp.array[wp.transform],
+    body_qd_in: wp.array[wp.spatial_vector],
+    half: int,
+    fewest: int,
+    status_in: wp.array[wp.int32],
+    # outputs:
+    counts_out: wp.array[wp.int32],
+):
+    body = wp.tid()
+    total = wp.abs(body_q_in[body][0])
+    for k in range(1, 7):
+        total += wp.abs(body_q_in[body][k])
+    for k in range(6):
+        total += wp.abs(body_qd_in[body][k])
+    if not wp.isfinite(total):
+        pair = ((fewest // 2) << status_in[STATUS_LEVEL]) - status_in[STATUS_REMAINING]
+        wp.atomic_min(counts_out, COUNT_BAD_BODY, (2 * pair + half) * body_q_in.shape[0] + body)
+
+
+def launch_watch_finite(half: int, state, limits: Limits, b: StepBuffers):
+    """Note the first body whose pose or velocity is not finite: magnets infect all others within a substep.
+
+    ``COUNT_BAD_BODY`` is the number of the substep times that of the bodies, plus the lowest such body in it.
+
+    Args:
+        half: Which substep of a pair ``state`` stands before, 0 or 1.
+        state: The state.
+        limits: When a step holds.
+        b: The state machine.
+    """
+    wp.launch(
+        _watch_finite,
+        dim=state.body_q.shape[0],
+        inputs=[state.body_q, state.body_qd, half, limits.fewest, b.status],
+        outputs=[b.counts],
+        device=b.status.device,
+    )
+
+
+@wp.kernel
 def _end_pair(
     # inputs:
     level: int,

@@ -123,9 +123,18 @@ class Simulation:
             self._start_from_stage()
         self._center = self._positions().mean(axis=0) if len(self._moving) else np.zeros(3)
         self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
+        self._statistics.coarseness = self._coarseness()
 
     def _moves(self, body: int) -> bool:
         return math.isfinite(self._sizes.thickness[body])
+
+    def _coarseness(self) -> float:
+        """Return the distance of neighbouring single-precision positions over the thickness of the thinnest body."""
+        moving = np.isfinite(self._sizes.thickness)
+        if not moving.any():
+            return 0.0
+        farthest = np.abs(self.state.body_q.numpy()[moving, :3]).max()
+        return float(np.spacing(farthest) / self._sizes.thickness[moving].min())
 
     def _check_poses(self) -> None:
         for name in ("body_q", "body_qd"):

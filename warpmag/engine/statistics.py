@@ -6,6 +6,8 @@ import numpy as np
 
 from warpmag.engine.stepper import StepReport
 
+_COARSE = 1e-3
+"""Coarseness of positions from which on contacts tremble: they are settled to about a thousandth of the thickness."""
 _DEEP = 0.05
 """Penetration over the thickness that no user takes for contact."""
 
@@ -33,6 +35,7 @@ class Statistics:
         held_rms_speed: Root mean square speed of those [m/s].
         farthest: Largest distance of a magnet from the centre of where they all started, in any frame [m].
         overlapping: Contacts that overlap at the start.
+        coarseness: Distance of neighbouring single-precision positions at the start over the thinnest body's thickness.
         wall_seconds: Time that the run took [s].
     """
 
@@ -54,6 +57,7 @@ class Statistics:
     held_rms_speed: float = 0.0
     farthest: float = 0.0
     overlapping: int = 0
+    coarseness: float = 0.0
     wall_seconds: float = 0.0
     _seconds: list[tuple[float, float, float] | None] = field(default_factory=list)
 
@@ -88,6 +92,9 @@ class Statistics:
         if self.overlapping:
             many = self.overlapping > 1
             lines.append(f"{self.overlapping} pair{'s' * many} of bodies overlap{'s' * (not many)} at the start")
+        if self.coarseness > _COARSE:
+            percent = 100.0 * self.coarseness
+            lines.append(f"bodies are so far from the origin that positions are known to {percent:.2g} % of a radius")
         if self.unconverged:
             lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
         if self.final_overlap > _DEEP:

@@ -197,7 +197,7 @@ class Stepper:
         )
 
     def _give_up(self) -> None:
-        body = int(self._read("counts")[monitor.COUNT_BAD_BODY])
+        body = int(self._read("counts")[monitor.COUNT_BAD_BODY]) % self._model.body_count
         self.steps, number = self._reported, self._reported + 1
         raise SimulationError(
             f"step {number} ({number * self._step:g} s): {self._model.body_label[body]} has left all finite numbers"
@@ -274,15 +274,16 @@ class Stepper:
         for level in range(int(stepping.LEVELS)):
             wp.capture_while(self._buffers.remaining(level), self._advance_twice, level=level)
         self._find_contacts(self.state, 0.0, 0.0)
-        monitor.watch_finite(self.state, self._buffers.counts)
+        stepping.launch_watch_finite(0, self.state, self._limits, self._buffers)
         stepping.launch_mark(RIGID, self._buffers)
         stepping.launch_judge(self._limits, self._buffers)
         self._copy_state(stepping.FLAG_REJECTED, self._saved, self.state)
 
     def _advance_twice(self, level: int) -> None:
         dt = self._step / (self._fewest << level)
-        self._substep(self.state, self._other, dt)
-        self._substep(self._other, self.state, dt)
+        for half, (now, then) in enumerate(((self.state, self._other), (self._other, self.state))):
+            stepping.launch_watch_finite(half, now, self._limits, self._buffers)
+            self._substep(now, then, dt)
         stepping.launch_end_pair(level, self._buffers)
 
     def _substep(self, now: newton.State, then: newton.State, dt: float) -> None:
