@@ -103,7 +103,7 @@ class Stepper:
         self._model, self._magnetics, self._solver = model, magnetics, solver
         self._device = wp.get_device(model.device)
         self._step = step
-        # An even number, so that a step ends in the state that it began in; powers of two, so that few graphs do.
+        # Even, so that a step ends in the state that it began in.
         self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
         self.state, self._other, self._saved = model.state(), model.state(), model.state()
         self._thickness = wp.array(sizes.thickness, dtype=float, device=self._device)
