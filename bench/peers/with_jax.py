@@ -1,5 +1,9 @@
 """JAX: broadcast over a block of targets, fused by XLA."""
 
+import os
+
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # or it takes most of the GPU's memory from its peers
+
 import jax
 import jax.numpy as jnp
 import numpy as np
