@@ -329,6 +329,14 @@ def pair_overlap(packed: wp.array2d(dtype=Any), i: int, j: int):
 
 
 @wp.func
+def contact_unit(a: Any, b: Any):
+    """Inverse of two balls' distance in contact [1/m]; in it as the unit of length, no power of r overflows."""
+    s = a + b
+    one = type(s)(1.0)
+    return wp.where(s > type(s)(0.0), one / s, one)
+
+
+@wp.func
 def near_field(
     packed: wp.array2d(dtype=Any),
     moments: wp.array(dtype=Any),
@@ -350,7 +358,10 @@ def near_field(
             j = neighbor[i, n]
             if j >= begin and j < end:
                 r = x - type(h)(packed[0, j], packed[1, j], packed[2, j])
-                h += field_of(pair_factors(wp.dot(r, r), packed[3, i], packed[3, j]), r, moments[j])
+                unit = contact_unit(packed[3, i], packed[3, j])
+                r *= unit
+                g = pair_factors(wp.dot(r, r), unit * packed[3, i], unit * packed[3, j])
+                h += field_of(g, r, (unit * unit * unit) * moments[j])
     return h
 
 
@@ -374,15 +385,17 @@ def pair_correction(dtype, gradient: bool, exclude_body: bool):
         if wp.static(exclude_body):
             left_out = targets[7, i] == sources[7, j]
         if d2 < s * s and not left_out:
-            m = vec3(sources[4, j], sources[5, j], sources[6, j])
-            g = overlap_factors(d2, targets[3, i], sources[3, j])
+            unit = contact_unit(targets[3, i], sources[3, j])
+            m = (unit * unit * unit) * vec3(sources[4, j], sources[5, j], sources[6, j])
+            r *= unit
+            g = overlap_factors(unit * unit * d2, unit * targets[3, i], unit * sources[3, j])
             h = field_of(g, r, m)
             for c in range(3):
                 total[c] = h[c]
             if wp.static(gradient):
                 t = gradient_of(g, r, m)
                 for c in range(6):
-                    total[3 + c] = t[c]
+                    total[3 + c] = unit * t[c]
         return total
 
     @wp.func

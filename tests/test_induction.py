@@ -39,6 +39,7 @@ def test_isolated_ball_takes_one_iteration(curve, susceptibility, strength, devi
     assert np.linalg.norm(found.magnetizations - exact) <= 1e-6 * np.linalg.norm(exact)
 
 
+@pytest.mark.filterwarnings("ignore:solve_induction. did not converge")  # ended on purpose
 @pytest.mark.parametrize("evaluations, error", [(6, 1e-2), (8, 1e-3), (11, 1e-4)])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_cold_block_converges_fast(block, evaluations, error, dtype, device):
@@ -124,7 +125,8 @@ def test_curves_and_materials(curve, device):
 
 def test_not_converging_is_said(block, device):
     x, radius, sources, _ = block
-    found = warpmag.solve_induction(x, radius, saturation=MS, sources=sources, max_evaluations=2, device=device)
+    with pytest.warns(warpmag.ConvergenceWarning, match="did not converge, error .* after max_evaluations = 2"):
+        found = warpmag.solve_induction(x, radius, saturation=MS, sources=sources, max_evaluations=2, device=device)
     assert not found.converged and found.evaluations == 2 and found.error > 1e-3
 
 

@@ -11,6 +11,7 @@ from importlib import import_module
 _HOMES = {
     "InputError": "warpmag.errors",
     "SimulationError": "warpmag.errors",
+    "ConvergenceWarning": "warpmag.errors",
     "h_field": "warpmag.fields",
     "wrench": "warpmag.fields",
     "solve_induction": "warpmag.induction",

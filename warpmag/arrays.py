@@ -11,6 +11,20 @@ DTYPES = {"float32": wp.float32, "float64": wp.float64}
 ACCURACY = {"float32": 2e-6, "float64": 1e-13}
 """Relative L2 error of all-pairs sums in each precision that tests hold them to: no tolerance below it is met."""
 
+RADIUS_RANGE = {wp.float32: (5e-8, 2e4), wp.float64: (0.0, np.inf)}
+"""Smallest and largest radius [m] of a ball by Warp scalar type: neither r⁻⁵ nor products of moments may overflow."""
+
+
+def check_radii(name: str, radii: np.ndarray, dtype):
+    """Raise :class:`InputError` where a radius [m] is negative, or out of range of the Warp scalar type ``dtype``."""
+    if not (radii >= 0.0).all():
+        raise InputError(f"{name}: must not be negative, got {radii.min()}")
+    least, most = RADIUS_RANGE[dtype]
+    outside = (radii > 0.0) & ((radii < least) | (radii > most))
+    if outside.any():
+        first = radii[outside].flat[0]
+        raise InputError(f"{name}: must be {least:g} to {most:g} m in float32, got {first:g}; use float64")
+
 
 def vec3_type(dtype):
     """Three-vector of a Warp scalar type."""

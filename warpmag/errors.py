@@ -1,4 +1,4 @@
-"""The error that bad input raises."""
+"""Errors and warnings of the library."""
 
 
 class InputError(ValueError):
@@ -10,3 +10,7 @@ class InputError(ValueError):
 
 class SimulationError(RuntimeError):
     """A simulation that cannot go on: one line that names the step and the body."""
+
+
+class ConvergenceWarning(UserWarning):
+    """An induction solve that gave up before its tolerance."""

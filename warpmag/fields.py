@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import ACCURACY, Kind, resolve_kind, vec3_type
+from warpmag.arrays import ACCURACY, Kind, check_radii, resolve_kind, vec3_type
 from warpmag.errors import InputError
 from warpmag.kernels import pair_loops
 from warpmag.kernels.field import launch_finish_field
@@ -133,7 +133,7 @@ def _packed(kind: Kind, name, radii, positions, moments) -> PackedMoments:
     """Pack one-shot arrays, radii checked under ``name``."""
     n = positions.shape[0]
     array = kind.scalars(name, 0.0 if radii is None else radii, n)
-    packed = PackedMoments(array, largest_radius=_largest_radius(name, radii))
+    packed = PackedMoments(array, largest_radius=_largest_radius(name, radii, kind.dtype))
     packed.pack(positions, moments)
     return packed
 
@@ -156,15 +156,14 @@ def _pair_sums(rows, at, sources, exclude, smoothing):
     return partial
 
 
-def _largest_radius(name, radii) -> float:
-    """Largest radius [m]; ``InputError`` for a negative one."""
+def _largest_radius(name, radii, dtype) -> float:
+    """Largest radius [m]; ``InputError`` for one that is negative or too small."""
     if radii is None:
         return 0.0
     host = radii.numpy() if isinstance(radii, wp.array) else np.asarray(radii, float)
     if host.size == 0:
         return 0.0
-    if not host.min() >= 0.0:
-        raise InputError(f"{name}: must not be negative, got {host.min()}")
+    check_radii(name, host, dtype)
     return float(host.max())
 
 

@@ -1,13 +1,14 @@
 """Magnetic equilibrium of inducible balls: the one-shot call on arrays."""
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from warpmag.arrays import Kind, resolve_kind
-from warpmag.errors import InputError
+from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.kernels.wrench import FORCE_IDS
 from warpmag.magnets import check_positive, check_token
 from warpmag.system import MomentSystem
@@ -98,6 +99,9 @@ def solve_induction(
 
     Raises:
         InputError: An argument has a wrong shape, is not finite or is out of range.
+
+    Warns:
+        ConvergenceWarning: ``max_evaluations`` did not suffice; the result is the best that was found.
     """
     kind = resolve_kind(positions, dtype, device)
     check_token("contact_model", contact_model, CONTACT_MODELS)
@@ -139,7 +143,7 @@ def solve_induction(
     if initial is not None:
         system.start_from(kind.vectors("initial", initial, n))
     system.solve()
-    return InductionResult(
+    result = InductionResult(
         magnetizations=kind.finish(system.magnetizations(), n),
         h_field=kind.finish(system.h, n),
         error=float(system.error.numpy().max(initial=0.0)),
@@ -149,6 +153,10 @@ def solve_induction(
         _kind=kind,
         _count=n,
     )
+    if not result.converged:
+        reached = f"error {result.error:.2g} > rtol {rtol:g} after max_evaluations = {max_evaluations}"
+        warnings.warn(f"solve_induction: did not converge, {reached}", ConvergenceWarning, stacklevel=2)
+    return result
 
 
 def _host(name, value, count):

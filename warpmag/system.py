@@ -5,7 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import ACCURACY, resolve_device, resolve_dtype, vec3_type
+from warpmag.arrays import ACCURACY, check_radii, resolve_device, resolve_dtype, vec3_type
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels import induction, pair_loops
@@ -97,6 +97,7 @@ class MomentSystem:
             raise InputError(f"max_evaluations: must be at least 1, got {max_evaluations}")
         n = len(radii)
         radii = np.asarray(radii, float)
+        check_radii("radii", radii, self.dtype)
         worlds = np.zeros(n, int) if worlds is None else np.asarray(worlds)
         permanent = np.zeros(n, bool) if permanent is None else np.asarray(permanent, bool)
         bodies = np.arange(n) if bodies is None else np.asarray(bodies)
