@@ -10,9 +10,9 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from warpmag import cli
-from warpmag.magnets import Magnet
+from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import balls_up
-from warpmag.usd import author_magnet
+from warpmag.usd import author_magnet, author_settings
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +64,22 @@ def test_a_deterministic_run_repeats(scene, device, tmp_path, capfd):
         ends.append([ball.GetAttribute("warpmag:moment").Get(12.0) for ball in balls])
         ends.append([UsdGeom.Xformable(ball).ComputeLocalToWorldTransform(12.0) for ball in balls])
     assert ends[:2] == ends[2:]
+
+
+def test_contact_model_by_option_and_by_stage(scene, device, tmp_path, capsys):
+    out = str(tmp_path / "out.usda")
+    command = ["run", "-o", out, "--frames", "1", "--device", device]
+    assert cli.main([*command, str(scene), "--contact-model", "multipole"]) == 0
+
+    def choose(stage):
+        settings = MagneticSettings(contact_model="multipole")
+        author_settings(next(p for p in stage.Traverse() if p.IsA(UsdPhysics.Scene)), settings)
+
+    stage = edited(scene, tmp_path / "near.usda", choose)
+    assert cli.main(["check", str(stage)]) == 0
+    assert "kelvin, theta, multipole" in capsys.readouterr().out
+    assert cli.main([*command, str(stage), "--force", "zeeman"]) == cli.BAD_INPUT
+    assert "multipole" in capsys.readouterr().err
 
 
 def test_scenes_lists_what_is_bundled(capsys):

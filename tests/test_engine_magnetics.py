@@ -8,7 +8,8 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag import oracle
+import warpmag.magnets
+from warpmag import near_contact, oracle
 
 M = 1e6  # A/m
 R = 0.005  # m
@@ -91,6 +92,33 @@ def test_an_inducible_ball_is_magnetized_and_pulled(device):
     np.testing.assert_allclose(torques, 0.0, atol=3e-5 * size * R)
     order = np.argsort(magnetics.shapes)
     np.testing.assert_allclose(magnetics.shape_moments()[order], moments, atol=3e-5 * M * VOLUME)
+
+
+def test_balls_that_nearly_touch_pull_harder_than_dipoles(device):
+    builder = new_builder()
+    x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.05 * R], [2.05 * R, 0.0, 0.0]])
+    for position in x:
+        add_ball(builder, tuple(position))
+    add_ball(builder, (0.0, 0.0, 0.1), (0.0, 0.0, M))  # a permanent ball far off, which takes no part
+    model = builder.finalize(device=device)
+    field = np.array([0.0, 3e3, 1e4])
+    forces, _, magnetics = wrenches(model, external_field=tuple(field), contact_model="multipole", rtol=1e-5)
+    dipoles, _, _ = wrenches(model, external_field=tuple(field), rtol=1e-5)
+    applied = field + oracle.h_field([[0.0, 0.0, 0.1]], [[0.0, 0.0, M * VOLUME]], x)
+    exact, near = near_contact.equilibrium(x, R, applied, saturation=warpmag.magnets.SATURATION_OF_IRON)
+    pull = oracle.gradient_at([[0.0, 0.0, 0.1]], [[0.0, 0.0, M * VOLUME]], x)
+    near += oracle.kelvin_force(VOLUME * exact.magnetizations, pull)
+    np.testing.assert_allclose(forces[:3], near, atol=1e-3 * np.abs(near).max())  # of rtol, some ten times amplified
+    assert np.abs(forces[:3]).max() > 2.0 * np.abs(dipoles[:3]).max()
+    assert np.abs(forces.sum(0)).max() < 1e-5 * np.abs(forces).max()
+    # captured and replayed
+    state, again = model.state(), model.state()
+    with wp.ScopedCapture(model.device) as capture:
+        again.clear_forces()
+        magnetics.apply(again)
+    magnetics.apply(state)
+    wp.capture_launch(capture.graph)
+    np.testing.assert_allclose(again.body_f.numpy(), state.body_f.numpy(), atol=1e-4 * np.abs(forces).max())
 
 
 def test_a_moment_off_the_centre_of_mass_turns_its_body(device):

@@ -5,9 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from arrangements import as_float32, fcc_block, relative
 
+import warpmag
 from warpmag import near_contact, oracle
 from warpmag.near_contact import NearContacts
+from warpmag.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.reference.near_contact_table import pair_conductance
@@ -181,3 +184,141 @@ def test_any_arrangement_has_one_solution(extent):
     assert eigenvalues.real.min() > 0.5
     coupling = oracle.coupling_matrix(x, 1.0) + near.coupling() * 4.0 / 3.0 * np.pi
     assert np.linalg.eigvalsh(0.5 * (coupling + coupling.T)).max() < 1.0 / 3.0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# On the device
+# ---------------------------------------------------------------------------------------------------------------------
+
+IRON = 1.7e6
+MIXED = 0.005 * np.array([[0.0, 0.0, 0.0], [2.05, 0.0, 0.0], [0.4, 2.2, 0.3], [1.5, 1.6, 1.6], [0.0, 0.0, -2.3]])
+MIXED_RADII = 0.005 * np.array([1.0, 1.0, 1.0, 0.9, 1.0])
+MIXED_SUSCEPTIBILITIES = np.array([5.0, np.inf, 50.0, 10.0, 3.0])
+
+
+def solve(x, radii, field, device, dtype="float64", **settings):
+    rtol = 1e-11 if dtype == "float64" else 3e-6
+    return warpmag.solve_induction(
+        x, radii, saturation=IRON, external_field=field, contact_model="multipole", dtype=dtype, device=device,
+        **{"rtol": rtol} | settings,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype, error", [("float64", 1e-6), ("float32", 1e-3)])
+@pytest.mark.parametrize("strength", [1e-3, 0.2, 2.0])
+def test_device_solution_is_the_reference(strength, dtype, error, device):
+    """Balls of five materials and two sizes, at gaps of 5 to 60 %, unsaturated to saturated."""
+    field = strength * IRON * np.array([0.4, -0.3, 0.9])
+    settings = {"susceptibility": MIXED_SUSCEPTIBILITIES}
+    exact, exact_forces = near_contact.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
+    found = solve(MIXED, MIXED_RADII, field, device, dtype, **settings)
+    assert found.converged
+    assert relative(found.magnetizations, exact.magnetizations) < error
+    assert relative(found.h_field, exact.h) < error
+    forces, torques = found.wrench()
+    assert relative(forces, exact_forces) < error  # float32: forces add up from parts ten times as large
+    assert np.abs(forces.sum(0)).max() < (1e-12 if dtype == "float64" else 1e-5) * np.abs(forces).max()
+    assert np.abs(torques).max() < error * 0.005 * np.abs(forces).max()
+
+
+def test_device_pair_is_exact(device):
+    """Balls of infinite permeability at 1 % of the radius in a weak field, against the exact force."""
+    two = pair(2.01 * 0.005, (0.005, 0.005), (np.inf, np.inf))
+    m = np.linalg.solve(two.resistance[0], np.full(2, 100.0))
+    found = solve(np.array([0 * ALONG, 2.01 * 0.005 * ALONG]), 0.005, 100.0 * ALONG, device)
+    # a field of 6e-5 Ms already softens the contact by (M/Ms)²
+    assert found.wrench()[0][1, 2] == pytest.approx(-0.5 * MU0 * m @ two.slope[0] @ m, rel=2e-3)
+
+
+@pytest.mark.parametrize("extent", [0.5, 0.2, 0.08])
+def test_device_heaps(extent, device):
+    """300 balls with no regard for one another: the solve ends converged, and forces add up to nothing."""
+    x = np.random.default_rng(1).uniform(-0.5, 0.5, (300, 3)) * extent
+    found = solve(x, 0.01, 0.1 * IRON * ALONG, device, rtol=1e-9)
+    assert found.converged
+    forces, _ = found.wrench()
+    assert np.isfinite(forces).all()
+    assert np.abs(forces.sum(0)).max() < 1e-9 * np.abs(forces).max()
+
+
+def test_device_zero_field_and_no_near_pair(device):
+    none = solve(MIXED, MIXED_RADII, np.zeros(3), device)
+    assert none.converged and np.abs(none.wrench()[0]).max() == 0.0
+    far = solve(10.0 * MIXED, MIXED_RADII, 1e5 * ALONG, device)
+    dipoles = warpmag.solve_induction(
+        10.0 * MIXED, MIXED_RADII, saturation=IRON, external_field=1e5 * ALONG, rtol=1e-11, dtype="float64",
+        device=device,
+    )  # fmt: skip
+    np.testing.assert_array_equal(far.wrench()[0], dipoles.wrench()[0])
+
+
+def test_device_worlds_and_bodies_keep_apart(device):
+    """Worlds do not see each other, and only single inducible moments take part."""
+    x = np.concatenate([MIXED, MIXED, MIXED])
+    n = len(MIXED)
+    system = MomentSystem(
+        radii=np.tile(MIXED_RADII, 3), worlds=np.repeat([0, 1, 2], n), saturation=IRON, contact_model="multipole",
+        bodies=np.concatenate([np.arange(2 * n), np.full(n, 2 * n)]), external_field=1e5 * ALONG, rtol=1e-11,
+        dtype="float64", device=device,
+    )  # fmt: skip
+    system.positions.assign(x)
+    system.solve()
+    system.apply_forces()
+    forces = system.forces.numpy().reshape(3, n, 3)
+    alone, _ = solve(MIXED, MIXED_RADII, 1e5 * ALONG, device).wrench()
+    np.testing.assert_allclose(forces[0], alone, rtol=1e-6, atol=1e-9 * np.abs(alone).max())
+    np.testing.assert_allclose(forces[1], alone, rtol=1e-6, atol=1e-9 * np.abs(alone).max())
+    assert np.abs(forces[2]).max() == 0.0  # one body of five moments
+
+
+def test_device_runs_repeat_bit_by_bit(device):
+    x = as_float32(fcc_block((3, 3, 3)))[0]
+    first, second = (solve(x, 0.00499, 1e4 * ALONG, device, "float32", rtol=1e-3).wrench()[0] for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_only_the_kelvin_law(device):
+    found = solve(MIXED, MIXED_RADII, 1e5 * ALONG, device)
+    with pytest.raises(warpmag.InputError, match="multipole"):
+        found.wrench("zeeman")
+    with pytest.raises(warpmag.InputError, match="multipole"):
+        MomentSystem(radii=np.ones(2), force="zeeman", contact_model="multipole", device=device)
+
+
+@pytest.mark.parametrize("contact_model, fewest", [("dipole", 200), ("multipole", 800)])
+def test_two_balls_that_approach_conserve_energy(contact_model, fewest, device):
+    """Velocity Verlet, frictionless, oblique to the field, stopped before contact: error of order two in the step.
+
+    Energy is kinetic plus the co-energy −½ μ0 Σ m·H0 of unsaturated balls.
+    """
+    field, mass, end = np.array([0.0, 0.0, 200.0]), 4.1e-3, 0.0
+    system = MomentSystem(
+        radii=np.full(2, 0.005), saturation=1e12, external_field=field, contact_model=contact_model, rtol=1e-11,
+        dtype="float64", device=device,
+    )  # fmt: skip
+
+    def pull(x):
+        system.positions.assign(x)
+        system.solve()
+        system.apply_forces()
+        return system.forces.numpy(), -0.5 * MU0 * np.sum(system.moments.numpy() @ field)
+
+    drifts = []
+    for steps in (fewest, 2 * fewest):
+        x, v = 0.005 * np.array([[0.0, 0.0, -1.3], [0.6, 0.0, 1.3]]), np.zeros((2, 3))
+        force, start = pull(x)
+        step, drift = 6.0 / steps, 0.0
+        while True:
+            v = v + 0.5 * step * force / mass
+            x = x + step * v
+            force, co_energy = pull(x)
+            v = v + 0.5 * step * force / mass
+            end = np.linalg.norm(x[1] - x[0])
+            if end < 0.005 * 2.05 or drift > 1.0:
+                break
+            kinetic = 0.5 * mass * np.sum(v * v)
+            drift = max(drift, abs(kinetic + co_energy - start) / abs(start))
+            assert np.abs(v.sum(0)).max() <= 1e-6 * max(np.abs(v).max(), 1e-30)
+        drifts.append(drift)
+    assert drifts[1] < 1e-4
+    assert 3.0 < drifts[0] / drifts[1] < 5.0

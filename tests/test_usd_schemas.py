@@ -91,6 +91,7 @@ def test_fallbacks_are_the_defaults_of_the_records():
         ("warpmag:externalField", "vector3f", None),
         ("warpmag:force", "token", magnets.FORCES),
         ("warpmag:dynamics", "token", magnets.DYNAMICS),
+        ("warpmag:contactModel", "token", magnets.CONTACT_MODELS),
         ("warpmag:rtol", "float", None),
     ],
 )

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from warpmag.errors import InputError, SimulationError
-from warpmag.magnets import DYNAMICS, FORCES, METHODS
+from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 """Exit codes; 0 where all went well."""
@@ -60,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
+    run.add_argument("--contact-model", choices=CONTACT_MODELS, help="balls that nearly touch (default: the stage's)")
     run.add_argument("--rtol", type=float, metavar="X", help="magnetization error to reach (default: the stage's)")
     run.add_argument(
         "--deterministic", action="store_true", help="same bits in every run on a GPU too (xpbd only, slower)"
@@ -119,7 +120,8 @@ def _check(options) -> int:
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
     settings = contents.settings
     field = ", ".join(f"{value:g}" for value in settings.external_field)
-    print(f"magnetics   {settings.force}, {settings.dynamics}, rtol {settings.rtol:g}, external field ({field}) A/m")
+    laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"
+    print(f"magnetics   {laws}, rtol {settings.rtol:g}, external field ({field}) A/m")
     for finding in report.findings:
         print(f"{finding.severity:11} {finding}")
     return BAD_INPUT if report.errors else 0
@@ -143,6 +145,7 @@ def _run(options) -> int:
         solver=options.solver,
         force=options.force or (method and method.force),
         dynamics=options.dynamics or (method and method.dynamics),
+        contact_model=options.contact_model,
         curve=method and method.curve,
         rtol=options.rtol,
         device=options.device,

@@ -13,8 +13,6 @@ from warpmag.kernels.wrench import FORCE_IDS
 from warpmag.magnets import check_positive, check_token
 from warpmag.system import MomentSystem
 
-CONTACT_MODELS = ("dipole",)
-
 
 @dataclass(frozen=True)
 class InductionResult:
@@ -41,7 +39,7 @@ class InductionResult:
         """Force and torque on each ball from the other balls, the sources and the external field.
 
         Args:
-            force: ``kelvin``, F = μ0 (m·∇)H (Eqs. 13, 14), or ``zeeman`` (Eq. 4).
+            force: ``kelvin``, F = μ0 (m·∇)H (Eqs. 13, 14), or ``zeeman`` (Eq. 4), with the contact model ``dipole``.
 
         Returns:
             Forces [N] and torques μ0 m × H [N·m], each of shape [n, 3], in the kind of the solve's arrays. The torques
@@ -87,7 +85,8 @@ def solve_induction(
         sources: Permanent magnets as (positions [m], moments [A·m²]), each of shape [k, 3]; point dipoles.
         dynamics: ``theta``: the exact flow of Eqs. 8 and 9, accelerated; ``theta-euler``: their explicit step;
             ``llg``, ``llg-damping``: Eq. 6 with and without precession.
-        contact_model: ``dipole``.
+        contact_model: ``dipole``; or ``multipole``, which adds what balls lack where they nearly touch, from the exact
+            solution of two balls (see ``warpmag.near_contact``).
         rtol: Relative residual at which to end.
         max_evaluations: Field evaluations after which to give up; ``converged`` tells.
         initial: Magnetizations to start from [A/m], shape [n, 3].
@@ -104,7 +103,6 @@ def solve_induction(
         ConvergenceWarning: ``max_evaluations`` did not suffice; the result is the best that was found.
     """
     kind = resolve_kind(positions, dtype, device)
-    check_token("contact_model", contact_model, CONTACT_MODELS)
     x = kind.vectors("positions", positions)
     n = x.shape[0]
     size = _host("radii", radii, n)
@@ -129,6 +127,7 @@ def solve_induction(
         susceptibility=with_sources(susceptibility),
         curve=curve,
         dynamics=dynamics,
+        contact_model=contact_model,
         rtol=rtol,
         max_evaluations=max_evaluations,
         lone_torque=True,

@@ -12,6 +12,7 @@ from warpmag.errors import InputError
 KINDS = ("inducible", "permanent")
 CURVES = ("tanh", "langevin", "clamped")
 FORCES = ("kelvin", "zeeman")
+CONTACT_MODELS = ("dipole", "multipole")
 DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 
 SATURATION_OF_IRON = 1.7e6
@@ -34,6 +35,13 @@ def check_finite(name: str, values: tuple[float, ...]) -> None:
     """Raise :class:`InputError` unless every one of ``values`` is finite."""
     if not all(math.isfinite(v) for v in values):
         raise InputError(f"{name}: must be finite, got {tuple(values)}")
+
+
+def check_contact_model(name: str, value: str, force: str) -> None:
+    """Raise :class:`InputError` unless ``value`` is a contact model that goes with the force law ``force``."""
+    check_token(name, value, CONTACT_MODELS)
+    if value == "multipole" and force != "kelvin":
+        raise InputError(f"{name}: 'multipole' goes with the force law 'kelvin' only, got {force!r}")
 
 
 @dataclass(frozen=True)
@@ -78,12 +86,14 @@ class MagneticSettings:
         force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
         dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
             ``llg-damping`` (Eq. 6, with and without precession).
+        contact_model: ``dipole``, or ``multipole``, which adds what balls lack where they nearly touch (Kelvin only).
         rtol: Relative magnetization error at which a step's induction ends, the computable form of Eq. 12.
     """
 
     external_field: tuple[float, float, float] = (0.0, 0.0, 0.0)
     force: str = "kelvin"
     dynamics: str = "theta"
+    contact_model: str = "dipole"
     rtol: float = 1e-3
 
     def check(self, name: str) -> None:
@@ -91,6 +101,7 @@ class MagneticSettings:
         check_finite(f"{name}: external field", self.external_field)
         check_token(f"{name}: force", self.force, FORCES)
         check_token(f"{name}: dynamics", self.dynamics, DYNAMICS)
+        check_contact_model(f"{name}: contact model", self.contact_model, self.force)
         check_positive(f"{name}: rtol", self.rtol)
 
 

@@ -8,13 +8,13 @@ import warp as wp
 from warpmag.arrays import ACCURACY, check_radii, resolve_device, resolve_dtype, vec3_type
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
-from warpmag.kernels import induction, pair_loops
+from warpmag.kernels import induction, near_contact, pair_loops
 from warpmag.kernels.curves import CURVE_IDS
 from warpmag.kernels.field import launch_finish_field
 from warpmag.kernels.packing import launch_divide_by_volume
 from warpmag.kernels.pair_code import FORCE, WRENCH
 from warpmag.kernels.wrench import FORCE_IDS, ZEEMAN, Material, launch_finish_wrench, launch_zeeman_moments
-from warpmag.magnets import FORCES, check_token
+from warpmag.magnets import FORCES, check_contact_model, check_token
 from warpmag.packed import PackedMoments
 
 
@@ -52,6 +52,7 @@ class MomentSystem:
         external_field=(0.0, 0.0, 0.0),
         force="kelvin",
         dynamics="theta",
+        contact_model="dipole",
         rtol=1e-3,
         max_evaluations=1000,
         step=None,
@@ -76,6 +77,8 @@ class MomentSystem:
             force: ``kelvin`` or ``zeeman``.
             dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
                 submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
+            contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
+                nearly touch (see ``warpmag.near_contact``).
             rtol: Relative residual at which induction ends.
             max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
             step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
@@ -90,6 +93,7 @@ class MomentSystem:
         """
         check_token("force", force, FORCES)
         check_token("curve", curve, tuple(CURVE_IDS))
+        check_contact_model("contact_model", contact_model, force)
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         if not ACCURACY[dtype] <= rtol < math.inf:
             raise InputError(f"rtol: must be at least {ACCURACY[dtype]:g} in {dtype}, got {rtol}")
@@ -124,6 +128,11 @@ class MomentSystem:
         self._make_rows(worlds, permanent, movable, WRENCH if twisted.any() else FORCE)
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
         self._induction = induction.allocate(worlds, ~permanent, self.dtype, self.device)
+        self._near = None
+        if contact_model == "multipole":
+            lone = ~permanent & (size[body] == 1) & (radii > 0.0)
+            susceptibility = np.broadcast_to(np.asarray(susceptibility, float), n)
+            self._near = near_contact.allocate(radii, worlds, lone, susceptibility, self.dtype, self.device)
         self.h = self._induction.h
         self.error = self._induction.error
         self.evaluations = self._induction.evaluations
@@ -188,6 +197,9 @@ class MomentSystem:
     def forget(self):
         """Start the next solve cold, from no magnetization, in every world."""
         self._induction.warm.zero_()
+        if self._near is not None:
+            self._near.contact.zero_()
+            self._near.last_contact.zero_()
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
@@ -206,6 +218,8 @@ class MomentSystem:
         packed.find_overlaps()
         if self._induced.count == 0:
             return
+        if self._near is not None:
+            near_contact.launch_find_pairs(packed, self._near)
         if self._applied.pair_count:
             pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
         induction.launch_begin(
@@ -221,15 +235,22 @@ class MomentSystem:
 
     def iterate(self):
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
-        packed = self._packed.packed
-        pair_loops.launch_pair_loop(self._induced, packed, packed, self._induced_partial)
+        self._sum_induced()
         self.dynamics.iterate()
 
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""
+        self._sum_induced()
+        packed = self._packed
+        launch_finish_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
+
+    def _sum_induced(self):
+        """Launch the field loop among the inducible moments."""
         packed = self._packed
         pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
-        launch_finish_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
+        if self._near is not None:
+            near_contact.launch_sweeps(packed, self.moments, self._material, self._near, near_contact.SWEEPS)
+            near_contact.launch_add_field(self._induced, self._near, self._induced_partial)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
@@ -240,8 +261,11 @@ class MomentSystem:
     def apply_forces(self, force=None):
         """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""
         packed = self._packed
+        law = self._force_law if force is None else FORCE_IDS[force]
+        if self._near is not None and law == ZEEMAN:
+            raise InputError("force: the contact model 'multipole' goes with the force law 'kelvin' only")
         effective = packed.moments
-        if (self._force_law if force is None else FORCE_IDS[force]) == ZEEMAN:
+        if law == ZEEMAN:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
         pair_loops.launch_pair_loop(self._felt, packed.packed, packed.packed, self._felt_partial, effective=effective)
@@ -255,3 +279,6 @@ class MomentSystem:
             self.forces,
             self.torques,
         )
+        if self._near is not None:
+            near_contact.launch_sweeps(packed, self.moments, self._material, self._near, near_contact.FORCE_SWEEPS)
+            near_contact.launch_add_forces(self._felt, packed, self._near, self._twisted, self.forces, self.torques)

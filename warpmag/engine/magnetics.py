@@ -61,6 +61,7 @@ class Magnetics:
         *,
         force: str = "kelvin",
         dynamics: str = "theta",
+        contact_model: str = "dipole",
         rtol: float = 1e-3,
         external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
         max_evaluations: int = 1000,
@@ -73,6 +74,8 @@ class Magnetics:
             force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
             dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
                 ``llg-damping`` (Eq. 6, with and without precession).
+            contact_model: ``dipole``, or ``multipole``, which adds what balls of one moment lack where they nearly
+                touch.
             rtol: Relative magnetization error at which induction ends.
             external_field: Uniform applied field H0 [A/m], world frame.
             max_evaluations: Field evaluations after which induction gives up.
@@ -82,7 +85,7 @@ class Magnetics:
             InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would be
                 felt in several.
         """
-        settings = MagneticSettings(tuple(external_field), force, dynamics, rtol)
+        settings = MagneticSettings(tuple(external_field), force, dynamics, contact_model, rtol)
         settings.check("Magnetics")
         if curve is not None:
             check_token("Magnetics: curve", curve, CURVES)
@@ -113,6 +116,7 @@ class Magnetics:
             external_field=settings.external_field,
             force=settings.force,
             dynamics=settings.dynamics,
+            contact_model=settings.contact_model,
             rtol=settings.rtol,
             max_evaluations=max_evaluations,
             device=self._model.device,

@@ -51,6 +51,7 @@ class Simulation:
         solver: str = "xpbd",
         force: str | None = None,
         dynamics: str | None = None,
+        contact_model: str | None = None,
         rtol: float | None = None,
         external_field: tuple[float, float, float] | None = None,
         curve: str | None = None,
@@ -67,6 +68,7 @@ class Simulation:
             solver: Newton's solver: ``xpbd``, ``steel``, ...
             force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
+            contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
             curve: ``tanh``, ``langevin`` or ``clamped`` for all magnets; by default each magnet's own.
@@ -100,6 +102,7 @@ class Simulation:
             self.model,
             force=settings.force if force is None else force,
             dynamics=settings.dynamics if dynamics is None else dynamics,
+            contact_model=settings.contact_model if contact_model is None else contact_model,
             rtol=settings.rtol if rtol is None else rtol,
             external_field=settings.external_field if external_field is None else external_field,
             curve=curve,

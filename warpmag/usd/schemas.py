@@ -36,6 +36,7 @@ _SETTINGS_ATTRIBUTES = {
     "external_field": "warpmag:externalField",
     "force": "warpmag:force",
     "dynamics": "warpmag:dynamics",
+    "contact_model": "warpmag:contactModel",
     "rtol": "warpmag:rtol",
 }
 
