@@ -331,15 +331,16 @@ def _pairs_kernel(dtype):
             other = own
             if kind[i] != kind[j]:
                 other = conductances(tables, kind[j] * kind_count + kind[i], gap)
-            g = short_range(d, radius, b)
+            unit = dtype(1.0) / (radius + b)  # powers of metres overflow float32
+            g = short_range(unit * d, unit * radius, unit * b)
             if share[j] == dtype(0.0):
                 g = vec4()
             for c in range(3):
                 pairs_out[i, n, c] = r[c] / wp.max(d, dtype(1.0e-6) * radius)
-            pairs_out[i, n, 12] = g[0]
-            pairs_out[i, n, 13] = g[1] * d
-            pairs_out[i, n, 14] = g[1]
-            pairs_out[i, n, 15] = g[2] * d * d
+            pairs_out[i, n, 12] = unit * g[0]
+            pairs_out[i, n, 13] = unit * unit * (g[1] * unit * d)
+            pairs_out[i, n, 14] = unit * unit * unit * g[1]
+            pairs_out[i, n, 15] = unit * unit * unit * (g[2] * unit * d * unit * d)
             for f in range(8):
                 pairs_out[i, n, 3 + f] = part * own[0, f]
             pairs_out[i, n, 11] = part * other[0, 3]
@@ -410,7 +411,7 @@ def _drive_kernel(dtype):
             from_moments += times_pair(pairs, i, n, dtype(0.0), moments[j])
         drive_out[i] = from_moments - from_contacts
         field_out[i] = vec3(from_contacts[1], from_contacts[2], from_contacts[3])
-        reduced = wp.length(m) / (ball_volume(radii[i]) * saturation[i])
+        reduced = wp.length(m) / ball_volume(radii[i]) / saturation[i]
         steepness = reduced_curve_slope(inverse_curve_ratio(reduced, curve[i]) * reduced, curve[i])
         third = dtype(1.0 / 3.0)
         state = dtype(1.0) / wp.max(slope[i] * steepness, dtype(1.0e-12)) - third
@@ -576,8 +577,7 @@ def _force_kernel(dtype):
             return
         a = packed[3, i]
         m = vec3(packed[4, i], packed[5, i], packed[6, i])
-        q_smooth = -contact[i][0]
-        m_smooth = m - vec3(contact[i][1], contact[i][2], contact[i][3])
+        smooth = m - vec3(contact[i][1], contact[i][2], contact[i][3])
         total = vec3()
         for n in range(count[i]):
             j = neighbor[i, n]
@@ -587,9 +587,16 @@ def _force_kernel(dtype):
                 d = wp.max(wp.length(r), dtype(1.0e-6) * a)
                 m_j = vec3(packed[4, j], packed[5, j], packed[6, j])
                 smooth_j = m_j - vec3(contact[j][1], contact[j][2], contact[j][3])
-                g = short_range(d, a, b)
-                total += source_force(g, r, q_smooth, m_smooth, -contact[j][0], smooth_j)
-                total -= source_force(g, r, dtype(0.0), m, dtype(0.0), m_j)
+                unit = dtype(1.0) / (a + b)  # powers of metres overflow float32
+                square = unit * unit
+                cube = square * unit
+                g = short_range(unit * d, unit * a, unit * b)
+                x = unit * r
+                sources = source_force(
+                    g, x, -square * contact[i][0], cube * smooth, -square * contact[j][0], cube * smooth_j
+                )
+                sources -= source_force(g, x, dtype(0.0), cube * m, dtype(0.0), cube * m_j)
+                total += sources / square
                 scale = dtype(2.0) * a * b / (a + b)
                 gap = (d - a - b) / scale
                 part = share[i] * share[j] * similarity(a, b) * weight[i] * weight[j]

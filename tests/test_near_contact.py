@@ -241,6 +241,15 @@ def test_device_heaps(extent, device):
     assert np.abs(forces.sum(0)).max() < 1e-9 * np.abs(forces).max()
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_device_scale(scale, device):
+    """Lengths times s: the same magnetizations, forces times s², also in float32."""
+    one = solve(MIXED, MIXED_RADII, 1e5 * ALONG, device, "float32", rtol=1e-5)
+    other = solve(scale * MIXED, scale * MIXED_RADII, 1e5 * ALONG, device, "float32", rtol=1e-5)
+    assert relative(other.magnetizations, one.magnetizations) < 1e-4  # roundings, and rtol
+    assert relative(other.wrench()[0] / scale**2, one.wrench()[0]) < 1e-3
+
+
 def test_device_zero_field_and_no_near_pair(device):
     none = solve(MIXED, MIXED_RADII, np.zeros(3), device)
     assert none.converged and np.abs(none.wrench()[0]).max() == 0.0
