@@ -11,7 +11,7 @@ from warpmag.magnets import METHODS
 SECONDS, SMALL_SECONDS = 1.0, 0.05
 RTOL = 1e-2
 """Magnetization error at which induction ends: below it the pairs of ``theta-euler`` crawl in a pile of balls."""
-PATIENCE = {"cpu": 150.0, "cuda": 25.0}
+PATIENCE = {"cpu": 150.0, "cuda": 12.0}
 """Time after which a run is ended [s]."""
 PAPERS_TIMES = {
     ("balls_up", "kim2018"): (20, 3.5, 14),
