@@ -186,7 +186,11 @@ def test_an_interrupted_run_leaves_the_frames_so_far(scene, device, tmp_path):
     out = tmp_path / "out.usda"
     command = [sys.executable, "-m", "warpmag.cli", "run", str(scene), "-o", str(out), "--device", device]
     process = subprocess.Popen(
-        [*command, "--frames", "100000"], stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+        [*command, "--frames", "100000"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in background jobs
     )
     deadline = time.monotonic() + 240.0
     text = ""

@@ -80,6 +80,7 @@ def run_trial(trial: Trial) -> dict:
         rtol=trial.rtol,
         device=trial.device,
     )
+    simulation.step()  # compiles what was not compiled before
     ended, began = "", time.perf_counter()
     frames = max(1, round(trial.seconds * simulation.frame_rate))
     try:

@@ -1,0 +1,188 @@
+"""How far an answer is from the truth, and what it costs: ``python -m bench.accuracy [--device cuda:0] [-o DIR]``.
+
+Four errors, each against its own reference and each on its own axis:
+
+| error | of what | reference |
+|---|---|---|
+| rounding | fields and forces in float32 and float64 | the float64 oracle |
+| iteration | magnetizations at a tolerance | a float64 Newton solution |
+| model | forces of two permeable balls as dipoles, or with the near-contact model | their exact multipole solution |
+| time step | energy of two balls that fall towards each other | conservation |
+
+Prints a table of each, and writes ``accuracy.jsonl`` and ``accuracy.png``: error against cost.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from bench.cases import RADIUS, SATURATION, touching_pile
+from bench.machine import describe
+from bench.reference import spheres
+from bench.reference.fall import DURATION, fall
+from bench.run import RUNNERS, make_system, measure
+from warpmag import oracle
+from warpmag.magnets import CONTACT_MODELS
+from warpmag.system import MomentSystem
+
+SIZES = (243, 1032, 2560, 10000)
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
+BLOCK = 1000
+"""Balls of the pile whose iteration error is measured: as many as the dense Newton solution can do."""
+PERMEABILITIES = (2.0, 4.0, 10.0, 1000.0, np.inf)
+GAPS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+"""Gaps between two balls over their radius."""
+STEPS = (4e-4, 2e-4, 1e-4, 5e-5)
+"""Time steps [s]."""
+
+
+def rounding(device) -> Iterator[dict]:
+    """Fields and forces of a touching pile: relative error and time of an evaluation."""
+    for quantity in ("field", "force"):
+        for dtype in ("float32", "float64"):
+            for count in SIZES:
+                system = make_system(count, dtype, device)
+                system.solve()
+                system.apply_forces()
+                found = RUNNERS[quantity](system, device)
+                milliseconds = 1e3 * found["seconds"]
+                yield {"of": quantity, "dtype": dtype, "balls": count, "ms": milliseconds, "error": found["error"]}
+
+
+def iteration(device) -> Iterator[dict]:
+    """Magnetizations of a pile in a field that half saturates it: error, evaluations and time of a cold solve."""
+    x = touching_pile(BLOCK).astype(float)
+    field = [0.0, 0.0, 0.5 * SATURATION]
+    exact = oracle.equilibrium(x, float(np.float32(RADIUS)), field, saturation=SATURATION).magnetizations
+    for dtype in ("float32", "float64"):
+        for rtol in TOLERANCES:
+            system = MomentSystem(
+                radii=np.full(BLOCK, RADIUS), saturation=SATURATION, external_field=field, rtol=rtol, dtype=dtype,
+                device=device,
+            )  # fmt: skip
+            system.positions.assign(x)
+
+            def cold(system=system):
+                system.forget()
+                system.solve()
+
+            milliseconds = 1e3 * measure(cold, device)
+            error = np.linalg.norm(system.magnetizations().numpy() - exact) / np.linalg.norm(exact)
+            evaluations = int(system.evaluations.numpy()[0])
+            yield {"dtype": dtype, "rtol": rtol, "evaluations": evaluations, "ms": milliseconds, "error": float(error)}
+
+
+def model(device) -> Iterator[dict]:
+    """Forces of two permeable balls, in line with a weak field and across it, over those of the exact solution."""
+    field = 1e3  # A/m, so weak that nothing saturates
+    for m, (name, direction) in enumerate((("in line", (0.0, 0.0, 1.0)), ("across", (1.0, 0.0, 0.0)))):
+        for permeability in PERMEABILITIES:
+            for gap in GAPS:
+                x = RADIUS * np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0 + gap]])
+                h0 = field * np.array(direction)
+                exact = _exact_pair_force(RADIUS * (2.0 + gap), permeability, m, field)
+                ratios = {one: _pair_force(x, h0, permeability, one, device) / exact for one in CONTACT_MODELS}
+                yield {"field": name, "permeability": permeability, "gap": gap, **ratios}
+
+
+def _exact_pair_force(distance, permeability, m, field) -> float:
+    """Force [N] that draws the balls apart; the field is along their axis (``m`` 0) or across it (1)."""
+    pair = spheres.pair(distance, (RADIUS, RADIUS), (permeability, permeability))
+    moments = np.linalg.solve(pair.resistance[m], [field, field])
+    return float(-0.5 * oracle.MU0 * moments @ pair.slope[m] @ moments)
+
+
+def _pair_force(positions, field, permeability, contact_model, device) -> float:
+    system = MomentSystem(
+        radii=np.full(2, RADIUS), saturation=SATURATION, susceptibility=permeability - 1.0, external_field=field,
+        rtol=1e-10, dtype="float64", contact_model=contact_model, device=device,
+    )  # fmt: skip
+    system.positions.assign(positions)
+    system.solve()
+    system.apply_forces()
+    return float(system.forces.numpy()[1, 2])
+
+
+def time_step(device) -> Iterator[dict]:
+    """Energy and momentum of two balls that fall towards each other."""
+    for dt in STEPS:
+        found = fall(2, dt, device)
+        yield {"dt": dt, "steps": round(DURATION / dt), "error": found.drift, "momentum": found.momentum}
+
+
+ERRORS = {"rounding": rounding, "iteration": iteration, "model": model, "time step": time_step}
+
+
+def print_table(rows: list[dict]) -> None:
+    """Print rows with the same keys."""
+    head = list(rows[0])
+    cells = [
+        head,
+        *[[f"{row[key]:.3g}" if isinstance(row[key], float) else str(row[key]) for key in head] for row in rows],
+    ]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(head))]
+    for line in cells:
+        print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
+
+
+def draw(results: dict[str, list[dict]], path: Path) -> None:
+    """Draw error against cost, a panel for each error."""
+    import matplotlib.pyplot as plt  # noqa: PLC0415 - slow to import, and --help does without it
+
+    figure, axes = plt.subplots(1, 4, figsize=(19, 4.5))
+
+    def line(axis, rows, x, y, label):
+        axis.loglog([row[x] for row in rows], [row[y] for row in rows], "o-", label=label, markersize=4)
+
+    for axis, (name, rows) in zip(axes, results.items(), strict=True):
+        axis.set_title(f"{name} error")
+        axis.grid(alpha=0.3)
+        if name == "rounding":
+            for of, dtype in sorted({(row["of"], row["dtype"]) for row in rows}):
+                part = [row for row in rows if (row["of"], row["dtype"]) == (of, dtype)]
+                line(axis, part, "ms", "error", f"{of}, {dtype}, {part[0]['balls']} to {part[-1]['balls']} balls")
+            axis.set(xlabel="time of an evaluation [ms]", ylabel="relative error")
+        elif name == "iteration":
+            for dtype in ("float32", "float64"):
+                line(axis, [row for row in rows if row["dtype"] == dtype], "ms", "error", f"{dtype}, rtol 0.1 to 1e-5")
+            axis.set(xlabel=f"time of a cold solve, {BLOCK} balls [ms]", ylabel="relative error")
+        elif name == "model":
+            for kind in CONTACT_MODELS:
+                for field, style in (("in line", "-"), ("across", "--")):
+                    part = [row for row in rows if row["field"] == field and row["permeability"] == np.inf]
+                    axis.semilogx(
+                        [row["gap"] for row in part], [row[kind] for row in part], style, label=f"{kind}, {field}"
+                    )
+            axis.set(xlabel="gap over radius, μr = ∞", ylabel="force over the exact one")
+        else:
+            line(axis, rows, "steps", "error", "energy drift over kinetic energy")
+            axis.set(xlabel="steps", ylabel="relative error")
+        axis.legend(fontsize=7)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+
+
+def main() -> None:
+    """Measure what the command line asks for."""
+    parser = argparse.ArgumentParser(prog="python -m bench.accuracy", description=__doc__.partition("\n")[0])
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench_out"), metavar="DIR")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    device = wp.get_device(options.device)
+    options.output.mkdir(parents=True, exist_ok=True)
+    machine, results = describe(device), {}
+    with open(options.output / "accuracy.jsonl", "w", encoding="utf-8") as file:
+        for name, run in ERRORS.items():
+            results[name] = list(run(device))
+            print(f"\n{name}")
+            print_table(results[name])
+            file.writelines(json.dumps({"error_of": name, **row, **machine}) + "\n" for row in results[name])
+    draw(results, options.output / "accuracy.png")
+
+
+if __name__ == "__main__":
+    main()
