@@ -49,6 +49,7 @@ def run_scene(count: int, device) -> dict:
         "tf_ms": force,
         "tr_ms": rigid,
         "magnetics_share": (induction + force) / rigid,
+        "capture_failure": simulation.capture_failure,
         "host_us": 1e6 * float(np.median(host)),
         "host_us_max": 1e6 * max(host),
         "allocations": sum(int(n) for n in re.findall(r"^\s+(?:cpu|pinned|cuda:\d+)\s+(\d+) \(", reports[0], re.M)),

@@ -175,6 +175,8 @@ def _run(options) -> int:
         print(line)
     print(f"written        {output}")
     _warn([line for line in statistics.warnings() if line not in known])
+    if simulation.capture_failure:
+        _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
     return 0
 
 

@@ -181,6 +181,11 @@ class Simulation:
         return self._statistics
 
     @property
+    def capture_failure(self) -> str:
+        """Why steps are launched from Python, which is slower, and not as one graph; empty where they are a graph."""
+        return self._stepper.capture_failure
+
+    @property
     def time(self) -> float:
         """Time since the start [s]."""
         return self._stepper.steps * self.step_size

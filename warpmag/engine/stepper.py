@@ -76,6 +76,7 @@ class Stepper:
     Attributes:
         state: The present state, once :meth:`look` has been called.
         steps: Steps asked for so far.
+        capture_failure: Why a step could not be captured in a graph; empty if it could, or was not tried.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class Stepper:
         self._clock = _Clock(self._device)
         self._workspace = Workspace(self._device) if self._device.is_cuda else None
         self._capture, self._graph = graphs, None
+        self.capture_failure = ""
         self._cold: set[int] = set()
         self.steps = self._reported = 0
         self._prepare()
@@ -235,8 +237,8 @@ class Stepper:
             stepping.launch_set_status(stepping.STATUS_HALT, stepping.PAUSED, self._buffers)
             wp.capture_launch(capture.graph)
             self._graph = capture.graph
-        except Exception:  # whatever a solver does that cannot be captured, it can still be launched
-            self._capture = False
+        except Exception as error:  # whatever a solver does that cannot be captured, it can still be launched
+            self._capture, self.capture_failure = False, " ".join(str(error).split()) or type(error).__name__
             _clear_error(self._device)
         stepping.launch_set_status(stepping.STATUS_HALT, stepping.RUNNING, self._buffers)
 
