@@ -87,20 +87,6 @@ def test_a_magnet_1000_times_too_strong(device):
         assert simulation.statistics.capped and simulation.statistics.warnings()
 
 
-def test_a_body_that_is_not_finite_any_more_is_named(device):
-    builder = new_builder(ground=False)
-    add_pile(builder, 2)
-    simulation = warpmag.Simulation(builder, device=device)
-    simulation.step()
-    velocities = simulation.state.body_qd.numpy()
-    velocities[5] = np.nan
-    simulation.state.body_qd.assign(velocities)
-    with pytest.raises(SimulationError, match=r"step 2 \(0.002 s\): .*body_5"):
-        for _ in range(2):
-            simulation.step()
-        simulation.finish()
-
-
 @pytest.mark.parametrize("magnetization", [(0.0, 0.0, 0.0), (1e6, 0.0, 0.0)])
 def test_only_permanent_magnets(magnetization, device):
     builder = new_builder()

@@ -294,15 +294,14 @@ def test_only_the_kelvin_law(device):
         MomentSystem(radii=np.ones(2), force="zeeman", contact_model="multipole", device=device)
 
 
-@pytest.mark.parametrize("contact_model, fewest", [("dipole", 200), ("multipole", 800)])
-def test_two_balls_that_approach_conserve_energy(contact_model, fewest, device):
+def test_two_balls_that_approach_conserve_energy(device):
     """Velocity Verlet, frictionless, oblique to the field, stopped before contact: error of order two in the step.
 
     Energy is kinetic plus the co-energy −½ μ0 Σ m·H0 of unsaturated balls.
     """
     field, mass, end = np.array([0.0, 0.0, 200.0]), 4.1e-3, 0.0
     system = MomentSystem(
-        radii=np.full(2, 0.005), saturation=1e12, external_field=field, contact_model=contact_model, rtol=1e-11,
+        radii=np.full(2, 0.005), saturation=1e12, external_field=field, contact_model="multipole", rtol=1e-11,
         dtype="float64", device=device,
     )  # fmt: skip
 
@@ -313,7 +312,7 @@ def test_two_balls_that_approach_conserve_energy(contact_model, fewest, device):
         return system.forces.numpy(), -0.5 * MU0 * np.sum(system.moments.numpy() @ field)
 
     drifts = []
-    for steps in (fewest, 2 * fewest):
+    for steps in (800, 1600):
         x, v = 0.005 * np.array([[0.0, 0.0, -1.3], [0.6, 0.0, 1.3]]), np.zeros((2, 3))
         force, start = pull(x)
         step, drift = 6.0 / steps, 0.0
@@ -323,6 +322,7 @@ def test_two_balls_that_approach_conserve_energy(contact_model, fewest, device):
             force, co_energy = pull(x)
             v = v + 0.5 * step * force / mass
             end = np.linalg.norm(x[1] - x[0])
+            assert np.isfinite([end, co_energy]).all()  # else neither the loop nor max() would notice
             if end < 0.005 * 2.05 or drift > 1.0:
                 break
             kinetic = 0.5 * mass * np.sum(v * v)

@@ -8,9 +8,7 @@ import math
 from dataclasses import dataclass
 
 from warpmag.errors import InputError
-
-MU0 = 4e-7 * math.pi
-"""Magnetic constant [T·m/A]."""
+from warpmag.oracle import MU0
 
 _BOZORTH = "R. M. Bozorth, Ferromagnetism, 1951, table of magnetic materials: permeability at 2 mT, saturation"
 _NDFEB = "GB/T 13560-2017, sintered NdFeB, middle of the range of remanence"

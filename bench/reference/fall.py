@@ -73,5 +73,5 @@ def fall(count: int, dt: float, device, *, force: str = "kelvin") -> Fall:
             total.append(kinetic[-1] + free_energy(now.body_q.numpy()[:, :3].astype(float)))
             momentum.append(np.linalg.norm(np.sum(mass * v, axis=0)) / np.sum(np.linalg.norm(mass * v, axis=1)))
         now, then = then, now
-    drift = np.abs(np.array(total) - total[0]).max() / max(kinetic)
-    return Fall(float(drift), float(max(momentum)), now.body_q.numpy()[:, :3].astype(float))
+    drift = np.abs(np.array(total) - total[0]).max() / np.max(kinetic)
+    return Fall(float(drift), float(np.max(momentum)), now.body_q.numpy()[:, :3].astype(float))
