@@ -1,10 +1,12 @@
-"""Finishing of the field loop: split sums added up, overlapping pairs corrected."""
+"""Field at targets: the sums of the pair loop, or of this very kernel's blocks, with overlapping pairs corrected."""
 
 from functools import cache
 
 import warp as wp
 
 from warpmag.kernels.neighbors import pair_correction
+from warpmag.kernels.pair_code import FIELD
+from warpmag.kernels.pair_sums_cuda import Shape, pair_summation, target_share
 
 INVERSE_4PI = 0.07957747154594767
 
@@ -33,10 +35,50 @@ def finished_field(dtype):
             h += vec3(partial[split, row, 0], partial[split, row, 1], partial[split, row, 2])
         skip = wp.where(same_set == 1, i, -1)
         if neighbor_count[i] > 0:
-            h += correct_pairs(targets, sources, i, begin, end, skip, neighbor, neighbor_count)
+            h += correct_pairs(targets, sources, i, begin, end, skip, neighbor, neighbor_count, 0, 1)
         return dtype(wp.static(INVERSE_4PI)) * h
 
     return finish
+
+
+@cache
+def summed_field(dtype, shape: Shape):
+    """Warp function by which a block sums the field [A/m] of a tile's sources at its targets.
+
+    All threads of the block call it; each gets the target row that is its own to go on with, or -1, and its field.
+    """
+    vec3 = wp.types.vector(3, dtype)
+    share_of = target_share(shape)
+    correct_pairs = pair_correction(dtype, gradient=False, exclude_body=False)
+    sum_pairs = pair_summation(dtype, FIELD, shape)
+
+    @wp.func
+    def field_of_tile(
+        tile: int,
+        thread: int,
+        tiles: wp.array2d[int],
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        same_set: int,
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+    ):
+        correction = vec3()
+        i, share = share_of(tile, thread, tiles)
+        if i >= 0:
+            begin = tiles[tile, 3]
+            end = tiles[tile, 4]
+            skip = wp.where(same_set == 1, i, -1)
+            correction = correct_pairs(
+                targets, sources, i, begin, end, skip, neighbor, neighbor_count, share, wp.static(shape.shares)
+            )
+        h = dtype(wp.static(INVERSE_4PI)) * sum_pairs(tile, thread, tiles, targets, sources, targets, correction)
+        row = tiles[tile, 0] + thread
+        if row >= tiles[tile, 1]:
+            row = -1
+        return row, h
+
+    return field_of_tile
 
 
 @cache
@@ -69,12 +111,40 @@ def _finish_kernel(dtype):
     return finish_field
 
 
-def launch_finish_field(rows, partial, targets, sources, same_set, base, h):
+@cache
+def _sum_kernel(dtype, shape: Shape):
+    vec3 = wp.types.vector(3, dtype)
+    field_of_tile = summed_field(dtype, shape)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=shape.launch_bounds(dtype))
+    def sum_field(
+        # inputs:
+        tiles: wp.array2d[int],
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        row_target: wp.array[int],
+        same_set: int,
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        base: wp.array[vec3],
+        # outputs:
+        h_out: wp.array[vec3],
+    ):
+        tile, thread = wp.tid()
+        row, h = field_of_tile(tile, thread, tiles, targets, sources, same_set, neighbor, neighbor_count)
+        if row >= 0:
+            i = row_target[row]
+            h_out[i] = base[i] + h
+
+    return sum_field
+
+
+def launch_field(rows, partial, targets, sources, same_set, base, h):
     """Write the field of the sources at each target, on top of a given one.
 
     Args:
-        rows: Work list that ``partial`` was summed over.
-        partial: Sums of the native field loop, shape [splits, rows, 3].
+        rows: Work list.
+        partial: Sums of the pair loop over it, see ``pair_loops``; nothing if ``rows.fused``.
         targets: Packed targets with their overlapping sources (``warpmag.packed.PackedMoments``), t of them.
         sources: Packed sources.
         same_set: Whether targets and sources are the same moments, none of which is its own neighbour.
@@ -83,21 +153,21 @@ def launch_finish_field(rows, partial, targets, sources, same_set, base, h):
     """
     if rows.count == 0:
         return
-    wp.launch(
-        _finish_kernel(partial.dtype),
-        dim=rows.count,
-        inputs=[
-            partial,
-            targets.packed,
-            sources.packed,
-            rows.target,
-            rows.begin,
-            rows.end,
-            int(same_set),
-            targets.neighbors,
-            targets.neighbor_counts,
-            base,
-        ],
-        outputs=[h],
-        device=partial.device,
-    )
+    near = [int(same_set), targets.neighbors, targets.neighbor_counts]
+    if rows.fused:
+        wp.launch_tiled(
+            _sum_kernel(targets.dtype, rows.shape),
+            dim=[rows.tiles.shape[0]],
+            inputs=[rows.tiles, targets.packed, sources.packed, rows.target, *near, base],
+            outputs=[h],
+            block_dim=rows.shape.threads,
+            device=targets.device,
+        )
+    else:
+        wp.launch(
+            _finish_kernel(targets.dtype),
+            dim=rows.count,
+            inputs=[partial, targets.packed, sources.packed, rows.target, rows.begin, rows.end, *near, base],
+            outputs=[h],
+            device=targets.device,
+        )

@@ -28,8 +28,6 @@ CAPACITY = 32
 SKIN = 0.1
 """Part of its radius that a moment may move before the lists are made anew."""
 _BUCKETS_PER_MOMENT = 4
-_AT_ONCE = 4
-"""Listed neighbours that are looked at together; a divisor of the capacity."""
 _FARTHEST_CELL = 1.0e9
 """Cells from the origin beyond which a moment is left out: its cell would be no integer."""
 
@@ -369,7 +367,8 @@ def near_field(
 def pair_correction(dtype, gradient: bool, exclude_body: bool):
     """Warp function that corrects one target's sums for its overlapping sources within a range.
 
-    It returns 4π times the field [A/m] and, with ``gradient``, the gradient [A/m²], as a vector of 3 or 9.
+    It returns 4π times the field [A/m] and, with ``gradient``, the gradient [A/m²], as a vector of 3 or 9. Of several
+    threads that take turns, thread ``share`` of ``shares`` gets its share of that.
     """
     vec3 = wp.types.vector(3, dtype)
     width = 9 if gradient else 3
@@ -408,26 +407,18 @@ def pair_correction(dtype, gradient: bool, exclude_body: bool):
         skip: int,
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
+        share: int,
+        shares: int,
     ):
         total = sums()
         count = neighbor_count[i]
-        x = vec3(targets[0, i], targets[1, i], targets[2, i])
         if count <= wp.static(CAPACITY):
-            for first in range(0, count, wp.static(_AT_ONCE)):
-                # several are looked at together, since a GPU would have one wait for the other: bit k for first + k
-                overlapping = int(0)
-                for k in range(wp.static(_AT_ONCE)):
-                    j = neighbor[i, first + k]
-                    listed = first + k < count and j >= begin and j < end
-                    j = wp.where(listed, j, 0)
-                    s = targets[3, i] + sources[3, j]
-                    r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
-                    overlapping += wp.where(listed and wp.dot(r, r) < s * s, 1 << k, 0)
-                for n in range(first, wp.min(first + wp.static(_AT_ONCE), count)):
-                    if (overlapping >> (n - first)) & 1 == 1:
-                        total += one_pair(targets, sources, i, neighbor[i, n])
+            for n in range(share, count, shares):
+                j = neighbor[i, n]
+                if j >= begin and j < end:
+                    total += one_pair(targets, sources, i, j)
         else:
-            for j in range(begin, end):
+            for j in range(begin + share, end, shares):
                 if j != skip:
                     total += one_pair(targets, sources, i, j)
         return total

@@ -24,12 +24,15 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
+from warpmag.kernels import pair_sums_cuda
 from warpmag.kernels.pair_code import FIELD, FORCE, TILE_COLUMNS, WIDTHS
 from warpmag.kernels.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
 from warpmag.kernels.pair_loops_cpu import MOST_THREADS, STRIPE, launch_pair_loop_cpu
 from warpmag.kernels.pair_loops_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
 
 PACKED_ROWS = 8
+PITCH = 4
+"""Packed rows are a multiple of so many moments apart, for loads of up to four of them at a time."""
 EXCLUDE_NOTHING, EXCLUDE_SELF, EXCLUDE_BODY = 0, 1, 2
 """Sources that a loop leaves out: none, the target itself, or everything with the target's body label."""
 
@@ -54,6 +57,8 @@ class Rows:
         tiles: Work list of the native loop, see ``pair_code``, shape [tiles, TILE_COLUMNS].
         shares: On a CPU the tile at which each thread begins, and the end, shape [threads + 1].
         shape: On a GPU the shape of the blocks, one a tile.
+        fused: Whether the kernel that needs the sums makes them itself (``pair_sums_cuda``), so that no loop goes
+            before it.
         splits: Partial sums per target row.
         pair_count: Pairs that the loop evaluates.
     """
@@ -65,7 +70,8 @@ class Rows:
     end: wp.array
     tiles: wp.array
     shares: wp.array
-    shape: Shape
+    shape: pair_sums_cuda.Shape | Shape
+    fused: bool
     splits: int
     pair_count: int
 
@@ -75,13 +81,14 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def make_rows(segments, device, quantity=FIELD) -> Rows:
+def make_rows(segments, device, quantity=FIELD, *, fused=True) -> Rows:
     """Build the work list of target ranges that each see one source range.
 
     Args:
         segments: Integers [k, 4]: target column begin and end, source begin and end.
         device: Warp device.
         quantity: What is to be summed.
+        fused: Whether the sums may be left to the kernel that needs them.
     """
     segments = np.asarray(segments, np.int64).reshape(-1, 4)
     sizes = segments[:, 1] - segments[:, 0]
@@ -93,10 +100,14 @@ def make_rows(segments, device, quantity=FIELD) -> Rows:
     pair_count = int(np.sum(sizes * (segments[:, 3] - segments[:, 2])))
 
     device = wp.get_device(device)
-    shape = choose_shape(quantity, count)
-    if device.is_cuda:
+    shape = pair_sums_cuda.choose_shape(quantity, count) if device.is_cuda and fused else None
+    fused = shape is not None
+    shares = np.zeros(0)
+    if fused:
+        tiles, splits = _block_tiles(segments, starts, shape.targets, 1), 0
+    elif device.is_cuda:
+        shape = choose_shape(quantity, count)
         tiles, splits = _cuda_tiles(segments, starts, shape, device.sm_count)
-        shares = np.zeros(0)
     else:
         splits = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(_cores(), MOST_THREADS)))
         tiles, shares = _cpu_tiles(segments, starts, splits)
@@ -113,6 +124,7 @@ def make_rows(segments, device, quantity=FIELD) -> Rows:
         tiles=to_device(tiles.reshape(-1, TILE_COLUMNS)),
         shares=to_device(shares),
         shape=shape,
+        fused=fused,
         splits=splits,
         pair_count=pair_count,
     )
@@ -124,13 +136,18 @@ def _cuda_tiles(segments, starts, shape: Shape, multiprocessors: int):
     sizes = segments[:, 1] - segments[:, 0]
     longest = int(np.max(segments[:, 3] - segments[:, 2], initial=0))
     splits = choose_splits(shape, int(np.sum(-(-sizes // width))), longest, multiprocessors)
+    return _block_tiles(segments, starts, width, splits), splits
+
+
+def _block_tiles(segments, starts, width: int, splits: int):
+    """Tiles of at most ``width`` targets, each for every part of the sources."""
     tiles = [
         (row, min(row + width, starts[k + 1]), t0 + row - starts[k], *source, split, 0)
         for k, (t0, _, s0, s1) in enumerate(segments)
         for row in range(starts[k], starts[k + 1], width)
         for split, source in enumerate(_cut(s0, s1, splits))
     ]
-    return np.array(tiles, np.int64), splits
+    return np.array(tiles, np.int64)
 
 
 def _cpu_tiles(segments, starts, threads: int):
@@ -250,7 +267,7 @@ def launch_pair_loop(rows: Rows, targets, sources, partial, *, effective=None, r
             overlapping pairs exactly; None for the native loop.
         epsilon2: Smoothing ε² [m⁵], reference loop only.
     """
-    if rows.count == 0:
+    if rows.count == 0 or rows.fused:
         return
     device, dtype = partial.device, partial.dtype
     effective = targets if effective is None else effective

@@ -304,7 +304,8 @@ def _snippet(real: str, quantity: str) -> str:
     Share shared[MOST_THREADS];
     for (int t = 0; t < threads; ++t)
         shared[t] = Share{{(const REAL*)targets.data, (const REAL*)sources.data, (const REAL*)effective.data,
-                          (size_t)targets.shape[1], (size_t)sources.shape[1], (size_t)effective.shape[1],
+                          targets.strides[0] / sizeof(REAL), sources.strides[0] / sizeof(REAL),
+                          effective.strides[0] / sizeof(REAL),
                           tiles.data, shares.data[t], shares.data[t + 1],
                           (REAL*)partial_out.data + t * rows * {WIDTHS[quantity]}, rows}};
     {_RUN_THREADS}

@@ -149,7 +149,8 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
     const int row_begin = tile[0], row_end = tile[1], column_begin = tile[2], split = tile[5];
     const int per_warp = (tile[4] - tile[3] + {warps - 1}) / {warps};
     const int source_begin = tile[3] + warp * per_warp, source_end = min(tile[4], source_begin + per_warp);
-    const size_t ns = sources.shape[1], nt = targets.shape[1], ne = effective.shape[1], rows = partial_out.shape[1];
+    const size_t ns = sources.strides[0] / sizeof(REAL), nt = targets.strides[0] / sizeof(REAL);
+    const size_t ne = effective.strides[0] / sizeof(REAL), rows = partial_out.shape[1];
     const REAL *src = (const REAL*)sources.data, *tgt = (const REAL*)targets.data, *eff = (const REAL*)effective.data;
     const bool same = src == tgt;
     {loads}

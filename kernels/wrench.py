@@ -19,8 +19,9 @@ from warpmag.kernels.curves import curve_derivative_times
 from warpmag.kernels.field import INVERSE_4PI
 from warpmag.kernels.neighbors import pair_correction
 from warpmag.kernels.packing import ball_volume
-from warpmag.kernels.pair_code import WRENCH
+from warpmag.kernels.pair_code import WIDTHS, WRENCH
 from warpmag.kernels.pair_law import gradient_times
+from warpmag.kernels.pair_sums_cuda import Shape, pair_summation, target_share
 
 MU0 = 1.2566370614359173e-06
 """Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
@@ -93,10 +94,62 @@ def launch_zeeman_moments(moments, h, material: Material, effective):
 
 
 @cache
-def _wrench_kernel(dtype, quantity: str):
+def _wrench_functions(dtype, quantity: str):
+    """Warp functions that correct a target's sums, and that make force and torque of what they come to."""
     vec3 = wp.types.vector(3, dtype)
+    sums = wp.types.vector(WIDTHS[quantity], dtype)
     summed_field = quantity == WRENCH
     correct_pairs = pair_correction(dtype, gradient=True, exclude_body=True)
+
+    @wp.func
+    def correct(
+        packed: wp.array2d[dtype],
+        effective: wp.array2d[dtype],
+        i: int,
+        begin: int,
+        end: int,
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        share: int,
+        shares: int,
+    ):
+        total = sums()
+        if neighbor_count[i] > share:
+            c = correct_pairs(packed, packed, i, begin, end, i, neighbor, neighbor_count, share, shares)
+            e = vec3(effective[0, i], effective[1, i], effective[2, i])
+            f = gradient_times(wp.vector(c[3], c[4], c[5], c[6], c[7], c[8], length=6), e)
+            for k in range(3):
+                total[k] = f[k]
+                if wp.static(summed_field):
+                    total[3 + k] = c[k]
+        return total
+
+    @wp.func
+    def store(
+        i: int,
+        total: sums,
+        packed: wp.array2d[dtype],
+        external_field: wp.array[vec3],
+        twisted: wp.array[int],
+        force_out: wp.array[vec3],
+        torque_out: wp.array[vec3],
+    ):
+        force_out[i] = dtype(wp.static(MU0 * INVERSE_4PI)) * vec3(total[0], total[1], total[2])
+        torque = vec3()
+        if wp.static(summed_field):
+            if twisted[i] == 1:
+                m = vec3(packed[4, i], packed[5, i], packed[6, i])
+                h = dtype(wp.static(INVERSE_4PI)) * vec3(total[3], total[4], total[5]) + external_field[i]
+                torque = dtype(wp.static(MU0)) * wp.cross(m, h)
+        torque_out[i] = torque
+
+    return correct, store
+
+
+@cache
+def _finish_kernel(dtype, quantity: str):
+    vec3 = wp.types.vector(3, dtype)
+    correct, store = _wrench_functions(dtype, quantity)
 
     @wp.kernel(module="unique", enable_backward=False)
     def finish_wrench(
@@ -117,36 +170,63 @@ def _wrench_kernel(dtype, quantity: str):
     ):
         row = wp.tid()
         i = row_target[row]
-        f = vec3()
-        h = vec3()
+        total = correct(packed, effective, i, row_begin[row], row_end[row], neighbor, neighbor_count, 0, 1)
         for split in range(partial.shape[0]):
-            f += vec3(partial[split, row, 0], partial[split, row, 1], partial[split, row, 2])
-            if wp.static(summed_field):
-                h += vec3(partial[split, row, 3], partial[split, row, 4], partial[split, row, 5])
-        if neighbor_count[i] > 0:
-            c = correct_pairs(packed, packed, i, row_begin[row], row_end[row], i, neighbor, neighbor_count)
-            h += vec3(c[0], c[1], c[2])
-            e = vec3(effective[0, i], effective[1, i], effective[2, i])
-            f += gradient_times(wp.vector(c[3], c[4], c[5], c[6], c[7], c[8], length=6), e)
-        force_out[i] = dtype(wp.static(MU0 * INVERSE_4PI)) * f
-        torque = vec3()
-        if wp.static(summed_field):
-            if twisted[i] == 1:
-                m = vec3(packed[4, i], packed[5, i], packed[6, i])
-                torque = dtype(wp.static(MU0)) * wp.cross(m, dtype(wp.static(INVERSE_4PI)) * h + external_field[i])
-        torque_out[i] = torque
+            for c in range(wp.static(WIDTHS[quantity])):
+                total[c] += partial[split, row, c]
+        store(i, total, packed, external_field, twisted, force_out, torque_out)
 
     return finish_wrench
 
 
-def launch_finish_wrench(rows, partial, moments, effective, external_field, twisted, forces, torques):
+@cache
+def _sum_kernel(dtype, quantity: str, shape: Shape):
+    vec3 = wp.types.vector(3, dtype)
+    sums = wp.types.vector(WIDTHS[quantity], dtype)
+    correct, store = _wrench_functions(dtype, quantity)
+    share_of = target_share(shape)
+    sum_pairs = pair_summation(dtype, quantity, shape)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=shape.launch_bounds(dtype))
+    def sum_wrench(
+        # inputs:
+        tiles: wp.array2d[int],
+        packed: wp.array2d[dtype],
+        effective: wp.array2d[dtype],
+        row_target: wp.array[int],
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        external_field: wp.array[vec3],
+        twisted: wp.array[int],
+        # outputs:
+        force_out: wp.array[vec3],
+        torque_out: wp.array[vec3],
+    ):
+        tile, thread = wp.tid()
+        correction = sums()
+        i, share = share_of(tile, thread, tiles)
+        if i >= 0:
+            begin = tiles[tile, 3]
+            end = tiles[tile, 4]
+            correction = correct(
+                packed, effective, i, begin, end, neighbor, neighbor_count, share, wp.static(shape.shares)
+            )
+        total = sum_pairs(tile, thread, tiles, packed, packed, effective, correction)
+        row = tiles[tile, 0] + thread
+        if row < tiles[tile, 1]:
+            store(row_target[row], total, packed, external_field, twisted, force_out, torque_out)
+
+    return sum_wrench
+
+
+def launch_wrench(rows, partial, moments, effective, external_field, twisted, forces, torques):
     """Write the force and the torque on each moment.
 
     Args:
-        rows: Work list that ``partial`` was summed over, of forces or of wrenches; without fields there is no torque.
-        partial: Sums of the native loop, shape as ``pair_loops.partial_shape`` says.
+        rows: Work list, of forces or of wrenches; without fields there is no torque.
+        partial: Sums of the pair loop over it, see ``pair_loops``; nothing if ``rows.fused``.
         moments: Packed moments with their overlapping neighbours (``warpmag.packed.PackedMoments``).
-        effective: Effective moments that the loop summed with [A·m²], shape [3, n].
+        effective: Effective moments that are summed with [A·m²], shape [3, n].
         external_field: Applied field [A/m], shape [n].
         twisted: Whether a moment feels its torque m × H, shape [n]; a lone inducible ball's is parallel to H.
         forces: Out, forces [N], shape [n].
@@ -154,21 +234,22 @@ def launch_finish_wrench(rows, partial, moments, effective, external_field, twis
     """
     if rows.count == 0:
         return
-    wp.launch(
-        _wrench_kernel(partial.dtype, rows.quantity),
-        dim=rows.count,
-        inputs=[
-            partial,
-            moments.packed,
-            effective,
-            rows.target,
-            rows.begin,
-            rows.end,
-            moments.neighbors,
-            moments.neighbor_counts,
-            external_field,
-            twisted,
-        ],
-        outputs=[forces, torques],
-        device=partial.device,
-    )
+    near = [moments.neighbors, moments.neighbor_counts]
+    if rows.fused:
+        wp.launch_tiled(
+            _sum_kernel(moments.dtype, rows.quantity, rows.shape),
+            dim=[rows.tiles.shape[0]],
+            inputs=[rows.tiles, moments.packed, effective, rows.target, *near, external_field, twisted],
+            outputs=[forces, torques],
+            block_dim=rows.shape.threads,
+            device=moments.device,
+        )
+    else:
+        ends = [rows.target, rows.begin, rows.end]
+        wp.launch(
+            _finish_kernel(moments.dtype, rows.quantity),
+            dim=rows.count,
+            inputs=[partial, moments.packed, effective, *ends, *near, external_field, twisted],
+            outputs=[forces, torques],
+            device=moments.device,
+        )

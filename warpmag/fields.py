@@ -6,9 +6,9 @@ import warp as wp
 from warpmag.arrays import ACCURACY, Kind, check_radii, resolve_kind, vec3_type
 from warpmag.errors import InputError
 from warpmag.kernels import pair_loops
-from warpmag.kernels.field import launch_finish_field
+from warpmag.kernels.field import launch_field
 from warpmag.kernels.pair_code import WRENCH
-from warpmag.kernels.wrench import launch_finish_wrench
+from warpmag.kernels.wrench import launch_wrench
 from warpmag.packed import PackedMoments
 
 METHODS = ("auto", "vectorized", "reference")
@@ -63,15 +63,15 @@ def h_field(
     if not same_set:
         points = kind.vectors("targets", targets)
         at = _packed(kind, "target_radii", target_radii, points, wp.zeros_like(points))
-    rows = pair_loops.make_rows([(0, at.count, 0, sources.count)], kind.device)
     exact = method == "reference" or smoothing > 0.0
+    rows = pair_loops.make_rows([(0, at.count, 0, sources.count)], kind.device, fused=not exact)
     exclude = pair_loops.EXCLUDE_SELF if same_set else pair_loops.EXCLUDE_NOTHING
     partial = _pair_sums(rows, at, sources, exclude if exact else None, smoothing)
     if not exact:
         at.find_overlaps(None if same_set else sources)
     base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
     h = wp.zeros_like(base)
-    launch_finish_field(rows, partial, at, sources, same_set, base, h)
+    launch_field(rows, partial, at, sources, same_set, base, h)
     return kind.finish(h)
 
 
@@ -118,14 +118,14 @@ def wrench(
     n = x.shape[0]
     external = kind.vectors("external_field", np.zeros(3) if external_field is None else external_field, n)
     packed = _packed(kind, "radii", radii, x, m)
-    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, WRENCH)
     exact = method == "reference" or smoothing > 0.0
+    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, WRENCH, fused=not exact)
     partial = _pair_sums(rows, packed, packed, pair_loops.EXCLUDE_BODY if exact else None, smoothing)
     if not exact:
         packed.find_overlaps()
     forces, torques = wp.zeros_like(x), wp.zeros_like(x)
     twisted = wp.ones(n, dtype=int, device=kind.device)
-    launch_finish_wrench(rows, partial, packed, packed.moments, external, twisted, forces, torques)
+    launch_wrench(rows, partial, packed, packed.moments, external, twisted, forces, torques)
     return kind.finish(forces), kind.finish(torques)
 
 

@@ -10,10 +10,10 @@ from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels import induction, near_contact, pair_loops
 from warpmag.kernels.curves import CURVE_IDS
-from warpmag.kernels.field import launch_finish_field
+from warpmag.kernels.field import launch_field
 from warpmag.kernels.packing import launch_divide_by_volume
 from warpmag.kernels.pair_code import FORCE, WRENCH
-from warpmag.kernels.wrench import FORCE_IDS, ZEEMAN, Material, launch_finish_wrench, launch_zeeman_moments
+from warpmag.kernels.wrench import FORCE_IDS, ZEEMAN, Material, launch_wrench, launch_zeeman_moments
 from warpmag.magnets import FORCES, check_contact_model, check_token
 from warpmag.packed import PackedMoments
 
@@ -173,8 +173,8 @@ class MomentSystem:
             applied.append((first, middle, middle, last))
             edges = np.flatnonzero(np.diff(np.concatenate([[0], movable[first:last].astype(int), [0]])))
             felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
-        self._induced = pair_loops.make_rows(induced, self.device)
-        self._applied = pair_loops.make_rows(applied, self.device)
+        self._induced = pair_loops.make_rows(induced, self.device, fused=False)
+        self._applied = pair_loops.make_rows(applied, self.device, fused=False)
         self._felt = pair_loops.make_rows(felt, self.device, felt_quantity)
 
         def partial(rows):
@@ -242,7 +242,7 @@ class MomentSystem:
         """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""
         self._sum_induced()
         packed = self._packed
-        launch_finish_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
+        launch_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
 
     def _sum_induced(self):
         """Launch the field loop among the inducible moments."""
@@ -269,7 +269,7 @@ class MomentSystem:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
         pair_loops.launch_pair_loop(self._felt, packed.packed, packed.packed, self._felt_partial, effective=effective)
-        launch_finish_wrench(
+        launch_wrench(
             self._felt,
             self._felt_partial,
             packed,

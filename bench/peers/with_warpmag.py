@@ -4,7 +4,7 @@ import warp as wp
 
 from bench.cases import RADIUS
 from bench.peers import Evaluation
-from warpmag.kernels.field import launch_finish_field
+from warpmag.kernels.field import launch_field
 from warpmag.kernels.pair_loops import launch_pair_loop, make_rows, partial_shape
 from warpmag.packed import PackedMoments
 
@@ -22,7 +22,7 @@ def prepare(positions, moments, device):
 
     def evaluate():
         launch_pair_loop(rows, packed.packed, packed.packed, partial)
-        launch_finish_field(rows, partial, packed, packed, True, base, h)
+        launch_field(rows, partial, packed, packed, True, base, h)
 
     evaluate()
     with wp.ScopedCapture(device) as capture:
