@@ -18,10 +18,10 @@ of its choice (a Newton step for 1/√c is an operation shorter if it ends at 2/
 The products are ordered so that no factor beyond r⁻³ leaves the float32 range before it meets r.
 """
 
-FIELD, FORCE, WRENCH = "field", "force", "wrench"
-"""What a loop sums: H; (e·∇)H for an effective moment e of the target; or both of them."""
+FIELD, FORCE, WRENCH, KELVIN = "field", "force", "wrench", "kelvin"
+"""What a loop sums: H; (e·∇)H for an effective moment e of the target; both of them; (e·∇)H where e is its moment."""
 
-WIDTHS = {FIELD: 3, FORCE: 3, WRENCH: 6}
+WIDTHS = {FIELD: 3, FORCE: 3, WRENCH: 6, KELVIN: 3}
 """Numbers per target that a loop leaves."""
 
 TILE_COLUMNS = 7
@@ -74,6 +74,41 @@ _ADDED = {FIELD: _FIELD, FORCE: _FORCE + _ALONG, WRENCH: _FORCE + _FIELD_BESIDE_
 def pair(quantity: str, inverse: str, k: str = "") -> str:
     """Text of one pair; ``inverse`` computes W/d from the squared distance ``d2``, clamped and masked."""
     return (_SEPARATION + f"const NUMBER inv = {inverse};" + _POWERS + _ADDED[quantity]).format(k=k)
+
+
+_MIRRORED = {
+    FIELD: _FIELD
+    + """
+    const NUMBER back = inv2 * (rx * mx{k} + ry * my{k} + rz * mz{k});
+    gx += inv3 * (back * rx - nx{k});
+    gy += inv3 * (back * ry - ny{k});
+    gz += inv3 * (back * rz - nz{k});
+""",
+    KELVIN: """
+    const NUMBER inv5 = inv3 * inv2;
+    const NUMBER rb = rx * bx + ry * by + rz * bz;
+    const NUMBER rm = rx * mx{k} + ry * my{k} + rz * mz{k};
+    const NUMBER bm = bx * mx{k} + by * my{k} + bz * mz{k};
+    const NUMBER c = inv5 * rb, e = inv5 * rm, q = inv5 * (bm - 5 * (inv2 * rb) * rm);
+    const NUMBER fx = c * mx{k} + e * bx + q * rx;
+    const NUMBER fy = c * my{k} + e * by + q * ry;
+    const NUMBER fz = c * mz{k} + e * bz + q * rz;
+    hx{k} += fx;
+    hy{k} += fy;
+    hz{k} += fz;
+    gx -= fx;
+    gy -= fy;
+    gz -= fz;
+""",
+}
+
+
+def mirrored_pair(quantity: str, inverse: str, k: str = "") -> str:
+    """Text of one pair for both of its ends: moment m of the one, for a field scaled n as well, sums h and g; W is 1.
+
+    What is summed is worth three times itself.
+    """
+    return (_SEPARATION + f"const NUMBER inv = {inverse};" + _POWERS + _MIRRORED[quantity]).format(k=k)
 
 
 def scaled_moment(quantity: str, w: float) -> float:

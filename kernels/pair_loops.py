@@ -24,8 +24,8 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from warpmag.kernels import pair_sums_cuda
-from warpmag.kernels.pair_code import FIELD, FORCE, TILE_COLUMNS, WIDTHS
+from warpmag.kernels import pair_mirror_cuda, pair_sums_cuda
+from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS
 from warpmag.kernels.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
 from warpmag.kernels.pair_loops_cpu import MOST_THREADS, STRIPE, launch_pair_loop_cpu
 from warpmag.kernels.pair_loops_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
@@ -35,6 +35,13 @@ PITCH = 4
 """Packed rows are a multiple of so many moments apart, for loads of up to four of them at a time."""
 EXCLUDE_NOTHING, EXCLUDE_SELF, EXCLUDE_BODY = 0, 1, 2
 """Sources that a loop leaves out: none, the target itself, or everything with the target's body label."""
+LOOP, FUSED, MIRRORED = FORMS = "loop", "fused", "mirrored"
+"""How sums are made: by a loop that goes before the kernel that needs them; by that kernel itself; by a loop that meets
+each pair of moments once, for both of its ends."""
+
+# Measured on an H200: the most targets for which the fused form is best, and the fewest for which the mirrored is.
+_MOST_FUSED = 20000
+_LEAST_MIRRORED = {FIELD: 6000, KELVIN: 6000}
 
 _PAIRS_PER_START = 200_000
 """Pairs that a CPU sums while another of its threads starts: 50 µs, most of it to wake a core."""
@@ -56,9 +63,9 @@ class Rows:
         end: One past the last source of each target row, shape [count].
         tiles: Work list of the native loop, see ``pair_code``, shape [tiles, TILE_COLUMNS].
         shares: On a CPU the tile at which each thread begins, and the end, shape [threads + 1].
+        form: How the sums are made: ``LOOP``, ``FUSED`` or ``MIRRORED``.
         shape: On a GPU the shape of the blocks, one a tile.
-        fused: Whether the kernel that needs the sums makes them itself (``pair_sums_cuda``), so that no loop goes
-            before it.
+        mirror: What takes the tiles' place in the mirrored form.
         splits: Partial sums per target row.
         pair_count: Pairs that the loop evaluates.
     """
@@ -70,10 +77,16 @@ class Rows:
     end: wp.array
     tiles: wp.array
     shares: wp.array
-    shape: pair_sums_cuda.Shape | Shape
-    fused: bool
+    form: str
+    shape: pair_sums_cuda.Shape | Shape | None
+    mirror: pair_mirror_cuda.Mirror | None
     splits: int
     pair_count: int
+
+    @property
+    def fused(self) -> bool:
+        """Whether the kernel that needs the sums makes them itself, so that no loop goes before it."""
+        return self.form == FUSED
 
 
 def _cores() -> int:
@@ -81,14 +94,15 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def make_rows(segments, device, quantity=FIELD, *, fused=True) -> Rows:
+def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
     """Build the work list of target ranges that each see one source range.
 
     Args:
         segments: Integers [k, 4]: target column begin and end, source begin and end.
         device: Warp device.
         quantity: What is to be summed.
-        fused: Whether the sums may be left to the kernel that needs them.
+        forms: Ways in which the sums may be made. ``MIRRORED`` is for targets that are the sources only, and ``FUSED``
+            for kernels that call ``pair_sums_cuda`` themselves. A CPU has a ``LOOP`` only.
     """
     segments = np.asarray(segments, np.int64).reshape(-1, 4)
     sizes = segments[:, 1] - segments[:, 0]
@@ -100,15 +114,19 @@ def make_rows(segments, device, quantity=FIELD, *, fused=True) -> Rows:
     pair_count = int(np.sum(sizes * (segments[:, 3] - segments[:, 2])))
 
     device = wp.get_device(device)
-    shape = pair_sums_cuda.choose_shape(quantity, count) if device.is_cuda and fused else None
-    fused = shape is not None
-    shares = np.zeros(0)
-    if fused:
+    form = _choose_form(segments, quantity, forms) if device.is_cuda else LOOP
+    shape, mirror, tiles, shares = None, None, np.zeros(0), np.zeros(0)
+    if form == MIRRORED:
+        mirror = pair_mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, device)
+        splits = mirror.slabs + mirror.splits
+    quantity = FORCE if quantity == KELVIN else quantity
+    if form == FUSED:
+        shape = pair_sums_cuda.choose_shape(quantity, count)
         tiles, splits = _block_tiles(segments, starts, shape.targets, 1), 0
-    elif device.is_cuda:
+    elif form == LOOP and device.is_cuda:
         shape = choose_shape(quantity, count)
         tiles, splits = _cuda_tiles(segments, starts, shape, device.sm_count)
-    else:
+    elif form == LOOP:
         splits = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(_cores(), MOST_THREADS)))
         tiles, shares = _cpu_tiles(segments, starts, splits)
 
@@ -123,11 +141,23 @@ def make_rows(segments, device, quantity=FIELD, *, fused=True) -> Rows:
         end=to_device(end),
         tiles=to_device(tiles.reshape(-1, TILE_COLUMNS)),
         shares=to_device(shares),
+        form=form,
         shape=shape,
-        fused=fused,
+        mirror=mirror,
         splits=splits,
         pair_count=pair_count,
     )
+
+
+def _choose_form(segments, quantity, forms) -> str:
+    """Form of the sums on a GPU, the fastest of those that may be."""
+    count = int(np.sum(segments[:, 1] - segments[:, 0]))
+    mutual = quantity in _LEAST_MIRRORED and len(segments) == 1 and (segments[0, :2] == segments[0, 2:]).all()
+    if MIRRORED in forms and mutual and (count >= _LEAST_MIRRORED[quantity] or len(forms) == 1):
+        return MIRRORED
+    if FUSED in forms and (count <= _MOST_FUSED or LOOP not in forms):
+        return FUSED
+    return LOOP
 
 
 def _cuda_tiles(segments, starts, shape: Shape, multiprocessors: int):
@@ -267,7 +297,7 @@ def launch_pair_loop(rows: Rows, targets, sources, partial, *, effective=None, r
             overlapping pairs exactly; None for the native loop.
         epsilon2: Smoothing ε² [m⁵], reference loop only.
     """
-    if rows.count == 0 or rows.fused:
+    if rows.count == 0 or rows.form == FUSED:
         return
     device, dtype = partial.device, partial.dtype
     effective = targets if effective is None else effective
@@ -279,6 +309,8 @@ def launch_pair_loop(rows: Rows, targets, sources, partial, *, effective=None, r
             outputs=[partial],
             device=device,
         )
+    elif rows.form == MIRRORED:
+        pair_mirror_cuda.launch_pair_loop_mirrored(rows.mirror, sources, partial)
     elif device.is_cuda:
         launch_pair_loop_cuda(rows.quantity, rows.shape, targets, sources, effective, rows.tiles, partial)
     else:

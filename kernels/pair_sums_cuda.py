@@ -52,15 +52,15 @@ class Shape:
 
 # Measured on an H200: the shape, and the most targets that it is best for.
 _SHAPES = {
-    FIELD: ((512, Shape(1, 2, 2, 8)), (20000, Shape(4, 4, 2, 5))),
-    FORCE: ((512, Shape(1, 2, 2, 8)), (20000, Shape(4, 4, 2, 4))),
-    WRENCH: ((512, Shape(1, 2, 2, 8)), (20000, Shape(4, 4, 2, 3))),
+    FIELD: ((512, Shape(1, 2, 2, 8)), (None, Shape(4, 4, 2, 5))),
+    FORCE: ((512, Shape(1, 2, 2, 8)), (None, Shape(4, 4, 2, 4))),
+    WRENCH: ((512, Shape(1, 2, 2, 8)), (None, Shape(4, 4, 2, 3))),
 }
 
 
-def choose_shape(quantity: str, count: int) -> Shape | None:
-    """Shape for a number of targets; None where the sums had better be made by a loop of their own."""
-    return next((shape for most, shape in _SHAPES[quantity] if count <= most), None)
+def choose_shape(quantity: str, count: int) -> Shape:
+    """Shape for a number of targets."""
+    return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
 
 
 # the library's rsqrtf spends as many slots on denormal distances as the pair law has left

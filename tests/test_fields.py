@@ -8,9 +8,10 @@ from arrangements import as_float32, overlapping, pile, relative
 
 import warpmag
 from warpmag import oracle
-from warpmag.kernels import pair_loops
+from warpmag.kernels import pair_loops, pair_mirror_cuda
 from warpmag.kernels.field import launch_field
-from warpmag.kernels.pair_code import FIELD, FORCE, WRENCH
+from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, WRENCH
+from warpmag.kernels.pair_loops import FUSED, LOOP, MIRRORED
 from warpmag.kernels.wrench import launch_wrench
 from warpmag.packed import PackedMoments
 
@@ -101,8 +102,8 @@ def test_segments(dtype, threads, device, monkeypatch):
     x, _, m = pile(count=1500)
     radii = as_float32(np.where(np.arange(1500) < 900, 0.0049, 0.0045))[0]
     segments = [(0, 901, 0, 901), (901, 1490, 901, 1490), (1490, 1500, 3, 1489)]
-    for fused in forms(device):
-        (h,) = sums(x, radii, m, segments, FIELD, dtype, device, fused=fused)
+    for form in forms(device):
+        (h,) = sums(x, radii, m, segments, FIELD, dtype, device, form=form)
         for t0, t1, s0, s1 in segments:
             own = {} if t0 == s0 else {"targets": x[t0:t1], "target_radii": radii[t0:t1]}
             expected = oracle.h_field(x[s0:s1], m[s0:s1], radii=radii[s0:s1], **own)
@@ -110,7 +111,7 @@ def test_segments(dtype, threads, device, monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("quantity", [FORCE, WRENCH])
+@pytest.mark.parametrize("quantity", [KELVIN, FORCE, WRENCH])
 def test_moments_of_one_body_leave_each_other_alone(quantity, dtype, device):
     """Bodies of seven moments each, out of order."""
     x, radii, m = pile(count=1100)
@@ -118,8 +119,8 @@ def test_moments_of_one_body_leave_each_other_alone(quantity, dtype, device):
     bodies = np.random.default_rng(4).permutation(1100) // 7
     force = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii, bodies=bodies))
     torque = oracle.torque(m, oracle.h_field(x, m, radii=radii, bodies=bodies))
-    for fused in forms(device):
-        found = sums(x, radii, m, [(0, 1100, 0, 1100)], quantity, dtype, device, bodies, fused=fused)
+    for form in forms(device, *[MIRRORED] * (quantity == KELVIN)):
+        found = sums(x, radii, m, [(0, 1100, 0, 1100)], quantity, dtype, device, bodies, form=form)
         assert relative(found[0], force) < TOLERANCE[dtype]
         if quantity == WRENCH:
             assert relative(found[1], torque) < TOLERANCE[dtype]
@@ -128,33 +129,51 @@ def test_moments_of_one_body_leave_each_other_alone(quantity, dtype, device):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("count", [1, 2, 31, 33, 127, 243, 257])
 def test_any_count_of_touching_balls(count, dtype, device):
-    """Both forms of the sums, of field and wrench, whatever is left over of vectors, warps and tiles."""
+    """All forms of the sums, whatever is left over of vectors, warps and tiles."""
     x, radii, m = pile(count=count)
     every = [(0, count, 0, count)]
     h = oracle.h_field(x, m, radii=radii)
     force, torque = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii)), oracle.torque(m, h)
-    for fused in forms(device):
-        found = [*sums(x, radii, m, every, FIELD, dtype, device, fused=fused)]
-        found += sums(x, radii, m, every, WRENCH, dtype, device, fused=fused)
-        for value, expected in zip(found, (h, force, torque), strict=True):
+    for form in forms(device, MIRRORED):
+        found = [*sums(x, radii, m, every, FIELD, dtype, device, form=form)]
+        quantity = KELVIN if form == MIRRORED else WRENCH
+        found += sums(x, radii, m, every, quantity, dtype, device, form=form)
+        for value, expected in zip(found[: len(found) - (quantity == KELVIN)], (h, force, torque), strict=False):
             # not as a ratio: a lone ball feels nothing at all
             assert np.linalg.norm(value - expected) <= TOLERANCE[dtype] * np.linalg.norm(expected)
 
 
-def forms(device):
-    """Whether the kernel that needs the sums makes them itself; a CPU has one form only."""
-    return (False,) if device == "cpu" else (False, True)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("quantity", [FIELD, KELVIN])
+@pytest.mark.parametrize("slabs", [1, 3, 100])
+def test_mirrored_passes(slabs, quantity, dtype, device, monkeypatch):
+    """Eleven tiles of moments, in as many passes as little memory asks for; some of them in a body of three."""
+    monkeypatch.setattr(pair_mirror_cuda, "_SLAB_BYTES", slabs * 12 * 2001)
+    x, _, m = pile(count=2001)
+    radii, bodies = as_float32(np.where(np.arange(2001) < 1500, 0.0049, 0.004))[0], np.arange(2001) // 3
+    form = MIRRORED if device != "cpu" else LOOP
+    (found, *_) = sums(x, radii, m, [(0, 2001, 0, 2001)], quantity, dtype, device, bodies, form=form)
+    if quantity == FIELD:
+        assert relative(found, oracle.h_field(x, m, radii=radii)) < TOLERANCE[dtype]
+    else:
+        gradient = oracle.field_gradient(x, m, radii=radii, bodies=bodies)
+        assert relative(found, oracle.kelvin_force(m, gradient)) < TOLERANCE[dtype]
 
 
-def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, fused):
+def forms(device, *mirrored):
+    """Forms of the sums to try, with or without the mirrored one; a CPU has one only."""
+    return (LOOP,) if device == "cpu" else (LOOP, FUSED, *mirrored)
+
+
+def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, form):
     """Field [A/m], or forces [N] and torques [N·m], of segments of one moment set, in one form of the native sums."""
     kind = {"float32": wp.float32, "float64": wp.float64}[dtype]
     vectors = [wp.array(a, dtype=wp.types.vector(3, kind), device=device) for a in (x, m)]
     packed = PackedMoments(wp.array(radii, dtype=kind, device=device), largest_radius=radii.max(), labels=bodies)
     packed.pack(*vectors)
     packed.find_overlaps()
-    rows = pair_loops.make_rows(segments, device, quantity, fused=fused)
-    assert rows.fused == fused
+    rows = pair_loops.make_rows(segments, device, quantity, forms=(form,))
+    assert rows.form == form
     partial = wp.full(pair_loops.partial_shape(rows), np.nan, dtype=kind, device=device)
     pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=packed.moments)
     none, *out = (wp.zeros_like(vectors[0]) for _ in range(3))

@@ -64,7 +64,8 @@ def h_field(
         points = kind.vectors("targets", targets)
         at = _packed(kind, "target_radii", target_radii, points, wp.zeros_like(points))
     exact = method == "reference" or smoothing > 0.0
-    rows = pair_loops.make_rows([(0, at.count, 0, sources.count)], kind.device, fused=not exact)
+    forms = (pair_loops.LOOP,) if exact else pair_loops.FORMS if same_set else (pair_loops.LOOP, pair_loops.FUSED)
+    rows = pair_loops.make_rows([(0, at.count, 0, sources.count)], kind.device, forms=forms)
     exclude = pair_loops.EXCLUDE_SELF if same_set else pair_loops.EXCLUDE_NOTHING
     partial = _pair_sums(rows, at, sources, exclude if exact else None, smoothing)
     if not exact:
@@ -119,7 +120,8 @@ def wrench(
     external = kind.vectors("external_field", np.zeros(3) if external_field is None else external_field, n)
     packed = _packed(kind, "radii", radii, x, m)
     exact = method == "reference" or smoothing > 0.0
-    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, WRENCH, fused=not exact)
+    forms = (pair_loops.LOOP,) if exact else pair_loops.FORMS
+    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, WRENCH, forms=forms)
     partial = _pair_sums(rows, packed, packed, pair_loops.EXCLUDE_BODY if exact else None, smoothing)
     if not exact:
         packed.find_overlaps()

@@ -12,7 +12,7 @@ from warpmag.kernels import induction, near_contact, pair_loops
 from warpmag.kernels.curves import CURVE_IDS
 from warpmag.kernels.field import launch_field
 from warpmag.kernels.packing import launch_divide_by_volume
-from warpmag.kernels.pair_code import FORCE, WRENCH
+from warpmag.kernels.pair_code import FORCE, KELVIN, WRENCH
 from warpmag.kernels.wrench import FORCE_IDS, ZEEMAN, Material, launch_wrench, launch_zeeman_moments
 from warpmag.magnets import FORCES, check_contact_model, check_token
 from warpmag.packed import PackedMoments
@@ -125,7 +125,7 @@ class MomentSystem:
         _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
         twisted = permanent | (size[body] > 1) | lone_torque
         self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
-        self._make_rows(worlds, permanent, movable, WRENCH if twisted.any() else FORCE)
+        self._make_rows(worlds, permanent, movable, twisted.any())
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
         self._induction = induction.allocate(worlds, ~permanent, self.dtype, self.device)
         self._near = None
@@ -163,7 +163,7 @@ class MomentSystem:
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
 
-    def _make_rows(self, worlds, permanent, movable, felt_quantity):
+    def _make_rows(self, worlds, permanent, movable, any_twisted):
         """Work lists: inducible on inducible, permanent on inducible, everything on whatever moves."""
         induced, applied, felt = [], [], []
         for w in range(int(worlds[-1]) + 1 if len(worlds) else 0):
@@ -173,16 +173,19 @@ class MomentSystem:
             applied.append((first, middle, middle, last))
             edges = np.flatnonzero(np.diff(np.concatenate([[0], movable[first:last].astype(int), [0]])))
             felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
-        self._induced = pair_loops.make_rows(induced, self.device, fused=False)
-        self._applied = pair_loops.make_rows(applied, self.device, fused=False)
-        self._felt = pair_loops.make_rows(felt, self.device, felt_quantity)
+        self._induced = pair_loops.make_rows(induced, self.device, forms=(pair_loops.LOOP, pair_loops.MIRRORED))
+        self._applied = pair_loops.make_rows(applied, self.device, forms=(pair_loops.LOOP,))
+        self._felt = {
+            law: pair_loops.make_rows(felt, self.device, WRENCH if any_twisted else quantity)
+            for law, quantity in ((FORCE_IDS["kelvin"], KELVIN), (ZEEMAN, FORCE))
+        }
 
         def partial(rows):
             return wp.zeros(pair_loops.partial_shape(rows), dtype=self.dtype, device=self.device)
 
         self._induced_partial = partial(self._induced)
         self._applied_partial = partial(self._applied)
-        self._felt_partial = partial(self._felt)
+        self._felt_partial = {law: partial(rows) for law, rows in self._felt.items()}
 
     @property
     def radii(self):
@@ -268,10 +271,11 @@ class MomentSystem:
         if law == ZEEMAN:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
-        pair_loops.launch_pair_loop(self._felt, packed.packed, packed.packed, self._felt_partial, effective=effective)
+        rows, partial = self._felt[law], self._felt_partial[law]
+        pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
         launch_wrench(
-            self._felt,
-            self._felt_partial,
+            rows,
+            partial,
             packed,
             effective,
             self.external_field,
@@ -281,4 +285,4 @@ class MomentSystem:
         )
         if self._near is not None:
             near_contact.launch_sweeps(packed, self.moments, self._material, self._near, near_contact.FORCE_SWEEPS)
-            near_contact.launch_add_forces(self._felt, packed, self._near, self._twisted, self.forces, self.torques)
+            near_contact.launch_add_forces(rows, packed, self._near, self._twisted, self.forces, self.torques)
