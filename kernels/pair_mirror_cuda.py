@@ -13,6 +13,7 @@ up the slabs in order, so that nothing depends on scheduling. Slabs that would t
 in passes, each of which adds to the slabs of the last.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -76,13 +77,14 @@ class Mirror:
 def make_mirror(origin: int, count: int, quantity: str, device) -> Mirror:
     """Plan the walk of ``count`` moments from packed column ``origin`` on."""
     shape = SHAPES[quantity]
-    tiles = max(-(-count // (32 * shape.moments)), 3)
+    tiles = max(math.ceil(count / (32 * shape.moments)), 3)
     tiles += 1 - tiles % 2
-    stages = -(-(-(-count // tiles)) // 32)
+    stages = math.ceil(math.ceil(count / tiles) / 32)
     farthest = tiles // 2
     slabs = min(farthest, max(1, _SLAB_BYTES // (12 * count)))
-    slabs = -(-farthest // -(-farthest // slabs))
-    splits = int(np.clip(-(-_WAVES * shape.blocks * device.sm_count // tiles), 1, slabs * stages // shape.warps + 1))
+    slabs = math.ceil(farthest / math.ceil(farthest / slabs))  # as many in each pass
+    wanted = math.ceil(_WAVES * shape.blocks * device.sm_count / tiles)
+    splits = min(wanted, slabs * stages // shape.warps + 1)
     blocks, passes = [], []
     for nearest in range(1, farthest + 1, slabs):
         # the first pass has the pairs within a tile, too
@@ -154,7 +156,9 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     left_out += " || (distance == 0 && begin + (lane + step) % 32 == row@)"
     careful_pairs = each("{" + mirrored_pair(quantity, f"careful(d2, tr@ + qc.x, {left_out})", "@") + "}")
     worth = "REAL(3)"
-    stores = "".join(f"warp_sums[(lane + 32 * {k}) * 3 + {i}] = {worth} * h{c}{k};" for k in ks for i, c in enumerate("xyz"))
+    stores = "".join(
+        f"warp_sums[(lane + 32 * {k}) * 3 + {i}] = {worth} * h{c}{k};" for k in ks for i, c in enumerate("xyz")
+    )
     return f"""
     typedef {real} REAL;
     typedef REAL NUMBER;
@@ -171,7 +175,8 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     const int* p = blocks.data + 4 * block;
     const int home = p[0], share = p[3], rows = partial_out.shape[1], tiles = edges.shape[0] - 1;
     const int row_begin = edges.data[home], row_end = edges.data[home + 1];
-    const int walk_begin = p[1] + (p[2] - p[1]) * warp / {warps}, walk_end = p[1] + (p[2] - p[1]) * (warp + 1) / {warps};
+    const int walk = p[2] - p[1];
+    const int walk_begin = p[1] + walk * warp / {warps}, walk_end = p[1] + walk * (warp + 1) / {warps};
     const size_t n = packed.strides[0] / sizeof(REAL);
     const REAL* src = (const REAL*)packed.data;
     REAL* out = (REAL*)partial_out.data;
@@ -184,10 +189,10 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     {bounds}
     Quad *staged_a = staging[warp], *staged_b = staged_a + 64, *staged_c = staged_b + 64;
     #pragma unroll 1
-    for (int walk = walk_begin; walk < walk_end; ++walk) {{
-        const int distance = walk / stages;
+    for (int at = walk_begin; at < walk_end; ++at) {{
+        const int distance = at / stages;
         const int other = home + distance < tiles ? home + distance : home + distance - tiles;
-        const int begin = edges.data[other] + 32 * (walk - distance * stages), end = edges.data[other + 1];
+        const int begin = edges.data[other] + 32 * (at - distance * stages), end = edges.data[other + 1];
         if (begin >= end) continue;
         // lanes beyond the last moment stand where it stands, without a moment
         const bool there = begin + lane < end;
@@ -273,9 +278,7 @@ def _kernel(dtype, quantity: str, shape: Shape):
         partial_out: wp.array3d[dtype],
     ):
         block, thread = wp.tid()
-        walk_tiles(
-            first_block + block, thread, packed, origin, edges, blocks, stages, slabs, nearest, partial_out
-        )
+        walk_tiles(first_block + block, thread, packed, origin, edges, blocks, stages, slabs, nearest, partial_out)
 
     return pair_loop_mirrored
 

@@ -124,12 +124,8 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         f"if (j - {shape.sources} * lane + {32 * shape.sources * warps} < source_end)"
         f"load(j + {32 * shape.sources * warps}, next);"
     )
-    sums = "".join(
-        f"r[{int(k) * width + c}] = {text};" for k in ks for c, text in enumerate(results(quantity, _W, k))
-    )
-    halvings = "".join(
-        f"halve({targets * width >> level}, {32 >> level});" for level in range(1, targets.bit_length())
-    )
+    sums = "".join(f"r[{int(k) * width + c}] = {text};" for k in ks for c, text in enumerate(results(quantity, _W, k)))
+    halvings = "".join(f"halve({targets * width >> level}, {32 >> level});" for level in range(1, targets.bit_length()))
     return f"""
     typedef {real} REAL;
     typedef REAL NUMBER;
@@ -167,7 +163,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
             }}
         }};
         int j = first + {shape.sources} * thread;
-        {"Pack next[8]; if (j - %d * lane < source_end) load(j, next);" % shape.sources if PREFETCH else ""}
+        {f"Pack next[8]; if (j - {shape.sources} * lane < source_end) load(j, next);" if PREFETCH else ""}
         #pragma unroll 1
         for (; j - {shape.sources} * lane < source_end; j += {32 * shape.sources * warps}) {{
             Pack s[8];

@@ -40,9 +40,8 @@ class PackedMoments:
         self.labels = integers(np.arange(n) if labels is None else labels)
         self.groups = integers(np.zeros(n) if groups is None else groups)
         pitch = -(-n // pair_loops.PITCH) * pair_loops.PITCH
-        self.packed = wp.zeros((pair_loops.PACKED_ROWS, pitch), dtype=dtype, device=device)
-        if n:
-            self.packed = self.packed[:, :n]
+        pitched = wp.zeros((pair_loops.PACKED_ROWS, pitch), dtype=dtype, device=device)
+        self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
         self._lists = neighbors.allocate(n, dtype, device)
         self.neighbors, self.neighbor_counts = self._lists.neighbor, self._lists.count
