@@ -6,7 +6,7 @@ import warp as wp
 
 from warpmag.kernels.neighbors import pair_correction
 from warpmag.kernels.pair_code import FIELD
-from warpmag.kernels.pair_sums_cuda import Shape, pair_summation, target_share
+from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share
 
 INVERSE_4PI = 0.07957747154594767
 
@@ -45,7 +45,7 @@ def finished_field(dtype):
 def summed_field(dtype, shape: Shape):
     """Warp function by which a block sums the field [A/m] of a tile's sources at its targets.
 
-    All threads of the block call it; each gets the target row that is its own to go on with, or -1, and its field.
+    All threads of the block call it. A thread that has a target, see ``pair_sums_cuda.own_target``, gets its field.
     """
     vec3 = wp.types.vector(3, dtype)
     share_of = target_share(shape)
@@ -73,10 +73,7 @@ def summed_field(dtype, shape: Shape):
                 targets, sources, i, begin, end, skip, neighbor, neighbor_count, share, wp.static(shape.shares)
             )
         h = dtype(wp.static(INVERSE_4PI)) * sum_pairs(tile, thread, tiles, targets, sources, targets, correction)
-        row = tiles[tile, 0] + thread
-        if row >= tiles[tile, 1]:
-            row = -1
-        return row, h
+        return h
 
     return field_of_tile
 
@@ -122,7 +119,6 @@ def _sum_kernel(dtype, shape: Shape):
         tiles: wp.array2d[int],
         targets: wp.array2d[dtype],
         sources: wp.array2d[dtype],
-        row_target: wp.array[int],
         same_set: int,
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
@@ -130,11 +126,15 @@ def _sum_kernel(dtype, shape: Shape):
         # outputs:
         h_out: wp.array[vec3],
     ):
-        tile, thread = wp.tid()
-        row, h = field_of_tile(tile, thread, tiles, targets, sources, same_set, neighbor, neighbor_count)
-        if row >= 0:
-            i = row_target[row]
-            h_out[i] = base[i] + h
+        tile = wp.tid() // wp.static(shape.threads)
+        thread = wp.tid() % wp.static(shape.threads)
+        i = own_target(tile, thread, tiles)
+        start = vec3()
+        if i >= 0:
+            start = base[i]  # here, so that nothing waits for it at the end
+        h = field_of_tile(tile, thread, tiles, targets, sources, same_set, neighbor, neighbor_count)
+        if i >= 0:
+            h_out[i] = start + h
 
     return sum_field
 
@@ -155,10 +155,10 @@ def launch_field(rows, partial, targets, sources, same_set, base, h):
         return
     near = [int(same_set), targets.neighbors, targets.neighbor_counts]
     if rows.fused:
-        wp.launch_tiled(
+        wp.launch(
             _sum_kernel(targets.dtype, rows.shape),
-            dim=[rows.tiles.shape[0]],
-            inputs=[rows.tiles, targets.packed, sources.packed, rows.target, *near, base],
+            dim=rows.tiles.shape[0] * rows.shape.threads,
+            inputs=[rows.tiles, targets.packed, sources.packed, *near, base],
             outputs=[h],
             block_dim=rows.shape.threads,
             device=targets.device,

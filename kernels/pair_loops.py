@@ -31,8 +31,8 @@ from warpmag.kernels.pair_loops_cpu import MOST_THREADS, STRIPE, launch_pair_loo
 from warpmag.kernels.pair_loops_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
 
 PACKED_ROWS = 8
-PITCH = 4
-"""Packed rows are a multiple of so many moments apart, for loads of up to four of them at a time."""
+PITCH = 128
+"""Packed rows are a multiple of so many moments apart. Beyond the last stand moments of nothing, for vector loads."""
 EXCLUDE_NOTHING, EXCLUDE_SELF, EXCLUDE_BODY = 0, 1, 2
 """Sources that a loop leaves out: none, the target itself, or everything with the target's body label."""
 LOOP, FUSED, MIRRORED = FORMS = "loop", "fused", "mirrored"

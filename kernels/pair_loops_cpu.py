@@ -14,12 +14,15 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pair_code import FIELD, SUMS, TILE_COLUMNS, WIDTHS, pair, results, scaled_moment
+from warpmag.kernels.pair_code import FIELD, SUMS, TILE_COLUMNS, WIDTHS, mirrored_pair, pair, results, scaled_moment
 
 STRIPE = 512
 """Most sources, and most targets, of a tile."""
 MOST_THREADS = 64
 """Threads that a loop may start."""
+
+_AT_ONCE = 2
+"""Targets that meet the sources together, so that a core always has something to start; a divisor of all widths."""
 
 _W = 2.0  # see pair_code: W/√c is cheapest for W = 2
 
@@ -147,39 +150,47 @@ def _add_rows(quantity: str) -> str:
     }};
     """
 
+def _add_both_ways() -> str:
+    """Text of ``add_both_ways``, which meets the sources with some targets at a time."""
 
-_ADD_BOTH_WAYS = f"""
+    def each(text: str) -> str:
+        return "".join(text.replace("@", str(k)) for k in range(_AT_ONCE))
+
+    target = each("".join(f"""
+            const NUMBER t{c}@ = number(home.packed[{i}], i + @), m{c}@ = number(home.packed[{i + 4}], i + @);
+            const NUMBER n{c}@ = number(home.u[{i}], i + @);
+            NUMBER h{c}@ = 0;""" for i, c in enumerate("xyz")))  # fmt: skip
+    own = each("auto others@ = clamp > 0; others@[(i + @) % LANES] = 0;")
+    apart = each("{" + mirrored_pair(FIELD, "inverse_root(d2 > clamp ? d2 : clamp)", "@") + "}")
+    meeting = each("{" + pair(FIELD, "others@ ? inverse_root(d2 > clamp ? d2 : clamp) : 0", "@") + "}")
+    return f"""
     auto add_both_ways = [=](Tile& home, NUMBER (&lanes)[3][STRIPE], Tile& tile) ONCE {{
         const NUMBER contact = home.radius + tile.radius, clamp = contact * contact;
         const bool diagonal = &home == &tile;
-        for (int i = 0; i < home.count; ++i) {{
-            const NUMBER tx = number(home.packed[0], i), ty = number(home.packed[1], i), tz = number(home.packed[2], i);
-            const NUMBER mx = number(home.packed[4], i), my = number(home.packed[5], i), mz = number(home.packed[6], i);
-            const NUMBER nx = number(home.u[0], i), ny = number(home.u[1], i), nz = number(home.u[2], i);
-            NUMBER hx = 0, hy = 0, hz = 0;
+        // a target beyond the last stands where it stands, without a moment
+        for (int i = 0; i < home.count; i += {_AT_ONCE}) {{
+            {target}
             int v = 0;
-            if (diagonal) {{  // vectors before the target's own have met it; its own it meets one way, without itself
+            if (diagonal) {{  // vectors before the targets' own have met them; their own they meet one way, without self
                 v = i / LANES;
-                auto others = clamp > 0;
-                others[i % LANES] = 0;
+                {own}
                 {_SOURCES}
-                {pair(FIELD, "others ? inverse_root(d2 > clamp ? d2 : clamp) : 0")}
+                {meeting}
                 ++v;
             }}
             for (; v < tile.vectors; ++v) {{
                 {_SOURCES}
-                {pair(FIELD, "inverse_root(d2 > clamp ? d2 : clamp)")}
-                const NUMBER back = inv2 * (rx * mx + ry * my + rz * mz);
-                tile.h[0][v] += inv3 * (back * rx - nx);
-                tile.h[1][v] += inv3 * (back * ry - ny);
-                tile.h[2][v] += inv3 * (back * rz - nz);
+                NUMBER gx = tile.h[0][v], gy = tile.h[1][v], gz = tile.h[2][v];
+                {apart}
+                tile.h[0][v] = gx;
+                tile.h[1][v] = gy;
+                tile.h[2][v] = gz;
             }}
-            lanes[0][i] += hx;
-            lanes[1][i] += hy;
-            lanes[2][i] += hz;
+            {each(" ".join(f"lanes[{i}][i + @] += h{c}@;" for i, c in enumerate("xyz")))}
         }}
     }};
 """
+
 
 _ENTER_HOME = """
     Tile home;  // the targets of mirrored tiles, and what is summed for them, by lanes
@@ -295,7 +306,7 @@ def _snippet(real: str, quantity: str) -> str:
         {_VECTORS}
         {_INVERSE_ROOT[real]}
         {_add_rows(quantity)}
-        {_ADD_BOTH_WAYS if quantity == FIELD else ""}
+        {_add_both_ways() if quantity == FIELD else ""}
         {_walk(quantity)}
         return nullptr;
     }};

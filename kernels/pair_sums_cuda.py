@@ -24,7 +24,7 @@ class Shape:
     """Shape of the blocks that walk a work list.
 
     Attributes:
-        targets: Targets of a block; a power of two up to 16.
+        targets: Targets of a block, up to 16.
         warps: Warps of a block that share out the sources.
         sources: Sources that a lane takes at a time; 1, 2 or 4.
         blocks: Blocks that a multiprocessor holds at once, in float32.
@@ -42,8 +42,8 @@ class Shape:
 
     @property
     def shares(self) -> int:
-        """Threads of the correcting warp that share out a target's corrections."""
-        return 32 // self.targets
+        """Lanes of a warp that end with the sums of one target, and threads that share out its corrections."""
+        return 32 >> (self.targets - 1).bit_length()
 
     def launch_bounds(self, dtype) -> tuple[int, int]:
         """Bounds of a kernel: threads of a block, and blocks that a multiprocessor holds at once."""
@@ -73,21 +73,21 @@ _INVERSE_ROOT = {
 _W = 1.0  # see pair_code
 
 
-PREFETCH = False
-
 
 def _snippet(real: str, quantity: str, shape: Shape) -> str:
     """One thread of a block."""
     field = quantity == FIELD
-    targets, warps, width = shape.targets, shape.warps, WIDTHS[quantity]
-    ks = [str(k) for k in range(targets)]
-    rows = range(7 if field else 8)  # of the packed sources that are read
+    targets, warps, width, taken = shape.targets, shape.warps, WIDTHS[quantity], shape.sources
+    padded = 32 // shape.shares  # targets, so many that halving ends with one
+    ks, vs = [str(k) for k in range(targets)], range(taken)
+    # what is read of a source, and in which packed row it is
+    rows = {"ax": 0, "ay": 1, "az": 2, "radius": 3, "bx": 4, "by": 5, "bz": 6, **({} if field else {"label": 7})}
 
     def each(text: str) -> str:
         return "".join(text.replace("@", k) for k in ks)
 
     effective = "" if field else "".join(f"const REAL e{c}@ = eff[{r} * ne + column@];" for r, c in enumerate("xyz"))
-    loads = each(
+    targets_loaded = each(
         f"""
         // targets beyond the last are the last again
         const int column@ = column_begin + min(@, count - 1);
@@ -99,33 +99,34 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     )
     if field:
         bounds = "const int own_begin = same ? column_begin : source_end, own_end = own_begin + count;"
-        apart = f"(j >= own_end || j + {shape.sources} <= own_begin)"
-        left_out = "j + v == own_begin + @"
+        apart = [f"(j >= own_end || j + {taken} <= own_begin)"]
+        left_out = "i == own_begin + @"
     else:
         bounds = "REAL lowest = tl0, highest = tl0;" + "".join(
             f"lowest = min(lowest, tl{k}); highest = max(highest, tl{k});" for k in ks[1:]
         )
-        apart = " && ".join(f"(s[7].at[{v}] < lowest || s[7].at[{v}] > highest)" for v in range(shape.sources))
-        left_out = "s[7].at[v] == tl@"
-    whole_loads = "".join(f"s[{row}] = *(const Pack*)(src + {row} * ns + j);" for row in rows)
-    single_loads = "".join(
-        f"s[{row}].at[v] = {'j + v != there ? REAL(0) : ' if row in (4, 5, 6) else ''}src[{row} * ns + there];"
-        for row in rows
-    )
-    one_radius = " && ".join(f"s[3].at[{v}] == one_radius" for v in range(shape.sources))
-    source = """
-                    const REAL ax = s[0].at[v], ay = s[1].at[v], az = s[2].at[v];
-                    const REAL bx = s[4].at[v], by = s[5].at[v], bz = s[6].at[v];
-                    const REAL ux = SCALE * bx, uy = SCALE * by, uz = SCALE * bz;
-    """
+        apart = [f"(p_label.at[{v}] < lowest || p_label.at[{v}] > highest)" for v in vs]
+        left_out = "label == tl@"
+    apart += [f"p_radius.at[{v}] == one_radius" for v in vs]
+    row_starts = "".join(f"const char* row_{name} = (const char*)(src + {row} * ns);" for name, row in rows.items())
+    packs_loaded = "".join(f"p_{name} = *(const Pack*)(row_{name} + at);" for name in rows)
+    scaled = "const REAL ux = SCALE * bx, uy = SCALE * by, uz = SCALE * bz;"
     fast_pairs = each("{" + pair(quantity, "inverse_root(max(d2, clamp@))", "@") + "}")
-    careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + s[3].at[v], {left_out})", "@") + "}")
-    prefetch = "".join(f"s[{row}] = next[{row}];" for row in rows) + (
-        f"if (j - {shape.sources} * lane + {32 * shape.sources * warps} < source_end)"
-        f"load(j + {32 * shape.sources * warps}, next);"
+    fast_sources = "".join(
+        "{" + "".join(f"const REAL {name} = p_{name}.at[{v}];" for name in rows) + scaled + fast_pairs + "}" for v in vs
     )
-    sums = "".join(f"r[{int(k) * width + c}] = {text};" for k in ks for c, text in enumerate(results(quantity, _W, k)))
-    halvings = "".join(f"halve({targets * width >> level}, {32 >> level});" for level in range(1, targets.bit_length()))
+    careful_source = (
+        "".join(
+            f"const REAL {name} = {'i != j + v ? REAL(0) : ' if name[0] == 'b' else ''}src[{row} * ns + i];"
+            for name, row in rows.items()
+        )
+        + scaled
+    )
+    careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + radius, {left_out})", "@") + "}")
+    sums = "".join(
+        f"r[{int(k) * width + c}] = {text};" for k in ks for c, text in enumerate(results(quantity, _W, k))
+    ) + "".join(f"r[{c}] = 0;" for c in range(targets * width, padded * width))
+    halvings = "".join(f"halve({padded * width >> level}, {32 >> level});" for level in range(1, padded.bit_length()))
     return f"""
     typedef {real} REAL;
     typedef REAL NUMBER;
@@ -135,49 +136,43 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         const REAL c = max(d2, s * s);
         return c > 0 && !left_out ? inverse_root(c) : REAL(0);
     }};
-    struct alignas({shape.sources} * sizeof(REAL)) Pack {{ REAL at[{shape.sources}]; }};
-    __shared__ REAL sums[{warps + 1}][{targets}][{width}];
+    struct alignas({taken} * sizeof(REAL)) Pack {{ REAL at[{taken}]; }};
+    __shared__ REAL sums[{warps + 1}][{padded}][{width}];
     const int lane = thread % 32, warp = thread / 32;
-    const int* p = tiles.data + {TILE_COLUMNS} * tile;
-    const int count = p[1] - p[0], column_begin = p[2], source_begin = p[3], source_end = p[4];
-    REAL r[{targets * width}];  // of all targets, target by target; then of fewer and fewer
+    const int* t = tiles.data + {TILE_COLUMNS} * tile;
+    const int count = t[1] - t[0], column_begin = t[2], source_begin = t[3], source_end = t[4];
+    REAL r[{padded * width}];  // of all targets, target by target; then of fewer and fewer
     if (warp < {warps} && source_begin < source_end) {{
         const size_t ns = sources.strides[0] / sizeof(REAL), nt = targets.strides[0] / sizeof(REAL);
         const size_t ne = effective.strides[0] / sizeof(REAL);
         const REAL *src = (const REAL*)sources.data, *tgt = (const REAL*)targets.data;
         const REAL* eff = (const REAL*)effective.data;
         const bool same = src == tgt;
+        {row_starts}
         const REAL one_radius = src[3 * ns + source_begin];
-        {loads}
+        {targets_loaded}
         {bounds}
-        const int first = source_begin / {shape.sources} * {shape.sources};
-        auto load = [&](int j, Pack (&s)[8]) {{
-            if (j >= source_begin && j + {shape.sources} <= source_end) {{
-                {whole_loads}
-            }} else {{  // beyond the ends stand the first or the last source again, without a moment
-                #pragma unroll
-                for (int v = 0; v < {shape.sources}; ++v) {{
-                    const int there = min(max(j + v, source_begin), source_end - 1);
-                    {single_loads}
-                }}
-            }}
-        }};
-        int j = first + {shape.sources} * thread;
-        {f"Pack next[8]; if (j - {shape.sources} * lane < source_end) load(j, next);" if PREFETCH else ""}
+        // the last moment is followed by moments of nothing
+        const int readable_end = source_end < sources.shape[1] ? source_end : (int)ns;
         #pragma unroll 1
-        for (; j - {shape.sources} * lane < source_end; j += {32 * shape.sources * warps}) {{
-            Pack s[8];
-            {prefetch if PREFETCH else "load(j, s);"}
-            if (__all_sync(~0u, one_radius > 0 && {one_radius} && {apart})) {{
-                #pragma unroll
-                for (int v = 0; v < {shape.sources}; ++v) {{
-                    {source}
-                    {fast_pairs}
-                }}
+        for (int base = source_begin / {taken} * {taken} + {32 * taken} * warp; base < source_end;
+             base += {32 * taken * warps}) {{
+            const int j = base + {taken} * lane;
+            Pack {", ".join("p_" + name for name in rows)};
+            bool fast = one_radius > 0 && j >= source_begin && j + {taken} <= readable_end;
+            if (fast) {{
+                const unsigned at = j * (unsigned)sizeof(REAL);
+                {packs_loaded}
+                fast = {" && ".join(apart)};
+            }}
+            if (__all_sync(~0u, fast)) {{
+                {fast_sources}
             }} else {{
-                #pragma unroll
-                for (int v = 0; v < {shape.sources}; ++v) {{
-                    {source}
+                #pragma unroll 1
+                for (int v = 0; v < {taken}; ++v) {{
+                    // beyond the ends stand the first or the last source again, without a moment
+                    const int i = min(max(j + v, source_begin), source_end - 1);
+                    {careful_source}
                     {careful_pairs}
                 }}
             }}
@@ -195,11 +190,11 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         for (int c = 0; c < {width}; ++c) r[c] = warp < {warps} ? REAL(0) : correction[c];
     }}
     #pragma unroll
-    for (int step = {16 // targets}; step > 0; step /= 2)
+    for (int step = {shape.shares // 2}; step > 0; step /= 2)
         #pragma unroll
         for (int c = 0; c < {width}; ++c) r[c] += __shfl_xor_sync(~0u, r[c], step);
-    if (lane % {32 // targets} == 0)
-        for (int c = 0; c < {width}; ++c) sums[warp][lane / {32 // targets}][c] = r[c];
+    if (lane % {shape.shares} == 0)
+        for (int c = 0; c < {width}; ++c) sums[warp][lane / {shape.shares}][c] = r[c];
     __syncthreads();
     wp::vec_t<{width}, REAL> total;
     if (thread < {targets}) {{
@@ -231,6 +226,14 @@ def pair_summation(dtype, quantity: str, shape: Shape):
     ) -> vector: ...
 
     return sum_pairs
+
+
+@wp.func
+def own_target(tile: int, thread: int, tiles: wp.array2d[int]):
+    """Packed column of the target whose sum a thread gets; -1 for none."""
+    if thread < tiles[tile, 1] - tiles[tile, 0]:
+        return tiles[tile, 2] + thread
+    return -1
 
 
 @cache

@@ -21,7 +21,7 @@ from warpmag.kernels.neighbors import pair_correction
 from warpmag.kernels.packing import ball_volume
 from warpmag.kernels.pair_code import WIDTHS, WRENCH
 from warpmag.kernels.pair_law import gradient_times
-from warpmag.kernels.pair_sums_cuda import Shape, pair_summation, target_share
+from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share
 
 MU0 = 1.2566370614359173e-06
 """Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
@@ -193,7 +193,6 @@ def _sum_kernel(dtype, quantity: str, shape: Shape):
         tiles: wp.array2d[int],
         packed: wp.array2d[dtype],
         effective: wp.array2d[dtype],
-        row_target: wp.array[int],
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
         external_field: wp.array[vec3],
@@ -202,7 +201,8 @@ def _sum_kernel(dtype, quantity: str, shape: Shape):
         force_out: wp.array[vec3],
         torque_out: wp.array[vec3],
     ):
-        tile, thread = wp.tid()
+        tile = wp.tid() // wp.static(shape.threads)
+        thread = wp.tid() % wp.static(shape.threads)
         correction = sums()
         i, share = share_of(tile, thread, tiles)
         if i >= 0:
@@ -212,9 +212,9 @@ def _sum_kernel(dtype, quantity: str, shape: Shape):
                 packed, effective, i, begin, end, neighbor, neighbor_count, share, wp.static(shape.shares)
             )
         total = sum_pairs(tile, thread, tiles, packed, packed, effective, correction)
-        row = tiles[tile, 0] + thread
-        if row < tiles[tile, 1]:
-            store(row_target[row], total, packed, external_field, twisted, force_out, torque_out)
+        i = own_target(tile, thread, tiles)
+        if i >= 0:
+            store(i, total, packed, external_field, twisted, force_out, torque_out)
 
     return sum_wrench
 
@@ -236,10 +236,10 @@ def launch_wrench(rows, partial, moments, effective, external_field, twisted, fo
         return
     near = [moments.neighbors, moments.neighbor_counts]
     if rows.fused:
-        wp.launch_tiled(
+        wp.launch(
             _sum_kernel(moments.dtype, rows.quantity, rows.shape),
-            dim=[rows.tiles.shape[0]],
-            inputs=[rows.tiles, moments.packed, effective, rows.target, *near, external_field, twisted],
+            dim=rows.tiles.shape[0] * rows.shape.threads,
+            inputs=[rows.tiles, moments.packed, effective, *near, external_field, twisted],
             outputs=[forces, torques],
             block_dim=rows.shape.threads,
             device=moments.device,

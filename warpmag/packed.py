@@ -39,8 +39,9 @@ class PackedMoments:
 
         self.labels = integers(np.arange(n) if labels is None else labels)
         self.groups = integers(np.zeros(n) if groups is None else groups)
-        pitch = -(-n // pair_loops.PITCH) * pair_loops.PITCH
-        pitched = wp.zeros((pair_loops.PACKED_ROWS, pitch), dtype=dtype, device=device)
+        pitched = np.zeros((pair_loops.PACKED_ROWS, -(-n // pair_loops.PITCH) * pair_loops.PITCH))
+        pitched[3], pitched[7] = largest_radius, -1.0
+        pitched = wp.array(pitched, dtype=dtype, device=device)
         self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
         self._lists = neighbors.allocate(n, dtype, device)
