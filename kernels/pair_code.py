@@ -104,11 +104,17 @@ _MIRRORED = {
 
 
 def mirrored_pair(quantity: str, inverse: str, k: str = "") -> str:
-    """Text of one pair for both of its ends: moment m of the one, for a field scaled n as well, sums h and g; W is 1.
+    """Text of one pair for both of its ends, the target's moment being m, for a field scaled n as well.
 
-    What is summed is worth three times itself.
+    What is done to the target is added to the sums h, what is done to the source to g; of a force, with W = 1, both are
+    the force itself, 4π(m·∇)H = 3 h.
     """
-    return (_SEPARATION + f"const NUMBER inv = {inverse};" + _POWERS + _MIRRORED[quantity]).format(k=k)
+    return (_SEPARATION + f"const NUMBER inv = {inverse};").format(k=k) + mirrored_sums(quantity, k)
+
+
+def mirrored_sums(quantity: str, k: str = "") -> str:
+    """Text of :func:`mirrored_pair` after its separation and inverse distance."""
+    return (_POWERS + _MIRRORED[quantity]).format(k=k)
 
 
 def scaled_moment(quantity: str, w: float) -> float:

@@ -14,15 +14,12 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pair_code import FIELD, SUMS, TILE_COLUMNS, WIDTHS, mirrored_pair, pair, results, scaled_moment
+from warpmag.kernels.pair_code import FIELD, SUMS, TILE_COLUMNS, WIDTHS, mirrored_sums, pair, results, scaled_moment
 
 STRIPE = 512
 """Most sources, and most targets, of a tile."""
 MOST_THREADS = 64
 """Threads that a loop may start."""
-
-_AT_ONCE = 2
-"""Targets that meet the sources together, so that a core always has something to start; a divisor of all widths."""
 
 _W = 2.0  # see pair_code: W/√c is cheapest for W = 2
 
@@ -45,9 +42,9 @@ _VECTORS = """
     };
 
     struct Tile {
-        NUMBER packed[8][VECTORS];  // rows of the packed sources
-        NUMBER u[3][VECTORS];       // their scaled moments
-        NUMBER h[3][VECTORS];       // what is summed at the sources themselves
+        NUMBER packed[8][VECTORS + 2];  // rows of the packed sources, and two vectors for loops to read ahead
+        NUMBER u[3][VECTORS];           // their scaled moments
+        NUMBER h[3][VECTORS];           // what is summed at the sources themselves
         int begin, count, vectors;
         REAL radius;                // the one radius of all of them, or 0
     };
@@ -62,6 +59,7 @@ _VECTORS = """
             // the lanes beyond the last source stand where it stands, without a moment
             for (int i = tile.count; i < tile.vectors * LANES; ++i)
                 number(tile.packed[c], i) = c >= 4 && c < 7 ? REAL(0) : row[tile.count - 1];
+            tile.packed[c][tile.vectors] = tile.packed[c][tile.vectors + 1] = row[tile.count - 1];
         }
         for (int c = 0; c < 3; ++c)
             for (int v = 0; v < tile.vectors; ++v) {
@@ -150,47 +148,52 @@ def _add_rows(quantity: str) -> str:
     }};
     """
 
-def _add_both_ways() -> str:
-    """Text of ``add_both_ways``, which meets the sources with some targets at a time."""
 
-    def each(text: str) -> str:
-        return "".join(text.replace("@", str(k)) for k in range(_AT_ONCE))
-
-    target = each("".join(f"""
-            const NUMBER t{c}@ = number(home.packed[{i}], i + @), m{c}@ = number(home.packed[{i + 4}], i + @);
-            const NUMBER n{c}@ = number(home.u[{i}], i + @);
-            NUMBER h{c}@ = 0;""" for i, c in enumerate("xyz")))  # fmt: skip
-    own = each("auto others@ = clamp > 0; others@[(i + @) % LANES] = 0;")
-    apart = each("{" + mirrored_pair(FIELD, "inverse_root(d2 > clamp ? d2 : clamp)", "@") + "}")
-    meeting = each("{" + pair(FIELD, "others@ ? inverse_root(d2 > clamp ? d2 : clamp) : 0", "@") + "}")
-    return f"""
+# Three vectors of sources are under way at a time, so that nothing waits for its inverse root: one has its separations
+# computed, the one before its root, and the one before that is summed.
+_ADD_BOTH_WAYS = f"""
+    struct Apart {{ NUMBER x, y, z, c; }};
     auto add_both_ways = [=](Tile& home, NUMBER (&lanes)[3][STRIPE], Tile& tile) ONCE {{
         const NUMBER contact = home.radius + tile.radius, clamp = contact * contact;
         const bool diagonal = &home == &tile;
-        // a target beyond the last stands where it stands, without a moment
-        for (int i = 0; i < home.count; i += {_AT_ONCE}) {{
-            {target}
+        for (int i = 0; i < home.count; ++i) {{
+            const NUMBER tx = number(home.packed[0], i), ty = number(home.packed[1], i), tz = number(home.packed[2], i);
+            const NUMBER mx = number(home.packed[4], i), my = number(home.packed[5], i), mz = number(home.packed[6], i);
+            const NUMBER nx = number(home.u[0], i), ny = number(home.u[1], i), nz = number(home.u[2], i);
+            NUMBER hx = 0, hy = 0, hz = 0;
+            auto apart = [&](int v) -> Apart {{
+                const NUMBER x = tx - tile.packed[0][v], y = ty - tile.packed[1][v], z = tz - tile.packed[2][v];
+                const NUMBER d2 = x * x + y * y + z * z;
+                return Apart{{x, y, z, d2 > clamp ? d2 : clamp}};
+            }};
             int v = 0;
-            if (diagonal) {{  // vectors before the targets' own have met them; their own they meet one way, without self
+            if (diagonal) {{  // vectors before the target's own have met it; its own it meets one way, without itself
                 v = i / LANES;
-                {own}
+                auto others = clamp > 0;
+                others[i % LANES] = 0;
                 {_SOURCES}
-                {meeting}
+                {pair(FIELD, "others ? inverse_root(d2 > clamp ? d2 : clamp) : 0")}
                 ++v;
             }}
+            Apart now = apart(v), next = apart(v + 1);
+            NUMBER inv_now = inverse_root(now.c);
+            #pragma clang loop unroll_count(3)
             for (; v < tile.vectors; ++v) {{
+                const Apart later = apart(v + 2);
+                const NUMBER inv_next = inverse_root(next.c);
+                const NUMBER rx = now.x, ry = now.y, rz = now.z, inv = inv_now;
                 {_SOURCES}
                 NUMBER gx = tile.h[0][v], gy = tile.h[1][v], gz = tile.h[2][v];
-                {apart}
-                tile.h[0][v] = gx;
-                tile.h[1][v] = gy;
-                tile.h[2][v] = gz;
+                {mirrored_sums(FIELD)}
+                tile.h[0][v] = gx, tile.h[1][v] = gy, tile.h[2][v] = gz;
+                now = next, next = later, inv_now = inv_next;
             }}
-            {each(" ".join(f"lanes[{i}][i + @] += h{c}@;" for i, c in enumerate("xyz")))}
+            lanes[0][i] += hx;
+            lanes[1][i] += hy;
+            lanes[2][i] += hz;
         }}
     }};
 """
-
 
 _ENTER_HOME = """
     Tile home;  // the targets of mirrored tiles, and what is summed for them, by lanes
@@ -306,7 +309,7 @@ def _snippet(real: str, quantity: str) -> str:
         {_VECTORS}
         {_INVERSE_ROOT[real]}
         {_add_rows(quantity)}
-        {_add_both_ways() if quantity == FIELD else ""}
+        {_ADD_BOTH_WAYS if quantity == FIELD else ""}
         {_walk(quantity)}
         return nullptr;
     }};

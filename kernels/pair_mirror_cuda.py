@@ -43,8 +43,9 @@ class Shape:
 SHAPES = {FIELD: Shape(6, 4, 2, 2), KELVIN: Shape(6, 4, 2, 2)}
 _SLAB_BYTES = 2**28
 """Memory that slabs may take."""
-_WAVES = 8
-"""Waves of blocks that a pass should have at least, so that its end, when some blocks still run, takes little."""
+_MOST_SPLITS = 32
+_FIXED_COST = 0.2
+"""Time that a block takes to start and to end, and that a split takes to be added up, in stages of a warp."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,7 @@ def make_mirror(origin: int, count: int, quantity: str, device) -> Mirror:
     farthest = tiles // 2
     slabs = min(farthest, max(1, _SLAB_BYTES // (12 * count)))
     slabs = math.ceil(farthest / math.ceil(farthest / slabs))  # as many in each pass
-    wanted = math.ceil(_WAVES * shape.blocks * device.sm_count / tiles)
-    splits = min(wanted, slabs * stages // shape.warps + 1)
+    splits = _choose_splits(shape, tiles, stages * min(slabs + 1, farthest + 1), device.sm_count)
     blocks, passes = [], []
     for nearest in range(1, farthest + 1, slabs):
         # the first pass has the pairs within a tile, too
@@ -103,6 +103,19 @@ def make_mirror(origin: int, count: int, quantity: str, device) -> Mirror:
         stages=stages,
         splits=splits,
     )
+
+
+def _choose_splits(shape: Shape, tiles: int, walk: int, multiprocessors: int) -> int:
+    """Blocks that share the walk of a tile, of so many stages; see ``pair_loops_cuda.choose_splits``."""
+
+    def cost(splits):
+        waves, rest = divmod(tiles * splits, multiprocessors * shape.blocks)
+        # a multiprocessor with few blocks goes through each of them faster, but does less in all
+        share = -(-rest // multiprocessors) / shape.blocks
+        work = shape.blocks * math.ceil(walk / splits / shape.warps)
+        return waves * work + (0.4 + 0.6 * share) * work * (rest > 0) + (waves + (rest > 0) + splits) * _FIXED_COST
+
+    return min(range(1, min(_MOST_SPLITS, walk) + 1), key=cost)
 
 
 # the library's rsqrtf spends as many slots on denormal distances as the pair law has left
@@ -131,7 +144,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     const REAL mz@ = row@ < row_end ? src[6 * n + column@] : 0;
     {"const REAL nx@ = SCALE * mx@, ny@ = SCALE * my@, nz@ = SCALE * mz@;" if field else ""}
     {"" if field else "const REAL tl@ = src[7 * n + column@];"}
-    REAL hx@ = 0, hy@ = 0, hz@ = 0;"""
+    REAL sum_hx@ = 0, sum_hy@ = 0, sum_hz@ = 0;"""
     )
     if field:
         apart, left_out, bounds = "true", "false", ""
@@ -157,7 +170,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     careful_pairs = each("{" + mirrored_pair(quantity, f"careful(d2, tr@ + qc.x, {left_out})", "@") + "}")
     worth = "REAL(3)"
     stores = "".join(
-        f"warp_sums[(lane + 32 * {k}) * 3 + {i}] = {worth} * h{c}{k};" for k in ks for i, c in enumerate("xyz")
+        f"warp_sums[(lane + 32 * {k}) * 3 + {i}] = {worth} * sum_h{c}{k};" for k in ks for i, c in enumerate("xyz")
     )
     return f"""
     typedef {real} REAL;
@@ -207,6 +220,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         staged_c[lane] = staged_c[lane + 32] = Quad{{radius, {0 if field else "label"}, 0, 0}};
         __syncwarp();
         REAL gx = 0, gy = 0, gz = 0;
+        {each("REAL hx@ = 0, hy@ = 0, hz@ = 0;")}
         if (fast) {{
             {each("const REAL clamp@ = (tr@ + one_radius) * (tr@ + one_radius);")}
             #pragma unroll {shape.unrolled}
@@ -224,6 +238,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
                 {hand_on}
             }}
         }}
+        {each("sum_hx@ += hx@; sum_hy@ += hy@; sum_hz@ += hz@;")}
         if (there && distance > 0) {{
             store(distance - nearest, 3 * (begin + lane), {worth} * gx);
             store(distance - nearest, 3 * (begin + lane) + 1, {worth} * gy);

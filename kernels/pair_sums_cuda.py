@@ -73,7 +73,6 @@ _INVERSE_ROOT = {
 _W = 1.0  # see pair_code
 
 
-
 def _snippet(real: str, quantity: str, shape: Shape) -> str:
     """One thread of a block."""
     field = quantity == FIELD
