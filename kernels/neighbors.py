@@ -387,7 +387,7 @@ def pair_correction(dtype, gradient: bool, exclude_body: bool):
             unit = contact_unit(targets[3, i], sources[3, j])
             m = (unit * unit * unit) * vec3(sources[4, j], sources[5, j], sources[6, j])
             r *= unit
-            g = overlap_factors(unit * unit * d2, unit * targets[3, i], unit * sources[3, j])
+            g = overlap_factors(unit * wp.sqrt(d2), unit * targets[3, i], unit * sources[3, j])
             h = field_of(g, r, m)
             for c in range(3):
                 total[c] = h[c]
