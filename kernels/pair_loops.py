@@ -9,11 +9,17 @@ loads on a GPU:
 
 A ``Rows`` object says which target sees which contiguous range of sources, and what is summed over them (the quantities
 of ``pair_code``): 4π times the field H [A/m], or 4π times (e·∇)H [A²] for an effective moment e of the target, or both,
-the latter first. The loops come in two forms behind :func:`launch_pair_loop`: the plain Warp loop, readable, exact for
-overlapping balls, and kept as the reference; and the native loops of ``pair_loops_cpu`` and ``pair_loops_cuda``, which
-evaluate the dipole clamped at contact (see ``pair_law``) and leave overlapping pairs to ``neighbors``. Sums leave in
-``partial`` rows, several per target where threads or blocks share out a target's sources; the caller's finishing kernel
-adds them up in a fixed order, so that results do not depend on scheduling.
+the latter first. There are the plain Warp loop, readable, exact for overlapping balls, and kept as the reference; and
+native code, which evaluates the dipole clamped at contact (see ``pair_law``) and leaves overlapping pairs to
+``neighbors``. Sums leave in ``partial`` rows, several per target where threads or blocks share out the pairs; the
+caller's finishing kernel adds them up in a fixed order, so that results do not depend on scheduling. On a GPU there are
+three forms, of which ``Rows`` holds the fastest that a caller allows:
+
+| form | native code | for |
+|---|---|---|
+| ``FUSED`` | ``pair_sums_cuda`` | few moments: no loop, the kernel that needs the sums makes them itself |
+| ``MIRRORED`` | ``pair_mirror_cuda`` | many moments among themselves: each pair is met once, for both of its ends |
+| ``LOOP`` | ``pair_loops_cuda``, ``pair_loops_cpu`` | anything |
 """
 
 import os

@@ -177,7 +177,6 @@ _ADD_BOTH_WAYS = f"""
             }}
             Apart now = apart(v), next = apart(v + 1);
             NUMBER inv_now = inverse_root(now.c);
-            #pragma clang loop unroll_count(3)
             for (; v < tile.vectors; ++v) {{
                 const Apart later = apart(v + 2);
                 const NUMBER inv_next = inverse_root(next.c);
