@@ -412,9 +412,11 @@ def pair_correction(dtype, gradient: bool, exclude_body: bool):
     ):
         total = sums()
         count = neighbor_count[i]
+        j = neighbor[i, share]  # before it is known to be one, so that both are waited for at once
         if count <= wp.static(CAPACITY):
             for n in range(share, count, shares):
-                j = neighbor[i, n]
+                if n > share:
+                    j = neighbor[i, n]
                 if j >= begin and j < end:
                     total += one_pair(targets, sources, i, j)
         else:

@@ -107,8 +107,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         apart = [f"(p_label.at[{v}] < lowest || p_label.at[{v}] > highest)" for v in vs]
         left_out = "label == tl@"
     apart += [f"p_radius.at[{v}] == one_radius" for v in vs]
-    row_starts = "".join(f"const char* row_{name} = (const char*)(src + {row} * ns);" for name, row in rows.items())
-    packs_loaded = "".join(f"p_{name} = *(const Pack*)(row_{name} + at);" for name in rows)
+    packs_loaded = "".join(f"p_{name} = *(const Pack*)(src + {row} * ns + j);" for name, row in rows.items())
     scaled = "const REAL ux = SCALE * bx, uy = SCALE * by, uz = SCALE * bz;"
     fast_pairs = each("{" + pair(quantity, "inverse_root(max(d2, clamp@))", "@") + "}")
     fast_sources = "".join(
@@ -147,23 +146,24 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         const REAL *src = (const REAL*)sources.data, *tgt = (const REAL*)targets.data;
         const REAL* eff = (const REAL*)effective.data;
         const bool same = src == tgt;
-        {row_starts}
         const REAL one_radius = src[3 * ns + source_begin];
-        {targets_loaded}
-        {bounds}
         // the last moment is followed by moments of nothing
         const int readable_end = source_end < sources.shape[1] ? source_end : (int)ns;
-        #pragma unroll 1
-        for (int base = source_begin / {taken} * {taken} + {32 * taken} * warp; base < source_end;
-             base += {32 * taken * warps}) {{
-            const int j = base + {taken} * lane;
-            Pack {", ".join("p_" + name for name in rows)};
-            bool fast = one_radius > 0 && j >= source_begin && j + {taken} <= readable_end;
-            if (fast) {{
-                const unsigned at = j * (unsigned)sizeof(REAL);
+        int j = source_begin / {taken} * {taken} + {taken} * thread;
+        bool loaded;
+        Pack {", ".join("p_" + name for name in rows)};
+        auto load = [&]() {{
+            loaded = j >= source_begin && j + {taken} <= readable_end;
+            if (loaded) {{
                 {packs_loaded}
-                fast = {" && ".join(apart)};
             }}
+        }};
+        load();  // before the targets, so that both are waited for at once
+        {targets_loaded}
+        {bounds}
+        #pragma unroll 1
+        for (; j - {taken} * lane < source_end; j += {32 * taken * warps}, load()) {{
+            const bool fast = loaded && one_radius > 0 && {" && ".join(apart)};
             if (__all_sync(~0u, fast)) {{
                 {fast_sources}
             }} else {{
