@@ -38,7 +38,7 @@ from warpmag.kernels.pair_loops_cuda import Shape, choose_shape, choose_splits, 
 
 PACKED_ROWS = 8
 PITCH = 128
-"""Packed rows are a multiple of so many moments apart. Beyond the last stand moments of nothing, for vector loads."""
+"""Packed rows are a multiple of so many moments apart, and as many of nothing follow the last, for vector loads."""
 EXCLUDE_NOTHING, EXCLUDE_SELF, EXCLUDE_BODY = 0, 1, 2
 """Sources that a loop leaves out: none, the target itself, or everything with the target's body label."""
 LOOP, FUSED, MIRRORED = FORMS = "loop", "fused", "mirrored"

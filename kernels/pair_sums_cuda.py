@@ -86,26 +86,24 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         return "".join(text.replace("@", k) for k in ks)
 
     effective = "" if field else "".join(f"const REAL e{c}@ = eff[{r} * ne + column@];" for r, c in enumerate("xyz"))
-    targets_loaded = each(
-        f"""
-        // targets beyond the last are the last again
-        const int column@ = column_begin + min(@, count - 1);
-        const REAL tx@ = tgt[column@], ty@ = tgt[nt + column@], tz@ = tgt[2 * nt + column@];
-        const REAL tr@ = tgt[3 * nt + column@], clamp@ = (tr@ + one_radius) * (tr@ + one_radius);
+    target = f"""
+        const REAL tx@ = tgt[column@], ty@ = tgt[nt + column@], tz@ = tgt[2 * nt + column@], tr@ = tgt[3 * nt + column@];
         {"" if field else "const REAL tl@ = tgt[7 * nt + column@];"}
         {effective}
         REAL {", ".join(f"{name}@ = 0" for name in SUMS[quantity])};"""
-    )
+    # targets beyond the last are the last again
+    targets_loaded = each(f"""
+        const int column@ = column_begin + min(@, count - 1);
+        {target}
+        const REAL clamp@ = (tr@ + one_radius) * (tr@ + one_radius);""")
     if field:
-        bounds = "const int own_begin = same ? column_begin : source_end, own_end = own_begin + count;"
-        apart = [f"(j >= own_end || j + {taken} <= own_begin)"]
-        left_out = "i == own_begin + @"
+        bounds, apart, left_out, own_left_out = "", [], "false", "i == column"
     else:
         bounds = "REAL lowest = tl0, highest = tl0;" + "".join(
             f"lowest = min(lowest, tl{k}); highest = max(highest, tl{k});" for k in ks[1:]
         )
         apart = [f"(p_label.at[{v}] < lowest || p_label.at[{v}] > highest)" for v in vs]
-        left_out = "label == tl@"
+        left_out, own_left_out = "label == tl@", "label == tl"
     apart += [f"p_radius.at[{v}] == one_radius" for v in vs]
     packs_loaded = "".join(f"p_{name} = *(const Pack*)(src + {row} * ns + j);" for name, row in rows.items())
     scaled = "const REAL ux = SCALE * bx, uy = SCALE * by, uz = SCALE * bz;"
@@ -113,14 +111,12 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     fast_sources = "".join(
         "{" + "".join(f"const REAL {name} = p_{name}.at[{v}];" for name in rows) + scaled + fast_pairs + "}" for v in vs
     )
-    careful_source = (
-        "".join(
-            f"const REAL {name} = {'i != j + v ? REAL(0) : ' if name[0] == 'b' else ''}src[{row} * ns + i];"
-            for name, row in rows.items()
-        )
-        + scaled
-    )
+    source = "".join(f"const REAL {name} = src[{row} * ns + i];" for name, row in rows.items() if name[0] != "b")
+    moment = "".join(f"const REAL b{c} = there ? src[{row} * ns + i] : 0;" for row, c in enumerate("xyz", 4)) + scaled
     careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + radius, {left_out})", "@") + "}")
+    own_target = target.replace("@", "")
+    own_pair = pair(quantity, f"careful(d2, tr + radius, {own_left_out})")
+    own_sums = "".join(f"r[{c}] += {text};" for c, text in enumerate(results(quantity, _W)))
     sums = "".join(
         f"r[{int(k) * width + c}] = {text};" for k in ks for c, text in enumerate(results(quantity, _W, k))
     ) + "".join(f"r[{c}] = 0;" for c in range(targets * width, padded * width))
@@ -139,20 +135,24 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     const int lane = thread % 32, warp = thread / 32;
     const int* t = tiles.data + {TILE_COLUMNS} * tile;
     const int count = t[1] - t[0], column_begin = t[2], source_begin = t[3], source_end = t[4];
+    const size_t ns = sources.strides[0] / sizeof(REAL), nt = targets.strides[0] / sizeof(REAL);
+    const size_t ne = effective.strides[0] / sizeof(REAL);
+    const REAL *src = (const REAL*)sources.data, *tgt = (const REAL*)targets.data, *eff = (const REAL*)effective.data;
+    // the targets themselves, with what else is taken with them, are left to the correcting warp
+    const int first = source_begin / {taken} * {taken};
+    const int own_begin = src == tgt ? min(max(column_begin / {taken} * {taken}, first), source_end) : source_end;
+    const int own_end = min(max((column_begin + count + {taken - 1}) / {taken} * {taken}, own_begin), source_end);
+    const int skipped = (own_end - own_begin + {taken - 1}) / {taken} * {taken};
     REAL r[{padded * width}];  // of all targets, target by target; then of fewer and fewer
     if (warp < {warps} && source_begin < source_end) {{
-        const size_t ns = sources.strides[0] / sizeof(REAL), nt = targets.strides[0] / sizeof(REAL);
-        const size_t ne = effective.strides[0] / sizeof(REAL);
-        const REAL *src = (const REAL*)sources.data, *tgt = (const REAL*)targets.data;
-        const REAL* eff = (const REAL*)effective.data;
-        const bool same = src == tgt;
         const REAL one_radius = src[3 * ns + source_begin];
         // the last moment is followed by moments of nothing
         const int readable_end = source_end < sources.shape[1] ? source_end : (int)ns;
-        int j = source_begin / {taken} * {taken} + {taken} * thread;
+        int walk = first + {taken} * thread, j;
         bool loaded;
         Pack {", ".join("p_" + name for name in rows)};
         auto load = [&]() {{
+            j = walk < own_begin ? walk : walk + skipped;
             loaded = j >= source_begin && j + {taken} <= readable_end;
             if (loaded) {{
                 {packs_loaded}
@@ -162,7 +162,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         {targets_loaded}
         {bounds}
         #pragma unroll 1
-        for (; j - {taken} * lane < source_end; j += {32 * taken * warps}, load()) {{
+        for (; walk - {taken} * lane < source_end - skipped; walk += {32 * taken * warps}, load()) {{
             const bool fast = loaded && one_radius > 0 && {" && ".join(apart)};
             if (__all_sync(~0u, fast)) {{
                 {fast_sources}
@@ -171,7 +171,9 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
                 for (int v = 0; v < {taken}; ++v) {{
                     // beyond the ends stand the first or the last source again, without a moment
                     const int i = min(max(j + v, source_begin), source_end - 1);
-                    {careful_source}
+                    const bool there = i == j + v;
+                    {source}
+                    {moment}
                     {careful_pairs}
                 }}
             }}
@@ -187,6 +189,17 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         {halvings}
     }} else {{
         for (int c = 0; c < {width}; ++c) r[c] = warp < {warps} ? REAL(0) : correction[c];
+        const int column = column_begin + lane / {shape.shares};
+        if (warp == {warps} && column < column_begin + count) {{
+            {own_target}
+            for (int i = max(own_begin, source_begin) + lane % {shape.shares}; i < own_end; i += {shape.shares}) {{
+                const bool there = true;
+                {source}
+                {moment}
+                {own_pair}
+            }}
+            {own_sums}
+        }}
     }}
     #pragma unroll
     for (int step = {shape.shares // 2}; step > 0; step /= 2)

@@ -39,7 +39,7 @@ class PackedMoments:
 
         self.labels = integers(np.arange(n) if labels is None else labels)
         self.groups = integers(np.zeros(n) if groups is None else groups)
-        pitched = np.zeros((pair_loops.PACKED_ROWS, -(-n // pair_loops.PITCH) * pair_loops.PITCH))
+        pitched = np.zeros((pair_loops.PACKED_ROWS, (1 + -(-n // pair_loops.PITCH)) * pair_loops.PITCH))
         pitched[3], pitched[7] = largest_radius, -1.0
         pitched = wp.array(pitched, dtype=dtype, device=device)
         self.packed: wp.array = pitched[:, :n] if n else pitched
