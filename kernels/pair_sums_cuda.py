@@ -85,17 +85,16 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     def each(text: str) -> str:
         return "".join(text.replace("@", k) for k in ks)
 
-    effective = "" if field else "".join(f"const REAL e{c}@ = eff[{r} * ne + column@];" for r, c in enumerate("xyz"))
-    target = f"""
-        const REAL tx@ = tgt[column@], ty@ = tgt[nt + column@], tz@ = tgt[2 * nt + column@], tr@ = tgt[3 * nt + column@];
-        {"" if field else "const REAL tl@ = tgt[7 * nt + column@];"}
-        {effective}
-        REAL {", ".join(f"{name}@ = 0" for name in SUMS[quantity])};"""
-    # targets beyond the last are the last again
-    targets_loaded = each(f"""
-        const int column@ = column_begin + min(@, count - 1);
-        {target}
-        const REAL clamp@ = (tr@ + one_radius) * (tr@ + one_radius);""")
+    # what is read of a target, and where it is
+    target = {"tx": "tgt[0 * nt", "ty": "tgt[1 * nt", "tz": "tgt[2 * nt", "tr": "tgt[3 * nt"}
+    if not field:
+        target |= {"tl": "tgt[7 * nt", "ex": "eff[0 * ne", "ey": "eff[1 * ne", "ez": "eff[2 * ne"}
+    target_loaded = "".join(f"const REAL {name} = {place} + column];" for name, place in target.items())
+    targets_shared = each(
+        "".join(f"const REAL {name}@ = __shfl_sync(~0u, {name}, @);" for name in target)
+        + f"REAL {', '.join(f'{name}@ = 0' for name in SUMS[quantity])};"
+        + "const REAL clamp@ = (tr@ + one_radius) * (tr@ + one_radius);"
+    )
     if field:
         bounds, apart, left_out, own_left_out = "", [], "false", "i == column"
     else:
@@ -114,7 +113,6 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     source = "".join(f"const REAL {name} = src[{row} * ns + i];" for name, row in rows.items() if name[0] != "b")
     moment = "".join(f"const REAL b{c} = there ? src[{row} * ns + i] : 0;" for row, c in enumerate("xyz", 4)) + scaled
     careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + radius, {left_out})", "@") + "}")
-    own_target = target.replace("@", "")
     own_pair = pair(quantity, f"careful(d2, tr + radius, {own_left_out})")
     own_sums = "".join(f"r[{c}] += {text};" for c, text in enumerate(results(quantity, _W)))
     sums = "".join(
@@ -143,6 +141,9 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     const int own_begin = src == tgt ? min(max(column_begin / {taken} * {taken}, first), source_end) : source_end;
     const int own_end = min(max((column_begin + count + {taken - 1}) / {taken} * {taken}, own_begin), source_end);
     const int skipped = (own_end - own_begin + {taken - 1}) / {taken} * {taken};
+    // a lane reads one target; those beyond the last are the last again
+    const int own = warp < {warps} ? lane : lane / {shape.shares}, column = column_begin + min(own, count - 1);
+    {target_loaded}
     REAL r[{padded * width}];  // of all targets, target by target; then of fewer and fewer
     if (warp < {warps} && source_begin < source_end) {{
         const REAL one_radius = src[3 * ns + source_begin];
@@ -158,8 +159,8 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
                 {packs_loaded}
             }}
         }};
-        load();  // before the targets, so that both are waited for at once
-        {targets_loaded}
+        load();  // before the targets are wanted, so that both are waited for at once
+        {targets_shared}
         {bounds}
         #pragma unroll 1
         for (; walk - {taken} * lane < source_end - skipped; walk += {32 * taken * warps}, load()) {{
@@ -189,9 +190,8 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         {halvings}
     }} else {{
         for (int c = 0; c < {width}; ++c) r[c] = warp < {warps} ? REAL(0) : correction[c];
-        const int column = column_begin + lane / {shape.shares};
-        if (warp == {warps} && column < column_begin + count) {{
-            {own_target}
+        if (warp == {warps} && own < count) {{
+            REAL {", ".join(f"{name} = 0" for name in SUMS[quantity])};
             for (int i = max(own_begin, source_begin) + lane % {shape.shares}; i < own_end; i += {shape.shares}) {{
                 const bool there = true;
                 {source}
