@@ -11,6 +11,7 @@ a constant of the target and nothing is masked: 20 instructions a pair for the f
 ten or so that a source takes once for all targets.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -24,26 +25,38 @@ class Shape:
     """Shape of the blocks that walk a work list.
 
     Attributes:
-        targets: Targets of a block, up to 16.
-        warps: Warps of a block that share out the sources.
+        targets: Targets of a block.
+        groups: Groups of them that each have warps of their own, which hold up to 16 targets.
+        warps: Warps of a group that share out the sources.
         sources: Sources that a lane takes at a time; 1, 2 or 4.
         blocks: Blocks that a multiprocessor holds at once, in float32.
     """
 
     targets: int
+    groups: int
     warps: int
     sources: int
     blocks: int
 
     @property
+    def summing(self) -> int:
+        """Threads of a block that sum."""
+        return 32 * self.groups * self.warps
+
+    @property
+    def correcting(self) -> int:
+        """Threads of a block that correct, after those that sum."""
+        return 32 * math.ceil(self.targets / 16)
+
+    @property
     def threads(self) -> int:
-        """Threads of a block, those of the correcting warp included."""
-        return 32 * (self.warps + 1)
+        """Threads of a block."""
+        return self.summing + self.correcting
 
     @property
     def shares(self) -> int:
-        """Lanes of a warp that end with the sums of one target, and threads that share out its corrections."""
-        return 32 >> (self.targets - 1).bit_length()
+        """Threads that share out the corrections of a target, a power of two."""
+        return min(32, 1 << (self.correcting // self.targets).bit_length() - 1)
 
     def launch_bounds(self, dtype) -> tuple[int, int]:
         """Bounds of a kernel: threads of a block, and blocks that a multiprocessor holds at once."""
@@ -52,9 +65,9 @@ class Shape:
 
 # Measured on an H200: the shape, and the most targets that it is best for.
 _SHAPES = {
-    FIELD: ((512, Shape(1, 2, 2, 8)), (None, Shape(4, 4, 2, 5))),
-    FORCE: ((512, Shape(1, 2, 2, 8)), (None, Shape(4, 4, 2, 4))),
-    WRENCH: ((512, Shape(1, 2, 2, 8)), (None, Shape(4, 4, 2, 3))),
+    FIELD: ((700, Shape(2, 1, 4, 2, 6)), (None, Shape(5, 1, 3, 4, 4))),
+    FORCE: ((700, Shape(2, 1, 4, 2, 4)), (None, Shape(4, 1, 3, 2, 5))),
+    WRENCH: ((700, Shape(2, 1, 4, 2, 4)), (None, Shape(4, 1, 3, 2, 4))),
 }
 
 
@@ -76,9 +89,10 @@ _W = 1.0  # see pair_code
 def _snippet(real: str, quantity: str, shape: Shape) -> str:
     """One thread of a block."""
     field = quantity == FIELD
-    targets, warps, width, taken = shape.targets, shape.warps, WIDTHS[quantity], shape.sources
-    padded = 32 // shape.shares  # targets, so many that halving ends with one
-    ks, vs = [str(k) for k in range(targets)], range(taken)
+    groups, warps, width, taken = shape.groups, shape.warps, WIDTHS[quantity], shape.sources
+    held = shape.targets // groups
+    padded = 1 << (held - 1).bit_length()  # targets, so many that halving ends with one
+    ks, vs = [str(k) for k in range(held)], range(taken)
     # what is read of a source, and in which packed row it is
     rows = {"ax": 0, "ay": 1, "az": 2, "radius": 3, "bx": 4, "by": 5, "bz": 6, **({} if field else {"label": 7})}
 
@@ -117,7 +131,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     own_sums = "".join(f"r[{c}] += {text};" for c, text in enumerate(results(quantity, _W)))
     sums = "".join(
         f"r[{int(k) * width + c}] = {text};" for k in ks for c, text in enumerate(results(quantity, _W, k))
-    ) + "".join(f"r[{c}] = 0;" for c in range(targets * width, padded * width))
+    ) + "".join(f"r[{c}] = 0;" for c in range(held * width, padded * width))
     halvings = "".join(f"halve({padded * width >> level}, {32 >> level});" for level in range(1, padded.bit_length()))
     return f"""
     typedef {real} REAL;
@@ -129,27 +143,33 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         return c > 0 && !left_out ? inverse_root(c) : REAL(0);
     }};
     struct alignas({taken} * sizeof(REAL)) Pack {{ REAL at[{taken}]; }};
-    __shared__ REAL sums[{warps + 1}][{padded}][{width}];
+    __shared__ REAL sums[{groups * warps}][{padded}][{width}], corrections[{shape.targets}][{width}];
     const int lane = thread % 32, warp = thread / 32;
+    const bool summing = thread < {shape.summing};
     const int* t = tiles.data + {TILE_COLUMNS} * tile;
     const int count = t[1] - t[0], column_begin = t[2], source_begin = t[3], source_end = t[4];
     const size_t ns = sources.strides[0] / sizeof(REAL), nt = targets.strides[0] / sizeof(REAL);
     const size_t ne = effective.strides[0] / sizeof(REAL);
     const REAL *src = (const REAL*)sources.data, *tgt = (const REAL*)targets.data, *eff = (const REAL*)effective.data;
-    // the targets themselves, with what else is taken with them, are left to the correcting warp
-    const int first = source_begin / {taken} * {taken};
-    const int own_begin = src == tgt ? min(max(column_begin / {taken} * {taken}, first), source_end) : source_end;
-    const int own_end = min(max((column_begin + count + {taken - 1}) / {taken} * {taken}, own_begin), source_end);
-    const int skipped = (own_end - own_begin + {taken - 1}) / {taken} * {taken};
     // a lane reads one target; those beyond the last are the last again
-    const int own = warp < {warps} ? lane : lane / {shape.shares}, column = column_begin + min(own, count - 1);
+    const int group = warp / {warps};
+    const int own = summing ? group * {held} + min(lane, {held - 1}) : (thread - {shape.summing}) / {shape.shares};
+    const int column = column_begin + min(own, count - 1);
     {target_loaded}
+    // the targets of a group, with what else is taken with them, are left to the correcting threads
+    const int first = source_begin / {taken} * {taken}, group_begin = column_begin + own / {held} * {held};
+    const int group_end = min(group_begin + {held}, column_begin + count);
+    const int own_begin = src == tgt ? min(max(group_begin / {taken} * {taken}, first), source_end) : source_end;
+    const int own_end = min(max((group_end + {taken - 1}) / {taken} * {taken}, own_begin), source_end);
+    const int skipped = (own_end - own_begin + {taken - 1}) / {taken} * {taken};
     REAL r[{padded * width}];  // of all targets, target by target; then of fewer and fewer
-    if (warp < {warps} && source_begin < source_end) {{
+    #pragma unroll
+    for (int c = 0; c < {width}; ++c) r[c] = summing ? REAL(0) : correction[c];
+    if (summing && group_begin < group_end && source_begin < source_end) {{
         const REAL one_radius = src[3 * ns + source_begin];
         // the last moment is followed by moments of nothing
         const int readable_end = source_end < sources.shape[1] ? source_end : (int)ns;
-        int walk = first + {taken} * thread, j;
+        int walk = first + {taken} * (thread % {32 * warps}), j;
         bool loaded;
         Pack {", ".join("p_" + name for name in rows)};
         auto load = [&]() {{
@@ -188,30 +208,38 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
             }}
         }};
         {halvings}
-    }} else {{
-        for (int c = 0; c < {width}; ++c) r[c] = warp < {warps} ? REAL(0) : correction[c];
-        if (warp == {warps} && own < count) {{
-            REAL {", ".join(f"{name} = 0" for name in SUMS[quantity])};
-            for (int i = max(own_begin, source_begin) + lane % {shape.shares}; i < own_end; i += {shape.shares}) {{
-                const bool there = true;
-                {source}
-                {moment}
-                {own_pair}
-            }}
-            {own_sums}
+    }} else if (!summing && own < count) {{
+        REAL {", ".join(f"{name} = 0" for name in SUMS[quantity])};
+        for (int i = max(own_begin, source_begin) + thread % {shape.shares}; i < own_end; i += {shape.shares}) {{
+            const bool there = true;
+            {source}
+            {moment}
+            {own_pair}
         }}
+        {own_sums}
     }}
-    #pragma unroll
-    for (int step = {shape.shares // 2}; step > 0; step /= 2)
+    auto add_lanes = [&](int lanes) {{
         #pragma unroll
-        for (int c = 0; c < {width}; ++c) r[c] += __shfl_xor_sync(~0u, r[c], step);
-    if (lane % {shape.shares} == 0)
-        for (int c = 0; c < {width}; ++c) sums[warp][lane / {shape.shares}][c] = r[c];
+        for (int step = lanes / 2; step > 0; step /= 2)
+            #pragma unroll
+            for (int c = 0; c < {width}; ++c) r[c] += __shfl_xor_sync(~0u, r[c], step);
+    }};
+    if (summing) {{
+        add_lanes({32 // padded});
+        if (lane % {32 // padded} == 0)
+            for (int c = 0; c < {width}; ++c) sums[warp][lane / {32 // padded}][c] = r[c];
+    }} else {{
+        add_lanes({shape.shares});
+        if (thread % {shape.shares} == 0 && own < count)
+            for (int c = 0; c < {width}; ++c) corrections[own][c] = r[c];
+    }}
     __syncthreads();
     wp::vec_t<{width}, REAL> total;
-    if (thread < {targets}) {{
-        for (int w = 0; w < {warps + 1}; ++w)
-            for (int c = 0; c < {width}; ++c) total[c] += sums[w][thread][c];
+    if (thread < count) {{
+        for (int c = 0; c < {width}; ++c) {{
+            total[c] = corrections[thread][c];
+            for (int w = 0; w < {warps}; ++w) total[c] += sums[thread / {held} * {warps} + w][thread % {held}][c];
+        }}
     }}
     return total;
     """
@@ -254,11 +282,10 @@ def target_share(shape: Shape):
 
     @wp.func
     def share_of(tile: int, thread: int, tiles: wp.array2d[int]):
-        lane = thread - wp.static(32 * shape.warps)
-        k = lane // wp.static(shape.shares)
+        k = (thread - wp.static(shape.summing)) // wp.static(shape.shares)
         i = -1
-        if lane >= 0 and k < tiles[tile, 1] - tiles[tile, 0]:
+        if thread >= wp.static(shape.summing) and k < tiles[tile, 1] - tiles[tile, 0]:
             i = tiles[tile, 2] + k
-        return i, lane % wp.static(shape.shares)
+        return i, thread % wp.static(shape.shares)
 
     return share_of
