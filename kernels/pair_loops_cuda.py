@@ -14,7 +14,18 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pair_code import FIELD, FORCE, SUMS, TILE_COLUMNS, WIDTHS, WRENCH, pair, results, scaled_moment
+from warpmag.kernels.pair_code import (
+    FIELD,
+    FORCE,
+    SUMS,
+    TILE_COLUMNS,
+    WIDTHS,
+    WRENCH,
+    cuda_head,
+    pair,
+    results,
+    scaled_moment,
+)
 
 
 @dataclass(frozen=True)
@@ -72,12 +83,6 @@ def choose_splits(shape: Shape, tiles: int, longest: int, multiprocessors: int) 
 _STAGES_PER_SUM = 16
 """Stages after which a warp adds what it has summed to a second set of sums, so that long sums keep their digits."""
 
-# the library's rsqrtf spends as many slots on denormal distances as the pair law has left
-_INVERSE_ROOT = {
-    "float": """
-    auto inverse_root = [](float c) { float y; asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c)); return y; };""",
-    "double": "auto inverse_root = [](double c) { return rsqrt(c); };",
-}
 
 _W = 1.0  # see pair_code
 
@@ -134,14 +139,8 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
         for c, text in enumerate(results(quantity, _W, k))
     )
     return f"""
-    typedef {real} REAL;
-    typedef REAL NUMBER;
+    {cuda_head(real)}
     constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
-    {_INVERSE_ROOT[real]}
-    auto careful = [&](REAL d2, REAL s, bool left_out) {{
-        const REAL c = max(d2, s * s);
-        return c > 0 && !left_out ? inverse_root(c) : REAL(0);
-    }};
     struct alignas(16) Quad {{ REAL x, y, z, w; }};
     __shared__ Quad staging[{warps}][{staging}];  // of each warp, for its sources, and at the end for its sums
     const int lane = thread % 32, warp = thread / 32 % {warps};

@@ -20,7 +20,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pair_code import FIELD, KELVIN, mirrored_pair, scaled_moment
+from warpmag.kernels.pair_code import FIELD, KELVIN, cuda_head, mirrored_pair, scaled_moment
 
 
 @dataclass(frozen=True)
@@ -119,14 +119,6 @@ def _choose_splits(shape: Shape, tiles: int, walk: int, multiprocessors: int) ->
     return min(range(1, min(_MOST_SPLITS, walk) + 1), key=cost)
 
 
-# the library's rsqrtf spends as many slots on denormal distances as the pair law has left
-_INVERSE_ROOT = {
-    "float": """
-    auto inverse_root = [](float c) { float y; asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c)); return y; };""",
-    "double": "auto inverse_root = [](double c) { return rsqrt(c); };",
-}
-
-
 def _snippet(real: str, quantity: str, shape: Shape) -> str:
     """One thread of a block."""
     field = quantity == FIELD
@@ -177,14 +169,8 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
         f"warp_sums[(lane + 32 * {k}) * 3 + {i}] = {worth} * {h}{c}{k};" for k in ks for i, c in enumerate("xyz")
     )
     return f"""
-    typedef {real} REAL;
-    typedef REAL NUMBER;
+    {cuda_head(real)}
     constexpr REAL SCALE = {scaled_moment(FIELD, 1.0)!r};
-    {_INVERSE_ROOT[real]}
-    auto careful = [&](REAL d2, REAL s, bool left_out) {{
-        const REAL c = max(d2, s * s);
-        return c > 0 && !left_out ? inverse_root(c) : REAL(0);
-    }};
     struct alignas(16) Quad {{ REAL x, y, z, w; }};
     // of each warp, for the moments of a stage, twice over, and at the end for its sums
     __shared__ Quad staging[{warps}][{max(192, 24 * held)}];

@@ -17,7 +17,18 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pair_code import FIELD, FORCE, SUMS, TILE_COLUMNS, WIDTHS, WRENCH, pair, results, scaled_moment
+from warpmag.kernels.pair_code import (
+    FIELD,
+    FORCE,
+    SUMS,
+    TILE_COLUMNS,
+    WIDTHS,
+    WRENCH,
+    cuda_head,
+    pair,
+    results,
+    scaled_moment,
+)
 
 
 @dataclass(frozen=True)
@@ -76,13 +87,6 @@ def choose_shape(quantity: str, count: int) -> Shape:
     return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
 
 
-# the library's rsqrtf spends as many slots on denormal distances as the pair law has left
-_INVERSE_ROOT = {
-    "float": """
-    auto inverse_root = [](float c) { float y; asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c)); return y; };""",
-    "double": "auto inverse_root = [](double c) { return rsqrt(c); };",
-}
-
 _W = 1.0  # see pair_code
 
 
@@ -134,14 +138,8 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     ) + "".join(f"r[{c}] = 0;" for c in range(held * width, padded * width))
     halvings = "".join(f"halve({padded * width >> level}, {32 >> level});" for level in range(1, padded.bit_length()))
     return f"""
-    typedef {real} REAL;
-    typedef REAL NUMBER;
+    {cuda_head(real)}
     constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
-    {_INVERSE_ROOT[real]}
-    auto careful = [&](REAL d2, REAL s, bool left_out) {{
-        const REAL c = max(d2, s * s);
-        return c > 0 && !left_out ? inverse_root(c) : REAL(0);
-    }};
     struct alignas({taken} * sizeof(REAL)) Pack {{ REAL at[{taken}]; }};
     __shared__ REAL sums[{groups * warps}][{padded}][{width}], corrections[{shape.targets}][{width}];
     const int lane = thread % 32, warp = thread / 32;
