@@ -31,7 +31,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels import pair_mirror_cuda, pair_sums_cuda
-from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS
+from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS, WRENCH
 from warpmag.kernels.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
 from warpmag.kernels.pair_loops_cpu import MOST_THREADS, STRIPE, launch_pair_loop_cpu
 from warpmag.kernels.pair_loops_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
@@ -46,8 +46,8 @@ LOOP, FUSED, MIRRORED = FORMS = "loop", "fused", "mirrored"
 each pair of moments once, for both of its ends."""
 
 # Measured on an H200: the most targets for which the fused form is best, and the fewest for which the mirrored is.
-_MOST_FUSED = 20000
-_LEAST_MIRRORED = {FIELD: 6000, KELVIN: 6000}
+_MOST_FUSED = {FIELD: 7000, FORCE: 3000, KELVIN: 3000, WRENCH: 3000}
+_LEAST_MIRRORED = {FIELD: 7000, KELVIN: 3000}
 
 _PAIRS_PER_START = 200_000
 """Pairs that a CPU sums while another of its threads starts: 50 µs, most of it to wake a core."""
@@ -161,7 +161,7 @@ def _choose_form(segments, quantity, forms) -> str:
     mutual = quantity in _LEAST_MIRRORED and len(segments) == 1 and (segments[0, :2] == segments[0, 2:]).all()
     if MIRRORED in forms and mutual and (count >= _LEAST_MIRRORED[quantity] or len(forms) == 1):
         return MIRRORED
-    if FUSED in forms and (count <= _MOST_FUSED or LOOP not in forms):
+    if FUSED in forms and (count <= _MOST_FUSED[quantity] or LOOP not in forms):
         return FUSED
     return LOOP
 

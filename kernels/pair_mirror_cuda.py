@@ -40,11 +40,15 @@ class Shape:
     unrolled: int
 
 
-# Measured on an H200 at 5,000 to 131,072 moments.
-SHAPES = {FIELD: Shape(4, 4, 4, 1), KELVIN: Shape(4, 4, 4, 1)}
+# Measured on an H200 at 5,000 to 131,072 moments: the shape, and the most moments that it is best for.
+_SHAPES = {
+    FIELD: ((30000, Shape(4, 4, 4, 1)), (None, Shape(6, 4, 3, 2))),
+    KELVIN: ((None, Shape(4, 4, 4, 1)),),
+}
 _SLAB_BYTES = 2**28
 """Memory that slabs may take."""
-_MOST_SPLITS = 32
+_MOST_SPLITS, _MOST_STAGES = 32, 32
+"""Blocks that share the walk of a tile, and stages that a warp sums in one piece: longer sums would lose digits."""
 _FIXED_COST = 0.1
 """Time that a block takes to start and to end, and that a split takes to be added up, in stages of a warp."""
 
@@ -78,7 +82,7 @@ class Mirror:
 
 def make_mirror(origin: int, count: int, quantity: str, device) -> Mirror:
     """Plan the walk of ``count`` moments from packed column ``origin`` on."""
-    shape = SHAPES[quantity]
+    shape = next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
     tiles = max(math.ceil(count / (32 * shape.moments)), 3)
     tiles += 1 - tiles % 2
     stages = math.ceil(math.ceil(count / tiles) / 32)
@@ -116,7 +120,8 @@ def _choose_splits(shape: Shape, tiles: int, walk: int, multiprocessors: int) ->
         work = shape.blocks * math.ceil(walk / splits / shape.warps)
         return waves * work + (0.4 + 0.6 * share) * work * (rest > 0) + (waves + (rest > 0) + splits) * _FIXED_COST
 
-    return min(range(1, min(_MOST_SPLITS, walk) + 1), key=cost)
+    least = math.ceil(walk / shape.warps / _MOST_STAGES)
+    return min(range(least, max(least, min(_MOST_SPLITS, walk)) + 1), key=cost)
 
 
 def _snippet(real: str, quantity: str, shape: Shape) -> str:

@@ -76,9 +76,9 @@ class Shape:
 
 # Measured on an H200: the shape, and the most targets that it is best for.
 _SHAPES = {
-    FIELD: ((700, Shape(2, 1, 4, 2, 6)), (None, Shape(5, 1, 3, 4, 4))),
-    FORCE: ((700, Shape(2, 1, 4, 2, 4)), (None, Shape(4, 1, 3, 2, 5))),
-    WRENCH: ((700, Shape(2, 1, 4, 2, 4)), (None, Shape(4, 1, 3, 2, 4))),
+    FIELD: ((350, Shape(2, 1, 4, 2, 6)), (1500, Shape(4, 1, 8, 2, 2)), (None, Shape(5, 1, 3, 4, 4))),
+    FORCE: ((700, Shape(2, 1, 4, 2, 4)), (1500, Shape(4, 1, 4, 2, 2)), (None, Shape(20, 5, 2, 4, 1))),
+    WRENCH: ((700, Shape(2, 1, 4, 2, 4)), (1500, Shape(4, 1, 4, 2, 2)), (None, Shape(4, 1, 3, 2, 4))),
 }
 
 
