@@ -6,8 +6,11 @@
 | zeeman | F = μ0 V [f'(H) ∇H (2M + H) + ∇H M] | Eq. 4 |
 
 Both are μ0 (e·∇)H for an effective moment e, m or m + f'(H)(2m + V H), which the pair loop contracts with as it sums.
-The torque on a moment is τ = μ0 m × H. The moments of one body make neither force nor torque on each other: what they
-would add up to is zero, and rounding must not make it otherwise.
+The torque on a moment is τ = μ0 e × H. The moments of one body make neither force nor torque on each other: with
+Kelvin's law what they would add up to is zero, and rounding must not make it otherwise. With Eq. 4 the paper, which
+handles no torque, sums pairs of one body, too (Algorithm 1). In equilibrium the two agree: e is λm with λ of 1 to 8 and
+m is parallel to the whole field, so that the body's own pairs turn it by −λm × H_own = λm × H, as far as λ is one
+number in the body; where it is not, they also push it, which no body can do to itself.
 """
 
 from dataclasses import dataclass
@@ -132,8 +135,8 @@ def _wrench_kernel(dtype, quantity: str):
         torque = vec3()
         if wp.static(summed_field):
             if twisted[i] == 1:
-                m = vec3(packed[4, i], packed[5, i], packed[6, i])
-                torque = dtype(wp.static(MU0)) * wp.cross(m, dtype(wp.static(INVERSE_4PI)) * h + external_field[i])
+                e = vec3(effective[0, i], effective[1, i], effective[2, i])
+                torque = dtype(wp.static(MU0)) * wp.cross(e, dtype(wp.static(INVERSE_4PI)) * h + external_field[i])
         torque_out[i] = torque
 
     return finish_wrench
