@@ -45,6 +45,7 @@ def run(output: Output):
 
 
 def _text(rows, seconds) -> str:
+    saturation, moment = (SATURATED["alphabets"][name] for name in ("saturation", "moment"))
     return f"""## Stability: the dynamic scenes for {seconds:g} s
 
 **Paper:** in Balls Up the balls do not settle down with kim2018 and do with the paper's method, in Alphabets they are
@@ -57,6 +58,6 @@ Eq. 4 is λ times Kelvin's force on each moment, λ from 8 in weak fields to 1 i
 different λ, action is not reaction, and momentum comes from nothing: a free magnet and the balls on its one side drag
 each other along, heaps spin up. The paper gives no strengths; its "excessively strong" magnets, and its argument that
 f'(H) falls as M grows (section 6.1), are about saturation. "Saturated" are the same scenes with iron that saturates at
-{SATURATED["balls_up"]["saturation"]:g} A/m in place of 1.7e6 and, in Alphabets, a moment of {SATURATED["alphabets"]["moment"]:g} A·m² in place of 12.
+{saturation:g} A/m in place of 1.7e6 and, in Alphabets, a moment of {moment:g} A·m² in place of 12.
 
 {table(["scene", "method", *outcome_head()], rows)}"""

@@ -103,6 +103,7 @@ def run_trial(trial: Trial) -> dict:
         "magnets": figures.magnets,
         "held": figures.held,
         "held_rms_speed": figures.held_rms_speed,
+        "held_median_speed": figures.held_median_speed,
         "rms_speed": figures.rms_speed,
         "peak_speed": figures.peak_speed,
         "overlap": figures.overlap,
@@ -129,7 +130,16 @@ def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
 def outcome_head() -> list[str]:
     """Column heads of :func:`outcome_cells`."""
     head = ["substeps per step", "field evaluations per substep", "substeps not converged", "held"]
-    return [*head, "RMS speed of these [cm/s]", "of all [cm/s]", "peak [m/s]", "farthest [m]", "penetration", "end"]
+    return [
+        *head,
+        "RMS speed of these [cm/s]",
+        "median",
+        "of all, RMS",
+        "peak [m/s]",
+        "farthest [m]",
+        "penetration",
+        "end",
+    ]
 
 
 def outcome_cells(values: dict) -> list[str]:
@@ -140,6 +150,7 @@ def outcome_cells(values: dict) -> list[str]:
         f"{100.0 * values['unconverged']:.0f} %",
         f"{values['held']} of {values['magnets']}" if values["held"] else "",
         f"{100.0 * values['held_rms_speed']:.2f}" if values["held"] else "",
+        f"{100.0 * values['held_median_speed']:.2f}" if values["held"] else "",
         f"{100.0 * values['rms_speed']:.2f}",
         f"{values['peak_speed']:.2f}",
         f"{values['farthest']:.3f}",
