@@ -6,8 +6,11 @@
 | zeeman | F = μ0 V [f'(H) ∇H (2M + H) + ∇H M] | Eq. 4 |
 
 Both are μ0 (e·∇)H for an effective moment e, m or m + f'(H)(2m + V H), which the pair loop contracts with as it sums.
-The torque on a moment is τ = μ0 m × H. The moments of one body make neither force nor torque on each other: what they
-would add up to is zero, and rounding must not make it otherwise.
+The torque on a moment is τ = μ0 e × H. The moments of one body make neither force nor torque on each other: with
+Kelvin's law what they would add up to is zero, and rounding must not make it otherwise. With Eq. 4 the paper, which
+handles no torque, sums pairs of one body, too (Algorithm 1). In equilibrium the two agree: e is λm with λ of 1 to 8 and
+m is parallel to the whole field, so that the body's own pairs turn it by −λm × H_own = λm × H, as far as λ is one
+number in the body; where it is not, they also push it, which no body can do to itself.
 """
 
 from dataclasses import dataclass
@@ -128,7 +131,7 @@ def _wrench_functions(dtype, quantity: str):
     def store(
         i: int,
         total: sums,
-        packed: wp.array2d[dtype],
+        effective: wp.array2d[dtype],
         external_field: wp.array[vec3],
         twisted: wp.array[int],
         force_out: wp.array[vec3],
@@ -138,9 +141,9 @@ def _wrench_functions(dtype, quantity: str):
         torque = vec3()
         if wp.static(summed_field):
             if twisted[i] == 1:
-                m = vec3(packed[4, i], packed[5, i], packed[6, i])
+                e = vec3(effective[0, i], effective[1, i], effective[2, i])
                 h = dtype(wp.static(INVERSE_4PI)) * vec3(total[3], total[4], total[5]) + external_field[i]
-                torque = dtype(wp.static(MU0)) * wp.cross(m, h)
+                torque = dtype(wp.static(MU0)) * wp.cross(e, h)
         torque_out[i] = torque
 
     return correct, store
@@ -174,7 +177,7 @@ def _finish_kernel(dtype, quantity: str):
         for split in range(partial.shape[0]):
             for c in range(wp.static(WIDTHS[quantity])):
                 total[c] += partial[split, row, c]
-        store(i, total, packed, external_field, twisted, force_out, torque_out)
+        store(i, total, effective, external_field, twisted, force_out, torque_out)
 
     return finish_wrench
 
@@ -214,7 +217,7 @@ def _sum_kernel(dtype, quantity: str, shape: Shape):
         total = sum_pairs(tile, thread, tiles, packed, packed, effective, correction)
         i = own_target(tile, thread, tiles)
         if i >= 0:
-            store(i, total, packed, external_field, twisted, force_out, torque_out)
+            store(i, total, effective, external_field, twisted, force_out, torque_out)
 
     return sum_wrench
 

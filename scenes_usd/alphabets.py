@@ -46,6 +46,7 @@ def author(
     moment_spacing: float = 0.004,
     moment: float = 12.0,
     core: float = 0.03,
+    saturation: float = 1.7e6,
     friction: float = 0.4,
 ) -> None:
     """Write the stage to ``path``.
@@ -60,6 +61,7 @@ def author(
         moment_spacing: Distance between the moments of a letter [m].
         moment: The invisible moment, along z [A·m²].
         core: Radius of the ball that it is spread over, which nothing collides with [m].
+        saturation: Saturation magnetization of the letters [A/m].
         friction: Coefficient of friction of the letters.
     """
     for name, value in (("columns", columns), ("rows", rows), ("layers", layers)):
@@ -87,7 +89,7 @@ def author(
         body.GetInherits().AddInherit(_class_of(letter))
         UsdPhysics.MassAPI.Apply(body).CreateMassAttr(authoring.IRON_DENSITY * shapes[letter][1])
         UsdShade.MaterialBindingAPI.Apply(body).Bind(paints[number % len(paints)])
-        author_magnet(body, Magnet(moment_spacing=moment_spacing))
+        author_magnet(body, Magnet(moment_spacing=moment_spacing, saturation=saturation))
     _add_center(stage, moment, core)
     reach = 0.5 * float(np.linalg.norm(pitch * (columns, layers, rows)))
     authoring.add_camera(stage, (1.5 * reach, -3.8 * reach, 0.9 * reach), (0.0, 0.0, 0.0))

@@ -19,6 +19,7 @@ def author(
     rows: int = 9,
     layers: int = 3,
     radius: float = 0.005,
+    saturation: float = 1.7e6,
     magnet_size: float = 0.04,
     magnetization: float = 1e6,
     height: float = 0.051,
@@ -31,6 +32,7 @@ def author(
         rows: Balls along y.
         layers: Balls along z; the lowest layer rests on the ground.
         radius: Radius of the balls [m].
+        saturation: Saturation magnetization of the balls [A/m].
         magnet_size: Edge of the magnet [m].
         magnetization: Magnetization of the magnet along z [A/m].
         height: Centre of the magnet above the ground [m].
@@ -62,10 +64,11 @@ def author(
         motion=authoring.KINEMATIC,
     )
     UsdGeom.Scope.Define(stage, "/World/Balls")
+    ball_magnet = Magnet(saturation=saturation)
     places = [(x, y, z) for z in range(layers) for y in range(rows) for x in range(columns)]
     for number, (x, y, z) in enumerate(places):
         position = ((x - 0.5 * (columns - 1)) * pitch, (y - 0.5 * (rows - 1)) * pitch, radius + z * pitch)
-        authoring.add_ball(stage, f"/World/Balls/Ball_{number:04d}", position, radius, iron, magnet=Magnet())
+        authoring.add_ball(stage, f"/World/Balls/Ball_{number:04d}", position, radius, iron, magnet=ball_magnet)
     authoring.add_camera(stage, (0.28, -0.36, 0.2), (0.0, 0.0, 0.5 * height))
     authoring.add_lights(stage)
     authoring.save(stage, path)

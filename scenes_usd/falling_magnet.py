@@ -20,6 +20,7 @@ def author(
     balls: int = 1032,
     layers: int = 6,
     radius: float = 0.005,
+    saturation: float = 1.7e6,
     magnet_radius: float = 0.02,
     magnet_density: float = 7500.0,
     magnetization: float = 1e6,
@@ -33,6 +34,7 @@ def author(
         balls: Number of balls.
         layers: Layers of the stack, at most.
         radius: Radius of the balls [m].
+        saturation: Saturation magnetization of the balls [A/m].
         magnet_radius: Radius of the magnet [m].
         magnet_density: Density of the magnet [kg/m³].
         magnetization: Magnetization of the magnet, along z [A/m].
@@ -65,8 +67,9 @@ def author(
     authoring.add_ground(stage, ground, size=2.0)
     positions = stack(balls, layers, radius)
     UsdGeom.Scope.Define(stage, "/World/Balls")
+    ball_magnet = Magnet(saturation=saturation)
     for number, position in enumerate(positions):
-        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=Magnet())
+        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
     top = float(positions[:, 2].max()) + radius
     authoring.add_ball(
         stage,

@@ -67,6 +67,7 @@ def author(
     balls: int = 2500,
     branches: int = 180,
     radius: float = 0.005,
+    saturation: float = 1.7e6,
     height: float = 0.4,
     bud_radius: float = 0.004,
     magnetization: float = 6e6,
@@ -81,6 +82,7 @@ def author(
         balls: Number of balls.
         branches: Ends of branches, at most: fewer where the crown has no room.
         radius: Radius of the balls [m].
+        saturation: Saturation magnetization of the balls [A/m].
         height: Height of the tree [m].
         bud_radius: Radius of the magnets at the ends of the branches [m].
         magnetization: Magnetization of these magnets, along the branch [A/m].
@@ -112,8 +114,9 @@ def author(
     authoring.add_ground(stage, ground, size=10.0 * height)
     _add_tree(stage, tree, bark, bud, bud_radius, magnetization)
     UsdGeom.Scope.Define(stage, "/World/Balls")
+    ball_magnet = Magnet(saturation=saturation)
     for number, position in enumerate(rain(balls, radius, spacing, height, np.random.default_rng(seed))):
-        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=Magnet())
+        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
     authoring.add_camera(stage, (1.3 * height, -4.6 * height, 1.2 * height), (0.0, 0.0, 0.8 * height))
     authoring.add_lights(stage)
     authoring.save(stage, path)

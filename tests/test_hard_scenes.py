@@ -7,7 +7,6 @@ import warp as wp
 
 import warpmag
 from warpmag.errors import SimulationError
-from warpmag.scenes_usd import balls_up
 
 R = 0.005  # m
 G = 9.81  # m/s²
@@ -142,11 +141,32 @@ def test_balls_of_a_gas_of_denormal_speed(device):
     assert spread(run(builder, device, 0.005)) < 0.03
 
 
+def test_a_chain_of_1000_balls(device):
+    """A crooked chain of touching balls along the field, 10 m long, neither breaks nor folds up."""
+    builder = new_builder(ground=False)
+    builder.gravity = wp.vec3(0.0, 0.0, 0.0)
+    crooked = 0.01 * R * np.random.default_rng(9).uniform(-1.0, 1.0, (1000, 2))
+    for number, (y, z) in enumerate(crooked):
+        add_ball(builder, (2.0 * R * (number - 500), y, z))
+    simulation = run(builder, device, 0.01, external_field=(3e5, 0.0, 0.0))
+    x = simulation.state.body_q.numpy()[:, :3].astype(float)
+    gaps = np.linalg.norm(np.diff(x, axis=0), axis=1) / R - 2.0
+    assert simulation.statistics.unconverged == 0 and simulation.statistics.overlap < 0.05
+    assert np.abs(x[:, 1:]).max() < 0.05 * R and gaps.max() < 0.02
+
+
 @pytest.mark.long
 @pytest.mark.cuda
-def test_100_000_balls_in_one_clump(device, tmp_path):
+def test_100_000_balls_in_one_clump(device):
     """A block of balls below a magnet, far larger than any scene: nothing is lost in the first steps."""
-    path = tmp_path / "scene.usdc"
-    balls_up.author(path, columns=50, rows=50, layers=40, height=0.45)
-    simulation = run(path, device, 0.01)
+    layer = newton.ModelBuilder()
+    warpmag.register_attributes(layer)
+    for place in np.ndindex(50, 50):
+        add_ball(layer, 2.002 * R * np.array([*place, 0.5]))
+    builder = new_builder()
+    for number in range(40):  # in bulk: a ball at a time would take a minute
+        builder.add_builder(layer, xform=wp.transform(wp.vec3(0.0, 0.0, 2.002 * R * number), wp.quat_identity()))
+    add_ball(builder, (50.0 * R, 50.0 * R, 86.0 * R), magnetization=(0.0, 0.0, 1e6), radius=4.0 * R, is_kinematic=True)
+    simulation = run(builder, device, 0.01)
+    assert simulation.statistics.magnets == 100_000
     assert simulation.statistics.overlap < 0.05 and simulation.statistics.unconverged == 0

@@ -14,7 +14,8 @@ from warpmag.kernels.curves import TANH
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.paper import __main__ as command
 from bench.paper import crystal_balls
-from bench.paper.output import ORDER
+from bench.paper.output import ORDER, Output
+from bench.paper.trials import Trial, run_trial
 
 MS = 1.7e6
 
@@ -138,6 +139,29 @@ def test_every_figure_can_be_drawn(tmp_path, device):
     apart = [json.loads(line) for line in (tmp_path / "uniqueness.jsonl").read_text().splitlines()]
     agreed = [line for line in apart if line.get("converged")]
     assert len(agreed) >= 8 and all(line["from_newton"] < 1e-6 for line in agreed)
+
+
+def test_a_part_of_a_section_stays_when_another_is_measured(tmp_path):
+    for name, text, part in (
+        ("table1", "old", "cpu"),
+        ("fig7", "seven", ""),
+        ("table1", "gpu", "gpu"),
+        ("table1", "new", "cpu"),
+    ):
+        Output(name, tmp_path, "cpu", True).report(text, part)
+    report = (tmp_path / "report.md").read_text()
+    at = [
+        report.index(text)
+        for text in ("<!-- section fig7 -->\nseven", "<!-- section table1 cpu -->\nnew", "gpu -->\ngpu")
+    ]
+    assert at == sorted(at) and "old" not in report
+
+
+def test_a_trial_ends_with_patience(device):
+    """What is left is a row: however slow the method, a step was done and timed."""
+    values = run_trial(Trial("balls_up", "kim2018", seconds=1.0, device=device, patience=0.1))
+    assert 2 <= values["steps"] < 100 and values["simulated"] == pytest.approx(1e-3 * values["steps"])
+    assert all(0.0 < values[key] < 1e4 for key in ("ti_ms", "tf_ms", "tr_ms")) and not values["ended"]
 
 
 def test_bad_device_is_one_line(capsys):

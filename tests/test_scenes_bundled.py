@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
 from warpmag.magnets import MagneticSettings
-from warpmag.scenes_usd import alphabets, authoring, bundled, crystal_balls, falling_magnet, sakura_tree
+from warpmag.scenes_usd import alphabets, authoring, balls_up, bundled, crystal_balls, falling_magnet, sakura_tree
 from warpmag.usd import check, open_stage, read_magnets
 
 needs_outlines = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="the letters' outlines")
@@ -192,6 +192,23 @@ def test_other_counts_and_sizes(tmp_path):
     assert _least_gap(*_balls(open_stage(path))) > 0.0
     crystal_balls.author(path, columns=5, rows=7, bar=1, bar_rows=1)
     assert len(check(path).magnets("inducible")) == 34 and not check(path).findings
+
+
+@pytest.mark.parametrize(
+    "author,parameters,body",
+    [
+        (balls_up.author, {"columns": 1, "rows": 1}, "/World/Balls/Ball_0002"),
+        (falling_magnet.author, {"balls": 5}, "/World/Balls/Ball_00004"),
+        (sakura_tree.author, {"balls": 5, "branches": 12}, "/World/Balls/Ball_00004"),
+        pytest.param(
+            alphabets.author, {"columns": 1, "rows": 1, "layers": 1}, "/World/Letters/A_000", marks=needs_outlines
+        ),
+    ],
+)
+def test_saturation_can_be_chosen(tmp_path, author, parameters, body):
+    path = tmp_path / "scene.usdc"
+    author(path, saturation=5e4, **parameters)
+    assert open_stage(path).GetPrimAtPath(body).GetAttribute("warpmag:saturationMagnetization").Get() == 5e4
 
 
 @needs_outlines

@@ -73,6 +73,40 @@ def test_moments_of_one_body_exert_no_force_on_each_other(device):
     assert relative(system.torques.numpy(), oracle.torque(m, oracle.h_field(x, m, radii=radii, bodies=bodies))) < 1e-6
 
 
+@pytest.mark.parametrize(("strength", "tolerance"), [(1e3, 1e-7), (1e9, 1e-7)])
+@pytest.mark.parametrize("force", ["kelvin", "zeeman"])
+def test_a_body_is_turned_as_by_all_pairs_of_moments(force, strength, tolerance, device):
+    """The paper's Algorithm 1 has no torque, but forces between the moments of one body, which come to the same.
+
+    With Eq. 4 that is so where its forces are one multiple of Kelvin's in all of the body: 8 in weak fields, 1 in
+    saturation, up to the square of M/Ms and to what is left of the curve's slope.
+    """
+    radius, magnets = 0.002, np.array([[0.02, 0.03, 0.025], [-0.03, 0.01, -0.02]])
+    letter = 2.2 * radius * np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 2, 0], [0, 0, 1]])
+    x, n = np.concatenate([letter, magnets]), len(letter)
+    moments = np.concatenate([np.zeros((n, 3)), strength * 1e-5 * np.array([[1.0, -2.0, 0.5], [0.3, 1.0, 2.0]])])
+    system = MomentSystem(
+        radii=np.full(n + 2, radius), permanent=np.arange(n + 2) >= n, bodies=np.r_[np.zeros(n, int), 1, 2],
+        saturation=MS, force=force, rtol=1e-10, dtype="float64", device=device,
+    )  # fmt: skip
+    system.positions.assign(x)
+    system.moments.assign(moments)
+    system.solve()
+    system.apply_forces()
+    m = system.moments.numpy()
+    gradient = oracle.field_gradient(x, m, radii=radius)[:n]
+    if force == "kelvin":
+        expected = oracle.kelvin_force(m[:n], gradient)
+    else:
+        h = oracle.h_field(x, m, radii=radius)[:n]
+        volumes = np.full(n, 4.0 / 3.0 * np.pi * radius**3)
+        expected = oracle.zeeman_force(volumes, h, gradient, *oracle.magnetization(h, MS))
+    forces, torques = system.forces.numpy()[:n], system.torques.numpy()[:n]
+    turned = np.sum(torques + np.cross(letter, forces), axis=0)
+    assert relative(turned, np.cross(letter, expected).sum(axis=0)) < tolerance
+    assert relative(forces.sum(axis=0), expected.sum(axis=0)) < tolerance
+
+
 def test_only_movable_moments_get_forces(device):
     x, radii, m = pile(count=30)
     movable = np.arange(30) % 7 < 4

@@ -76,6 +76,13 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("check", help="tell what a stage holds and what is wrong with it")
     check.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     check.set_defaults(command=_check)
+
+    render = commands.add_parser("render", help="draw a frame of a stage, of a finished run for example")
+    render.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
+    render.add_argument("-o", "--output", metavar="PNG", required=True, help="picture to write")
+    render.add_argument("--frame", type=int, metavar="N", help="frame after the start (default: the last)")
+    render.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
+    render.set_defaults(command=_render)
     return parser
 
 
@@ -125,6 +132,16 @@ def _check(options) -> int:
     for finding in report.findings:
         print(f"{finding.severity:11} {finding}")
     return BAD_INPUT if report.errors else 0
+
+
+def _render(options) -> int:
+    path, _ = _find_scene(options.stage)
+    _quiet_warp()
+    from warpmag.engine.render import render  # noqa: PLC0415
+
+    render(path, options.output, frame=options.frame, device=options.device)
+    print(f"written {options.output}")
+    return 0
 
 
 def _run(options) -> int:

@@ -50,22 +50,23 @@ class Output:
         figure.savefig(path, dpi=110, bbox_inches="tight")
         return f"![{self.name}]({path.name})"
 
-    def report(self, text: str):
-        """Set this experiment's section of the report; the others stay."""
+    def report(self, text: str, part: str = ""):
+        """Set this experiment's section of the report, or one part of it; all others stay."""
         self._machine = self._machine or describe(self.device)
         path = self.folder / "report.md"
         sections = _read_sections(path)
         where = ", ".join(f"{self._machine[key]}" for key in ("device", "machine", "commit") if self._machine[key])
         size = " Small version." if self.small else ""
-        sections[self.name] = f"{text.strip()}\n\n*Measured on {where}.{size}*"
-        body = "\n\n".join(f"{_MARK.format(name)}\n{sections[name]}" for name in ORDER if name in sections)
+        sections[f"{self.name} {part}".strip()] = f"{text.strip()}\n\n*Measured on {where}.{size}*"
+        names = sorted(sections, key=lambda name: (ORDER.index(name.split()[0]), name))
+        body = "\n\n".join(f"{_MARK.format(name)}\n{sections[name]}" for name in names)
         path.write_text(f"{_HEAD}\n{body}\n", encoding="utf-8")
 
 
 def _read_sections(path: Path) -> dict[str, str]:
     if not path.exists():
         return {}
-    parts = re.split(_MARK.format(r"(\w+)"), path.read_text(encoding="utf-8"))
+    parts = re.split(_MARK.format(r"(\w+(?: \w+)?)"), path.read_text(encoding="utf-8"))
     return {name: text.strip() for name, text in zip(parts[1::2], parts[2::2], strict=True)}
 
 

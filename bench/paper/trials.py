@@ -6,10 +6,13 @@ after the other, or several at once where nobody looks at the time.
 
 import multiprocessing
 import os
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
 
 import warpmag
 from warpmag.errors import SimulationError
@@ -31,9 +34,10 @@ class Trial:
         method: Name of a published method, of :data:`warpmag.magnets.METHODS`.
         seconds: Simulated time [s].
         device: Name of the Warp device.
-        patience: Time after which the run is ended [s].
+        patience: Time after which the run is ended [s], the first step not counted.
         rtol: Magnetization error at which induction ends.
         force: Force law in place of the method's own.
+        parameters: Parameters of the scene's script, where it is not to be as bundled.
     """
 
     scene: str
@@ -43,6 +47,7 @@ class Trial:
     patience: float
     rtol: float = 1e-3
     force: str | None = None
+    parameters: dict = field(default_factory=dict)
 
 
 def run_trials(trials: Sequence[Trial], workers: int = 1) -> Iterator[tuple[Trial, dict]]:
@@ -71,20 +76,14 @@ def _pin(shares) -> None:
 
 def run_trial(trial: Trial) -> dict:
     """Run a trial and return what became of the scene, ready for a JSON line."""
-    method = METHODS[trial.method]
-    simulation = warpmag.Simulation(
-        bundled()[trial.scene],
-        dynamics=method.dynamics,
-        curve=method.curve,
-        force=trial.force or method.force,
-        rtol=trial.rtol,
-        device=trial.device,
-    )
-    simulation.step()  # compiles what was not compiled before
+    with tempfile.TemporaryDirectory() as folder:
+        simulation = _load(trial, Path(folder))
+    simulation.frame_rate = 1.0 / simulation.step_size  # looks after every step whether patience has ended
+    simulation.run(1)  # compiles kernels, grows buffers and captures graphs
     ended, began = "", time.perf_counter()
-    frames = max(1, round(trial.seconds * simulation.frame_rate))
+    steps = max(1, round(trial.seconds / simulation.step_size))
     try:
-        simulation.run(frames, on_frame=lambda frame: time.perf_counter() - began < trial.patience)
+        simulation.run(steps, on_frame=lambda frame: time.perf_counter() - began < trial.patience)
     except SimulationError as error:
         ended = str(error)
     figures = simulation.finish()
@@ -94,6 +93,7 @@ def run_trial(trial: Trial) -> dict:
         **asdict(trial),
         "simulated": simulation.time,
         "ended": ended,
+        "steps": figures.steps,
         "substeps": figures.substeps / done,
         "ti_ms": induction,
         "tf_ms": force,
@@ -103,6 +103,7 @@ def run_trial(trial: Trial) -> dict:
         "magnets": figures.magnets,
         "held": figures.held,
         "held_rms_speed": figures.held_rms_speed,
+        "held_median_speed": figures.held_median_speed,
         "rms_speed": figures.rms_speed,
         "peak_speed": figures.peak_speed,
         "overlap": figures.overlap,
@@ -110,10 +111,35 @@ def run_trial(trial: Trial) -> dict:
     }
 
 
+def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
+    """Load a trial's scene, authored in ``folder`` if it is not the bundled one."""
+    stage, method = bundled()[trial.scene], METHODS[trial.method]
+    if trial.parameters:
+        stage = folder / f"{trial.scene}.usdc"
+        import_module(f"warpmag.scenes_usd.{trial.scene}").author(stage, **trial.parameters)
+    return warpmag.Simulation(
+        stage,
+        dynamics=method.dynamics,
+        curve=method.curve,
+        force=trial.force or method.force,
+        rtol=trial.rtol,
+        device=trial.device,
+    )
+
+
 def outcome_head() -> list[str]:
     """Column heads of :func:`outcome_cells`."""
     head = ["substeps per step", "field evaluations per substep", "substeps not converged", "held"]
-    return [*head, "RMS speed of these [cm/s]", "of all [cm/s]", "peak [m/s]", "farthest [m]", "penetration", "end"]
+    return [
+        *head,
+        "RMS speed of these [cm/s]",
+        "median",
+        "of all, RMS",
+        "peak [m/s]",
+        "farthest [m]",
+        "penetration",
+        "end",
+    ]
 
 
 def outcome_cells(values: dict) -> list[str]:
@@ -124,6 +150,7 @@ def outcome_cells(values: dict) -> list[str]:
         f"{100.0 * values['unconverged']:.0f} %",
         f"{values['held']} of {values['magnets']}" if values["held"] else "",
         f"{100.0 * values['held_rms_speed']:.2f}" if values["held"] else "",
+        f"{100.0 * values['held_median_speed']:.2f}" if values["held"] else "",
         f"{100.0 * values['rms_speed']:.2f}",
         f"{values['peak_speed']:.2f}",
         f"{values['farthest']:.3f}",

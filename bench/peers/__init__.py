@@ -19,11 +19,13 @@ class Evaluation:
         run: Starts one evaluation.
         wait: Returns when all that were started have ended.
         result: Field [A/m] of the last one, shape [n, 3].
+        kept: What has to live as long as this does: a captured graph does not hold the arrays that it works on.
     """
 
     run: Callable[[], object]
     wait: Callable[[], object]
     result: Callable[[], np.ndarray]
+    kept: object = None
 
 
 @dataclass(frozen=True)

@@ -42,4 +42,6 @@ def capture(kernel, dim, inputs, like, device, block_dim):
     launch()
     with wp.ScopedCapture(device) as graph:
         launch()
-    return Evaluation(lambda: wp.capture_launch(graph.graph), lambda: wp.synchronize_device(device), lambda: h.numpy())
+    return Evaluation(
+        lambda: wp.capture_launch(graph.graph), lambda: wp.synchronize_device(device), lambda: h.numpy(), launch
+    )

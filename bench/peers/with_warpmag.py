@@ -28,5 +28,5 @@ def prepare(positions, moments, device):
     with wp.ScopedCapture(device) as capture:
         evaluate()
     return Evaluation(
-        lambda: wp.capture_launch(capture.graph), lambda: wp.synchronize_device(device), lambda: h.numpy()
+        lambda: wp.capture_launch(capture.graph), lambda: wp.synchronize_device(device), lambda: h.numpy(), evaluate
     )

@@ -35,17 +35,18 @@ class ImportedScene:
     magnet_shapes: dict[str, list[int]]
 
 
-def import_scene(path: str | os.PathLike, *, visuals: bool = False) -> ImportedScene:
+def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: float | None = None) -> ImportedScene:
     """Read a stage and everything magnetic on it.
 
     Args:
         path: USD file.
         visuals: Also import what is only seen, for a viewer.
+        time_code: The moment at which bodies stand; by default the start of the stage.
 
     Raises:
         InputError: The stage cannot be read, or a magnet of it became no shape.
     """
-    stage = open_stage(path)
+    stage = open_stage(path, time_code)
     magnets = read_magnets(stage)
     clock = stage_clock(stage)
     builder = newton.ModelBuilder()

@@ -295,6 +295,7 @@ class Simulation:
         held = np.intersect1d(np.flatnonzero(self._held()), self._moving)
         figures.held = len(held)
         figures.held_rms_speed = float(np.sqrt(np.mean(speeds[held] ** 2))) if len(held) else 0.0
+        figures.held_median_speed = float(np.median(speeds[held])) if len(held) else 0.0
         figures.rms_speed = float(np.sqrt(np.mean(speeds[self._moving] ** 2))) if len(self._moving) else 0.0
         return figures
 

@@ -33,6 +33,7 @@ class Statistics:
         rms_speed: Root mean square speed of the magnets at the end [m/s].
         held: Magnets held by a permanent or fixed magnet at the end, see :func:`find_held`.
         held_rms_speed: Root mean square speed of those [m/s].
+        held_median_speed: Median speed of those [m/s]: far less where one slides on the others without friction.
         farthest: Largest distance of a magnet from the centre of where they all started, in any frame [m].
         overlapping: Contacts that overlap at the start.
         coarseness: Distance of neighbouring single-precision positions at the start over the thinnest body's thickness.
@@ -55,6 +56,7 @@ class Statistics:
     rms_speed: float = 0.0
     held: int = 0
     held_rms_speed: float = 0.0
+    held_median_speed: float = 0.0
     farthest: float = 0.0
     overlapping: int = 0
     coarseness: float = 0.0
@@ -122,7 +124,8 @@ class Statistics:
             f"farthest       {self.farthest:.3f} m from the centre of the start",
         ]
         if self.held:
-            lines.append(f"held           {self.held} by a magnet, RMS {100.0 * self.held_rms_speed:.2f} cm/s")
+            rms, median = 100.0 * self.held_rms_speed, 100.0 * self.held_median_speed
+            lines.append(f"held           {self.held} by a magnet, RMS {rms:.2f} cm/s, median {median:.2f}")
         return lines
 
 

@@ -168,6 +168,14 @@ def stage_clock(stage: Usd.Stage) -> StageClock:
     return StageClock(start, max(start, stage.GetEndTimeCode()), codes, frames, step)
 
 
+def first_camera(stage: Usd.Stage) -> Usd.Prim | None:
+    """Return the first camera of a stage with perspective; None where there is none."""
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Camera) and UsdGeom.Camera(prim).GetProjectionAttr().Get() == UsdGeom.Tokens.perspective:
+            return prim
+    return None
+
+
 def describe(path: str | os.PathLike) -> str:
     """Return the first line of a stage's documentation, without composing it."""
     layer = Sdf.Layer.OpenAsAnonymous(str(path), metadataOnly=True)
