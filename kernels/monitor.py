@@ -15,11 +15,12 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 PEAK_TRAVEL = wp.constant(0)  # predicted motion of a body in one substep over its thickness [1]
-PEAK_SPEED = wp.constant(1)  # speed of a body's centre of mass [m/s]
-PEAK_OVERLAP = wp.constant(2)  # penetration over the thickness of the thinner body [1]
-PEAK_DEPTH = wp.constant(3)  # penetration [m]
-PEAK_ERROR = wp.constant(4)  # magnetization error [1]
-PEAKS = 5
+PEAK_LONG_TRAVEL = wp.constant(1)  # the same in a substep twice as long
+PEAK_SPEED = wp.constant(2)  # speed of a body's centre of mass [m/s]
+PEAK_OVERLAP = wp.constant(3)  # penetration over the thickness of the thinner body [1]
+PEAK_DEPTH = wp.constant(4)  # penetration [m]
+PEAK_ERROR = wp.constant(5)  # magnetization error [1]
+PEAKS = 6
 
 COUNT_BAD_BODY = wp.constant(0)  # the first body whose state was not finite, see kernels.stepping; else NO_BODY
 COUNT_EVALUATIONS = wp.constant(1)  # field evaluations, summed over substeps
@@ -46,25 +47,30 @@ def _watch_motion(
     # outputs:
     peaks_out: wp.array[float],
 ):
-    """Fold in how far each body would move in ``dt`` without contacts: |v| dt + |a| dt²/2, and the same of turning."""
+    """Fold in how far each body would move in ``dt`` and in twice that without contacts.
+
+    That is |v| dt + |a| dt²/2, and the same of turning.
+    """
     body = wp.tid()
     if thickness_in[body] == wp.inf:
         return
     speed = wp.length(wp.spatial_top(body_qd_in[body]))
     gravity = gravity_in[body_world_in[body]]
     acceleration = wp.length(wp.spatial_top(body_f_in[body]) * body_inv_mass_in[body] + gravity)
-    travel = (speed + 0.5 * acceleration * dt) * dt
+    steady = speed * dt
+    gained = 0.5 * acceleration * dt * dt
     if reach_in[body] > 0.0:
         rotation = wp.transform_get_rotation(body_q_in[body])
         torque = wp.quat_rotate_inv(rotation, wp.spatial_bottom(body_f_in[body]))
-        turn = wp.length(wp.spatial_bottom(body_qd_in[body])) + 0.5 * wp.length(body_inv_inertia_in[body] * torque) * dt
-        travel += reach_in[body] * turn * dt
-    wp.atomic_max(peaks_out, PEAK_TRAVEL, travel / thickness_in[body])
+        steady += reach_in[body] * wp.length(wp.spatial_bottom(body_qd_in[body])) * dt
+        gained += 0.5 * reach_in[body] * wp.length(body_inv_inertia_in[body] * torque) * dt * dt
+    wp.atomic_max(peaks_out, PEAK_TRAVEL, (steady + gained) / thickness_in[body])
+    wp.atomic_max(peaks_out, PEAK_LONG_TRAVEL, (2.0 * steady + 4.0 * gained) / thickness_in[body])
     wp.atomic_max(peaks_out, PEAK_SPEED, speed)
 
 
 def watch_motion(model, state, thickness, reach, dt, peaks):
-    """Fold the bodies' predicted motion in the next ``dt`` and their speed into ``peaks``."""
+    """Fold the bodies' predicted motion in the next ``dt`` and in twice that, and their speed, into ``peaks``."""
     wp.launch(
         _watch_motion,
         dim=model.body_count,

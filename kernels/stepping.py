@@ -8,10 +8,13 @@ halted, steps do nothing, so that the host may look whenever it likes and go on 
 ``flags`` [int32]: conditions of the loops around a step, see the ``FLAG_*`` indices.
 ``status`` [int32]: where stepping stands, see the ``STATUS_*`` indices.
 ``log`` [float64, shape [records, LOG_FIELDS]]: a ring with a record of each step done, see the ``LOG_*`` indices.
+``last_overlap`` [float32]: deepest penetration of the last step done; and of the present step's last attempt that was
+put back for it, else infinite.
 ``ticks`` [uint64]: time spent in each stage since the last step was accepted, then the time of the last mark;
 nanoseconds on a GPU, clock cycles on a CPU.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -23,6 +26,7 @@ from warpmag.kernels.monitor import (
     COUNT_EVALUATIONS,
     COUNT_UNCONVERGED,
     NO_BODY,
+    PEAK_LONG_TRAVEL,
     PEAK_OVERLAP,
     PEAK_TRAVEL,
     PEAKS,
@@ -61,8 +65,8 @@ LOG_REGROWN = wp.constant(3)
 LOG_EVALUATIONS = wp.constant(4)
 LOG_UNCONVERGED = wp.constant(5)
 LOG_PEAKS = wp.constant(6)  # first of monitor.PEAKS
-LOG_TICKS = wp.constant(11)  # first of STAGES
-LOG_FIELDS = 14
+LOG_TICKS = wp.constant(LOG_PEAKS + PEAKS)  # first of STAGES
+LOG_FIELDS = int(LOG_TICKS) + int(STAGES)
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,8 @@ class Limits:
     Attributes:
         travel: Largest motion in a substep, in parts of a body's thickness.
         overlap: Deepest new penetration, in parts of the thickness of the thinner body.
-        ease: Substeps are made longer again where the motion stays below this part of ``travel``.
+        ease: Substeps are made longer again where the motion in twice their length stays below this part of ``travel``.
+        futile: Substeps that leave more than this part of a penetration that was too deep are not made shorter still.
         fewest: Substeps of the first level, an even number.
         capacities: Size of each buffer whose fill is watched, on the device.
     """
@@ -80,6 +85,7 @@ class Limits:
     travel: float
     overlap: float
     ease: float
+    futile: float
     fewest: int
     capacities: wp.array
 
@@ -117,7 +123,7 @@ def allocate(records: int, capacities: int, device) -> StepBuffers:
         status=zeros(STATUSES, wp.int32),
         peaks=zeros(PEAKS, wp.float32),
         counts=zeros(int(COUNT_CAPACITIES) + capacities, wp.int32),
-        last_overlap=zeros(1, wp.float32),
+        last_overlap=wp.array([0.0, math.inf], dtype=wp.float32, device=device),
         ticks=zeros(int(STAGES) + 1, wp.uint64),
         log=zeros((records, LOG_FIELDS), wp.float64),
     )
@@ -321,6 +327,7 @@ def _judge(
     travel_limit: float,
     overlap_limit: float,
     ease: float,
+    futile: float,
     fewest: int,
     # outputs:
     status_out: wp.array[wp.int32],
@@ -339,10 +346,14 @@ def _judge(
     travel = peaks_in[PEAK_TRAVEL]
     overlap = peaks_in[PEAK_OVERLAP]
     pressed = overlap > wp.max(overlap_limit, last_overlap_out[0])
+    # shorter substeps undo what was pressed too fast, but not a contact that found another normal
+    helped = overlap < futile * last_overlap_out[1]
     lost = counts_in[COUNT_BAD_BODY] != NO_BODY
-    if (travel > travel_limit or pressed or lost) and level + 1 < LEVELS:
+    if (travel > travel_limit or (pressed and helped) or lost) and level + 1 < LEVELS:
         status_out[STATUS_LEVEL] = level + 1
         flags_out[FLAG_ATTEMPT] = 1
+        if pressed:
+            last_overlap_out[1] = overlap
         return
     if lost:
         status_out[STATUS_HALT] = NOT_FINITE
@@ -350,6 +361,7 @@ def _judge(
 
     flags_out[FLAG_REJECTED] = 0
     last_overlap_out[0] = overlap
+    last_overlap_out[1] = wp.inf
     record = status_out[STATUS_DONE] % log_out.shape[0]
     log_out[record, LOG_SUBSTEPS] = wp.float64(fewest << level)
     log_out[record, LOG_ATTEMPTS] = wp.float64(status_out[STATUS_ATTEMPTS])
@@ -365,8 +377,8 @@ def _judge(
     status_out[STATUS_DONE] = status_out[STATUS_DONE] + 1
     status_out[STATUS_ATTEMPTS] = 0
     status_out[STATUS_REGROWN] = 0
-    calm = travel < ease * travel_limit and overlap < 0.5 * overlap_limit
-    if calm and level > 0:
+    calm = overlap < 0.5 * overlap_limit or (pressed and not helped)
+    if calm and peaks_in[PEAK_LONG_TRAVEL] < ease * travel_limit and level > 0:
         status_out[STATUS_LEVEL] = level - 1
 
 
@@ -382,6 +394,7 @@ def launch_judge(limits: Limits, b: StepBuffers):
             limits.travel,
             limits.overlap,
             limits.ease,
+            limits.futile,
             limits.fewest,
         ],
         outputs=[b.status, b.flags, b.last_overlap, b.ticks, b.log],

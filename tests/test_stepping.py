@@ -6,7 +6,7 @@ import warp as wp
 
 from warpmag.kernels import monitor, stepping
 
-TRAVEL, OVERLAP, EASE, FEWEST, CAPACITY = 0.25, 0.008, 0.2, 2, 100
+TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 0.008, 0.8, 0.8, 2, 100
 
 
 class Rules:
@@ -14,23 +14,27 @@ class Rules:
 
     def __init__(self):
         self.level = self.done = self.attempts = self.regrown = 0
-        self.overlap, self.halt = 0.0, "no"
+        self.overlap, self.pressed_before, self.halt = 0.0, np.inf, "no"
 
-    def judge(self, travel, overlap, lost, fill):
+    def judge(self, travel, long_travel, overlap, lost, fill):
         """Returns what becomes of the attempt, and the record of a step that is done."""
         self.attempts += 1
         if fill > CAPACITY:
             self.halt = "overflow"
             return "halted", None
-        if (travel > TRAVEL or overlap > max(OVERLAP, self.overlap) or lost) and self.level < stepping.LEVELS - 1:
+        pressed = overlap > max(OVERLAP, self.overlap)
+        helped = overlap < FUTILE * self.pressed_before
+        if (travel > TRAVEL or (pressed and helped) or lost) and self.level < stepping.LEVELS - 1:
             self.level += 1
+            self.pressed_before = overlap if pressed else self.pressed_before
             return "again", None
         if lost:
             self.halt = "lost"
             return "halted", None
         record = (FEWEST * 2**self.level, self.attempts, travel > TRAVEL, self.regrown)
-        self.done, self.attempts, self.regrown, self.overlap = self.done + 1, 0, 0, overlap
-        if travel < EASE * TRAVEL and overlap < 0.5 * OVERLAP and self.level:
+        self.done, self.attempts, self.regrown = self.done + 1, 0, 0
+        self.overlap, self.pressed_before = overlap, np.inf
+        if long_travel < EASE * TRAVEL and (overlap < 0.5 * OVERLAP or (pressed and not helped)) and self.level:
             self.level -= 1
         return "done", record
 
@@ -39,14 +43,15 @@ class Rules:
 def machine(device):
     buffers = stepping.allocate(16, 1, device)
     capacities = wp.array([CAPACITY], dtype=wp.int32, device=device)
-    return buffers, stepping.Limits(TRAVEL, OVERLAP, EASE, FEWEST, capacities)
+    return buffers, stepping.Limits(TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, capacities)
 
 
-def report(buffers, travel, overlap, lost, fill):
+def report(buffers, travel, long_travel, overlap, lost, fill):
     """Stand in for the monitor."""
     peaks, counts = buffers.peaks.numpy(), buffers.counts.numpy()
     assert (peaks == 0.0).all() and counts[monitor.COUNT_BAD_BODY] == monitor.NO_BODY
-    peaks[[monitor.PEAK_TRAVEL, monitor.PEAK_OVERLAP, monitor.PEAK_ERROR]] = travel, overlap, 0.125
+    peaks[[monitor.PEAK_TRAVEL, monitor.PEAK_LONG_TRAVEL]] = travel, long_travel
+    peaks[[monitor.PEAK_OVERLAP, monitor.PEAK_ERROR]] = overlap, 0.125
     counts[monitor.COUNT_EVALUATIONS], counts[monitor.COUNT_CAPACITIES] = 7, fill
     if lost:
         counts[monitor.COUNT_BAD_BODY] = 3
@@ -69,12 +74,13 @@ def test_the_device_follows_the_rules(machine):
                 stepping.launch_end_pair(rules.level, buffers)
                 pairs += 1
             assert 2 * pairs == FEWEST * 2**rules.level
-            travel = np.float32(rng.choice([0.01, 0.1, 0.3]))
+            travel = np.float32(rng.choice([0.01, 0.08, 0.3]))
+            long_travel = np.float32(travel * rng.uniform(2.0, 4.0))  # 0.2 is the limit of easing
             overlap = np.float32(rng.choice([0.001, 0.005, 0.01, 0.02], p=[0.6, 0.2, 0.1, 0.1]))
             lost, fill = rng.random() < 0.05, int(rng.choice([50, CAPACITY, 101], p=[0.8, 0.15, 0.05]))
-            report(buffers, travel, overlap, lost, fill)
+            report(buffers, travel, long_travel, overlap, lost, fill)
             record_at = rules.done % 16
-            outcome, record = rules.judge(float(travel), float(overlap), lost, fill)
+            outcome, record = rules.judge(float(travel), float(long_travel), float(overlap), lost, fill)
             stepping.launch_judge(limits, buffers)
             assert buffers.attempting.numpy()[0] == (outcome == "again")
             assert buffers.flags.numpy()[stepping.FLAG_REJECTED] == (outcome != "done")

@@ -28,8 +28,10 @@ TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
-_EASE = 0.2
-"""Substeps double in length once the motion, up to four times as long then, would stay well within the limit."""
+_EASE = 0.8
+"""Substeps double in length once the motion in twice their length would stay within this part of the limit."""
+_FUTILE = 0.8
+"""Substeps of half the length that leave more than this part of a penetration do not press less, however short."""
 _RECORDS = 64
 """Steps that may be done before the host looks; on a CPU, which it waits for anyway, it looks after each."""
 
@@ -126,7 +128,7 @@ class Stepper:
         """Fit everything to the solver's buffers, whose number does not change."""
         sizes = [buffer.limit for buffer in self._solver.buffers]
         capacities = wp.array(sizes, dtype=wp.int32, device=self._device)
-        self._limits = stepping.Limits(TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, self._fewest, capacities)
+        self._limits = stepping.Limits(TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities)
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -259,7 +261,7 @@ class Stepper:
             self._prepare()
         peaks, counts = self._read("peaks"), self._read("counts")
         overlap = float(peaks[monitor.PEAK_OVERLAP])
-        b.last_overlap.fill_(overlap)
+        b.last_overlap.assign(np.array([overlap, math.inf], np.float32))
         return overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -291,6 +293,7 @@ class Stepper:
     def _substep(self, now: newton.State, then: newton.State, dt: float) -> None:
         b, system = self._buffers, self._magnetics.system
         now.clear_forces()
+        stepping.launch_mark(RIGID, b)
         self._magnetics.induce(now)
         monitor.watch_induction(system.error, system.evaluations, system.converged, b.peaks, b.counts)
         stepping.launch_mark(INDUCTION, b)
@@ -299,7 +302,6 @@ class Stepper:
         monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, b.peaks)
         self._find_contacts(now, dt, 0.0)
         self._solver.step(now, then, dt)
-        stepping.launch_mark(RIGID, b)
 
     def _find_contacts(self, state: newton.State, dt: float, overlap_threshold: float) -> None:
         solver, b = self._solver, self._buffers
