@@ -5,22 +5,25 @@ and torque τ on each of them are added to the wrench of its body about the cent
 
     F_body = Σ F_i,    τ_body = Σ τ_i + (x_i − c) × F_i
 
-Sums run in a fixed order and without atomics, so that a run repeats bit by bit: the moments of a body are cut into
-chunks of neighbours, one thread sums a chunk, and one thread a body's chunks.
+Sums run in a fixed order and without atomics, so that a run repeats bit by bit: on a GPU a warp sums the moments of a
+body.
 
 | variable | shape | dtype | meaning |
 |---|---|---|---|
 | positions, moments | [moment_count] | vec3 | [m], [A·m²], world frame |
 | local_positions, local_moments | [moment_count] | vec3 | the same in the frame of the body |
 | moment_body | [moment_count] | int32 | body, −1 where the magnet is fixed in the world |
-| chunk_range | [chunk_count] | vec2i | first moment of each chunk, and the one after its last; sorted by body |
-| chunk_body | [chunk_count] | int32 | the chunk's body |
-| body_list, body_chunk_start | [n], [n + 1] | int32 | bodies that take forces, first chunk of each |
+| body_list, body_run_start | [n], [n + 1] | int32 | bodies that take forces, first run of moments of each |
+| runs | [run_count] | vec2i | first moment of each run, and the one after its last |
 """
 
 import warp as wp
 
+from warpmag.kernels.induction import block_sum
+
 wp.set_module_options({"enable_backward": False})
+
+_BLOCK = 32
 
 
 @wp.kernel
@@ -57,85 +60,66 @@ def gather_moments(body_q, moment_body, permanent, local_positions, local_moment
 
 
 @wp.kernel
-def _sum_chunks(
+def _add_to_bodies(
     # inputs:
     body_q_in: wp.array[wp.transform],
     body_com_in: wp.array[wp.vec3],
-    chunk_range_in: wp.array[wp.vec2i],
-    chunk_body_in: wp.array[wp.int32],
+    body_flags_in: wp.array[wp.int32],
+    kinematic_flag: int,
+    body_list_in: wp.array[wp.int32],
+    body_run_start_in: wp.array[wp.int32],
+    run_in: wp.array[wp.vec2i],
     positions_in: wp.array[wp.vec3],
     forces_in: wp.array[wp.vec3],
     torques_in: wp.array[wp.vec3],
     # outputs:
-    wrenches_out: wp.array[wp.spatial_vector],
-):
-    chunk = wp.tid()
-    body = chunk_body_in[chunk]
-    force = wp.vec3(0.0)
-    torque = wp.vec3(0.0)
-    if body >= 0:
-        center = wp.transform_point(body_q_in[body], body_com_in[body])
-        for i in range(chunk_range_in[chunk][0], chunk_range_in[chunk][1]):
-            force += forces_in[i]
-            torque += torques_in[i] + wp.cross(positions_in[i] - center, forces_in[i])
-    wrenches_out[chunk] = wp.spatial_vector(force, torque)
-
-
-@wp.kernel
-def _add_to_bodies(
-    # inputs:
-    body_list_in: wp.array[wp.int32],
-    body_chunk_start_in: wp.array[wp.int32],
-    body_flags_in: wp.array[wp.int32],
-    kinematic_flag: int,
-    wrenches_in: wp.array[wp.spatial_vector],
-    # outputs:
     body_f_out: wp.array[wp.spatial_vector],
 ):
-    k = wp.tid()
+    k, lane = wp.tid()
     body = body_list_in[k]
     if (body_flags_in[body] & kinematic_flag) != 0:
         return
-    wrench = wp.spatial_vector()
-    for chunk in range(body_chunk_start_in[k], body_chunk_start_in[k + 1]):
-        wrench += wrenches_in[chunk]
-    body_f_out[body] = body_f_out[body] + wrench
+    center = wp.transform_point(body_q_in[body], body_com_in[body])
+    mine = wp.spatial_vectord()
+    for run in range(body_run_start_in[k], body_run_start_in[k + 1]):
+        for i in range(run_in[run][0] + lane, run_in[run][1], wp.block_dim()):
+            force = forces_in[i]
+            torque = torques_in[i] + wp.cross(positions_in[i] - center, force)
+            for c in range(3):
+                mine[c] += wp.float64(force[c])
+                mine[c + 3] += wp.float64(torque[c])
+    total = block_sum(mine)
+    if lane == 0:
+        force = wp.vec3(float(total[0]), float(total[1]), float(total[2]))
+        torque = wp.vec3(float(total[3]), float(total[4]), float(total[5]))
+        body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
 
 
 def scatter_wrenches(
-    body_q,
-    body_com,
-    body_flags,
-    kinematic_flag,
-    chunk_range,
-    chunk_body,
-    body_list,
-    body_chunk_start,
-    positions,
-    forces,
-    torques,
-    wrenches,
-    body_f,
+    body_q, body_com, body_flags, kinematic_flag, body_list, body_run_start, runs, positions, forces, torques, body_f
 ):
-    """Add the force and torque of every moment to the wrench of its body; ``wrenches`` [chunk_count] is scratch.
+    """Add the force and torque of every moment to the wrench of its body.
 
     Bodies that carry ``kinematic_flag`` take none.
     """
-    if not len(body_list):
-        return
-    wp.launch(
-        _sum_chunks,
-        dim=len(chunk_body),
-        inputs=[body_q, body_com, chunk_range, chunk_body, positions, forces, torques],
-        outputs=[wrenches],
-        device=wrenches.device,
-    )
-    wp.launch(
+    wp.launch_tiled(
         _add_to_bodies,
-        dim=len(body_list),
-        inputs=[body_list, body_chunk_start, body_flags, kinematic_flag, wrenches],
+        dim=[len(body_list)],
+        inputs=[
+            body_q,
+            body_com,
+            body_flags,
+            kinematic_flag,
+            body_list,
+            body_run_start,
+            runs,
+            positions,
+            forces,
+            torques,
+        ],
         outputs=[body_f],
-        device=wrenches.device,
+        block_dim=_BLOCK,
+        device=body_f.device,
     )
 
 

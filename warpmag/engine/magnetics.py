@@ -1,6 +1,5 @@
 """Magnetic forces on the bodies of a Newton model."""
 
-import itertools
 from dataclasses import dataclass, replace
 
 import newton
@@ -14,8 +13,6 @@ from warpmag.kernels.bodies import gather_moments, scatter_wrenches, sum_moments
 from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_token
 from warpmag.system import MomentSystem
 
-_CHUNK = 32
-"""Moments that one thread sums: long enough for the balls' one moment to stay cheap, short enough for a GPU."""
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 
@@ -133,25 +130,20 @@ class Magnetics:
         local = self._volumes[:, None] * np.repeat([one.magnet.magnetization for one in self.magnets], counts, axis=0)
 
         start = np.concatenate([[0], np.cumsum(counts)])
-        chunks = [np.arange(first, last, _CHUNK) for first, last in itertools.pairwise(start)]
-        chunk_body = np.repeat([one.body for one in self.magnets], [len(one) for one in chunks])
-        order = np.argsort(chunk_body, kind="stable")
-        bodies, first = np.unique(chunk_body[order], return_index=True)
+        run_body = np.array([one.body for one in self.magnets])
+        order = np.argsort(run_body, kind="stable")
+        bodies, first = np.unique(run_body[order], return_index=True)
         dynamic = bodies >= 0
 
         def put(values, dtype):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        chunk_start = np.concatenate(chunks)
-        chunk_end = np.concatenate([chunk_start[1:], start[-1:]])
         self._moment_body, self._permanent = put(body, wp.int32), put(permanent, wp.bool)
         self._local_positions = put(np.concatenate([one.positions for one in lattices]), wp.vec3)
         self._local_moments = put(local, wp.vec3)
-        self._chunk_range = put(np.stack([chunk_start, chunk_end], axis=1)[order], wp.vec2i)
-        self._chunk_body = put(chunk_body[order], wp.int32)
         self._body_list = put(bodies[dynamic], wp.int32)
-        self._body_chunk_start = put(np.append(first[dynamic], len(order)), wp.int32)
-        self._wrenches = wp.zeros(len(order), dtype=wp.spatial_vector, device=device)
+        self._body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
+        self._runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
 
         self.shapes = np.concatenate([one.shapes for one in self.magnets])
         self._parts = np.concatenate([[0], np.cumsum(np.concatenate([one.counts for one in lattices]))])
@@ -190,14 +182,12 @@ class Magnetics:
             self._model.body_com,
             self._model.body_flags,
             _KINEMATIC,
-            self._chunk_range,
-            self._chunk_body,
             self._body_list,
-            self._body_chunk_start,
+            self._body_run_start,
+            self._runs,
             self.system.positions,
             self.system.forces,
             self.system.torques,
-            self._wrenches,
             state.body_f,
         )
 
