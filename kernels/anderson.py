@@ -5,12 +5,12 @@ With the differences Δr_j of the present residual r to the last few, the coeffi
 columns: the right side ⟨φΔr_a, φr⟩, then the upper triangle of the matrix ⟨φΔr_a, φΔr_b⟩, row by row.
 """
 
+from functools import cache
+
 import warp as wp
 
 DEPTH = 5
-"""Earlier iterates that are mixed."""
-SLOTS = DEPTH + 1
-"""Iterates that are kept, in a ring: the earlier ones and the present one."""
+"""Changes between iterates that are kept, in a ring, and mixed."""
 COLUMNS = DEPTH + DEPTH * (DEPTH + 1) // 2
 """Sums that the normal equations take."""
 _RIDGE = 1.0e-9
@@ -18,14 +18,14 @@ _RIDGE = 1.0e-9
 _LARGEST = 1.0e4
 """Sum of |α_j| beyond which the iterates are as good as dependent."""
 
-_matrix = wp.types.matrix((DEPTH, DEPTH), wp.float64)
-_vector = wp.types.vector(DEPTH, wp.float64)
+coefficients = wp.types.vector(DEPTH, wp.float64)
+"""Type of the α_j."""
 
 
 @wp.func
 def slot_of(current: int, age: int):
-    """Slot of the iterate ``age`` before the one in slot ``current``."""
-    return (current - age + wp.static(SLOTS)) % wp.static(SLOTS)
+    """Slot of the change ``age`` before the one in slot ``current``."""
+    return (current - age + wp.static(DEPTH)) % wp.static(DEPTH)
 
 
 @wp.func
@@ -36,46 +36,50 @@ def matrix_column(a: int, b: int):
     return wp.static(DEPTH) + low * wp.static(DEPTH) - (low * (low - 1)) // 2 + high - low
 
 
-@wp.func
-def least_squares(matrix: _matrix, right: _vector, size: int):
-    """Solve a symmetric positive definite system of ``size`` rows by elimination; zeros where it is singular."""
-    m = matrix
-    x = right
-    for p in range(size):
-        pivot = m[p, p]
-        if not pivot > wp.float64(0.0):
-            return _vector()
-        for row in range(p + 1, size):
-            factor = m[row, p] / pivot
-            for column in range(p, size):
-                m[row, column] = m[row, column] - factor * m[p, column]
-            x[row] = x[row] - factor * x[p]
-    for back in range(size):
-        p = size - 1 - back
-        value = x[p]
-        for column in range(p + 1, size):
-            value -= m[p, column] * x[column]
-        x[p] = value / m[p, p]
-    return x
+@cache
+def anderson_solver(columns: int, first: int):
+    """Warp function that returns the coefficients α_j of the last ``kept`` changes; zeros if they are of no use.
 
-
-@wp.func
-def anderson_coefficients(sums: wp.array2d[wp.float64], w: int, first: int, history: int):
-    """Coefficients α_j of the last ``history`` iterates; zeros if they are of no use.
-
-    The normal equations are those of world ``w``, in the columns of ``sums`` from ``first`` on.
+    It takes a vector of ``columns`` sums; the normal equations begin at ``first``.
     """
-    matrix = _matrix()
-    right = _vector()
-    for a in range(history):
-        right[a] = sums[w, first + a]
-        for b in range(history):
-            matrix[a, b] = sums[w, first + matrix_column(a, b)]
-        matrix[a, a] = matrix[a, a] * wp.float64(wp.static(1.0 + _RIDGE))
-    alpha = least_squares(matrix, right, history)
-    size = wp.float64(0.0)
-    for a in range(history):
-        size += wp.abs(alpha[a])
-    if not size < wp.float64(wp.static(_LARGEST)):
-        return _vector()
-    return alpha
+
+    # in C, since loops of Warp over arrays in registers would put these into memory
+    @wp.func_native(f"""
+    double m[{DEPTH}][{DEPTH}], x[{DEPTH}], size = 0.0;
+    bool regular = true;
+    #pragma unroll
+    for (int a = 0, column = {first + DEPTH}; a < {DEPTH}; ++a) {{
+        x[a] = a < kept ? sums[{first} + a] : 0.0;
+        #pragma unroll
+        for (int b = a; b < {DEPTH}; ++b, ++column)
+            m[a][b] = b < kept ? sums[column] * (a == b ? {1.0 + _RIDGE!r} : 1.0) : (a == b ? 1.0 : 0.0);
+    }}
+    // elimination in the upper triangle of a symmetric positive definite matrix
+    #pragma unroll
+    for (int p = 0; p < {DEPTH}; ++p) {{
+        regular = regular && m[p][p] > 0.0;
+        const double inverse = 1.0 / m[p][p];
+        #pragma unroll
+        for (int row = p + 1; row < {DEPTH}; ++row) {{
+            const double factor = m[p][row] * inverse;
+            #pragma unroll
+            for (int column = row; column < {DEPTH}; ++column) m[row][column] -= factor * m[p][column];
+            x[row] -= factor * x[p];
+        }}
+        m[p][p] = inverse;
+    }}
+    #pragma unroll
+    for (int p = {DEPTH - 1}; p >= 0; --p) {{
+        #pragma unroll
+        for (int column = p + 1; column < {DEPTH}; ++column) x[p] -= m[p][column] * x[column];
+        x[p] *= m[p][p];
+        size += x[p] < 0.0 ? -x[p] : x[p];
+    }}
+    wp::vec_t<{DEPTH}, wp::float64> alpha;
+    #pragma unroll
+    for (int a = 0; a < {DEPTH}; ++a) alpha[a] = regular && size < {_LARGEST!r} ? x[a] : 0.0;
+    return alpha;
+    """)
+    def solve(sums: wp.types.vector(columns, wp.float64), kept: int) -> coefficients: ...
+
+    return solve

@@ -15,9 +15,8 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels import anderson
-from warpmag.kernels.anderson import DEPTH, SLOTS
+from warpmag.kernels.anderson import DEPTH
 from warpmag.kernels.field import finished_field
-from warpmag.kernels.neighbors import shared_volume
 
 CHUNK = 64
 """Moments whose sums one block adds up, on a GPU each of them by a thread of its own."""
@@ -30,6 +29,39 @@ _FLOW_STEP = 0.9
 """Share of the largest convergent step length that is used."""
 
 
+@wp.struct
+class World:
+    """How a world stands between evaluations: one cache line, where a GPU would wait for an array after another.
+
+    Attributes:
+        active: Whether it still iterates.
+        evaluations: Field evaluations of this solve.
+        mode: What it does next, see ``theta_flow``.
+        linked: Whether the next iterate's change from the last one is worth keeping.
+        kept: Changes that are kept, in ``history``.
+        newest: Slot of the newest of them.
+        used: How many of them the next step mixes.
+        improved: Whether the last iterate is the best so far.
+        plain_steps: Steps to be taken without mixing.
+        omega: Step length.
+        best: Smallest merit of this solve, negative before the first.
+        alpha: Anderson coefficients.
+    """
+
+    active: int
+    evaluations: int
+    mode: int
+    linked: int
+    kept: int
+    newest: int
+    used: int
+    improved: int
+    plain_steps: int
+    omega: wp.float64
+    best: wp.float64
+    alpha: anderson.coefficients
+
+
 @dataclass(frozen=True)
 class InductionBuffers:
     """Everything an induction solve keeps on the device, for n moments, w worlds and c chunks.
@@ -38,33 +70,43 @@ class InductionBuffers:
         world: World of each moment, shape [n].
         chunk: Rows of the inducible moments' work list from and to, and world, of each chunk, shape [c].
         chunk_begin: First chunk of each world, shape [w + 1].
+        part, part_begin: The same of what a block judges: tiles, if it sums their field itself, else chunks.
         h0: Applied field [A/m]: external and from permanent magnets, shape [n].
         h: Whole field [A/m], shape [n].
         s: Dual variable [dimensionless], shape [n].
-        last_s, last_change: Solution of the last solve, and how it differs from that of the one before, shape [n].
-        history_s, history_r: Last iterates and residuals, shape [SLOTS, n].
+        last_s: Solution of the solve before the last, shape [n].
+        past_positions, past_moments, past_field: Where the last two solves were done [m], the moments [A·m²] that they
+            ended at and what fields they make [A/m], the last solve first, shape [2, n].
+        iterate_s, iterate_r: The last iterate judged, and its residual, shape [n].
+        history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
         best_s, best_r: Those of the smallest merit, shape [n].
         mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
         mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
         change, next_change: What a step adds to them [A·m²], shape [n].
         start: Largest applied field [A/m] and stiffness k (2/3 + o_i) of each world until it is judged, shape [w, 2].
-        sums, world_sums: Sums of each chunk and world, shape [c, COLUMNS] and [w, COLUMNS].
-        omega, best, error: Step length, smallest merit, relative residual of each world, shape [w].
+        sums: Sums of each part, shape [parts, COLUMNS].
+        arrived: Parts of each world whose sums are done, shape [w].
+        worlds: How each world stands, shape [w].
         warm: Solves of each world since it began cold, as far as it matters, shape [w].
-        active, converged, evaluations: How each world stands, shape [w].
-        history, slot, plain_steps, mode, improved, used_slot, used_history: What it does next, shape [w].
-        alpha: Anderson coefficients, shape [w, DEPTH].
+        error: Relative residual of each world, shape [w].
+        evaluations, converged: What a solve took, and whether it reached its goal, shape [w].
         condition: Whether any world still iterates, shape [1].
     """
 
     world: wp.array
     chunk: wp.array
     chunk_begin: wp.array
+    part: wp.array
+    part_begin: wp.array
     h0: wp.array
     h: wp.array
     s: wp.array
     last_s: wp.array
-    last_change: wp.array
+    past_positions: wp.array
+    past_moments: wp.array
+    past_field: wp.array
+    iterate_s: wp.array
+    iterate_r: wp.array
     history_s: wp.array
     history_r: wp.array
     best_s: wp.array
@@ -75,31 +117,22 @@ class InductionBuffers:
     next_change: wp.array
     start: wp.array
     sums: wp.array
-    world_sums: wp.array
-    omega: wp.array
-    best: wp.array
-    error: wp.array
+    arrived: wp.array
+    worlds: wp.array
     warm: wp.array
-    active: wp.array
-    history: wp.array
-    slot: wp.array
-    plain_steps: wp.array
+    error: wp.array
     evaluations: wp.array
     converged: wp.array
-    mode: wp.array
-    improved: wp.array
-    used_slot: wp.array
-    used_history: wp.array
-    alpha: wp.array
     condition: wp.array
 
 
-def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
+def allocate(worlds, inducible, rows, dtype, device) -> InductionBuffers:
     """Allocate the buffers.
 
     Args:
         worlds: World of each moment, non-decreasing, shape [n].
         inducible: Whether a moment is inducible, shape [n]; in each world these come first.
+        rows: Work list, inducible moments on inducible moments.
         dtype: Warp scalar type.
         device: Warp device.
     """
@@ -110,6 +143,10 @@ def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
         chunks += [(a, min(a + CHUNK, last), w) for a in range(first, last, CHUNK)]
         chunk_begin.append(len(chunks))
         first = last
+    parts = chunks
+    if rows.fused:
+        parts = [(tile[0], tile[1], worlds[tile[2]]) for tile in rows.tiles.numpy()]
+    part_begin = np.searchsorted([part[2] for part in parts], np.arange(world_count + 1))
     vec3 = wp.types.vector(3, dtype)
 
     def put(values, kind):
@@ -118,22 +155,23 @@ def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
     def zeros(shape, kind):
         return wp.zeros(shape, dtype=kind, device=device)
 
-    integers = ("warm", "active", "history", "slot", "plain_steps", "evaluations")
-    integers += ("mode", "improved", "used_slot", "used_history")
     return InductionBuffers(
         world=put(worlds, wp.int32),
         chunk=put(np.reshape(chunks, (-1, 3)), wp.vec3i),
         chunk_begin=put(chunk_begin, wp.int32),
-        **{name: zeros(n, vec3) for name in ("h0", "h", "s", "last_s", "last_change", "best_s", "best_r")},
+        part=put(np.reshape(parts, (-1, 3)), wp.vec3i),
+        part_begin=put(part_begin, wp.int32),
+        **{name: zeros(n, vec3) for name in ("h0", "h", "s", "last_s", "best_s", "best_r")},
         **{name: zeros(n, vec3) for name in ("mixed_g", "mixed_moment", "change", "next_change")},
-        **{name: zeros((SLOTS, n), vec3) for name in ("history_s", "history_r")},
+        **{name: zeros((2, n), vec3) for name in ("past_positions", "past_moments", "past_field")},
+        **{name: zeros(n, vec3) for name in ("iterate_s", "iterate_r")},
+        **{name: zeros((DEPTH, n), vec3) for name in ("history_s", "history_r")},
         start=zeros((world_count, 2), wp.float64),
-        sums=zeros((len(chunks), COLUMNS), wp.float64),
-        world_sums=zeros((world_count, COLUMNS), wp.float64),
-        **{name: zeros(world_count, wp.float64) for name in ("omega", "best", "error")},
-        **{name: zeros(world_count, wp.int32) for name in integers},
+        sums=zeros((len(parts), COLUMNS), wp.float64),
+        worlds=zeros(world_count, World),
+        error=zeros(world_count, wp.float64),
+        **{name: zeros(world_count, wp.int32) for name in ("arrived", "warm", "evaluations")},
         converged=put(np.ones(world_count), wp.int32),  # a world without inducible moments has nothing to converge
-        alpha=zeros((world_count, DEPTH), wp.float64),
         condition=zeros(1, wp.int32),
     )
 
@@ -151,113 +189,49 @@ def block_max(mine: Any):
 
 
 @cache
-def _begin_kernel(dtype):
+def applied_field(dtype):
+    """Warp function that returns the applied field [A/m] at a row's target: external and from permanent magnets."""
     vec3 = wp.types.vector(3, dtype)
     finish = finished_field(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def begin_solve(
-        # inputs:
-        chunk: wp.array[wp.vec3i],
+    @wp.func
+    def apply_field(
         partial: wp.array3d[dtype],
         packed: wp.array2d[dtype],
-        row_target: wp.array[int],
-        source_begin: wp.array[int],
-        source_end: wp.array[int],
-        induced_begin: wp.array[int],
-        induced_end: wp.array[int],
+        row: int,
+        i: int,
+        begin: int,
+        end: int,
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
         external_field: wp.array[vec3],
-        slope: wp.array[dtype],
-        # outputs:
-        h0_out: wp.array[vec3],
-        start_out: wp.array2d[wp.float64],
-        active_out: wp.array[int],
-        history_out: wp.array[int],
-        slot_out: wp.array[int],
-        plain_steps_out: wp.array[int],
-        best_out: wp.array[wp.float64],
-        evaluations_out: wp.array[int],
-        converged_out: wp.array[int],
-        condition_out: wp.array[int],
     ):
-        c, lane = wp.tid()
-        field = wp.float64(0.0)
-        stiffest = dtype(0.0)
-        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
-            i = row_target[row]
-            first = source_begin[row]
-            last = source_end[row]
-            h = external_field[i]
-            if last > first:
-                h += finish(partial, packed, packed, row, i, first, last, 1, neighbor, neighbor_count)
-            h0_out[i] = h
-            field = wp.max(field, wp.float64(wp.length(h)))
-            overlap = shared_volume(packed, i, induced_begin[row], induced_end[row], neighbor, neighbor_count)
-            stiffest = wp.max(stiffest, slope[i] * (overlap + dtype(2.0 / 3.0)))
-        field = block_max(field)
-        stiffest = block_max(stiffest)
-        if lane == 0:
-            w = chunk[c][2]
-            wp.atomic_max(start_out, w, wp.static(FIELD), field)
-            wp.atomic_max(start_out, w, wp.static(STIFFNESS), wp.float64(stiffest))
-            active_out[w] = 1
-            history_out[w] = 0
-            slot_out[w] = 0
-            plain_steps_out[w] = 0
-            best_out[w] = wp.float64(-1.0)
-            evaluations_out[w] = 0
-            converged_out[w] = 0
-            condition_out[0] = 1
+        h0 = external_field[i]
+        if end > begin:
+            h0 += finish(partial, packed, packed, row, i, begin, end, 1, neighbor, neighbor_count)
+        return h0
 
-    return begin_solve
+    return apply_field
 
 
-def launch_begin(applied, partial, induced, moments, external_field, material, b: InductionBuffers):
-    """Begin a solve in every world: the applied field ``b.h0``, what its step length follows from, its state reset.
-
-    Args:
-        applied: Work list, permanent moments on inducible ones.
-        partial: Sums of the native field loop over ``applied``.
-        induced: Work list, inducible moments on inducible ones, with the same targets.
-        moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``).
-        external_field: External field [A/m], shape [n].
-        material: What the moments are made of (``kernels.wrench.Material``).
-        b: The buffers.
-    """
-    wp.launch_tiled(
-        _begin_kernel(moments.dtype),
-        dim=[b.chunk.shape[0]],
-        inputs=[
-            b.chunk,
-            partial,
-            moments.packed,
-            applied.target,
-            applied.begin,
-            applied.end,
-            induced.begin,
-            induced.end,
-            moments.neighbors,
-            moments.neighbor_counts,
-            external_field,
-            material.slope,
-        ],
-        outputs=[
-            b.h0,
-            b.start,
-            b.active,
-            b.history,
-            b.slot,
-            b.plain_steps,
-            b.best,
-            b.evaluations,
-            b.converged,
-            b.condition,
-        ],
-        block_dim=CHUNK,
-        device=moments.device,
-    )
+@wp.func
+def begin_world(
+    w: int,
+    field: wp.float64,
+    stiffness: wp.float64,
+    start: wp.array2d[wp.float64],
+    worlds: wp.array[World],
+    condition: wp.array[int],
+):
+    """Let a world iterate; ``field`` and ``stiffness`` are the largest of one of its chunks."""
+    wp.atomic_max(start, w, wp.static(FIELD), field)
+    wp.atomic_max(start, w, wp.static(STIFFNESS), stiffness)
+    worlds[w].active = 1
+    worlds[w].evaluations = 0
+    worlds[w].linked = 0
+    worlds[w].plain_steps = 0
+    worlds[w].best = wp.float64(-1.0)
+    condition[0] = 1
 
 
 @wp.func
@@ -267,29 +241,66 @@ def step_length(stiffness: wp.float64):
 
 
 @wp.func
-def relative_error(sums: wp.array2d[wp.float64], w: int):
-    """Relative residual ‖M − f(H)‖/‖f(H)‖ of a world; not relative where there is no field."""
-    lack = wp.sqrt(sums[w, wp.static(LACK)])
-    goal = wp.sqrt(sums[w, wp.static(GOAL)])
+def relative_error(sums: Any):
+    """Relative residual ‖M − f(H)‖/‖f(H)‖ of a world's sums; not relative where there is no field."""
+    lack = wp.sqrt(sums[wp.static(LACK)])
+    goal = wp.sqrt(sums[wp.static(GOAL)])
     return wp.where(goal > wp.float64(0.0), lack / goal, lack)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __threadfence();
+#endif
+""")
+def fence():
+    """Let what a thread has written be seen by other blocks before what it writes next."""
+    ...
+
+
+@wp.func
+def is_last_of_world(lane: int, w: int, chunks: int, arrived: wp.array[int]):
+    """Whether this block is the last of those that sum the ``chunks`` of world ``w``, whose sums it can then read."""
+    last = int(0)
+    if lane == 0:
+        fence()
+        if wp.atomic_add(arrived, w, 1) == chunks - 1:
+            arrived[w] = 0
+            last = 1
+        fence()
+    return block_max(last) == 1
 
 
 @cache
 def world_summation(columns: int):
-    """Warp function by which a block adds up the first ``columns`` sums of the chunks of a world."""
+    """Warp function by which the last block of a world adds up its sums.
+
+    The first thread of every block brings its block's; that of the last one gets all of them, and others ``False``.
+    """
     vector = wp.types.vector(columns, wp.float64)
 
     @wp.func
-    def sum_chunks(
-        w: int, lane: int, begin: int, end: int, sums: wp.array2d[wp.float64], world_sums_out: wp.array2d[wp.float64]
+    def sum_world(
+        total: vector,
+        c: int,
+        lane: int,
+        w: int,
+        begin: int,
+        end: int,
+        sums: wp.array2d[wp.float64],
+        arrived: wp.array[int],
     ):
-        mine = vector()
-        for c in range(begin + lane, end, wp.block_dim()):
-            for column in range(wp.static(columns)):
-                mine[column] += sums[c, column]
-        total = block_sum(mine)
+        if end - begin == 1:
+            return True, total
         if lane == 0:
             for column in range(wp.static(columns)):
-                world_sums_out[w, column] = total[column]
+                sums[c, column] = total[column]
+        if not is_last_of_world(lane, w, end - begin, arrived):
+            return False, total
+        mine = vector()
+        for chunk in range(begin + lane, end, wp.block_dim()):
+            for column in range(wp.static(columns)):
+                mine[column] += sums[chunk, column]
+        return True, block_sum(mine)
 
-    return sum_chunks
+    return sum_world

@@ -25,8 +25,10 @@ from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, ove
 
 CAPACITY = 32
 """Neighbours a list can hold before its target falls back to walking all its sources."""
-SKIN = 0.1
+SKIN = 0.3
 """Part of its radius that a moment may move before the lists are made anew."""
+_LANES = 8
+"""Threads of a GPU that share out the neighbours of a moment; a part of a warp."""
 _BUCKETS_PER_MOMENT = 4
 _FARTHEST_CELL = 1.0e9
 """Cells from the origin beyond which a moment is left out: its cell would be no integer."""
@@ -284,6 +286,29 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def lanes(device) -> int:
+    """Threads that share out the neighbours of a moment; each takes every so many of them."""
+    return _LANES if device.is_cuda else 1
+
+
+@cache
+def group_sum(vector):
+    """Warp function that adds up a vector over groups of 2ᵏ threads of a warp, for each of them."""
+
+    @wp.func_native(f"""
+    auto total = value;
+    #if defined(__CUDA_ARCH__)
+    const unsigned group = (width == 32 ? ~0u : (1u << width) - 1u) << (threadIdx.x & (32 - width));
+    for (int step = width / 2; step > 0; step /= 2)
+        for (int c = 0; c < {vector._length_}; ++c) total[c] += __shfl_xor_sync(group, total[c], step);
+    #endif
+    return total;
+    """)
+    def sum_group(value: vector, width: int) -> vector: ...
+
+    return sum_group
+
+
 @wp.func
 def shared_volume(
     packed: wp.array2d(dtype=Any),
@@ -292,8 +317,12 @@ def shared_volume(
     end: int,
     neighbor: wp.array2d[int],
     neighbor_count: wp.array[int],
+    share: int,
+    shares: int,
 ):
     """Volume that ball ``i`` shares with balls ``begin`` to ``end``, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
+
+    Of that, as of all sums here, thread ``share`` of ``shares`` gets its share.
 
     Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
     above 1/3 − (1 + max o_i), which is −2/3 without overlap. From it the induction solver takes a step length that
@@ -302,12 +331,12 @@ def shared_volume(
     total = packed[3, i] - packed[3, i]
     count = neighbor_count[i]
     if count <= wp.static(CAPACITY):
-        for n in range(count):
+        for n in range(share, count, shares):
             j = neighbor[i, n]
             if j >= begin and j < end:
                 total += pair_overlap(packed, i, j)
     else:
-        for j in range(begin, end):
+        for j in range(begin + share, end, shares):
             if j != i:
                 total += pair_overlap(packed, i, j)
     return total
@@ -335,6 +364,14 @@ def contact_unit(a: Any, b: Any):
 
 
 @wp.func
+def near_pair(xi: Any, xj: Any, a: Any, b: Any, moment: Any):
+    """4π times the field [A/m] at a ball of radius ``a`` of another's ``moment`` [A·m²], radius ``b``."""
+    unit = contact_unit(a, b)
+    r = unit * (xi - xj)
+    return field_of(pair_factors(wp.dot(r, r), unit * a, unit * b), r, (unit * unit * unit) * moment)
+
+
+@wp.func
 def near_field(
     packed: wp.array2d(dtype=Any),
     moments: wp.array(dtype=Any),
@@ -343,6 +380,8 @@ def near_field(
     end: int,
     neighbor: wp.array2d[int],
     neighbor_count: wp.array[int],
+    share: int,
+    shares: int,
 ):
     """4π times the field [A/m] at ball ``i`` of other ``moments`` [A·m²] on its neighbours among ``begin`` to ``end``.
 
@@ -352,14 +391,41 @@ def near_field(
     count = neighbor_count[i]
     if count <= wp.static(CAPACITY):
         x = type(h)(packed[0, i], packed[1, i], packed[2, i])
-        for n in range(count):
+        for n in range(share, count, shares):
             j = neighbor[i, n]
             if j >= begin and j < end:
-                r = x - type(h)(packed[0, j], packed[1, j], packed[2, j])
-                unit = contact_unit(packed[3, i], packed[3, j])
-                r *= unit
-                g = pair_factors(wp.dot(r, r), unit * packed[3, i], unit * packed[3, j])
-                h += field_of(g, r, (unit * unit * unit) * moments[j])
+                y = type(h)(packed[0, j], packed[1, j], packed[2, j])
+                h += near_pair(x, y, packed[3, i], packed[3, j], moments[j])
+    return h
+
+
+@wp.func
+def extrapolated_near_field(
+    packed: wp.array2d(dtype=Any),
+    positions: wp.array2d(dtype=Any),
+    moments: wp.array2d(dtype=Any),
+    i: int,
+    begin: int,
+    end: int,
+    neighbor: wp.array2d[int],
+    neighbor_count: wp.array[int],
+    share: int,
+    shares: int,
+):
+    """What :func:`near_field` would be by linear extrapolation from that of the last solution and the one before.
+
+    Both are those of the present neighbours. Positions [m] and moments [A·m²] have shape [2, n], the last ones first.
+    """
+    h = moments[0, i] - moments[0, i]
+    count = neighbor_count[i]
+    if count <= wp.static(CAPACITY):
+        a = packed[3, i]
+        for n in range(share, count, shares):
+            j = neighbor[i, n]
+            if j >= begin and j < end:
+                b = packed[3, j]
+                last = near_pair(positions[0, i], positions[0, j], a, b, moments[0, j])
+                h += last + (last - near_pair(positions[1, i], positions[1, j], a, b, moments[1, j]))
     return h
 
 

@@ -33,8 +33,11 @@ from warpmag.kernels.induction import (
     FIELD,
     GOAL,
     LACK,
-    STIFFNESS,
     InductionBuffers,
+    World,
+    applied_field,
+    begin_world,
+    block_max,
     block_sum,
     relative_error,
     world_summation,
@@ -108,6 +111,53 @@ def step_submagnetization(u: Any, h_eff: Any, kappa: Any, precession: Any, side:
 
 
 @cache
+def _begin_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+    apply_field = applied_field(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def begin_pairs(
+        # inputs:
+        chunk: wp.array[wp.vec3i],
+        partial: wp.array3d[dtype],
+        packed: wp.array2d[dtype],
+        row_target: wp.array[int],
+        source_begin: wp.array[int],
+        source_end: wp.array[int],
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        external_field: wp.array[vec3],
+        # outputs:
+        h0_out: wp.array[vec3],
+        start_out: wp.array2d[wp.float64],
+        worlds_out: wp.array[World],
+        condition_out: wp.array[int],
+    ):
+        c, lane = wp.tid()
+        field = wp.float64(0.0)
+        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
+            i = row_target[row]
+            h0 = apply_field(
+                partial,
+                packed,
+                row,
+                i,
+                source_begin[row],
+                source_end[row],
+                neighbor,
+                neighbor_count,
+                external_field,
+            )
+            h0_out[i] = h0
+            field = wp.max(field, wp.float64(wp.length(h0)))
+        field = block_max(field)
+        if lane == 0:
+            begin_world(chunk[c][2], field, wp.float64(0.0), start_out, worlds_out, condition_out)
+
+    return begin_pairs
+
+
+@cache
 def _start_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
 
@@ -168,6 +218,41 @@ def _split_kernel(dtype):
     return split_magnetizations
 
 
+_columns = wp.types.vector(2, wp.float64)
+_sum_world = world_summation(2)
+
+
+@wp.func
+def judge(
+    w: int,
+    sums: _columns,
+    rtol: wp.float64,
+    max_evaluations: int,
+    worlds: wp.array[World],
+    start_out: wp.array2d[wp.float64],
+    error_out: wp.array[wp.float64],
+    evaluations_out: wp.array[int],
+    converged_out: wp.array[int],
+    warm_out: wp.array[int],
+    condition_out: wp.array[int],
+):
+    """Tell whether a world has converged, given up or come to nothing; else it steps on."""
+    evaluations = worlds[w].evaluations + 1
+    error = relative_error(sums)
+    lost = not wp.isfinite(error)
+    worlds[w].evaluations = evaluations
+    evaluations_out[w] = evaluations
+    error_out[w] = error
+    converged_out[w] = wp.where(error <= rtol, 1, 0)
+    start_out[w, wp.static(FIELD)] = wp.float64(0.0)
+    if error <= rtol or evaluations >= max_evaluations or lost:
+        worlds[w].active = 0
+        # a state that is not finite must not be the next start
+        warm_out[w] = wp.where(lost, 0, 1)
+    else:
+        condition_out[0] = 1
+
+
 @cache
 def _evaluate_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
@@ -177,6 +262,7 @@ def _evaluate_kernel(dtype):
     def evaluate_pairs(
         # inputs:
         chunk: wp.array[wp.vec3i],
+        chunk_begin: wp.array[int],
         partial: wp.array3d[dtype],
         packed: wp.array2d[dtype],
         row_target: wp.array[int],
@@ -190,18 +276,26 @@ def _evaluate_kernel(dtype):
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
-        active: wp.array[int],
+        rtol: wp.float64,
+        max_evaluations: int,
+        # in and out:
+        worlds: wp.array[World],
+        sums: wp.array2d[wp.float64],
+        arrived: wp.array[int],
         # outputs:
         h_out: wp.array[vec3],
-        sums_out: wp.array2d[wp.float64],
+        start_out: wp.array2d[wp.float64],
+        error_out: wp.array[wp.float64],
+        evaluations_out: wp.array[int],
+        converged_out: wp.array[int],
+        warm_out: wp.array[int],
         condition_out: wp.array[int],
     ):
         c, lane = wp.tid()
-        if c == 0 and lane == 0:
-            condition_out[0] = 0
-        if active[chunk[c][2]] == 0:
+        w = chunk[c][2]
+        if worlds[w].active == 0:
             return
-        mine = wp.vec2d()
+        mine = _columns()
         for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
             i = row_target[row]
             h = h0[i] + finish(
@@ -215,55 +309,23 @@ def _evaluate_kernel(dtype):
             lack_length = wp.float64(wp.length(goal - (dtype(0.5) * saturation[i]) * (first[i] + second[i])))
             mine[wp.static(LACK)] += lack_length * lack_length
             mine[wp.static(GOAL)] += goal_length * goal_length
-        total = block_sum(mine)
-        if lane == 0:
-            for column in range(2):
-                sums_out[c, column] = total[column]
+        last, total = _sum_world(block_sum(mine), c, lane, w, chunk_begin[w], chunk_begin[w + 1], sums, arrived)
+        if last and lane == 0:
+            judge(
+                w,
+                total,
+                rtol,
+                max_evaluations,
+                worlds,
+                start_out,
+                error_out,
+                evaluations_out,
+                converged_out,
+                warm_out,
+                condition_out,
+            )
 
     return evaluate_pairs
-
-
-_sum_world = world_summation(2)
-
-
-@wp.kernel(enable_backward=False)
-def judge(
-    # inputs:
-    chunk_begin: wp.array[int],
-    sums: wp.array2d[wp.float64],
-    rtol: wp.float64,
-    max_evaluations: int,
-    # in and out:
-    active: wp.array[int],
-    evaluations: wp.array[int],
-    # outputs:
-    world_sums_out: wp.array2d[wp.float64],
-    start_out: wp.array2d[wp.float64],
-    error_out: wp.array[wp.float64],
-    converged_out: wp.array[int],
-    warm_out: wp.array[int],
-    condition_out: wp.array[int],
-):
-    """Tell which worlds have converged, given up or come to nothing; the others step on."""
-    w, lane = wp.tid()
-    if active[w] == 0:
-        return
-    _sum_world(w, lane, chunk_begin[w], chunk_begin[w + 1], sums, world_sums_out)
-    if lane > 0:
-        return
-    evaluations[w] = evaluations[w] + 1
-    error = relative_error(world_sums_out, w)
-    error_out[w] = error
-    start_out[w, wp.static(FIELD)] = wp.float64(0.0)
-    start_out[w, wp.static(STIFFNESS)] = wp.float64(0.0)
-    lost = not wp.isfinite(error)
-    if error <= rtol or evaluations[w] >= max_evaluations or lost:
-        active[w] = 0
-        converged_out[w] = wp.where(error <= rtol, 1, 0)
-        # a state that is not finite must not be the next start
-        warm_out[w] = wp.where(lost, 0, 1)
-        return
-    condition_out[0] = 1
 
 
 @cache
@@ -275,7 +337,7 @@ def _step_kernel(dtype):
         # inputs:
         row_target: wp.array[int],
         world: wp.array[int],
-        active: wp.array[int],
+        worlds: wp.array[World],
         h: wp.array[vec3],
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
@@ -291,7 +353,7 @@ def _step_kernel(dtype):
         packed_out: wp.array2d[dtype],
     ):
         i = row_target[wp.tid()]
-        if active[world[i]] == 0:
+        if worlds[world[i]].active == 0:
             return
         u = first[i]
         v = second[i]
@@ -323,22 +385,42 @@ def launch_split_magnetizations(rows, magnetizations, material, b: InductionBuff
     )
 
 
-def launch_start_pairs(moments, rows, material, b: InductionBuffers, first, second, moments_out):
-    """Begin a solve from the applied field ``b.h0`` and, in worlds that are warm, from the pairs as they are.
+def launch_begin(applied, partial, moments, external_field, material, b: InductionBuffers, first, second, moments_out):
+    """Begin a solve from the applied field and, in worlds that are warm, from the pairs as they are.
 
     Args:
+        applied: Work list, permanent moments on inducible ones.
+        partial: Sums of the native field loop over ``applied``.
         moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
-        rows: Work list whose targets are the inducible moments.
-        material: What they are made of (``kernels.wrench.Material``).
-        b: Fields and world state, as ``induction.launch_begin`` left them.
+        external_field: External field [A/m], shape [n].
+        material: What the moments are made of (``kernels.wrench.Material``).
+        b: Fields and world state.
         first: Directions of M1, shape [n].
         second: Directions of M2, shape [n].
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
+    wp.launch_tiled(
+        _begin_kernel(moments.dtype),
+        dim=[b.chunk.shape[0]],
+        inputs=[
+            b.chunk,
+            partial,
+            moments.packed,
+            applied.target,
+            applied.begin,
+            applied.end,
+            moments.neighbors,
+            moments.neighbor_counts,
+            external_field,
+        ],
+        outputs=[b.h0, b.start, b.worlds, b.condition],
+        block_dim=CHUNK,
+        device=moments.device,
+    )
     wp.launch(
         _start_kernel(moments.dtype),
-        dim=rows.count,
-        inputs=[rows.target, b.world, b.warm, b.start, b.h0, material.saturation],
+        dim=applied.count,
+        inputs=[applied.target, b.world, b.warm, b.start, b.h0, material.saturation],
         outputs=[first, second, moments_out, moments.packed],
         device=moments.device,
     )
@@ -378,11 +460,13 @@ def launch_step_pairs(
         max_evaluations: Field evaluations after which a world gives up.
     """
     device, dtype = moments.device, moments.dtype
+    b.condition.zero_()  # until a world wants another evaluation
     wp.launch_tiled(
         _evaluate_kernel(dtype),
         dim=[b.chunk.shape[0]],
         inputs=[
             b.chunk,
+            b.chunk_begin,
             partial,
             moments.packed,
             rows.target,
@@ -396,17 +480,13 @@ def launch_step_pairs(
             material.saturation,
             material.slope,
             material.curve,
-            b.active,
+            wp.float64(rtol),
+            max_evaluations,
+            b.worlds,
+            b.sums,
+            b.arrived,
         ],
-        outputs=[b.h, b.sums, b.condition],
-        block_dim=CHUNK,
-        device=device,
-    )
-    wp.launch_tiled(
-        judge,
-        dim=[b.error.shape[0]],
-        inputs=[b.chunk_begin, b.sums, wp.float64(rtol), max_evaluations, b.active, b.evaluations],
-        outputs=[b.world_sums, b.start, b.error, b.converged, b.warm, b.condition],
+        outputs=[b.h, b.start, b.error, b.evaluations, b.converged, b.warm, b.condition],
         block_dim=CHUNK,
         device=device,
     )
@@ -416,7 +496,7 @@ def launch_step_pairs(
         inputs=[
             rows.target,
             b.world,
-            b.active,
+            b.worlds,
             b.h,
             material.saturation,
             material.slope,

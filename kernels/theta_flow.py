@@ -2,7 +2,7 @@
 
 Unknown is the dual variable s = k f⁻¹(M)/Ms of every inducible moment, so that M = Ms c(‖s‖) ŝ. One field evaluation
 gives the target g = k H(M)/Ms and the residual r = g − s; the exact θ flow moves s by ω r (``curves.theta_flow``).
-With the iterate's differences Δs_j, Δr_j to the last few, Anderson's step is
+With the last few changes Δs_j, Δr_j from one evaluation to the next, Anderson's step is
 
     s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖,
 
@@ -19,9 +19,12 @@ overlap.
 An accelerated step or a swept one that leaves the merit ‖φ r‖ more than twice the best is taken back, and a few plain
 steps follow from the best iterate.
 
-The residual that ends a solve is good for one more step: with that polished s, and its change β Δs to come, the next
-solve starts, Δs the change since the solve before it. β is what would have predicted Δs from the change before it,
-β = Δs·Δs'/‖Δs'‖² within [0, 1], for each moment by itself: smooth motion is followed, a jump is not repeated. A start
+The residual that ends a solve is good for one more step: with that polished s, and its change since the solve before it
+once more, the next solve starts, and sweeps over neighbours go before its first evaluation. What these are to each
+other is known exactly where they stand now; the rest of the field, the far part F = H − H0 − G' M, is extrapolated:
+g = (k/Ms) (H0 + G' M(s) + 2 F₁ − F₂) with F of the last solve and of the one before, both of the present neighbours.
+In Balls Up that leaves 1.5 evaluations a substep of 2.1. The changes Δs_j, Δr_j outlive a solve, since what they tell
+of the coupling hardly changes: a slow mode, as of long columns of balls, costs one evaluation instead of three. A start
 is only a start, and whatever it is worth the solve converges to the one solution.
 """
 
@@ -30,9 +33,9 @@ from typing import Any
 
 import warp as wp
 
-from warpmag.kernels.anderson import DEPTH, SLOTS, anderson_coefficients, matrix_column, slot_of
+from warpmag.kernels.anderson import DEPTH, anderson_solver, matrix_column, slot_of
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio, theta_flow
-from warpmag.kernels.field import INVERSE_4PI, finished_field
+from warpmag.kernels.field import INVERSE_4PI, finished_field, summed_field
 from warpmag.kernels.induction import (
     CHUNK,
     COLUMNS,
@@ -43,66 +46,134 @@ from warpmag.kernels.induction import (
     STIFFNESS,
     TERMS,
     InductionBuffers,
+    World,
+    applied_field,
+    begin_world,
+    block_max,
     block_sum,
     relative_error,
     step_length,
     world_summation,
 )
-from warpmag.kernels.neighbors import near_field
+from warpmag.kernels.neighbors import extrapolated_near_field, group_sum, lanes, near_field, shared_volume
 from warpmag.kernels.packing import ball_volume, store_magnetization
+from warpmag.kernels.pair_sums_cuda import Shape, own_target
 
-PLAIN_STEPS = SLOTS
+PLAIN_STEPS = DEPTH + 1
 """Plain steps after an accelerated one was taken back, before the next is tried."""
-REST, RETREAT, ADVANCE, SWEEP = 0, 1, 2, 3
-"""What a world does next: nothing, a plain step from the best iterate, a step, a step and sweeps over neighbours."""
+REST, VANISH, RETREAT, ADVANCE, SWEEP = 0, 1, 2, 3, 4
+"""What a world does next: nothing; no magnetization, where there is no field; a plain step from the best iterate; a
+step; a step and sweeps over neighbours."""
+MOST_FUSED = 1500
+"""Moments up to which the kernel that judges them had better sum their field itself, on an H200."""
 STEADY = 3
 """Solves in a row that make two changes to extrapolate from."""
 
 
 @cache
-def _start_kernel(dtype):
+def _begin_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
+    sum_group = group_sum(wp.types.vector(4, dtype))
+    apply_field = applied_field(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def start_moments(
+    def begin_flow(
         # inputs:
+        chunk: wp.array[wp.vec3i],
+        partial: wp.array3d[dtype],
+        packed: wp.array2d[dtype],
         row_target: wp.array[int],
-        world: wp.array[int],
+        source_begin: wp.array[int],
+        source_end: wp.array[int],
+        induced_begin: wp.array[int],
+        induced_end: wp.array[int],
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        external_field: wp.array[vec3],
         warm: wp.array[int],
-        start: wp.array2d[wp.float64],
-        h0: wp.array[vec3],
+        past_positions: wp.array2d[vec3],
+        past_moments: wp.array2d[vec3],
+        past_field: wp.array2d[vec3],
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
+        shares: int,
         # in and out:
         s_inout: wp.array[vec3],
         last_s: wp.array[vec3],
-        last_change: wp.array[vec3],
         # outputs:
+        h0_out: wp.array[vec3],
+        mixed_g_out: wp.array[vec3],
+        mixed_moment_out: wp.array[vec3],
+        change_out: wp.array[vec3],
         moments_out: wp.array[vec3],
         packed_out: wp.array2d[dtype],
+        start_out: wp.array2d[wp.float64],
+        worlds_out: wp.array[World],
+        condition_out: wp.array[int],
     ):
-        i = row_target[wp.tid()]
-        w = world[i]
-        s = s_inout[i]
-        change = s - last_s[i]
-        earlier = last_change[i]
-        # without a field the one solution is no magnetization, which a cold start hits
-        cold = warm[w] == 0 or start[w, wp.static(FIELD)] == wp.float64(0.0)
-        if cold:
-            # the θ flow with κ = k from no magnetization: exact for a lone ball; shorter where balls overlap deeply
-            step = wp.min(dtype(1.0), dtype(step_length(start[w, wp.static(STIFFNESS)])) / dtype(0.6))
-            s = (step * slope[i] / saturation[i]) * h0[i]
-            change = vec3()
-        last_s[i] = s
-        last_change[i] = change
-        square = wp.dot(earlier, earlier)
-        if warm[w] == wp.static(STEADY) and square > dtype(0.0):
-            s += wp.clamp(wp.dot(change, earlier) / square, dtype(0.0), dtype(1.0)) * change
-        s_inout[i] = s
-        store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
+        c, lane = wp.tid()
+        share = lane % shares
+        w = chunk[c][2]
+        steady = warm[w] == wp.static(STEADY)
+        field = wp.float64(0.0)
+        stiffest = wp.float64(0.0)
+        for row in range(chunk[c][0] + lane // shares, chunk[c][1], (wp.block_dim() + shares - 1) // shares):
+            i = row_target[row]
+            first = induced_begin[row]
+            last = induced_end[row]
+            k = slope[i]
+            limit = saturation[i]
+            h0 = apply_field(
+                partial,
+                packed,
+                row,
+                i,
+                source_begin[row],
+                source_end[row],
+                neighbor,
+                neighbor_count,
+                external_field,
+            )
+            near = vec3()
+            if steady:
+                near = extrapolated_near_field(
+                    packed, past_positions, past_moments, i, first, last, neighbor, neighbor_count, share, shares
+                )
+            overlap = shared_volume(packed, i, first, last, neighbor, neighbor_count, share, shares)
+            about = sum_group(wp.vector(near[0], near[1], near[2], overlap, length=4), shares)
+            stiffness = wp.float64(k * (about[3] + dtype(2.0 / 3.0)))
+            field = wp.max(field, wp.float64(wp.length(h0)))
+            stiffest = wp.max(stiffest, stiffness)
+            if share == 0:
+                h0_out[i] = h0
+                s = s_inout[i]
+                change = s - last_s[i]
+                if warm[w] == 0:
+                    # the θ flow with κ = k from no magnetization: exact for a lone ball; shorter where balls overlap
+                    # deeply
+                    step = wp.min(dtype(1.0), dtype(step_length(stiffness)) / dtype(0.6))
+                    s = (step * k / limit) * h0
+                last_s[i] = s
+                if steady:
+                    s += change
+                s_inout[i] = s
+                store_magnetization(i, (limit * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
+                if steady:
+                    near = dtype(wp.static(INVERSE_4PI)) * vec3(about[0], about[1], about[2])
+                    far = past_field[0, i] + (past_field[0, i] - past_field[1, i]) - near
+                    mixed_g_out[i] = (k / limit) * (h0 + far)
+                    mixed_moment_out[i] = vec3()
+                    change_out[i] = moments_out[i]
+        field = block_max(field)
+        stiffest = block_max(stiffest)
+        if lane == 0:
+            begin_world(w, field, stiffest, start_out, worlds_out, condition_out)
+            worlds_out[w].mode = wp.where(steady, wp.static(SWEEP), wp.static(REST))
+            if warm[w] == 0:
+                worlds_out[w].kept = 0
 
-    return start_moments
+    return begin_flow
 
 
 @cache
@@ -138,17 +209,156 @@ def product(a: Any, b: Any):
     return total
 
 
+_columns = wp.types.vector(COLUMNS, wp.float64)
+_sum_world = world_summation(COLUMNS)
+_solve = anderson_solver(COLUMNS, TERMS)
+
+
 @cache
-def _residual_kernel(dtype):
+def _measured(dtype):
+    """Warp function that notes an iterate's residual and returns what a moment adds to its world's sums."""
     vec3 = wp.types.vector(3, dtype)
     differences = wp.types.matrix((DEPTH, 3), dtype)
-    columns = wp.types.vector(COLUMNS, wp.float64)
-    finish = finished_field(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def residuals(
+    @wp.func
+    def measure(
+        i: int,
+        h: vec3,
+        s: vec3,
+        saturation: dtype,
+        slope: dtype,
+        curve: int,
+        linked: int,
+        newest: int,
+        kept: int,
+        iterate_s: wp.array[vec3],
+        iterate_r: wp.array[vec3],
+        history_s: wp.array2d[vec3],
+        history_r: wp.array2d[vec3],
+    ):
+        mine = _columns()
+        g = (slope / saturation) * h
+        r = g - s
+        if linked == 1:
+            history_s[newest, i] = s - iterate_s[i]
+            history_r[newest, i] = r - iterate_r[i]
+        iterate_s[i] = s
+        iterate_r[i] = r
+        length_s = wp.length(s)
+        length_g = wp.length(g)
+        worth_s = saturation * curve_ratio(length_s, curve)
+        worth_g = saturation * curve_ratio(length_g, curve)
+        # lengths, not squares: a field of 1e-20 A/m squared is no float32
+        goal_length = wp.float64(worth_g * length_g)
+        lack_length = wp.float64(wp.length(worth_g * g - worth_s * s))
+        weight = wp.float64(wp.where(length_s > length_g, worth_s, worth_g))
+        merit = weight * wp.float64(wp.length(r))
+        mine[wp.static(LACK)] = lack_length * lack_length
+        mine[wp.static(GOAL)] = goal_length * goal_length
+        mine[wp.static(MERIT)] = merit * merit
+        change = differences()
+        for a in range(wp.static(DEPTH)):
+            if a < kept:
+                old = history_r[slot_of(newest, a), i]
+                for k in range(3):
+                    change[a, k] = old[k]
+                mine[wp.static(TERMS) + a] = weight * weight * product(change[a], r)
+                for b in range(a + 1):
+                    mine[wp.static(TERMS) + matrix_column(b, a)] = weight * weight * product(change[b], change[a])
+        return mine
+
+    return measure
+
+
+@wp.func
+def decide(
+    w: int,
+    sums: _columns,
+    newest: int,
+    kept: int,
+    rtol: wp.float64,
+    max_evaluations: int,
+    start: wp.array2d[wp.float64],
+    worlds: wp.array[World],
+    warm: wp.array[int],
+    error_out: wp.array[wp.float64],
+    evaluations_out: wp.array[int],
+    converged_out: wp.array[int],
+    condition_out: wp.array[int],
+):
+    """Judge a world's iterate by its sums and choose its next step."""
+    error = relative_error(sums)
+    merit = wp.sqrt(sums[wp.static(MERIT)])
+    best = worlds[w].best
+    plain_steps = worlds[w].plain_steps
+    evaluations = worlds[w].evaluations + 1
+    lost = not wp.isfinite(merit)
+    first = best < wp.float64(0.0)
+    done = error <= rtol or evaluations >= max_evaluations or (first and lost)
+    fieldless = False
+    if evaluations == 1:
+        fieldless = start[w, wp.static(FIELD)] == wp.float64(0.0)
+        worlds[w].omega = step_length(start[w, wp.static(STIFFNESS)])
+        start[w, wp.static(STIFFNESS)] = wp.float64(0.0)
+        start[w, wp.static(FIELD)] = wp.float64(0.0)
+    error_out[w] = error
+    evaluations_out[w] = evaluations
+    worlds[w].evaluations = evaluations
+    worlds[w].newest = newest
+    worlds[w].improved = 0
+    mode = int(ADVANCE)
+    if done:
+        worlds[w].active = 0
+        converged_out[w] = wp.where(error <= rtol, 1, 0)
+        # a state that is not finite must not be the next start
+        warm[w] = wp.where(lost, 0, wp.min(warm[w] + 1, wp.static(STEADY)))
+    else:
+        converged_out[w] = 0
+        condition_out[0] = 1
+    # plain steps descend in energy whatever the merit does on the way, so only accelerated ones are judged by it
+    if done and lost:
+        mode = REST
+    elif fieldless and not done:
+        mode = VANISH
+    elif lost or (not first and plain_steps == 0 and merit > wp.float64(2.0) * best):
+        mode = RETREAT
+        plain_steps = wp.static(PLAIN_STEPS)
+    else:
+        plain_steps = wp.max(plain_steps - 1, 0)
+        descended = plain_steps == 0 and kept == wp.static(DEPTH) and worlds[w].used == 0
+        if first or merit < best or descended:
+            worlds[w].best = merit
+            worlds[w].improved = 1
+            plain_steps = 0
+        used = wp.where(plain_steps > 0, 0, kept)
+        worlds[w].used = used
+        worlds[w].alpha = _solve(sums, used)
+        if not done and plain_steps == 0:
+            mode = SWEEP
+    worlds[w].mode = mode
+    worlds[w].plain_steps = plain_steps
+    worlds[w].linked = wp.where(mode >= wp.static(ADVANCE), 1, 0)
+    worlds[w].kept = wp.where(mode >= wp.static(ADVANCE), kept, 0)
+
+
+@cache
+def _judgement_kernel(dtype, shape: Shape | None):
+    """Kernel whose blocks judge a part of a world each, with a ``shape`` tiles whose field they sum themselves."""
+    vec3 = wp.types.vector(3, dtype)
+    fused = shape is not None
+    field_of_tile = summed_field(dtype, shape) if fused else None
+    finish = finished_field(dtype)
+    measure = _measured(dtype)
+    sum_group = group_sum(_columns)
+    group = 1 << (shape.targets - 1).bit_length() if fused else 0
+    bounds = {"grid_stride": False, "launch_bounds": (shape.threads, min(shape.blocks, 4))} if fused else {}
+
+    @wp.kernel(module="unique", enable_backward=False, **bounds)
+    def judge_iterates(
         # inputs:
-        chunk: wp.array[wp.vec3i],
+        part: wp.array[wp.vec3i],
+        part_begin: wp.array[int],
+        tiles: wp.array2d[int],
         partial: wp.array3d[dtype],
         packed: wp.array2d[dtype],
         row_target: wp.array[int],
@@ -161,149 +371,98 @@ def _residual_kernel(dtype):
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
-        active: wp.array[int],
-        history: wp.array[int],
-        slot: wp.array[int],
+        rtol: wp.float64,
+        max_evaluations: int,
+        # in and out:
+        worlds: wp.array[World],
+        start: wp.array2d[wp.float64],
+        warm: wp.array[int],
+        sums: wp.array2d[wp.float64],
+        arrived: wp.array[int],
+        iterate_s: wp.array[vec3],
+        iterate_r: wp.array[vec3],
+        history_s: wp.array2d[vec3],
+        history_r: wp.array2d[vec3],
         # outputs:
         h_out: wp.array[vec3],
-        history_s_out: wp.array2d[vec3],
-        history_r_out: wp.array2d[vec3],
-        sums_out: wp.array2d[wp.float64],
+        error_out: wp.array[wp.float64],
+        evaluations_out: wp.array[int],
+        converged_out: wp.array[int],
         condition_out: wp.array[int],
     ):
-        c, lane = wp.tid()
-        if c == 0 and lane == 0:
-            condition_out[0] = 0
-        w = chunk[c][2]
-        if active[w] == 0:
+        p, lane = wp.tid()
+        w = part[p][2]
+        first_part = part_begin[w]
+        if worlds[w].active == 0:
+            if p == first_part and lane == 0:
+                worlds[w].mode = wp.static(REST)
             return
-        current = slot[w]
-        mine = columns()
-        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
-            i = row_target[row]
-            h = h0[i] + finish(
-                partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count
+        linked = worlds[w].linked
+        newest = (worlds[w].newest + linked) % wp.static(DEPTH)
+        kept = wp.min(worlds[w].kept + linked, wp.static(DEPTH))
+        mine = _columns()
+        if wp.static(fused):
+            i = own_target(p, lane, tiles)
+            k = wp.max(i, 0)
+            # here, so that nothing waits for them behind the sum
+            base = h0[k]
+            s = s_in[k]
+            limit = saturation[k]
+            initial_slope = slope[k]
+            law = curve[k]
+            h = base + field_of_tile(p, lane, tiles, packed, packed, 1, neighbor, neighbor_count)
+            if i >= 0:
+                h_out[i] = h
+                mine = measure(
+                    i, h, s, limit, initial_slope, law, linked, newest, kept, iterate_s, iterate_r, history_s, history_r
+                )
+        else:
+            for row in range(part[p][0] + lane, part[p][1], wp.block_dim()):
+                i = row_target[row]
+                h = h0[i] + finish(
+                    partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count
+                )
+                h_out[i] = h
+                mine += measure(
+                    i,
+                    h,
+                    s_in[i],
+                    saturation[i],
+                    slope[i],
+                    curve[i],
+                    linked,
+                    newest,
+                    kept,
+                    iterate_s,
+                    iterate_r,
+                    history_s,
+                    history_r,
+                )
+        total = _columns()
+        if wp.static(fused):
+            if lane < wp.static(group):
+                total = sum_group(mine, wp.static(group))
+        else:
+            total = block_sum(mine)
+        last, total = _sum_world(total, p, lane, w, first_part, part_begin[w + 1], sums, arrived)
+        if last and lane == 0:
+            decide(
+                w,
+                total,
+                newest,
+                kept,
+                rtol,
+                max_evaluations,
+                start,
+                worlds,
+                warm,
+                error_out,
+                evaluations_out,
+                converged_out,
+                condition_out,
             )
-            h_out[i] = h
-            s = s_in[i]
-            g = (slope[i] / saturation[i]) * h
-            r = g - s
-            history_s_out[current, i] = s
-            history_r_out[current, i] = r
-            length_s = wp.length(s)
-            length_g = wp.length(g)
-            worth_s = saturation[i] * curve_ratio(length_s, curve[i])
-            worth_g = saturation[i] * curve_ratio(length_g, curve[i])
-            # lengths, not squares: a field of 1e-20 A/m squared is no float32
-            goal_length = wp.float64(worth_g * length_g)
-            lack_length = wp.float64(wp.length(worth_g * g - worth_s * s))
-            weight = wp.float64(wp.where(length_s > length_g, worth_s, worth_g))
-            merit = weight * wp.float64(wp.length(r))
-            mine[wp.static(LACK)] += lack_length * lack_length
-            mine[wp.static(GOAL)] += goal_length * goal_length
-            mine[wp.static(MERIT)] += merit * merit
-            change = differences()
-            for a in range(wp.static(DEPTH)):
-                if a < history[w]:
-                    old = history_r_out[slot_of(current, a + 1), i]
-                    for k in range(3):
-                        change[a, k] = r[k] - old[k]
-                    mine[wp.static(TERMS) + a] += weight * weight * product(change[a], r)
-                    for b in range(a + 1):
-                        mine[wp.static(TERMS) + matrix_column(b, a)] += weight * weight * product(change[b], change[a])
-        total = block_sum(mine)
-        if lane == 0:
-            for column in range(wp.static(COLUMNS)):
-                sums_out[c, column] = total[column]
 
-    return residuals
-
-
-_sum_world = world_summation(COLUMNS)
-
-
-@wp.kernel(enable_backward=False)
-def decide(
-    # inputs:
-    chunk_begin: wp.array[int],
-    sums: wp.array2d[wp.float64],
-    rtol: wp.float64,
-    max_evaluations: int,
-    # in and out:
-    start: wp.array2d[wp.float64],
-    active: wp.array[int],
-    history: wp.array[int],
-    slot: wp.array[int],
-    plain_steps: wp.array[int],
-    best: wp.array[wp.float64],
-    evaluations: wp.array[int],
-    warm: wp.array[int],
-    # outputs:
-    world_sums_out: wp.array2d[wp.float64],
-    omega_out: wp.array[wp.float64],
-    error_out: wp.array[wp.float64],
-    converged_out: wp.array[int],
-    mode_out: wp.array[int],
-    improved_out: wp.array[int],
-    used_slot_out: wp.array[int],
-    used_history_out: wp.array[int],
-    alpha_out: wp.array2d[wp.float64],
-    condition_out: wp.array[int],
-):
-    """Judge each world's iterate and choose its next step; a block sums a world, its first thread judges."""
-    w, lane = wp.tid()
-    if active[w] == 0:
-        if lane == 0:
-            mode_out[w] = wp.static(REST)
-        return
-    _sum_world(w, lane, chunk_begin[w], chunk_begin[w + 1], sums, world_sums_out)
-    if lane > 0:
-        return
-    mode_out[w] = wp.static(REST)
-    evaluations[w] = evaluations[w] + 1
-    merit = wp.sqrt(world_sums_out[w, wp.static(MERIT)])
-    error = relative_error(world_sums_out, w)
-    error_out[w] = error
-    lost = not wp.isfinite(merit)
-    first = best[w] < wp.float64(0.0)
-    if evaluations[w] == 1:
-        omega_out[w] = step_length(start[w, wp.static(STIFFNESS)])
-        start[w, wp.static(STIFFNESS)] = wp.float64(0.0)
-        start[w, wp.static(FIELD)] = wp.float64(0.0)
-    if error <= rtol or evaluations[w] >= max_evaluations or (first and lost):
-        active[w] = 0
-        converged_out[w] = wp.where(error <= rtol, 1, 0)
-        # a state that is not finite must not be the next start
-        warm[w] = wp.where(lost, 0, wp.min(warm[w] + 1, wp.static(STEADY)))
-        if lost:
-            return
-    else:
-        condition_out[0] = 1
-    current = slot[w]
-    used_slot_out[w] = current
-    improved_out[w] = 0
-    # plain steps descend in energy whatever the merit does on the way, so only accelerated ones are judged by it
-    if lost or (not first and plain_steps[w] == 0 and merit > wp.float64(2.0) * best[w]):
-        mode_out[w] = wp.static(RETREAT)
-        plain_steps[w] = wp.static(PLAIN_STEPS)
-        history[w] = 0
-        return
-    mode_out[w] = wp.static(ADVANCE)
-    plain_steps[w] = wp.max(plain_steps[w] - 1, 0)
-    descended = plain_steps[w] == 0 and history[w] == wp.static(DEPTH) and used_history_out[w] == 0
-    if first or merit < best[w] or descended:
-        best[w] = merit
-        improved_out[w] = 1
-        plain_steps[w] = 0
-    used = wp.where(plain_steps[w] > 0, 0, history[w])
-    if active[w] == 1 and plain_steps[w] == 0:
-        mode_out[w] = wp.static(SWEEP)
-    alpha = anderson_coefficients(world_sums_out, w, wp.static(TERMS), used)
-    for a in range(wp.static(DEPTH)):
-        alpha_out[w, a] = alpha[a]
-    used_history_out[w] = used
-    history[w] = wp.min(history[w] + 1, wp.static(DEPTH))
-    slot[w] = (current + 1) % wp.static(SLOTS)
+    return judge_iterates
 
 
 @cache
@@ -315,20 +474,21 @@ def _advance_kernel(dtype):
         # inputs:
         row_target: wp.array[int],
         world: wp.array[int],
-        mode: wp.array[int],
-        improved: wp.array[int],
-        used_slot: wp.array[int],
-        used_history: wp.array[int],
-        active: wp.array[int],
-        alpha: wp.array2d[wp.float64],
-        omega: wp.array[wp.float64],
+        worlds: wp.array[World],
+        iterate_s: wp.array[vec3],
+        iterate_r: wp.array[vec3],
         history_s: wp.array2d[vec3],
         history_r: wp.array2d[vec3],
         saturation: wp.array[dtype],
         curve: wp.array[int],
+        h: wp.array[vec3],
+        h0: wp.array[vec3],
         # in and out:
         best_s: wp.array[vec3],
         best_r: wp.array[vec3],
+        past_positions: wp.array2d[vec3],
+        past_moments: wp.array2d[vec3],
+        past_field: wp.array2d[vec3],
         # outputs:
         s_out: wp.array[vec3],
         mixed_g_out: wp.array[vec3],
@@ -339,35 +499,45 @@ def _advance_kernel(dtype):
     ):
         i = row_target[wp.tid()]
         w = world[i]
-        if mode[w] == wp.static(REST):
+        mode = worlds[w].mode
+        if mode == wp.static(REST):
             return
-        s = best_s[i]
-        r = best_r[i]
-        if mode[w] != wp.static(RETREAT):
-            current = used_slot[w]
-            s_now = history_s[current, i]
-            r_now = history_r[current, i]
-            if improved[w] == 1:
-                best_s[i] = s_now
-                best_r[i] = r_now
-            s = s_now
-            r = r_now
-            for a in range(used_history[w]):
-                old = slot_of(current, a + 1)
-                s -= dtype(alpha[w, a]) * (s_now - history_s[old, i])
-                r -= dtype(alpha[w, a]) * (r_now - history_r[old, i])
+        s = vec3()
+        r = vec3()
+        if mode == wp.static(RETREAT):
+            s = best_s[i]
+            r = best_r[i]
+        elif mode != wp.static(VANISH):
+            s = iterate_s[i]
+            r = iterate_r[i]
+            if worlds[w].improved == 1:
+                best_s[i] = s
+                best_r[i] = r
+            for a in range(wp.static(DEPTH)):
+                if a < worlds[w].used:
+                    old = slot_of(worlds[w].newest, a)
+                    alpha = dtype(worlds[w].alpha[a])
+                    s -= alpha * history_s[old, i]
+                    r -= alpha * history_r[old, i]
         mixed = s
-        s = theta_flow(mixed, mixed + r, dtype(omega[w]))
+        s = theta_flow(mixed, mixed + r, dtype(worlds[w].omega))
         s_out[i] = s
         # what has ended keeps the moments that its error was measured at, and s is the next solve's start
-        if active[w] == 1:
+        if worlds[w].active == 1:
             magnetization = (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s
             store_magnetization(i, magnetization, moments_out, packed_out)
-            if mode[w] == wp.static(SWEEP):
+            if mode == wp.static(SWEEP):
                 before = (saturation[i] * curve_ratio(wp.length(mixed), curve[i])) * mixed
                 mixed_g_out[i] = mixed + r
                 mixed_moment_out[i] = ball_volume(packed_out[3, i]) * before
                 change_out[i] = ball_volume(packed_out[3, i]) * (magnetization - before)
+        else:
+            past_positions[1, i] = past_positions[0, i]
+            past_moments[1, i] = past_moments[0, i]
+            past_field[1, i] = past_field[0, i]
+            past_positions[0, i] = vec3(packed_out[0, i], packed_out[1, i], packed_out[2, i])
+            past_moments[0, i] = moments_out[i]
+            past_field[0, i] = h[i] - h0[i]
 
     return advance
 
@@ -375,6 +545,7 @@ def _advance_kernel(dtype):
 @cache
 def _sweep_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
+    sum_group = group_sum(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def sweep(
@@ -385,37 +556,43 @@ def _sweep_kernel(dtype):
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
         world: wp.array[int],
-        mode: wp.array[int],
-        omega: wp.array[wp.float64],
+        worlds: wp.array[World],
         mixed_g: wp.array[vec3],
         mixed_moment: wp.array[vec3],
         change: wp.array[vec3],
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
+        shares: int,
         # outputs:
         s_out: wp.array[vec3],
         change_out: wp.array[vec3],
         moments_out: wp.array[vec3],
         packed_out: wp.array2d[dtype],
+        condition_out: wp.array[int],
     ):
-        row = wp.tid()
+        row = wp.tid() // shares
+        share = wp.tid() % shares
+        if wp.tid() == 0:
+            condition_out[0] = 0  # until a world wants another evaluation
         i = row_target[row]
         w = world[i]
-        if mode[w] != wp.static(SWEEP):
+        if worlds[w].mode != wp.static(SWEEP):
             return
-        h = near_field(packed_out, change, i, row_begin[row], row_end[row], neighbor, neighbor_count)
-        g = mixed_g[i] + (dtype(wp.static(INVERSE_4PI)) * slope[i] / saturation[i]) * h
-        s = theta_flow(s_out[i], g, dtype(omega[w]))
-        s_out[i] = s
-        store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
-        change_out[i] = moments_out[i] - mixed_moment[i]
+        h = near_field(packed_out, change, i, row_begin[row], row_end[row], neighbor, neighbor_count, share, shares)
+        h = sum_group(h, shares)
+        if share == 0:
+            g = mixed_g[i] + (dtype(wp.static(INVERSE_4PI)) * slope[i] / saturation[i]) * h
+            s = theta_flow(s_out[i], g, dtype(worlds[w].omega))
+            s_out[i] = s
+            store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
+            change_out[i] = moments_out[i] - mixed_moment[i]
 
     return sweep
 
 
 def launch_set_state(rows, magnetizations, material, b: InductionBuffers):
-    """Take given magnetizations [A/m], shape [n], for the last solution of all worlds; ``rows`` as in launch_start."""
+    """Take given magnetizations [A/m], shape [n], for the last solution of all worlds; ``rows`` are the inducible."""
     if rows.count == 0:
         return
     wp.launch(
@@ -427,31 +604,96 @@ def launch_set_state(rows, magnetizations, material, b: InductionBuffers):
     )
 
 
-def launch_start(rows, moments, material, b: InductionBuffers, moments_out):
-    """Set the moments that a solve starts from: in worlds that are warm what is left of the last solves.
+def launch_begin(applied, partial, induced, moments, external_field, material, b: InductionBuffers, moments_out):
+    """Begin a solve in every world: applied field, starting moments, and what their step length follows from.
 
     Args:
-        rows: Work list whose targets are the inducible moments.
-        moments: Packed moments (``warpmag.packed.PackedMoments``); gets the starting moments.
-        material: What they are made of (``kernels.wrench.Material``).
-        b: The buffers, as ``induction.launch_begin`` left them.
+        applied: Work list, permanent moments on inducible ones.
+        partial: Sums of the native field loop over ``applied``.
+        induced: Work list, inducible moments on inducible ones, with the same targets.
+        moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``); gets the starting moments.
+        external_field: External field [A/m], shape [n].
+        material: What the moments are made of (``kernels.wrench.Material``).
+        b: The buffers.
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
-    wp.launch(
-        _start_kernel(moments.dtype),
-        dim=rows.count,
-        inputs=[rows.target, b.world, b.warm, b.start, b.h0, material.saturation, material.slope, material.curve],
-        outputs=[b.s, b.last_s, b.last_change, moments_out, moments.packed],
+    shares = lanes(moments.device)
+    wp.launch_tiled(
+        _begin_kernel(moments.dtype),
+        dim=[b.chunk.shape[0]],
+        inputs=[
+            b.chunk,
+            partial,
+            moments.packed,
+            applied.target,
+            applied.begin,
+            applied.end,
+            induced.begin,
+            induced.end,
+            moments.neighbors,
+            moments.neighbor_counts,
+            external_field,
+            b.warm,
+            b.past_positions,
+            b.past_moments,
+            b.past_field,
+            material.saturation,
+            material.slope,
+            material.curve,
+            shares,
+            b.s,
+            b.last_s,
+        ],
+        outputs=[
+            b.h0,
+            b.mixed_g,
+            b.mixed_moment,
+            b.change,
+            moments_out,
+            moments.packed,
+            b.start,
+            b.worlds,
+            b.condition,
+        ],
+        block_dim=shares * CHUNK,
         device=moments.device,
     )
 
 
+def launch_sweeps(rows, moments, material, b: InductionBuffers, moments_out):
+    """Two sweeps over neighbours, before the field is summed, in worlds that want them; see the module."""
+    shares = lanes(moments.device)
+    for change, next_change in ((b.change, b.next_change), (b.next_change, b.change)):
+        wp.launch(
+            _sweep_kernel(moments.dtype),
+            dim=shares * rows.count,
+            inputs=[
+                rows.target,
+                rows.begin,
+                rows.end,
+                moments.neighbors,
+                moments.neighbor_counts,
+                b.world,
+                b.worlds,
+                b.mixed_g,
+                b.mixed_moment,
+                change,
+                material.saturation,
+                material.slope,
+                material.curve,
+                shares,
+            ],
+            outputs=[b.s, next_change, moments_out, moments.packed, b.condition],
+            device=moments.device,
+        )
+
+
 def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol, max_evaluations, moments_out):
-    """Judge the field just summed into ``partial`` and move every world that has not ended; see the module.
+    """Judge the field, summed into ``partial`` or here, and move every world that has not ended; see the module.
 
     Args:
         rows: Work list whose targets are the inducible moments.
-        partial: Sums of the native field loop over ``rows``.
+        partial: Sums of the pair loop over ``rows``; nothing if they are fused.
         moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``).
         material: What they are made of (``kernels.wrench.Material``).
         b: The buffers; ``b.condition`` tells whether another evaluation is wanted.
@@ -459,18 +701,14 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
         max_evaluations: Field evaluations after which a world gives up.
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
-    _launch_judgement(rows, partial, moments, material, b, rtol, max_evaluations)
-    _launch_step(rows, moments, material, b, moments_out)
-
-
-def _launch_judgement(rows, partial, moments, material, b, rtol, max_evaluations):
-    """Residuals and their sums, and what they make of each world."""
     device, dtype = moments.device, moments.dtype
     wp.launch_tiled(
-        _residual_kernel(dtype),
-        dim=[b.chunk.shape[0]],
+        _judgement_kernel(dtype, rows.shape if rows.fused else None),
+        dim=[b.part.shape[0]],
         inputs=[
-            b.chunk,
+            b.part,
+            b.part_begin,
+            rows.tiles,
             partial,
             moments.packed,
             rows.target,
@@ -483,94 +721,43 @@ def _launch_judgement(rows, partial, moments, material, b, rtol, max_evaluations
             material.saturation,
             material.slope,
             material.curve,
-            b.active,
-            b.history,
-            b.slot,
-        ],
-        outputs=[b.h, b.history_s, b.history_r, b.sums, b.condition],
-        block_dim=CHUNK,
-        device=device,
-    )
-    wp.launch_tiled(
-        decide,
-        dim=[b.omega.shape[0]],
-        inputs=[
-            b.chunk_begin,
-            b.sums,
             wp.float64(rtol),
             max_evaluations,
+            b.worlds,
             b.start,
-            b.active,
-            b.history,
-            b.slot,
-            b.plain_steps,
-            b.best,
-            b.evaluations,
             b.warm,
+            b.sums,
+            b.arrived,
+            b.iterate_s,
+            b.iterate_r,
+            b.history_s,
+            b.history_r,
         ],
-        outputs=[
-            b.world_sums,
-            b.omega,
-            b.error,
-            b.converged,
-            b.mode,
-            b.improved,
-            b.used_slot,
-            b.used_history,
-            b.alpha,
-            b.condition,
-        ],
-        block_dim=CHUNK,
+        outputs=[b.h, b.error, b.evaluations, b.converged, b.condition],
+        block_dim=rows.shape.threads if rows.fused else CHUNK,
         device=device,
     )
-
-
-def _launch_step(rows, moments, material, b, moments_out):
-    """The step that was decided on, and two sweeps over neighbours."""
-    device, dtype = moments.device, moments.dtype
     wp.launch(
         _advance_kernel(dtype),
         dim=rows.count,
         inputs=[
             rows.target,
             b.world,
-            b.mode,
-            b.improved,
-            b.used_slot,
-            b.used_history,
-            b.active,
-            b.alpha,
-            b.omega,
+            b.worlds,
+            b.iterate_s,
+            b.iterate_r,
             b.history_s,
             b.history_r,
             material.saturation,
             material.curve,
+            b.h,
+            b.h0,
             b.best_s,
             b.best_r,
+            b.past_positions,
+            b.past_moments,
+            b.past_field,
         ],
         outputs=[b.s, b.mixed_g, b.mixed_moment, b.change, moments_out, moments.packed],
         device=device,
     )
-    for change, next_change in ((b.change, b.next_change), (b.next_change, b.change)):
-        wp.launch(
-            _sweep_kernel(dtype),
-            dim=rows.count,
-            inputs=[
-                rows.target,
-                rows.begin,
-                rows.end,
-                moments.neighbors,
-                moments.neighbor_counts,
-                b.world,
-                b.mode,
-                b.omega,
-                b.mixed_g,
-                b.mixed_moment,
-                change,
-                material.saturation,
-                material.slope,
-                material.curve,
-            ],
-            outputs=[b.s, next_change, moments_out, moments.packed],
-            device=device,
-        )

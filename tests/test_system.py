@@ -165,6 +165,27 @@ def test_extrapolation_follows_a_steady_motion(device):
     assert max(errors) <= 1e-3
 
 
+def test_a_start_knows_where_the_neighbors_have_gone(device):
+    """What balls that shift at random do to their neighbours, the first moments have in them, before any field."""
+    x, radii, _ = pile(count=150)
+    field = np.array([0.0, 0.0, 0.1 * MS])
+    system = MomentSystem(radii=radii, saturation=MS, external_field=field, rtol=1e-5, device=device)
+    system.positions.assign(x)
+    for _ in range(4):
+        system.solve()
+    last = system.magnetizations().numpy().astype(float)
+    x = x + 0.02 * radii[:, None] * np.random.default_rng(2).normal(size=x.shape)
+    system.positions.assign(x)
+    system.begin()
+    system.iterate()
+    volumes = 4.0 / 3.0 * np.pi * radii[:, None] ** 3
+    h = field + oracle.h_field(x, volumes * last, radii=radii)
+    strength = np.linalg.norm(h, axis=1, keepdims=True)
+    unmoved = relative(last, MS * np.tanh(3.0 * strength / MS) * h / strength)
+    # two sweeps, each of which leaves 0.4 of what a ball's field has changed by and some of its neighbours' changes
+    assert system.error.numpy()[0] < 0.4 * unmoved
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_starts_never_decide_the_solution(dtype, device):
     """Whatever was extrapolated before it, a jump, a restored state or a reversed field ends in the one solution."""

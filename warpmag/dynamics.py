@@ -1,7 +1,8 @@
 """Magnetization dynamics: how inducible moments move from a field evaluation towards equilibrium.
 
-This is the one place where a dynamics is chosen. Each is an object with the same three methods, all of which only
-launch kernels: ``start`` begins a solve, ``iterate`` takes one step from the field just summed, ``start_from`` sets the
+This is the one place where a dynamics is chosen. Each is an object with the same four methods, all of which only launch
+kernels: ``start`` begins a solve in the field of the permanent moments just summed, ``refine`` improves the moments by
+what their neighbours tell, before the field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the
 magnetizations that the next solve starts from.
 """
 
@@ -62,10 +63,15 @@ class ThetaFlow:
         t = self._target
         theta_flow.launch_set_state(t.rows, magnetizations, t.material, t.state)
 
-    def start(self):
+    def start(self, applied, partial, external_field):
         """Begin a solve."""
         t = self._target
-        theta_flow.launch_start(t.rows, t.packed, t.material, t.state, t.moments)
+        theta_flow.launch_begin(applied, partial, t.rows, t.packed, external_field, t.material, t.state, t.moments)
+
+    def refine(self):
+        """Sweep over neighbours."""
+        t = self._target
+        theta_flow.launch_sweeps(t.rows, t.packed, t.material, t.state, t.moments)
 
     def iterate(self):
         """Judge the field just summed and move."""
@@ -109,10 +115,15 @@ class SubmagnetizationPairs:
             t.rows, magnetizations, t.material, t.state, self.first, self.second
         )
 
-    def start(self):
+    def start(self, applied, partial, external_field):
         """Begin a solve."""
         t = self._target
-        submagnetization.launch_start_pairs(t.packed, t.rows, t.material, t.state, self.first, self.second, t.moments)
+        submagnetization.launch_begin(
+            applied, partial, t.packed, external_field, t.material, t.state, self.first, self.second, t.moments
+        )
+
+    def refine(self):
+        """Nothing to do."""
 
     def iterate(self):
         """Judge the field just summed and step the pairs."""

@@ -8,7 +8,7 @@ import warp as wp
 from warpmag.arrays import ACCURACY, check_radii, resolve_device, resolve_dtype, vec3_type
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
-from warpmag.kernels import induction, near_contact, pair_loops
+from warpmag.kernels import induction, near_contact, pair_loops, theta_flow
 from warpmag.kernels.curves import CURVE_IDS
 from warpmag.kernels.field import launch_field
 from warpmag.kernels.packing import launch_divide_by_volume
@@ -126,9 +126,13 @@ class MomentSystem:
         _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
         twisted = permanent | (size[body] > 1) | lone_torque
         self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
-        self._make_rows(worlds, permanent, movable, twisted.any())
+        # only the flow sums the field that it needs itself, and only if nothing is to be added to it
+        few = np.count_nonzero(~permanent) <= theta_flow.MOST_FUSED
+        fusible = few and dynamics == "theta" and contact_model == "dipole"
+        forms = pair_loops.FORMS if fusible else (pair_loops.LOOP, pair_loops.MIRRORED)
+        self._make_rows(worlds, permanent, movable, twisted.any(), forms)
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
-        self._induction = induction.allocate(worlds, ~permanent, self.dtype, self.device)
+        self._induction = induction.allocate(worlds, ~permanent, self._induced, self.dtype, self.device)
         self._near = None
         if contact_model == "multipole":
             lone = ~permanent & (size[body] == 1) & (radii > 0.0)
@@ -164,7 +168,7 @@ class MomentSystem:
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
 
-    def _make_rows(self, worlds, permanent, movable, any_twisted):
+    def _make_rows(self, worlds, permanent, movable, any_twisted, forms):
         """Work lists: inducible on inducible, permanent on inducible, everything on whatever moves."""
         induced, applied, felt = [], [], []
         for w in range(int(worlds[-1]) + 1 if len(worlds) else 0):
@@ -174,7 +178,7 @@ class MomentSystem:
             applied.append((first, middle, middle, last))
             edges = np.flatnonzero(np.diff(np.concatenate([[0], movable[first:last].astype(int), [0]])))
             felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
-        self._induced = pair_loops.make_rows(induced, self.device, forms=(pair_loops.LOOP, pair_loops.MIRRORED))
+        self._induced = pair_loops.make_rows(induced, self.device, forms=forms)
         self._applied = pair_loops.make_rows(applied, self.device, forms=(pair_loops.LOOP,))
         self._felt = {
             law: pair_loops.make_rows(felt, self.device, WRENCH if any_twisted else quantity)
@@ -213,6 +217,8 @@ class MomentSystem:
         """Launch the induction solve: inducible ``moments`` in equilibrium with the field at ``positions``."""
         self.begin()
         if self._induced.count:
+            # no world is done before the first evaluation, and a loop costs a GPU more than what is in it
+            self.iterate()
             wp.capture_while(self._induction.condition, self.iterate)
 
     def begin(self):
@@ -226,19 +232,11 @@ class MomentSystem:
             near_contact.launch_find_pairs(packed, self._near)
         if self._applied.pair_count:
             pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
-        induction.launch_begin(
-            self._applied,
-            self._applied_partial,
-            self._induced,
-            packed,
-            self.external_field,
-            self._material,
-            self._induction,
-        )
-        self.dynamics.start()
+        self.dynamics.start(self._applied, self._applied_partial, self.external_field)
 
     def iterate(self):
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
+        self.dynamics.refine()
         self._sum_induced()
         self.dynamics.iterate()
 
