@@ -20,8 +20,8 @@ from warpmag.kernels.field import finished_field
 
 CHUNK = 64
 """Moments whose sums one block adds up, on a GPU each of them by a thread of its own."""
-LACK, GOAL, MERIT, TERMS = 0, 1, 2, 3
-"""Sums ‖M − f(H)‖², ‖f(H)‖² and ‖φr‖² of a chunk or world, and how many they are."""
+LACK, GOAL, MERIT, FOLLOWED, EARLIER, TERMS = range(6)
+"""Sums ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ⟨φΔg, φΔg'⟩ and ‖φΔg'‖² of a chunk or world, and how many they are."""
 COLUMNS = TERMS + anderson.COLUMNS
 """All sums of a chunk or world; those of ``anderson`` stand behind."""
 FIELD, STIFFNESS = 0, 1
@@ -44,6 +44,7 @@ class World:
         improved: Whether the last iterate is the best so far.
         plain_steps: Steps to be taken without mixing.
         omega: Step length.
+        ahead: Part of the last change from solve to solve that the next start adds.
         best: Smallest merit of this solve, negative before the first.
         alpha: Anderson coefficients.
     """
@@ -58,6 +59,7 @@ class World:
     improved: int
     plain_steps: int
     omega: wp.float64
+    ahead: wp.float64
     best: wp.float64
     alpha: anderson.coefficients
 
@@ -74,9 +76,8 @@ class InductionBuffers:
         h0: Applied field [A/m]: external and from permanent magnets, shape [n].
         h: Whole field [A/m], shape [n].
         s: Dual variable [dimensionless], shape [n].
-        last_s: Solution of the solve before the last, shape [n].
-        past_positions, past_moments, past_field: Where the last two solves were done [m], the moments [A·m²] that they
-            ended at and what fields they make [A/m], the last solve first, shape [2, n].
+        past_positions, past_moments, past_field, past_g: Where the last two solves were done [m], the moments [A·m²]
+            that they ended at, what fields these make [A/m], and the reduced whole field; the last first, shape [2, n].
         iterate_s, iterate_r: The last iterate judged, and its residual, shape [n].
         history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
         best_s, best_r: Those of the smallest merit, shape [n].
@@ -101,10 +102,10 @@ class InductionBuffers:
     h0: wp.array
     h: wp.array
     s: wp.array
-    last_s: wp.array
     past_positions: wp.array
     past_moments: wp.array
     past_field: wp.array
+    past_g: wp.array
     iterate_s: wp.array
     iterate_r: wp.array
     history_s: wp.array
@@ -161,9 +162,9 @@ def allocate(worlds, inducible, rows, dtype, device) -> InductionBuffers:
         chunk_begin=put(chunk_begin, wp.int32),
         part=put(np.reshape(parts, (-1, 3)), wp.vec3i),
         part_begin=put(part_begin, wp.int32),
-        **{name: zeros(n, vec3) for name in ("h0", "h", "s", "last_s", "best_s", "best_r")},
+        **{name: zeros(n, vec3) for name in ("h0", "h", "s", "best_s", "best_r")},
         **{name: zeros(n, vec3) for name in ("mixed_g", "mixed_moment", "change", "next_change")},
-        **{name: zeros((2, n), vec3) for name in ("past_positions", "past_moments", "past_field")},
+        **{name: zeros((2, n), vec3) for name in ("past_positions", "past_moments", "past_field", "past_g")},
         **{name: zeros(n, vec3) for name in ("iterate_s", "iterate_r")},
         **{name: zeros((DEPTH, n), vec3) for name in ("history_s", "history_r")},
         start=zeros((world_count, 2), wp.float64),

@@ -404,6 +404,7 @@ def extrapolated_near_field(
     packed: wp.array2d(dtype=Any),
     positions: wp.array2d(dtype=Any),
     moments: wp.array2d(dtype=Any),
+    ahead: Any,
     i: int,
     begin: int,
     end: int,
@@ -412,7 +413,7 @@ def extrapolated_near_field(
     share: int,
     shares: int,
 ):
-    """What :func:`near_field` would be by linear extrapolation from that of the last solution and the one before.
+    """What :func:`near_field` was at the last solution, and ``ahead`` of its change from the one before.
 
     Both are those of the present neighbours. Positions [m] and moments [A·m²] have shape [2, n], the last ones first.
     """
@@ -425,7 +426,7 @@ def extrapolated_near_field(
             if j >= begin and j < end:
                 b = packed[3, j]
                 last = near_pair(positions[0, i], positions[0, j], a, b, moments[0, j])
-                h += last + (last - near_pair(positions[1, i], positions[1, j], a, b, moments[1, j]))
+                h += last + ahead * (last - near_pair(positions[1, i], positions[1, j], a, b, moments[1, j]))
     return h
 
 
