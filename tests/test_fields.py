@@ -156,10 +156,11 @@ def test_any_count_of_touching_balls(count, dtype, device):
     ],
 )
 def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
-    """Those for many moments too, with some moments that fill no tile."""
+    """Those for many moments too, with some moments that fill no tile; of one radius but for a few."""
     monkeypatch.setitem(module.SHAPES, quantity, ((None, shape),))
     form = MIRRORED if module is pair_mirror_cuda else FUSED
     x, radii, m = pile(count=1103)
+    radii[40:] = 0.005
     (found, *_) = sums(x, radii, m, [(0, 1103, 0, 1103)], quantity, "float32", device, form=form)
     if quantity == FIELD:
         expected = oracle.h_field(x, m, radii=radii)
