@@ -50,7 +50,9 @@ _PRELUDE = """
     auto numbers = [](const REAL* row) -> NUMBER { return *row; };
     auto indices = [](const int* row) -> INDEX { return *row; };
     auto put = [](REAL* row, NUMBER n) { *row = n; };
-    auto own_moment = [=](int i) -> Vector { return {moment[i], moment[i + moment_stride], moment[i + 2 * moment_stride]}; };
+    auto own_moment = [=](int i) -> Vector {
+        return {moment[i], moment[i + moment_stride], moment[i + 2 * moment_stride]};
+    };
 #else
     constexpr int WIDTH = 64 / (int)sizeof(REAL), way = 0;
     typedef REAL NUMBER __attribute__((ext_vector_type(WIDTH)));
@@ -225,7 +227,8 @@ _TAKE = """
         for (int c = 0; c < 5; ++c) goal[9 + c] = numbers(drive + (9 + c) * (size_t)stride + i);
         for (int c = 0; c < STATE_ROWS; ++c) {
             const size_t place = (size_t)c * stride + i;
-            const NUMBER now = numbers(contact + place), pace = PACE * (c < 4 ? numbers(ease + (c > 0) * stride + i) : zero + 1);
+            const NUMBER now = numbers(contact + place);
+            const NUMBER pace = PACE * (c < 4 ? numbers(ease + (c > 0) * stride + i) : zero + 1);
             const NUMBER moved = now + pace * (goal[c] - now) + MOMENTUM * (now - numbers(last_contact + place));
             put(last_contact + place, now);
             put(contact + place, moved - moved == zero ? moved : zero);
@@ -285,7 +288,8 @@ _PULL = """
             auto row = [=](int r) -> NUMBER { return numbers(pair + (size_t)r * stride); };
             const INDEX j = indices(near + (size_t)s * stride + i);
             const Vector u = own_vector(pair, stride), m_j = vector_at(moment, moment_stride, j);
-            const Vector n_j = vector_at(contact + stride, stride, j), t_j = {m_j.x - n_j.x, m_j.y - n_j.y, m_j.z - n_j.z};
+            const Vector n_j = vector_at(contact + stride, stride, j);
+            const Vector t_j = {m_j.x - n_j.x, m_j.y - n_j.y, m_j.z - n_j.z};
             const Tensor theta_j = tensor_at(left, stride, j);
             const NUMBER q_j = -gather(contact, j), source = row(4), g1 = row(5), g2 = row(6), third = row(7);
             const NUMBER inverse = row(8), second = g2 * inverse;
@@ -318,7 +322,9 @@ _PULL = """
             const NUMBER energy_5 = (2 * product - 20 * dot(v, v_part) + 35 * (fifth * f_j) * f) * REAL(1.0 / 3.0);
             const Vector z = times(theta, t_j), z_j = times(theta_j, t), x = times(theta, v_part), x_j = times(part, v);
             auto turned = [=](NUMBER t, NUMBER t_j, NUMBER v, NUMBER v_j, NUMBER z, NUMBER x) -> NUMBER {
-                return 2 * k3 * (q * v_j + q_j * v) + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z) + REAL(-20.0 / 3.0) * x + REAL(70.0 / 3.0) * ((fifth * f_j) * v + (fifth * v_j) * f);
+                return 2 * k3 * (q * v_j + q_j * v)
+                    + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z)
+                    + REAL(70.0 / 3.0) * ((fifth * f_j) * v + (fifth * v_j) * f) - REAL(20.0 / 3.0) * x;
             };
             const Vector turn = {turned(t.x, t_j.x, v.x, v_j.x, z_j.x - z.x, x.x + x_j.x),
                                  turned(t.y, t_j.y, v.y, v_j.y, z_j.y - z.y, x.y + x_j.y),
@@ -346,9 +352,9 @@ _PULL = """
 """
 
 
-# On a GPU a launch is one pass, and ``WAYS`` threads share a ball's slots. A CPU makes all of them in one launch: its threads, of the
-# process's own library since a launch may sit inside a graph, take chunks of balls as they come, and go on to the next
-# pass when all chunks of the last are done. A thread that cannot be had is not missed.
+# On a GPU a launch is one pass, and ``WAYS`` threads share a ball's slots. A CPU makes all passes in one launch: its
+# threads, of the process's own library since a launch may sit inside a graph, take chunks of balls as they come, and go
+# on to the next pass when all chunks of the last are done. A thread that cannot be had is not missed.
 _RUN = """
 #if defined(__CUDA_ARCH__)
     if (only == 0) FIRST(thread / WAYS);
@@ -407,7 +413,9 @@ _RUN = """
 def _text(real: str, first: str, second: str, names: tuple[str, ...], body: str) -> str:
     """Text of a native function: its arrays by name, the definition of two passes, and how they are run."""
     pointers = "".join(
-        f"    auto* const {name} = {name}_in.data;\n" if name in _INTEGERS else f"    REAL* const {name} = (REAL*){name}_in.data;\n"
+        f"    auto* const {name} = {name}_in.data;\n"
+        if name in _INTEGERS
+        else f"    REAL* const {name} = (REAL*){name}_in.data;\n"
         for name in names
     )
     run = _RUN.replace("FIRST", first).replace("SECOND", second)

@@ -59,7 +59,7 @@ SOFTNESS = 0.03
 DEEPEST = (0.1, 0.3)
 """Overlap [radii] over which the pair's part fades: balls that deep in one another are no physical pair."""
 
-MOST_SHARED = (0.5, 1.0)
+MOST_SHARED = (0.1, 0.3)
 """Volume shared with neighbours, in volumes, over which a ball leaves the model: heaps that deep are no contacts."""
 LEAST_RATIO = (0.5, 0.8)
 """Ratio of radii over which the pair's part sets in: the table is that of equal balls."""
@@ -375,7 +375,14 @@ class NearContacts:
             phi_j, alpha_j, gamma_j, field_j, _, _ = its
             # what both share counts half for each
             mixed = np.sum(field * field_j, 1) + alpha * alpha_j
-            energy = [0.5 * phi**2, 0.5 * phi * phi_j, phi * alpha, phi * alpha_j, 0.5 * alpha**2, 0.5 * alpha * alpha_j]
+            energy = [
+                0.5 * phi**2,
+                0.5 * phi * phi_j,
+                phi * alpha,
+                phi * alpha_j,
+                0.5 * alpha**2,
+                0.5 * alpha * alpha_j,
+            ]
             energy += [0.5 * square, 0.5 * mixed, phi * gamma, phi * gamma_j, alpha * gamma, alpha * gamma_j]
             energy += [0.5 * gamma**2, 0.5 * gamma * gamma_j]
             radial += np.einsum("pf,fp->p", self.slope[side], np.array(energy))

@@ -18,7 +18,9 @@ from bench.reference.spheres import sufficient_order
 from warpmag import near_contact
 
 
-def reduced_resistance(distance: float, permeabilities, m: int, highest: int, order: int, source_quadrupole=1.0) -> np.ndarray:
+def reduced_resistance(
+    distance: float, permeabilities, m: int, highest: int, order: int, source_quadrupole=1.0
+) -> np.ndarray:
     """K of two balls of unit radius for order m, degrees up to ``highest`` of both balls, those up to ``order`` solved.
 
     A ball has a source where m = 0, which sees the other's quadrupole ``source_quadrupole`` times as strong as it is.
