@@ -1,24 +1,27 @@
 """The near-contact model on the device: what balls that nearly touch add to their dipoles.
 
-``warpmag.near_contact`` holds the physics, the table and the reference implementation; names are the same. Every ball i
-has contact sources n_i = (q, N), and with its actual ones a_i = (0, m_i)
+``warpmag.near_contact`` holds the physics, the table and the reference implementation; names are the same. Every ball
+has contact sources n = (q, N, n_Θ), and with what is left of its actual ones, ã = (−q, m − N, Θ̃),
 
-    e = M (a − n),    n = ΔC e,    4π H_near = (M n)_m,
+    e = M ã,    n = ΔC e,    e_Θ = (1 − p) (e' − n_Θ/R⁵),    Θ̃ = −p R⁵ e' − (1 − p) n_Θ,    4π H_near = (M_sr a − e)_m,
 
-M the short-range matrix of sources and dipoles, ΔC the conductances of the near pairs. The eigenvalues of 1 + ΔC M lie
-between 1 and a bound L that follows from the pairs, so heavy-ball sweeps
+e' the e_Θ that other balls make, p the polarizability. Heavy-ball sweeps
 
-    n ← n + α (ΔC e − n) + β (n − n'),    α = 4/(√L + 1)², β = ((√L − 1)/(√L + 1))²,
+    n ← n + α s (ΔC e − n) + β (n − n'),
 
-converge. They run along with the induction, from where the last left off.
+and the same for Θ̃, with s the inverse diagonal of 1 + ΔC M, run along with the induction, from where the last left off.
 
-Only eligible balls take part, in pairs with one another: single inducible moments with at most ``CAPACITY`` near ones
-and no more volume shared than the model allows.
+Only eligible balls take part, in pairs with one another: single inducible moments with no more near balls than there
+are slots, and no more volume shared than the model allows. Near balls are found as ``neighbors`` finds overlaps, and
+kept as slots: a pass over the pairs is in ``near_contact_code``, with what each row of an array is.
 
 | variable | shape | meaning |
 |---|---|---|
-| pairs | [n, CAPACITY, 16] | direction to j; A to H as ball i sees them; D as j does; U_sr, g1 d, g1, g2 d² |
-| contact, last_contact, drive | [n] | n, n of the sweep before, e: vectors (q or φ, x, y, z) |
+| near, touching | [slots, balls] | near balls, and those whose surfaces nearly touch |
+| pairs, contacts, slopes | [slots, rows, balls] | what does not change while balls stand still |
+| mirror | [slots, balls] | place among ``halves`` of the other ball's half |
+| contact, last_contact, drive | [rows, balls] | n and Θ̃, those of the sweep before, e |
+| field, force | [3, balls] | 4π H_near [A/m]; the force over μ0/4π |
 """
 
 from dataclasses import dataclass
@@ -29,62 +32,99 @@ import numpy as np
 import warp as wp
 
 from warpmag import near_contact as model
-from warpmag.kernels.curves import inverse_curve_ratio, reduced_curve_slope
+from warpmag.kernels import neighbors
+from warpmag.kernels.curves import TANH, inverse_curve_ratio, reduced_curve_slope
+from warpmag.kernels.near_contact_code import (
+    CONTACT_ROWS,
+    CONTACTS,
+    DRIVE_ROWS,
+    LANES,
+    NEAR,
+    OWN_DIPOLE,
+    OWN_SOURCE,
+    PAIR_ROWS,
+    SLOPE_ROWS,
+    STATE_ROWS,
+    WAYS,
+    force_text,
+    sweep_text,
+)
 from warpmag.kernels.packing import ball_volume
-from warpmag.kernels.pair_law import averaged_factors, overlap_fraction, pair_factors
+from warpmag.kernels.pair_law import overlap_fraction, pair_factors
+from warpmag.kernels.pair_loops import cores
 from warpmag.kernels.wrench import MU0
+from warpmag.near_contact import FUNCTIONS
 
-CAPACITY = 32
-"""Near balls a list can hold; balls that do not overlap have at most about 22."""
 SWEEPS = 2
 """Sweeps before each field evaluation: with one, a cold solve of a pile takes twice as many evaluations."""
 FORCE_SWEEPS = 2
 """Sweeps before forces are taken."""
 KINDS = 16
 """Susceptibilities that are told apart."""
-_COEFFICIENTS = 16
-_MOST_GRID_CELLS = 64
+_SKIN = 0.05
+"""Part of its radius that a ball may move before near balls are sought anew."""
+_CANDIDATES = 64
+"""Balls that may be listed as near, or about to be."""
+_BALLS_PER_THREAD = 500
+"""Balls that make another thread of a CPU worth its start."""
 
 
 @dataclass(frozen=True)
 class NearContactBuffers:
-    """All that the model keeps on the device, for n moments.
+    """All that the model keeps on the device, for n moments; balls are moments padded to ``LANES``.
 
     Attributes:
-        eligible: Whether a moment may take part, shape [n].
-        group: World of each moment, shape [n].
+        group: World of each moment, −1 if it may not take part, shape [n].
         kind: Kind of material of each moment, shape [n].
         kind_count: Number of kinds.
-        tables: Spline coefficients of A to H by gap for each pair of kinds, shape [kinds², gaps + 2, 8].
-        neighbor, count: Near balls of each and how many, shape [n, CAPACITY] and [n].
+        tables: Spline coefficients of A to P by gap for each pair of kinds, shape [kinds², gaps + 2, functions].
+        lists: Balls that are near, or about to be.
+        near, count: Near balls and how many, shape [NEAR, balls] and [balls].
+        touching, contact_count: Those that nearly touch, shape [CONTACTS, balls] and [balls].
+        used: Slots of both kinds that hold something, shape [2, n].
         share: Factor by which a ball takes part, shape [n].
-        weight: Factor that falls as it saturates, shape [n].
-        pairs, contact, last_contact, drive: See the module.
-        field: 4π H_near [A/m], shape [n].
-        bound: Bound L of each world, shape [worlds].
-        points: Positions in float32 [m], shape [n].
-        grid: Hash grid over them.
-        reach: Distance of the farthest pair [m]; 0 if no moment may take part.
+        radius: Radii [m], shape [balls].
+        polarizability: p of each ball's quadrupole, shape [balls].
+        weight: Factor that falls as it saturates, shape [balls].
+        ease: Inverse diagonals s of a ball's q and N, shape [2, balls].
+        pairs, contacts, slopes, mirror, contact, last_contact, drive, field, force: See the module.
+        halves: What each ball sees of its contacts' forces, and a zero, shape [CONTACTS + 1, 3, balls].
+        reach: Distance of the farthest contact [m]; 0 if no moment may take part.
+        threads: Threads of a CPU.
     """
 
-    eligible: wp.array
     group: wp.array
     kind: wp.array
     kind_count: int
     tables: wp.array
-    neighbor: wp.array
+    lists: neighbors.NeighborLists
+    near: wp.array
     count: wp.array
+    touching: wp.array
+    contact_count: wp.array
+    used: wp.array
     share: wp.array
+    radius: wp.array
+    polarizability: wp.array
     weight: wp.array
+    ease: wp.array
     pairs: wp.array
+    contacts: wp.array
+    slopes: wp.array
+    mirror: wp.array
     contact: wp.array
     last_contact: wp.array
     drive: wp.array
     field: wp.array
-    bound: wp.array
-    points: wp.array
-    grid: wp.HashGrid
+    halves: wp.array
+    force: wp.array
     reach: float
+    threads: int
+
+    def forget(self):
+        """Start cold, from no contact sources."""
+        for array in (self.contact, self.last_contact):
+            array.zero_()
 
 
 def allocate(radii, worlds, eligible, susceptibility, dtype, device) -> NearContactBuffers:
@@ -99,38 +139,55 @@ def allocate(radii, worlds, eligible, susceptibility, dtype, device) -> NearCont
         device: Warp device.
     """
     n = len(radii)
+    balls = -(-max(n, 1) // LANES) * LANES
+    eligible = np.asarray(eligible, bool)
     hardness = model.hardness(susceptibility)
     levels = np.unique(hardness[eligible]) if np.any(eligible) else np.zeros(1)
     if len(levels) > KINDS:
         levels = np.quantile(levels, np.linspace(0.0, 1.0, KINDS))
     kind = np.abs(hardness[:, None] - levels[None]).argmin(1)
     tables = np.array([model.gap_table(float(own), float(other)) for own in levels for other in levels])
-    vec4 = wp.types.vector(4, dtype)
+    padded = np.ones(balls)
+    padded[:n] = np.where(eligible, radii, 1.0)
 
     def put(values, kind):
         return wp.array(np.ascontiguousarray(values), dtype=kind, device=device)
 
-    # about one ball per cell of a compact pile; a larger grid only costs time to clear
-    cells = int(np.clip(2 ** np.ceil(np.log2(max(n, 1)) / 3.0), 8, _MOST_GRID_CELLS))
-    grid = wp.HashGrid(cells, cells, cells, device=device)
-    grid.reserve(max(n, 1), with_groups=True)
+    def zeros(*shape, kind=dtype):
+        return wp.zeros(shape, dtype=kind, device=device)
+
+    def itself(*shape):
+        return np.broadcast_to(np.arange(balls), shape)
+
+    ratio = 0.5 * model.REACH + _SKIN
     return NearContactBuffers(
-        eligible=put(np.asarray(eligible, np.int32), wp.int32),
-        group=put(np.asarray(worlds, np.int32), wp.int32),
-        kind=put(kind.astype(np.int32), wp.int32),
+        group=put(np.where(eligible, worlds, -1), wp.int32),
+        kind=put(kind, wp.int32),
         kind_count=len(levels),
         tables=put(tables, dtype),
-        neighbor=wp.zeros((n, CAPACITY), dtype=int, device=device),
-        count=wp.zeros(n, dtype=int, device=device),
-        share=wp.zeros(n, dtype=dtype, device=device),
-        weight=wp.zeros(n, dtype=dtype, device=device),
-        pairs=wp.zeros((n, CAPACITY, _COEFFICIENTS), dtype=dtype, device=device),
-        **{name: wp.zeros(n, dtype=vec4, device=device) for name in ("contact", "last_contact", "drive")},
-        field=wp.zeros(n, dtype=wp.types.vector(3, dtype), device=device),
-        bound=wp.zeros(int(np.max(worlds, initial=0)) + 1, dtype=dtype, device=device),
-        points=wp.zeros(n, dtype=wp.vec3, device=device),
-        grid=grid,
-        reach=model.RANGE * float(np.max(radii, initial=0.0, where=np.asarray(eligible, bool))),
+        lists=neighbors.allocate(n, dtype, device, ratio=ratio, capacity=_CANDIDATES),
+        near=put(itself(NEAR, balls), wp.int32),
+        count=zeros(balls, kind=wp.int32),
+        touching=put(itself(CONTACTS, balls), wp.int32),
+        contact_count=zeros(balls, kind=wp.int32),
+        used=zeros(2, n, kind=wp.int32),
+        share=zeros(n),
+        radius=put(padded, dtype),
+        polarizability=zeros(balls),
+        weight=zeros(balls),
+        ease=zeros(2, balls),
+        pairs=zeros(NEAR, PAIR_ROWS, balls),
+        contacts=zeros(CONTACTS, CONTACT_ROWS, balls),
+        slopes=zeros(CONTACTS, SLOPE_ROWS, balls),
+        mirror=put(CONTACTS * 3 * balls + itself(CONTACTS, balls), wp.int32),
+        contact=zeros(STATE_ROWS, balls),
+        last_contact=zeros(STATE_ROWS, balls),
+        drive=zeros(DRIVE_ROWS, balls),
+        field=zeros(3, balls),
+        halves=zeros(CONTACTS + 1, 3, balls),
+        force=zeros(3, balls),
+        reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
+        threads=max(1, min(cores(), n // _BALLS_PER_THREAD)),
     )
 
 
@@ -154,6 +211,17 @@ def smoothstep_slope(x: Any):
 
 
 @wp.func
+def window(gap: Any, near: Any, far: Any, shallow: Any, deep: Any):
+    """Factor that fades between two gaps and between two overlaps, and its derivative; ``model.window``."""
+    width = far - near
+    depth = deep - shallow
+    outer = (far - gap) / width
+    inner = (deep + gap) / depth
+    slope = smoothstep(outer) * smoothstep_slope(inner) / depth - smoothstep_slope(outer) * smoothstep(inner) / width
+    return wp.vector(smoothstep(outer) * smoothstep(inner), slope, length=2)
+
+
+@wp.func
 def averaged_potential(d: Any, a: Any, b: Any):
     """Potential U of two homogeneous balls, as ``model.averaged_potential``; nearly concentric ones as touching."""
     s = a + b
@@ -169,12 +237,12 @@ def averaged_potential(d: Any, a: Any, b: Any):
 @cache
 def _pair_functions(dtype):
     """Warp functions of one pair: its ΔC (functions and slopes by the gap) and its short-range factors."""
-    functions = wp.types.matrix((2, 8), dtype)
+    functions = wp.types.matrix((2, FUNCTIONS), dtype)
     vec4 = wp.types.vector(4, dtype)
 
     @wp.func
     def conductances(tables: wp.array3d[dtype], kinds: int, gap: dtype):
-        """A to H and their derivatives by the gap [radii], window included."""
+        """A to P and their derivatives by the gap [radii], window included."""
         first = dtype(wp.static(model.LOG_GAPS[0]))
         scale = dtype(wp.static((model.LOG_GAPS[2] - 1) / (model.LOG_GAPS[1] - model.LOG_GAPS[0])))
         smallest = dtype(wp.static(model.SMALLEST_GAP))
@@ -201,23 +269,23 @@ def _pair_functions(dtype):
             -half * (dtype(3.0) * u * u - dtype(4.0) * u),
             half * t * t,
         )
-        far = (dtype(wp.static(model.RANGE - 2.0)) - gap) / dtype(wp.static(model.WINDOW))
-        width = dtype(wp.static(model.DEEPEST[1] - model.DEEPEST[0]))
-        deep = (dtype(wp.static(model.DEEPEST[1])) + gap) / width
-        window = smoothstep(far) * smoothstep(deep)
-        window_slope = smoothstep(far) * smoothstep_slope(deep) / width - smoothstep_slope(far) * smoothstep(
-            deep
-        ) / dtype(wp.static(model.WINDOW))
+        fade = window(
+            gap,
+            dtype(wp.static(model.CONTACT_GAP[0])),
+            dtype(wp.static(model.CONTACT_GAP[1])),
+            dtype(wp.static(model.DEEPEST[0])),
+            dtype(wp.static(model.DEEPEST[1])),
+        )
         result = functions()
-        for f in range(8):
+        for f in range(wp.static(FUNCTIONS)):
             value = dtype(0.0)
             change = dtype(0.0)
             for k in range(4):
                 node = tables[kinds, row + k, f]
                 value += w[k] * node
                 change += v[k] * node
-            result[0, f] = window * value
-            result[1, f] = window * change + window_slope * value
+            result[0, f] = fade[0] * value
+            result[1, f] = fade[0] * change + fade[1] * value
         return result
 
     @wp.func
@@ -225,7 +293,7 @@ def _pair_functions(dtype):
         """U_sr and its radial factors g1, g2, g3."""
         half = dtype(wp.static(0.5 * model.RANGE))
         near = pair_factors(d * d, a, b)
-        far = averaged_factors(d, half * a, half * b)
+        far = pair_factors(d * d, half * a, half * b)
         u = averaged_potential(d, a, b) - averaged_potential(d, half * a, half * b)
         return vec4(u, near[0] - far[0], near[1] - far[1], near[2] - far[2])
 
@@ -240,376 +308,483 @@ def similarity(a: Any, b: Any):
 
 
 @cache
-def _find_kernel(dtype):
+def _watch_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def find_near_balls(
+    def watch_motion(
         # inputs:
-        grid: wp.uint64,
         packed: wp.array2d[dtype],
-        eligible: wp.array[int],
         group: wp.array[int],
-        reach: float,
+        found_at: wp.array[vec3],
         # outputs:
-        neighbor_out: wp.array2d[int],
-        count_out: wp.array[int],
-        share_out: wp.array[dtype],
-        bound_out: wp.array[dtype],
+        moved_out: wp.array[int],
     ):
         i = wp.tid()
-        bound_out[group[i]] = dtype(1.0)
-        count_out[i] = 0
-        share_out[i] = dtype(0.0)
         x = vec3(packed[0, i], packed[1, i], packed[2, i])
-        # not finite, or so far out that the index of its cell overflows: not in the model
-        if eligible[i] == 0 or not (wp.length(x) < dtype(1.0e8) * dtype(reach)):
-            return
-        radius = packed[3, i]
-        query = wp.hash_grid_query(grid, wp.vec3(float(x[0]), float(x[1]), float(x[2])), reach, group[i])
-        count = int(0)
-        shared = dtype(0.0)
-        j = int(0)
-        while wp.hash_grid_query_next(query, j):
-            if j != i and eligible[j] == 1:
-                d = wp.length(x - vec3(packed[0, j], packed[1, j], packed[2, j]))
-                if d < dtype(wp.static(0.5 * model.RANGE)) * (radius + packed[3, j]):
-                    if count < wp.static(CAPACITY):
-                        neighbor_out[i, count] = j
-                    count += 1
-                    shared += overlap_fraction(d, radius, packed[3, j])
-        if count > wp.static(CAPACITY):
-            return
-        count_out[i] = count
-        low = dtype(wp.static(model.MOST_SHARED[0]))
-        share_out[i] = dtype(1.0) - smoothstep((shared - low) / (dtype(wp.static(model.MOST_SHARED[1])) - low))
+        if group[i] >= 0 and not wp.length(x - found_at[i]) <= dtype(wp.static(_SKIN)) * packed[3, i]:
+            moved_out[0] = 1
 
-    return find_near_balls
+    return watch_motion
+
+
+@cache
+def _select_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def select_pairs(
+        # inputs:
+        packed: wp.array2d[dtype],
+        group: wp.array[int],
+        candidate: wp.array2d[int],
+        candidate_count: wp.array[int],
+        # outputs:
+        near_out: wp.array2d[int],
+        count_out: wp.array[int],
+        touching_out: wp.array2d[int],
+        contact_count_out: wp.array[int],
+        share_out: wp.array[dtype],
+    ):
+        """Choose the balls that are near now, and those that nearly touch."""
+        i = wp.tid()
+        count_out[i] = 0
+        contact_count_out[i] = 0
+        share_out[i] = dtype(0.0)
+        if group[i] < 0:
+            return
+        if candidate_count[i] > candidate.shape[1]:
+            return
+        x = vec3(packed[0, i], packed[1, i], packed[2, i])
+        radius = packed[3, i]
+        count = int(0)
+        contacts = int(0)
+        shared = dtype(0.0)
+        for k in range(candidate_count[i]):
+            j = candidate[i, k]
+            b = packed[3, j]
+            d = wp.length(x - vec3(packed[0, j], packed[1, j], packed[2, j]))
+            if d < dtype(wp.static(0.5 * model.REACH)) * (radius + b):
+                if count < wp.static(NEAR):
+                    near_out[count, i] = j
+                count += 1
+                shared += overlap_fraction(d, radius, b)
+                gap = (d - radius - b) * (radius + b) / (dtype(2.0) * radius * b)
+                if gap < dtype(wp.static(model.CONTACT_GAP[1])):
+                    if contacts < wp.static(CONTACTS):
+                        touching_out[contacts, i] = j
+                    contacts += 1
+        low = dtype(wp.static(model.MOST_SHARED[0]))
+        share = dtype(1.0) - smoothstep((shared - low) / (dtype(wp.static(model.MOST_SHARED[1])) - low))
+        if count <= wp.static(NEAR) and contacts <= wp.static(CONTACTS) and share > dtype(0.0):
+            count_out[i] = count
+            contact_count_out[i] = contacts
+            share_out[i] = share
+
+    return select_pairs
 
 
 @cache
 def _pairs_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
-    vec4 = wp.types.vector(4, dtype)
-    conductances, short_range = _pair_functions(dtype)
+    _, short_range = _pair_functions(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def tabulate_pairs(
         # inputs:
         packed: wp.array2d[dtype],
-        group: wp.array[int],
-        kind: wp.array[int],
-        kind_count: int,
-        tables: wp.array3d[dtype],
-        neighbor: wp.array2d[int],
         count: wp.array[int],
         share: wp.array[dtype],
+        used: wp.array2d[int],
+        stride: int,
         # outputs:
+        near_out: wp.array2d[int],
         pairs_out: wp.array3d[dtype],
-        contact_out: wp.array[vec4],
-        last_contact_out: wp.array[vec4],
-        bound_out: wp.array[dtype],
     ):
-        i = wp.tid()
-        if share[i] == dtype(0.0) or count[i] == 0:
-            contact_out[i] = vec4()
-            last_contact_out[i] = vec4()
-            return
-        radius = packed[3, i]
-        half = dtype(wp.static(0.5 * model.RANGE))
-        stiffness = dtype(0.0)
-        strongest = dtype(0.0)
-        for n in range(count[i]):
-            j = neighbor[i, n]
-            b = packed[3, j]
-            r = vec3(packed[0, j] - packed[0, i], packed[1, j] - packed[1, i], packed[2, j] - packed[2, i])
-            d = wp.length(r)
-            scale = dtype(2.0) * radius * b / (radius + b)
-            gap = (d - radius - b) / scale
-            part = scale * share[i] * share[j] * similarity(radius, b)
-            own = conductances(tables, kind[i] * kind_count + kind[j], gap)
-            other = own
-            if kind[i] != kind[j]:
-                other = conductances(tables, kind[j] * kind_count + kind[i], gap)
-            unit = dtype(1.0) / (radius + b)  # powers of metres overflow float32
-            g = short_range(unit * d, unit * radius, unit * b)
-            if share[j] == dtype(0.0):
-                g = vec4()
-            for c in range(3):
-                pairs_out[i, n, c] = r[c] / wp.max(d, dtype(1.0e-6) * radius)
-            pairs_out[i, n, 12] = unit * g[0]
-            pairs_out[i, n, 13] = unit * unit * (g[1] * unit * d)
-            pairs_out[i, n, 14] = unit * unit * unit * g[1]
-            pairs_out[i, n, 15] = unit * unit * unit * (g[2] * unit * d * unit * d)
-            for f in range(8):
-                pairs_out[i, n, 3 + f] = part * own[0, f]
-            pairs_out[i, n, 11] = part * other[0, 3]
-            stiffness += part * own[0, 0]
-            strongest = wp.max(strongest, part * own[0, 4])
-        inverse = dtype(1.0) / (half * radius)
-        source = dtype(1.0) / radius - dtype(1.2) * inverse
-        dipole = dtype(1.0) - inverse * inverse * inverse * radius * radius * radius
-        wp.atomic_max(bound_out, group[i], dtype(1.0) + stiffness * source + dtype(1.5) * strongest * dipole / radius)
+        """Fill the slots of near pairs, every ``stride``-th to a thread, and empty those that are no longer used."""
+        first, i = wp.tid()
+        a = packed[3, i]
+        x = vec3(packed[0, i], packed[1, i], packed[2, i])
+        for n in range(first, wp.max(count[i], used[0, i]), stride):
+            for row in range(wp.static(PAIR_ROWS)):
+                pairs_out[n, row, i] = dtype(0.0)
+            if n >= count[i]:
+                near_out[n, i] = i
+            elif share[near_out[n, i]] > dtype(0.0):
+                j = near_out[n, i]
+                b = packed[3, j]
+                r = vec3(packed[0, j], packed[1, j], packed[2, j]) - x
+                d = wp.max(wp.length(r), dtype(1.0e-6) * a)
+                for c in range(3):
+                    pairs_out[n, c, i] = r[c] / d
+                unit = dtype(1.0) / (a + b)  # powers of metres overflow float32
+                if d < dtype(wp.static(0.5 * model.RANGE)) * (a + b):
+                    y = unit * d
+                    g = short_range(y, unit * a, unit * b)
+                    pairs_out[n, 3, i] = unit * g[0]
+                    pairs_out[n, 4, i] = unit * unit * (g[1] * y)
+                    pairs_out[n, 5, i] = unit * unit * unit * g[1]
+                    pairs_out[n, 6, i] = unit * unit * unit * (g[2] * y * y)
+                    pairs_out[n, 7, i] = unit * unit * unit * (unit * (g[3] * y * y * y))
+                fade = window(
+                    dtype(2.0) * unit * d - dtype(2.0),
+                    dtype(wp.static(model.QUADRUPOLE_REACH[0] - 2.0)),
+                    dtype(wp.static(model.QUADRUPOLE_REACH[1] - 2.0)),
+                    dtype(wp.static(model.QUADRUPOLE_OVERLAP[0])),
+                    dtype(wp.static(model.QUADRUPOLE_OVERLAP[1])),
+                )
+                part = share[i] * share[j] * similarity(a, b)
+                pairs_out[n, 8, i] = dtype(1.0) / d
+                pairs_out[n, 9, i] = part * fade[0]
+                pairs_out[n, 10, i] = part * dtype(2.0) * unit * fade[1]
 
     return tabulate_pairs
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Sweeps
-# ---------------------------------------------------------------------------------------------------------------------
+@cache
+def _contacts_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+    functions = wp.types.matrix((2, FUNCTIONS), dtype)
+    conductances, _ = _pair_functions(dtype)
+
+    @wp.func
+    def slot_of(touching: wp.array2d[int], count: int, i: int, j: int):
+        """Slot in which ball ``i`` has ball ``j``; the one beyond all if it has not."""
+        for n in range(count):
+            if touching[n, i] == j:
+                return n
+        return wp.static(CONTACTS)
+
+    @wp.func
+    def store(
+        n: int,
+        i: int,
+        normal: vec3,
+        inverse: dtype,
+        scale: dtype,
+        part: dtype,
+        own: functions,
+        other: functions,
+        contacts: wp.array3d[dtype],
+        slopes: wp.array3d[dtype],
+    ):
+        for c in range(3):
+            contacts[n, c, i] = normal[c]
+        for f in range(wp.static(FUNCTIONS)):
+            contacts[n, 3 + f, i] = scale * part * own[0, f]
+            slopes[n, f, i] = part * own[1, f]
+        contacts[n, 17, i] = scale * part * other[0, 3]
+        contacts[n, 18, i] = scale * part * other[0, 9]
+        contacts[n, 19, i] = scale * part * other[0, 11]
+        slopes[n, 14, i] = inverse
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def tabulate_contacts(
+        # inputs:
+        packed: wp.array2d[dtype],
+        kind: wp.array[int],
+        kind_count: int,
+        tables: wp.array3d[dtype],
+        count: wp.array[int],
+        share: wp.array[dtype],
+        used: wp.array2d[int],
+        stride: int,
+        # outputs:
+        touching_out: wp.array2d[int],
+        mirror_out: wp.array2d[int],
+        contacts_out: wp.array3d[dtype],
+        slopes_out: wp.array3d[dtype],
+    ):
+        """Fill the slots of contacts, those of both balls from the lower one, and empty those no longer used."""
+        first, i = wp.tid()
+        balls = touching_out.shape[1]
+        a = packed[3, i]
+        x = vec3(packed[0, i], packed[1, i], packed[2, i])
+        for n in range(first, wp.max(count[i], used[1, i]), stride):
+            place = int(wp.static(CONTACTS))
+            j = int(i)
+            if n < count[i]:
+                j = touching_out[n, i]
+            else:
+                touching_out[n, i] = i
+            if n < count[i] and share[j] > dtype(0.0):
+                place = slot_of(touching_out, count[j], j, i)
+                if i < j:
+                    b = packed[3, j]
+                    r = vec3(packed[0, j], packed[1, j], packed[2, j]) - x
+                    d = wp.max(wp.length(r), dtype(1.0e-6) * a)
+                    scale = dtype(2.0) * a * b / (a + b)
+                    gap = (d - a - b) / scale
+                    own = conductances(tables, kind[i] * kind_count + kind[j], gap)
+                    other = own
+                    if kind[i] != kind[j]:
+                        other = conductances(tables, kind[j] * kind_count + kind[i], gap)
+                    part = share[i] * share[j] * similarity(a, b)
+                    inverse = dtype(1.0) / d
+                    store(n, i, inverse * r, inverse, scale, part, own, other, contacts_out, slopes_out)
+                    store(place, j, -inverse * r, inverse, scale, part, other, own, contacts_out, slopes_out)
+            else:
+                for row in range(wp.static(CONTACT_ROWS)):
+                    contacts_out[n, row, i] = dtype(0.0)
+                for row in range(wp.static(SLOPE_ROWS)):
+                    slopes_out[n, row, i] = dtype(0.0)
+            mirror_out[n, i] = place * 3 * balls + j
+
+    return tabulate_contacts
 
 
 @cache
-def _drive_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-    vec4 = wp.types.vector(4, dtype)
+def _ease_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_ease(
+        # inputs:
+        radius: wp.array[dtype],
+        count: wp.array[int],
+        contact_count: wp.array[int],
+        contacts: wp.array3d[dtype],
+        # outputs:
+        used_out: wp.array2d[int],
+        ease_out: wp.array2d[dtype],
+        contact_out: wp.array2d[dtype],
+        last_contact_out: wp.array2d[dtype],
+    ):
+        """Write the inverse diagonals, and clear the sources of balls that have no pair."""
+        i = wp.tid()
+        used_out[0, i] = count[i]
+        used_out[1, i] = contact_count[i]
+        if count[i] == 0:
+            for row in range(wp.static(STATE_ROWS)):
+                contact_out[row, i] = dtype(0.0)
+                last_contact_out[row, i] = dtype(0.0)
+            return
+        sources = dtype(0.0)
+        dipoles = dtype(0.0)
+        for n in range(contact_count[i]):
+            sources += contacts[n, 3, i]
+            dipoles += (contacts[n, 7, i] + dtype(2.0) * contacts[n, 9, i]) / dtype(3.0)
+        ease_out[0, i] = radius[i] / (radius[i] + dtype(wp.static(OWN_SOURCE)) * sources)
+        ease_out[1, i] = radius[i] / (radius[i] + dtype(wp.static(OWN_DIPOLE)) * dipoles)
 
-    @wp.func
-    def times_pair(pairs: wp.array3d[dtype], i: int, n: int, q: dtype, m: vec3):
-        """Block of M for the n-th pair of ball i, times a source and a moment of the other ball."""
-        normal = vec3(pairs[i, n, 0], pairs[i, n, 1], pairs[i, n, 2])
-        along = wp.dot(normal, m)
-        field = -(pairs[i, n, 13] * q + pairs[i, n, 15] * along) * normal - pairs[i, n, 14] * m
-        return vec4(pairs[i, n, 12] * q + pairs[i, n, 13] * along, field[0], field[1], field[2])
+    return find_ease
+
+
+@cache
+def _weight_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def find_drive(
+    def weigh_balls(
         # inputs:
-        radii: wp.array[dtype],
-        moments: wp.array[vec3],
-        share: wp.array[dtype],
-        neighbor: wp.array2d[int],
-        count: wp.array[int],
-        pairs: wp.array3d[dtype],
-        contact: wp.array[vec4],
+        group: wp.array[int],
+        packed: wp.array2d[dtype],
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
         # outputs:
-        drive_out: wp.array[vec4],
-        field_out: wp.array[vec3],
         weight_out: wp.array[dtype],
+        polarizability_out: wp.array[dtype],
     ):
-        """Write e = M (a − n), 4π H_near, and how far each ball still is from saturation."""
+        """Write how far each ball is from saturation."""
         i = wp.tid()
-        field_out[i] = vec3()
-        weight_out[i] = dtype(0.0)
-        if share[i] == dtype(0.0) or count[i] == 0:
+        if group[i] < 0:
             return
-        inverse = dtype(1.0) / radii[i]
-        far = dtype(wp.static(2.0 / model.RANGE)) * inverse
-        source = inverse - dtype(1.2) * far
-        dipole = inverse * inverse * inverse - far * far * far
-        m = moments[i]
-        own = contact[i]
-        from_contacts = vec4(source * own[0], dipole * own[1], dipole * own[2], dipole * own[3])
-        from_moments = vec4(dtype(0.0), dipole * m[0], dipole * m[1], dipole * m[2])
-        for n in range(count[i]):
-            j = neighbor[i, n]
-            its = contact[j]
-            from_contacts += times_pair(pairs, i, n, its[0], vec3(its[1], its[2], its[3]))
-            from_moments += times_pair(pairs, i, n, dtype(0.0), moments[j])
-        drive_out[i] = from_moments - from_contacts
-        field_out[i] = vec3(from_contacts[1], from_contacts[2], from_contacts[3])
-        reduced = wp.length(m) / ball_volume(radii[i]) / saturation[i]
-        steepness = reduced_curve_slope(inverse_curve_ratio(reduced, curve[i]) * reduced, curve[i])
+        one = dtype(1.0)
+        m = vec3(packed[4, i], packed[5, i], packed[6, i])
+        reduced = wp.length(m) / ball_volume(packed[3, i]) / saturation[i]
+        steepness = one - reduced * reduced  # of tanh
+        if curve[i] != wp.static(TANH):
+            steepness = reduced_curve_slope(inverse_curve_ratio(reduced, curve[i]) * reduced, curve[i])
         third = dtype(1.0 / 3.0)
-        state = dtype(1.0) / wp.max(slope[i] * steepness, dtype(1.0e-12)) - third
-        linear = dtype(1.0) / slope[i] - third
+        state = one / wp.max(slope[i] * steepness, dtype(1.0e-12)) - third
+        linear = one / slope[i] - third
         softest = dtype(2.5)  # of the higher multipoles: polarizability 2χ/(2χ + 5)
-        weight_out[i] = (dtype(1.0) + softest * linear) / (dtype(1.0) + softest * wp.max(state, dtype(0.0)))
+        polarizability = one / (one + softest * wp.max(state, dtype(0.0)))
+        polarizability_out[i] = polarizability
+        weight_out[i] = (one + softest * linear) * polarizability
 
-    return find_drive
+    return weigh_balls
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Sweeps and forces
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _vector_options() -> dict:
+    """Compiler options for registers as wide as the CPU has."""
+    return {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"}
+
+
+@cache
+def _sweep_kernel(dtype):
+    @wp.func_native(sweep_text("float" if dtype is wp.float32 else "double"))
+    def sweep(
+        thread: int,
+        only: int,
+        passes: int,
+        threads: int,
+        packed_in: wp.array2d[dtype],
+        near_in: wp.array2d[int],
+        pairs_in: wp.array3d[dtype],
+        count_in: wp.array[int],
+        touching_in: wp.array2d[int],
+        contacts_in: wp.array3d[dtype],
+        contact_count_in: wp.array[int],
+        radius_in: wp.array[dtype],
+        polarizability_in: wp.array[dtype],
+        weight_in: wp.array[dtype],
+        ease_in: wp.array2d[dtype],
+        contact_in: wp.array2d[dtype],
+        last_contact_in: wp.array2d[dtype],
+        drive_in: wp.array2d[dtype],
+        field_in: wp.array2d[dtype],
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=_vector_options())
+    def sweep_contacts(
+        # inputs:
+        only: int,
+        passes: int,
+        threads: int,
+        packed: wp.array2d[dtype],
+        near: wp.array2d[int],
+        pairs: wp.array3d[dtype],
+        count: wp.array[int],
+        touching: wp.array2d[int],
+        contacts: wp.array3d[dtype],
+        contact_count: wp.array[int],
+        radius: wp.array[dtype],
+        polarizability: wp.array[dtype],
+        weight: wp.array[dtype],
+        ease: wp.array2d[dtype],
+        # in and out:
+        contact: wp.array2d[dtype],
+        last_contact: wp.array2d[dtype],
+        # outputs:
+        drive_out: wp.array2d[dtype],
+        field_out: wp.array2d[dtype],
+    ):
+        sweep(
+            wp.tid(), only, passes, threads, packed, near, pairs, count, touching, contacts, contact_count, radius,
+            polarizability, weight, ease, contact, last_contact, drive_out, field_out,
+        )  # fmt: skip
+
+    return sweep_contacts
+
+
+@cache
+def _force_kernel(dtype):
+    @wp.func_native(force_text("float" if dtype is wp.float32 else "double"))
+    def sum_forces(
+        thread: int,
+        only: int,
+        passes: int,
+        threads: int,
+        packed_in: wp.array2d[dtype],
+        near_in: wp.array2d[int],
+        pairs_in: wp.array3d[dtype],
+        count_in: wp.array[int],
+        touching_in: wp.array2d[int],
+        contacts_in: wp.array3d[dtype],
+        contact_count_in: wp.array[int],
+        slopes_in: wp.array3d[dtype],
+        mirror_in: wp.array2d[int],
+        radius_in: wp.array[dtype],
+        weight_in: wp.array[dtype],
+        contact_in: wp.array2d[dtype],
+        drive_in: wp.array2d[dtype],
+        halves_in: wp.array3d[dtype],
+        force_in: wp.array2d[dtype],
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=_vector_options())
+    def near_forces(
+        # inputs:
+        only: int,
+        passes: int,
+        threads: int,
+        packed: wp.array2d[dtype],
+        near: wp.array2d[int],
+        pairs: wp.array3d[dtype],
+        count: wp.array[int],
+        touching: wp.array2d[int],
+        contacts: wp.array3d[dtype],
+        contact_count: wp.array[int],
+        slopes: wp.array3d[dtype],
+        mirror: wp.array2d[int],
+        radius: wp.array[dtype],
+        weight: wp.array[dtype],
+        contact: wp.array2d[dtype],
+        drive: wp.array2d[dtype],
+        # outputs:
+        halves_out: wp.array3d[dtype],
+        force_out: wp.array2d[dtype],
+    ):
+        sum_forces(
+            wp.tid(), only, passes, threads, packed, near, pairs, count, touching, contacts, contact_count, slopes,
+            mirror, radius, weight, contact, drive, halves_out, force_out,
+        )  # fmt: skip
+
+    return near_forces
+
+
+def _launch_passes(kernel, passes: int, packed, inputs, outputs, b: NearContactBuffers):
+    """Launch passes of two kinds in turn: one by one on a GPU, where a launch is what they meet at."""
+    gpu = packed.device.is_cuda
+    for only in range(passes) if gpu else (0,):
+        wp.launch(
+            kernel,
+            dim=WAYS * packed.count if gpu else 1,
+            inputs=[only % 2, passes, b.threads, packed.packed, *inputs],
+            outputs=outputs,
+            device=packed.device,
+            block_dim=128,
+        )
 
 
 @cache
 def _field_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
     @wp.kernel(module="unique", enable_backward=False)
     def add_field(
         # inputs:
         row_target: wp.array[int],
-        field: wp.array[vec3],
+        field: wp.array2d[dtype],
         # outputs:
         partial_out: wp.array3d[dtype],
     ):
         """Add 4π H_near to the sums of the field loop."""
         row = wp.tid()
-        h = field[row_target[row]]
+        i = row_target[row]
         for c in range(3):
-            partial_out[0, row, c] = partial_out[0, row, c] + h[c]
+            partial_out[0, row, c] = partial_out[0, row, c] + field[c, i]
 
     return add_field
 
 
 @cache
-def _contact_kernel(dtype):
+def _wrench_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
-    vec4 = wp.types.vector(4, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def sweep_contacts(
-        # inputs:
-        radii: wp.array[dtype],
-        group: wp.array[int],
-        share: wp.array[dtype],
-        weight: wp.array[dtype],
-        neighbor: wp.array2d[int],
-        count: wp.array[int],
-        pairs: wp.array3d[dtype],
-        drive: wp.array[vec4],
-        bound: wp.array[dtype],
-        # in and out:
-        contact: wp.array[vec4],
-        last_contact: wp.array[vec4],
-    ):
-        """Move n towards ΔC e."""
-        i = wp.tid()
-        if share[i] == dtype(0.0) or count[i] == 0:
-            return
-        own = radii[i]
-        phi = drive[i][0]
-        e = vec3(drive[i][1], drive[i][2], drive[i][3])
-        q = dtype(0.0)
-        m = vec3()
-        for n in range(count[i]):
-            j = neighbor[i, n]
-            w = weight[i] * weight[j]
-            normal = vec3(pairs[i, n, 0], pairs[i, n, 1], pairs[i, n, 2])
-            its = radii[j]
-            phi_j = drive[j][0]
-            e_j = (w * its) * vec3(drive[j][1], drive[j][2], drive[j][3])
-            phi_j = w * phi_j
-            alpha = (w * own) * wp.dot(normal, e)
-            alpha_j = -wp.dot(normal, e_j)
-            q += w * pairs[i, n, 3] * phi + pairs[i, n, 4] * phi_j + pairs[i, n, 5] * alpha + pairs[i, n, 6] * alpha_j
-            along = (
-                w * pairs[i, n, 5] * phi
-                + pairs[i, n, 11] * phi_j
-                + (pairs[i, n, 7] - pairs[i, n, 9]) * alpha
-                + (pairs[i, n, 8] + pairs[i, n, 10]) * alpha_j
-            )
-            m += along * normal + (w * own * pairs[i, n, 9]) * e + pairs[i, n, 10] * e_j
-        goal = vec4(q, own * m[0], own * m[1], own * m[2])
-        root = wp.sqrt(bound[group[i]])
-        one = dtype(1.0)
-        pace = dtype(4.0) / ((root + one) * (root + one))
-        momentum = (root - one) * (root - one) / ((root + one) * (root + one))
-        now = contact[i]
-        moved = now + pace * (goal - now) + momentum * (now - last_contact[i])
-        if not wp.isfinite(wp.length(moved)):
-            moved = vec4()
-        last_contact[i] = now
-        contact[i] = moved
-
-    return sweep_contacts
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Forces
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-@cache
-def _force_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-    vec4 = wp.types.vector(4, dtype)
-    conductances, short_range = _pair_functions(dtype)
-
-    @wp.func
-    def source_force(g: vec4, r: vec3, q: dtype, m: vec3, q_j: dtype, m_j: vec3):
-        """Force of a source and moment (q_j, m_j) on (q, m) at separation r = x − x_j."""
-        a = wp.dot(r, m_j)
-        b = wp.dot(r, m)
-        field = g[1] * (m_j - q_j * r) + (g[2] * a) * r
-        gradient = g[2] * (b * m_j + a * m + wp.dot(m, m_j) * r) + (g[3] * a * b) * r
-        return q * field + gradient - q_j * (g[1] * m + (g[2] * b) * r)
-
-    @wp.func
-    def contact_force(
-        own: wp.types.matrix((2, 8), dtype), other: wp.types.matrix((2, 8), dtype), scale: dtype, d: dtype,
-        normal: vec3, a: dtype, b: dtype, e: vec4, e_j: vec4,
-    ):  # fmt: skip
-        """Derivative of ½ e ΔC e of a pair by the position of its ball of radius a, ``normal`` the way to the other."""
-        half = dtype(0.5)
-        h = a * vec3(e[1], e[2], e[3])
-        h_j = b * vec3(e_j[1], e_j[2], e_j[3])
-        alpha = wp.dot(normal, h)
-        alpha_j = -wp.dot(normal, h_j)
-        square = wp.dot(h, h) - alpha * alpha
-        square_j = wp.dot(h_j, h_j) - alpha_j * alpha_j
-        mixed = wp.dot(h, h_j) + alpha * alpha_j
-        radial = half * (own[1, 0] * e[0] * e[0] + other[1, 0] * e_j[0] * e_j[0]) + own[1, 1] * e[0] * e_j[0]
-        radial += own[1, 2] * e[0] * alpha + other[1, 2] * e_j[0] * alpha_j
-        radial += own[1, 3] * e[0] * alpha_j + other[1, 3] * e_j[0] * alpha
-        radial += half * (own[1, 4] * alpha * alpha + other[1, 4] * alpha_j * alpha_j) + own[1, 5] * alpha * alpha_j
-        radial += half * (own[1, 6] * square + other[1, 6] * square_j) + own[1, 7] * mixed
-        shared = own[0, 5] + own[0, 7]
-        turn = own[0, 2] * e[0] + other[0, 3] * e_j[0] + (own[0, 4] - own[0, 6]) * alpha + shared * alpha_j
-        turn_j = other[0, 2] * e_j[0] + own[0, 3] * e[0] + (other[0, 4] - other[0, 6]) * alpha_j + shared * alpha
-        across = turn * h - turn_j * h_j
-        across -= wp.dot(normal, across) * normal
-        return -radial * normal - (scale / d) * across
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_forces(
+    def add_wrench(
         # inputs:
         row_target: wp.array[int],
         packed: wp.array2d[dtype],
-        kind: wp.array[int],
-        kind_count: int,
-        tables: wp.array3d[dtype],
-        share: wp.array[dtype],
-        weight: wp.array[dtype],
-        neighbor: wp.array2d[int],
-        count: wp.array[int],
-        contact: wp.array[vec4],
-        drive: wp.array[vec4],
-        field: wp.array[vec3],
+        force: wp.array2d[dtype],
+        field: wp.array2d[dtype],
         twisted: wp.array[int],
         # outputs:
         force_out: wp.array[vec3],
         torque_out: wp.array[vec3],
     ):
         i = row_target[wp.tid()]
-        if share[i] == dtype(0.0) or count[i] == 0:
-            return
-        a = packed[3, i]
-        m = vec3(packed[4, i], packed[5, i], packed[6, i])
-        smooth = m - vec3(contact[i][1], contact[i][2], contact[i][3])
-        total = vec3()
-        for n in range(count[i]):
-            j = neighbor[i, n]
-            if share[j] > dtype(0.0):
-                b = packed[3, j]
-                r = vec3(packed[0, i] - packed[0, j], packed[1, i] - packed[1, j], packed[2, i] - packed[2, j])
-                d = wp.max(wp.length(r), dtype(1.0e-6) * a)
-                m_j = vec3(packed[4, j], packed[5, j], packed[6, j])
-                smooth_j = m_j - vec3(contact[j][1], contact[j][2], contact[j][3])
-                unit = dtype(1.0) / (a + b)  # powers of metres overflow float32
-                square = unit * unit
-                cube = square * unit
-                g = short_range(unit * d, unit * a, unit * b)
-                x = unit * r
-                sources = source_force(
-                    g, x, -square * contact[i][0], cube * smooth, -square * contact[j][0], cube * smooth_j
-                )
-                sources -= source_force(g, x, dtype(0.0), cube * m, dtype(0.0), cube * m_j)
-                total += sources / square
-                scale = dtype(2.0) * a * b / (a + b)
-                gap = (d - a - b) / scale
-                part = share[i] * share[j] * similarity(a, b) * weight[i] * weight[j]
-                own = conductances(tables, kind[i] * kind_count + kind[j], gap)
-                other = own
-                if kind[i] != kind[j]:
-                    other = conductances(tables, kind[j] * kind_count + kind[i], gap)
-                total += part * contact_force(own, other, scale, d, -r / d, a, b, drive[i], drive[j])
-        force_out[i] = force_out[i] + dtype(wp.static(MU0 / (4.0 * np.pi))) * total
+        unit = dtype(wp.static(MU0 / (4.0 * np.pi)))
+        force_out[i] = force_out[i] + unit * vec3(force[0, i], force[1, i], force[2, i])
         if twisted[i] == 1:
-            torque_out[i] = torque_out[i] + dtype(wp.static(MU0 / (4.0 * np.pi))) * wp.cross(m, field[i])
+            m = vec3(packed[4, i], packed[5, i], packed[6, i])
+            torque_out[i] = torque_out[i] + unit * wp.cross(m, vec3(field[0, i], field[1, i], field[2, i]))
 
-    return add_forces
+    return add_wrench
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -621,66 +796,64 @@ def launch_find_pairs(moments, b: NearContactBuffers):
     """Find the near pairs of packed moments (``warpmag.packed.PackedMoments``) and tabulate what they add."""
     if b.reach == 0.0 or moments.count == 0:
         return
-    device, dtype = moments.device, moments.dtype
-    wp.launch(_points_kernel(dtype), dim=moments.count, inputs=[moments.packed], outputs=[b.points], device=device)
-    b.grid.build(b.points, b.reach, b.group)
+    device, dtype, n, packed = moments.device, moments.dtype, moments.count, moments.packed
     wp.launch(
-        _find_kernel(dtype),
-        dim=moments.count,
-        inputs=[b.grid.id, moments.packed, b.eligible, b.group, b.reach],
-        outputs=[b.neighbor, b.count, b.share, b.bound],
+        _watch_kernel(dtype), dim=n, inputs=[packed, b.group, b.lists.found_at], outputs=[b.lists.moved], device=device
+    )
+    neighbors.launch_find_neighbors(packed, packed, b.group, b.group, b.reach, b.lists, b.lists)
+    wp.launch(
+        _select_kernel(dtype),
+        dim=n,
+        inputs=[packed, b.group, b.lists.neighbor, b.lists.count],
+        outputs=[b.near, b.count, b.touching, b.contact_count, b.share],
+        device=device,
+    )
+    near_threads, contact_threads = (NEAR, CONTACTS) if device.is_cuda else (1, 1)
+    wp.launch(
+        _pairs_kernel(dtype),
+        dim=(near_threads, n),
+        inputs=[packed, b.count, b.share, b.used, near_threads],
+        outputs=[b.near, b.pairs],
         device=device,
     )
     wp.launch(
-        _pairs_kernel(dtype),
-        dim=moments.count,
-        inputs=[
-            moments.packed, b.group, b.kind, b.kind_count, b.tables, b.neighbor, b.count, b.share,
-        ],
-        outputs=[b.pairs, b.contact, b.last_contact, b.bound],
+        _contacts_kernel(dtype),
+        dim=(contact_threads, n),
+        inputs=[packed, b.kind, b.kind_count, b.tables, b.contact_count, b.share, b.used, contact_threads],
+        outputs=[b.touching, b.mirror, b.contacts, b.slopes],
         device=device,
-    )  # fmt: skip
+    )
+    wp.launch(
+        _ease_kernel(dtype),
+        dim=n,
+        inputs=[b.radius, b.count, b.contact_count, b.contacts],
+        outputs=[b.used, b.ease, b.contact, b.last_contact],
+        device=device,
+    )
 
 
-@cache
-def _points_kernel(dtype):
-    @wp.kernel(module="unique", enable_backward=False)
-    def copy_points(
-        # inputs:
-        packed: wp.array2d[dtype],
-        # outputs:
-        points_out: wp.array[wp.vec3],
-    ):
-        i = wp.tid()
-        points_out[i] = wp.vec3(float(packed[0, i]), float(packed[1, i]), float(packed[2, i]))
-
-    return copy_points
-
-
-def launch_sweeps(packed, moments, material, b: NearContactBuffers, sweeps: int):
-    """Move the contact sources towards those of given moments [A·m²], shape [n]; ``material`` as in ``wrench``."""
+def launch_sweeps(packed, material, b: NearContactBuffers, sweeps: int):
+    """Move the contact sources towards those of the packed moments; ``material`` as in ``wrench``."""
     if b.reach == 0.0 or packed.count == 0:
         return
-    for _ in range(sweeps):
-        wp.launch(
-            _drive_kernel(packed.dtype),
-            dim=packed.count,
-            inputs=[
-                packed.radii, moments, b.share, b.neighbor, b.count, b.pairs, b.contact,
-                material.saturation, material.slope, material.curve,
-            ],
-            outputs=[b.drive, b.field, b.weight],
-            device=packed.device,
-        )  # fmt: skip
-        wp.launch(
-            _contact_kernel(packed.dtype),
-            dim=packed.count,
-            inputs=[
-                packed.radii, b.group, b.share, b.weight, b.neighbor, b.count, b.pairs, b.drive, b.bound,
-                b.contact, b.last_contact,
-            ],
-            device=packed.device,
-        )  # fmt: skip
+    wp.launch(
+        _weight_kernel(packed.dtype),
+        dim=packed.count,
+        inputs=[b.group, packed.packed, material.saturation, material.slope, material.curve],
+        outputs=[b.weight, b.polarizability],
+        device=packed.device,
+    )
+    _launch_passes(
+        _sweep_kernel(packed.dtype),
+        2 * sweeps,
+        packed,
+        [
+            b.near, b.pairs, b.count, b.touching, b.contacts, b.contact_count, b.radius, b.polarizability, b.weight,
+            b.ease, b.contact, b.last_contact,
+        ],
+        [b.drive, b.field],
+        b,
+    )  # fmt: skip
 
 
 def launch_add_field(rows, b: NearContactBuffers, partial):
@@ -700,13 +873,21 @@ def launch_add_forces(rows, moments, b: NearContactBuffers, twisted, forces, tor
     """Add the forces [N] of near pairs to the moments of ``rows``, and the torques [N·m] to those ``twisted``."""
     if b.reach == 0.0 or rows.count == 0:
         return
-    wp.launch(
+    _launch_passes(
         _force_kernel(moments.dtype),
-        dim=rows.count,
-        inputs=[
-            rows.target, moments.packed, b.kind, b.kind_count, b.tables, b.share, b.weight,
-            b.neighbor, b.count, b.contact, b.drive, b.field, twisted,
+        2,
+        moments,
+        [
+            b.near, b.pairs, b.count, b.touching, b.contacts, b.contact_count, b.slopes, b.mirror, b.radius, b.weight,
+            b.contact, b.drive,
         ],
+        [b.halves, b.force],
+        b,
+    )  # fmt: skip
+    wp.launch(
+        _wrench_kernel(moments.dtype),
+        dim=rows.count,
+        inputs=[rows.target, moments.packed, b.force, b.field, twisted],
         outputs=[forces, torques],
         device=moments.device,
-    )  # fmt: skip
+    )

@@ -115,6 +115,7 @@ def _search_kernel(dtype):
         sources: wp.array2d[dtype],
         group: wp.array[int],
         width: wp.float64,
+        ratio: dtype,
         searching: wp.array[int],
         cell: wp.array[wp.vec4i],
         last: wp.array[int],
@@ -143,10 +144,10 @@ def _search_kernel(dtype):
                 # a bucket may hold several cells
                 if cell[j] == sought and not (same_set == 1 and i == j):
                     r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
-                    s = dtype(wp.static(1.0 + SKIN)) * (radius + sources[3, j])
+                    s = ratio * (radius + sources[3, j])
                     if wp.dot(r, r) < s * s:
                         place = wp.atomic_add(neighbor_count_out, i, 1)
-                        if place < wp.static(CAPACITY):
+                        if place < neighbor_out.shape[1]:
                             neighbor_out[i, place] = j
                 j = before[j]
 
@@ -171,7 +172,7 @@ def _sort_kernel(dtype):
             return
         i = wp.tid()
         found_at_out[i] = vec3(targets[0, i], targets[1, i], targets[2, i])
-        for n in range(1, wp.min(neighbor_count[i], wp.static(CAPACITY))):
+        for n in range(1, wp.min(neighbor_count[i], neighbor_out.shape[1])):
             j = neighbor_out[i, n]
             place = n
             for back in range(n):
@@ -190,7 +191,8 @@ class NeighborLists:
     """Neighbours of n moments, and what their search keeps.
 
     Attributes:
-        neighbor: Indices of the neighbours, ascending, shape [n, CAPACITY].
+        ratio: What is nearer than this times contact is a neighbour.
+        neighbor: Indices of the neighbours, ascending, shape [n, capacity].
         count: How many there are, also beyond the capacity, shape [n].
         found_at: Where each moment was when the lists were made [m], shape [n].
         moved: Whether one has moved too far since, shape [1]; set by ``packing``.
@@ -200,6 +202,7 @@ class NeighborLists:
         before: Moment that was put into its bucket before each, shape [n].
     """
 
+    ratio: float
     neighbor: wp.array
     count: wp.array
     found_at: wp.array
@@ -210,11 +213,12 @@ class NeighborLists:
     before: wp.array
 
 
-def allocate(count: int, dtype, device) -> NeighborLists:
+def allocate(count: int, dtype, device, *, ratio=1.0 + SKIN, capacity=CAPACITY) -> NeighborLists:
     """Allocate the lists of ``count`` moments, empty."""
     buckets = 2 ** int(np.ceil(np.log2(_BUCKETS_PER_MOMENT * max(count, 1))))
     return NeighborLists(
-        neighbor=wp.zeros((count, CAPACITY), dtype=int, device=device),
+        ratio=ratio,
+        neighbor=wp.zeros((count, capacity), dtype=int, device=device),
         count=wp.zeros(count, dtype=int, device=device),
         found_at=wp.full(count, math.inf, dtype=wp.types.vector(3, dtype), device=device),
         moved=wp.ones(1, dtype=int, device=device),
@@ -240,7 +244,7 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
     """
     device, dtype = targets.device, targets.dtype
     # what is near is nearer than a cell is wide, however the quotient is rounded
-    width = wp.float64((1.0 + SKIN + 1e-6) * reach)
+    width = wp.float64((lists.ratio + 1e-6) * reach)
     wp.launch(
         empty_lists,
         dim=max(source_lists.last.shape[0], targets.shape[1]),
@@ -263,6 +267,7 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
             sources,
             target_group,
             width,
+            dtype(lists.ratio),
             lists.searching,
             source_lists.cell,
             source_lists.last,

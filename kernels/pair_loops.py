@@ -95,7 +95,7 @@ class Rows:
         return self.form == FUSED
 
 
-def _cores() -> int:
+def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -133,7 +133,7 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
         shape = choose_shape(quantity, count)
         tiles, splits = _cuda_tiles(segments, starts, shape, device.sm_count)
     elif form == LOOP:
-        splits = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(_cores(), MOST_THREADS)))
+        splits = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(cores(), MOST_THREADS)))
         tiles, shares = _cpu_tiles(segments, starts, splits)
 
     def to_device(a):

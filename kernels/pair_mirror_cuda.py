@@ -41,7 +41,7 @@ class Shape:
 
 
 # Measured on an H200 at 5,000 to 131,072 moments: the shape, and the most moments that it is best for.
-_SHAPES = {
+SHAPES = {
     FIELD: ((30000, Shape(4, 4, 4, 1)), (None, Shape(6, 4, 3, 2))),
     KELVIN: ((None, Shape(4, 4, 4, 1)),),
 }
@@ -82,7 +82,7 @@ class Mirror:
 
 def make_mirror(origin: int, count: int, quantity: str, device) -> Mirror:
     """Plan the walk of ``count`` moments from packed column ``origin`` on."""
-    shape = next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
+    shape = next(shape for most, shape in SHAPES[quantity] if most is None or count <= most)
     tiles = max(math.ceil(count / (32 * shape.moments)), 3)
     tiles += 1 - tiles % 2
     stages = math.ceil(math.ceil(count / tiles) / 32)

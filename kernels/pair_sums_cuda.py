@@ -1,9 +1,9 @@
 """Sums over pairs on a GPU, made by the very kernel that needs them: no second launch waits for the first.
 
-The warps of a block share out the sources of a few targets: each lane takes some of them at a time and meets all the
-block's targets with them. What the lanes have summed is added up by shuffles, each of which halves the values that a
-lane keeps, and what the warps have summed in shared memory, in an order that depends on nothing. One more warp of the
-block brings what the loop leaves out, the correction of overlapping pairs, while the others sum. Thread k of a block
+Some warps share out the sources of a few targets: each lane takes some of them at a time, and meets all the targets
+with them. What the lanes have summed is added up by shuffles, each of which halves the values that a lane keeps, and
+what the warps have summed in shared memory, in an order that depends on nothing. Other threads of the block meanwhile
+bring what these leave out: the targets among themselves, and the correction of overlapping pairs. Thread k of a block
 ends with the whole sum of target k, for the kernel to go on with.
 
 Where all sources that a warp takes have one radius, and none of them is left out for one of the targets, the clamp is
@@ -75,7 +75,7 @@ class Shape:
 
 
 # Measured on an H200: the shape, and the most targets that it is best for.
-_SHAPES = {
+SHAPES = {
     FIELD: ((350, Shape(2, 1, 4, 2, 6)), (1500, Shape(4, 1, 8, 2, 2)), (None, Shape(5, 1, 3, 4, 4))),
     FORCE: ((700, Shape(2, 1, 4, 2, 4)), (1500, Shape(4, 1, 4, 2, 2)), (None, Shape(20, 5, 2, 4, 1))),
     WRENCH: ((700, Shape(2, 1, 4, 2, 4)), (1500, Shape(4, 1, 4, 2, 2)), (None, Shape(4, 1, 3, 2, 4))),
@@ -84,7 +84,7 @@ _SHAPES = {
 
 def choose_shape(quantity: str, count: int) -> Shape:
     """Shape for a number of targets."""
-    return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
+    return next(shape for most, shape in SHAPES[quantity] if most is None or count <= most)
 
 
 _W = 1.0  # see pair_code

@@ -254,6 +254,12 @@ def test_steps_that_cannot_be_captured_are_launched(device, how):
     np.testing.assert_array_equal(*ends)
 
 
+def test_steps_with_near_contacts_are_captured(device):
+    simulation = Simulation(pile(), device=device, contact_model="multipole")
+    run(simulation, 3)
+    assert simulation._stepper._graph is not None and not simulation.capture_failure
+
+
 def test_times_of_the_stages_add_up_to_that_of_the_step(device):
     simulation = Simulation(pile(), device=device)
     run(simulation, 5)

@@ -8,7 +8,7 @@ from arrangements import as_float32, overlapping, pile, relative
 
 import warpmag
 from warpmag import oracle
-from warpmag.kernels import pair_loops, pair_mirror_cuda
+from warpmag.kernels import pair_loops, pair_mirror_cuda, pair_sums_cuda
 from warpmag.kernels.field import launch_field
 from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, WRENCH
 from warpmag.kernels.pair_loops import FUSED, LOOP, MIRRORED
@@ -136,18 +136,44 @@ def test_any_count_of_touching_balls(count, dtype, device):
     force, torque = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii)), oracle.torque(m, h)
     for form in forms(device, MIRRORED):
         found = [*sums(x, radii, m, every, FIELD, dtype, device, form=form)]
-        quantity = KELVIN if form == MIRRORED else WRENCH
-        found += sums(x, radii, m, every, quantity, dtype, device, form=form)
-        for value, expected in zip(found[: len(found) - (quantity == KELVIN)], (h, force, torque), strict=False):
+        if form == MIRRORED:  # which has forces alone
+            found += [sums(x, radii, m, every, KELVIN, dtype, device, form=form)[0], torque]
+        else:
+            found += sums(x, radii, m, every, WRENCH, dtype, device, form=form)
+        for value, expected in zip(found, (h, force, torque), strict=True):
             # not as a ratio: a lone ball feels nothing at all
             assert np.linalg.norm(value - expected) <= TOLERANCE[dtype] * np.linalg.norm(expected)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(
+    "module, quantity, shape",
+    [
+        (module, quantity, shape)
+        for module in (pair_sums_cuda, pair_mirror_cuda)
+        for quantity, table in module.SHAPES.items()
+        for _, shape in table
+    ],
+)
+def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
+    """Those for many moments too, with some moments that fill no tile; of one radius but for a few."""
+    monkeypatch.setitem(module.SHAPES, quantity, ((None, shape),))
+    form = MIRRORED if module is pair_mirror_cuda else FUSED
+    x, radii, m = pile(count=1103)
+    radii[40:] = 0.005
+    (found, *_) = sums(x, radii, m, [(0, 1103, 0, 1103)], quantity, "float32", device, form=form)
+    if quantity == FIELD:
+        expected = oracle.h_field(x, m, radii=radii)
+    else:
+        expected = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii))
+    assert relative(found, expected) < TOLERANCE["float32"]
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("quantity", [FIELD, KELVIN])
 @pytest.mark.parametrize("slabs", [1, 3, 100])
 def test_mirrored_passes(slabs, quantity, dtype, device, monkeypatch):
-    """Eleven tiles of moments, in as many passes as little memory asks for; some of them in a body of three."""
+    """Tiles of moments in as many passes as little memory asks for; bodies of three."""
     monkeypatch.setattr(pair_mirror_cuda, "_SLAB_BYTES", slabs * 12 * 2001)
     x, _, m = pile(count=2001)
     radii, bodies = as_float32(np.where(np.arange(2001) < 1500, 0.0049, 0.004))[0], np.arange(2001) // 3

@@ -45,12 +45,12 @@ def cluster(name, gap):
 
 
 @pytest.mark.parametrize("own, other", [(np.inf, np.inf), (1000.0, 1000.0), (4.0, 4.0), (2.0, np.inf), (50.0, 3.0)])
-@pytest.mark.parametrize("gap", [0.0113, 0.07, 0.4, 0.93])
+@pytest.mark.parametrize("gap", [0.0113, 0.07, 0.2, 0.38])
 def test_table_is_the_exact_solution(own, other, gap):
     y = [np.atleast_1d(near_contact.hardness(mu - 1.0)) for mu in (own, other)]
     value, slope = near_contact.conductances(np.array([gap]), *y)
     exact = pair_conductance(2.0 + gap, [min(mu, 1e12) for mu in (own, other)])
-    # cubic splines of 28 and 11 nodes
+    # cubic splines of 26 and 11 nodes
     np.testing.assert_allclose(value[0], exact, atol=2e-3 * np.abs(exact).max())
     step = 1e-5 * gap
     high, low = (near_contact.conductances(np.array([gap + s * step]), *y)[0][0] for s in (1.0, -1.0))
@@ -60,15 +60,15 @@ def test_table_is_the_exact_solution(own, other, gap):
 @pytest.mark.parametrize("permeability", PERMEABILITIES)
 @pytest.mark.parametrize("field", [ALONG, ACROSS])
 def test_two_balls_are_exact_to_five_percent(permeability, field):
-    """Force and moment at gaps from 1 % of the radius up; 1 % of error up to one radius, where the model fades out."""
-    for gap in (0.01, 0.02, 0.05, 0.1, 0.3, 0.6, 0.95, 1.1, 1.2, 1.3, 1.5, 2.0, 5.0):
+    """Force and moment at gaps from 1 % of the radius up; 1 % of error until the pair's part fades."""
+    for gap in (0.01, 0.02, 0.05, 0.1, 0.3, 0.4, 0.5, 0.6, 0.8, 0.95, 1.1, 1.2, 1.3, 1.5, 2.0, 5.0):
         two = pair(2.0 + gap, (1.0, 1.0), (permeability, permeability), tolerance=1e-8)
         direction = 0 if field is ALONG else 1
         exact = np.linalg.solve(two.resistance[direction], np.ones(2))
         force = -0.5 * MU0 * exact @ two.slope[direction] @ exact
         moments, forces = linear(np.array([0 * ALONG, (2.0 + gap) * ALONG]), 1.0, permeability, field)
-        assert abs(forces[1, 2] / force - 1.0) < (0.01 if gap < 1.0 else 0.05)
-        assert np.abs(moments @ field / exact - 1.0).max() < 1e-3
+        assert abs(forces[1, 2] / force - 1.0) < (0.01 if gap <= near_contact.CONTACT_GAP[0] else 0.05)
+        assert np.abs(moments @ field / exact - 1.0).max() < 2e-3
 
 
 @pytest.mark.parametrize("permeabilities", [(2.0, np.inf), (4.0, 100.0)])
@@ -96,24 +96,25 @@ def test_unlike_radii():
 
 
 @pytest.mark.parametrize(
-    "name, gap, permeability, order, error",
+    "name, gap, permeability, order",
     [
-        ("chain", 0.02, np.inf, 30, 0.08),
-        ("chain", 0.02, 10.0, 24, 0.09),
-        ("chain", 0.1, 4.0, 16, 0.04),
-        ("fcc", 0.1, np.inf, 10, 0.16),
-        ("fcc", 0.1, 10.0, 9, 0.09),
-        ("fcc", 0.1, 4.0, 9, 0.07),
+        ("chain", 0.02, np.inf, 30),
+        ("chain", 0.02, 10.0, 24),
+        ("chain", 0.1, 4.0, 16),
+        ("fcc", 0.05, 4.0, 12),
+        ("fcc", 0.1, np.inf, 11),
+        ("fcc", 0.1, 10.0, 10),
+        ("fcc", 0.3, np.inf, 8),
     ],
 )
-def test_clusters(name, gap, permeability, order, error):
-    """Relative L2 error of all forces; dipoles are off by at least twice as much."""
+def test_clusters(name, gap, permeability, order):
+    """Relative L2 error of all forces within 10 %, of the moments within 2 %; dipoles are off by twice as much."""
     x = cluster(name, gap)
     for field in (ALONG, ACROSS):
         exact = spheres(x, 1.0, permeability, field, order=order, estimate=False)
         moments, forces = linear(x, 1.0, permeability, field)
-        assert np.linalg.norm(forces - exact.forces) < error * np.linalg.norm(exact.forces)
-        assert np.linalg.norm(moments - exact.moments) < 0.06 * np.linalg.norm(exact.moments)
+        assert np.linalg.norm(forces - exact.forces) < 0.1 * np.linalg.norm(exact.forces)
+        assert np.linalg.norm(moments - exact.moments) < 0.02 * np.linalg.norm(exact.moments)
         _, dipoles = linear(x, 1.0, permeability, field, near=False)
         assert np.linalg.norm(dipoles - exact.forces) > 2.0 * np.linalg.norm(forces - exact.forces)
 
@@ -155,10 +156,14 @@ def test_force_is_continuous_and_bounded(field):
 
 
 def test_cut_off_is_smooth():
-    for d in (near_contact.RANGE - 1e-6, near_contact.RANGE + 1e-6):
-        x = np.array([0 * ALONG, d * ALONG])
-        difference = linear(x, 1.0, np.inf, ALONG)[1] - linear(x, 1.0, np.inf, ALONG, near=False)[1]
-        assert np.abs(difference).max() < 1e-6 * MU0  # a smooth step 1e-6 R before its end
+    for end in (near_contact.REACH, near_contact.RANGE, 2.0 + near_contact.CONTACT_GAP[1]):
+        near, far = (
+            linear(np.array([0 * ALONG, (end + shift) * ALONG]), 1.0, np.inf, ALONG)[1] for shift in (-1e-6, 1e-6)
+        )
+        assert np.abs(near - far).max() < 1e-4 * MU0  # a force of 10 μ0 that changes over a radius
+    dipoles = linear(np.array([0 * ALONG, (near_contact.REACH + 1e-6) * ALONG]), 1.0, np.inf, ALONG, near=False)[1]
+    far = linear(np.array([0 * ALONG, (near_contact.REACH + 1e-6) * ALONG]), 1.0, np.inf, ALONG)[1]
+    np.testing.assert_array_equal(far, dipoles)
 
 
 @pytest.mark.parametrize("strength, dipole", [(1e-4, False), (0.1, False), (3.0, True), (1e3, True)])
@@ -175,12 +180,12 @@ def test_saturated_balls_are_dipoles(strength, dipole):
     assert np.abs(forces.sum(0)).max() < 1e-13 * np.abs(forces).max()
 
 
-@pytest.mark.parametrize("extent", [4.0, 8.0, 20.0])
+@pytest.mark.parametrize("extent", [4.0, 8.0, 9.0, 20.0])
 def test_any_arrangement_has_one_solution(extent):
     """1 + ΔC M has positive eigenvalues and the whole Jacobian too, also where balls overlap at will."""
-    x = np.random.default_rng(0).uniform(-0.5, 0.5, (80, 3)) * extent
+    x = np.random.default_rng(1).uniform(-0.5, 0.5, (80, 3)) * extent
     near = NearContacts(x, 1.0, np.inf)
-    eigenvalues = np.linalg.eigvals(np.eye(320) + near.conductance @ near.short_range)
+    eigenvalues = np.linalg.eigvals(np.eye(720) + near.conductance @ near.short_range)
     assert eigenvalues.real.min() > 0.5
     coupling = oracle.coupling_matrix(x, 1.0) + near.coupling() * 4.0 / 3.0 * np.pi
     assert np.linalg.eigvalsh(0.5 * (coupling + coupling.T)).max() < 1.0 / 3.0

@@ -2,27 +2,34 @@
 
 Close to contact the flux between two permeable balls crowds into the gap, and dipoles miss most of the force. As
 Bonnecaze and Brady did for suspensions, the far field stays many-body and what it lacks is added pair by pair, from the
-exact solution of two balls. Three things make it work for piles:
+exact solution of two balls. Four things make it work for piles:
 
 * **Conductances add, resistances do not.** At a contact it is the surfaces' potentials that drive the flux, whatever
   the other contacts of the ball do. So the pair's part is a conductance ΔC from potentials to sources, and a ball has a
   potential: besides its moment a source q, its net flux through contacts, which the rest of its surface gives back.
 * **Two ranges.** With 1/d split into U_lr, the potential of balls inflated to ``RANGE``/2 radii, and the rest U_sr,
   which vanishes beyond ``RANGE`` radii, sources q act by U_sr only: everything new is local. Both are positive.
-* **An energy.** With a = (0, m) the actual sources of a ball, split into smooth and contact ones, a = ã + n,
+* **Quadrupoles do not add.** Those that its neighbours induce in a ball add up before they act, and cancel in the
+  middle of a pile. So each ball has its quadrupole Θ (symmetric, traceless; its potential is n·Θn/d³), which acts up to
+  ``QUADRUPOLE_REACH`` radii, on sources by U_sr as everything does that sources do; what a pair adds is the rest, and
+  vanishes beyond ``CONTACT_GAP``.
+* **An energy.** With a = (0, m, Θ) the actual sources of a ball, split into smooth and contact ones, a = ã + n,
 
-      E_near(m) = min over ã of ½ ã M ã + ½ n ΔC⁻¹ n − ½ a M a,    M the matrix of U_sr (source, dipole).
+      E_near(m) = min over ã, Θ of ½ ã M ã + ½ n ΔC⁻¹ n + ½ Θ δ Θ − ½ a M_sr a,
 
-  It vanishes with ΔC, never endangers uniqueness, and gives with e = M ã, n = ΔC e the field (M n)_m at the moments and
-  the forces ½ e ∂ΔC e − ½ ã ∂M ã + ½ a ∂M a: momentum is conserved, and two balls come out exactly.
+  M the matrix of U_sr and of the quadrupoles, δ what a quadrupole of finite permeability costs, M_sr the dipoles of M.
+  It vanishes with ΔC and Θ, and gives with e = M ã, n = ΔC e the field (M_sr a − e)_m at
+  the moments and the forces ½ e ∂ΔC e − ½ ã ∂M ã + ½ a ∂M_sr a: momentum is conserved, and two balls come out exactly.
 
-ΔC of a pair has eight functions of the gap and the two permeabilities, tabulated from the exact solution of two equal
-balls by ``bench.reference.near_contact_table``. With n_i the direction from i towards j, α = n·e_m and ⊥ across it,
+ΔC of a pair has 14 functions of the gap and the two permeabilities, tabulated from the exact solution of two equal
+balls by ``bench.reference.near_contact_table``. With n_i the direction from i towards j, α = R n·e_m, γ the part of
+R² e_Θ that is symmetric about n, and ⊥ across it,
 
-    q_i = R [A φ_i + B φ_j] + R² [C α_i + D α_j],    n_i·m_i = R² [C φ_i + D' φ_j] + R³ [E α_i + F α_j],
-    m_i⊥ = R³ [G e_i⊥ + H e_j⊥],
+    q_i    = R [A φ_i + B φ_j + C α_i + D α_j + I γ_i + J γ_j],
+    n·m_i  = R² [C φ_i + D' φ_j + E α_i + F α_j + K γ_i + L γ_j],    m_i⊥ = R³ [G e_i⊥ + H e_j⊥],
+    Θ_i    = R³ [I φ_i + J' φ_j + K α_i + L' α_j + O γ_i + P γ_j] (3nn − 1)/2,
 
-where D' is the D that ball j sees.
+where D', J', L' are those that ball j sees.
 
 Reference: Bonnecaze and Brady 1990, "A method for determining the effective conductivity of dispersions of particles",
 Proc. R. Soc. Lond. A 430, 285-313.
@@ -35,10 +42,16 @@ import numpy as np
 
 from warpmag import oracle
 
-RANGE = 3.4
-"""Distance [radii] up to which two balls are a near pair."""
-WINDOW = 0.4
-"""Width [radii] over which the pair's part fades before ``RANGE``."""
+RANGE = 3.0
+"""Distance [mean radii] beyond which sources and dipoles have no short-range part."""
+QUADRUPOLE_REACH = (2.8, 3.3)
+"""Distance [mean radii] over which quadrupoles fade."""
+REACH = max(RANGE, QUADRUPOLE_REACH[1])
+"""Distance [mean radii] of the farthest near pair."""
+QUADRUPOLE_OVERLAP = (0.0, 0.15)
+"""Overlap [mean radii] over which they fade: nearer than contact they would induce each other without end."""
+CONTACT_GAP = (0.4, 0.8)
+"""Gap [radii] over which the pair's part fades."""
 SMALLEST_GAP = 0.01
 """Gap [radii] at which forces are largest: contact solvers cannot follow them further."""
 SOFTNESS = 0.03
@@ -46,23 +59,23 @@ SOFTNESS = 0.03
 DEEPEST = (0.1, 0.3)
 """Overlap [radii] over which the pair's part fades: balls that deep in one another are no physical pair."""
 
-MOST_SHARED = (0.5, 1.0)
+MOST_SHARED = (0.1, 0.3)
 """Volume shared with neighbours, in volumes, over which a ball leaves the model: heaps that deep are no contacts."""
 LEAST_RATIO = (0.5, 0.8)
 """Ratio of radii over which the pair's part sets in: the table is that of equal balls."""
 
-LOG_GAPS = (float(np.log(4.9e-4)), float(np.log(1.5)), 28)
+LOG_GAPS = (float(np.log(4.9e-4)), float(np.log(0.8)), 26)
 """Natural logarithm of gap/R: first node, last node, number of nodes."""
 HARDNESSES = (0.0, 1.0, 11)
 """μr^(-1/2): first node, last node, number of nodes."""
-FUNCTIONS = 8
+FUNCTIONS = 14
 
 TABLE_FILE = Path(__file__).with_name("near_contact.npy")
 
 
 @cache
 def table() -> np.ndarray:
-    """Cubic B-spline coefficients of A to H by gap, own and the other's hardness, shape [gaps + 2, n + 2, n + 2, 8]."""
+    """Cubic B-spline coefficients of A to P by gap, own and other hardness, shape [gaps + 2, n + 2, n + 2, 14]."""
     return np.load(TABLE_FILE)
 
 
@@ -84,11 +97,19 @@ def _smoothstep(x):
     return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x)
 
 
-def window(gap):
-    """Factor that fades the pair's part before ``RANGE`` and in deep overlaps, and its derivative."""
-    far, far_slope = _smoothstep((RANGE - 2.0 - gap) / WINDOW)
-    deep, deep_slope = _smoothstep((DEEPEST[1] + gap) / (DEEPEST[1] - DEEPEST[0]))
-    return far * deep, deep * -far_slope / WINDOW + far * deep_slope / (DEEPEST[1] - DEEPEST[0])
+def window(gap, far=CONTACT_GAP, deep=DEEPEST):
+    """Factor that fades from a gap ``far[0]`` to ``far[1]`` and in an overlap from ``deep[0]`` on, its derivative."""
+    outer, outer_slope = _smoothstep((far[1] - gap) / (far[1] - far[0]))
+    inner, inner_slope = _smoothstep((deep[1] + gap) / (deep[1] - deep[0]))
+    return outer * inner, outer * inner_slope / (deep[1] - deep[0]) - inner * outer_slope / (far[1] - far[0])
+
+
+def quadrupole_window(distance, radius_i, radius_j):
+    """Factor by which the quadrupoles of two balls take part, and its derivative by their distance."""
+    unit = 0.5 * (radius_i + radius_j)
+    far = (QUADRUPOLE_REACH[0] - 2.0, QUADRUPOLE_REACH[1] - 2.0)
+    value, slope = window(distance / unit - 2.0, far, QUADRUPOLE_OVERLAP)
+    return value, slope / unit
 
 
 def _b_spline(x, nodes):
@@ -105,7 +126,7 @@ def _b_spline(x, nodes):
 
 @cache
 def gap_table(own: float, other: float) -> np.ndarray:
-    """Coefficients of A to H by gap for a ball of hardness ``own`` near one of ``other``, shape [gaps + 2, 8]."""
+    """Coefficients of A to P by gap for a ball of hardness ``own`` near one of ``other``, shape [gaps + 2, 14]."""
     row, row_weights, _ = _b_spline(own, HARDNESSES)
     column, column_weights, _ = _b_spline(other, HARDNESSES)
     patch = table()[:, row : row + 4, column : column + 4].astype(float)
@@ -113,7 +134,7 @@ def gap_table(own: float, other: float) -> np.ndarray:
 
 
 def conductances(gap, own, other):
-    """The eight functions A to H of pairs, and their derivatives by the gap.
+    """The 14 functions A to P of pairs, and their derivatives by the gap.
 
     Args:
         gap: Gap between the surfaces over the radius, shape [p].
@@ -121,7 +142,7 @@ def conductances(gap, own, other):
         other: That of the other, shape [p].
 
     Returns:
-        Functions and derivatives [dimensionless], shape [p, 8] each.
+        Functions and derivatives [dimensionless], shape [p, 14] each.
     """
     gap = np.asarray(gap, float)
     u, du = log_gap(gap)
@@ -186,6 +207,18 @@ def averaged_potential(d, a, b):
 # Reference implementation, dense
 # ---------------------------------------------------------------------------------------------------------------------
 
+_HALF_ROOT = 0.5 * np.sqrt(3.0)
+_BASIS = np.array(
+    [
+        [[0.0, _HALF_ROOT, 0.0], [_HALF_ROOT, 0.0, 0.0], [0.0, 0.0, 0.0]],
+        [[0.0, 0.0, 0.0], [0.0, 0.0, _HALF_ROOT], [0.0, _HALF_ROOT, 0.0]],
+        [[0.0, 0.0, _HALF_ROOT], [0.0, 0.0, 0.0], [_HALF_ROOT, 0.0, 0.0]],
+        np.diag([-0.5, -0.5, 1.0]),
+        np.diag([_HALF_ROOT, -_HALF_ROOT, 0.0]),
+    ]
+)
+"""Quadrupoles Θ of which a ball of unit radius and infinite permeability has the energy 1/2, shape [5, 3, 3]."""
+
 
 def saturation_weight(h, saturation, susceptibility, curve):
     """Factor by which a ball's part in ΔC falls as it saturates, shape [n], from its field H [A/m], shape [n, 3].
@@ -200,7 +233,7 @@ def saturation_weight(h, saturation, susceptibility, curve):
 
 
 class NearContacts:
-    """The near pairs of n balls and their matrices, sources and moments interleaved: q, m_x, m_y, m_z of each ball."""
+    """The near pairs of n balls and their matrices, sources interleaved: q, m_x, m_y, m_z, Θ of each ball."""
 
     def __init__(self, positions, radii, susceptibility, weights=1.0):
         """Find the pairs and their ΔC, of balls whose part is scaled by ``weights`` (:func:`saturation_weight`)."""
@@ -209,8 +242,9 @@ class NearContacts:
         self.radii = np.broadcast_to(np.asarray(radii, float), n)
         y = np.broadcast_to(hardness(susceptibility), n)
         w = np.broadcast_to(np.asarray(weights, float), n).copy()
+        self.polarizability = w / (1.0 + 2.5 / np.broadcast_to(np.asarray(susceptibility, float), n))
         r = self.positions[:, None] - self.positions[None]
-        reach = 0.5 * RANGE * (self.radii[:, None] + self.radii[None])
+        reach = 0.5 * REACH * (self.radii[:, None] + self.radii[None])
         self.i, self.j = np.nonzero(np.triu(np.linalg.norm(r, axis=2) < reach, 1))
         i, j = self.i, self.j
         self.separation = self.positions[j] - self.positions[i]
@@ -219,9 +253,11 @@ class NearContacts:
         a, b = self.radii[i], self.radii[j]
         self.scale = 2.0 * a * b / (a + b)  # the curvature of the gap
         both = shared_volume(self.distance, a, b)
-        w *= crowding_weight(np.bincount(i, both, n) + np.bincount(j, both, n))
+        crowding = crowding_weight(np.bincount(i, both, n) + np.bincount(j, both, n))
         gap = (self.distance - a - b) / self.scale
-        share = (w[i] * w[j] * similarity(a, b))[:, None]
+        alike = crowding[i] * crowding[j] * similarity(a, b)
+        self.quadrupole = [alike * factor for factor in quadrupole_window(self.distance, a, b)]
+        share = (w[i] * w[j] * alike)[:, None]
         seen = [conductances(gap, y[one], y[other]) for one, other in ((i, j), (j, i))]
         self.value = [share * self.scale[:, None] * value for value, _ in seen]  # as ball i and as ball j sees them
         self.slope = [share * slope for _, slope in seen]
@@ -235,64 +271,95 @@ class NearContacts:
         return [x - y for x, y in zip(near, long_range(d, a, b), strict=True)]
 
     def _short_range(self):
-        """M, shape [4n, 4n]: 4π potentials and minus fields of sources and moments."""
+        """M, shape [9n, 9n]: 4π potentials, minus fields and minus their gradients, of the sources."""
         n = self.count
-        matrix = np.zeros((n, 4, n, 4))
+        matrix = np.zeros((n, 9, n, 9))
         source, dipole = long_range_self(self.radii)
         balls = np.arange(n)
         matrix[balls, 0, balls, 0] = 1.0 / self.radii - source
         for axis in (1, 2, 3):
             matrix[balls, axis, balls, axis] = 1.0 / self.radii**3 - dipole
+        for axis in range(4, 9):
+            matrix[balls, axis, balls, axis] = 1.0 / self.radii**5
         u, g1, g2, _ = self._factors()
         r = -self.separation  # x_i − x_j
-        block = np.zeros((len(r), 4, 4))
+        block = np.zeros((len(r), 9, 9))
         block[:, 0, 0] = u
-        block[:, 0, 1:] = -g1[:, None] * r
-        block[:, 1:, 0] = g1[:, None] * r
-        block[:, 1:, 1:] = -g1[:, None, None] * np.eye(3) - g2[:, None, None] * r[:, :, None] * r[:, None, :]
+        block[:, 0, 1:4] = -g1[:, None] * r
+        block[:, 1:4, 0] = g1[:, None] * r
+        block[:, 1:4, 1:4] = -g1[:, None, None] * np.eye(3) - g2[:, None, None] * r[:, :, None] * r[:, None, :]
+        n = self.direction
+        turned = np.einsum("abk,pk->pab", _BASIS, n)
+        along = np.einsum("pak,pk->pa", turned, n)
+        d = self.distance[:, None, None]
+        shape = along * (g2 * self.distance**2)[:, None] / 3.0
+        block[:, 0, 4:] = shape * self.quadrupole[0][:, None]
+        block[:, 4:, 0] = shape * self.quadrupole[0][:, None]
+        on_dipoles = 5.0 * n[:, :, None] * along[:, None, :] - 2.0 * turned.transpose(0, 2, 1)
+        block[:, 1:4, 4:] = on_dipoles / d**4
+        block[:, 4:, 1:4] = -on_dipoles.transpose(0, 2, 1) / d**4
+        among = 2.0 * np.einsum("akl,bkl->ab", _BASIS, _BASIS)[None] + 35.0 * along[:, :, None] * along[:, None, :]
+        block[:, 4:, 4:] = (among - 20.0 * np.einsum("pak,pbk->pab", turned, turned)) / (3.0 * d**5)
+        block[:, 4:, 1:] *= self.quadrupole[0][:, None, None]
+        block[:, 1:4, 4:] *= self.quadrupole[0][:, None, None]
         matrix[self.i, :, self.j, :] = block
         matrix[self.j, :, self.i, :] = block.transpose(0, 2, 1)
-        return matrix.reshape(4 * n, 4 * n)
+        return matrix.reshape(9 * self.count, 9 * self.count)
 
     def _conductance(self):
-        """ΔC, shape [4n, 4n]."""
+        """ΔC, shape [9n, 9n]."""
         n = self.count
-        matrix = np.zeros((n, 4, n, 4))
-        outer = self.direction[:, :, None] * self.direction[:, None, :]
-        across = np.eye(3) - outer
-        size = {1: self.radii[self.i], -1: self.radii[self.j]}
+        matrix = np.zeros((n, 9, n, 9))
         for side, one, other, sign in ((0, self.i, self.j, 1), (1, self.j, self.i, -1)):
-            own, its = size[sign], size[-sign]
-            normal = sign * self.direction
-            a, b, c, d, e, f, g, h = self.value[side].T
-            back = self.value[1 - side][:, 3]
-            block = np.zeros((len(a), 4, 4))
-            block[:, 0, 0] = a
-            block[:, 0, 1:] = block[:, 1:, 0] = (c * own)[:, None] * normal
-            block[:, 1:, 1:] = (own**2)[:, None, None] * (e[:, None, None] * outer + g[:, None, None] * across)
+            own, its = self._axes(one, sign), self._axes(other, -sign)
+            a, b, c, d, e, f, g, h, i, j, k, l, o, p = self.value[side].T  # noqa: E741
+            _, _, _, d_j, _, _, _, _, _, j_j, _, l_j, _, _ = self.value[1 - side].T
+            among = np.array([[a, c, i], [c, e, k], [i, k, o]])
+            cross = np.array([[b, d, j], [d_j, f, l], [j_j, l_j, p]])
+            across = (np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]) * self.radii[one, None, None]
+            block = np.einsum("uvp,pua,pvb->pab", among, own, own)
+            block[:, 1:4, 1:4] += (g * self.radii[one])[:, None, None] * across
             np.add.at(matrix, (one, slice(None), one), block)
-            block = np.zeros((len(a), 4, 4))
-            block[:, 0, 0] = b
-            block[:, 0, 1:] = -(d * its)[:, None] * normal
-            block[:, 1:, 0] = (back * own)[:, None] * normal
-            block[:, 1:, 1:] = (own * its)[:, None, None] * (h[:, None, None] * across - f[:, None, None] * outer)
+            block = np.einsum("uvp,pua,pvb->pab", cross, own, its)
+            block[:, 1:4, 1:4] += (h * self.radii[other])[:, None, None] * across
             matrix[one, :, other, :] = block
-        return matrix.reshape(4 * n, 4 * n)
+        return matrix.reshape(9 * n, 9 * n)
+
+    def _axes(self, ball, sign):
+        """Sources q, m, Θ that are of unit strength on the axis towards the other ball, shape [pairs, 3, 9]."""
+        axes = np.zeros((len(ball), 3, 9))
+        axes[:, 0, 0] = 1.0
+        axes[:, 1, 1:4] = sign * self.radii[ball, None] * self.direction
+        along = np.einsum("akl,pk,pl->pa", _BASIS, self.direction, self.direction)
+        axes[:, 2, 4:] = self.radii[ball, None] ** 2 * along
+        return axes
+
+    def _solve(self, moments):
+        """Smooth sources ã for given moments, shape [9n, columns], as the columns of ``moments`` [3n, columns]."""
+        n = self.count
+        kind = np.arange(9 * n) % 9
+        actual = np.zeros((9 * n, moments.shape[1]))
+        actual[(kind > 0) & (kind < 4)] = moments
+        system = np.eye(9 * n) + self.conductance @ self.short_range
+        # (M ã)_Θ = −δ Θ with the polarizability p = 1/(1 + δ), in units of R⁵
+        rows = kind > 3
+        p, size = np.repeat(self.polarizability, 5)[:, None], np.repeat(self.radii**5, 5)[:, None]
+        system[rows] = p * size * self.short_range[rows] + (1.0 - p) * system[rows]
+        return np.linalg.solve(system, actual)
 
     def coupling(self):
         """Matrix, shape [3n, 3n], of the field [A/m] that the model adds at the balls for given moments [A·m²]."""
-        moments = np.arange(4 * self.count) % 4 > 0
-        m, c = self.short_range, self.conductance
-        contact = np.linalg.solve(np.eye(len(m)) + c @ m, c @ m)
-        return (m @ contact)[np.ix_(moments, moments)] / (4.0 * np.pi)
+        moments = np.isin(np.arange(9 * self.count) % 9, (1, 2, 3))
+        drive = self.short_range @ self._solve(np.eye(3 * self.count))
+        return (self.short_range[np.ix_(moments, moments)] - drive[moments]) / (4.0 * np.pi)
 
     def forces(self, moments):
         """Forces [N] that the model adds for moments [A·m²], shape [n, 3] each."""
-        m, c = self.short_range, self.conductance
+        smooth = self._solve(np.reshape(moments, (-1, 1)))
+        drive, smooth = (self.short_range @ smooth).reshape(-1, 9), smooth.reshape(-1, 9)
         actual = np.concatenate([np.zeros((self.count, 1)), moments], axis=1)
-        smooth = np.linalg.solve(np.eye(len(m)) + c @ m, actual.ravel())
-        drive = (m @ smooth).reshape(-1, 4)
-        pull = self._conductance_force(drive) + self._source_force(smooth.reshape(-1, 4)) - self._source_force(actual)
+        pull = self._conductance_force(drive) + self._source_force(smooth) - self._source_force(actual)
+        pull += self._quadrupole_force(smooth)
         forces = np.zeros((self.count, 3))
         np.add.at(forces, self.j, pull)
         np.add.at(forces, self.i, -pull)
@@ -301,43 +368,84 @@ class NearContacts:
     def _conductance_force(self, drive):
         """Derivative of ½ e ΔC e of each pair by the position of ball j."""
         unit = self.direction
-        own, its = self.radii[self.i], self.radii[self.j]
-        (phi_i, field_i), (phi_j, field_j) = ((drive[k, 0], drive[k, 1:]) for k in (self.i, self.j))
-        alpha_i, alpha_j = (own * np.einsum("pk,pk->p", unit, field_i), -its * np.einsum("pk,pk->p", unit, field_j))
-        square_i = own**2 * np.sum(field_i**2, 1) - alpha_i**2
-        square_j = its**2 * np.sum(field_j**2, 1) - alpha_j**2
-        mixed = own * its * np.einsum("pk,pk->p", field_i, field_j) + alpha_i * alpha_j
-        energy_i = [0.5 * phi_i**2, phi_i * phi_j, phi_i * alpha_i, phi_i * alpha_j, 0.5 * alpha_i**2]
-        energy_i += [alpha_i * alpha_j, 0.5 * square_i, mixed]
-        zero = np.zeros_like(mixed)  # what both share counts once
-        energy_j = [
-            0.5 * phi_j**2,
-            zero,
-            phi_j * alpha_j,
-            phi_j * alpha_i,
-            0.5 * alpha_j**2,
-            zero,
-            0.5 * square_j,
-            zero,
-        ]
-        radial = np.einsum("pf,fp->p", self.slope[0], energy_i) + np.einsum("pf,fp->p", self.slope[1], energy_j)
-        _, _, c, d, e, f, g, h = self.value[0].T
-        _, _, c_j, d_j, e_j, _, g_j, _ = self.value[1].T
-        turn_i = own * (c * phi_i + d_j * phi_j + (e - g) * alpha_i + (f + h) * alpha_j)
-        turn_j = its * (c_j * phi_j + d * phi_i + (e_j - g_j) * alpha_j + (f + h) * alpha_i)
-        turn = turn_i[:, None] * field_i - turn_j[:, None] * field_j
+        radial, turn = 0.0, 0.0
+        for side, one, other, sign in ((0, self.i, self.j, 1.0), (1, self.j, self.i, -1.0)):
+            own, its = self._seen(drive, one, sign), self._seen(drive, other, -sign)
+            phi, alpha, gamma, field, pull, square = own
+            phi_j, alpha_j, gamma_j, field_j, _, _ = its
+            # what both share counts half for each
+            mixed = np.sum(field * field_j, 1) + alpha * alpha_j
+            energy = [
+                0.5 * phi**2,
+                0.5 * phi * phi_j,
+                phi * alpha,
+                phi * alpha_j,
+                0.5 * alpha**2,
+                0.5 * alpha * alpha_j,
+            ]
+            energy += [0.5 * square, 0.5 * mixed, phi * gamma, phi * gamma_j, alpha * gamma, alpha * gamma_j]
+            energy += [0.5 * gamma**2, 0.5 * gamma * gamma_j]
+            radial += np.einsum("pf,fp->p", self.slope[side], np.array(energy))
+            _, _, c, _, e, f, g, h, i, _, k, l, o, p = self.value[side].T  # noqa: E741
+            _, _, _, d_j, _, _, _, _, _, j_j, _, l_j, _, _ = self.value[1 - side].T
+            by_alpha = c * phi + d_j * phi_j + (e - g) * alpha + (f + h) * alpha_j + k * gamma + l * gamma_j
+            by_gamma = i * phi + j_j * phi_j + k * alpha + l_j * alpha_j + o * gamma + p * gamma_j
+            turn += sign * by_alpha[:, None] * field + 2.0 * by_gamma[:, None] * pull
         turn -= np.einsum("pk,pk->p", unit, turn)[:, None] * unit
         return radial[:, None] * unit + turn / self.distance[:, None]
+
+    def _seen(self, drive, ball, sign):
+        """φ, α and γ of a ball of each pair, its field R e_m, the vector R² e_Θ n, and what of R e_m is across."""
+        size = self.radii[ball]
+        field = size[:, None] * drive[ball, 1:4]
+        alpha = sign * np.sum(field * self.direction, 1)
+        pull = size[:, None] ** 2 * np.einsum("pa,akl,pl->pk", drive[ball, 4:], _BASIS, self.direction)
+        gamma = np.sum(pull * self.direction, 1)
+        return drive[ball, 0], alpha, gamma, field, pull, np.sum(field**2, 1) - alpha**2
 
     def _source_force(self, sources):
         """Force on ball j of each pair by ball i through U_sr, in units of μ0/4π."""
         _, g1, g2, g3 = (x[:, None] for x in self._factors())
         r = self.separation  # from i, the source, to j
-        q_i, m_i, q_j, m_j = sources[self.i, :1], sources[self.i, 1:], sources[self.j, :1], sources[self.j, 1:]
+        q_i, m_i, q_j, m_j = (sources[k, columns] for k in (self.i, self.j) for columns in (slice(0, 1), slice(1, 4)))
         a, b = (np.sum(r * m, 1, keepdims=True) for m in (m_i, m_j))
         field = g1 * (m_i - q_i * r) + g2 * a * r
         gradient = g2 * (m_i * b + m_j * a + r * np.sum(m_i * m_j, 1, keepdims=True)) + g3 * a * b * r
         return q_j * field + gradient - q_i * (g1 * m_j + g2 * b * r)
+
+    def _quadrupole_force(self, sources):
+        """Force on ball j of each pair through the quadrupoles, in units of μ0/4π."""
+        n, d = self.direction, self.distance
+        q_i, q_j = sources[self.i, 0], sources[self.j, 0]
+        m_i, m_j = sources[self.i, 1:4], sources[self.j, 1:4]
+        t_i, t_j = (np.einsum("pa,akl->pkl", sources[k, 4:], _BASIS) for k in (self.i, self.j))
+        v_i, v_j = (np.einsum("pkl,pl->pk", t, n) for t in (t_i, t_j))
+
+        def dot(a, b):
+            return np.sum(a * b, axis=-1)
+
+        s_i, s_j = dot(v_i, n), dot(v_j, n)
+        _, _, g2, g3 = self._factors()
+        # energies over g2 d²/3, d⁴ and d⁵, and their derivatives by the direction
+        energy_3 = q_i * s_j + q_j * s_i
+        turn_3 = 2.0 * (q_i[:, None] * v_j + q_j[:, None] * v_i)
+        energy_4, turn_4 = 0.0, 0.0
+        for m, t, v, s, sign in ((m_i, t_j, v_j, s_j, 1.0), (m_j, t_i, v_i, s_i, -1.0)):
+            along = dot(m, n)
+            energy_4 += sign * (5.0 * along * s - 2.0 * dot(m, v))
+            turned = np.einsum("pkl,pl->pk", t, m)
+            turn_4 += sign * (5.0 * s[:, None] * m + 10.0 * along[:, None] * v - 2.0 * turned)
+        energy_5 = (2.0 * np.sum(t_i * t_j, axis=(1, 2)) - 20.0 * dot(v_i, v_j) + 35.0 * s_i * s_j) / 3.0
+        turn_5 = -20.0 * (np.einsum("pkl,pl->pk", t_i, v_j) + np.einsum("pkl,pl->pk", t_j, v_i))
+        turn_5 = (turn_5 + 70.0 * (s_j[:, None] * v_i + s_i[:, None] * v_j)) / 3.0
+        weight, slope = self.quadrupole
+        third, fourth, fifth = g2 * d**2 / 3.0, d**-4.0, d**-5.0
+        radial = slope * (third * energy_3 + fourth * energy_4 + fifth * energy_5)
+        radial += weight * (g3 * d**3 + 2.0 * g2 * d) / 3.0 * energy_3
+        radial -= weight / d * (4.0 * fourth * energy_4 + 5.0 * fifth * energy_5)
+        turn = third[:, None] * turn_3 + fourth[:, None] * turn_4 + fifth[:, None] * turn_5
+        turn -= dot(turn, n)[:, None] * n
+        return -(radial[:, None] * n + (weight / d)[:, None] * turn)
 
 
 def equilibrium(positions, radii, h0, *, saturation, susceptibility=np.inf, curve="tanh", iterations=60):

@@ -206,8 +206,7 @@ class MomentSystem:
         """Start the next solve cold, from no magnetization, in every world."""
         self._induction.warm.zero_()
         if self._near is not None:
-            self._near.contact.zero_()
-            self._near.last_contact.zero_()
+            self._near.forget()
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
@@ -251,7 +250,7 @@ class MomentSystem:
         packed = self._packed
         pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
         if self._near is not None:
-            near_contact.launch_sweeps(packed, self.moments, self._material, self._near, near_contact.SWEEPS)
+            near_contact.launch_sweeps(packed, self._material, self._near, near_contact.SWEEPS)
             near_contact.launch_add_field(self._induced, self._near, self._induced_partial)
 
     def magnetizations(self):
@@ -283,5 +282,5 @@ class MomentSystem:
             self.torques,
         )
         if self._near is not None:
-            near_contact.launch_sweeps(packed, self.moments, self._material, self._near, near_contact.FORCE_SWEEPS)
+            near_contact.launch_sweeps(packed, self._material, self._near, near_contact.FORCE_SWEEPS)
             near_contact.launch_add_forces(rows, packed, self._near, self._twisted, self.forces, self.torques)

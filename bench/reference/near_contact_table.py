@@ -1,10 +1,11 @@
 """Writes the table of the near-contact model: ``python -m bench.reference.near_contact_table``.
 
-For two equal balls of unit radius the exact solution is reduced to sources and dipoles, driven by potentials and
-fields that a conducting surface would have: K = M_LL − M_LH (M_HH + δ)⁻¹ M_HL, where M is the matrix of two perfect
-conductors in multipoles, H the degrees from 2 up, and δ_l = (2l+1)/(l(μr−1)) what a finite permeability adds. Less the
-long-range part this is the short-range resistance of the pair, and with the short-range matrix M_sr of sources and
-dipoles alone, the pair's conductance is ΔC = (K − M_lr)⁻¹ − M_sr⁻¹.
+For two equal balls of unit radius the exact solution is reduced to sources, dipoles and, on the axis, quadrupoles,
+driven by potentials and fields that a conducting surface would have: K = M_LL − M_LH (M_HH + δ)⁻¹ M_HL, where M is the
+matrix of two perfect conductors in multipoles, H the degrees beyond, and δ_l = (2l+1)/(l(μr−1)) what a finite
+permeability adds. Less the long-range part this is the short-range resistance of the pair. K₂ is what of it the model
+has anyway: no degrees beyond 2, and sources and quadrupoles blind to each other. The pair's conductance is
+ΔC = (K − M_lr)⁻¹ − (K₂ − M_lr)⁻¹.
 """
 
 import math
@@ -17,40 +18,55 @@ from bench.reference.spheres import sufficient_order
 from warpmag import near_contact
 
 
-def reduced_resistance(distance: float, permeabilities, m: int, tolerance: float = 1e-7) -> np.ndarray:
-    """K of two balls of unit radius for order m, sources and dipoles (m = 0) or dipoles (m = 1) of both balls."""
-    order = sufficient_order(distance, 1.0, 1.0, tolerance)
+def reduced_resistance(
+    distance: float, permeabilities, m: int, highest: int, order: int, source_quadrupole=1.0
+) -> np.ndarray:
+    """K of two balls of unit radius for order m, degrees up to ``highest`` of both balls, those up to ``order`` solved.
+
+    A ball has a source where m = 0, which sees the other's quadrupole ``source_quadrupole`` times as strong as it is.
+    """
     degree = np.arange(m, order + 1)
     rows, columns = degree[:, None], degree[None, :]
     norm = -0.5 * (gammaln(degree + m + 1.0) + gammaln(degree - m + 1.0))
     size = gammaln(rows + columns + 1.0) + norm[:, None] + norm[None, :] - (rows + columns + 1.0) * math.log(distance)
     coupling = (-1.0) ** (rows + m) * np.exp(size)  # target second ball, on the +z side of the first
+    if m == 0:
+        coupling[0, 2] *= source_quadrupole
+        coupling[2, 0] *= source_quadrupole
     system = np.block([[np.eye(len(degree)), coupling.T], [coupling, np.eye(len(degree))]])
-    share = np.where(degree > 1, (2.0 * degree + 1.0) / np.maximum(degree, 1), 0.0)
+    share = np.where(degree > highest, (2.0 * degree + 1.0) / np.maximum(degree, 1), 0.0)
     system += np.diag(np.concatenate([share / (mu - 1.0) for mu in permeabilities]))
-    low = np.concatenate([np.arange(2 - m), len(degree) + np.arange(2 - m)])
+    low = np.arange(highest + 1 - m)
+    low = np.concatenate([low, len(degree) + low])
     return np.linalg.inv(cho_solve(cho_factor(system), np.eye(len(system))[:, low])[low])
 
 
-def pair_conductance(distance: float, permeabilities) -> np.ndarray:
-    """The functions A to H of the first of two balls of unit radius and given μr."""
+def pair_conductance(distance: float, permeabilities, tolerance: float = 1e-7) -> np.ndarray:
+    """The functions of the first of two balls of unit radius and given μr, in the order of the table."""
     u, g1, g2, _ = near_contact.long_range(np.array(distance), 1.0, 1.0)
+    # what U_sr leaves of 3/d³, with which a source and a quadrupole see each other
+    left = 1.0 - g2 * distance**5 / 3.0
     self_source, self_dipole = near_contact.long_range_self(1.0)
-    axial, across = g1 + g2 * distance**2, g1
     # potential of a dipole and field of a source on the axis have the radial derivative U' = g1 d
-    long = np.array([[u, -g1 * distance], [g1 * distance, -axial]])
+    axial = np.zeros((3, 3))
+    axial[:2, :2] = [[u, -g1 * distance], [g1 * distance, -g1 - g2 * distance**2]]
+    order = sufficient_order(distance, 1.0, 1.0, tolerance)
     parts = []
-    for m, coupling, own in (
-        (0, long, np.diag([self_source, self_dipole])),
-        (1, np.array([[-across]]), np.array([[self_dipole]])),
+    for m, highest, coupling, own in (
+        (0, 2, axial, np.diag([self_source, self_dipole, 0.0])),
+        (1, 1, np.array([[-g1]]), np.array([[self_dipole]])),
     ):
-        d = distance
-        dipoles = np.array([[1.0 / d, 1.0 / d**2], [-1.0 / d**2, -2.0 / d**3]]) if m == 0 else np.array([[1.0 / d**3]])
-        plain = np.block([[np.eye(2 - m), dipoles.T], [dipoles, np.eye(2 - m)]])
         far = np.block([[own, coupling.T], [coupling, own]])
-        parts.append(np.linalg.inv(reduced_resistance(distance, permeabilities, m) - far) - np.linalg.inv(plain - far))
+        exact = reduced_resistance(distance, permeabilities, m, highest, order)
+        plain = reduced_resistance(distance, permeabilities, m, highest, 2, left)
+        parts.append(np.linalg.inv(exact - far) - np.linalg.inv(plain - far))
     x, y = parts
-    return np.array([x[0, 0], x[0, 2], x[0, 1], -x[0, 3], x[1, 1], -x[1, 3], y[0, 0], y[0, 1]])
+    return np.array(
+        [
+            *(x[0, 0], x[0, 3], x[0, 1], -x[0, 4], x[1, 1], -x[1, 4], y[0, 0], y[0, 1]),
+            *(x[0, 2], x[0, 5], x[1, 2], x[1, 5], x[2, 2], x[2, 5]),
+        ]
+    )
 
 
 def spline_coefficients(values: np.ndarray) -> np.ndarray:
