@@ -13,7 +13,7 @@ PATIENCE = 120.0
 """Time after which a run is ended [s]."""
 SATURATED = {
     "balls_up": {"saturation": 5e4},
-    "alphabets": {"saturation": 5e4, "moment": 120.0},
+    "alphabets": {"saturation": 1e4, "moment": 40.0},
     "falling_magnet": {"saturation": 5e4},
     "sakura_tree": {"saturation": 5e4},
 }
@@ -45,7 +45,7 @@ def run(output: Output):
 
 
 def _text(rows, seconds) -> str:
-    saturation, moment = (SATURATED["alphabets"][name] for name in ("saturation", "moment"))
+    balls, letters = (SATURATED[scene] for scene in ("balls_up", "alphabets"))
     return f"""## Stability: the dynamic scenes for {seconds:g} s
 
 **Paper:** in Balls Up the balls do not settle down with kim2018 and do with the paper's method, in Alphabets they are
@@ -57,7 +57,8 @@ Nothing solid holds the letters, so that all of them count. A run ends after {PA
 Eq. 4 is λ times Kelvin's force on each moment, λ from 8 in weak fields to 1 in saturation. Where two magnets have
 different λ, action is not reaction, and momentum comes from nothing: a free magnet and the balls on its one side drag
 each other along, heaps spin up. The paper gives no strengths; its "excessively strong" magnets, and its argument that
-f'(H) falls as M grows (section 6.1), are about saturation. "Saturated" are the same scenes with iron that saturates at
-{saturation:g} A/m in place of 1.7e6 and, in Alphabets, a moment of {moment:g} A·m² in place of 12.
+f'(H) falls as M grows (section 6.1), are about saturation. "Saturated" are the same scenes where the magnets saturate
+what they hold: balls at {balls["saturation"]:g} A/m in place of 1.7e6, letters at {letters["saturation"]:g} A/m
+with a moment of {letters["moment"]:g} A·m² in place of 12.
 
 {table(["scene", "method", *outcome_head()], rows)}"""
