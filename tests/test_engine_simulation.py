@@ -13,10 +13,10 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 import warpmag
 from warpmag.engine.contacts import RigidSolver, body_sizes
-from warpmag.engine.deterministic import OrderedXPBD
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.statistics import find_held
 from warpmag.engine.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
+from warpmag.engine.xpbd import OrderedXPBD
 from warpmag.kernels.scan import launch_scan
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, balls_up

@@ -141,6 +141,43 @@ def test_balls_of_a_gas_of_denormal_speed(device):
     assert spread(run(builder, device, 0.005)) < 0.03
 
 
+def add_plate(builder, place, velocity=(0.0, 0.0, 0.0), tilt=0.02):
+    """A plate of 4 x 4 boxes, 40 x 40 x 5 mm."""
+    turn = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), tilt)
+    body = builder.add_body(xform=wp.transform(wp.vec3(*place), turn))
+    builder.body_qd[body] = wp.spatial_vector(*velocity, 0.0, 0.0, 0.0)
+    steel = newton.ModelBuilder.ShapeConfig(density=7870.0, mu=0.3)
+    for x, y in np.ndindex(4, 4):
+        at = wp.transform(wp.vec3(0.01 * (x - 1.5), 0.01 * (y - 1.5), 0.0), wp.quat_identity())
+        builder.add_shape_box(body, xform=at, hx=0.005, hy=0.005, hz=0.0025, cfg=steel)
+    warpmag.add_inducible(builder, body)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_plates_of_many_boxes_lie_on_each_other(deterministic, device):
+    """Some 250 contacts between two flat faces, that all push the same way, bring them to rest."""
+    builder = new_builder()
+    for z in (0.003, 0.009):
+        add_plate(builder, (0.0, 0.0, z))
+    simulation = run(builder, device, 0.05, deterministic=deterministic)
+    state, figures = simulation.state, simulation.statistics
+    assert np.abs(state.body_qd.numpy()).max() < 1e-3 and figures.overlap < 0.05
+    np.testing.assert_allclose(state.body_q.numpy()[:, 2], [0.0025, 0.0075], atol=5e-5)
+
+
+def test_plates_that_collide_keep_their_momentum(device):
+    """A contact's impulses on two bodies are opposite, however many of them share the bodies."""
+    builder = new_builder(ground=False)
+    builder.gravity = wp.vec3(0.0, 0.0, 0.0)
+    add_plate(builder, (0.0, 0.0, 0.0), (0.0, 0.0, 0.3), 0.0)
+    add_plate(builder, (0.001, 0.015, 0.007), (0.0, 0.02, -0.1), 0.03)
+    simulation = run(builder, device, 0.03)
+    velocities = simulation.state.body_qd.numpy()[:, :3]
+    assert velocities[1, 2] > 0.0  # they met
+    # single precision, 60 substeps of 60 sums of contacts
+    np.testing.assert_allclose(velocities.sum(axis=0), [0.0, 0.02, 0.2], atol=1e-5)
+
+
 def test_a_chain_of_1000_balls(device):
     """A crooked chain of touching balls along the field, 10 m long, neither breaks nor folds up."""
     builder = new_builder(ground=False)
