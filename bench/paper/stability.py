@@ -61,4 +61,9 @@ f'(H) falls as M grows (section 6.1), are about saturation. "Saturated" are the 
 what they hold: balls at {balls["saturation"]:g} A/m in place of 1.7e6, letters at {letters["saturation"]:g} A/m
 with a moment of {letters["moment"]:g} A·m² in place of 12.
 
+A ball that hangs on one other swings for good where there is no friction: in Balls Up a single one may carry the RMS,
+and the median tells how the others are. Newton's XPBD adds turn to a heap that is pressed together, a dt/r of it a
+second, for contacts act at where bodies are after the substep on what they were before: strong forces a, which
+letters feel around a moment that nothing anchors them to, spin them up with Kelvin's law, too.
+
 {table(["scene", "method", *outcome_head()], rows)}"""
