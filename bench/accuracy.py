@@ -34,7 +34,7 @@ TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 BLOCK = 1000
 """Balls of the pile whose iteration error is measured: as many as the dense Newton solution can do."""
 PERMEABILITIES = (2.0, 4.0, 10.0, 1000.0, np.inf)
-GAPS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+GAPS = (0.01, 0.03, 0.1, 0.3, 0.5, 0.9, 1.2, 3.0)
 """Gaps between two balls over their radius."""
 STEPS = (4e-4, 2e-4, 1e-4, 5e-5)
 """Time steps [s]."""
