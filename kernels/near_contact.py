@@ -21,6 +21,7 @@ kept as slots: a pass over the pairs is in ``near_contact_code``, with what each
 | pairs, contacts, slopes | [slots, rows, balls] | what does not change while balls stand still |
 | mirror | [slots, balls] | place among ``halves`` of the other ball's half |
 | contact, last_contact, drive | [rows, balls] | n and Θ̃, those of the sweep before, e |
+| outer | [rows, balls] | what the first pass keeps for the others |
 | field, force | [3, balls] | 4π H_near [A/m]; the force over μ0/4π |
 """
 
@@ -40,6 +41,7 @@ from warpmag.kernels.near_contact_code import (
     DRIVE_ROWS,
     LANES,
     NEAR,
+    OUTER_ROWS,
     OWN_DIPOLE,
     OWN_SOURCE,
     PAIR_ROWS,
@@ -87,7 +89,7 @@ class NearContactBuffers:
         polarizability: p of each ball's quadrupole, shape [balls].
         weight: Factor that falls as it saturates, shape [balls].
         ease: Inverse diagonals s of a ball's q and N, shape [2, balls].
-        pairs, contacts, slopes, mirror, contact, last_contact, drive, field, force: See the module.
+        pairs, contacts, slopes, mirror, contact, last_contact, drive, field, outer, force: See the module.
         halves: What each ball sees of its contacts' forces, and a zero, shape [CONTACTS + 1, 3, balls].
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
         threads: Threads of a CPU.
@@ -116,6 +118,7 @@ class NearContactBuffers:
     last_contact: wp.array
     drive: wp.array
     field: wp.array
+    outer: wp.array
     halves: wp.array
     force: wp.array
     reach: float
@@ -184,6 +187,7 @@ def allocate(radii, worlds, eligible, susceptibility, dtype, device) -> NearCont
         last_contact=zeros(STATE_ROWS, balls),
         drive=zeros(DRIVE_ROWS, balls),
         field=zeros(3, balls),
+        outer=zeros(OUTER_ROWS, balls),
         halves=zeros(CONTACTS + 1, 3, balls),
         force=zeros(3, balls),
         reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
@@ -346,7 +350,7 @@ def _select_kernel(dtype):
         contact_count_out: wp.array[int],
         share_out: wp.array[dtype],
     ):
-        """Choose the balls that are near now, and those that nearly touch."""
+        """Choose the balls that are near now, those that nearly touch first."""
         i = wp.tid()
         count_out[i] = 0
         contact_count_out[i] = 0
@@ -360,26 +364,33 @@ def _select_kernel(dtype):
         count = int(0)
         contacts = int(0)
         shared = dtype(0.0)
+        others = wp.uint64(0)  # a bit for each candidate
         for k in range(candidate_count[i]):
             j = candidate[i, k]
             b = packed[3, j]
             d = wp.length(x - vec3(packed[0, j], packed[1, j], packed[2, j]))
             if d < dtype(wp.static(0.5 * model.REACH)) * (radius + b):
-                if count < wp.static(NEAR):
-                    near_out[count, i] = j
                 count += 1
                 shared += overlap_fraction(d, radius, b)
                 gap = (d - radius - b) * (radius + b) / (dtype(2.0) * radius * b)
                 if gap < dtype(wp.static(model.CONTACT_GAP[1])):
                     if contacts < wp.static(CONTACTS):
+                        near_out[contacts, i] = j
                         touching_out[contacts, i] = j
                     contacts += 1
+                else:
+                    others += wp.uint64(1) << wp.uint64(k)
         low = dtype(wp.static(model.MOST_SHARED[0]))
         share = dtype(1.0) - smoothstep((shared - low) / (dtype(wp.static(model.MOST_SHARED[1])) - low))
         if count <= wp.static(NEAR) and contacts <= wp.static(CONTACTS) and share > dtype(0.0):
             count_out[i] = count
             contact_count_out[i] = contacts
             share_out[i] = share
+            n = int(contacts)
+            for k in range(candidate_count[i]):
+                if ((others >> wp.uint64(k)) & wp.uint64(1)) == wp.uint64(1):
+                    near_out[n, i] = candidate[i, k]
+                    n += 1
 
     return select_pairs
 
@@ -638,6 +649,7 @@ def _sweep_kernel(dtype):
         last_contact_in: wp.array2d[dtype],
         drive_in: wp.array2d[dtype],
         field_in: wp.array2d[dtype],
+        outer_in: wp.array2d[dtype],
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_vector_options())
@@ -663,10 +675,11 @@ def _sweep_kernel(dtype):
         # outputs:
         drive_out: wp.array2d[dtype],
         field_out: wp.array2d[dtype],
+        outer_out: wp.array2d[dtype],
     ):
         sweep(
             wp.tid(), only, passes, threads, packed, near, pairs, count, touching, contacts, contact_count, radius,
-            polarizability, weight, ease, contact, last_contact, drive_out, field_out,
+            polarizability, weight, ease, contact, last_contact, drive_out, field_out, outer_out,
         )  # fmt: skip
 
     return sweep_contacts
@@ -735,7 +748,7 @@ def _launch_passes(kernel, passes: int, packed, inputs, outputs, b: NearContactB
         wp.launch(
             kernel,
             dim=WAYS * packed.count if gpu else 1,
-            inputs=[only % 2, passes, b.threads, packed.packed, *inputs],
+            inputs=[only, passes, b.threads, packed.packed, *inputs],
             outputs=outputs,
             device=packed.device,
             block_dim=128,
@@ -851,7 +864,7 @@ def launch_sweeps(packed, material, b: NearContactBuffers, sweeps: int):
             b.near, b.pairs, b.count, b.touching, b.contacts, b.contact_count, b.radius, b.polarizability, b.weight,
             b.ease, b.contact, b.last_contact,
         ],
-        [b.drive, b.field],
+        [b.drive, b.field, b.outer],
         b,
     )  # fmt: skip
 

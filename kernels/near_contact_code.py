@@ -26,6 +26,8 @@ STATE_ROWS = 14
 """Rows of what sweeps move: q, N and xx, yy, xy, yz, zx of n_Θ, the contact sources; the same of Θ̃."""
 DRIVE_ROWS = 14
 """Rows of the drives: φ, e_m and e_Θ; what Θ̃ moves towards."""
+OUTER_ROWS = 13
+"""Rows of what does not change from pass to pass: parts of φ, of e_m and of the tensor that Θ feels; (M_sr a)_m."""
 
 OWN_SOURCE, OWN_DIPOLE = 1.0 - 1.2 * 2.0 / RANGE, 1.0 - (2.0 / RANGE) ** 3
 """M of a ball of unit radius on itself."""
@@ -106,14 +108,15 @@ _PRELUDE = """
 """
 
 _DRIVE = """
-    // e = M ã, what quadrupoles move towards, and 4π H_near = (M_sr a − e)_m
-    auto drive_of = [=](int i) {
-        const int slots = most(indices(count + i));
+    // e = M ã, what quadrupoles move towards, and 4π H_near = (M_sr a − e)_m. What balls make that do not touch, and
+    // what moments make, is summed by the first pass only, for the others to start from.
+    auto drive_of = [=](int i, bool first) {
+        const int contact_slots = most(indices(contact_count + i)), slots = most(indices(count + i));
         const NUMBER zero = numbers(radius + i) * REAL(0);
         NUMBER phi = zero;
         Vector e = {zero, zero, zero}, lone = e;
         NUMBER gxx = zero, gyy = zero, gzz = zero, gxy = zero, gyz = zero, gzx = zero;
-        for (int s = way; s < slots; s += WAYS) {
+        auto meet = [&](int s, bool with_moments) {
             const REAL* pair = pairs + ((size_t)s * PAIR_ROWS) * stride + i;
             auto row = [=](int r) -> NUMBER { return numbers(pair + (size_t)r * stride); };
             const INDEX j = indices(near + (size_t)s * stride + i);
@@ -126,13 +129,16 @@ _DRIVE = """
             const Vector v = times(theta, u);
             const NUMBER f = dot(v, u);
             phi += row(3) * q + source * along + k3 * f;
-            const NUMBER pull = 5 * k4 * f - source * q - g2 * along, lone_pull = -g2 * dot(u, m);
+            const NUMBER pull = 5 * k4 * f - source * q - g2 * along;
             e.x += pull * u.x - g1 * t.x - 2 * k4 * v.x;
             e.y += pull * u.y - g1 * t.y - 2 * k4 * v.y;
             e.z += pull * u.z - g1 * t.z - 2 * k4 * v.z;
-            lone.x += lone_pull * u.x - g1 * m.x;
-            lone.y += lone_pull * u.y - g1 * m.y;
-            lone.z += lone_pull * u.z - g1 * m.z;
+            if (with_moments) {
+                const NUMBER lone_pull = -g2 * dot(u, m);
+                lone.x += lone_pull * u.x - g1 * m.x;
+                lone.y += lone_pull * u.y - g1 * m.y;
+                lone.z += lone_pull * u.z - g1 * m.z;
+            }
             const NUMBER c = k3 * q - 5 * k4 * along + REAL(35.0 / 3.0) * k5 * f;
             const NUMBER k = 2 * k4, b = REAL(-20.0 / 3.0) * k5, own = REAL(2.0 / 3.0) * k5;
             const Vector y = {k * t.x + b * v.x + c * u.x, k * t.y + b * v.y + c * u.y, k * t.z + b * v.z + c * u.z};
@@ -142,13 +148,27 @@ _DRIVE = """
             gxy += REAL(0.5) * (u.x * y.y + u.y * y.x) + own * theta.xy;
             gyz += REAL(0.5) * (u.y * y.z + u.z * y.y) + own * theta.yz;
             gzx += REAL(0.5) * (u.z * y.x + u.x * y.z) + own * theta.zx;
+        };
+        NUMBER* const sums[OUTER_ROWS] = {
+            &phi, &e.x, &e.y, &e.z, &gxx, &gyy, &gzz, &gxy, &gyz, &gzx, &lone.x, &lone.y, &lone.z};
+        if (first) {
+            for (int s = contact_slots + way; s < slots; s += WAYS) meet(s, true);
+            for (int c = 0; c < 10; ++c) {
+                *sums[c] = total_of(*sums[c]);
+                if (way == 0) put(outer + (size_t)c * stride + i, *sums[c]);
+                else *sums[c] = zero;
+            }
+            for (int s = way; s < contact_slots; s += WAYS) meet(s, true);
+        } else {
+            for (int c = 0; c < 10 && way == 0; ++c) *sums[c] = numbers(outer + (size_t)c * stride + i);
+            for (int s = way; s < contact_slots; s += WAYS) meet(s, false);
         }
-        phi = total_of(phi);
-        e = {total_of(e.x), total_of(e.y), total_of(e.z)};
-        lone = {total_of(lone.x), total_of(lone.y), total_of(lone.z)};
-        gxx = total_of(gxx), gyy = total_of(gyy), gzz = total_of(gzz);
-        gxy = total_of(gxy), gyz = total_of(gyz), gzx = total_of(gzx);
+        for (int c = 0; c < 13; ++c) *sums[c] = total_of(*sums[c]);
         if (way > 0) return;
+        for (int c = 10; c < 13; ++c) {
+            if (first) put(outer + (size_t)c * stride + i, *sums[c]);
+            else *sums[c] = numbers(outer + (size_t)c * stride + i);
+        }
         const NUMBER inverse = 1 / numbers(radius + i), cube = inverse * inverse * inverse;
         const NUMBER source = OWN_SOURCE * inverse, dipole = OWN_DIPOLE * cube;
         const Vector m = own_moment(i), n = own_vector(contact + stride + i, stride);
@@ -238,7 +258,7 @@ _TAKE = """
 
 _HALVES = """
     // what a ball sees of its contacts' forces: derivatives of ½ e ΔC e by the other ball's place
-    auto halve = [=](int i) {
+    auto halve = [=](int i, bool) {
         const int slots = most(indices(contact_count + i));
         const NUMBER size = numbers(radius + i);
         for (int s = way; s < slots; s += WAYS) {
@@ -357,14 +377,14 @@ _PULL = """
 # on to the next pass when all chunks of the last are done. A thread that cannot be had is not missed.
 _RUN = """
 #if defined(__CUDA_ARCH__)
-    if (only == 0) FIRST(thread / WAYS);
+    if (only % 2 == 0) FIRST(thread / WAYS, only == 0);
     else SECOND(thread / WAYS);
 #else
     constexpr int CHUNK = 4 * WIDTH, MOST_PASSES = 8, MOST_THREADS = 64;
     auto chunk_of = [&](int pass, int chunk) {
         const int end = chunk * CHUNK + CHUNK < stride ? chunk * CHUNK + CHUNK : stride;
         for (int i = chunk * CHUNK; i < end; i += WIDTH) {
-            if (pass % 2 == 0) FIRST(i);
+            if (pass % 2 == 0) FIRST(i, pass == 0);
             else SECOND(i);
         }
     };
@@ -427,7 +447,7 @@ def _text(real: str, first: str, second: str, names: tuple[str, ...], body: str)
     constexpr int WAYS = 1;
     #endif
     constexpr int PAIR_ROWS = {PAIR_ROWS}, CONTACT_ROWS = {CONTACT_ROWS}, SLOPE_ROWS = {SLOPE_ROWS};
-    constexpr int STATE_ROWS = {STATE_ROWS};
+    constexpr int STATE_ROWS = {STATE_ROWS}, OUTER_ROWS = {OUTER_ROWS};
     constexpr REAL OWN_SOURCE = {OWN_SOURCE!r}, OWN_DIPOLE = {OWN_DIPOLE!r}, PACE = {_PACE!r}, MOMENTUM = {_MOMENTUM!r};
     const int stride = weight_in.shape[0], moment_count = packed_in.shape[1];
     const int moment_stride = packed_in.strides[0] / sizeof(REAL);
@@ -444,7 +464,7 @@ _GATHER = {
 _INTEGERS = ("near", "count", "touching", "contact_count", "mirror")
 SWEEP_ARRAYS = (
     *("near", "pairs", "count", "touching", "contacts", "contact_count", "radius", "polarizability", "weight", "ease"),
-    *("contact", "last_contact", "drive", "field"),
+    *("contact", "last_contact", "drive", "field", "outer"),
 )
 FORCE_ARRAYS = (
     *("near", "pairs", "count", "touching", "contacts", "contact_count", "slopes", "mirror", "radius", "weight"),
