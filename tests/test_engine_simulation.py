@@ -1,6 +1,5 @@
 """Steps, substeps, buffers and recorded frames of a simulation."""
 
-import functools
 import math
 import re
 import time
@@ -16,7 +15,6 @@ from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.statistics import find_held
 from warpmag.engine.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
-from warpmag.engine.xpbd import OrderedXPBD
 from warpmag.kernels.scan import launch_scan
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, balls_up
@@ -97,28 +95,6 @@ def test_on_a_cpu_every_run_is_deterministic(reference):
     if reference[1].device != "cpu":
         pytest.skip("the solver adds up contacts in any order on a GPU")
     np.testing.assert_array_equal(run(Simulation(pile(), device="cpu"), 30), reference[0])
-
-
-def test_the_deterministic_solver_is_newtons(device):
-    """Contacts added up side by side, in their order, give the bits of Newton's serial loop."""
-    end = []
-    for kind in (newton.solvers.SolverXPBD, functools.partial(OrderedXPBD, contact_max=100)):
-        builder = pile()
-        builder.default_shape_cfg.mu = 0.5  # friction turns the balls
-        model = builder.finalize(device="cpu")
-        model.joint_count = 0
-        solver = kind(model, iterations=20, rigid_contact_con_weighting=False)
-        pipeline = newton.CollisionPipeline(model, rigid_contact_max=100)
-        contacts, now, then = pipeline.contacts(), model.state(), model.state()
-        now.body_qd.assign(np.random.default_rng(3).normal(scale=0.1, size=(8, 6)))
-        for _ in range(40):
-            pipeline.collide(now, contacts)
-            solver.step(now, then, None, contacts, 5e-4)
-            now, then = then, now
-        end.append((contacts.rigid_contact_count.numpy()[0], now.body_q.numpy(), now.body_qd.numpy()))
-    assert end[0][0] > 8
-    for newtons, ours in zip(*end, strict=True):
-        np.testing.assert_array_equal(ours, newtons)
 
 
 def hinged_ball():

@@ -13,7 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.engine.xpbd import OrderedXPBD, SplittingXPBD
+from warpmag.engine.xpbd import OrderedXPBD, PileXPBD
 from warpmag.errors import InputError
 from warpmag.kernels.monitor import watch_capacity, watch_flags
 
@@ -131,7 +131,7 @@ def _xpbd(model: newton.Model, contact_max: int, ordered: bool = False):
     settings = {"iterations": 60, "rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
     model = _without_free_joints(model)
     if not ordered:
-        return SplittingXPBD(model, **settings)
+        return PileXPBD(model, contact_max, **settings)
     if model.joint_count or model.particle_count:
         raise ValueError("with joints or particles its runs on a GPU are not deterministic")
     return OrderedXPBD(model, contact_max, **settings)
