@@ -56,11 +56,11 @@ Nothing solid holds the letters, so that all of them count. A run ends after {PA
 
 Eq. 4 is λ times Kelvin's force on each moment, λ from 8 in weak fields to 1 in saturation. Where two magnets have
 different λ, action is not reaction, and momentum comes from nothing: a free magnet and the balls on its one side drag
-each other along, and a heap of letters turns, about a moment that nothing turns back, by just what the law's torques add
-up to. The paper gives no strengths; its "excessively strong" magnets, and its argument that
-f'(H) falls as M grows (section 6.1), are about saturation. "Saturated" are the same scenes where the magnets saturate
-what they hold: balls at {balls["saturation"]:g} A/m in place of 1.7e6, letters at {letters["saturation"]:g} A/m
-with a moment of {letters["moment"]:g} A·m² in place of 12.
+each other along, and a heap of letters turns about a moment that nothing turns back, by just what the law's torques
+add up to. The paper gives no strengths; its "excessively strong" magnets, and its argument that f'(H) falls as M grows
+(section 6.1), are about saturation. "Saturated" are the same scenes where the magnets saturate what they hold: balls at
+{balls["saturation"]:g} A/m in place of 1.7e6, letters at {letters["saturation"]:g} A/m with a moment of
+{letters["moment"]:g} A·m² in place of 12.
 
 A ball that hangs on one other swings for good where there is no friction: in Balls Up a single one may carry the RMS,
 and the median tells how the others are.
