@@ -89,7 +89,7 @@ _MIRRORED = {
     const NUMBER rb = rx * bx + ry * by + rz * bz;
     const NUMBER rm = rx * mx{k} + ry * my{k} + rz * mz{k};
     const NUMBER bm = bx * mx{k} + by * my{k} + bz * mz{k};
-    const NUMBER c = inv5 * rb, e = inv5 * rm, q = inv5 * (bm - 5 * (inv2 * rb) * rm);
+    const NUMBER c = inv5 * rb, e = inv5 * rm, q = inv5 * (bm - REAL({five!r}) * (inv2 * rb) * rm);
     const NUMBER fx = c * mx{k} + e * bx + q * rx;
     const NUMBER fy = c * my{k} + e * by + q * ry;
     const NUMBER fz = c * mz{k} + e * bz + q * rz;
@@ -103,18 +103,18 @@ _MIRRORED = {
 }
 
 
-def mirrored_pair(quantity: str, inverse: str, k: str = "") -> str:
+def mirrored_pair(quantity: str, inverse: str, k: str = "", w: float = 1.0) -> str:
     """Text of one pair for both of its ends, the target's moment being m, for a field scaled n as well.
 
-    What is done to the target is added to the sums h, what is done to the source to g; of a force, with W = 1, both are
-    the force itself, 4π(m·∇)H = 3 h.
+    What is done to the target is added to the sums h, what is done to the source to g; of a force, both are the force
+    itself, 4π(m·∇)H = 3 W⁻⁵ h.
     """
-    return (_SEPARATION + f"const NUMBER inv = {inverse};").format(k=k) + mirrored_sums(quantity, k)
+    return (_SEPARATION + f"const NUMBER inv = {inverse};").format(k=k) + mirrored_sums(quantity, k, w)
 
 
-def mirrored_sums(quantity: str, k: str = "") -> str:
+def mirrored_sums(quantity: str, k: str = "", w: float = 1.0) -> str:
     """Text of :func:`mirrored_pair` after its separation and inverse distance."""
-    return (_POWERS + _MIRRORED[quantity]).format(k=k)
+    return (_POWERS + _MIRRORED[quantity]).format(k=k, five=5.0 / w**2)
 
 
 def scaled_moment(quantity: str, w: float) -> float:
@@ -123,9 +123,12 @@ def scaled_moment(quantity: str, w: float) -> float:
 
 
 def results(quantity: str, w: float, k: str = "") -> list[str]:
-    """Expressions of the numbers that a loop leaves, from its sums: the field, or the force and then the field."""
+    """Expressions of the numbers that a loop leaves, from its sums: the field, or the force and then the field.
+
+    Those of ``KELVIN`` are from the sums of :func:`mirrored_sums`.
+    """
     h, f, a, g = 3.0 * w**-5, 15.0 * w**-7, 3.0 * w**-5, w**-3
-    if quantity == FIELD:
+    if quantity in (FIELD, KELVIN):
         return [f"REAL({h!r}) * h{c}{k}" for c in "xyz"]
     force = [f"REAL({f!r}) * f{c}{k} + REAL({a!r}) * along{k} * e{c}{k}" for c in "xyz"]
     field = [f"REAL({h!r}) * h{c}{k} - REAL({g!r}) * g{c}{k}" for c in "xyz"]

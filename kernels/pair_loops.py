@@ -62,7 +62,7 @@ class Rows:
     """Which target rows see which sources, on one device.
 
     Attributes:
-        quantity: What is summed: ``FIELD``, ``FORCE`` or ``WRENCH``.
+        quantity: What is summed: ``FIELD``, ``FORCE`` or ``WRENCH``, on a CPU also ``KELVIN``.
         count: Number of target rows.
         target: Packed column of each target row, shape [count].
         begin: First source of each target row, shape [count].
@@ -125,7 +125,8 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
     if form == MIRRORED:
         mirror = pair_mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, device)
         splits = mirror.slabs + mirror.splits
-    quantity = FORCE if quantity == KELVIN else quantity
+    if quantity == KELVIN and device.is_cuda:
+        quantity = FORCE
     if form == FUSED:
         shape = pair_sums_cuda.choose_shape(quantity, count)
         tiles, splits = _block_tiles(segments, starts, shape.targets, 1), 0
@@ -189,18 +190,20 @@ def _block_tiles(segments, starts, width: int, splits: int):
 def _cpu_tiles(segments, starts, threads: int):
     """Tiles of stripes of targets and stripes of sources; and where each thread's share of them begins.
 
-    A segment of moments among themselves needs the tiles above its diagonal only, each standing for its mirror image.
+    Targets among their own sources need the tiles above the diagonal only, each standing for its mirror image.
     """
     tiles, work = [], []
     for (t0, t1, s0, s1), row in zip(segments, starts, strict=False):
-        mirrored = (t0, t1) == (s0, s1)
-        wanted = int(np.ceil(np.sqrt((2 if mirrored else 1) * _TILES_PER_THREAD * threads)))
-        targets, sources = (_stripes(*ends, wanted if threads > 1 else 1) for ends in ((t0, t1), (s0, s1)))
-        for a, (i0, i1) in enumerate(targets):
-            for b, (j0, j1) in enumerate(sources):
-                if not mirrored or a <= b:
-                    tiles.append((row + i0 - t0, row + i1 - t0, i0, j0, j1, 0, mirrored))
-                    work.append((i1 - i0) * (j1 - j0) * (2.0 if mirrored and a < b else 1.0))
+        among = s0 <= t0 and t1 <= s1
+        for j0, j1 in ((t0, t1), (s0, t0), (t1, s1)) if among else ((s0, s1),):
+            mirrored = (t0, t1) == (j0, j1)
+            wanted = int(np.ceil(np.sqrt((2 if mirrored else 1) * _TILES_PER_THREAD * threads)))
+            targets, sources = (_stripes(*ends, wanted if threads > 1 else 1) for ends in ((t0, t1), (j0, j1)))
+            for a, (i0, i1) in enumerate(targets):
+                for b, (j0, j1) in enumerate(sources):
+                    if not mirrored or a <= b:
+                        tiles.append((row + i0 - t0, row + i1 - t0, i0, j0, j1, 0, mirrored))
+                        work.append((i1 - i0) * (j1 - j0) * (2.0 if mirrored and a < b else 1.0))
     # a tile goes to the thread in whose share its middle lies; the first thread is at work while the others start
     done = np.concatenate([[0.0], np.cumsum(work)])
     share = (done[-1] + _PAIRS_PER_START * (threads - 1)) / threads
@@ -229,7 +232,7 @@ def _stripes(begin, end, wanted):
 @cache
 def _reference_kernel(dtype, quantity: str):
     vec3 = wp.types.vector(3, dtype)
-    summed_field, summed_force = quantity != FORCE, quantity != FIELD
+    summed_field, summed_force = quantity in (FIELD, WRENCH), quantity != FIELD
 
     @wp.kernel(module="unique", enable_backward=False)
     def pair_loop_reference(

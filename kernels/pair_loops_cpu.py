@@ -4,8 +4,9 @@ A tile holds up to ``STRIPE`` sources in the first-level cache, for a range of t
 through it:
 
 * ``add_rows`` sums a target at a time, whatever the radii.
-* ``add_both_ways`` is for the field among moments of one radius: a separation and its powers serve the field at both
-  ends of the pair, which takes 35 vector operations for the two of them, where ``add_rows`` takes 28 for one.
+* ``add_both_ways`` is for the field, and Kelvin's force, among moments of one radius: a separation and its powers serve
+  both ends of the pair, which takes 35 vector operations for the two fields, where ``add_rows`` takes 28 for one, and 46
+  for the two forces, where it takes 37. Two tiles whose bodies may be the same ones have no force that way.
 
 Every thread has sums of its own, which the finishing kernel adds up in order, so that nothing depends on scheduling.
 """
@@ -14,7 +15,19 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pair_code import FIELD, SUMS, TILE_COLUMNS, WIDTHS, mirrored_sums, pair, results, scaled_moment
+from warpmag.kernels.pair_code import (
+    FIELD,
+    FORCE,
+    KELVIN,
+    SUMS,
+    TILE_COLUMNS,
+    WIDTHS,
+    mirrored_pair,
+    mirrored_sums,
+    pair,
+    results,
+    scaled_moment,
+)
 
 STRIPE = 512
 """Most sources, and most targets, of a tile."""
@@ -47,6 +60,8 @@ _VECTORS = """
         NUMBER h[3][VECTORS];           // what is summed at the sources themselves
         int begin, count, vectors;
         REAL radius;                // the one radius of all of them, or 0
+        REAL first, last;           // the lowest and the highest of their labels
+        bool distinct;              // whether their labels ascend, so that none are of one body
     };
     auto number = [](NUMBER* row, int i) -> REAL& { return ((REAL*)row)[i]; };
     auto fill = [number](Tile& tile, const REAL* packed, size_t stride, int begin, int end) ONCE {
@@ -66,10 +81,18 @@ _VECTORS = """
                 tile.u[c][v] = SCALE * tile.packed[4 + c][v];
                 tile.h[c][v] = 0;
             }
-        const REAL first = number(tile.packed[3], 0);
+        const REAL* radii = (const REAL*)tile.packed[3];
+        const REAL* labels = (const REAL*)tile.packed[7];
         bool same = true;
-        for (int i = 1; i < tile.count; ++i) same &= number(tile.packed[3], i) == first;
-        tile.radius = same ? first : 0;
+        tile.first = tile.last = labels[0];
+        tile.distinct = true;
+        for (int i = 1; i < tile.count; ++i) {
+            same &= radii[i] == radii[0];
+            tile.distinct &= labels[i - 1] < labels[i];
+            tile.first = tile.first < labels[i] ? tile.first : labels[i];
+            tile.last = tile.last > labels[i] ? tile.last : labels[i];
+        }
+        tile.radius = same ? radii[0] : 0;
     };
 """
 
@@ -107,6 +130,7 @@ _SOURCES = """
 
 def _add_rows(quantity: str) -> str:
     """Text of ``add`` for a target's sums, and of ``add_rows`` for those of some target rows over a tile."""
+    quantity = FORCE if quantity == KELVIN else quantity
     sums = SUMS[quantity]
     field = quantity == FIELD
     effective = "" if field else "REAL ex, REAL ey, REAL ez, "
@@ -151,7 +175,12 @@ def _add_rows(quantity: str) -> str:
 
 # Three vectors of sources are under way at a time, so that nothing waits for its inverse root: one has its separations
 # computed, the one before its root, and the one before that is summed.
-_ADD_BOTH_WAYS = f"""
+def _add_both_ways(quantity: str) -> str:
+    """Text of ``deposit`` for what is summed at a moment, and of ``add_both_ways`` for the pairs of two tiles."""
+    return f"""
+    auto deposit = [](REAL* out, REAL hx, REAL hy, REAL hz) {{
+        {" ".join(f"out[{c}] += {text};" for c, text in enumerate(results(quantity, _W)))}
+    }};
     struct Apart {{ NUMBER x, y, z, c; }};
     auto add_both_ways = [=](Tile& home, NUMBER (&lanes)[3][STRIPE], Tile& tile) ONCE {{
         const NUMBER contact = home.radius + tile.radius, clamp = contact * contact;
@@ -171,8 +200,9 @@ _ADD_BOTH_WAYS = f"""
                 v = i / LANES;
                 auto others = clamp > 0;
                 others[i % LANES] = 0;
+                NUMBER gx = 0, gy = 0, gz = 0;
                 {_SOURCES}
-                {pair(FIELD, "others ? inverse_root(d2 > clamp ? d2 : clamp) : 0")}
+                {mirrored_pair(quantity, "others ? inverse_root(d2 > clamp ? d2 : clamp) : 0", w=_W)}
                 ++v;
             }}
             Apart now = apart(v), next = apart(v + 1);
@@ -183,7 +213,7 @@ _ADD_BOTH_WAYS = f"""
                 const NUMBER rx = now.x, ry = now.y, rz = now.z, inv = inv_now;
                 {_SOURCES}
                 NUMBER gx = tile.h[0][v], gy = tile.h[1][v], gz = tile.h[2][v];
-                {mirrored_sums(FIELD)}
+                {mirrored_sums(quantity, w=_W)}
                 tile.h[0][v] = gx, tile.h[1][v] = gy, tile.h[2][v] = gz;
                 now = next, next = later, inv_now = inv_next;
             }}
@@ -192,7 +222,8 @@ _ADD_BOTH_WAYS = f"""
             lanes[2][i] += hz;
         }}
     }};
-"""
+    """
+
 
 _ENTER_HOME = """
     Tile home;  // the targets of mirrored tiles, and what is summed for them, by lanes
@@ -201,8 +232,8 @@ _ENTER_HOME = """
     home.begin = -1;
     auto leave_home = [&]() ONCE {
         for (int i = 0; i < home.count && home.begin >= 0; ++i)
-            add(share.out + 3 * (size_t)(home_row + i), total(lanes[0][i]) + number(home.h[0], i),
-                total(lanes[1][i]) + number(home.h[1], i), total(lanes[2][i]) + number(home.h[2], i));
+            deposit(share.out + 3 * (size_t)(home_row + i), total(lanes[0][i]) + number(home.h[0], i),
+                    total(lanes[1][i]) + number(home.h[1], i), total(lanes[2][i]) + number(home.h[2], i));
         home.begin = -1;
     };
     auto enter_home = [&](int row, int begin, int end) {
@@ -213,34 +244,40 @@ _ENTER_HOME = """
     };
 """
 
-_WALK_HOME = """
-        if (mirrored && share.targets == share.sources) {
+
+def _walk_home(quantity: str) -> str:
+    """Text that sums a mirrored tile."""
+    strangers = "home.radius > 0 && other.radius > 0"
+    if quantity == KELVIN:
+        strangers += " && (diagonal ? home.distinct : home.last < other.first || other.last < home.first)"
+    return f"""
+        if (mirrored && share.targets == share.sources) {{
             if (home.begin != column_begin || home_row != row_begin)
                 enter_home(row_begin, column_begin, column_begin + row_end - row_begin);
             const bool diagonal = source_begin == column_begin;
             Tile& other = diagonal ? home : tile;
             if (!diagonal) fill(tile, share.sources, share.source_stride, source_begin, source_end);
-            if (home.radius > 0 && other.radius > 0) {
+            if ({strangers}) {{
                 add_both_ways(home, lanes, other);
                 for (int j = 0; j < other.count && !diagonal; ++j)
-                    add(share.out + 3 * (size_t)(mirror_begin + j), number(other.h[0], j), number(other.h[1], j),
-                        number(other.h[2], j));
-            } else {
+                    deposit(share.out + 3 * (size_t)(mirror_begin + j), number(other.h[0], j), number(other.h[1], j),
+                            number(other.h[2], j));
+            }} else {{
                 add_rows(share, row_begin, row_end, column_begin, other);
                 if (!diagonal) add_rows(share, mirror_begin, mirror_end, source_begin, home);
-            }
+            }}
             continue;
-        }
-"""
+        }}
+    """
 
 
 def _walk(quantity: str) -> str:
     """Text that sums the tiles of a thread."""
-    field = quantity == FIELD
+    both_ways = quantity in (FIELD, KELVIN)
     return f"""
     __builtin_memset(share.out, 0, share.rows * {WIDTHS[quantity]} * sizeof(REAL));
     Tile tile;
-    {_ENTER_HOME if field else ""}
+    {_ENTER_HOME if both_ways else ""}
     for (int t = share.first; t < share.last; ++t) {{
         const int* p = share.tiles + {TILE_COLUMNS} * t;
         const int row_begin = p[0], row_end = p[1], column_begin = p[2], source_begin = p[3], source_end = p[4];
@@ -248,7 +285,7 @@ def _walk(quantity: str) -> str:
         const bool mirrored = p[6];
         const int mirror_begin = row_begin + source_begin - column_begin;
         const int mirror_end = mirror_begin + source_end - source_begin;
-        {_WALK_HOME if field else ""}
+        {_walk_home(quantity) if both_ways else ""}
         fill(tile, share.sources, share.source_stride, source_begin, source_end);
         add_rows(share, row_begin, row_end, column_begin, tile);
         if (mirrored && source_begin != column_begin) {{
@@ -256,7 +293,7 @@ def _walk(quantity: str) -> str:
             add_rows(share, mirror_begin, mirror_end, source_begin, tile);
         }}
     }}
-    {"leave_home();" if field else ""}
+    {"leave_home();" if both_ways else ""}
     """
 
 
@@ -308,7 +345,7 @@ def _snippet(real: str, quantity: str) -> str:
         {_VECTORS}
         {_INVERSE_ROOT[real]}
         {_add_rows(quantity)}
-        {_ADD_BOTH_WAYS if quantity == FIELD else ""}
+        {_add_both_ways(quantity) if quantity in (FIELD, KELVIN) else ""}
         {_walk(quantity)}
         return nullptr;
     }};

@@ -130,7 +130,7 @@ class MomentSystem:
         few = np.count_nonzero(~permanent) <= theta_flow.MOST_FUSED
         fusible = few and dynamics == "theta" and contact_model == "dipole"
         forms = pair_loops.FORMS if fusible else (pair_loops.LOOP, pair_loops.MIRRORED)
-        self._make_rows(worlds, permanent, movable, twisted.any(), forms)
+        self._make_rows(worlds, permanent, movable, (twisted & movable).any(), forms)
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
         self._induction = induction.allocate(worlds, ~permanent, self._induced, self.dtype, self.device)
         self._near = None
