@@ -153,7 +153,7 @@ def launch_field(rows, partial, targets, sources, same_set, base, h):
     """
     if rows.count == 0:
         return
-    near = [int(same_set), targets.neighbors, targets.neighbor_counts]
+    near = [int(same_set), targets.overlaps, targets.overlap_counts]
     if rows.fused:
         wp.launch(
             _sum_kernel(targets.dtype, rows.shape),

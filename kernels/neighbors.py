@@ -5,7 +5,8 @@ neighbours per moment, in the order of their indices. A list that is full is no 
 instead.
 
 Lists hold everything nearer than (1 + ``SKIN``) times contact, and are made anew once a moment has moved by ``SKIN``
-times its radius: what was farther apart is until then farther than contact.
+times its radius: what was farther apart is until then farther than contact. Which of them do overlap is sought for
+every arrangement, and is what the passes over the pairs walk.
 
 The search sorts moments into cubic cells as wide as the farthest pair of a list. A hash table holds for each cell the
 last moment that was put in, and each moment knows the one before it. A target meets its neighbours in its own cell and
@@ -283,6 +284,59 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
         inputs=[targets, lists.searching, lists.count],
         outputs=[lists.neighbor, lists.found_at],
         device=device,
+    )
+
+
+@cache
+def _overlap_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def list_overlaps(
+        # inputs:
+        targets: wp.array2d[dtype],
+        sources: wp.array2d[dtype],
+        neighbor: wp.array2d[int],
+        neighbor_count: wp.array[int],
+        # outputs:
+        overlap_out: wp.array2d[int],
+        overlap_count_out: wp.array[int],
+    ):
+        i = wp.tid()
+        count = neighbor_count[i]
+        found = count
+        if count <= wp.static(CAPACITY):
+            found = int(0)
+            x = vec3(targets[0, i], targets[1, i], targets[2, i])
+            radius = targets[3, i]
+            for n in range(count):
+                j = neighbor[i, n]
+                r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
+                s = radius + sources[3, j]
+                if wp.dot(r, r) < s * s:
+                    overlap_out[i, found] = j
+                    found += 1
+        overlap_count_out[i] = found
+
+    return list_overlaps
+
+
+def launch_list_overlaps(targets, sources, lists, overlap, overlap_count):
+    """List those of each target's neighbours that overlap it.
+
+    Args:
+        targets: Packed targets, shape [8, t].
+        sources: Packed sources, shape [8, n].
+        lists: The targets' lists, of ``CAPACITY``.
+        overlap: Out, indices of what overlaps each, ascending, shape [t, CAPACITY].
+        overlap_count: Out, how many they are, shape [t]; where a list was full, its count, beyond the capacity.
+    """
+    wp.launch(
+        _overlap_kernel(targets.dtype),
+        dim=targets.shape[1],
+        inputs=[targets, sources, lists.neighbor, lists.count],
+        outputs=[overlap, overlap_count],
+        device=targets.device,
     )
 
 

@@ -93,6 +93,8 @@ def _begin_kernel(dtype):
         induced_end: wp.array[int],
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
+        overlap: wp.array2d[int],
+        overlap_count: wp.array[int],
         external_field: wp.array[vec3],
         warm: wp.array[int],
         past_positions: wp.array2d[vec3],
@@ -136,8 +138,8 @@ def _begin_kernel(dtype):
                 i,
                 source_begin[row],
                 source_end[row],
-                neighbor,
-                neighbor_count,
+                overlap,
+                overlap_count,
                 external_field,
             )
             near = vec3()
@@ -145,8 +147,8 @@ def _begin_kernel(dtype):
                 near = extrapolated_near_field(
                     packed, past_positions, past_moments, ahead, i, first, last, neighbor, neighbor_count, share, shares
                 )
-            overlap = shared_volume(packed, i, first, last, neighbor, neighbor_count, share, shares)
-            about = sum_group(wp.vector(near[0], near[1], near[2], overlap, length=4), shares)
+            volume = shared_volume(packed, i, first, last, overlap, overlap_count, share, shares)
+            about = sum_group(wp.vector(near[0], near[1], near[2], volume, length=4), shares)
             stiffness = wp.float64(k * (about[3] + dtype(2.0 / 3.0)))
             field = wp.max(field, wp.float64(wp.length(h0)))
             stiffest = wp.max(stiffest, stiffness)
@@ -660,6 +662,8 @@ def launch_begin(applied, partial, induced, moments, external_field, material, b
             induced.end,
             moments.neighbors,
             moments.neighbor_counts,
+            moments.overlaps,
+            moments.overlap_counts,
             external_field,
             b.warm,
             b.past_positions,
@@ -742,8 +746,8 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             rows.target,
             rows.begin,
             rows.end,
-            moments.neighbors,
-            moments.neighbor_counts,
+            moments.overlaps,
+            moments.overlap_counts,
             b.h0,
             b.s,
             material.saturation,

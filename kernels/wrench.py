@@ -237,7 +237,7 @@ def launch_wrench(rows, partial, moments, effective, external_field, twisted, fo
     """
     if rows.count == 0:
         return
-    near = [moments.neighbors, moments.neighbor_counts]
+    near = [moments.overlaps, moments.overlap_counts]
     if rows.fused:
         wp.launch(
             _sum_kernel(moments.dtype, rows.quantity, rows.shape),

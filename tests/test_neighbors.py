@@ -31,14 +31,21 @@ def closeness(positions, radii, groups=None):
     return d
 
 
-def check(lists, counts, near):
+def check(packed, near):
     """Everything that overlaps is listed, nothing beyond the skin is, in the order of indices."""
+    full = packed.neighbor_counts.numpy() > CAPACITY
+    assert np.array_equal(packed.overlap_counts.numpy()[full], packed.neighbor_counts.numpy()[full])
+    check_lists(packed.neighbors.numpy(), packed.neighbor_counts.numpy(), near, 1.0 + SKIN)
+    check_lists(packed.overlaps.numpy()[~full], packed.overlap_counts.numpy()[~full], near[~full], 1.0)
+
+
+def check_lists(lists, counts, near, reach):
     rounding = 1e-5  # of a distance of float32 positions a few hundred radii from the origin
-    assert ((near < 1.0 - rounding).sum(1) <= counts).all() and (counts <= (near < 1.0 + SKIN + rounding).sum(1)).all()
+    assert ((near < 1.0 - rounding).sum(1) <= counts).all() and (counts <= (near < reach + rounding).sum(1)).all()
     for i in np.flatnonzero(counts <= CAPACITY):
         listed = lists[i, : counts[i]]
         assert (np.diff(listed) > 0).all()
-        assert (near[i, listed] < 1.0 + SKIN + rounding).all()
+        assert (near[i, listed] < reach + rounding).all()
         assert np.isin(np.flatnonzero(near[i] < 1.0 - rounding), listed).all()
 
 
@@ -48,10 +55,10 @@ def test_balls_of_many_sizes_in_two_worlds(extent, dtype, device):
     rng = np.random.default_rng(0)
     positions = rng.uniform(-extent, extent, (600, 3)) + np.array([1.0, -2.0, 0.0])
     radii, groups = rng.choice([0.002, 0.004, 0.01], 600), np.repeat([0, 1], 300)
-    lists, counts = find(make(radii, device, dtype, groups), positions)
-    near = closeness(positions, radii, groups)
+    packed = make(radii, device, dtype, groups)
+    _, counts = find(packed, positions)
     assert (counts.max() > CAPACITY) == (extent < 0.05)
-    check(lists, counts, near)
+    check(packed, closeness(positions, radii, groups))
 
 
 def test_lists_stay_complete_while_moments_move(device):
@@ -66,6 +73,7 @@ def test_lists_stay_complete_while_moments_move(device):
         near = closeness(positions, radii)
         overlapping = near < 1.0 - 1e-5
         assert all(np.isin(np.flatnonzero(overlapping[i]), lists[i, : counts[i]]).all() for i in range(200))
+        check_lists(packed.overlaps.numpy(), packed.overlap_counts.numpy(), near, 1.0)
         positions = positions + 0.012 * rng.normal(size=(200, 3))
     assert 10 < stale < 39  # lists are kept for a while, not for good
 
@@ -91,4 +99,4 @@ def test_other_moments(device):
         at.pack(x, wp.zeros_like(x))
         at.find_overlaps(of)
         near = np.linalg.norm(targets[:, None] - (sources + shift)[None], axis=2) / 1.5
-        check(at.neighbors.numpy(), at.neighbor_counts.numpy(), near)
+        check(at, near)

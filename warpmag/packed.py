@@ -16,6 +16,8 @@ class PackedMoments:
         moments: The moments among them, a view, shape [3, n].
         neighbors: Moments that overlap each, or nearly do, shape [n, capacity], valid after :meth:`find_overlaps`.
         neighbor_counts: How many they are, shape [n]; zero until then.
+        overlaps: Those of them that do overlap it, shape [n, capacity].
+        overlap_counts: How many they are, shape [n].
     """
 
     def __init__(self, radii, *, largest_radius: float, labels=None, groups=None):
@@ -46,6 +48,7 @@ class PackedMoments:
         self.moments = self.packed[4:7] if n else self.packed
         self._lists = neighbors.allocate(n, dtype, device)
         self.neighbors, self.neighbor_counts = self._lists.neighbor, self._lists.count
+        self.overlaps, self.overlap_counts = wp.zeros_like(self.neighbors), wp.zeros_like(self.neighbor_counts)
 
     def pack(self, positions, moments):
         """Launch the packing of positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
@@ -64,3 +67,4 @@ class PackedMoments:
         neighbors.launch_find_neighbors(
             self.packed, sources.packed, self.groups, sources.groups, reach, self._lists, sources._lists
         )
+        neighbors.launch_list_overlaps(self.packed, sources.packed, self._lists, self.overlaps, self.overlap_counts)
