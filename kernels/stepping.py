@@ -5,6 +5,11 @@ monitor (``kernels.monitor``) saw of it decides: it is accepted and reported, or
 tried at the next level, or stepping halts, because a buffer was too small or a body left all finite numbers. While
 halted, steps do nothing, so that the host may look whenever it likes and go on from exactly there.
 
+Substeps come in pairs. Where they are shorter than those of the first level, the second keeps the magnetic forces of
+the first, which then act no longer than they do at that level: what made substeps short is bodies that are fast or
+pressed, and a force changes with the place, not with the speed. It gets its own where forces alone would carry a body
+beyond the limit of travel within the pair.
+
 ``flags`` [int32]: conditions of the loops around a step, see the ``FLAG_*`` indices.
 ``status`` [int32]: where stepping stands, see the ``STATUS_*`` indices.
 ``log`` [float64, shape [records, LOG_FIELDS]]: a ring with a record of each step done, see the ``LOG_*`` indices.
@@ -28,6 +33,7 @@ from warpmag.kernels.monitor import (
     NO_BODY,
     PEAK_LONG_TRAVEL,
     PEAK_OVERLAP,
+    PEAK_PUSH,
     PEAK_TRAVEL,
     PEAKS,
 )
@@ -40,7 +46,8 @@ LEVELS = wp.constant(5)
 FLAG_ATTEMPT = wp.constant(0)  # the step is to be tried (again)
 FLAG_REJECTED = wp.constant(1)  # the last attempt did not hold
 FLAG_LEVEL = wp.constant(2)  # first of LEVELS: substeps of this level remain to be done
-FLAGS = 7
+FLAG_PUSHED = wp.constant(FLAG_LEVEL + LEVELS)  # forces are too strong to be kept for a substep
+FLAGS = int(FLAG_PUSHED) + 1
 
 STATUS_HALT = wp.constant(0)  # why steps do nothing: one of the reasons below
 STATUS_DONE = wp.constant(1)  # steps done
@@ -110,6 +117,11 @@ class StepBuffers:
     def remaining(self, level: int) -> wp.array:
         """Condition: substeps of ``level`` remain to be done."""
         return self.flags[int(FLAG_LEVEL) + level : int(FLAG_LEVEL) + level + 1]
+
+    @property
+    def pushed(self) -> wp.array:
+        """Condition: the second substep of a pair needs forces of its own."""
+        return self.flags[int(FLAG_PUSHED) :]
 
 
 def allocate(records: int, capacities: int, device) -> StepBuffers:
@@ -298,6 +310,22 @@ def launch_watch_finite(half: int, state, limits: Limits, b: StepBuffers):
         outputs=[b.counts],
         device=b.status.device,
     )
+
+
+@wp.kernel
+def _weigh_push(
+    # inputs:
+    peaks_in: wp.array[float],
+    travel_limit: float,
+    # outputs:
+    flags_out: wp.array[wp.int32],
+):
+    flags_out[FLAG_PUSHED] = wp.where(peaks_in[PEAK_PUSH] <= travel_limit, 0, 1)
+
+
+def launch_weigh_push(limits: Limits, b: StepBuffers):
+    """Decide between two substeps whether the second one needs forces of its own."""
+    wp.launch(_weigh_push, dim=1, inputs=[b.peaks, limits.travel], outputs=[b.flags], device=b.status.device)
 
 
 @wp.kernel

@@ -1,8 +1,9 @@
 """Advances a model by the step that the user asked for, in as many substeps as its motion needs.
 
-A substep is: clear forces, induction, magnetic forces, collision, solver. A step is tried and then judged: if a body
-moved too far in a substep, or bodies were pressed into each other, the state is put back and the step done again with
-shorter substeps. All of that is decided on the device (``kernels.stepping``), so that a step is one graph that the host
+A substep is: clear forces, induction, magnetic forces, collision, solver; substeps shorter than the longest ones share
+their forces two by two, as long as these are not too strong. A step is tried and then judged: if a body moved too far
+in a substep, or bodies were pressed into each other, the state is put back and the step done again with shorter
+substeps. All of that is decided on the device (``kernels.stepping``), so that a step is one graph that the host
 launches and does not wait for. The host looks every so many steps. Where it has to act, because a buffer overflowed or
 the state is not finite any more, the device has halted, and steps launched since did nothing.
 
@@ -287,21 +288,26 @@ class Stepper:
         dt = self._step / (self._fewest << level)
         for half, (now, then) in enumerate(((self.state, self._other), (self._other, self.state))):
             stepping.launch_watch_finite(half, now, self._limits, self._buffers)
-            self._substep(now, then, dt)
+            if level and half:
+                wp.copy(now.body_f, then.body_f)
+                stepping.launch_weigh_push(self._limits, self._buffers)
+                wp.capture_if(self._buffers.pushed, self._magnetize, state=now)
+            else:
+                self._magnetize(now)
+            monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, self._buffers.peaks)
+            self._find_contacts(now, dt, 0.0)
+            self._solver.step(now, then, dt)
         stepping.launch_end_pair(level, self._buffers)
 
-    def _substep(self, now: newton.State, then: newton.State, dt: float) -> None:
+    def _magnetize(self, state: newton.State) -> None:
         b, system = self._buffers, self._magnetics.system
-        now.clear_forces()
+        state.clear_forces()
         stepping.launch_mark(RIGID, b)
-        self._magnetics.induce(now)
+        self._magnetics.induce(state)
         monitor.watch_induction(system.error, system.evaluations, system.converged, b.peaks, b.counts)
         stepping.launch_mark(INDUCTION, b)
-        self._magnetics.add_forces(now)
+        self._magnetics.add_forces(state)
         stepping.launch_mark(FORCE, b)
-        monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, b.peaks)
-        self._find_contacts(now, dt, 0.0)
-        self._solver.step(now, then, dt)
 
     def _find_contacts(self, state: newton.State, dt: float, overlap_threshold: float) -> None:
         solver, b = self._solver, self._buffers
