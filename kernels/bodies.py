@@ -124,6 +124,35 @@ def scatter_wrenches(
 
 
 @wp.kernel
+def _predict_poses(
+    # inputs:
+    body_q_in: wp.array[wp.transform],
+    body_qd_in: wp.array[wp.spatial_vector],
+    body_com_in: wp.array[wp.vec3],
+    seconds: float,
+    # outputs:
+    body_q_out: wp.array[wp.transform],
+):
+    body = wp.tid()
+    center = wp.transform_point(body_q_in[body], body_com_in[body]) + seconds * wp.spatial_top(body_qd_in[body])
+    rotation = wp.transform_get_rotation(body_q_in[body])
+    turn = 0.5 * seconds * wp.spatial_bottom(body_qd_in[body])
+    rotation = wp.normalize(rotation + wp.quat(turn, 0.0) * rotation)
+    body_q_out[body] = wp.transform(center - wp.quat_rotate(rotation, body_com_in[body]), rotation)
+
+
+def predict_poses(state, body_com, seconds, body_q):
+    """Write where the bodies of ``state`` are after some ``seconds`` at their present velocities."""
+    wp.launch(
+        _predict_poses,
+        dim=state.body_q.shape[0],
+        inputs=[state.body_q, state.body_qd, body_com, seconds],
+        outputs=[body_q],
+        device=body_q.device,
+    )
+
+
+@wp.kernel
 def _sum_moments(
     # inputs:
     part_start_in: wp.array[wp.int32],

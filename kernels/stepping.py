@@ -5,10 +5,11 @@ monitor (``kernels.monitor``) saw of it decides: it is accepted and reported, or
 tried at the next level, or stepping halts, because a buffer was too small or a body left all finite numbers. While
 halted, steps do nothing, so that the host may look whenever it likes and go on from exactly there.
 
-Substeps come in pairs. Where they are shorter than those of the first level, the second keeps the magnetic forces of
-the first, which then act no longer than they do at that level: what made substeps short is bodies that are fast or
-pressed, and a force changes with the place, not with the speed. It gets its own where forces alone would carry a body
-beyond the limit of travel within the pair.
+Substeps come in pairs. Where they are shorter than those of the first level, two share their magnetic forces, which
+then act no longer than they do at that level: what makes substeps short is contacts of bodies that are fast or pressed.
+The forces are those half-way between the poses that the two start from, as far as velocities tell, so that they neither
+lag nor lead. The second substep gets its own where forces alone would carry a body beyond the limit of travel within
+the pair.
 
 ``flags`` [int32]: conditions of the loops around a step, see the ``FLAG_*`` indices.
 ``status`` [int32]: where stepping stands, see the ``STATUS_*`` indices.

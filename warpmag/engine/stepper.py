@@ -24,6 +24,7 @@ from warpmag.engine.contacts import BodySizes, RigidSolver
 from warpmag.engine.magnetics import Magnetics
 from warpmag.errors import SimulationError
 from warpmag.kernels import monitor, stepping
+from warpmag.kernels.bodies import predict_poses
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
@@ -110,6 +111,7 @@ class Stepper:
         # Even, so that a step ends in the state that it began in.
         self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
         self.state, self._other, self._saved = model.state(), model.state(), model.state()
+        self._shared = model.state()  # between the poses that two substeps start from, and the forces there
         self._thickness = wp.array(sizes.thickness, dtype=float, device=self._device)
         self._reach = wp.array(sizes.reach, dtype=float, device=self._device)
         self._buffers = stepping.allocate(_RECORDS, len(solver.buffers), self._device)
@@ -288,12 +290,16 @@ class Stepper:
         dt = self._step / (self._fewest << level)
         for half, (now, then) in enumerate(((self.state, self._other), (self._other, self.state))):
             stepping.launch_watch_finite(half, now, self._limits, self._buffers)
-            if level and half:
-                wp.copy(now.body_f, then.body_f)
-                stepping.launch_weigh_push(self._limits, self._buffers)
-                wp.capture_if(self._buffers.pushed, self._magnetize, state=now)
-            else:
+            if level == 0:
                 self._magnetize(now)
+            else:
+                if half == 0:
+                    predict_poses(now, self._model.body_com, 0.5 * dt, self._shared.body_q)
+                    self._magnetize(self._shared)
+                wp.copy(now.body_f, self._shared.body_f)
+                if half == 1:
+                    stepping.launch_weigh_push(self._limits, self._buffers)
+                    wp.capture_if(self._buffers.pushed, self._magnetize, state=now)
             monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, self._buffers.peaks)
             self._find_contacts(now, dt, 0.0)
             self._solver.step(now, then, dt)
