@@ -5,8 +5,8 @@ through it:
 
 * ``add_rows`` sums a target at a time, whatever the radii.
 * ``add_both_ways`` is for the field, and Kelvin's force, among moments of one radius: a separation and its powers serve
-  both ends of the pair, which takes 35 vector operations for the two fields, where ``add_rows`` takes 28 for one, and 46
-  for the two forces, where it takes 37. Two tiles whose bodies may be the same ones have no force that way.
+  both ends of the pair. That takes 35 vector operations for the two fields, where ``add_rows`` takes 28 for one, and 46
+  for the two forces, where it takes 37. Tiles that may hold moments of the same body do not have their forces that way.
 
 Every thread has sums of its own, which the finishing kernel adds up in order, so that nothing depends on scheduling.
 """

@@ -8,8 +8,7 @@ halted, steps do nothing, so that the host may look whenever it likes and go on 
 Substeps come in pairs. Where they are shorter than those of the first level, two share their magnetic forces, which
 then act no longer than they do at that level: what makes substeps short is contacts of bodies that are fast or pressed.
 The forces are those half-way between the poses that the two start from, as far as velocities tell, so that they neither
-lag nor lead. The second substep gets its own where forces alone would carry a body beyond the limit of travel within
-the pair.
+lag nor lead. The second substep gets its own where forces are too strong to be shared.
 
 ``flags`` [int32]: conditions of the loops around a step, see the ``FLAG_*`` indices.
 ``status`` [int32]: where stepping stands, see the ``STATUS_*`` indices.
@@ -83,6 +82,7 @@ class Limits:
 
     Attributes:
         travel: Largest motion in a substep, in parts of a body's thickness.
+        push: Largest motion by the forces alone in two substeps that share them, in the same parts.
         overlap: Deepest new penetration, in parts of the thickness of the thinner body.
         ease: Substeps are made longer again where the motion in twice their length stays below this part of ``travel``.
         futile: Substeps that leave more than this part of a penetration that was too deep are not made shorter still.
@@ -91,6 +91,7 @@ class Limits:
     """
 
     travel: float
+    push: float
     overlap: float
     ease: float
     futile: float
@@ -317,16 +318,16 @@ def launch_watch_finite(half: int, state, limits: Limits, b: StepBuffers):
 def _weigh_push(
     # inputs:
     peaks_in: wp.array[float],
-    travel_limit: float,
+    push_limit: float,
     # outputs:
     flags_out: wp.array[wp.int32],
 ):
-    flags_out[FLAG_PUSHED] = wp.where(peaks_in[PEAK_PUSH] <= travel_limit, 0, 1)
+    flags_out[FLAG_PUSHED] = wp.where(peaks_in[PEAK_PUSH] <= push_limit, 0, 1)
 
 
 def launch_weigh_push(limits: Limits, b: StepBuffers):
     """Decide between two substeps whether the second one needs forces of its own."""
-    wp.launch(_weigh_push, dim=1, inputs=[b.peaks, limits.travel], outputs=[b.flags], device=b.status.device)
+    wp.launch(_weigh_push, dim=1, inputs=[b.peaks, limits.push], outputs=[b.flags], device=b.status.device)
 
 
 @wp.kernel

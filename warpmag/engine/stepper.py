@@ -28,6 +28,12 @@ from warpmag.kernels.bodies import predict_poses
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
+PUSH_LIMIT = 0.5
+"""How far forces alone may move a body in two substeps that share them, in parts of its thickness.
+
+The pull a of a magnet on a ball at its surface changes by at most 2a/R along the way R, that of a dipole on an induced
+one by 3.5a/R, which a step T is stable with below aT²/2R = 0.57.
+"""
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
 _EASE = 0.8
@@ -131,7 +137,9 @@ class Stepper:
         """Fit everything to the solver's buffers, whose number does not change."""
         sizes = [buffer.limit for buffer in self._solver.buffers]
         capacities = wp.array(sizes, dtype=wp.int32, device=self._device)
-        self._limits = stepping.Limits(TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities)
+        self._limits = stepping.Limits(
+            TRAVEL_LIMIT, PUSH_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities
+        )
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
