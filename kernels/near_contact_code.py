@@ -1,31 +1,44 @@
-"""Text of the near-contact model's passes over the pairs, the same for a CPU and a GPU.
+"""Text of the near-contact model's passes over the slots of the balls' lists; ``vector_passes`` runs them."""
 
-A pass walks the slots of the balls' lists. On a CPU a vector has a ball in each lane; on a GPU ``WAYS`` threads share
-the slots of one. All arrays have the balls along their last axis, padded to ``LANES``; a slot that a ball does not use
-is zero.
-"""
+import math
 
-from warpmag.near_contact import RANGE
+from warpmag.kernels.curves import CLAMPED, LANGEVIN
+from warpmag.kernels.vector_passes import passes_text
+from warpmag.kernels.wrench import MU0
+from warpmag.near_contact import (
+    CONTACT_GAP,
+    DEEPEST,
+    LANGEVIN_STEEPNESS,
+    LEAST_RATIO,
+    LOG_GAPS,
+    MOST_SHARED,
+    QUADRUPOLE_OVERLAP,
+    QUADRUPOLE_REACH,
+    RANGE,
+    REACH,
+    SMALLEST_GAP,
+    SOFTNESS,
+)
 
-LANES = 16
-"""Multiple that the number of balls is padded to: lanes of the widest vectors."""
-WAYS = 8
-"""Threads of a GPU that share a ball's slots."""
 NEAR = 32
 """Slots for near balls; balls that do not overlap have at most about 24."""
 CONTACTS = 16
-"""Slots for those that nearly touch."""
+"""The first of them, for those that nearly touch."""
+CANDIDATES = 64
+"""Balls that may be listed as near, or about to be."""
+SKIN = 0.05
+"""Part of its radius that a ball may move before near balls are sought anew."""
 
-PAIR_ROWS = 11
-"""Rows of a near pair: direction to the other ball; U_sr, g1 d, g1, g2 d², g3 d³; 1/d; the quadrupoles' window, w'."""
-CONTACT_ROWS = 20
-"""Rows of a contact: direction to the other ball; A to P, then D', J' and L' that the other ball sees."""
-SLOPE_ROWS = 15
-"""Rows of a contact's derivatives: of A to P by the distance; 1/d."""
+PAIR_ROWS = 8
+"""Rows of a near pair: direction to the other ball; U_sr, g1 d, g2 d², 1/d, the quadrupoles' window."""
+CHANGE_ROWS = 2
+"""Rows of a near pair's derivatives: g3 d³ and the window's."""
+CONTACT_ROWS = 17
+"""Rows of a contact: A to P, then D', J' and L' that the other ball sees."""
+SLOPE_ROWS = 14
+"""Rows of a contact's derivatives: of A to P by the distance."""
 STATE_ROWS = 14
 """Rows of what sweeps move: q, N and xx, yy, xy, yz, zx of n_Θ, the contact sources; the same of Θ̃."""
-DRIVE_ROWS = 14
-"""Rows of the drives: φ, e_m and e_Θ; what Θ̃ moves towards."""
 OUTER_ROWS = 13
 """Rows of what does not change from pass to pass: parts of φ, of e_m and of the tensor that Θ feels; (M_sr a)_m."""
 
@@ -36,74 +49,53 @@ _LEAST, _MOST = 0.4, 4.0
 _PACE = 4.0 / (_MOST**0.5 + _LEAST**0.5) ** 2
 _MOMENTUM = ((_MOST**0.5 - _LEAST**0.5) / (_MOST**0.5 + _LEAST**0.5)) ** 2
 
-_PRELUDE = """
-#if defined(__CUDA_ARCH__)
-    typedef REAL NUMBER;
-    typedef int INDEX;
-    struct Vector { NUMBER x, y, z; };
-    auto gather = [](const REAL* row, INDEX j) -> NUMBER { return row[j]; };
-    const int way = threadIdx.x % WAYS;
-    auto total_of = [](NUMBER part) -> NUMBER {
-        const unsigned mates = ((1u << WAYS) - 1u) << (threadIdx.x % 32 / WAYS * WAYS);
-        for (int other = 1; other < WAYS; other *= 2) part += __shfl_xor_sync(mates, part, other);
-        return part;
-    };
-    auto most = [](INDEX count) -> int { return count; };
-    auto numbers = [](const REAL* row) -> NUMBER { return *row; };
-    auto indices = [](const int* row) -> INDEX { return *row; };
-    auto put = [](REAL* row, NUMBER n) { *row = n; };
+# Blocks: ``placed`` holds x, y, z, radius; share, kind. ``seen`` holds N, q; Θ̃ and m. ``driven`` holds e_m,
+# φ; e_Θ, radius, weight, and what Θ̃ moves towards.
+_SHOW = """
+    struct Sources { Vector t, m; NUMBER q; Tensor theta; };
     auto own_moment = [=](int i) -> Vector {
-        return {moment[i], moment[i + moment_stride], moment[i + 2 * moment_stride]};
+        return {numbers(moment + i), numbers(moment + moment_stride + i), numbers(moment + 2 * moment_stride + i)};
     };
-#else
-    constexpr int WIDTH = 64 / (int)sizeof(REAL), way = 0;
-    typedef REAL NUMBER __attribute__((ext_vector_type(WIDTH)));
-    typedef int INDEX __attribute__((ext_vector_type(WIDTH)));
-    struct Vector { NUMBER x, y, z; };
-    auto gather = [](const REAL* row, INDEX j) -> NUMBER {
-        NUMBER lanes = 0;
-#if defined(__AVX512F__)
-        GATHER
-#else
-        for (int l = 0; l < WIDTH; ++l) lanes[l] = row[j[l]];
-#endif
-        return lanes;
+    auto sources_in = [=](Four a, Four b, NUMBER zx, Vector m) -> Sources {
+        return {{m.x - a.x, m.y - a.y, m.z - a.z}, m, -a.w, {b.x, b.y, b.z, b.w, zx}};
     };
-    auto total_of = [](NUMBER part) -> NUMBER { return part; };
-    auto most = [](INDEX count) -> int {
-        int largest = 0;
-        for (int l = 0; l < WIDTH; ++l) largest = count[l] > largest ? count[l] : largest;
-        return largest;
+    auto sources_at = [=](const int* j) -> Sources {
+        const Four a = four_at(seen, 0, j), b = four_at(seen, 1, j), c = four_at(seen, 2, j);
+    #if defined(__CUDA_ARCH__)
+        return sources_in(a, b, c.x, own_moment(*j));
+    #else
+        return sources_in(a, b, c.x, {c.y, c.z, c.w});
+    #endif
     };
-    auto numbers = [](const REAL* row) -> NUMBER { NUMBER n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
-    auto indices = [](const int* row) -> INDEX { INDEX n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
-    auto put = [](REAL* row, NUMBER n) { __builtin_memcpy(row, &n, sizeof(n)); };
-    // moments are not padded
-    auto own_moment = [=](int i) -> Vector {
-        INDEX j;
-        for (int l = 0; l < WIDTH; ++l) j[l] = i + l < moment_count ? i + l : moment_count - 1;
-        return {gather(moment, j), gather(moment + moment_stride, j), gather(moment + 2 * moment_stride, j)};
+    auto own_sources = [=](int i) -> Sources {
+        return sources_in(own_four(seen, 0, i), own_four(seen, 1, i), own_four(seen, 2, i).x, own_moment(i));
     };
-#endif
-    struct Tensor { NUMBER xx, yy, xy, yz, zx; };  // symmetric, traceless
-    auto dot = [](Vector a, Vector b) -> NUMBER { return a.x * b.x + a.y * b.y + a.z * b.z; };
-    auto times = [](Tensor t, Vector a) -> Vector {
-        return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
-                t.zx * a.x + t.yz * a.y - (t.xx + t.yy) * a.z};
+"""
+
+_PREPARE = """
+    // On a CPU moments stand with the sources, of which a GPU has no need, where they are read at once.
+    auto prepare = [=](int i) {
+        const Vector m = own_moment(i);
+        put_four(seen, 2, i, {numbers(rows_at(contact, STATE_ROWS, i) + 13 * LANES), m.x, m.y, m.z});
     };
-    auto vector_at = [=](const REAL* rows, int stride, INDEX j) -> Vector {
-        return {gather(rows, j), gather(rows + stride, j), gather(rows + 2 * stride, j)};
-    };
-    auto tensor_at = [=](const REAL* rows, int stride, INDEX j) -> Tensor {
-        return {gather(rows, j), gather(rows + stride, j), gather(rows + 2 * stride, j), gather(rows + 3 * stride, j),
-                gather(rows + 4 * stride, j)};
-    };
-    auto own_vector = [=](const REAL* rows, int stride) -> Vector {
-        return {numbers(rows), numbers(rows + stride), numbers(rows + 2 * stride)};
-    };
-    auto own_tensor = [=](const REAL* rows, int stride) -> Tensor {
-        return {numbers(rows), numbers(rows + stride), numbers(rows + 2 * stride), numbers(rows + 3 * stride),
-                numbers(rows + 4 * stride)};
+    struct Softness { NUMBER p, weight; };  // polarizability of a ball's quadrupole; factor that falls as it saturates
+    auto softness_of = [=](int i) -> Softness {
+        const NUMBER size = numbers(radius + i), slope = numbers(curve_slope + i), one = size * REAL(0) + 1;
+        const Vector m = own_moment(i);
+        const NUMBER volume = REAL(4.18879020478639) * size * size * size;
+        const NUMBER reduced = root(dot(m, m)) / volume / numbers(saturation + i), square = reduced * reduced;
+        NUMBER steepness = one - square;  // of tanh
+        if (curve == CLAMPED) steepness = reduced < one ? one : one * 0;
+        if (curve == LANGEVIN) {
+            steepness *= 3 * steepness / (3 + square * square);
+            NUMBER fit = one * 0;
+            for (int k = 0; k < FITTED; ++k) fit = fit * (2 * reduced - 1) + STEEPNESS[k];
+            steepness *= fit;
+        }
+        const NUMBER state = 1 / larger(slope * steepness, one * REAL(1e-12)) - REAL(1.0 / 3.0);
+        // of the higher multipoles: polarizability 2χ/(2χ + 5)
+        const NUMBER p = 1 / (1 + REAL(2.5) * larger(state, one * 0));
+        return {p, (1 + REAL(2.5) * (1 / slope - REAL(1.0 / 3.0))) * p};
     };
 """
 
@@ -111,20 +103,22 @@ _DRIVE = """
     // e = M ã, what quadrupoles move towards, and 4π H_near = (M_sr a − e)_m. What balls make that do not touch, and
     // what moments make, is summed by the first pass only, for the others to start from.
     auto drive_of = [=](int i, bool first) {
-        const int contact_slots = most(indices(contact_count + i)), slots = most(indices(count + i));
-        const NUMBER zero = numbers(radius + i) * REAL(0);
+        const int contact_slots = most(contact_count + i), slots = most(count + i);
+        REAL* const kept = rows_at(outer, OUTER_ROWS, i);
+        const REAL* const state = rows_at(contact, STATE_ROWS, i);
+        const NUMBER size = numbers(radius + i), zero = size * REAL(0);
         NUMBER phi = zero;
         Vector e = {zero, zero, zero}, lone = e;
         NUMBER gxx = zero, gyy = zero, gzz = zero, gxy = zero, gyz = zero, gzx = zero;
         auto meet = [&](int s, bool with_moments) {
-            const REAL* pair = pairs + ((size_t)s * PAIR_ROWS) * stride + i;
-            auto row = [=](int r) -> NUMBER { return numbers(pair + (size_t)r * stride); };
-            const INDEX j = indices(near + (size_t)s * stride + i);
-            const Vector u = own_vector(pair, stride), m = vector_at(moment, moment_stride, j);
-            const Vector n = vector_at(contact + stride, stride, j), t = {m.x - n.x, m.y - n.y, m.z - n.z};
-            const Tensor theta = tensor_at(left, stride, j);
-            const NUMBER q = -gather(contact, j), along = dot(u, t), source = row(4), g1 = row(5), g2 = row(6);
-            const NUMBER inverse = row(8), square = inverse * inverse, w = row(9);
+            const REAL* pair = slot_at(pairs, NEAR, PAIR_ROWS, s, i);
+            auto row = [=](int r) -> NUMBER { return numbers(pair + r * LANES); };
+            const Vector u = own_vector(pair);
+            const Sources o = sources_at(list_at(near, NEAR, s, i));
+            const Vector t = o.t, m = o.m;
+            const Tensor theta = o.theta;
+            const NUMBER q = o.q, along = dot(u, t), source = row(4), g2 = row(5), inverse = row(6), w = row(7);
+            const NUMBER g1 = source * inverse, square = inverse * inverse;
             const NUMBER k3 = REAL(1.0 / 3.0) * w * g2, k4 = w * square * square, k5 = k4 * inverse;
             const Vector v = times(theta, u);
             const NUMBER f = dot(v, u);
@@ -155,86 +149,100 @@ _DRIVE = """
             for (int s = contact_slots + way; s < slots; s += WAYS) meet(s, true);
             for (int c = 0; c < 10; ++c) {
                 *sums[c] = total_of(*sums[c]);
-                if (way == 0) put(outer + (size_t)c * stride + i, *sums[c]);
+                if (way == 0) put(kept + c * LANES, *sums[c]);
                 else *sums[c] = zero;
             }
             for (int s = way; s < contact_slots; s += WAYS) meet(s, true);
         } else {
-            for (int c = 0; c < 10 && way == 0; ++c) *sums[c] = numbers(outer + (size_t)c * stride + i);
+            for (int c = 0; c < 10 && way == 0; ++c) *sums[c] = numbers(kept + c * LANES);
             for (int s = way; s < contact_slots; s += WAYS) meet(s, false);
         }
         for (int c = 0; c < 13; ++c) *sums[c] = total_of(*sums[c]);
         if (way > 0) return;
         for (int c = 10; c < 13; ++c) {
-            if (first) put(outer + (size_t)c * stride + i, *sums[c]);
-            else *sums[c] = numbers(outer + (size_t)c * stride + i);
+            if (first) put(kept + c * LANES, *sums[c]);
+            else *sums[c] = numbers(kept + c * LANES);
         }
-        const NUMBER inverse = 1 / numbers(radius + i), cube = inverse * inverse * inverse;
+        const NUMBER inverse = 1 / size, cube = inverse * inverse * inverse;
         const NUMBER source = OWN_SOURCE * inverse, dipole = OWN_DIPOLE * cube;
-        const Vector m = own_moment(i), n = own_vector(contact + stride + i, stride);
-        phi -= source * numbers(contact + i);
+        const Vector m = own_moment(i), n = own_vector(state + LANES);
+        phi -= source * numbers(state);
         e = {e.x + dipole * (m.x - n.x), e.y + dipole * (m.y - n.y), e.z + dipole * (m.z - n.z)};
         lone = {lone.x + dipole * m.x, lone.y + dipole * m.y, lone.z + dipole * m.z};
-        const REAL* taken = contact + 4 * (size_t)stride + i;
-        const NUMBER p = numbers(polarizability + i), fifth = cube * inverse * inverse, trace = gxx + gyy + gzz;
+        const Softness soft = softness_of(i);
+        const NUMBER p = soft.p, fifth = cube * inverse * inverse, trace = gxx + gyy + gzz;
         const NUMBER felt[5] = {REAL(1.5) * gxx - REAL(0.5) * trace, REAL(1.5) * gyy - REAL(0.5) * trace,
                                 REAL(1.5) * gxy, REAL(1.5) * gyz, REAL(1.5) * gzx};
-        put(drive + i, phi);
-        put(drive + stride + i, e.x);
-        put(drive + 2 * stride + i, e.y);
-        put(drive + 3 * stride + i, e.z);
+        NUMBER drive[5], goal[5];
         for (int c = 0; c < 5; ++c) {
-            const NUMBER own = numbers(taken + (size_t)c * stride);
-            put(drive + (4 + c) * (size_t)stride + i, (1 - p) * (felt[c] - fifth * own));
-            put(drive + (9 + c) * (size_t)stride + i, (p - 1) * own - p * felt[c] / fifth);
+            const NUMBER own = numbers(state + (4 + c) * LANES);
+            drive[c] = (1 - p) * (felt[c] - fifth * own);
+            goal[c] = (p - 1) * own - p * felt[c] / fifth;
         }
-        put(field + i, lone.x - e.x);
-        put(field + stride + i, lone.y - e.y);
-        put(field + 2 * stride + i, lone.z - e.z);
+        put_four(driven, 0, i, {e.x, e.y, e.z, phi});
+        put_four(driven, 1, i, {drive[0], drive[1], drive[2], drive[3]});
+        put_four(driven, 2, i, {drive[4], size, soft.weight, goal[4]});
+        put_four(driven, 3, i, {goal[0], goal[1], goal[2], goal[3]});
+        const Vector h = {lone.x - e.x, lone.y - e.y, lone.z - e.z};
+        put_vector(rows_at(field, 3, i), h);
+        for (int l = 0; l < AT_ONCE; ++l) {
+            if (row_of[i + l] < 0) continue;
+            REAL* const sum = partial + 3 * (size_t)row_of[i + l];
+            sum[0] = lane_of(h.x, l);
+            sum[1] = lane_of(h.y, l);
+            sum[2] = lane_of(h.z, l);
+        }
     };
 """
 
 # What a ball sees of a contact, its own drive and that of the other ball.
 _SEEN = """
+    struct Drive { NUMBER phi, size, weight; Vector e; Tensor t; };
+    auto drive_in = [=](Four a, Four b, Four c) -> Drive {
+        return {a.w, c.y, c.z, {a.x, a.y, a.z}, {b.x, b.y, b.z, b.w, c.x}};
+    };
+    auto drive_at = [=](const int* j) -> Drive {
+        return drive_in(four_at(driven, 0, j), four_at(driven, 1, j), four_at(driven, 2, j));
+    };
+    auto own_drive = [=](int i) -> Drive {
+        return drive_in(own_four(driven, 0, i), own_four(driven, 1, i), own_four(driven, 2, i));
+    };
     struct Seen { NUMBER phi, alpha, gamma; Vector field, pull; };  // R e_m, and R² e_Θ times the direction
-    auto seen = [=](NUMBER phi, Vector e, Tensor t, NUMBER size, Vector u, int sign) -> Seen {
-        const Vector v = times(t, u), field = {size * e.x, size * e.y, size * e.z};
-        const NUMBER square = size * size;
+    auto seen_by = [=](const Drive& o, Vector u, int sign) -> Seen {
+        const Vector v = times(o.t, u), e = {o.size * o.e.x, o.size * o.e.y, o.size * o.e.z};
+        const NUMBER square = o.size * o.size;
         const Vector pull = {square * v.x, square * v.y, square * v.z};
-        return {phi, sign * dot(field, u), dot(pull, u), field, pull};
+        return {o.phi, sign * dot(e, u), dot(pull, u), e, pull};
     };
-    auto seen_own = [=](int i, NUMBER size, Vector u) -> Seen {
-        return seen(numbers(drive + i), own_vector(drive + stride + i, stride),
-                    own_tensor(drive + 4 * (size_t)stride + i, stride), size, u, 1);
-    };
-    auto seen_other = [=](INDEX j, Vector u) -> Seen {
-        return seen(gather(drive, j), vector_at(drive + stride, stride, j),
-                    tensor_at(drive + 4 * (size_t)stride, stride, j), gather(radius, j), u, -1);
-    };
+    // rows of D', J' and L', which balls of one kind have in common with D, J and L
+    const int d_row = kinds > 1 ? 14 : 3, j_row = kinds > 1 ? 15 : 9, l_row = kinds > 1 ? 16 : 11;
 """
 
 _TAKE = """
     // n towards ΔC e, and Θ̃ towards its place, by a heavy ball's step
     auto take = [=](int i) {
-        const int slots = most(indices(contact_count + i));
-        const NUMBER size = numbers(radius + i), zero = size * REAL(0);
+        const int slots = most(contact_count + i);
+        const Drive own = own_drive(i);
+        const NUMBER size = own.size, zero = size * REAL(0);
         NUMBER goal[STATE_ROWS] = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
         for (int s = way; s < slots; s += WAYS) {
-            const REAL* rows = contacts + ((size_t)s * CONTACT_ROWS) * stride + i;
-            const INDEX j = indices(touching + (size_t)s * stride + i);
-            const Vector u = own_vector(rows, stride);
-            const NUMBER w = numbers(weight + i) * gather(weight, j);
-            NUMBER f[CONTACT_ROWS - 3];
-            for (int c = 0; c < CONTACT_ROWS - 3; ++c) f[c] = w * numbers(rows + (size_t)(3 + c) * stride);
-            const Seen a = seen_own(i, size, u), b = seen_other(j, u);
-            goal[0] += f[0] * a.phi + f[1] * b.phi + f[2] * a.alpha + f[3] * b.alpha + f[8] * a.gamma + f[9] * b.gamma;
-            const NUMBER along = f[2] * a.phi + f[14] * b.phi + (f[4] - f[6]) * a.alpha + (f[5] + f[7]) * b.alpha
-                + f[10] * a.gamma + f[11] * b.gamma;
-            goal[1] += size * (along * u.x + f[6] * a.field.x + f[7] * b.field.x);
-            goal[2] += size * (along * u.y + f[6] * a.field.y + f[7] * b.field.y);
-            goal[3] += size * (along * u.z + f[6] * a.field.z + f[7] * b.field.z);
-            const NUMBER pull = f[8] * a.phi + f[15] * b.phi + f[10] * a.alpha + f[16] * b.alpha + f[12] * a.gamma
-                + f[13] * b.gamma;
+            const REAL* rows = slot_at(contacts, CONTACTS, CONTACT_ROWS, s, i);
+            const Vector u = own_vector(slot_at(pairs, NEAR, PAIR_ROWS, s, i));
+            const Drive its = drive_at(list_at(near, NEAR, s, i));
+            const NUMBER w = own.weight * its.weight;
+            auto f = [=](int c) -> NUMBER { return numbers(rows + c * LANES); };
+            const Seen a = seen_by(own, u, 1), b = seen_by(its, u, -1);
+            goal[0] += w * (f(0) * a.phi + f(1) * b.phi + f(2) * a.alpha + f(3) * b.alpha + f(8) * a.gamma
+                + f(9) * b.gamma);
+            const NUMBER g = f(6), h = f(7);
+            const NUMBER along = w * (f(2) * a.phi + f(d_row) * b.phi + (f(4) - g) * a.alpha + (f(5) + h) * b.alpha
+                + f(10) * a.gamma + f(11) * b.gamma);
+            const NUMBER on = w * g, on_b = w * h;
+            goal[1] += size * (along * u.x + on * a.field.x + on_b * b.field.x);
+            goal[2] += size * (along * u.y + on * a.field.y + on_b * b.field.y);
+            goal[3] += size * (along * u.z + on * a.field.z + on_b * b.field.z);
+            const NUMBER pull = w * (f(8) * a.phi + f(j_row) * b.phi + f(10) * a.alpha + f(l_row) * b.alpha
+                + f(12) * a.gamma + f(13) * b.gamma);
             const NUMBER turned = REAL(1.5) * size * size * pull, third = REAL(0.5) * size * size * pull;
             goal[4] += turned * u.x * u.x - third;
             goal[5] += turned * u.y * u.y - third;
@@ -244,32 +252,44 @@ _TAKE = """
         }
         for (int c = 0; c < 9; ++c) goal[c] = total_of(goal[c]);
         if (way > 0) return;
-        for (int c = 0; c < 5; ++c) goal[9 + c] = numbers(drive + (9 + c) * (size_t)stride + i);
+        const Four last = own_four(driven, 3, i);
+        goal[9] = last.x;
+        goal[10] = last.y;
+        goal[11] = last.z;
+        goal[12] = last.w;
+        goal[13] = own_four(driven, 2, i).w;
         for (int c = 0; c < STATE_ROWS; ++c) {
-            const size_t place = (size_t)c * stride + i;
-            const NUMBER now = numbers(contact + place);
+            REAL* const place = rows_at(contact, STATE_ROWS, i) + c * LANES;
+            REAL* const last_place = rows_at(last_contact, STATE_ROWS, i) + c * LANES;
+            const NUMBER now = numbers(place);
             const NUMBER pace = PACE * (c < 4 ? numbers(ease + (c > 0) * stride + i) : zero + 1);
-            const NUMBER moved = now + pace * (goal[c] - now) + MOMENTUM * (now - numbers(last_contact + place));
-            put(last_contact + place, now);
-            put(contact + place, moved - moved == zero ? moved : zero);
+            const NUMBER moved = now + pace * (goal[c] - now) + MOMENTUM * (now - numbers(last_place));
+            put(last_place, now);
+            goal[c] = moved - moved == zero ? moved : zero;
+            put(place, goal[c]);
         }
+        put_four(seen, 0, i, {goal[1], goal[2], goal[3], goal[0]});
+        put_four(seen, 1, i, {goal[9], goal[10], goal[11], goal[12]});
+        const Vector m = own_moment(i);
+        put_four(seen, 2, i, {goal[13], m.x, m.y, m.z});
     };
 """
 
 _HALVES = """
     // what a ball sees of its contacts' forces: derivatives of ½ e ΔC e by the other ball's place
-    auto halve = [=](int i, bool) {
-        const int slots = most(indices(contact_count + i));
-        const NUMBER size = numbers(radius + i);
+    auto halve = [=](int i) {
+        const int slots = most(contact_count + i);
+        const Drive own = own_drive(i);
         for (int s = way; s < slots; s += WAYS) {
-            const REAL* rows = contacts + ((size_t)s * CONTACT_ROWS) * stride + i;
-            const REAL* changes = slopes + ((size_t)s * SLOPE_ROWS) * stride + i;
-            const INDEX j = indices(touching + (size_t)s * stride + i);
-            const Vector u = own_vector(rows, stride);
-            const NUMBER w = numbers(weight + i) * gather(weight, j);
-            auto f = [=](int c) -> NUMBER { return numbers(rows + (size_t)(3 + c) * stride); };
-            auto g = [=](int c) -> NUMBER { return numbers(changes + (size_t)c * stride); };
-            const Seen a = seen_own(i, size, u), b = seen_other(j, u);
+            const REAL* rows = slot_at(contacts, CONTACTS, CONTACT_ROWS, s, i);
+            const REAL* tilts = slot_at(slopes, CONTACTS, SLOPE_ROWS, s, i);
+            const REAL* pair = slot_at(pairs, NEAR, PAIR_ROWS, s, i);
+            const Vector u = own_vector(pair);
+            const Drive its = drive_at(list_at(near, NEAR, s, i));
+            const NUMBER w = own.weight * its.weight;
+            auto f = [=](int c) -> NUMBER { return numbers(rows + c * LANES); };
+            auto g = [=](int c) -> NUMBER { return numbers(tilts + c * LANES); };
+            const Seen a = seen_by(own, u, 1), b = seen_by(its, u, -1);
             const NUMBER square = dot(a.field, a.field) - a.alpha * a.alpha;
             const NUMBER mixed = dot(a.field, b.field) + a.alpha * b.alpha;
             // what both share counts half for each
@@ -278,17 +298,15 @@ _HALVES = """
             const NUMBER radial = REAL(0.5) * doubled
                 + a.phi * (g(2) * a.alpha + g(3) * b.alpha + g(8) * a.gamma + g(9) * b.gamma)
                 + a.alpha * (g(10) * a.gamma + g(11) * b.gamma);
-            const NUMBER by_alpha = f(2) * a.phi + f(14) * b.phi + (f(4) - f(6)) * a.alpha + (f(5) + f(7)) * b.alpha
-                + f(10) * a.gamma + f(11) * b.gamma;
-            const NUMBER by_gamma = 2 * (f(8) * a.phi + f(15) * b.phi + f(10) * a.alpha + f(16) * b.alpha
+            const NUMBER by_alpha = f(2) * a.phi + f(d_row) * b.phi + (f(4) - f(6)) * a.alpha
+                + (f(5) + f(7)) * b.alpha + f(10) * a.gamma + f(11) * b.gamma;
+            const NUMBER by_gamma = 2 * (f(8) * a.phi + f(j_row) * b.phi + f(10) * a.alpha + f(l_row) * b.alpha
                 + f(12) * a.gamma + f(13) * b.gamma);
-            const NUMBER inverse = g(14);
+            const NUMBER inverse = numbers(pair + 6 * LANES);
             const NUMBER rest = w * radial - w * inverse * (by_alpha * a.alpha + by_gamma * a.gamma);
             const NUMBER x = w * inverse * by_alpha, y = w * inverse * by_gamma;
-            REAL* out = halves + ((size_t)s * 3) * stride + i;
-            put(out, rest * u.x + x * a.field.x + y * a.pull.x);
-            put(out + stride, rest * u.y + x * a.field.y + y * a.pull.y);
-            put(out + 2 * (size_t)stride, rest * u.z + x * a.field.z + y * a.pull.z);
+            put_vector(slot_at(halves, CONTACTS, 3, s, i), {rest * u.x + x * a.field.x + y * a.pull.x,
+                rest * u.y + x * a.field.y + y * a.pull.y, rest * u.z + x * a.field.z + y * a.pull.z});
         }
     };
 """
@@ -298,21 +316,20 @@ _PULL = """
     auto pull = [=](int i) {
         const NUMBER zero = numbers(radius + i) * REAL(0);
         Vector total = {zero, zero, zero};
-        const Vector m = own_moment(i), n = own_vector(contact + stride + i, stride);
-        const Vector t = {m.x - n.x, m.y - n.y, m.z - n.z};
-        const NUMBER q = -numbers(contact + i);
-        const Tensor theta = own_tensor(left + i, stride);
-        const int near_slots = most(indices(count + i));
+        const Sources own = own_sources(i);
+        const Vector t = own.t, m = own.m;
+        const NUMBER q = own.q;
+        const Tensor theta = own.theta;
+        const int near_slots = most(count + i);
         for (int s = way; s < near_slots; s += WAYS) {
-            const REAL* pair = pairs + ((size_t)s * PAIR_ROWS) * stride + i;
-            auto row = [=](int r) -> NUMBER { return numbers(pair + (size_t)r * stride); };
-            const INDEX j = indices(near + (size_t)s * stride + i);
-            const Vector u = own_vector(pair, stride), m_j = vector_at(moment, moment_stride, j);
-            const Vector n_j = vector_at(contact + stride, stride, j);
-            const Vector t_j = {m_j.x - n_j.x, m_j.y - n_j.y, m_j.z - n_j.z};
-            const Tensor theta_j = tensor_at(left, stride, j);
-            const NUMBER q_j = -gather(contact, j), source = row(4), g1 = row(5), g2 = row(6), third = row(7);
-            const NUMBER inverse = row(8), second = g2 * inverse;
+            const REAL* pair = slot_at(pairs, NEAR, PAIR_ROWS, s, i);
+            auto row = [=](int r) -> NUMBER { return numbers(pair + r * LANES); };
+            const REAL* change = slot_at(changes, NEAR, CHANGE_ROWS, s, i);
+            const Sources its = sources_at(list_at(near, NEAR, s, i));
+            const Vector u = own_vector(pair), m_j = its.m, t_j = its.t;
+            const Tensor theta_j = its.theta;
+            const NUMBER q_j = its.q, source = row(4), g2 = row(5), inverse = row(6), third = numbers(change);
+            const NUMBER g1 = source * inverse, second = g2 * inverse;
 
             // dipoles: of what is left of them, less the actual ones
             const NUMBER a = dot(u, t), a_j = dot(u, t_j), lone = dot(u, m), lone_j = dot(u, m_j);
@@ -326,7 +343,8 @@ _PULL = """
             total.z += on * t_j.z + on_j * t.z + second * (lone * m_j.z + lone_j * m.z);
 
             // quadrupoles: derivatives of their energy by the distance and by the direction
-            const NUMBER w = row(9), slope = row(10), square = inverse * inverse, fourth = square * square;
+            const NUMBER w = row(7), slope = numbers(change + LANES);
+            const NUMBER square = inverse * inverse, fourth = square * square;
             const Vector v = times(theta, u), v_j = times(theta_j, u);
             const NUMBER f = dot(v, u), f_j = dot(v_j, u);
             const NUMBER on_sources = q * f_j + q_j * f, k3 = REAL(1.0 / 3.0) * g2;
@@ -341,14 +359,14 @@ _PULL = """
             const NUMBER energy_4 = fourth * on_dipoles;
             const NUMBER energy_5 = (2 * product - 20 * dot(v, v_part) + 35 * (fifth * f_j) * f) * REAL(1.0 / 3.0);
             const Vector z = times(theta, t_j), z_j = times(theta_j, t), x = times(theta, v_part), x_j = times(part, v);
-            auto turned = [=](NUMBER t, NUMBER t_j, NUMBER v, NUMBER v_j, NUMBER z, NUMBER x) -> NUMBER {
+            auto turn_of = [=](NUMBER t, NUMBER t_j, NUMBER v, NUMBER v_j, NUMBER z, NUMBER x) -> NUMBER {
                 return 2 * k3 * (q * v_j + q_j * v)
                     + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z)
                     + REAL(70.0 / 3.0) * ((fifth * f_j) * v + (fifth * v_j) * f) - REAL(20.0 / 3.0) * x;
             };
-            const Vector turn = {turned(t.x, t_j.x, v.x, v_j.x, z_j.x - z.x, x.x + x_j.x),
-                                 turned(t.y, t_j.y, v.y, v_j.y, z_j.y - z.y, x.y + x_j.y),
-                                 turned(t.z, t_j.z, v.z, v_j.z, z_j.z - z.z, x.z + x_j.z)};
+            const Vector turn = {turn_of(t.x, t_j.x, v.x, v_j.x, z_j.x - z.x, x.x + x_j.x),
+                                 turn_of(t.y, t_j.y, v.y, v_j.y, z_j.y - z.y, x.y + x_j.y),
+                                 turn_of(t.z, t_j.z, v.z, v_j.z, z_j.z - z.z, x.z + x_j.z)};
             radial += slope * (k3 * on_sources + energy_4 + energy_5)
                 + w * REAL(1.0 / 3.0) * (third + 2 * second) * on_sources
                 - w * inverse * (4 * energy_4 + 5 * energy_5 + dot(turn, u));
@@ -356,127 +374,382 @@ _PULL = """
             total.y += radial * u.y + w * inverse * turn.y;
             total.z += radial * u.z + w * inverse * turn.z;
         }
-        const int contact_slots = most(indices(contact_count + i));
+        const int contact_slots = most(contact_count + i);
         for (int s = way; s < contact_slots; s += WAYS) {
-            const REAL* own = halves + ((size_t)s * 3) * stride + i;
-            const Vector other = vector_at(halves, stride, indices(mirror + (size_t)s * stride + i));
-            total = {total.x + other.x - numbers(own), total.y + other.y - numbers(own + stride),
-                     total.z + other.z - numbers(own + 2 * (size_t)stride)};
+            const Vector half = own_vector(slot_at(halves, CONTACTS, 3, s, i));
+            const int* other = list_at(mirror, CONTACTS, s, i);
+            total.x += gather(halves, other) - half.x;
+            total.y += gather(halves + LANES, other) - half.y;
+            total.z += gather(halves + 2 * LANES, other) - half.z;
         }
         total = {total_of(total.x), total_of(total.y), total_of(total.z)};
         if (way > 0) return;
-        put(force + i, total.x);
-        put(force + stride + i, total.y);
-        put(force + 2 * (size_t)stride + i, total.z);
+        const Vector h = own_vector(rows_at(field, 3, i));
+        const Vector turn = {m.y * h.z - m.z * h.y, m.z * h.x - m.x * h.z, m.x * h.y - m.y * h.x};
+        auto add = [=](REAL* out, Vector v, int l) {
+            out[0] += UNIT * lane_of(v.x, l);
+            out[1] += UNIT * lane_of(v.y, l);
+            out[2] += UNIT * lane_of(v.z, l);
+        };
+        for (int l = 0; l < AT_ONCE; ++l) {
+            if (movable[i + l] == 0) continue;
+            add(forces + 3 * (size_t)(i + l), total, l);
+            if (twisted[i + l] == 1) add(torques + 3 * (size_t)(i + l), turn, l);
+        }
     };
 """
 
-
-# On a GPU a launch is one pass, and ``WAYS`` threads share a ball's slots. A CPU makes all passes in one launch: its
-# threads, of the process's own library since a launch may sit inside a graph, take chunks of balls as they come, and go
-# on to the next pass when all chunks of the last are done. A thread that cannot be had is not missed.
-_RUN = """
-#if defined(__CUDA_ARCH__)
-    if (only % 2 == 0) FIRST(thread / WAYS, only == 0);
-    else SECOND(thread / WAYS);
-#else
-    constexpr int CHUNK = 4 * WIDTH, MOST_PASSES = 8, MOST_THREADS = 64;
-    auto chunk_of = [&](int pass, int chunk) {
-        const int end = chunk * CHUNK + CHUNK < stride ? chunk * CHUNK + CHUNK : stride;
-        for (int i = chunk * CHUNK; i < end; i += WIDTH) {
-            if (pass % 2 == 0) FIRST(i, pass == 0);
-            else SECOND(i);
-        }
+_LAW = """
+    struct Fade { NUMBER value, slope; };
+    auto smoothstep = [=](NUMBER x) -> Fade {
+        const NUMBER zero = x * REAL(0), t = smaller(larger(x, zero), zero + 1);
+        return {t * t * (3 - 2 * t), 6 * t * (1 - t)};
     };
-    struct Team { const decltype(chunk_of)* work; int passes, chunks, next[MOST_PASSES], done[MOST_PASSES]; };
-    Team team = {&chunk_of, passes, (stride + CHUNK - 1) / CHUNK, {}, {}};
-#if !defined(_WIN32)
-#if defined(__APPLE__)
-    #define SYMBOL(name) "_" name
-#else
-    #define SYMBOL(name) name
-#endif
-    typedef void* (*Start)(void*);
-    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
-    extern int join_thread(unsigned long, void**) __asm__(SYMBOL("pthread_join"));
-    extern int yield_thread() __asm__(SYMBOL("sched_yield"));
-    #undef SYMBOL
-#else
-    auto yield_thread = [] {};
-#endif
-    auto join_in = [](void* argument) -> void* {
-        Team& team = *(Team*)argument;
-        for (int pass = 0; pass < team.passes; ++pass) {
-            for (int c; (c = __atomic_fetch_add(&team.next[pass], 1, __ATOMIC_RELAXED)) < team.chunks;) {
-                (*team.work)(pass, c);
-                __atomic_fetch_add(&team.done[pass], 1, __ATOMIC_RELEASE);
-            }
-            while (__atomic_load_n(&team.done[pass], __ATOMIC_ACQUIRE) < team.chunks) yield_thread();
-        }
-        return nullptr;
+    // fades between two gaps and between two overlaps
+    auto window = [=](NUMBER gap, REAL near, REAL far, REAL shallow, REAL deep) -> Fade {
+        const REAL width = 1 / (far - near), depth = 1 / (deep - shallow);
+        const Fade outer = smoothstep((far - gap) * width), inner = smoothstep((deep + gap) * depth);
+        return {outer.value * inner.value, outer.value * inner.slope * depth - outer.slope * inner.value * width};
     };
-#if defined(_WIN32)
-    join_in(&team);
-#else
-    unsigned long ids[MOST_THREADS];
-    bool started[MOST_THREADS];
-    const int others = (threads < MOST_THREADS ? threads : MOST_THREADS) - 1;
-    for (int t = 0; t < others; ++t) started[t] = start_thread(&ids[t], nullptr, join_in, &team) == 0;
-    join_in(&team);
-    for (int t = 0; t < others; ++t)
-        if (started[t]) join_thread(ids[t], nullptr);
-#endif
-#endif
+    // U of two homogeneous balls and its radial factors, as pair_law.averaged_factors has them where they overlap
+    struct Factors { NUMBER u, g1, g2, g3; };
+    auto factors = [=](NUMBER d, NUMBER i1, NUMBER a, NUMBER b) -> Factors {  // i1 = 1/d
+        const NUMBER s = a + b, i2 = i1 * i1, i3 = i2 * i1;
+        Factors f = {i1, -i3, 3 * i3 * i2, -15 * i3 * i2 * i2};
+        if (!any(d < s)) return f;
+        const NUMBER p = a * b, c = 1 / (160 * p * p * p), squares = a * a + b * b;
+        NUMBER e = s - d, e2 = e * e, q0 = 5 * squares - 20 * p;
+        const NUMBER q = q0 * i1 - 4 * s - d, q1 = -q0 * i2 - 1, q2 = 2 * q0 * i3, q3 = -6 * q0 * i3 * i1;
+        const NUMBER w1 = c * e2 * e * (e * q1 - 4 * q) * i1;
+        const NUMBER w2 = c * e2 * (12 * q - 8 * e * q1 + e2 * q2) * i2;
+        const NUMBER w3 = c * e * (36 * e * q1 - 24 * q - 12 * e2 * q2 + e2 * e * q3) * i3;
+        NUMBER g1 = w1 - i3, g2 = w2 - (w1 - 3 * i3) * i2, g3 = w3 - 3 * (w2 - w1 * i2) * i2 - 15 * i3 * i2 * i2;
+        const auto deep = d <= REAL(0.5) * s;
+        if (any(deep)) {
+            const NUMBER delta = a - b, delta2 = delta * delta, k = 5 * delta2 * delta2 * (delta2 + 6 * p);
+            const NUMBER u1 = 45 * s * s * delta2, u2 = -40 * s * (delta2 + p), u3 = 15 * (delta2 + 2 * p);
+            g1 = deep ? c * (2 * u2 + 3 * u3 * d - 5 * d * d * d + (u1 - k * i2) * i1) : g1;
+            g2 = deep ? c * (3 * u3 * i1 - 15 * d + (3 * k * i2 - u1) * i3) : g2;
+            g3 = deep ? c * ((3 * u1 - 15 * k * i2) * i3 * i2 - 3 * u3 * i3 - 15 * i1) : g3;
+            const auto within = d <= larger(delta, -delta);
+            const NUMBER large = larger(a, b);
+            g1 = within ? -1 / (large * large * large) : g1;
+            g2 = within ? 0 * d : g2;
+            g3 = within ? 0 * d : g3;
+        }
+        const NUMBER x = larger(d, REAL(0.05) * s);  // nearly concentric ones as touching
+        e = s - x;
+        e2 = e * e;
+        const NUMBER u = (1 + e2 * e2 * (5 * squares - 20 * p - 4 * s * x - x * x) * c) / x;
+        return {d < s ? u : f.u, d < s ? g1 : f.g1, d < s ? g2 : f.g2, d < s ? g3 : f.g3};
+    };
 """
 
+_PLACE = """
+    // places and radii as others read them, and whether a ball has moved so far that near ones are sought anew
+    auto place = [=](int i) {
+        if (way > 0) return;
+        const REAL* row = (const REAL*)arrays.packed.data + i;
+        const NUMBER x = numbers(row), y = numbers(row + moment_stride), z = numbers(row + 2 * moment_stride);
+        const NUMBER size = numbers(row + 3 * moment_stride), zero = size * REAL(0);
+        put_four(placed, 0, i, {x, y, z, size});
+        put_four(placed, 1, i, {zero, number_of(indices(kind + i)), zero, zero});
+        for (int l = 0; l < AT_ONCE; ++l) {
+            if (group[i + l] < 0) continue;
+            const REAL* found = found_at + 3 * (size_t)(i + l);
+            const REAL rx = row[l] - found[0], ry = row[moment_stride + l] - found[1];
+            const REAL rz = row[2 * moment_stride + l] - found[2], limit = SKIN * row[3 * moment_stride + l];
+            if (!(rx * rx + ry * ry + rz * rz <= limit * limit)) *moved = 1;
+        }
+    };
+"""
 
-def _text(real: str, first: str, second: str, names: tuple[str, ...], body: str) -> str:
-    """Text of a native function: its arrays by name, the definition of two passes, and how they are run."""
-    pointers = "".join(
-        f"    auto* const {name} = {name}_in.data;\n"
-        if name in _INTEGERS
-        else f"    REAL* const {name} = (REAL*){name}_in.data;\n"
-        for name in names
-    )
-    run = _RUN.replace("FIRST", first).replace("SECOND", second)
-    return f"""
-    typedef {real} REAL;
+_SELECT = """
+    // enter those of balls j that are chosen, 1 or 0, in the lists of balls i, of which so many slots are filled
+    auto append = [=](int i, const int* j, INDEX chosen, int slots, int* filled) {
     #if defined(__CUDA_ARCH__)
-    constexpr int WAYS = {WAYS};
+        const int shift = threadIdx.x % 32 / WAYS * WAYS;
+        const unsigned mates = ((1u << WAYS) - 1u) << shift;
+        const unsigned all = __ballot_sync(mates, chosen) >> shift & ((1u << WAYS) - 1u);
+        const int s = *filled + __popc(all & ((1u << way) - 1u));
+        if (chosen && s < slots) *list_at(near, NEAR, s, i) = *j;
+        *filled += __popc(all);
     #else
-    constexpr int WAYS = 1;
+        const Places count = places(chosen);
+        for (int l = 0; l < WIDTH; ++l) {
+            if (filled[l] < slots) list_at(near, NEAR, filled[l], i)[l] = j[l];
+            filled[l] += count.at[l];
+        }
     #endif
-    constexpr int PAIR_ROWS = {PAIR_ROWS}, CONTACT_ROWS = {CONTACT_ROWS}, SLOPE_ROWS = {SLOPE_ROWS};
-    constexpr int STATE_ROWS = {STATE_ROWS}, OUTER_ROWS = {OUTER_ROWS};
-    constexpr REAL OWN_SOURCE = {OWN_SOURCE!r}, OWN_DIPOLE = {OWN_DIPOLE!r}, PACE = {_PACE!r}, MOMENTUM = {_MOMENTUM!r};
-    const int stride = weight_in.shape[0], moment_count = packed_in.shape[1];
-    const int moment_stride = packed_in.strides[0] / sizeof(REAL);
-    const REAL* const moment = (const REAL*)packed_in.data + 4 * (size_t)moment_stride;
-{pointers}    const REAL* const left = contact + 9 * (size_t)stride;  // Θ̃
-{_PRELUDE.replace("GATHER", _GATHER[real])}{body}{run}"""
+    };
+    // the balls that are near now, those that nearly touch first, and how far a ball takes part
+    auto select = [=](int i) {
+        int own[AT_ONCE], filled[AT_ONCE], touching[AT_ONCE], largest = 0;
+        for (int l = 0; l < AT_ONCE; ++l) {
+            own[l] = group[i + l] < 0 || candidate_count[i + l] > CANDIDATES ? 0 : candidate_count[i + l];
+            largest = own[l] > largest ? own[l] : largest;
+            filled[l] = 0;
+        }
+        const Four at = own_four(placed, 0, i);
+        const NUMBER owns = number_of(indices(own)), a = at.w, zero = a * REAL(0), one = zero + 1;
+        NUMBER shared = zero;
+        for (int apart = 0; apart < 2; ++apart) {
+            for (int first = 0; first < largest; first += WAYS) {
+                const int k = first + way;
+                int j[AT_ONCE];
+                for (int l = 0; l < AT_ONCE; ++l)
+                    j[l] = k < own[l] ? candidate[(size_t)(i + l) * CANDIDATES + k] : i + l;
+                const Four o = four_at(placed, 0, j);
+                const Vector r = {o.x - at.x, o.y - at.y, o.z - at.z};
+                const NUMBER d = root(dot(r, r)), b = o.w, sum = a + b;
+                const auto near_now = (owns > REAL(k)) & (d < HALF_REACH * sum);
+                const auto close = (d - sum) * sum < 2 * CONTACT_FAR * a * b;
+                const NUMBER chosen = near_now ? (close ? one - apart : zero + apart) : zero;
+                append(i, j, whole(chosen), apart ? NEAR : CONTACTS, filled);
+                const auto overlap = near_now & (d < sum);
+                if (apart || !any(overlap)) continue;
+                const NUMBER small = smaller(a, b), large = larger(a, b), delta = large - small, e = sum - d, p = a * b;
+                const NUMBER lens = e * e * (d * d + 2 * d * sum - 3 * delta * delta) / (16 * d) / (p * root(p));
+                shared += overlap ? (d > delta ? lens : small / large * root(small / large)) : zero;
+            }
+            for (int l = 0; l < AT_ONCE && !apart; ++l) touching[l] = filled[l];
+        }
+        const NUMBER excess = (total_of(shared) - SHARED_LOW) * (1 / (SHARED_HIGH - SHARED_LOW));
+        const NUMBER share = 1 - smoothstep(excess).value;
+        for (int l = 0; l < AT_ONCE && way == 0; ++l) {
+            const REAL part = lane_of(share, l);
+            const bool fits = own[l] > 0 && filled[l] <= NEAR && touching[l] <= CONTACTS && part > 0;
+            count[i + l] = fits ? filled[l] : 0;
+            contact_count[i + l] = fits ? touching[l] : 0;
+            placed[BLOCK * (size_t)(i + l) + 4] = fits ? part : 0;
+        }
+    };
+"""
 
+_TABULATE = """
+    // slot of ball i in the list of another, or −1
+    auto slot_of = [=](int i, int j) -> int {
+        int place = -1;
+        for (int s = 0; s < contact_count[j]; ++s) place = *list_at(near, NEAR, s, j) == i ? s : place;
+        return place;
+    };
+    auto shared = [=](int i) -> REAL { return placed[BLOCK * (size_t)i + 4]; };
+    // slots beyond a ball's count hold the ball itself
+    auto fill_up = [=](int* list, int i, int s) {
+        for (int l = 0; l < AT_ONCE; ++l) list[l] = s < count[i + l] ? list[l] : i + l;
+    };
+    // what does not change while balls stand still; slots that are no longer used are emptied
+    auto tabulate = [=](int i) {
+        const int counted = most(count + i), contact_slots = most(contact_count + i);
+        const int used_slots = most(used + i), used_contacts = most(used + stride + i);
+        const NUMBER counts = number_of(indices(count + i)), contact_counts = number_of(indices(contact_count + i));
+        const Four own = own_four(placed, 0, i), own_part = own_four(placed, 1, i);
+        const NUMBER a = own.w, zero = a * REAL(0), one = zero + 1;
+        NUMBER sources = zero, dipoles = zero;
+        const int slots = counted > used_slots ? counted : used_slots;
+        for (int s = way; s < slots; s += WAYS) {
+            int* const list = list_at(near, NEAR, s, i);
+            fill_up(list, i, s);
+            REAL* const pair = slot_at(pairs, NEAR, PAIR_ROWS, s, i);
+            const Four other = four_at(placed, 0, list), part = four_at(placed, 1, list);
+            const NUMBER share = counts > REAL(s) ? own_part.x * part.x : zero;
+            const auto live = share > zero;
+            const NUMBER b = live ? other.w : a + (a > zero ? zero : one), sum = a + b, unit = 1 / sum;
+            const Vector r = {other.x - own.x, other.y - own.y, other.z - own.z};
+            const NUMBER length = root(dot(r, r)), least = REAL(1e-6) * a;
+            const NUMBER d = live ? (length > least ? length : least) : sum, inverse = 1 / d;
+            auto keep = [=](int row, NUMBER n) { put(pair + row * LANES, live ? n : zero); };
+            keep(0, r.x * inverse);
+            keep(1, r.y * inverse);
+            keep(2, r.z * inverse);
+            // in units of the distance in contact: powers of metres overflow float32
+            const NUMBER y = unit * d, over_y = sum * inverse, third = unit * unit * unit;
+            const Factors whole_law = factors(y, over_y, unit * a, unit * b);
+            const Factors far = factors(y, over_y, HALF_RANGE * unit * a, HALF_RANGE * unit * b);
+            const NUMBER short_range = y < HALF_RANGE ? one : zero;
+            keep(3, short_range * unit * (whole_law.u - far.u));
+            keep(4, short_range * unit * unit * ((whole_law.g1 - far.g1) * y));
+            keep(5, short_range * third * ((whole_law.g2 - far.g2) * y * y));
+            keep(6, inverse);
+            REAL* const change = slot_at(changes, NEAR, CHANGE_ROWS, s, i);
+            put(change, live ? short_range * third * (unit * ((whole_law.g3 - far.g3) * y * y * y)) : zero);
+            const NUMBER alike = smoothstep((smaller(a, b) / larger(a, b) - LEAST) * (1 / (MOST - LEAST))).value;
+            const Fade quadrupole =
+                window(2 * y - 2, QUADRUPOLE_NEAR, QUADRUPOLE_FAR, QUADRUPOLE_SHALLOW, QUADRUPOLE_DEEP);
+            keep(7, share * alike * quadrupole.value);
+            put(change + LANES, live ? share * alike * 2 * unit * quadrupole.slope : zero);
 
-# in which clang does not recognise a gather by itself
-_GATHER = {
-    "float": "lanes = __builtin_ia32_gathersiv16sf(lanes, row, j, (unsigned short)-1, sizeof(REAL));",
-    "double": "lanes = __builtin_ia32_gathersiv8df(lanes, row, j, (unsigned char)-1, sizeof(REAL));",
+            if (s >= contact_slots && s >= used_contacts) continue;
+            const NUMBER both = contact_counts > REAL(s) ? share * alike : zero;
+            const auto touches = both > zero;
+            REAL* const rows = slot_at(contacts, CONTACTS, CONTACT_ROWS, s, i);
+            REAL* const slope_rows = slot_at(slopes, CONTACTS, SLOPE_ROWS, s, i);
+            // coordinate of the table, and its derivative
+            const NUMBER scale = 2 * a * b * unit, gap = (d - sum) / scale;
+            const NUMBER outside = larger(gap, one * SMALLEST_GAP);
+            const NUMBER z = smaller(gap - SMALLEST_GAP, zero) * (1 / SOFTNESS), steep = 1 / root(1 + z * z);
+            NUMBER x = logarithm(outside) + (SOFTNESS / SMALLEST_GAP) * z * steep;
+            x = smaller(larger((x - FIRST) * NODES_PER_UNIT, zero), one * (NODES - 1));
+            const INDEX row = whole(smaller(x, one * (NODES - 2)));
+            const NUMBER v = x - number_of(row), u = 1 - v, sixth = one * REAL(1.0 / 6.0);
+            const NUMBER slope = REAL(0.5) * NODES_PER_UNIT * steep * steep * steep / outside;
+            const NUMBER weights[4] = {sixth * u * u * u, sixth * (4 - 6 * v * v + 3 * v * v * v),
+                                       sixth * (4 - 6 * u * u + 3 * u * u * u), sixth * v * v * v};
+            const NUMBER tilts[4] = {-slope * u * u, slope * (3 * v * v - 4 * v), slope * (4 * u - 3 * u * u),
+                                     slope * v * v};
+            const Fade fade = window(gap, CONTACT_NEAR, CONTACT_FAR, SHALLOW, DEEP);
+            const NUMBER part_value = scale * both * fade.value, part_slope = both * fade.slope;
+            const NUMBER part_change = both * fade.value;
+            const INDEX kind = whole(own_part.y), its_kind = whole(part.y);
+            const Places lines = places((kind * kinds + its_kind) * (NODES + 2) + row);
+            auto store = [=](int f, NUMBER value, NUMBER change) {
+                put(rows + f * LANES, touches ? part_value * value : zero);
+                put(slope_rows + f * LANES, touches ? part_change * change + part_slope * value : zero);
+            };
+            for (int quarter = 0; quarter < 4; ++quarter) {
+                Four value = {zero, zero, zero, zero}, change = value;
+                for (int k = 0; k < 4; ++k) {
+                    const Four node = four_at(tables + BLOCK * k, quarter, lines.at);
+                    value = {value.x + weights[k] * node.x, value.y + weights[k] * node.y,
+                             value.z + weights[k] * node.z, value.w + weights[k] * node.w};
+                    change = {change.x + tilts[k] * node.x, change.y + tilts[k] * node.y,
+                              change.z + tilts[k] * node.z, change.w + tilts[k] * node.w};
+                }
+                store(4 * quarter, value.x, change.x);
+                store(4 * quarter + 1, value.y, change.y);
+                if (quarter == 0) sources += touches ? part_value * value.x : zero;
+                if (quarter == 1) dipoles += touches ? part_value * (value.x + 2 * value.z) : zero;
+                if (quarter == 3) break;
+                store(4 * quarter + 2, value.z, change.z);
+                store(4 * quarter + 3, value.w, change.w);
+            }
+            if (kinds > 1) {
+                const Places others = places((its_kind * kinds + kind) * (NODES + 2) + row);
+                NUMBER seen_d = zero, seen_j = zero, seen_l = zero;
+                for (int k = 0; k < 4; ++k) {
+                    seen_d += weights[k] * four_at(tables + BLOCK * k, 0, others.at).w;
+                    const Four node = four_at(tables + BLOCK * k, 2, others.at);
+                    seen_j += weights[k] * node.y;
+                    seen_l += weights[k] * node.w;
+                }
+                put(rows + 14 * LANES, touches ? part_value * seen_d : zero);
+                put(rows + 15 * LANES, touches ? part_value * seen_j : zero);
+                put(rows + 16 * LANES, touches ? part_value * seen_l : zero);
+            }
+            for (int l = 0; l < AT_ONCE; ++l) {
+                const int j = list[l];
+                const bool touch = s < contact_count[i + l] && shared(i + l) * shared(j) > 0;
+                const int place = touch ? slot_of(i + l, j) : -1;
+                list_at(mirror, CONTACTS, s, i)[l] =
+                    place < 0 ? CONTACTS * 3 * stride : (int)(slot_at(halves, CONTACTS, 3, place, j) - halves);
+            }
+        }
+        sources = total_of(sources);
+        dipoles = total_of(dipoles) * REAL(1.0 / 3.0);
+        if (way > 0) return;
+        const NUMBER size = numbers(radius + i);
+        put(ease + i, size / (size + OWN_SOURCE * sources));
+        put(ease + stride + i, size / (size + OWN_DIPOLE * dipoles));
+        put_indices(used + i, indices(count + i));
+        put_indices(used + stride + i, indices(contact_count + i));
+        if (!any(counts == zero)) return;
+        for (int quarter = 0; quarter < 3; ++quarter) {
+            const Four f = own_four(seen, quarter, i);
+            put_four(seen, quarter, i, {counts > zero ? f.x : zero, counts > zero ? f.y : zero,
+                                        counts > zero ? f.z : zero, counts > zero ? f.w : zero});
+        }
+        for (int c = 0; c < STATE_ROWS; ++c)
+            for (int last = 0; last < 2; ++last) {
+                REAL* const place = rows_at(last ? last_contact : contact, STATE_ROWS, i) + c * LANES;
+                put(place, counts > zero ? numbers(place) : zero);
+            }
+    };
+"""
+
+_CONSTANTS = {
+    "NEAR": NEAR,
+    "CONTACTS": CONTACTS,
+    "PAIR_ROWS": PAIR_ROWS,
+    "CHANGE_ROWS": CHANGE_ROWS,
+    "CONTACT_ROWS": CONTACT_ROWS,
+    "SLOPE_ROWS": SLOPE_ROWS,
+    "STATE_ROWS": STATE_ROWS,
+    "OUTER_ROWS": OUTER_ROWS,
+    "NODES": LOG_GAPS[2],
+    "LANGEVIN": LANGEVIN,
+    "CLAMPED": CLAMPED,
+    "CANDIDATES": CANDIDATES,
+    "FITTED": len(LANGEVIN_STEEPNESS),
 }
-_INTEGERS = ("near", "count", "touching", "contact_count", "mirror")
-SWEEP_ARRAYS = (
-    *("near", "pairs", "count", "touching", "contacts", "contact_count", "radius", "polarizability", "weight", "ease"),
-    *("contact", "last_contact", "drive", "field", "outer"),
+_NUMBERS = {
+    "UNIT": MU0 / (4.0 * math.pi),
+    "OWN_SOURCE": OWN_SOURCE,
+    "OWN_DIPOLE": OWN_DIPOLE,
+    "PACE": _PACE,
+    "MOMENTUM": _MOMENTUM,
+    "HALF_RANGE": 0.5 * RANGE,
+    "HALF_REACH": 0.5 * REACH,
+    "SKIN": SKIN,
+    "SHARED_LOW": MOST_SHARED[0],
+    "SHARED_HIGH": MOST_SHARED[1],
+    "LEAST": LEAST_RATIO[0],
+    "MOST": LEAST_RATIO[1],
+    "QUADRUPOLE_NEAR": QUADRUPOLE_REACH[0] - 2.0,
+    "QUADRUPOLE_FAR": QUADRUPOLE_REACH[1] - 2.0,
+    "QUADRUPOLE_SHALLOW": QUADRUPOLE_OVERLAP[0],
+    "QUADRUPOLE_DEEP": QUADRUPOLE_OVERLAP[1],
+    "CONTACT_NEAR": CONTACT_GAP[0],
+    "CONTACT_FAR": CONTACT_GAP[1],
+    "SHALLOW": DEEPEST[0],
+    "DEEP": DEEPEST[1],
+    "SMALLEST_GAP": SMALLEST_GAP,
+    "SOFTNESS": SOFTNESS,
+    "FIRST": LOG_GAPS[0],
+    "NODES_PER_UNIT": (LOG_GAPS[2] - 1) / (LOG_GAPS[1] - LOG_GAPS[0]),
+}
+_INTEGER_ARRAYS = (
+    *("group", "kind", "candidate", "candidate_count", "moved"),
+    *("near", "count", "contact_count", "used", "mirror", "row_of", "movable", "twisted"),
 )
-FORCE_ARRAYS = (
-    *("near", "pairs", "count", "touching", "contacts", "contact_count", "slopes", "mirror", "radius", "weight"),
-    *("contact", "drive", "halves", "force"),
+_REAL_ARRAYS = (
+    *("found_at", "tables", "radius", "saturation", "curve_slope", "ease", "placed", "pairs", "changes", "contacts"),
+    *("slopes", "contact", "last_contact", "seen", "driven", "outer", "halves", "field", "forces", "torques"),
 )
 
 
-def sweep_text(real: str) -> str:
-    """Text of sweeps over contact sources and quadrupoles."""
-    return _text(real, "drive_of", "take", SWEEP_ARRAYS, _DRIVE + _SEEN + _TAKE)
+_ARRAYS = """
+    const int kinds = arrays.kinds, curve = arrays.curve;
+    const size_t moment_stride = arrays.packed.strides[0] / sizeof(REAL);
+    const REAL* const moment = (const REAL*)arrays.packed.data + 4 * moment_stride;
+    // the last of the field loop's partial sums
+    REAL* const partial = (REAL*)arrays.partial.data
+        + (size_t)(arrays.partial.shape[0] - 1) * arrays.partial.shape[1] * arrays.partial.shape[2];
+    constexpr REAL STEEPNESS[FITTED] = {COEFFICIENTS};
+""".replace("COEFFICIENTS", ", ".join(map(repr, LANGEVIN_STEEPNESS)))
 
 
-def force_text(real: str) -> str:
-    """Text of the forces."""
-    return _text(real, "halve", "pull", FORCE_ARRAYS, _SEEN + _HALVES + _PULL)
+def _text(real: str, ways: int, body: str, passes: str) -> str:
+    return passes_text(real, ways, _CONSTANTS, _NUMBERS, _INTEGER_ARRAYS, _REAL_ARRAYS, _ARRAYS + body, passes)
+
+
+def sweep_text(real: str, ways: int) -> str:
+    """Text of sweeps over contact sources and quadrupoles: one pass that prepares them, two for each."""
+    body = _SHOW + _PREPARE + _DRIVE + _SEEN + _TAKE
+    return _text(
+        real, ways, body, "if (pass == 0) prepare(i); else if (pass % 2 == 1) drive_of(i, pass == 1); else take(i);"
+    )
+
+
+def force_text(real: str, ways: int) -> str:
+    """Text of the forces, two passes."""
+    return _text(real, ways, _SHOW + _SEEN + _HALVES + _PULL, "if (pass == 0) halve(i); else pull(i);")
+
+
+def place_text(real: str, ways: int) -> str:
+    """Text of what is done with an arrangement before near balls are sought, one pass."""
+    return _text(real, ways, _PLACE, "place(i);")
+
+
+def tabulate_text(real: str, ways: int) -> str:
+    """Text of what is done when they are found, two passes."""
+    return _text(real, ways, _LAW + _SELECT + _TABULATE, "if (pass == 0) select(i); else tabulate(i);")

@@ -212,6 +212,19 @@ def test_device_solution_is_the_reference(strength, dtype, error, device):
     assert np.abs(torques).max() < error * 0.005 * np.abs(forces).max()
 
 
+@pytest.mark.parametrize(
+    "curve, strength", [("langevin", 1e-3), ("langevin", 0.2), ("langevin", 2.0), ("clamped", 1e-2)]
+)
+def test_device_follows_the_curve(curve, strength, device):
+    field = strength * IRON * np.array([0.4, -0.3, 0.9])
+    settings = {"susceptibility": MIXED_SUSCEPTIBILITIES, "curve": curve}
+    exact, exact_forces = near_contact.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
+    found = solve(MIXED, MIXED_RADII, field, device, **settings)
+    # the slope of Langevin's curve is good to 2e-4 there
+    assert relative(found.magnetizations, exact.magnetizations) < 1e-4
+    assert relative(found.wrench()[0], exact_forces) < 1e-4
+
+
 def test_device_pair_is_exact(device):
     """Balls of infinite permeability at 1 % of the radius in a weak field, against the exact force."""
     two = pair(2.01 * 0.005, (0.005, 0.005), (np.inf, np.inf))

@@ -20,6 +20,8 @@ exact solution of two balls. Four things make it work for piles:
   M the matrix of U_sr and of the quadrupoles, δ what a quadrupole of finite permeability costs, M_sr the dipoles of M.
   It vanishes with ΔC and Θ, and gives with e = M ã, n = ΔC e the field (M_sr a − e)_m at
   the moments and the forces ½ e ∂ΔC e − ½ ã ∂M ã + ½ a ∂M_sr a: momentum is conserved, and two balls come out exactly.
+  That there is one minimum is measured (``test_any_arrangement_has_one_solution``), not proven: in wide gaps ΔC alone
+  has eigenvalues down to −0.03 R.
 
 ΔC of a pair has 14 functions of the gap and the two permeabilities, tabulated from the exact solution of two equal
 balls by ``bench.reference.near_contact_table``. With n_i the direction from i towards j, α = R n·e_m, γ the part of
@@ -86,10 +88,10 @@ def hardness(susceptibility):
 
 def log_gap(gap):
     """Logarithm of the gap [radii] at which the table is read, and its derivative; levels off near contact."""
-    depth = np.tanh(np.minimum(gap - SMALLEST_GAP, 0.0) / SOFTNESS)
+    depth = np.minimum(gap - SMALLEST_GAP, 0.0) / SOFTNESS
     outside = np.maximum(gap, SMALLEST_GAP)
-    value = np.log(outside) + SOFTNESS / SMALLEST_GAP * depth
-    return value, (1.0 - depth**2) / outside
+    value = np.log(outside) + SOFTNESS / SMALLEST_GAP * depth / np.sqrt(1.0 + depth**2)
+    return value, (1.0 + depth**2) ** -1.5 / outside
 
 
 def _smoothstep(x):
@@ -110,6 +112,19 @@ def quadrupole_window(distance, radius_i, radius_j):
     far = (QUADRUPOLE_REACH[0] - 2.0, QUADRUPOLE_REACH[1] - 2.0)
     value, slope = window(distance / unit - 2.0, far, QUADRUPOLE_OVERLAP)
     return value, slope / unit
+
+
+def _fit_langevin(degree: int = 12) -> tuple[float, ...]:
+    """Slope of Langevin's curve at a magnetization c over that of Cohen's approximation, 3 (1 − c²)²/(3 + c⁴).
+
+    Coefficients of a polynomial in 2c − 1, highest first, good to 2e-4.
+    """
+    s = np.concatenate([np.linspace(0.0, 10.0, 2000), np.geomspace(10.0, 1e4, 1000)])
+    c, slope = oracle.reduced_curve(s, "langevin")
+    return tuple(map(float, np.polyfit(2.0 * c - 1.0, slope * (3.0 + c**4) / (3.0 * (1.0 - c**2) ** 2), degree)))
+
+
+LANGEVIN_STEEPNESS = _fit_langevin()
 
 
 def _b_spline(x, nodes):

@@ -130,14 +130,19 @@ class MomentSystem:
         few = np.count_nonzero(~permanent) <= theta_flow.MOST_FUSED
         fusible = few and dynamics == "theta" and contact_model == "dipole"
         forms = pair_loops.FORMS if fusible else (pair_loops.LOOP, pair_loops.MIRRORED)
-        self._make_rows(worlds, permanent, movable, (twisted & movable).any(), forms)
+        self._make_rows(worlds, permanent, movable, (twisted & movable).any(), forms, near=contact_model == "multipole")
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
         self._induction = induction.allocate(worlds, ~permanent, self._induced, self.dtype, self.device)
         self._near = None
         if contact_model == "multipole":
             lone = ~permanent & (size[body] == 1) & (radii > 0.0)
             susceptibility = np.broadcast_to(np.asarray(susceptibility, float), n)
-            self._near = near_contact.allocate(radii, worlds, lone, susceptibility, self.dtype, self.device)
+            saturation = np.broadcast_to(np.asarray(saturation, float), n)
+            self._near = near_contact.allocate(
+                self._packed, worlds, lone, susceptibility, saturation, CURVE_IDS[curve], rows=self._induced,
+                partial=self._induced_partial, movable=movable, twisted=twisted, forces=self.forces,
+                torques=self.torques,
+            )  # fmt: skip
         self.h = self._induction.h
         self.error = self._induction.error
         self.evaluations = self._induction.evaluations
@@ -168,7 +173,7 @@ class MomentSystem:
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
 
-    def _make_rows(self, worlds, permanent, movable, any_twisted, forms):
+    def _make_rows(self, worlds, permanent, movable, any_twisted, forms, near):
         """Work lists: inducible on inducible, permanent on inducible, everything on whatever moves."""
         induced, applied, felt = [], [], []
         for w in range(int(worlds[-1]) + 1 if len(worlds) else 0):
@@ -185,10 +190,11 @@ class MomentSystem:
             for law, quantity in ((FORCE_IDS["kelvin"], KELVIN), (ZEEMAN, FORCE))
         }
 
-        def partial(rows):
-            return wp.zeros(pair_loops.partial_shape(rows), dtype=self.dtype, device=self.device)
+        def partial(rows, more=0):
+            splits, count, width = pair_loops.partial_shape(rows)
+            return wp.zeros((splits + more, count, width), dtype=self.dtype, device=self.device)
 
-        self._induced_partial = partial(self._induced)
+        self._induced_partial = partial(self._induced, int(near))  # and one of the near contacts
         self._applied_partial = partial(self._applied)
         self._felt_partial = {law: partial(rows) for law, rows in self._felt.items()}
 
@@ -224,34 +230,41 @@ class MomentSystem:
         """Launch the start of a solve. Callers of :meth:`solve` do not need it; it serves to watch the iteration."""
         packed = self._packed
         packed.pack(self.positions, self.moments)
+        if self._near is not None:
+            near_contact.launch_find_pairs(packed, self._near)
         packed.find_overlaps()
         if self._induced.count == 0:
             return
-        if self._near is not None:
-            near_contact.launch_find_pairs(packed, self._near)
         if self._applied.pair_count:
             pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
         self.dynamics.start(self._applied, self._applied_partial, self.external_field)
+        if self._near is not None:
+            near_contact.wait(self._near)
 
     def iterate(self):
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
         self.dynamics.refine()
         self._sum_induced()
         self.dynamics.iterate()
+        if self._near is not None:
+            near_contact.wait(self._near)
 
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""
-        self._sum_induced()
         packed = self._packed
+        self._sum_induced()
         launch_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
+        if self._near is not None:
+            near_contact.wait(self._near)
 
     def _sum_induced(self):
         """Launch the field loop among the inducible moments."""
         packed = self._packed
+        if self._near is not None:
+            near_contact.launch_sweeps(self._near)
         pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
         if self._near is not None:
-            near_contact.launch_sweeps(packed, self._material, self._near, near_contact.SWEEPS)
-            near_contact.launch_add_field(self._induced, self._near, self._induced_partial)
+            near_contact.wait_for_field(self._near)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
@@ -269,6 +282,8 @@ class MomentSystem:
         if law == ZEEMAN:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
+        if self._near is not None:
+            near_contact.launch_sweeps(self._near)
         rows, partial = self._felt[law], self._felt_partial[law]
         pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
         launch_wrench(
@@ -282,5 +297,5 @@ class MomentSystem:
             self.torques,
         )
         if self._near is not None:
-            near_contact.launch_sweeps(packed, self._material, self._near, near_contact.FORCE_SWEEPS)
-            near_contact.launch_add_forces(rows, packed, self._near, self._twisted, self.forces, self.torques)
+            near_contact.wait(self._near)
+            near_contact.launch_add_forces(self._near)

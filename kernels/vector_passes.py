@@ -1,0 +1,291 @@
+"""Text of passes over balls, the same for a CPU and a GPU.
+
+On a CPU a vector has a ball in each lane; on a GPU some threads share what is to be done for one. Arrays have
+``LANES`` balls along their last axis, so that what a vector of balls needs follows in memory as it is read. What a ball
+reads of others stands in one block of a cache line for each: on a CPU a vector of blocks is turned into vectors of
+their numbers in registers, which is faster than to gather them one by one.
+
+A pass is a function of the first ball i of a vector. In the text ``NUMBER`` and ``INDEX`` are a REAL and an int for
+each ball, ``Four`` four numbers of a block; ``slot_at`` and ``list_at`` find what a ball keeps for one of its slots.
+"""
+
+from collections.abc import Iterable
+
+LANES = 16
+"""Multiple that the number of balls is padded to: lanes of the widest vectors."""
+BLOCK = 16
+"""Numbers in a block."""
+
+_PRELUDE = """
+#if defined(__CUDA_ARCH__)
+    typedef REAL NUMBER;
+    typedef int INDEX;
+    struct alignas(4 * sizeof(REAL)) Four { REAL x, y, z, w; };
+    const int way = threadIdx.x % WAYS;
+    auto total_of = [](NUMBER part) -> NUMBER {
+        const unsigned mates = ((1u << WAYS) - 1u) << (threadIdx.x % 32 / WAYS * WAYS);
+        for (int other = 1; other < WAYS; other *= 2) part += __shfl_xor_sync(mates, part, other);
+        return part;
+    };
+    auto most = [](const int* counts) -> int { return *counts; };
+    auto any = [](bool mask) -> bool { return mask; };
+    auto root = [](NUMBER x) -> NUMBER { return sqrt(x); };
+    auto logarithm = [](NUMBER x) -> NUMBER { return log(x); };
+    auto larger = [](NUMBER a, NUMBER b) -> NUMBER { return a > b ? a : b; };
+    auto smaller = [](NUMBER a, NUMBER b) -> NUMBER { return a < b ? a : b; };
+    auto number_of = [](INDEX n) -> NUMBER { return (NUMBER)n; };
+    auto whole = [](NUMBER x) -> INDEX { return (int)x; };
+    auto numbers = [](const REAL* row) -> NUMBER { return *row; };
+    auto indices = [](const int* row) -> INDEX { return *row; };
+    auto put = [](REAL* row, NUMBER n) { *row = n; };
+    auto put_indices = [](int* row, INDEX n) { *row = n; };
+    auto gather = [](const REAL* row, const int* j) -> NUMBER { return row[*j]; };
+    auto four_at = [](const REAL* blocks, int quarter, const int* j) -> Four {
+        return ((const Four*)blocks)[4 * (size_t)*j + quarter];
+    };
+    auto own_four = [](const REAL* blocks, int quarter, int i) -> Four {
+        return ((const Four*)blocks)[4 * (size_t)i + quarter];
+    };
+    auto put_four = [](REAL* blocks, int quarter, int i, Four f) { ((Four*)blocks)[4 * (size_t)i + quarter] = f; };
+    constexpr int AT_ONCE = 1;
+    struct Places { int at[1]; };
+    auto places = [](INDEX j) -> Places { return {{j}}; };
+    auto lane_of = [](NUMBER x, int) -> REAL { return x; };
+#else
+    constexpr int WIDTH = 64 / (int)sizeof(REAL), way = 0;
+    typedef REAL NUMBER __attribute__((ext_vector_type(WIDTH)));
+    typedef int INDEX __attribute__((ext_vector_type(WIDTH)));
+    typedef REAL QUARTER __attribute__((ext_vector_type(4)));
+    struct Four { NUMBER x, y, z, w; };
+    auto total_of = [](NUMBER part) -> NUMBER { return part; };
+    auto most = [](const int* counts) -> int {
+        int largest = 0;
+        for (int l = 0; l < WIDTH; ++l) largest = counts[l] > largest ? counts[l] : largest;
+        return largest;
+    };
+    auto any = [](auto mask) -> bool { return __builtin_reduce_or(mask) != 0; };
+    auto root = [](NUMBER x) -> NUMBER { return __builtin_elementwise_sqrt(x); };
+    auto logarithm = [](NUMBER x) -> NUMBER {
+        if constexpr (sizeof(REAL) == 8) return __builtin_elementwise_log(x);  // one by one
+        // x = 2ⁿ m, m between √½ and √2, of which the series in s = (m − 1)/(m + 1) is good to float32
+        INDEX bits;
+        __builtin_memcpy(&bits, &x, sizeof(bits));
+        const INDEX n = (bits - 0x3f3504f3) >> 23;
+        bits -= n << 23;
+        NUMBER m;
+        __builtin_memcpy(&m, &bits, sizeof(bits));
+        const NUMBER s = (m - 1) / (m + 1), z = s * s;
+        const NUMBER series = 1 + z * (REAL(1.0 / 3) + z * (REAL(1.0 / 5) + z * (REAL(1.0 / 7) + z * REAL(1.0 / 9))));
+        return __builtin_convertvector(n, NUMBER) * REAL(0.693147180559945) + 2 * s * series;
+    };
+    auto larger = [](NUMBER a, NUMBER b) -> NUMBER { return __builtin_elementwise_max(a, b); };
+    auto smaller = [](NUMBER a, NUMBER b) -> NUMBER { return __builtin_elementwise_min(a, b); };
+    auto number_of = [](INDEX n) -> NUMBER { return __builtin_convertvector(n, NUMBER); };
+    auto whole = [](NUMBER x) -> INDEX { return __builtin_convertvector(x, INDEX); };
+    auto numbers = [](const REAL* row) -> NUMBER { NUMBER n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
+    auto indices = [](const int* row) -> INDEX { INDEX n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
+    auto put = [](REAL* row, NUMBER n) { __builtin_memcpy(row, &n, sizeof(n)); };
+    auto put_indices = [](int* row, INDEX n) { __builtin_memcpy(row, &n, sizeof(n)); };
+    auto gather = [](const REAL* row, const int* j) -> NUMBER {
+        NUMBER n = 0;
+        for (int l = 0; l < WIDTH; ++l) n[l] = row[j[l]];
+        return n;
+    };
+    // rows and columns of each group of four lanes change places
+    auto turned = [](NUMBER a, NUMBER b, NUMBER c, NUMBER d) -> Four {
+        const NUMBER ab = __builtin_shufflevector(a, b, LOW), cd = __builtin_shufflevector(c, d, LOW);
+        const NUMBER top_ab = __builtin_shufflevector(a, b, HIGH), top_cd = __builtin_shufflevector(c, d, HIGH);
+        return {__builtin_shufflevector(ab, cd, EVEN), __builtin_shufflevector(ab, cd, ODD),
+                __builtin_shufflevector(top_ab, top_cd, EVEN), __builtin_shufflevector(top_ab, top_cd, ODD)};
+    };
+    auto fours = [turned](auto place) -> Four {
+        auto part = [=](int l) -> QUARTER { QUARTER q; __builtin_memcpy(&q, place(l), sizeof(q)); return q; };
+        auto row = [=](int l) -> NUMBER { return JOINED; };
+        return turned(row(0), row(1), row(2), row(3));
+    };
+    auto four_at = [fours](const REAL* blocks, int quarter, const int* j) -> Four {
+        return fours([=](int l) { return blocks + BLOCK * (size_t)j[l] + 4 * quarter; });
+    };
+    auto own_four = [fours](const REAL* blocks, int quarter, int i) -> Four {
+        return fours([=](int l) { return blocks + BLOCK * (size_t)(i + l) + 4 * quarter; });
+    };
+    auto put_four = [turned](REAL* blocks, int quarter, int i, Four f) {
+        const Four rows = turned(f.x, f.y, f.z, f.w);
+        const NUMBER row[4] = {rows.x, rows.y, rows.z, rows.w};
+        for (int r = 0; r < 4; ++r) {
+            REAL* place = blocks + BLOCK * (size_t)(i + r) + 4 * quarter;
+            PARTS
+        }
+    };
+    constexpr int AT_ONCE = WIDTH;
+    struct Places { int at[WIDTH]; };
+    auto places = [](INDEX j) -> Places { Places p; __builtin_memcpy(p.at, &j, sizeof(j)); return p; };
+    auto lane_of = [](NUMBER x, int l) -> REAL { return x[l]; };
+#endif
+    // where the rows of an array stand for ball i, or for one of its slots, each LANES numbers from the last
+    auto rows_at = [](REAL* array, int rows, int i) -> REAL* {
+        return array + (size_t)(i / LANES) * rows * LANES + i % LANES;
+    };
+    auto slot_at = [=](REAL* array, int slots, int rows, int s, int i) -> REAL* {
+        return rows_at(array, slots * rows, i) + s * rows * LANES;
+    };
+    auto list_at = [](int* lists, int slots, int s, int i) -> int* {
+        return lists + ((size_t)(i / LANES) * slots + s) * LANES + i % LANES;
+    };
+    struct Vector { NUMBER x, y, z; };
+    struct Tensor { NUMBER xx, yy, xy, yz, zx; };  // symmetric, traceless
+    auto put_vector = [=](REAL* rows, Vector v) {
+        put(rows, v.x);
+        put(rows + LANES, v.y);
+        put(rows + 2 * LANES, v.z);
+    };
+    auto dot = [](Vector a, Vector b) -> NUMBER { return a.x * b.x + a.y * b.y + a.z * b.z; };
+    auto times = [](Tensor t, Vector a) -> Vector {
+        return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
+                t.zx * a.x + t.yz * a.y - (t.xx + t.yy) * a.z};
+    };
+    auto own_vector = [=](const REAL* rows) -> Vector {
+        return {numbers(rows), numbers(rows + LANES), numbers(rows + 2 * LANES)};
+    };
+"""
+
+# A launch makes passes ``first`` to ``last``: one on a GPU. On a CPU
+# threads, of the process's own library since a launch may sit inside a graph, take chunks of balls as they come, and go
+# on to the next pass when one is done. A thread that cannot be had is not missed.
+_RUN = """
+#if defined(__CUDA_ARCH__)
+    make_pass(first, thread / WAYS);
+#else
+    constexpr int CHUNK = 4 * WIDTH, MOST_PASSES = 16, MOST_THREADS = 64;
+    auto chunk_of = [&](int pass, int chunk) {
+        const int end = chunk * CHUNK + CHUNK < stride ? chunk * CHUNK + CHUNK : stride;
+        for (int i = chunk * CHUNK; i < end; i += WIDTH) make_pass(pass, i);
+    };
+    // the caller takes chunks from the first on, other threads from the last: each has its own in its cache next time
+    struct Team {
+        const decltype(chunk_of)* work;
+        int begin, end, chunks, taken[MOST_PASSES], ahead[MOST_PASSES], behind[MOST_PASSES], done[MOST_PASSES];
+    };
+    Team team = {&chunk_of, first, last, (stride + CHUNK - 1) / CHUNK, {}, {}, {}, {}};
+#if !defined(_WIN32)
+#if defined(__APPLE__)
+    #define SYMBOL(name) "_" name
+#else
+    #define SYMBOL(name) name
+#endif
+    typedef void* (*Start)(void*);
+    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
+    extern int join_thread(unsigned long, void**) __asm__(SYMBOL("pthread_join"));
+    extern int yield_thread() __asm__(SYMBOL("sched_yield"));
+    #undef SYMBOL
+#else
+    auto yield_thread = [] {};
+#endif
+    static constexpr auto work_through = [](Team& team, bool ahead, auto wait) {
+        for (int pass = team.begin; pass < team.end; ++pass) {
+            while (__atomic_fetch_add(&team.taken[pass], 1, __ATOMIC_RELAXED) < team.chunks) {
+                int* const ends = ahead ? team.ahead : team.behind;
+                const int n = __atomic_fetch_add(&ends[pass], 1, __ATOMIC_RELAXED);
+                (*team.work)(pass, ahead ? n : team.chunks - 1 - n);
+                __atomic_fetch_add(&team.done[pass], 1, __ATOMIC_RELEASE);
+            }
+            while (__atomic_load_n(&team.done[pass], __ATOMIC_ACQUIRE) < team.chunks) wait();
+        }
+    };
+    auto join_in = [](void* argument) -> void* {
+        work_through(*(Team*)argument, false, [] { yield_thread(); });
+        return nullptr;
+    };
+#if defined(_WIN32)
+    work_through(team, true, yield_thread);
+#else
+    unsigned long ids[MOST_THREADS];
+    bool started[MOST_THREADS];
+    const int others = (threads < MOST_THREADS ? threads : MOST_THREADS) - 1;
+    for (int t = 0; t < others; ++t) started[t] = start_thread(&ids[t], nullptr, join_in, &team) == 0;
+    work_through(team, true, [] { yield_thread(); });
+    for (int t = 0; t < others; ++t)
+        if (started[t]) join_thread(ids[t], nullptr);
+#endif
+#endif
+"""
+
+
+# Which lanes of two vectors clang's shuffles take for each group of four, those of the second counted from four on.
+_SHUFFLES = {"LOW": (0, 4, 1, 5), "HIGH": (2, 6, 3, 7), "EVEN": (0, 1, 4, 5), "ODD": (2, 3, 6, 7)}
+
+
+def _vector_text(width: int) -> dict[str, str]:
+    """What stands for some names in the text for vectors of ``width`` numbers."""
+
+    def listed(lanes):
+        return ", ".join(map(str, lanes))
+
+    names = {
+        name: listed(group + lane % 4 + width * (lane > 3) for group in range(0, width, 4) for lane in lanes)
+        for name, lanes in _SHUFFLES.items()
+    }
+    joined = [f"part(l + {group})" for group in range(0, width, 4)]
+    while len(joined) > 1:
+        lanes = listed(range(2 * width // len(joined)))
+        joined = [f"__builtin_shufflevector({joined[k]}, {joined[k + 1]}, {lanes})" for k in range(0, len(joined), 2)]
+    names["JOINED"] = joined[0]
+    names["PARTS"] = "\n            ".join(
+        f"{{ const QUARTER q = __builtin_shufflevector(row[r], row[r], {listed(range(group, group + 4))}); "
+        f"__builtin_memcpy(place + {group} * BLOCK, &q, sizeof(q)); }}"
+        for group in range(0, width, 4)
+    )
+    return names
+
+
+def passes_text(
+    real: str,
+    ways: int,
+    constants: dict,
+    numbers: dict,
+    integer_arrays: Iterable,
+    real_arrays: Iterable,
+    body: str,
+    passes: str,
+) -> str:
+    """Text of a native function (thread, first, last, threads, arrays) that makes passes ``first`` to ``last``.
+
+    Args:
+        real: ``float`` or ``double``.
+        ways: Threads of a GPU that share a ball, a power of two.
+        constants: Integers by their names in the text.
+        numbers: Reals by theirs.
+        integer_arrays: Arrays of the struct ``arrays`` that the text names.
+        real_arrays: Those of reals or vectors; ``radius`` has one number for each ball, padded.
+        body: Definitions of the passes.
+        passes: Statement that makes pass ``pass`` for ball ``i``.
+    """
+    integers = "\n".join(f"constexpr int {name} = {value};" for name, value in constants.items())
+    reals = "\n".join(f"constexpr REAL {name} = {value!r};" for name, value in numbers.items())
+    pointers = "\n".join(
+        [f"int* const {name} = arrays.{name}.data;" for name in integer_arrays]
+        + [f"REAL* const {name} = (REAL*)arrays.{name}.data;" for name in real_arrays]
+    )
+    prelude = _PRELUDE
+    for name, text in _vector_text(16 if real == "float" else 8).items():
+        prelude = prelude.replace(name, text)
+    return f"""
+    {{
+    #if !defined(__CUDA_ARCH__)
+    #pragma clang fp contract(fast)
+    #endif
+    typedef {real} REAL;
+    #if defined(__CUDA_ARCH__)
+    constexpr int WAYS = {ways};
+    #else
+    constexpr int WAYS = 1;
+    #endif
+    constexpr int LANES = {LANES}, BLOCK = {BLOCK};
+    {integers}
+    {reals}
+    const int stride = arrays.radius.shape[0];
+    {pointers}
+    {prelude}{body}
+    auto make_pass = [&](int pass, int i) {{ {passes} }};
+    {_RUN}
+    }}"""
