@@ -20,8 +20,7 @@ PEAK_SPEED = wp.constant(2)  # speed of a body's centre of mass [m/s]
 PEAK_OVERLAP = wp.constant(3)  # penetration over the thickness of the thinner body [1]
 PEAK_DEPTH = wp.constant(4)  # penetration [m]
 PEAK_ERROR = wp.constant(5)  # magnetization error [1]
-PEAK_PUSH = wp.constant(6)  # motion of a body by the forces alone in two substeps over its thickness [1]
-PEAKS = 7
+PEAKS = 6
 
 COUNT_BAD_BODY = wp.constant(0)  # the first body whose state was not finite, see kernels.stepping; else NO_BODY
 COUNT_EVALUATIONS = wp.constant(1)  # field evaluations, summed over substeps
@@ -67,7 +66,6 @@ def _watch_motion(
         gained += 0.5 * reach_in[body] * wp.length(body_inv_inertia_in[body] * torque) * dt * dt
     wp.atomic_max(peaks_out, PEAK_TRAVEL, (steady + gained) / thickness_in[body])
     wp.atomic_max(peaks_out, PEAK_LONG_TRAVEL, (2.0 * steady + 4.0 * gained) / thickness_in[body])
-    wp.atomic_max(peaks_out, PEAK_PUSH, 4.0 * gained / thickness_in[body])
     wp.atomic_max(peaks_out, PEAK_SPEED, speed)
 
 

@@ -8,7 +8,7 @@ halted, steps do nothing, so that the host may look whenever it likes and go on 
 Substeps come in pairs. Where they are shorter than those of the first level, two share their magnetic forces, which
 then act no longer than they do at that level: what makes substeps short is contacts of bodies that are fast or pressed.
 The forces are those half-way between the poses that the two start from, as far as velocities tell, so that they neither
-lag nor lead. The second substep gets its own where forces are too strong to be shared.
+lag nor lead; the limit of travel, which counts what forces do in a substep, keeps these poses close to each other.
 
 ``flags`` [int32]: conditions of the loops around a step, see the ``FLAG_*`` indices.
 ``status`` [int32]: where stepping stands, see the ``STATUS_*`` indices.
@@ -33,7 +33,6 @@ from warpmag.kernels.monitor import (
     NO_BODY,
     PEAK_LONG_TRAVEL,
     PEAK_OVERLAP,
-    PEAK_PUSH,
     PEAK_TRAVEL,
     PEAKS,
 )
@@ -46,8 +45,7 @@ LEVELS = wp.constant(5)
 FLAG_ATTEMPT = wp.constant(0)  # the step is to be tried (again)
 FLAG_REJECTED = wp.constant(1)  # the last attempt did not hold
 FLAG_LEVEL = wp.constant(2)  # first of LEVELS: substeps of this level remain to be done
-FLAG_PUSHED = wp.constant(FLAG_LEVEL + LEVELS)  # forces are too strong to be kept for a substep
-FLAGS = int(FLAG_PUSHED) + 1
+FLAGS = 7
 
 STATUS_HALT = wp.constant(0)  # why steps do nothing: one of the reasons below
 STATUS_DONE = wp.constant(1)  # steps done
@@ -82,7 +80,6 @@ class Limits:
 
     Attributes:
         travel: Largest motion in a substep, in parts of a body's thickness.
-        push: Largest motion by the forces alone in two substeps that share them, in the same parts.
         overlap: Deepest new penetration, in parts of the thickness of the thinner body.
         ease: Substeps are made longer again where the motion in twice their length stays below this part of ``travel``.
         futile: Substeps that leave more than this part of a penetration that was too deep are not made shorter still.
@@ -91,7 +88,6 @@ class Limits:
     """
 
     travel: float
-    push: float
     overlap: float
     ease: float
     futile: float
@@ -119,11 +115,6 @@ class StepBuffers:
     def remaining(self, level: int) -> wp.array:
         """Condition: substeps of ``level`` remain to be done."""
         return self.flags[int(FLAG_LEVEL) + level : int(FLAG_LEVEL) + level + 1]
-
-    @property
-    def pushed(self) -> wp.array:
-        """Condition: the second substep of a pair needs forces of its own."""
-        return self.flags[int(FLAG_PUSHED) :]
 
 
 def allocate(records: int, capacities: int, device) -> StepBuffers:
@@ -312,22 +303,6 @@ def launch_watch_finite(half: int, state, limits: Limits, b: StepBuffers):
         outputs=[b.counts],
         device=b.status.device,
     )
-
-
-@wp.kernel
-def _weigh_push(
-    # inputs:
-    peaks_in: wp.array[float],
-    push_limit: float,
-    # outputs:
-    flags_out: wp.array[wp.int32],
-):
-    flags_out[FLAG_PUSHED] = wp.where(peaks_in[PEAK_PUSH] <= push_limit, 0, 1)
-
-
-def launch_weigh_push(limits: Limits, b: StepBuffers):
-    """Decide between two substeps whether the second one needs forces of its own."""
-    wp.launch(_weigh_push, dim=1, inputs=[b.peaks, limits.push], outputs=[b.flags], device=b.status.device)
 
 
 @wp.kernel

@@ -6,7 +6,7 @@ import warp as wp
 
 from warpmag.kernels import monitor, stepping
 
-TRAVEL, PUSH, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 0.5, 0.008, 0.8, 0.8, 2, 100
+TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 0.008, 0.8, 0.8, 2, 100
 
 
 class Rules:
@@ -43,7 +43,7 @@ class Rules:
 def machine(device):
     buffers = stepping.allocate(16, 1, device)
     capacities = wp.array([CAPACITY], dtype=wp.int32, device=device)
-    return buffers, stepping.Limits(TRAVEL, PUSH, OVERLAP, EASE, FUTILE, FEWEST, capacities)
+    return buffers, stepping.Limits(TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, capacities)
 
 
 def report(buffers, travel, long_travel, overlap, lost, fill):
@@ -130,13 +130,3 @@ def test_arrays_of_any_type_are_copied_where_a_flag_stands(machine):
             buffers.flags.fill_(flag)
             stepping.launch_copy_where(stepping.FLAG_REJECTED, source, target, buffers)
             np.testing.assert_array_equal(target.numpy(), expected)
-
-
-@pytest.mark.parametrize(("push", "wanted"), [(0.0, 0), (0.49, 0), (0.51, 1), (np.nan, 1)])
-def test_forces_that_are_too_strong_are_not_shared(machine, push, wanted):
-    buffers, limits = machine
-    peaks = np.zeros(buffers.peaks.shape[0], np.float32)
-    peaks[monitor.PEAK_PUSH] = push
-    buffers.peaks.assign(peaks)
-    stepping.launch_weigh_push(limits, buffers)
-    assert buffers.pushed.numpy().tolist() == [wanted]

@@ -1,11 +1,11 @@
 """Advances a model by the step that the user asked for, in as many substeps as its motion needs.
 
 A substep is: clear forces, induction, magnetic forces, collision, solver; substeps shorter than the longest ones share
-their forces two by two, as long as these are not too strong. A step is tried and then judged: if a body moved too far
-in a substep, or bodies were pressed into each other, the state is put back and the step done again with shorter
-substeps. All of that is decided on the device (``kernels.stepping``), so that a step is one graph that the host
-launches and does not wait for. The host looks every so many steps. Where it has to act, because a buffer overflowed or
-the state is not finite any more, the device has halted, and steps launched since did nothing.
+their forces two by two. A step is tried and then judged: if a body moved too far in a substep, or bodies were pressed
+into each other, the state is put back and the step done again with shorter substeps. All of that is decided on the
+device (``kernels.stepping``), so that a step is one graph that the host launches and does not wait for. The host looks
+every so many steps. Where it has to act, because a buffer overflowed or the state is not finite any more, the device
+has halted, and steps launched since did nothing.
 
 What cannot be captured in a graph is launched from Python, by the same code.
 """
@@ -28,12 +28,6 @@ from warpmag.kernels.bodies import predict_poses
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
-PUSH_LIMIT = 0.5
-"""How far forces alone may move a body in two substeps that share them, in parts of its thickness.
-
-The pull a of a magnet on a ball at its surface changes by at most 2a/R along the way R, that of a dipole on an induced
-one by 3.5a/R, which a step T is stable with below aT²/2R = 0.57.
-"""
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
 _EASE = 0.8
@@ -137,9 +131,7 @@ class Stepper:
         """Fit everything to the solver's buffers, whose number does not change."""
         sizes = [buffer.limit for buffer in self._solver.buffers]
         capacities = wp.array(sizes, dtype=wp.int32, device=self._device)
-        self._limits = stepping.Limits(
-            TRAVEL_LIMIT, PUSH_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities
-        )
+        self._limits = stepping.Limits(TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities)
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -305,9 +297,6 @@ class Stepper:
                     predict_poses(now, self._model.body_com, 0.5 * dt, self._shared.body_q)
                     self._magnetize(self._shared)
                 wp.copy(now.body_f, self._shared.body_f)
-                if half == 1:
-                    stepping.launch_weigh_push(self._limits, self._buffers)
-                    wp.capture_if(self._buffers.pushed, self._magnetize, state=now)
             monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, self._buffers.peaks)
             self._find_contacts(now, dt, 0.0)
             self._solver.step(now, then, dt)
