@@ -53,6 +53,9 @@ _PAIRS_PER_START = 200_000
 """Pairs that a CPU sums while another of its threads starts: 50 µs, most of it to wake a core."""
 _TILES_PER_THREAD = 16
 """Tiles that a thread should have, so that they can be shared out evenly."""
+_ROUNDS, _MOST_SHARES = 3, 12
+"""Shares of a thread, each round of them half as large as the one before; unless there are so many threads that adding
+up their sums would take longer than waiting for each other."""
 _LANES = 16
 """Width of the widest vectors: a stripe of a multiple of it wastes none."""
 
@@ -68,7 +71,8 @@ class Rows:
         begin: First source of each target row, shape [count].
         end: One past the last source of each target row, shape [count].
         tiles: Work list of the native loop, see ``pair_code``, shape [tiles, TILE_COLUMNS].
-        shares: On a CPU the tile at which each thread begins, and the end, shape [threads + 1].
+        shares: On a CPU the tile at which each share begins, and the end, shape [splits + 1].
+        threads: On a CPU the threads that take them.
         form: How the sums are made: ``LOOP``, ``FUSED`` or ``MIRRORED``.
         shape: On a GPU the shape of the blocks, one a tile.
         mirror: What takes the tiles' place in the mirrored form.
@@ -83,6 +87,7 @@ class Rows:
     end: wp.array
     tiles: wp.array
     shares: wp.array
+    threads: int
     form: str
     shape: pair_sums_cuda.Shape | Shape | None
     mirror: pair_mirror_cuda.Mirror | None
@@ -121,7 +126,7 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
 
     device = wp.get_device(device)
     form = _choose_form(segments, quantity, forms) if device.is_cuda else LOOP
-    shape, mirror, tiles, shares = None, None, np.zeros(0), np.zeros(0)
+    shape, mirror, tiles, shares, threads = None, None, np.zeros(0), np.zeros(0), 1
     if form == MIRRORED:
         mirror = pair_mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, device)
         splits = mirror.slabs + mirror.splits
@@ -134,8 +139,9 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
         shape = choose_shape(quantity, count)
         tiles, splits = _cuda_tiles(segments, starts, shape, device.sm_count)
     elif form == LOOP:
-        splits = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(cores(), MOST_THREADS)))
-        tiles, shares = _cpu_tiles(segments, starts, splits)
+        threads = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(cores(), MOST_THREADS)))
+        tiles, shares = _cpu_tiles(segments, starts, threads)
+        splits = len(shares) - 1
 
     def to_device(a):
         return wp.array(a.astype(np.int32), dtype=wp.int32, device=device)
@@ -148,6 +154,7 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
         end=to_device(end),
         tiles=to_device(tiles.reshape(-1, TILE_COLUMNS)),
         shares=to_device(shares),
+        threads=threads,
         form=form,
         shape=shape,
         mirror=mirror,
@@ -188,7 +195,7 @@ def _block_tiles(segments, starts, width: int, splits: int):
 
 
 def _cpu_tiles(segments, starts, threads: int):
-    """Tiles of stripes of targets and stripes of sources; and where each thread's share of them begins.
+    """Tiles of stripes of targets and stripes of sources; and where each share of them begins.
 
     Targets among their own sources need the tiles above the diagonal only, each standing for its mirror image.
     """
@@ -204,11 +211,11 @@ def _cpu_tiles(segments, starts, threads: int):
                     if not mirrored or a <= b:
                         tiles.append((row + i0 - t0, row + i1 - t0, i0, j0, j1, 0, mirrored))
                         work.append((i1 - i0) * (j1 - j0) * (2.0 if mirrored and a < b else 1.0))
-    # a tile goes to the thread in whose share its middle lies; the first thread is at work while the others start
+    rounds = int(np.clip(_MOST_SHARES // threads, 1, _ROUNDS)) if threads > 1 else 1
+    sizes = np.repeat(0.5 ** np.arange(rounds), threads)
+    # a tile goes to the share in which its middle lies
     done = np.concatenate([[0.0], np.cumsum(work)])
-    share = (done[-1] + _PAIRS_PER_START * (threads - 1)) / threads
-    edges = share + (share - _PAIRS_PER_START) * np.arange(threads - 1)
-    ends = np.searchsorted((done[:-1] + done[1:]) / 2.0, edges)
+    ends = np.searchsorted((done[:-1] + done[1:]) / 2.0, done[-1] * np.cumsum(sizes)[:-1] / sizes.sum())
     return np.array(tiles, np.int64), np.concatenate([[0], ends, [len(tiles)]])
 
 
@@ -323,4 +330,4 @@ def launch_pair_loop(rows: Rows, targets, sources, partial, *, effective=None, r
     elif device.is_cuda:
         launch_pair_loop_cuda(rows.quantity, rows.shape, targets, sources, effective, rows.tiles, partial)
     else:
-        launch_pair_loop_cpu(rows.quantity, targets, sources, effective, rows.tiles, rows.shares, partial)
+        launch_pair_loop_cpu(rows.quantity, targets, sources, effective, rows.tiles, rows.shares, rows.threads, partial)

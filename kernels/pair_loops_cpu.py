@@ -1,4 +1,4 @@
-"""The native pair loop on a CPU: vectors as wide as the machine has them, tile by tile, shared out to threads.
+"""The native pair loop on a CPU: vectors as wide as the machine has them, tile by tile, by several threads.
 
 A tile holds up to ``STRIPE`` sources in the first-level cache, for a range of target rows to meet. There are two ways
 through it:
@@ -8,7 +8,9 @@ through it:
   both ends of the pair. That takes 35 vector operations for the two fields, where ``add_rows`` takes 28 for one, and 46
   for the two forces, where it takes 37. Tiles that may hold moments of the same body do not have their forces that way.
 
-Every thread has sums of its own, which the finishing kernel adds up in order, so that nothing depends on scheduling.
+Threads take shares of the tiles, the largest first, as they get to it: one that wakes late or is interrupted leaves
+more to the others. Every share has sums of its own, which the finishing kernel adds up in order, so that nothing
+depends on who took which.
 """
 
 from functools import cache
@@ -32,7 +34,7 @@ from warpmag.kernels.pair_code import (
 STRIPE = 512
 """Most sources, and most targets, of a tile."""
 MOST_THREADS = 64
-"""Threads that a loop may start."""
+"""Threads, and shares, that a loop may have."""
 
 _W = 2.0  # see pair_code: W/√c is cheapest for W = 2
 
@@ -272,7 +274,7 @@ def _walk_home(quantity: str) -> str:
 
 
 def _walk(quantity: str) -> str:
-    """Text that sums the tiles of a thread."""
+    """Text that sums the tiles of a share."""
     both_ways = quantity in (FIELD, KELVIN)
     return f"""
     __builtin_memset(share.out, 0, share.rows * {WIDTHS[quantity]} * sizeof(REAL));
@@ -298,10 +300,10 @@ def _walk(quantity: str) -> str:
 
 
 # Threads of the process's own library: Warp launches serially on a CPU, and a launch may sit inside a graph, where
-# Python's threads cannot help. A thread that cannot be had leaves its tiles to this one.
+# Python's threads cannot help. A thread that cannot be had leaves its shares to the others.
 _RUN_THREADS = """
 #if defined(_WIN32)
-    for (int t = 0; t < threads; ++t) work(&shared[t]);
+    work(&job);
 #else
 #if defined(__APPLE__)
     #define SYMBOL(name) "_" name
@@ -313,19 +315,17 @@ _RUN_THREADS = """
     extern int join_thread(unsigned long, void**) __asm__(SYMBOL("pthread_join"));
     unsigned long ids[MOST_THREADS];
     bool started[MOST_THREADS];
-    for (int t = 1; t < threads; ++t) started[t] = start_thread(&ids[t], nullptr, work, &shared[t]) == 0;
-    if (threads > 0) work(&shared[0]);
-    for (int t = 1; t < threads; ++t) {
+    for (int t = 1; t < threads; ++t) started[t] = start_thread(&ids[t], nullptr, work, &job) == 0;
+    work(&job);
+    for (int t = 1; t < threads; ++t)
         if (started[t]) join_thread(ids[t], nullptr);
-        else work(&shared[t]);
-    }
     #undef SYMBOL
 #endif
 """
 
 
 def _snippet(real: str, quantity: str) -> str:
-    """All tiles of a work list, shared out to threads."""
+    """All tiles of a work list, by several threads."""
     return f"""
     typedef {real} REAL;
     #define ONCE __attribute__((noinline))  // compiled once, not wherever it is called
@@ -338,22 +338,31 @@ def _snippet(real: str, quantity: str) -> str:
         REAL* out;
         size_t rows;
     }};
+    struct Job {{
+        Share shares[MOST_THREADS];
+        int count, next;
+    }};
     auto work = [](void* argument) -> void* {{
         #pragma clang fp contract(fast)
-        const Share& share = *(const Share*)argument;
+        Job& job = *(Job*)argument;
         constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
         {_VECTORS}
         {_INVERSE_ROOT[real]}
         {_add_rows(quantity)}
         {_add_both_ways(quantity) if quantity in (FIELD, KELVIN) else ""}
-        {_walk(quantity)}
+        auto sum = [=](const Share& share) {{
+            {_walk(quantity)}
+        }};
+        auto take = [&]() {{ return __atomic_fetch_add(&job.next, 1, __ATOMIC_RELAXED); }};
+        for (int taken = take(); taken < job.count; taken = take()) sum(job.shares[taken]);
         return nullptr;
     }};
-    const int threads = (int)shares.shape[0] - 1;
     const size_t rows = partial_out.shape[1];
-    Share shared[MOST_THREADS];
-    for (int t = 0; t < threads; ++t)
-        shared[t] = Share{{(const REAL*)targets.data, (const REAL*)sources.data, (const REAL*)effective.data,
+    Job job;
+    job.count = (int)shares.shape[0] - 1;
+    job.next = 0;
+    for (int t = 0; t < job.count; ++t)
+        job.shares[t] = Share{{(const REAL*)targets.data, (const REAL*)sources.data, (const REAL*)effective.data,
                           targets.strides[0] / sizeof(REAL), sources.strides[0] / sizeof(REAL),
                           effective.strides[0] / sizeof(REAL),
                           tiles.data, shares.data[t], shares.data[t + 1],
@@ -372,6 +381,7 @@ def _kernel(dtype, quantity: str):
         effective: wp.array2d[dtype],
         tiles: wp.array2d[int],
         shares: wp.array[int],
+        threads: int,
         partial_out: wp.array3d[dtype],
     ): ...
 
@@ -386,20 +396,21 @@ def _kernel(dtype, quantity: str):
         effective: wp.array2d[dtype],
         tiles: wp.array2d[int],
         shares: wp.array[int],
+        threads: int,
         # outputs:
         partial_out: wp.array3d[dtype],
     ):
-        sum_tiles(targets, sources, effective, tiles, shares, partial_out)
+        sum_tiles(targets, sources, effective, tiles, shares, threads, partial_out)
 
     return pair_loop_cpu
 
 
-def launch_pair_loop_cpu(quantity: str, targets, sources, effective, tiles, shares, partial):
+def launch_pair_loop_cpu(quantity: str, targets, sources, effective, tiles, shares, threads, partial):
     """Sum a quantity over all tiles; see ``pair_loops.launch_pair_loop``."""
     wp.launch(
         _kernel(partial.dtype, quantity),
         dim=1,
-        inputs=[targets, sources, effective, tiles, shares],
+        inputs=[targets, sources, effective, tiles, shares, threads],
         outputs=[partial],
         device=partial.device,
     )
