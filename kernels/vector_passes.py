@@ -164,9 +164,9 @@ _RUN = """
     // the caller takes chunks from the first on, other threads from the last: each has its own in its cache next time
     struct Team {
         const decltype(chunk_of)* work;
-        int begin, end, chunks, taken[MOST_PASSES], ahead[MOST_PASSES], behind[MOST_PASSES], done[MOST_PASSES];
+        int begin, end, chunks, taken[MOST_PASSES], ahead[MOST_PASSES], behind[MOST_PASSES], done[MOST_PASSES], left;
     };
-    Team team = {&chunk_of, first, last, (stride + CHUNK - 1) / CHUNK, {}, {}, {}, {}};
+    Team team = {&chunk_of, first, last, (stride + CHUNK - 1) / CHUNK, {}, {}, {}, {}, 0};
 #if !defined(_WIN32)
 #if defined(__APPLE__)
     #define SYMBOL(name) "_" name
@@ -175,7 +175,7 @@ _RUN = """
 #endif
     typedef void* (*Start)(void*);
     extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
-    extern int join_thread(unsigned long, void**) __asm__(SYMBOL("pthread_join"));
+    extern int detach_thread(unsigned long) __asm__(SYMBOL("pthread_detach"));
     extern int yield_thread() __asm__(SYMBOL("sched_yield"));
     #undef SYMBOL
 #else
@@ -193,19 +193,25 @@ _RUN = """
         }
     };
     auto join_in = [](void* argument) -> void* {
-        work_through(*(Team*)argument, false, [] { yield_thread(); });
+        Team& team = *(Team*)argument;
+        work_through(team, false, [] { yield_thread(); });
+        __atomic_fetch_add(&team.left, 1, __ATOMIC_RELEASE);
         return nullptr;
     };
 #if defined(_WIN32)
     work_through(team, true, yield_thread);
 #else
-    unsigned long ids[MOST_THREADS];
-    bool started[MOST_THREADS];
+    // to sleep until a thread has ended would take longer than to wait for it to say so
     const int others = (threads < MOST_THREADS ? threads : MOST_THREADS) - 1;
-    for (int t = 0; t < others; ++t) started[t] = start_thread(&ids[t], nullptr, join_in, &team) == 0;
+    int started = 0;
+    for (int t = 0; t < others; ++t) {
+        unsigned long id;
+        if (start_thread(&id, nullptr, join_in, &team) != 0) break;
+        detach_thread(id);
+        ++started;
+    }
     work_through(team, true, [] { yield_thread(); });
-    for (int t = 0; t < others; ++t)
-        if (started[t]) join_thread(ids[t], nullptr);
+    while (__atomic_load_n(&team.left, __ATOMIC_ACQUIRE) < started) yield_thread();
 #endif
 #endif
 """
