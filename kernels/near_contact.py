@@ -32,6 +32,7 @@ Ball i is number i mod LANES of chunk i div LANES.
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -145,6 +146,7 @@ class NearContactBuffers:
         ways: Threads of a GPU that share a ball.
         stream: Stream of a GPU for what is done beside the pair loops.
         events: There, when it starts, when the field is summed, and when all is done.
+        commands: Launches as they were recorded, which spares packing the arrays each time.
     """
 
     group: wp.array
@@ -155,6 +157,7 @@ class NearContactBuffers:
     ways: int
     stream: wp.Stream | None
     events: tuple[wp.Event, ...]
+    commands: dict
 
     def forget(self):
         """Start cold, from no contact sources."""
@@ -250,6 +253,7 @@ def allocate(
         ways=8 if n < _MANY_BALLS else 4,
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
+        commands={},
     )
 
 
@@ -278,14 +282,19 @@ def _kernel(dtype, text, ways: int):
 
 def _launch(text, first: int, last: int, b: NearContactBuffers):
     """Launch passes ``first`` to ``last``; one by one on a GPU, where a launch is what they meet at."""
-    balls, device = b.arrays.radius.shape[0], b.arrays.radius.device
-    kernel = _kernel(b.arrays.radius.dtype, text, b.ways)
-    if device.is_cpu:
-        wp.launch(kernel, dim=1, inputs=[first, last, b.threads, b.arrays], device=device)
-        return
-    for only in range(first, last):
-        inputs = [only, only + 1, b.threads, b.arrays]
-        wp.launch(kernel, dim=b.ways * balls, inputs=inputs, device=device, block_dim=128)
+    device = b.arrays.radius.device
+    for begin, end in [(first, last)] if device.is_cpu else pairwise(range(first, last + 1)):
+        key = text, begin, end
+        if key not in b.commands:
+            b.commands[key] = wp.launch(
+                _kernel(b.arrays.radius.dtype, text, b.ways),
+                dim=1 if device.is_cpu else b.ways * b.arrays.radius.shape[0],
+                inputs=[begin, end, b.threads, b.arrays],
+                device=device,
+                block_dim=128,
+                record_cmd=True,
+            )
+        b.commands[key].launch()
 
 
 @contextmanager
