@@ -51,6 +51,7 @@ from warpmag.kernels.near_contact_code import (
     SKIN,
     SLOPE_ROWS,
     STATE_ROWS,
+    SWEEPS,
     force_text,
     place_text,
     sweep_text,
@@ -60,9 +61,6 @@ from warpmag.kernels.pair_loops import cores
 from warpmag.kernels.vector_passes import BLOCK, LANES
 from warpmag.near_contact import FUNCTIONS
 
-SWEEPS = 2
-"""Sweeps before each field evaluation, and before forces are taken: with one, a cold solve of a pile takes twice as
-many evaluations."""
 KINDS = 16
 """Susceptibilities that are told apart."""
 _BALLS_PER_THREAD = 500

@@ -39,8 +39,12 @@ SLOPE_ROWS = 14
 """Rows of a contact's derivatives: of A to P by the distance."""
 STATE_ROWS = 14
 """Rows of what sweeps move: q, N and xx, yy, xy, yz, zx of n_Θ, the contact sources; the same of Θ̃."""
-OUTER_ROWS = 13
-"""Rows of what does not change from pass to pass: parts of φ, of e_m and of the tensor that Θ feels; (M_sr a)_m."""
+OUTER_ROWS = 15
+"""Rows of what does not change from pass to pass: parts of φ, of e_m and of the tensor that Θ feels; (M_sr a)_m; the
+polarizability of the quadrupole, and the factor that falls as a ball saturates."""
+SWEEPS = 2
+"""Sweeps before each field evaluation, and before forces are taken: with one, a cold solve of a pile takes twice as
+many evaluations."""
 
 OWN_SOURCE, OWN_DIPOLE = 1.0 - 1.2 * 2.0 / RANGE, 1.0 - (2.0 / RANGE) ** 3
 """M of a ball of unit radius on itself."""
@@ -78,7 +82,7 @@ _PREPARE = """
         const Vector m = own_moment(i);
         put_four(seen, 2, i, {numbers(rows_at(contact, STATE_ROWS, i) + 13 * LANES), m.x, m.y, m.z});
     };
-    struct Softness { NUMBER p, weight; };  // polarizability of a ball's quadrupole; factor that falls as it saturates
+    struct Softness { NUMBER p, weight; };
     auto softness_of = [=](int i) -> Softness {
         const NUMBER size = numbers(radius + i), slope = numbers(curve_slope + i), one = size * REAL(0) + 1;
         const Vector m = own_moment(i);
@@ -102,7 +106,7 @@ _PREPARE = """
 _DRIVE = """
     // e = M ã, what quadrupoles move towards, and 4π H_near = (M_sr a − e)_m. What balls make that do not touch, and
     // what moments make, is summed by the first pass only, for the others to start from.
-    auto drive_of = [=](int i, bool first) {
+    auto drive_of = [=](int i, bool first, bool last) {
         const int contact_slots = most(contact_count + i), slots = most(count + i);
         REAL* const kept = rows_at(outer, OUTER_ROWS, i);
         const REAL* const state = rows_at(contact, STATE_ROWS, i);
@@ -143,7 +147,7 @@ _DRIVE = """
             gyz += REAL(0.5) * (u.y * y.z + u.z * y.y) + own * theta.yz;
             gzx += REAL(0.5) * (u.z * y.x + u.x * y.z) + own * theta.zx;
         };
-        NUMBER* const sums[OUTER_ROWS] = {
+        NUMBER* const sums[13] = {
             &phi, &e.x, &e.y, &e.z, &gxx, &gyy, &gzz, &gxy, &gyz, &gzx, &lone.x, &lone.y, &lone.z};
         if (first) {
             for (int s = contact_slots + way; s < slots; s += WAYS) meet(s, true);
@@ -169,7 +173,12 @@ _DRIVE = """
         phi -= source * numbers(state);
         e = {e.x + dipole * (m.x - n.x), e.y + dipole * (m.y - n.y), e.z + dipole * (m.z - n.z)};
         lone = {lone.x + dipole * m.x, lone.y + dipole * m.y, lone.z + dipole * m.z};
-        const Softness soft = softness_of(i);
+        Softness soft = {numbers(kept + 13 * LANES), numbers(kept + 14 * LANES)};
+        if (first) {
+            soft = softness_of(i);
+            put(kept + 13 * LANES, soft.p);
+            put(kept + 14 * LANES, soft.weight);
+        }
         const NUMBER p = soft.p, fifth = cube * inverse * inverse, trace = gxx + gyy + gzz;
         const NUMBER felt[5] = {REAL(1.5) * gxx - REAL(0.5) * trace, REAL(1.5) * gyy - REAL(0.5) * trace,
                                 REAL(1.5) * gxy, REAL(1.5) * gyz, REAL(1.5) * gzx};
@@ -183,6 +192,7 @@ _DRIVE = """
         put_four(driven, 1, i, {drive[0], drive[1], drive[2], drive[3]});
         put_four(driven, 2, i, {drive[4], size, soft.weight, goal[4]});
         put_four(driven, 3, i, {goal[0], goal[1], goal[2], goal[3]});
+        if (!last) return;
         const Vector h = {lone.x - e.x, lone.y - e.y, lone.z - e.z};
         put_vector(rows_at(field, 3, i), h);
         for (int l = 0; l < AT_ONCE; ++l) {
@@ -735,9 +745,8 @@ def _text(real: str, ways: int, body: str, passes: str) -> str:
 def sweep_text(real: str, ways: int) -> str:
     """Text of sweeps over contact sources and quadrupoles: one pass that prepares them, two for each."""
     body = _SHOW + _PREPARE + _DRIVE + _SEEN + _TAKE
-    return _text(
-        real, ways, body, "if (pass == 0) prepare(i); else if (pass % 2 == 1) drive_of(i, pass == 1); else take(i);"
-    )
+    drive = f"drive_of(i, pass == 1, pass == {2 * SWEEPS - 1})"
+    return _text(real, ways, body, f"if (pass == 0) prepare(i); else if (pass % 2 == 1) {drive}; else take(i);")
 
 
 def force_text(real: str, ways: int) -> str:
