@@ -215,15 +215,13 @@ def draw(results: dict[str, list[dict]], path: Path) -> None:
                     )
             axis.set(xlabel="gap over radius, μr = ∞", ylabel="force over the exact one")
         elif name == "clusters":
-            for kind, style in zip(CONTACT_MODELS, (":", "-"), strict=True):
+            for kind, style in zip(CONTACT_MODELS, ("--", "-"), strict=True):
                 for which in clusters.FIELDS:
-                    for permeability in clusters.PERMEABILITIES:
-                        part = [r for r in rows if (r["cluster"], r["permeability"]) == (which, permeability)]
-                        part = part[:: len(clusters.FIELDS[which])]  # the first field
-                        axis.loglog(
-                            [row["gap"] for row in part], [row[kind] for row in part], style,
-                            label=f"{kind}, {which}, μr = {permeability:g}",
-                        )  # fmt: skip
+                    worst = [
+                        max(row[kind] for row in rows if (row["cluster"], row["gap"]) == (which, gap))
+                        for gap in clusters.GAPS
+                    ]
+                    axis.loglog(clusters.GAPS, worst, style, label=f"{kind}, {which}, the worst of μr and fields")
             axis.set(xlabel="gap over radius", ylabel="relative error of forces")
         else:
             line(axis, rows, "steps", "error", "energy drift over kinetic energy")
