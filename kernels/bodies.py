@@ -19,11 +19,13 @@ body.
 
 import warp as wp
 
-from warpmag.kernels.induction import block_sum
+from warpmag.kernels.neighbors import group_sum
 
 wp.set_module_options({"enable_backward": False})
 
-_BLOCK = 32
+_SHARES = 32
+"""Threads of a GPU that share out the moments of a body: a warp."""
+_sum_group = group_sum(wp.spatial_vectord)
 
 
 @wp.kernel
@@ -72,24 +74,26 @@ def _add_to_bodies(
     positions_in: wp.array[wp.vec3],
     forces_in: wp.array[wp.vec3],
     torques_in: wp.array[wp.vec3],
+    shares: int,
     # outputs:
     body_f_out: wp.array[wp.spatial_vector],
 ):
-    k, lane = wp.tid()
+    k = wp.tid() // shares
+    share = wp.tid() % shares
     body = body_list_in[k]
     if (body_flags_in[body] & kinematic_flag) != 0:
         return
     center = wp.transform_point(body_q_in[body], body_com_in[body])
     mine = wp.spatial_vectord()
     for run in range(body_run_start_in[k], body_run_start_in[k + 1]):
-        for i in range(run_in[run][0] + lane, run_in[run][1], wp.block_dim()):
+        for i in range(run_in[run][0] + share, run_in[run][1], shares):
             force = forces_in[i]
             torque = torques_in[i] + wp.cross(positions_in[i] - center, force)
             for c in range(3):
                 mine[c] += wp.float64(force[c])
                 mine[c + 3] += wp.float64(torque[c])
-    total = block_sum(mine)
-    if lane == 0:
+    total = _sum_group(mine, shares)
+    if share == 0:
         force = wp.vec3(float(total[0]), float(total[1]), float(total[2]))
         torque = wp.vec3(float(total[3]), float(total[4]), float(total[5]))
         body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
@@ -102,9 +106,10 @@ def scatter_wrenches(
 
     Bodies that carry ``kinematic_flag`` take none.
     """
-    wp.launch_tiled(
+    shares = _SHARES if body_f.device.is_cuda else 1
+    wp.launch(
         _add_to_bodies,
-        dim=[len(body_list)],
+        dim=shares * len(body_list),
         inputs=[
             body_q,
             body_com,
@@ -116,9 +121,9 @@ def scatter_wrenches(
             positions,
             forces,
             torques,
+            shares,
         ],
         outputs=[body_f],
-        block_dim=_BLOCK,
         device=body_f.device,
     )
 

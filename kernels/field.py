@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.neighbors import pair_correction
+from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
 from warpmag.kernels.pair_code import FIELD
 from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share
 
@@ -13,7 +13,10 @@ INVERSE_4PI = 0.07957747154594767
 
 @cache
 def finished_field(dtype):
-    """Warp function that turns one target row's partial sums into the field [A/m] of its sources."""
+    """Warp function that turns one target row's partial sums into the field [A/m] of its sources.
+
+    Thread ``share`` of ``shares`` gets its share of it, for ``neighbors.group_sum`` to add up.
+    """
     vec3 = wp.types.vector(3, dtype)
     correct_pairs = pair_correction(dtype, gradient=False, exclude_body=False)
 
@@ -29,13 +32,15 @@ def finished_field(dtype):
         same_set: int,
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
+        share: int,
+        shares: int,
     ):
         h = vec3()
-        for split in range(partial.shape[0]):
+        for split in range(share, partial.shape[0], shares):
             h += vec3(partial[split, row, 0], partial[split, row, 1], partial[split, row, 2])
         skip = wp.where(same_set == 1, i, -1)
-        if neighbor_count[i] > 0:
-            h += correct_pairs(targets, sources, i, begin, end, skip, neighbor, neighbor_count, 0, 1)
+        if neighbor_count[i] > share:
+            h += correct_pairs(targets, sources, i, begin, end, skip, neighbor, neighbor_count, share, shares)
         return dtype(wp.static(INVERSE_4PI)) * h
 
     return finish
@@ -82,6 +87,7 @@ def summed_field(dtype, shape: Shape):
 def _finish_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
     finish = finished_field(dtype)
+    sum_group = group_sum(vec3)
 
     @wp.kernel(module="unique", enable_backward=False)
     def finish_field(
@@ -96,14 +102,19 @@ def _finish_kernel(dtype):
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
         base: wp.array[vec3],
+        shares: int,
         # outputs:
         h_out: wp.array[vec3],
     ):
-        row = wp.tid()
+        row = wp.tid() // shares
+        share = wp.tid() % shares
         i = row_target[row]
-        h_out[i] = base[i] + finish(
-            partial, targets, sources, row, i, row_begin[row], row_end[row], same_set, neighbor, neighbor_count
-        )
+        begin = row_begin[row]
+        end = row_end[row]
+        mine = finish(partial, targets, sources, row, i, begin, end, same_set, neighbor, neighbor_count, share, shares)
+        h = sum_group(mine, shares)
+        if share == 0:
+            h_out[i] = base[i] + h
 
     return finish_field
 
@@ -164,10 +175,11 @@ def launch_field(rows, partial, targets, sources, same_set, base, h):
             device=targets.device,
         )
     else:
+        shares = lanes(targets.device)
         wp.launch(
             _finish_kernel(targets.dtype),
-            dim=rows.count,
-            inputs=[partial, targets.packed, sources.packed, rows.target, rows.begin, rows.end, *near, base],
+            dim=shares * rows.count,
+            inputs=[partial, targets.packed, sources.packed, rows.target, rows.begin, rows.end, *near, base, shares],
             outputs=[h],
             device=targets.device,
         )

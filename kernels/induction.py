@@ -18,7 +18,7 @@ from warpmag.kernels import anderson
 from warpmag.kernels.anderson import DEPTH
 from warpmag.kernels.field import finished_field
 
-CHUNK = 64
+CHUNK = 128
 """Moments whose sums one block adds up, on a GPU each of them by a thread of its own."""
 LACK, GOAL, MERIT, FOLLOWED, EARLIER, TERMS = range(6)
 """Sums ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ⟨φΔg, φΔg'⟩ and ‖φΔg'‖² of a chunk or world, and how many they are."""
@@ -127,13 +127,13 @@ class InductionBuffers:
     condition: wp.array
 
 
-def allocate(worlds, inducible, rows, dtype, device) -> InductionBuffers:
+def allocate(worlds, inducible, tiles, dtype, device) -> InductionBuffers:
     """Allocate the buffers.
 
     Args:
         worlds: World of each moment, non-decreasing, shape [n].
         inducible: Whether a moment is inducible, shape [n]; in each world these come first.
-        rows: Work list, inducible moments on inducible moments.
+        tiles: Tiles of inducible moments on inducible ones, if what judges them sums their field itself, else None.
         dtype: Warp scalar type.
         device: Warp device.
     """
@@ -145,8 +145,8 @@ def allocate(worlds, inducible, rows, dtype, device) -> InductionBuffers:
         chunk_begin.append(len(chunks))
         first = last
     parts = chunks
-    if rows.fused:
-        parts = [(tile[0], tile[1], worlds[tile[2]]) for tile in rows.tiles.numpy()]
+    if tiles is not None:
+        parts = [(tile[0], tile[1], worlds[tile[2]]) for tile in tiles.numpy()]
     part_begin = np.searchsorted([part[2] for part in parts], np.arange(world_count + 1))
     vec3 = wp.types.vector(3, dtype)
 
@@ -191,7 +191,10 @@ def block_max(mine: Any):
 
 @cache
 def applied_field(dtype):
-    """Warp function that returns the applied field [A/m] at a row's target: external and from permanent magnets."""
+    """Warp function that returns the applied field [A/m] at a row's target: external and from permanent magnets.
+
+    Thread ``share`` of ``shares`` gets its share of it, for ``neighbors.group_sum`` to add up.
+    """
     vec3 = wp.types.vector(3, dtype)
     finish = finished_field(dtype)
 
@@ -206,10 +209,14 @@ def applied_field(dtype):
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
         external_field: wp.array[vec3],
+        share: int,
+        shares: int,
     ):
-        h0 = external_field[i]
+        h0 = vec3()
+        if share == 0:
+            h0 = external_field[i]
         if end > begin:
-            h0 += finish(partial, packed, packed, row, i, begin, end, 1, neighbor, neighbor_count)
+            h0 += finish(partial, packed, packed, row, i, begin, end, 1, neighbor, neighbor_count, share, shares)
         return h0
 
     return apply_field

@@ -10,8 +10,8 @@ every arrangement, and is what the passes over the pairs walk.
 
 The search sorts moments into cubic cells as wide as the farthest pair of a list. A hash table holds for each cell the
 last moment that was put in, and each moment knows the one before it. A target meets its neighbours in its own cell and
-the 26 around it, a thread in three of them. The lists are then sorted, so that the order in which threads came does not
-show.
+the 26 around it, on a GPU by a thread for each. The lists are then sorted, so that the order in which threads came does
+not show.
 """
 
 import math
@@ -24,10 +24,11 @@ import warp as wp
 
 from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction, pair_factors
 
-CAPACITY = 32
+CAPACITY = 64
 """Neighbours a list can hold before its target falls back to walking all its sources."""
-SKIN = 0.3
-"""Part of its radius that a moment may move before the lists are made anew."""
+SKIN = 0.6
+"""Part of its radius that a moment may move before the lists are made anew. Longer lists are walked longer, but made
+less often, and spare induction evaluations (see ``theta_flow``): what moves nearby is known best where it is listed."""
 _LANES = 8
 """Threads of a GPU that share out the neighbours of a moment; a part of a warp."""
 _BUCKETS_PER_MOMENT = 4
@@ -106,7 +107,8 @@ def _fill_kernel(dtype):
 
 
 @cache
-def _search_kernel(dtype):
+def _search_kernel(dtype, cells: int):
+    """Kernel whose threads search ``cells`` of the 27 cells around a target."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -138,8 +140,8 @@ def _search_kernel(dtype):
             return
         x = vec3(targets[0, i], targets[1, i], targets[2, i])
         radius = targets[3, i]
-        for z in range(-1, 2):
-            sought = own + wp.vec4i(k // 3 - 1, k % 3 - 1, z, 0)
+        for c in range(k * wp.static(cells), (k + 1) * wp.static(cells)):
+            sought = own + wp.vec4i(c // 9 - 1, c // 3 % 3 - 1, c % 3 - 1, 0)
             j = last[bucket_of(sought, last.shape[0])]
             while j >= 0:
                 # a bucket may hold several cells
@@ -155,9 +157,21 @@ def _search_kernel(dtype):
     return search_cells
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+""")
+def wait_for_warp():
+    """Wait until the other threads of a warp are here, too."""
+    ...
+
+
 @cache
-def _sort_kernel(dtype):
+def _sort_kernel(dtype, shares: int, capacity: int):
+    """Kernel that sorts each list by ``shares`` threads, a whole warp if more than one."""
     vec3 = wp.types.vector(3, dtype)
+    entries = wp.types.vector(math.ceil(capacity / shares), int)
 
     @wp.kernel(module="unique", enable_backward=False)
     def sort_lists(
@@ -171,18 +185,23 @@ def _sort_kernel(dtype):
     ):
         if searching[0] == 0:
             return
-        i = wp.tid()
-        found_at_out[i] = vec3(targets[0, i], targets[1, i], targets[2, i])
-        for n in range(1, wp.min(neighbor_count[i], neighbor_out.shape[1])):
+        i = wp.tid() // wp.static(shares)
+        share = wp.tid() % wp.static(shares)
+        if share == 0:
+            found_at_out[i] = vec3(targets[0, i], targets[1, i], targets[2, i])
+        count = wp.min(neighbor_count[i], wp.static(capacity))
+        mine = entries()
+        place = entries()
+        for n in range(share, count, wp.static(shares)):
             j = neighbor_out[i, n]
-            place = n
-            for back in range(n):
-                other = neighbor_out[i, n - 1 - back]
-                if other < j:
-                    break
-                place = n - 1 - back
-                neighbor_out[i, place + 1] = other
-            neighbor_out[i, place] = j
+            before = int(0)
+            for other in range(count):
+                before += wp.where(neighbor_out[i, other] < j, 1, 0)
+            mine[n // wp.static(shares)] = j
+            place[n // wp.static(shares)] = before
+        wait_for_warp()
+        for n in range(share, count, wp.static(shares)):
+            neighbor_out[i, place[n // wp.static(shares)]] = mine[n // wp.static(shares)]
 
     return sort_lists
 
@@ -260,9 +279,10 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
         outputs=[source_lists.cell, source_lists.last, source_lists.before, lists.moved],
         device=device,
     )
+    cells = 1 if device.is_cuda else 27
     wp.launch(
-        _search_kernel(dtype),
-        dim=(9, targets.shape[1]),
+        _search_kernel(dtype, cells),
+        dim=(27 // cells, targets.shape[1]),
         inputs=[
             targets,
             sources,
@@ -278,13 +298,28 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
         outputs=[lists.neighbor, lists.count],
         device=device,
     )
+    shares, capacity = 32 if device.is_cuda else 1, lists.neighbor.shape[1]
     wp.launch(
-        _sort_kernel(dtype),
-        dim=targets.shape[1],
+        _sort_kernel(dtype, shares, capacity),
+        dim=shares * targets.shape[1],
         inputs=[targets, lists.searching, lists.count],
         outputs=[lists.neighbor, lists.found_at],
         device=device,
     )
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned group = (width == 32 ? ~0u : (1u << width) - 1u) << (threadIdx.x & (32 - width));
+    const unsigned wanted = __ballot_sync(group, wants);
+    return wp::vec_t<2, wp::int32>(__popc(wanted & ((1u << (threadIdx.x & 31)) - 1u)), __popc(wanted));
+#else
+    return wp::vec_t<2, wp::int32>(0, wants);
+#endif
+""")
+def places_in_group(wants: int, width: int) -> wp.vec2i:
+    """Of 2ᵏ threads of a warp, how many before this one want a place, 1 or 0 each, and how many do in all."""
+    ...
 
 
 @cache
@@ -298,25 +333,33 @@ def _overlap_kernel(dtype):
         sources: wp.array2d[dtype],
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
+        shares: int,
         # outputs:
         overlap_out: wp.array2d[int],
         overlap_count_out: wp.array[int],
     ):
-        i = wp.tid()
+        i = wp.tid() // shares
+        share = wp.tid() % shares
         count = neighbor_count[i]
         found = count
         if count <= wp.static(CAPACITY):
             found = int(0)
             x = vec3(targets[0, i], targets[1, i], targets[2, i])
             radius = targets[3, i]
-            for n in range(count):
-                j = neighbor[i, n]
-                r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
-                s = radius + sources[3, j]
-                if wp.dot(r, r) < s * s:
-                    overlap_out[i, found] = j
-                    found += 1
-        overlap_count_out[i] = found
+            for first in range(0, count, shares):
+                overlapping = int(0)
+                j = neighbor[i, wp.min(first + share, count - 1)]
+                if first + share < count:
+                    r = x - vec3(sources[0, j], sources[1, j], sources[2, j])
+                    s = radius + sources[3, j]
+                    if wp.dot(r, r) < s * s:
+                        overlapping = 1
+                places = places_in_group(overlapping, shares)
+                if overlapping == 1:
+                    overlap_out[i, found + places[0]] = j
+                found += places[1]
+        if share == 0:
+            overlap_count_out[i] = found
 
     return list_overlaps
 
@@ -331,10 +374,11 @@ def launch_list_overlaps(targets, sources, lists, overlap, overlap_count):
         overlap: Out, indices of what overlaps each, ascending, shape [t, CAPACITY].
         overlap_count: Out, how many they are, shape [t]; where a list was full, its count, beyond the capacity.
     """
+    shares = lanes(targets.device)
     wp.launch(
         _overlap_kernel(targets.dtype),
-        dim=targets.shape[1],
-        inputs=[targets, sources, lists.neighbor, lists.count],
+        dim=shares * targets.shape[1],
+        inputs=[targets, sources, lists.neighbor, lists.count, shares],
         outputs=[overlap, overlap_count],
         device=targets.device,
     )
@@ -538,17 +582,16 @@ def pair_correction(dtype, gradient: bool, exclude_body: bool):
     ):
         total = sums()
         count = neighbor_count[i]
-        j = neighbor[i, share]  # before it is known to be one, so that both are waited for at once
-        if count <= wp.static(CAPACITY):
-            for n in range(share, count, shares):
-                if n > share:
-                    j = neighbor[i, n]
-                if j >= begin and j < end:
-                    total += one_pair(targets, sources, i, j)
-        else:
-            for j in range(begin + share, end, shares):
-                if j != skip:
-                    total += one_pair(targets, sources, i, j)
+        nearest = neighbor[i, share]  # before it is known to be one, so that both are waited for at once
+        listed = count <= wp.static(CAPACITY)
+        for n in range(share, wp.where(listed, count, end - begin), shares):
+            j = nearest
+            if not listed:
+                j = begin + n
+            elif n > share:
+                j = neighbor[i, n]
+            if j >= begin and j < end and j != skip:
+                total += one_pair(targets, sources, i, j)
         return total
 
     return correct_pairs

@@ -47,7 +47,9 @@ each pair of moments once, for both of its ends."""
 
 # Measured on an H200: the most targets for which the fused form is best, and the fewest for which the mirrored is.
 _MOST_FUSED = {FIELD: 7000, FORCE: 3000, KELVIN: 3000, WRENCH: 3000}
-_LEAST_MIRRORED = {FIELD: 7000, KELVIN: 3000}
+_LEAST_MIRRORED = {FIELD: 4500, KELVIN: 3000}
+_LEAST_MUTUAL = 0.75
+"""Least part of the sources that are targets, for both ends of a pair to be worth what the mirrored form costs."""
 
 _PAIRS_PER_START = 200_000
 """Pairs that a CPU sums while another of its threads starts: 50 µs, most of it to wake a core."""
@@ -112,10 +114,15 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
         segments: Integers [k, 4]: target column begin and end, source begin and end.
         device: Warp device.
         quantity: What is to be summed.
-        forms: Ways in which the sums may be made. ``MIRRORED`` is for targets that are the sources only, and ``FUSED``
-            for kernels that call ``pair_sums_cuda`` themselves. A CPU has a ``LOOP`` only.
+        forms: Ways in which the sums may be made. ``MIRRORED`` is for targets that are most of one range of sources,
+            and brings the sums of the rest, too; ``FUSED`` for kernels that call ``pair_sums_cuda`` themselves. A CPU
+            has a ``LOOP`` only.
     """
     segments = np.asarray(segments, np.int64).reshape(-1, 4)
+    device = wp.get_device(device)
+    form = _choose_form(segments, quantity, forms) if device.is_cuda else LOOP
+    if form == MIRRORED:
+        segments = segments[:1, [2, 3, 2, 3]]
     sizes = segments[:, 1] - segments[:, 0]
     starts = np.concatenate([[0], np.cumsum(sizes)])
     count = int(starts[-1])
@@ -124,8 +131,6 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
     begin, end = np.repeat(segments[:, 2], sizes), np.repeat(segments[:, 3], sizes)
     pair_count = int(np.sum(sizes * (segments[:, 3] - segments[:, 2])))
 
-    device = wp.get_device(device)
-    form = _choose_form(segments, quantity, forms) if device.is_cuda else LOOP
     shape, mirror, tiles, shares, threads = None, None, np.zeros(0), np.zeros(0), 1
     if form == MIRRORED:
         mirror = pair_mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, device)
@@ -166,12 +171,21 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
 def _choose_form(segments, quantity, forms) -> str:
     """Form of the sums on a GPU, the fastest of those that may be."""
     count = int(np.sum(segments[:, 1] - segments[:, 0]))
-    mutual = quantity in _LEAST_MIRRORED and len(segments) == 1 and (segments[0, :2] == segments[0, 2:]).all()
-    if MIRRORED in forms and mutual and (count >= _LEAST_MIRRORED[quantity] or len(forms) == 1):
-        return MIRRORED
+    if MIRRORED in forms and quantity in _LEAST_MIRRORED and _are_mutual(segments, count):
+        if count >= _LEAST_MIRRORED[quantity] or len(forms) == 1:
+            return MIRRORED
     if FUSED in forms and (count <= _MOST_FUSED[quantity] or LOOP not in forms):
         return FUSED
     return LOOP
+
+
+def _are_mutual(segments, count: int) -> bool:
+    """Whether ``count`` targets are most of the only range of sources, so that both ends of most pairs are wanted."""
+    if count == 0 or (segments[:, 2:] != segments[0, 2:]).any():
+        return False
+    begin, end = segments[0, 2:]
+    inside = segments[:, 0].min() >= begin and segments[:, 1].max() <= end
+    return bool(inside and count >= _LEAST_MUTUAL * (end - begin))
 
 
 def _cuda_tiles(segments, starts, shape: Shape, multiprocessors: int):

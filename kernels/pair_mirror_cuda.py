@@ -42,8 +42,8 @@ class Shape:
 
 # Measured on an H200 at 5,000 to 131,072 moments: the shape, and the most moments that it is best for.
 SHAPES = {
-    FIELD: ((30000, Shape(4, 4, 4, 1)), (None, Shape(6, 4, 3, 2))),
-    KELVIN: ((None, Shape(4, 4, 4, 1)),),
+    FIELD: ((7000, Shape(2, 4, 6, 2)), (30000, Shape(3, 4, 4, 2)), (None, Shape(6, 4, 3, 2))),
+    KELVIN: ((7000, Shape(2, 4, 6, 2)), (None, Shape(4, 4, 4, 1))),
 }
 _SLAB_BYTES = 2**28
 """Memory that slabs may take."""

@@ -27,7 +27,6 @@ from typing import Any
 import warp as wp
 
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio
-from warpmag.kernels.field import finished_field
 from warpmag.kernels.induction import (
     CHUNK,
     FIELD,
@@ -147,6 +146,8 @@ def _begin_kernel(dtype):
                 neighbor,
                 neighbor_count,
                 external_field,
+                0,
+                1,
             )
             h0_out[i] = h0
             field = wp.max(field, wp.float64(wp.length(h0)))
@@ -256,21 +257,14 @@ def judge(
 @cache
 def _evaluate_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
-    finish = finished_field(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def evaluate_pairs(
         # inputs:
         chunk: wp.array[wp.vec3i],
         chunk_begin: wp.array[int],
-        partial: wp.array3d[dtype],
-        packed: wp.array2d[dtype],
         row_target: wp.array[int],
-        row_begin: wp.array[int],
-        row_end: wp.array[int],
-        neighbor: wp.array2d[int],
-        neighbor_count: wp.array[int],
-        h0: wp.array[vec3],
+        h: wp.array[vec3],
         first: wp.array[vec3],
         second: wp.array[vec3],
         saturation: wp.array[dtype],
@@ -283,7 +277,6 @@ def _evaluate_kernel(dtype):
         sums: wp.array2d[wp.float64],
         arrived: wp.array[int],
         # outputs:
-        h_out: wp.array[vec3],
         start_out: wp.array2d[wp.float64],
         error_out: wp.array[wp.float64],
         evaluations_out: wp.array[int],
@@ -298,11 +291,7 @@ def _evaluate_kernel(dtype):
         mine = _columns()
         for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
             i = row_target[row]
-            h = h0[i] + finish(
-                partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count
-            )
-            h_out[i] = h
-            g = (slope[i] / saturation[i]) * h
+            g = (slope[i] / saturation[i]) * h[i]
             goal = (saturation[i] * curve_ratio(wp.length(g), curve[i])) * g
             # lengths, not squares: a field of 1e-20 A/m squared is no float32
             goal_length = wp.float64(wp.length(goal))
@@ -429,7 +418,6 @@ def launch_begin(applied, partial, moments, external_field, material, b: Inducti
 def launch_step_pairs(
     moments,
     rows,
-    partial,
     material,
     b: InductionBuffers,
     first,
@@ -442,12 +430,11 @@ def launch_step_pairs(
     rtol: float,
     max_evaluations: int,
 ):
-    """Judge the field just summed into ``partial`` and step the pairs of every world that has not ended.
+    """Judge the field at the inducible moments and step the pairs of every world that has not ended.
 
     Args:
         moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``).
-        rows: Work list whose targets are the inducible moments.
-        partial: Sums of the native field loop over ``rows``.
+        rows: Work list whose targets are the inducible moments, whose field stands in ``b.h``.
         material: What they are made of (``kernels.wrench.Material``).
         b: Fields and world state; ``b.condition`` tells whether another evaluation is wanted.
         first: Directions of M1, shape [n].
@@ -467,14 +454,8 @@ def launch_step_pairs(
         inputs=[
             b.chunk,
             b.chunk_begin,
-            partial,
-            moments.packed,
             rows.target,
-            rows.begin,
-            rows.end,
-            moments.overlaps,
-            moments.overlap_counts,
-            b.h0,
+            b.h,
             first,
             second,
             material.saturation,
@@ -486,7 +467,7 @@ def launch_step_pairs(
             b.sums,
             b.arrived,
         ],
-        outputs=[b.h, b.start, b.error, b.evaluations, b.converged, b.warm, b.condition],
+        outputs=[b.start, b.error, b.evaluations, b.converged, b.warm, b.condition],
         block_dim=CHUNK,
         device=device,
     )

@@ -12,9 +12,9 @@ ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω �
 for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``neighbors``).
 
 What a step changes is felt most by neighbours. Their part of it is known without another field evaluation: with the
-coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s) follow,
-ḡ = s̄ + r̄. From cold they spare a pile of touching balls 1 or 2 of 8 to 10 evaluations to 1e-3, and more where balls
-overlap.
+coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
+follow, ḡ = s̄ + r̄, ω' a little above ω. From cold they spare a pile of touching balls 1 or 2 of 8 to 10 evaluations to
+1e-3, and more where balls overlap.
 
 An accelerated step or a swept one that leaves the merit ‖φ r‖ more than twice the best is taken back, and a few plain
 steps follow from the best iterate.
@@ -22,12 +22,12 @@ steps follow from the best iterate.
 The residual that ends a solve is good for one more step: that polished s, further by β Δg, is where the next solve
 starts, Δg the last change of g from solve to solve. Sweeps over neighbours go before its first evaluation: what these
 are to each other is known exactly where they stand now, and of the field of all others, F = H − H0 − G' M, it is
-F₁ + β (F₁ − F₂) that they use, F of the last solve and of the one before for the present neighbours. β is what would
-have predicted the last change from the one before it, β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth
-motion is followed, noise is not. The changes Δs_j, Δr_j outlive a solve, since what they tell of the coupling hardly
-changes: a slow mode, as of long columns of balls, costs one evaluation instead of three. On the same motion all that
-leaves 1.7 evaluations a solve of 2.4 where Balls Up jumps, 1.6 of 1.8 in Falling Magnet. A start is only a start, and
-whatever it is worth the solve converges to the one solution.
+F₁ + β (F₁ − F₂) that they use, F of the last solve and of the one before for the present neighbours. Both are those of
+s̄ and ḡ, which are nearer to the solution than what was judged. β is what would have predicted the last change from the
+one before it, β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth motion is followed, noise is not. The
+changes Δs_j, Δr_j outlive a solve, since what they tell of the coupling hardly changes: a slow mode, as of long columns
+of balls, costs one evaluation instead of three. All that leaves 1.5 evaluations a solve where 2,500 balls jump (Balls
+Up). A start is only a start, and whatever it is worth the solve converges to the one solution.
 """
 
 from functools import cache
@@ -37,7 +37,7 @@ import warp as wp
 
 from warpmag.kernels.anderson import DEPTH, anderson_solver, matrix_column, slot_of
 from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio, theta_flow
-from warpmag.kernels.field import INVERSE_4PI, finished_field, summed_field
+from warpmag.kernels.field import INVERSE_4PI, summed_field
 from warpmag.kernels.induction import (
     CHUNK,
     COLUMNS,
@@ -72,12 +72,16 @@ MOST_FUSED = 1500
 """Moments up to which the kernel that judges them had better sum their field itself, on an H200."""
 STEADY = 3
 """Solves in a row that make two changes to extrapolate from."""
+_BEGINNERS = 4
+"""Blocks that share the moments of a chunk at the start of a solve, where a moment takes many threads."""
+_SWEEP_STEP = 1.4
+"""Step length of a sweep over that of a step: long chains of balls near their solution want more than is safe alone."""
 
 
 @cache
 def _begin_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
-    sum_group = group_sum(wp.types.vector(4, dtype))
+    sum_group = group_sum(wp.types.vector(7, dtype))
     apply_field = applied_field(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -118,20 +122,23 @@ def _begin_kernel(dtype):
         worlds_out: wp.array[World],
         condition_out: wp.array[int],
     ):
-        c, lane = wp.tid()
+        block, lane = wp.tid()
+        c = block // wp.static(_BEGINNERS)
+        at_once = (wp.block_dim() + shares - 1) // shares
         share = lane % shares
         w = chunk[c][2]
         steady = warm[w] == wp.static(STEADY)
         ahead = dtype(worlds_out[w].ahead)
         field = wp.float64(0.0)
         stiffest = wp.float64(0.0)
-        for row in range(chunk[c][0] + lane // shares, chunk[c][1], (wp.block_dim() + shares - 1) // shares):
+        begin = chunk[c][0] + at_once * (block % wp.static(_BEGINNERS)) + lane // shares
+        for row in range(begin, chunk[c][1], at_once * wp.static(_BEGINNERS)):
             i = row_target[row]
             first = induced_begin[row]
             last = induced_end[row]
             k = slope[i]
             limit = saturation[i]
-            h0 = apply_field(
+            applied = apply_field(
                 partial,
                 packed,
                 row,
@@ -141,6 +148,8 @@ def _begin_kernel(dtype):
                 overlap,
                 overlap_count,
                 external_field,
+                share,
+                shares,
             )
             near = vec3()
             if steady:
@@ -148,8 +157,10 @@ def _begin_kernel(dtype):
                     packed, past_positions, past_moments, ahead, i, first, last, neighbor, neighbor_count, share, shares
                 )
             volume = shared_volume(packed, i, first, last, overlap, overlap_count, share, shares)
-            about = sum_group(wp.vector(near[0], near[1], near[2], volume, length=4), shares)
-            stiffness = wp.float64(k * (about[3] + dtype(2.0 / 3.0)))
+            mine = wp.vector(applied[0], applied[1], applied[2], near[0], near[1], near[2], volume, length=7)
+            about = sum_group(mine, shares)
+            h0 = vec3(about[0], about[1], about[2])
+            stiffness = wp.float64(k * (about[6] + dtype(2.0 / 3.0)))
             field = wp.max(field, wp.float64(wp.length(h0)))
             stiffest = wp.max(stiffest, stiffness)
             if share == 0:
@@ -165,7 +176,7 @@ def _begin_kernel(dtype):
                 s_inout[i] = s
                 store_magnetization(i, (limit * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
                 if steady:
-                    near = dtype(wp.static(INVERSE_4PI)) * vec3(about[0], about[1], about[2])
+                    near = dtype(wp.static(INVERSE_4PI)) * vec3(about[3], about[4], about[5])
                     far = past_field[0, i] + ahead * (past_field[0, i] - past_field[1, i]) - near
                     mixed_g_out[i] = (k / limit) * (h0 + far)
                     mixed_moment_out[i] = vec3()
@@ -359,7 +370,6 @@ def _judgement_kernel(dtype, shape: Shape | None):
     vec3 = wp.types.vector(3, dtype)
     fused = shape is not None
     field_of_tile = summed_field(dtype, shape) if fused else None
-    finish = finished_field(dtype)
     measure = _measured(dtype)
     sum_group = group_sum(_columns)
     group = 1 << (shape.targets - 1).bit_length() if fused else 0
@@ -371,11 +381,8 @@ def _judgement_kernel(dtype, shape: Shape | None):
         part: wp.array[wp.vec3i],
         part_begin: wp.array[int],
         tiles: wp.array2d[int],
-        partial: wp.array3d[dtype],
         packed: wp.array2d[dtype],
         row_target: wp.array[int],
-        row_begin: wp.array[int],
-        row_end: wp.array[int],
         neighbor: wp.array2d[int],
         neighbor_count: wp.array[int],
         h0: wp.array[vec3],
@@ -386,6 +393,7 @@ def _judgement_kernel(dtype, shape: Shape | None):
         rtol: wp.float64,
         max_evaluations: int,
         # in and out:
+        h_inout: wp.array[vec3],
         worlds: wp.array[World],
         start: wp.array2d[wp.float64],
         warm: wp.array[int],
@@ -397,7 +405,6 @@ def _judgement_kernel(dtype, shape: Shape | None):
         history_s: wp.array2d[vec3],
         history_r: wp.array2d[vec3],
         # outputs:
-        h_out: wp.array[vec3],
         error_out: wp.array[wp.float64],
         evaluations_out: wp.array[int],
         converged_out: wp.array[int],
@@ -425,7 +432,7 @@ def _judgement_kernel(dtype, shape: Shape | None):
             law = curve[k]
             h = base + field_of_tile(p, lane, tiles, packed, packed, 1, neighbor, neighbor_count)
             if i >= 0:
-                h_out[i] = h
+                h_inout[i] = h
                 mine = measure(
                     i,
                     h,
@@ -445,13 +452,9 @@ def _judgement_kernel(dtype, shape: Shape | None):
         else:
             for row in range(part[p][0] + lane, part[p][1], wp.block_dim()):
                 i = row_target[row]
-                h = h0[i] + finish(
-                    partial, packed, packed, row, i, row_begin[row], row_end[row], 1, neighbor, neighbor_count
-                )
-                h_out[i] = h
                 mine += measure(
                     i,
-                    h,
+                    h_inout[i],
                     s_in[i],
                     saturation[i],
                     slope[i],
@@ -507,8 +510,8 @@ def _advance_kernel(dtype):
         history_s: wp.array2d[vec3],
         history_r: wp.array2d[vec3],
         saturation: wp.array[dtype],
+        slope: wp.array[dtype],
         curve: wp.array[int],
-        h: wp.array[vec3],
         h0: wp.array[vec3],
         # in and out:
         best_s: wp.array[vec3],
@@ -547,15 +550,17 @@ def _advance_kernel(dtype):
                     alpha = dtype(worlds[w].alpha[a])
                     s -= alpha * history_s[old, i]
                     r -= alpha * history_r[old, i]
+        limit = saturation[i]
+        law = curve[i]
         mixed = s
         s = theta_flow(mixed, mixed + r, dtype(worlds[w].omega))
         s_out[i] = s
         # what has ended keeps the moments that its error was measured at, and s is the next solve's start
         if worlds[w].active == 1:
-            magnetization = (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s
+            magnetization = (limit * curve_ratio(wp.length(s), law)) * s
             store_magnetization(i, magnetization, moments_out, packed_out)
             if mode == wp.static(SWEEP):
-                before = (saturation[i] * curve_ratio(wp.length(mixed), curve[i])) * mixed
+                before = (limit * curve_ratio(wp.length(mixed), law)) * mixed
                 mixed_g_out[i] = mixed + r
                 mixed_moment_out[i] = ball_volume(packed_out[3, i]) * before
                 change_out[i] = ball_volume(packed_out[3, i]) * (magnetization - before)
@@ -565,9 +570,11 @@ def _advance_kernel(dtype):
             past_field[1, i] = past_field[0, i]
             past_g[1, i] = past_g[0, i]
             past_positions[0, i] = vec3(packed_out[0, i], packed_out[1, i], packed_out[2, i])
-            past_moments[0, i] = moments_out[i]
-            past_field[0, i] = h[i] - h0[i]
-            past_g[0, i] = iterate_s[i] + iterate_r[i]
+            # the mixed iterate is nearer to the solution than the one that was judged
+            g = mixed + r
+            past_moments[0, i] = (ball_volume(packed_out[3, i]) * limit * curve_ratio(wp.length(mixed), law)) * mixed
+            past_field[0, i] = (limit / slope[i]) * g - h0[i]
+            past_g[0, i] = g
 
     return advance
 
@@ -613,7 +620,7 @@ def _sweep_kernel(dtype):
         h = sum_group(h, shares)
         if share == 0:
             g = mixed_g[i] + (dtype(wp.static(INVERSE_4PI)) * slope[i] / saturation[i]) * h
-            s = theta_flow(s_out[i], g, dtype(worlds[w].omega))
+            s = theta_flow(s_out[i], g, wp.min(dtype(1.0), dtype(wp.static(_SWEEP_STEP)) * dtype(worlds[w].omega)))
             s_out[i] = s
             store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
             change_out[i] = moments_out[i] - mixed_moment[i]
@@ -650,7 +657,7 @@ def launch_begin(applied, partial, induced, moments, external_field, material, b
     shares = lanes(moments.device)
     wp.launch_tiled(
         _begin_kernel(moments.dtype),
-        dim=[b.chunk.shape[0]],
+        dim=[_BEGINNERS * b.chunk.shape[0]],
         inputs=[
             b.chunk,
             partial,
@@ -687,7 +694,7 @@ def launch_begin(applied, partial, induced, moments, external_field, material, b
             b.worlds,
             b.condition,
         ],
-        block_dim=shares * CHUNK,
+        block_dim=shares * CHUNK // _BEGINNERS,
         device=moments.device,
     )
 
@@ -720,12 +727,16 @@ def launch_sweeps(rows, moments, material, b: InductionBuffers, moments_out):
         )
 
 
-def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol, max_evaluations, moments_out):
-    """Judge the field, summed into ``partial`` or here, and move every world that has not ended; see the module.
+def sums_field(rows) -> bool:
+    """Whether :func:`launch_iteration` sums the field over ``rows`` itself."""
+    return rows.fused and rows.count <= MOST_FUSED
+
+
+def launch_iteration(rows, moments, material, b: InductionBuffers, rtol, max_evaluations, moments_out):
+    """Judge the field at the inducible moments, and move every world that has not ended; see the module.
 
     Args:
-        rows: Work list whose targets are the inducible moments.
-        partial: Sums of the pair loop over ``rows``; nothing if they are fused.
+        rows: Work list whose targets are the inducible moments, and whose field stands in ``b.h``, or is summed here.
         moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``).
         material: What they are made of (``kernels.wrench.Material``).
         b: The buffers; ``b.condition`` tells whether another evaluation is wanted.
@@ -734,18 +745,16 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
     device, dtype = moments.device, moments.dtype
+    shape = rows.shape if sums_field(rows) else None
     wp.launch_tiled(
-        _judgement_kernel(dtype, rows.shape if rows.fused else None),
+        _judgement_kernel(dtype, shape),
         dim=[b.part.shape[0]],
         inputs=[
             b.part,
             b.part_begin,
             rows.tiles,
-            partial,
             moments.packed,
             rows.target,
-            rows.begin,
-            rows.end,
             moments.overlaps,
             moments.overlap_counts,
             b.h0,
@@ -755,6 +764,7 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             material.curve,
             wp.float64(rtol),
             max_evaluations,
+            b.h,
             b.worlds,
             b.start,
             b.warm,
@@ -766,8 +776,8 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             b.history_s,
             b.history_r,
         ],
-        outputs=[b.h, b.error, b.evaluations, b.converged, b.condition],
-        block_dim=rows.shape.threads if rows.fused else CHUNK,
+        outputs=[b.error, b.evaluations, b.converged, b.condition],
+        block_dim=shape.threads if shape else CHUNK,
         device=device,
     )
     wp.launch(
@@ -782,8 +792,8 @@ def launch_iteration(rows, partial, moments, material, b: InductionBuffers, rtol
             b.history_s,
             b.history_r,
             material.saturation,
+            material.slope,
             material.curve,
-            b.h,
             b.h0,
             b.best_s,
             b.best_r,

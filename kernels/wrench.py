@@ -20,7 +20,7 @@ import warp as wp
 
 from warpmag.kernels.curves import curve_derivative_times
 from warpmag.kernels.field import INVERSE_4PI
-from warpmag.kernels.neighbors import pair_correction
+from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
 from warpmag.kernels.packing import ball_volume
 from warpmag.kernels.pair_code import WIDTHS, WRENCH
 from warpmag.kernels.pair_law import gradient_times
@@ -153,6 +153,7 @@ def _wrench_functions(dtype, quantity: str):
 def _finish_kernel(dtype, quantity: str):
     vec3 = wp.types.vector(3, dtype)
     correct, store = _wrench_functions(dtype, quantity)
+    sum_group = group_sum(wp.types.vector(WIDTHS[quantity], dtype))
 
     @wp.kernel(module="unique", enable_backward=False)
     def finish_wrench(
@@ -167,17 +168,21 @@ def _finish_kernel(dtype, quantity: str):
         neighbor_count: wp.array[int],
         external_field: wp.array[vec3],
         twisted: wp.array[int],
+        shares: int,
         # outputs:
         force_out: wp.array[vec3],
         torque_out: wp.array[vec3],
     ):
-        row = wp.tid()
+        row = wp.tid() // shares
+        share = wp.tid() % shares
         i = row_target[row]
-        total = correct(packed, effective, i, row_begin[row], row_end[row], neighbor, neighbor_count, 0, 1)
-        for split in range(partial.shape[0]):
+        mine = correct(packed, effective, i, row_begin[row], row_end[row], neighbor, neighbor_count, share, shares)
+        for split in range(share, partial.shape[0], shares):
             for c in range(wp.static(WIDTHS[quantity])):
-                total[c] += partial[split, row, c]
-        store(i, total, effective, external_field, twisted, force_out, torque_out)
+                mine[c] += partial[split, row, c]
+        total = sum_group(mine, shares)
+        if share == 0:
+            store(i, total, effective, external_field, twisted, force_out, torque_out)
 
     return finish_wrench
 
@@ -249,10 +254,11 @@ def launch_wrench(rows, partial, moments, effective, external_field, twisted, fo
         )
     else:
         ends = [rows.target, rows.begin, rows.end]
+        shares = lanes(moments.device)
         wp.launch(
             _finish_kernel(moments.dtype, rows.quantity),
-            dim=rows.count,
-            inputs=[partial, moments.packed, effective, *ends, *near, external_field, twisted],
+            dim=shares * rows.count,
+            inputs=[partial, moments.packed, effective, *ends, *near, external_field, twisted, shares],
             outputs=[forces, torques],
             device=moments.device,
         )

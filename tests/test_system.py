@@ -7,6 +7,8 @@ from arrangements import pile, relative
 
 import warpmag
 from warpmag import oracle
+from warpmag.kernels import pair_loops
+from warpmag.kernels.pair_code import FIELD, KELVIN
 from warpmag.system import MomentSystem
 
 MS = 1.7e6
@@ -105,6 +107,29 @@ def test_a_body_is_turned_as_by_all_pairs_of_moments(force, strength, tolerance,
     turned = np.sum(torques + np.cross(letter, forces), axis=0)
     assert relative(turned, np.cross(letter, expected).sum(axis=0)) < tolerance
     assert relative(forces.sum(axis=0), expected.sum(axis=0)) < tolerance
+
+
+def test_forces_on_balls_and_on_magnets(device, monkeypatch):
+    """Balls, a fixed magnet and a free one, which is turned, too; on a GPU by both ends of each pair."""
+    monkeypatch.setattr(pair_loops, "_LEAST_MIRRORED", dict.fromkeys((FIELD, KELVIN), 1))
+    x, radii, m = pile(count=700)
+    balls, fixed, free = np.arange(700) < 600, slice(600, 660), slice(660, 700)
+    bodies, movable = np.where(balls, np.arange(700), 600), np.ones(700, bool)
+    bodies[free], movable[fixed] = 601, False
+    system = MomentSystem(
+        radii=radii, permanent=~balls, bodies=bodies, movable=movable, saturation=MS, rtol=1e-5, device=device
+    )
+    system.positions.assign(x)
+    system.moments.assign(np.where(balls[:, None], 0.0, m))
+    system.solve()
+    system.apply_forces()
+    m = system.moments.numpy().astype(float)
+    force = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii, bodies=bodies))
+    torque = oracle.torque(m, oracle.h_field(x, m, radii=radii, bodies=bodies))
+    assert system.converged.numpy().all()
+    assert relative(system.forces.numpy()[movable], force[movable]) < 2e-6  # rounding
+    assert relative(system.torques.numpy()[free], torque[free]) < 2e-6
+    assert not system.torques.numpy()[balls].any()
 
 
 def test_only_movable_moments_get_forces(device):

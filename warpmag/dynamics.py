@@ -3,7 +3,7 @@
 This is the one place where a dynamics is chosen. Each is an object with the same four methods, all of which only launch
 kernels: ``start`` begins a solve in the field of the permanent moments just summed, ``refine`` improves the moments by
 what their neighbours tell, before the field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the
-magnetizations that the next solve starts from.
+magnetizations that the next solve starts from. ``sums_field`` tells whether ``iterate`` sums the field itself.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,6 @@ class Inducibles:
 
     Attributes:
         rows: Work list, inducible moments on inducible moments.
-        partial: Sums of the field loop over ``rows``.
         packed: All moments, packed.
         material: What they are made of.
         moments: Moments [A·m²], shape [n]; the inducible ones are written.
@@ -42,7 +41,6 @@ class Inducibles:
     """
 
     rows: Rows
-    partial: wp.array
     packed: PackedMoments
     material: Material
     moments: wp.array
@@ -57,6 +55,7 @@ class ThetaFlow:
     def __init__(self, target: Inducibles):
         """Move ``target``."""
         self._target = target
+        self.sums_field = theta_flow.sums_field(target.rows)
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
@@ -76,9 +75,7 @@ class ThetaFlow:
     def iterate(self):
         """Judge the field just summed and move."""
         t = self._target
-        theta_flow.launch_iteration(
-            t.rows, t.partial, t.packed, t.material, t.state, t.rtol, t.max_evaluations, t.moments
-        )
+        theta_flow.launch_iteration(t.rows, t.packed, t.material, t.state, t.rtol, t.max_evaluations, t.moments)
 
 
 class SubmagnetizationPairs:
@@ -88,6 +85,8 @@ class SubmagnetizationPairs:
         first: Directions M1/Ms, shape [n].
         second: Directions M2/Ms, shape [n].
     """
+
+    sums_field = False
 
     def __init__(self, target: Inducibles, law: str, step: float, damping: float):
         """Move ``target`` by the law ``theta-euler``, ``llg`` or ``llg-damping``."""
@@ -129,7 +128,7 @@ class SubmagnetizationPairs:
         """Judge the field just summed and step the pairs."""
         t = self._target
         submagnetization.launch_step_pairs(
-            t.packed, t.rows, t.partial, t.material, t.state, self.first, self.second, t.moments, **self._settings
+            t.packed, t.rows, t.material, t.state, self.first, self.second, t.moments, **self._settings
         )
 
 

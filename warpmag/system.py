@@ -31,7 +31,7 @@ class MomentSystem:
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
         dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
         h: Field at inducible moments [A/m], external and all other moments', shape [n].
-        forces: Forces [N], shape [n], by :meth:`apply_forces`.
+        forces: Forces [N] on those that may move, shape [n], by :meth:`apply_forces`.
         torques: Torques e × H about each moment's position [N·m], e being m with Kelvin's law (see ``kernels.wrench``),
             shape [n]; zero for an inducible ball of one moment.
         error: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world, the computable form of Eq. 12, shape [worlds].
@@ -126,13 +126,11 @@ class MomentSystem:
         _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
         twisted = permanent | (size[body] > 1) | lone_torque
         self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
-        # only the flow sums the field that it needs itself, and only if nothing is to be added to it
-        few = np.count_nonzero(~permanent) <= theta_flow.MOST_FUSED
-        fusible = few and dynamics == "theta" and contact_model == "dipole"
-        forms = pair_loops.FORMS if fusible else (pair_loops.LOOP, pair_loops.MIRRORED)
-        self._make_rows(worlds, permanent, movable, (twisted & movable).any(), forms, near=contact_model == "multipole")
+        self._make_rows(worlds, permanent, movable, twisted, near=contact_model == "multipole")
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
-        self._induction = induction.allocate(worlds, ~permanent, self._induced, self.dtype, self.device)
+        fused = dynamics == "theta" and theta_flow.sums_field(self._induced)
+        tiles = self._induced.tiles if fused else None
+        self._induction = induction.allocate(worlds, ~permanent, tiles, self.dtype, self.device)
         self._near = None
         if contact_model == "multipole":
             lone = ~permanent & (size[body] == 1) & (radii > 0.0)
@@ -149,7 +147,6 @@ class MomentSystem:
         self.converged = self._induction.converged
         target = Inducibles(
             self._induced,
-            self._induced_partial,
             self._packed,
             self._material,
             self.moments,
@@ -173,21 +170,29 @@ class MomentSystem:
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
 
-    def _make_rows(self, worlds, permanent, movable, any_twisted, forms, near):
+    def _make_rows(self, worlds, permanent, movable, twisted, near):
         """Work lists: inducible on inducible, permanent on inducible, everything on whatever moves."""
-        induced, applied, felt = [], [], []
+        induced, applied, pushed, turned = [], [], [], []
         for w in range(int(worlds[-1]) + 1 if len(worlds) else 0):
             first, last = np.searchsorted(worlds, [w, w + 1])
             middle = first + int(np.count_nonzero(~permanent[first:last]))
             induced.append((first, middle, first, middle))
             applied.append((first, middle, middle, last))
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], movable[first:last].astype(int), [0]])))
-            felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
+            for felt, which in ((pushed, movable & ~twisted), (turned, movable & twisted)):
+                edges = np.flatnonzero(np.diff(np.concatenate([[0], which[first:last].astype(int), [0]])))
+                felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
+        # near contacts add to partial sums
+        forms = (pair_loops.LOOP, pair_loops.MIRRORED) if near else pair_loops.FORMS
         self._induced = pair_loops.make_rows(induced, self.device, forms=forms)
         self._applied = pair_loops.make_rows(applied, self.device, forms=(pair_loops.LOOP,))
+        # those that are turned, too, come last: the loop over the others may bring what pushes them
         self._felt = {
-            law: pair_loops.make_rows(felt, self.device, WRENCH if any_twisted else quantity)
-            for law, quantity in ((FORCE_IDS["kelvin"], KELVIN), (ZEEMAN, FORCE))
+            law: [
+                pair_loops.make_rows(segments, self.device, quantity)
+                for segments, quantity in ((pushed, push), (turned, WRENCH))
+                if segments
+            ]
+            for law, push in ((FORCE_IDS["kelvin"], KELVIN), (ZEEMAN, FORCE))
         }
 
         def partial(rows, more=0):
@@ -196,7 +201,7 @@ class MomentSystem:
 
         self._induced_partial = partial(self._induced, int(near))  # and one of the near contacts
         self._applied_partial = partial(self._applied)
-        self._felt_partial = {law: partial(rows) for law, rows in self._felt.items()}
+        self._felt_partial = {law: [partial(rows) for rows in passes] for law, passes in self._felt.items()}
 
     @property
     def radii(self):
@@ -244,27 +249,27 @@ class MomentSystem:
     def iterate(self):
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
         self.dynamics.refine()
-        self._sum_induced()
+        if not self.dynamics.sums_field:
+            self._sum_field()
         self.dynamics.iterate()
         if self._near is not None:
             near_contact.wait(self._near)
 
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""
-        packed = self._packed
-        self._sum_induced()
-        launch_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
+        self._sum_field()
         if self._near is not None:
             near_contact.wait(self._near)
 
-    def _sum_induced(self):
-        """Launch the field loop among the inducible moments."""
+    def _sum_field(self):
+        """Launch the sums of the field at the inducible moments."""
         packed = self._packed
         if self._near is not None:
             near_contact.launch_sweeps(self._near)
         pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
         if self._near is not None:
             near_contact.wait_for_field(self._near)
+        launch_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
@@ -284,18 +289,18 @@ class MomentSystem:
             launch_zeeman_moments(packed, self.h, self._material, effective)
         if self._near is not None:
             near_contact.launch_sweeps(self._near)
-        rows, partial = self._felt[law], self._felt_partial[law]
-        pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
-        launch_wrench(
-            rows,
-            partial,
-            packed,
-            effective,
-            self.external_field,
-            self._twisted,
-            self.forces,
-            self.torques,
-        )
+        for rows, partial in zip(self._felt[law], self._felt_partial[law], strict=True):
+            pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
+            launch_wrench(
+                rows,
+                partial,
+                packed,
+                effective,
+                self.external_field,
+                self._twisted,
+                self.forces,
+                self.torques,
+            )
         if self._near is not None:
             near_contact.wait(self._near)
             near_contact.launch_add_forces(self._near)
