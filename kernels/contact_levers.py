@@ -88,7 +88,7 @@ def launch_correct_levers(contacts, impulses, bodies, dt):
     Args:
         contacts: Newton's contacts.
         impulses: What each did to its first body, force and torque [N·s, N·m·s], shape [rigid_contact_max].
-        bodies: What contacts act on, as :class:`warpmag.engine.xpbd.ContactBodies`, with mean velocities.
+        bodies: What contacts act on, as :class:`warpmag.kernels.contact_sides.ContactBodies`, with mean velocities.
         dt: Substep [s].
     """
     wp.launch(

@@ -17,6 +17,33 @@ wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True)
+class ContactBodies:
+    """What contacts act on: b bodies, or copies of them.
+
+    Attributes:
+        q, qd, com, inv_mass, inv_inertia, flags: As those of Newton's model and state, shape [b].
+        first, second: Shapes of each contact, shape [rigid_contact_max].
+        shape_body: Body of each shape, shape [shapes].
+        mu, mu_torsional, mu_rolling: Friction of each shape, shape [shapes].
+        deltas: Impulses and impulses of torque that contacts add up [N·s, N·m·s], shape [b].
+    """
+
+    q: wp.array
+    qd: wp.array
+    com: wp.array
+    inv_mass: wp.array
+    inv_inertia: wp.array
+    flags: wp.array
+    first: wp.array
+    second: wp.array
+    shape_body: wp.array
+    mu: wp.array
+    mu_torsional: wp.array
+    mu_rolling: wp.array
+    deltas: wp.array
+
+
+@dataclass(frozen=True)
 class ContactSides:
     """Buffers for c contacts and b bodies.
 

@@ -12,7 +12,6 @@ each contact (``kernels.contact_sides``).
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import newton
 import numpy as np
@@ -21,34 +20,8 @@ from newton._src.solvers.xpbd.kernels import solve_body_contact_positions
 
 from warpmag.kernels import contact_sides
 from warpmag.kernels.contact_levers import launch_correct_levers, launch_take_mean
+from warpmag.kernels.contact_sides import ContactBodies
 from warpmag.kernels.mass_splitting import launch_split_masses
-
-
-@dataclass(frozen=True)
-class ContactBodies:
-    """What contacts act on: b bodies, or copies of them.
-
-    Attributes:
-        q, qd, com, inv_mass, inv_inertia, flags: As those of Newton's model and state, shape [b].
-        first, second: Shapes of each contact, shape [rigid_contact_max].
-        shape_body: Body of each shape, shape [shapes].
-        mu, mu_torsional, mu_rolling: Friction of each shape, shape [shapes].
-        deltas: Impulses and impulses of torque that contacts add up [N·s, N·m·s], shape [b].
-    """
-
-    q: wp.array
-    qd: wp.array
-    com: wp.array
-    inv_mass: wp.array
-    inv_inertia: wp.array
-    flags: wp.array
-    first: wp.array
-    second: wp.array
-    shape_body: wp.array
-    mu: wp.array
-    mu_torsional: wp.array
-    mu_rolling: wp.array
-    deltas: wp.array
 
 
 class PileXPBD(newton.solvers.SolverXPBD):
