@@ -134,11 +134,13 @@ def _predict_poses(
     body_q_in: wp.array[wp.transform],
     body_qd_in: wp.array[wp.spatial_vector],
     body_com_in: wp.array[wp.vec3],
-    seconds: float,
+    substeps_in: wp.array[wp.int32],
+    dt: float,
     # outputs:
     body_q_out: wp.array[wp.transform],
 ):
     body = wp.tid()
+    seconds = 0.5 * float(substeps_in[0] - 1) * dt
     center = wp.transform_point(body_q_in[body], body_com_in[body]) + seconds * wp.spatial_top(body_qd_in[body])
     rotation = wp.transform_get_rotation(body_q_in[body])
     turn = 0.5 * seconds * wp.spatial_bottom(body_qd_in[body])
@@ -146,12 +148,12 @@ def _predict_poses(
     body_q_out[body] = wp.transform(center - wp.quat_rotate(rotation, body_com_in[body]), rotation)
 
 
-def predict_poses(state, body_com, seconds, body_q):
-    """Write where the bodies of ``state`` are after some ``seconds`` at their present velocities."""
+def predict_poses(state, body_com, substeps, dt, body_q):
+    """Write poses half-way between those that the next ``substeps`` [1] of ``dt`` each start from, by velocities."""
     wp.launch(
         _predict_poses,
         dim=state.body_q.shape[0],
-        inputs=[state.body_q, state.body_qd, body_com, seconds],
+        inputs=[state.body_q, state.body_qd, body_com, substeps, dt],
         outputs=[body_q],
         device=body_q.device,
     )

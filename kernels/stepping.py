@@ -5,10 +5,11 @@ monitor (``kernels.monitor``) saw of it decides: it is accepted and reported, or
 tried at the next level, or stepping halts, because a buffer was too small or a body left all finite numbers. While
 halted, steps do nothing, so that the host may look whenever it likes and go on from exactly there.
 
-Substeps come in pairs. Where they are shorter than those of the first level, two share their magnetic forces, which
+Substeps come in pairs. Where they are shorter than those of the first level, several share their magnetic forces, which
 then act no longer than they do at that level: what makes substeps short is contacts of bodies that are fast or pressed.
-The forces are those half-way between the poses that the two start from, as far as velocities tell, so that they neither
-lag nor lead; the limit of travel, which counts what forces do in a substep, keeps these poses close to each other.
+The forces are those half-way between the poses that the first and the last of these substeps start from, as far as
+velocities tell, so that they neither lag nor lead. Two substeps always share them; more, up to as many as make one of
+the first level, while the motion seen in the last attempt keeps their poses close to each other.
 
 ``flags`` [int32]: conditions of the loops around a step, see the ``FLAG_*`` indices.
 ``status`` [int32]: where stepping stands, see the ``STATUS_*`` indices.
@@ -44,8 +45,9 @@ LEVELS = wp.constant(5)
 
 FLAG_ATTEMPT = wp.constant(0)  # the step is to be tried (again)
 FLAG_REJECTED = wp.constant(1)  # the last attempt did not hold
-FLAG_LEVEL = wp.constant(2)  # first of LEVELS: substeps of this level remain to be done
-FLAGS = 7
+FLAG_FORCES = wp.constant(2)  # the next substeps need forces of their own
+FLAG_LEVEL = wp.constant(3)  # first of LEVELS: substeps of this level remain to be done
+FLAGS = 8
 
 STATUS_HALT = wp.constant(0)  # why steps do nothing: one of the reasons below
 STATUS_DONE = wp.constant(1)  # steps done
@@ -53,7 +55,8 @@ STATUS_LEVEL = wp.constant(2)  # level of the substeps
 STATUS_ATTEMPTS = wp.constant(3)  # attempts at the step under way
 STATUS_REMAINING = wp.constant(4)  # pairs of substeps that this attempt still has to do
 STATUS_REGROWN = wp.constant(5)  # buffers grew since the last step; set by the host
-STATUSES = 6
+STATUS_SHARING = wp.constant(6)  # substeps that share their forces, a power of two; beyond the first level
+STATUSES = 7
 
 RUNNING = wp.constant(0)
 OVERFLOW = wp.constant(1)
@@ -80,6 +83,7 @@ class Limits:
 
     Attributes:
         travel: Largest motion in a substep, in parts of a body's thickness.
+        shared_travel: Largest motion while more than two substeps share their forces, in parts of a body's thickness.
         overlap: Deepest new penetration, in parts of the thickness of the thinner body.
         ease: Substeps are made longer again where the motion in twice their length stays below this part of ``travel``.
         futile: Substeps that leave more than this part of a penetration that was too deep are not made shorter still.
@@ -88,6 +92,7 @@ class Limits:
     """
 
     travel: float
+    shared_travel: float
     overlap: float
     ease: float
     futile: float
@@ -111,6 +116,16 @@ class StepBuffers:
     def attempting(self) -> wp.array:
         """Condition: the step is to be tried (again)."""
         return self.flags[0:1]
+
+    @property
+    def forces_due(self) -> wp.array:
+        """Condition: the next substeps need forces of their own."""
+        return self.flags[int(FLAG_FORCES) : int(FLAG_FORCES) + 1]
+
+    @property
+    def sharing(self) -> wp.array:
+        """Number of substeps that share their forces."""
+        return self.status[int(STATUS_SHARING) : int(STATUS_SHARING) + 1]
 
     def remaining(self, level: int) -> wp.array:
         """Condition: substeps of ``level`` remain to be done."""
@@ -225,6 +240,7 @@ def _begin_attempt(
     status_out[STATUS_ATTEMPTS] = status_out[STATUS_ATTEMPTS] + 1
     level = status_out[STATUS_LEVEL]
     status_out[STATUS_REMAINING] = (fewest // 2) << level
+    flags_out[FLAG_FORCES] = 1
     for k in range(LEVELS):
         flags_out[FLAG_LEVEL + k] = wp.where(k == level, 1, 0)
     for k in range(peaks_out.shape[0]):
@@ -316,11 +332,24 @@ def _end_pair(
     remaining = status_out[STATUS_REMAINING] - 1
     status_out[STATUS_REMAINING] = remaining
     flags_out[FLAG_LEVEL + level] = wp.where(remaining > 0, 1, 0)
+    # what remains is a multiple of what shares forces whenever the next begin to
+    flags_out[FLAG_FORCES] = wp.where((2 * remaining) % wp.max(status_out[STATUS_SHARING], 2) == 0, 1, 0)
 
 
 def launch_end_pair(level: int, b: StepBuffers):
     """Count two substeps of ``level`` as done."""
     wp.launch(_end_pair, dim=1, inputs=[level], outputs=[b.status, b.flags], device=b.status.device)
+
+
+@wp.func
+def _sharing(level: int, long_travel: float, seen_at: int, limit: float) -> int:
+    """Number of substeps of ``level`` to share forces, from the motion seen in two substeps at ``seen_at``."""
+    count = 1 << level
+    travel = 0.5 * long_travel * float(1 << seen_at)
+    while count > 2 and not travel <= limit:
+        count /= 2
+        travel *= 0.5
+    return count
 
 
 @wp.kernel
@@ -330,6 +359,7 @@ def _judge(
     counts_in: wp.array[wp.int32],
     capacities_in: wp.array[wp.int32],
     travel_limit: float,
+    shared_travel_limit: float,
     overlap_limit: float,
     ease: float,
     futile: float,
@@ -356,6 +386,7 @@ def _judge(
     lost = counts_in[COUNT_BAD_BODY] != NO_BODY
     if (travel > travel_limit or (pressed and helped) or lost) and level + 1 < LEVELS:
         status_out[STATUS_LEVEL] = level + 1
+        status_out[STATUS_SHARING] = _sharing(level + 1, peaks_in[PEAK_LONG_TRAVEL], level, shared_travel_limit)
         flags_out[FLAG_ATTEMPT] = 1
         if pressed:
             last_overlap_out[1] = overlap
@@ -385,6 +416,8 @@ def _judge(
     calm = overlap < 0.5 * overlap_limit or (pressed and not helped)
     if calm and peaks_in[PEAK_LONG_TRAVEL] < ease * travel_limit and level > 0:
         status_out[STATUS_LEVEL] = level - 1
+    next_level = status_out[STATUS_LEVEL]
+    status_out[STATUS_SHARING] = _sharing(next_level, peaks_in[PEAK_LONG_TRAVEL], level, shared_travel_limit)
 
 
 def launch_judge(limits: Limits, b: StepBuffers):
@@ -397,6 +430,7 @@ def launch_judge(limits: Limits, b: StepBuffers):
             b.counts,
             limits.capacities,
             limits.travel,
+            limits.shared_travel,
             limits.overlap,
             limits.ease,
             limits.futile,

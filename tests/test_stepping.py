@@ -6,7 +6,7 @@ import warp as wp
 
 from warpmag.kernels import monitor, stepping
 
-TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 0.008, 0.8, 0.8, 2, 100
+TRAVEL, SHARED_TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 1.0, 0.008, 0.8, 0.8, 2, 100
 
 
 class Rules:
@@ -15,16 +15,25 @@ class Rules:
     def __init__(self):
         self.level = self.done = self.attempts = self.regrown = 0
         self.overlap, self.pressed_before, self.halt = 0.0, np.inf, "no"
+        self.motion = 0.0  # in a substep of the first level
+
+    @property
+    def sharing(self):
+        """Substeps that share forces: two at least, else what moves no farther than it may meanwhile."""
+        fitting = [n for n in (2**k for k in range(self.level + 1)) if self.motion * n / 2**self.level <= SHARED_TRAVEL]
+        return min(2**self.level, max([2, *fitting]))
 
     def judge(self, travel, long_travel, overlap, lost, fill):
         """Returns what becomes of the attempt, and the record of a step that is done."""
         self.attempts += 1
+        motion = long_travel / 2 * 2**self.level
         if fill > CAPACITY:
             self.halt = "overflow"
             return "halted", None
         pressed = overlap > max(OVERLAP, self.overlap)
         helped = overlap < FUTILE * self.pressed_before
         if (travel > TRAVEL or (pressed and helped) or lost) and self.level < stepping.LEVELS - 1:
+            self.motion = motion
             self.level += 1
             self.pressed_before = overlap if pressed else self.pressed_before
             return "again", None
@@ -33,7 +42,7 @@ class Rules:
             return "halted", None
         record = (FEWEST * 2**self.level, self.attempts, travel > TRAVEL, self.regrown)
         self.done, self.attempts, self.regrown = self.done + 1, 0, 0
-        self.overlap, self.pressed_before = overlap, np.inf
+        self.overlap, self.pressed_before, self.motion = overlap, np.inf, motion
         if long_travel < EASE * TRAVEL and (overlap < 0.5 * OVERLAP or (pressed and not helped)) and self.level:
             self.level -= 1
         return "done", record
@@ -43,7 +52,7 @@ class Rules:
 def machine(device):
     buffers = stepping.allocate(16, 1, device)
     capacities = wp.array([CAPACITY], dtype=wp.int32, device=device)
-    return buffers, stepping.Limits(TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, capacities)
+    return buffers, stepping.Limits(TRAVEL, SHARED_TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, capacities)
 
 
 def report(buffers, travel, long_travel, overlap, lost, fill):
@@ -62,7 +71,7 @@ def report(buffers, travel, long_travel, overlap, lost, fill):
 def test_the_device_follows_the_rules(machine):
     buffers, limits = machine
     rules, rng = Rules(), np.random.default_rng(7)
-    seen = set()
+    seen, shared = set(), set()
     for _ in range(300):
         stepping.launch_begin_step(buffers)
         while buffers.attempting.numpy()[0]:
@@ -71,6 +80,10 @@ def test_the_device_follows_the_rules(machine):
             assert wanted == [level == rules.level for level in range(stepping.LEVELS)]
             pairs = 0
             while buffers.remaining(rules.level).numpy()[0]:
+                if rules.level:
+                    assert buffers.sharing.numpy()[0] == rules.sharing
+                    assert buffers.forces_due.numpy()[0] == (2 * pairs % rules.sharing == 0)
+                    shared.add((rules.level, rules.sharing))
                 stepping.launch_end_pair(rules.level, buffers)
                 pairs += 1
             assert 2 * pairs == FEWEST * 2**rules.level
@@ -104,6 +117,7 @@ def test_the_device_follows_the_rules(machine):
             rules.halt, rules.regrown = "no", 1
     assert {level for _, level in seen} == set(range(stepping.LEVELS))
     assert {outcome for outcome, _ in seen} == {"done", "again", "halted"}
+    assert shared > {(1, 2), (2, 2), (2, 4), (3, 2), (3, 4), (3, 8), (4, 2), (4, 4), (4, 8)}
 
 
 def test_time_is_counted_for_the_stage_that_it_was_spent_in(machine):

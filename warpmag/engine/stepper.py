@@ -1,7 +1,7 @@
 """Advances a model by the step that the user asked for, in as many substeps as its motion needs.
 
 A substep is: clear forces, induction, magnetic forces, collision, solver; substeps shorter than the longest ones share
-their forces two by two. A step is tried and then judged: if a body moved too far in a substep, or bodies were pressed
+their forces with others. A step is tried and then judged: if a body moved too far in a substep, or bodies were pressed
 into each other, the state is put back and the step done again with shorter substeps. All of that is decided on the
 device (``kernels.stepping``), so that a step is one graph that the host launches and does not wait for. The host looks
 every so many steps. Where it has to act, because a buffer overflowed or the state is not finite any more, the device
@@ -28,6 +28,8 @@ from warpmag.kernels.bodies import predict_poses
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
+_SHARED_TRAVEL_LIMIT = 1.0
+"""How far a body may move, in parts of its thickness, while more than two substeps share their forces."""
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
 _EASE = 0.8
@@ -111,7 +113,7 @@ class Stepper:
         # Even, so that a step ends in the state that it began in.
         self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
         self.state, self._other, self._saved = model.state(), model.state(), model.state()
-        self._shared = model.state()  # between the poses that two substeps start from, and the forces there
+        self._shared = model.state()  # between the poses that some substeps start from, and the forces there
         self._thickness = wp.array(sizes.thickness, dtype=float, device=self._device)
         self._reach = wp.array(sizes.reach, dtype=float, device=self._device)
         self._buffers = stepping.allocate(_RECORDS, len(solver.buffers), self._device)
@@ -131,7 +133,9 @@ class Stepper:
         """Fit everything to the solver's buffers, whose number does not change."""
         sizes = [buffer.limit for buffer in self._solver.buffers]
         capacities = wp.array(sizes, dtype=wp.int32, device=self._device)
-        self._limits = stepping.Limits(TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities)
+        self._limits = stepping.Limits(
+            TRAVEL_LIMIT, _SHARED_TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities
+        )
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -288,19 +292,24 @@ class Stepper:
 
     def _advance_twice(self, level: int) -> None:
         dt = self._step / (self._fewest << level)
+        if level == 1:  # two substeps are all that share
+            self._share_forces(dt)
+        elif level > 1:
+            wp.capture_if(self._buffers.forces_due, self._share_forces, dt=dt)
         for half, (now, then) in enumerate(((self.state, self._other), (self._other, self.state))):
             stepping.launch_watch_finite(half, now, self._limits, self._buffers)
             if level == 0:
                 self._magnetize(now)
             else:
-                if half == 0:
-                    predict_poses(now, self._model.body_com, 0.5 * dt, self._shared.body_q)
-                    self._magnetize(self._shared)
                 wp.copy(now.body_f, self._shared.body_f)
             monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, self._buffers.peaks)
             self._find_contacts(now, dt, 0.0)
             self._solver.step(now, then, dt)
         stepping.launch_end_pair(level, self._buffers)
+
+    def _share_forces(self, dt: float) -> None:
+        predict_poses(self.state, self._model.body_com, self._buffers.sharing, dt, self._shared.body_q)
+        self._magnetize(self._shared)
 
     def _magnetize(self, state: newton.State) -> None:
         b, system = self._buffers, self._magnetics.system
