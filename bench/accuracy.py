@@ -1,6 +1,7 @@
 """How far an answer is from the truth, and what it costs: ``python -m bench.accuracy [--device cuda:0] [-o DIR]``.
 
-Four errors, each against its own reference and each on its own axis, and what the near-contact model costs:
+Four errors, each against its own reference and each on its own axis, the same of box magnets, and what the near-contact
+model costs:
 
 | error | of what | reference |
 |---|---|---|
@@ -9,6 +10,7 @@ Four errors, each against its own reference and each on its own axis, and what t
 | model | forces of two permeable balls as dipoles, or with the near-contact model | their exact multipole solution |
 | clusters | the same of three balls in a row and of thirteen, and their moments | ``bench.reference.clusters`` |
 | time step | energy of two balls that fall towards each other | conservation |
+| boxes | forces of two box magnets, sampled as they come | ``bench.reference.cuboids`` |
 | price | time of the near-contact model in a touching pile | dipoles alone |
 
 Prints a table of each, or of those named, and writes ``accuracy.jsonl`` and, of all, ``accuracy.png``.
@@ -19,12 +21,14 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import newton
 import numpy as np
 import warp as wp
 
+import warpmag
 from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
-from bench.reference import clusters, spheres
+from bench.reference import clusters, cuboids, spheres
 from bench.reference.fall import DURATION, fall
 from bench.run import RUNNERS, make_system, measure
 from warpmag import oracle
@@ -38,6 +42,8 @@ BLOCK = 1000
 PERMEABILITIES = (2.0, 4.0, 10.0, 1000.0, np.inf)
 GAPS = (0.01, 0.03, 0.1, 0.3, 0.5, 0.9, 1.2, 3.0)
 """Gaps between two balls over their radius."""
+SIDE, BOX_GAPS, MAGNETIZATION = 0.02, (0.2, 0.5, 1.0, 2.0), 1e6
+"""Longest edge of box magnets [m], gaps between two of them over it, and their magnetization along z [A/m]."""
 PILES = (2500, 10000)
 """Balls of the piles on which the near-contact model's price is taken."""
 STEPS = (4e-4, 2e-4, 1e-4, 5e-5)
@@ -142,6 +148,31 @@ def time_step(device) -> Iterator[dict]:
         yield {"dt": dt, "steps": round(DURATION / dt), "error": found.drift, "momentum": found.momentum}
 
 
+def boxes(device, names=tuple(cuboids.PAIRS)) -> Iterator[dict]:
+    """Forces of two box magnets: relative error, and the moments that both are sampled with."""
+    for name in names:
+        for gap in BOX_GAPS:
+            half1, half2, offset = cuboids.pair(name, gap, SIDE)
+            exact = cuboids.force(half1, half2, offset, MAGNETIZATION, MAGNETIZATION)
+            found, moments = _box_force(half1, half2, offset, device)
+            yield {"boxes": name, "gap": gap, "moments": moments, "error": _relative(found, exact)}
+
+
+def _box_force(half1, half2, offset, device) -> tuple[np.ndarray, int]:
+    """Force [N] on the second of two boxes magnetized along z, and the number of all moments."""
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    for half, place in ((half1, np.zeros(3)), (half2, offset)):
+        body = builder.add_body(xform=wp.transform(wp.vec3(*place), wp.quat_identity()))
+        builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2])
+        warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, MAGNETIZATION))
+    model = builder.finalize(device=device)
+    magnetics, state = warpmag.Magnetics(model), model.state()
+    state.clear_forces()
+    magnetics.apply(state)
+    return state.body_f.numpy()[1, :3], magnetics.system.count
+
+
 def price(device) -> Iterator[dict]:
     """Time of the parts of a step of a touching pile [ms] with either model, in turns, and their ratio: medians."""
     for count in PILES:
@@ -168,7 +199,7 @@ def price(device) -> Iterator[dict]:
 
 ERRORS = {
     "rounding": rounding, "iteration": iteration, "model": model, "clusters": cluster, "time step": time_step,
-    "price": price,
+    "boxes": boxes, "price": price,
 }  # fmt: skip
 
 
@@ -185,10 +216,10 @@ def print_table(rows: list[dict]) -> None:
 
 
 def draw(results: dict[str, list[dict]], path: Path) -> None:
-    """Draw error against cost, a panel for each error: all of ``ERRORS`` but the last."""
+    """Draw error against cost, a panel for each of the first five of ``ERRORS``."""
     import matplotlib.pyplot as plt  # noqa: PLC0415 - slow to import, and --help does without it
 
-    drawn = list(results.items())[:-1]
+    drawn = list(results.items())[:5]
     figure, axes = plt.subplots(1, len(drawn), figsize=(4.8 * len(drawn), 4.5))
 
     def line(axis, rows, x, y, label):

@@ -9,6 +9,33 @@ MU0 = 4e-7 * math.pi
 """Magnetic constant [T·m/A]."""
 
 
+CUBE, PLATE, BAR = (1.0, 1.0, 1.0), (1.0, 1.0, 0.2), (0.3, 0.3, 1.0)
+"""Half extents of boxes of side 2."""
+PAIRS = {
+    "cubes in line": (CUBE, CUBE, 2, 0.0),
+    "cubes side by side": (CUBE, CUBE, 0, 0.0),
+    "plates": (PLATE, PLATE, 2, 0.0),
+    "bars": (BAR, BAR, 2, 0.0),
+    "cube and plate off axis": (CUBE, PLATE, 2, 0.3),
+}
+"""Two boxes, the axis along which they are apart, and how far off it the second is, in sides along x."""
+
+
+def pair(name: str, gap: float, side: float):
+    """Half extents [m] of a pair of ``PAIRS``, and the offset of the second box [m], shape [3] each.
+
+    Args:
+        name: Which pair.
+        gap: Distance between the faces, in sides.
+        side: Longest edge of the boxes [m].
+    """
+    half1, half2, axis, aside = PAIRS[name]
+    offset = np.zeros(3)
+    offset[0] = aside * side
+    offset[axis] = (0.5 * (half1[axis] + half2[axis]) + gap) * side
+    return 0.5 * side * np.array(half1), 0.5 * side * np.array(half2), offset
+
+
 def force(half1, half2, offset, magnetization1: float, magnetization2: float) -> np.ndarray:
     """Force [N] of the first box on the second, both magnetized along z and edges along the axes, shape [3].
 
