@@ -25,7 +25,7 @@ LACK, GOAL, MERIT, FOLLOWED, EARLIER, TERMS = range(6)
 COLUMNS = TERMS + anderson.COLUMNS
 """All sums of a chunk or world; those of ``anderson`` stand behind."""
 FIELD, STIFFNESS = 0, 1
-_FLOW_STEP = 0.9
+FLOW_STEP = 0.9
 """Share of the largest convergent step length that is used."""
 
 
@@ -245,7 +245,7 @@ def begin_world(
 @wp.func
 def step_length(stiffness: wp.float64):
     """Step length ω = κ/k that converges at the largest k (2/3 + o_i) of a world; see ``theta_flow``."""
-    return wp.min(wp.float64(1.0), wp.float64(wp.static(2.0 * _FLOW_STEP)) / (wp.float64(1.0) + stiffness))
+    return wp.min(wp.float64(1.0), wp.float64(wp.static(2.0 * FLOW_STEP)) / (wp.float64(1.0) + stiffness))
 
 
 @wp.func

@@ -40,6 +40,7 @@ import warp as wp
 
 from warpmag import near_contact as model
 from warpmag.kernels import neighbors
+from warpmag.kernels.cpu_team import cores, team
 from warpmag.kernels.near_contact_code import (
     CANDIDATES,
     CHANGE_ROWS,
@@ -57,7 +58,6 @@ from warpmag.kernels.near_contact_code import (
     sweep_text,
     tabulate_text,
 )
-from warpmag.kernels.pair_loops import cores
 from warpmag.kernels.vector_passes import BLOCK, LANES
 from warpmag.near_contact import FUNCTIONS
 
@@ -266,14 +266,16 @@ def _kernel(dtype, text, ways: int):
     arrays_type = _arrays_type(dtype)
 
     @wp.func_native(text("float" if dtype is wp.float32 else "double", ways))
-    def make_passes(thread: int, first: int, last: int, threads: int, arrays: arrays_type): ...
+    def make_passes(
+        thread: int, first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type
+    ): ...
 
     # registers as wide as the CPU has
     flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
-    def near_contact_passes(first: int, last: int, threads: int, arrays: arrays_type):
-        make_passes(wp.tid(), first, last, threads, arrays)
+    def near_contact_passes(first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type):
+        make_passes(wp.tid(), first, last, threads, team, arrays)
 
     return near_contact_passes
 
@@ -287,7 +289,7 @@ def _launch(text, first: int, last: int, b: NearContactBuffers):
             b.commands[key] = wp.launch(
                 _kernel(b.arrays.radius.dtype, text, b.ways),
                 dim=1 if device.is_cpu else b.ways * b.arrays.radius.shape[0],
-                inputs=[begin, end, b.threads, b.arrays],
+                inputs=[begin, end, b.threads, team() if device.is_cpu else None, b.arrays],
                 device=device,
                 block_dim=128,
                 record_cmd=True,

@@ -22,7 +22,6 @@ three forms, of which ``Rows`` holds the fastest that a caller allows:
 | ``LOOP`` | ``pair_loops_cuda``, ``pair_loops_cpu`` | anything |
 """
 
-import os
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -31,9 +30,10 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels import pair_mirror_cuda, pair_sums_cuda
+from warpmag.kernels.cpu_team import MOST_THREADS, cores
 from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS, WRENCH
 from warpmag.kernels.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
-from warpmag.kernels.pair_loops_cpu import MOST_THREADS, STRIPE, launch_pair_loop_cpu
+from warpmag.kernels.pair_loops_cpu import STRIPE, launch_pair_loop_cpu
 from warpmag.kernels.pair_loops_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
 
 PACKED_ROWS = 8
@@ -100,11 +100,6 @@ class Rows:
     def fused(self) -> bool:
         """Whether the kernel that needs the sums makes them itself, so that no loop goes before it."""
         return self.form == FUSED
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:

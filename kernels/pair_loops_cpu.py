@@ -17,6 +17,7 @@ from functools import cache
 
 import warp as wp
 
+from warpmag.kernels.cpu_team import MOST_THREADS, TOGETHER, team
 from warpmag.kernels.pair_code import (
     FIELD,
     FORCE,
@@ -33,8 +34,6 @@ from warpmag.kernels.pair_code import (
 
 STRIPE = 512
 """Most sources, and most targets, of a tile."""
-MOST_THREADS = 64
-"""Threads, and shares, that a loop may have."""
 
 _W = 2.0  # see pair_code: W/√c is cheapest for W = 2
 
@@ -99,7 +98,7 @@ _VECTORS = """
 """
 
 # W/√c. On AVX-512 by Newton's steps from an estimate y good to 2⁻¹⁴: root and quotient take the machine twice the time.
-_INVERSE_ROOT = {
+INVERSE_ROOT = {
     "float": """
     auto inverse_root = [](NUMBER c) -> NUMBER {
     #if defined(__AVX512F__)
@@ -299,37 +298,12 @@ def _walk(quantity: str) -> str:
     """
 
 
-# Threads of the process's own library: Warp launches serially on a CPU, and a launch may sit inside a graph, where
-# Python's threads cannot help. A thread that cannot be had leaves its shares to the others.
-_RUN_THREADS = """
-#if defined(_WIN32)
-    work(&job);
-#else
-#if defined(__APPLE__)
-    #define SYMBOL(name) "_" name
-#else
-    #define SYMBOL(name) name
-#endif
-    typedef void* (*Start)(void*);
-    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
-    extern int join_thread(unsigned long, void**) __asm__(SYMBOL("pthread_join"));
-    unsigned long ids[MOST_THREADS];
-    bool started[MOST_THREADS];
-    for (int t = 1; t < threads; ++t) started[t] = start_thread(&ids[t], nullptr, work, &job) == 0;
-    work(&job);
-    for (int t = 1; t < threads; ++t)
-        if (started[t]) join_thread(ids[t], nullptr);
-    #undef SYMBOL
-#endif
-"""
-
-
 def _snippet(real: str, quantity: str) -> str:
     """All tiles of a work list, by several threads."""
     return f"""
     typedef {real} REAL;
     #define ONCE __attribute__((noinline))  // compiled once, not wherever it is called
-    constexpr int STRIPE = {STRIPE}, MOST_THREADS = {MOST_THREADS};
+    constexpr int STRIPE = {STRIPE};
     struct Share {{
         const REAL *targets, *sources, *effective;
         size_t target_stride, source_stride, effective_stride;
@@ -339,15 +313,14 @@ def _snippet(real: str, quantity: str) -> str:
         size_t rows;
     }};
     struct Job {{
-        Share shares[MOST_THREADS];
+        Share shares[{MOST_THREADS}];
         int count, next;
     }};
-    auto work = [](void* argument) -> void* {{
+    auto work_on = [](Job& job) {{
         #pragma clang fp contract(fast)
-        Job& job = *(Job*)argument;
         constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
         {_VECTORS}
-        {_INVERSE_ROOT[real]}
+        {INVERSE_ROOT[real]}
         {_add_rows(quantity)}
         {_add_both_ways(quantity) if quantity in (FIELD, KELVIN) else ""}
         auto sum = [=](const Share& share) {{
@@ -355,7 +328,6 @@ def _snippet(real: str, quantity: str) -> str:
         }};
         auto take = [&]() {{ return __atomic_fetch_add(&job.next, 1, __ATOMIC_RELAXED); }};
         for (int taken = take(); taken < job.count; taken = take()) sum(job.shares[taken]);
-        return nullptr;
     }};
     const size_t rows = partial_out.shape[1];
     Job job;
@@ -367,7 +339,9 @@ def _snippet(real: str, quantity: str) -> str:
                           effective.strides[0] / sizeof(REAL),
                           tiles.data, shares.data[t], shares.data[t + 1],
                           (REAL*)partial_out.data + t * rows * {WIDTHS[quantity]}, rows}};
-    {_RUN_THREADS}
+    {TOGETHER}
+    auto work = [&](int) {{ work_on(job); }};
+    together(team.data, threads, work);
     #undef ONCE
     """
 
@@ -382,6 +356,7 @@ def _kernel(dtype, quantity: str):
         tiles: wp.array2d[int],
         shares: wp.array[int],
         threads: int,
+        team: wp.array2d[wp.uint64],
         partial_out: wp.array3d[dtype],
     ): ...
 
@@ -397,10 +372,11 @@ def _kernel(dtype, quantity: str):
         tiles: wp.array2d[int],
         shares: wp.array[int],
         threads: int,
+        team: wp.array2d[wp.uint64],
         # outputs:
         partial_out: wp.array3d[dtype],
     ):
-        sum_tiles(targets, sources, effective, tiles, shares, threads, partial_out)
+        sum_tiles(targets, sources, effective, tiles, shares, threads, team, partial_out)
 
     return pair_loop_cpu
 
@@ -410,7 +386,7 @@ def launch_pair_loop_cpu(quantity: str, targets, sources, effective, tiles, shar
     wp.launch(
         _kernel(partial.dtype, quantity),
         dim=1,
-        inputs=[targets, sources, effective, tiles, shares, threads],
+        inputs=[targets, sources, effective, tiles, shares, threads, team()],
         outputs=[partial],
         device=partial.device,
     )

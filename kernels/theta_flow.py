@@ -74,8 +74,16 @@ STEADY = 3
 """Solves in a row that make two changes to extrapolate from."""
 _BEGINNERS = 4
 """Blocks that share the moments of a chunk at the start of a solve, where a moment takes many threads."""
-_SWEEP_STEP = 1.4
+SWEEP_STEP = 1.4
 """Step length of a sweep over that of a step: long chains of balls near their solution want more than is safe alone."""
+
+
+@wp.func
+def open_world(w: int, warm: int, worlds: wp.array[World]):
+    """Let a world start from what it remembers."""
+    worlds[w].mode = wp.where(warm == wp.static(STEADY), wp.static(SWEEP), wp.static(REST))
+    if warm == 0:
+        worlds[w].kept = 0
 
 
 @cache
@@ -160,7 +168,7 @@ def _begin_kernel(dtype):
             mine = wp.vector(applied[0], applied[1], applied[2], near[0], near[1], near[2], volume, length=7)
             about = sum_group(mine, shares)
             h0 = vec3(about[0], about[1], about[2])
-            stiffness = wp.float64(k * (about[6] + dtype(2.0 / 3.0)))
+            stiffness = wp.float64(k * (about[6] + dtype(wp.static(2.0 / 3.0))))
             field = wp.max(field, wp.float64(wp.length(h0)))
             stiffest = wp.max(stiffest, stiffness)
             if share == 0:
@@ -185,9 +193,7 @@ def _begin_kernel(dtype):
         stiffest = block_max(stiffest)
         if lane == 0:
             begin_world(w, field, stiffest, start_out, worlds_out, condition_out)
-            worlds_out[w].mode = wp.where(steady, wp.static(SWEEP), wp.static(REST))
-            if warm[w] == 0:
-                worlds_out[w].kept = 0
+            open_world(w, warm[w], worlds_out)
 
     return begin_flow
 
@@ -225,7 +231,7 @@ def product(a: Any, b: Any):
     return total
 
 
-_columns = wp.types.vector(COLUMNS, wp.float64)
+columns = wp.types.vector(COLUMNS, wp.float64)
 _sum_world = world_summation(COLUMNS)
 _solve = anderson_solver(COLUMNS, TERMS)
 
@@ -253,7 +259,7 @@ def _measured(dtype):
         history_s: wp.array2d[vec3],
         history_r: wp.array2d[vec3],
     ):
-        mine = _columns()
+        mine = columns()
         g = (slope / saturation) * h
         r = g - s
         if linked == 1:
@@ -293,7 +299,7 @@ def _measured(dtype):
 @wp.func
 def decide(
     w: int,
-    sums: _columns,
+    sums: columns,
     newest: int,
     kept: int,
     rtol: wp.float64,
@@ -371,7 +377,7 @@ def _judgement_kernel(dtype, shape: Shape | None):
     fused = shape is not None
     field_of_tile = summed_field(dtype, shape) if fused else None
     measure = _measured(dtype)
-    sum_group = group_sum(_columns)
+    sum_group = group_sum(columns)
     group = 1 << (shape.targets - 1).bit_length() if fused else 0
     bounds = {"grid_stride": False, "launch_bounds": (shape.threads, min(shape.blocks, 2))} if fused else {}
 
@@ -420,7 +426,7 @@ def _judgement_kernel(dtype, shape: Shape | None):
         linked = worlds[w].linked
         newest = (worlds[w].newest + linked) % wp.static(DEPTH)
         kept = wp.min(worlds[w].kept + linked, wp.static(DEPTH))
-        mine = _columns()
+        mine = columns()
         if wp.static(fused):
             i = own_target(p, lane, tiles)
             k = wp.max(i, 0)
@@ -468,7 +474,7 @@ def _judgement_kernel(dtype, shape: Shape | None):
                     history_s,
                     history_r,
                 )
-        total = _columns()
+        total = columns()
         if wp.static(fused):
             if lane < wp.static(group):
                 total = sum_group(mine, wp.static(group))
@@ -620,7 +626,7 @@ def _sweep_kernel(dtype):
         h = sum_group(h, shares)
         if share == 0:
             g = mixed_g[i] + (dtype(wp.static(INVERSE_4PI)) * slope[i] / saturation[i]) * h
-            s = theta_flow(s_out[i], g, wp.min(dtype(1.0), dtype(wp.static(_SWEEP_STEP)) * dtype(worlds[w].omega)))
+            s = theta_flow(s_out[i], g, wp.min(dtype(1.0), dtype(wp.static(SWEEP_STEP)) * dtype(worlds[w].omega)))
             s_out[i] = s
             store_magnetization(i, (saturation[i] * curve_ratio(wp.length(s), curve[i])) * s, moments_out, packed_out)
             change_out[i] = moments_out[i] - mixed_moment[i]

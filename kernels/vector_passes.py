@@ -11,6 +11,8 @@ each ball, ``Four`` four numbers of a block; ``slot_at`` and ``list_at`` find wh
 
 from collections.abc import Iterable
 
+from warpmag.kernels.cpu_team import TOGETHER
+
 LANES = 16
 """Multiple that the number of balls is padded to: lanes of the widest vectors."""
 BLOCK = 16
@@ -149,70 +151,32 @@ _PRELUDE = """
     };
 """
 
-# A launch makes passes ``first`` to ``last``: one on a GPU. On a CPU
-# threads, of the process's own library since a launch may sit inside a graph, take chunks of balls as they come, and go
-# on to the next pass when one is done. A thread that cannot be had is not missed.
-_RUN = """
+# A launch makes passes ``first`` to ``last``: one on a GPU. On a CPU threads take chunks of balls as they come, and go
+# on to the next pass when one is done.
+_RUN = f"""
 #if defined(__CUDA_ARCH__)
     make_pass(first, thread / WAYS);
 #else
-    constexpr int CHUNK = 4 * WIDTH, MOST_PASSES = 16, MOST_THREADS = 64;
-    auto chunk_of = [&](int pass, int chunk) {
+    constexpr int CHUNK = 4 * WIDTH, MOST_PASSES = 16;
+    const int chunks = (stride + CHUNK - 1) / CHUNK;
+    auto make_chunk = [&](int pass, int chunk) {{
         const int end = chunk * CHUNK + CHUNK < stride ? chunk * CHUNK + CHUNK : stride;
         for (int i = chunk * CHUNK; i < end; i += WIDTH) make_pass(pass, i);
-    };
+    }};
+    {TOGETHER}
     // the caller takes chunks from the first on, other threads from the last: each has its own in its cache next time
-    struct Team {
-        const decltype(chunk_of)* work;
-        int begin, end, chunks, taken[MOST_PASSES], ahead[MOST_PASSES], behind[MOST_PASSES], done[MOST_PASSES], left;
-    };
-    Team team = {&chunk_of, first, last, (stride + CHUNK - 1) / CHUNK, {}, {}, {}, {}, 0};
-#if !defined(_WIN32)
-#if defined(__APPLE__)
-    #define SYMBOL(name) "_" name
-#else
-    #define SYMBOL(name) name
-#endif
-    typedef void* (*Start)(void*);
-    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
-    extern int detach_thread(unsigned long) __asm__(SYMBOL("pthread_detach"));
-    extern int yield_thread() __asm__(SYMBOL("sched_yield"));
-    #undef SYMBOL
-#else
-    auto yield_thread = [] {};
-#endif
-    static constexpr auto work_through = [](Team& team, bool ahead, auto wait) {
-        for (int pass = team.begin; pass < team.end; ++pass) {
-            while (__atomic_fetch_add(&team.taken[pass], 1, __ATOMIC_RELAXED) < team.chunks) {
-                int* const ends = ahead ? team.ahead : team.behind;
-                const int n = __atomic_fetch_add(&ends[pass], 1, __ATOMIC_RELAXED);
-                (*team.work)(pass, ahead ? n : team.chunks - 1 - n);
-                __atomic_fetch_add(&team.done[pass], 1, __ATOMIC_RELEASE);
-            }
-            while (__atomic_load_n(&team.done[pass], __ATOMIC_ACQUIRE) < team.chunks) wait();
-        }
-    };
-    auto join_in = [](void* argument) -> void* {
-        Team& team = *(Team*)argument;
-        work_through(team, false, [] { yield_thread(); });
-        __atomic_fetch_add(&team.left, 1, __ATOMIC_RELEASE);
-        return nullptr;
-    };
-#if defined(_WIN32)
-    work_through(team, true, yield_thread);
-#else
-    // to sleep until a thread has ended would take longer than to wait for it to say so
-    const int others = (threads < MOST_THREADS ? threads : MOST_THREADS) - 1;
-    int started = 0;
-    for (int t = 0; t < others; ++t) {
-        unsigned long id;
-        if (start_thread(&id, nullptr, join_in, &team) != 0) break;
-        detach_thread(id);
-        ++started;
-    }
-    work_through(team, true, [] { yield_thread(); });
-    while (__atomic_load_n(&team.left, __ATOMIC_ACQUIRE) < started) yield_thread();
-#endif
+    int taken[MOST_PASSES] = {{}}, ahead[MOST_PASSES] = {{}}, behind[MOST_PASSES] = {{}}, done[MOST_PASSES] = {{}};
+    auto work = [&](int member) {{
+        for (int pass = first; pass < last; ++pass) {{
+            while (__atomic_fetch_add(&taken[pass], 1, __ATOMIC_RELAXED) < chunks) {{
+                const int n = __atomic_fetch_add(member == 0 ? &ahead[pass] : &behind[pass], 1, __ATOMIC_RELAXED);
+                make_chunk(pass, member == 0 ? n : chunks - 1 - n);
+                __atomic_fetch_add(&done[pass], 1, __ATOMIC_RELEASE);
+            }}
+            while (__atomic_load_n(&done[pass], __ATOMIC_ACQUIRE) < chunks) yield_thread();
+        }}
+    }};
+    together(team.data, threads, work);
 #endif
 """
 
@@ -253,8 +217,9 @@ def passes_text(
     real_arrays: Iterable,
     body: str,
     passes: str,
+    balls: str = "arrays.radius.shape[0]",
 ) -> str:
-    """Text of a native function (thread, first, last, threads, arrays) that makes passes ``first`` to ``last``.
+    """Text of a native function (thread, first, last, threads, team, arrays) that makes passes ``first`` to ``last``.
 
     Args:
         real: ``float`` or ``double``.
@@ -262,9 +227,10 @@ def passes_text(
         constants: Integers by their names in the text.
         numbers: Reals by theirs.
         integer_arrays: Arrays of the struct ``arrays`` that the text names.
-        real_arrays: Those of reals or vectors; ``radius`` has one number for each ball, padded.
+        real_arrays: Those of reals or vectors.
         body: Definitions of the passes.
         passes: Statement that makes pass ``pass`` for ball ``i``.
+        balls: How many balls there are, a multiple of ``LANES``.
     """
     integers = "\n".join(f"constexpr int {name} = {value};" for name, value in constants.items())
     reals = "\n".join(f"constexpr REAL {name} = {value!r};" for name, value in numbers.items())
@@ -289,7 +255,7 @@ def passes_text(
     constexpr int LANES = {LANES}, BLOCK = {BLOCK};
     {integers}
     {reals}
-    const int stride = arrays.radius.shape[0];
+    const int stride = {balls};
     {pointers}
     {prelude}{body}
     auto make_pass = [&](int pass, int i) {{ {passes} }};

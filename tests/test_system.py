@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 import warp as wp
-from arrangements import pile, relative
+from arrangements import overlapping, pile, relative
 
 import warpmag
-from warpmag import oracle
+from warpmag import dynamics, oracle
 from warpmag.kernels import pair_loops
+from warpmag.kernels.neighbors import CAPACITY
 from warpmag.kernels.pair_code import FIELD, KELVIN
 from warpmag.system import MomentSystem
 
 MS = 1.7e6
+STATE = ("h0", "h", "s", "iterate_s", "iterate_r", "past_positions", "past_moments", "past_field", "past_g")
 
 
 def two_worlds(device, **settings):
@@ -235,6 +237,47 @@ def test_starts_never_decide_the_solution(dtype, device):
         assert system.converged.numpy()[0] == 1, step
         # the residual is amplified by the inverse Jacobian, some ten times in a pile
         assert np.linalg.norm(found - exact) <= 100.0 * rtol * np.linalg.norm(exact), step
+
+
+@pytest.mark.parametrize("curve", ["tanh", "langevin", "clamped"])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_vector_passes_do_what_plain_ones_do(dtype, curve, device, monkeypatch):
+    """What a CPU does in vectors: on the move, with magnets among the balls, and more neighbours than lists hold.
+
+    Tolerance: rounding, where differences of iterates, 1e-3 of them and less, are divided by one another.
+    """
+    if device != "cpu":
+        pytest.skip("a GPU has the plain passes only")
+    x, radii, _ = pile(count=61)
+    y, _, _ = overlapping(150, extent=0.03)
+    velocities = np.random.default_rng(3).normal(size=(211, 3)) * 2e-4
+    permanent = np.isin(np.arange(211), [60, 210])
+    systems = []
+    for vectors in (False, True):
+        monkeypatch.setattr(dynamics, "VECTOR_PASSES", vectors)
+        systems.append(MomentSystem(
+            radii=np.r_[radii, np.random.default_rng(4).uniform(0.005, 0.01, 150)], worlds=np.repeat([0, 1], [61, 150]),
+            permanent=permanent, saturation=MS, curve=curve, external_field=[0.0, 0.0, 1e5], dtype=dtype, device=device,
+        ))  # fmt: skip
+        systems[-1].moments.assign(np.where(permanent[:, None], [0.2, 0.0, 0.3], 0.0))
+    for step in range(6):
+        for one in systems:
+            one.positions.assign(np.r_[x, y] + step * velocities)
+            one.begin()
+            one.iterate()
+        states = [{name: getattr(one._induction, name).numpy() for name in STATE} for one in systems]
+        for name in STATE:
+            difference = np.linalg.norm(states[1][name] - states[0][name])
+            limit = 1e5 * np.finfo(dtype).eps * np.linalg.norm(states[0][name])
+            assert difference <= limit, f"{name} of step {step}"
+        for one in systems:
+            wp.capture_while(one._induction.condition, one.iterate)
+            assert one.converged.numpy().all()
+        for name, array in vars(systems[0]._induction).items():
+            wp.copy(getattr(systems[1]._induction, name), array)  # or the next step would start from other rounding
+    plain, vectored = (one.moments.numpy() for one in systems)
+    assert (systems[0]._packed.neighbor_counts.numpy() > CAPACITY).any()
+    assert relative(vectored, plain) < 1e-3  # both within rtol
 
 
 def test_magnet_that_goes_away(device):

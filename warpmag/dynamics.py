@@ -12,13 +12,15 @@ import numpy as np
 import warp as wp
 
 from warpmag.errors import InputError
-from warpmag.kernels import submagnetization, theta_flow
+from warpmag.kernels import submagnetization, theta_flow, theta_flow_cpu
 from warpmag.kernels.induction import InductionBuffers
 from warpmag.kernels.pair_loops import Rows
 from warpmag.kernels.wrench import Material
 from warpmag.magnets import DYNAMICS, check_positive, check_token
 from warpmag.packed import PackedMoments
 
+VECTOR_PASSES = True
+"""Whether a CPU makes the θ flow's passes in vectors and by threads; else they are plain Warp, as on a GPU."""
 STEP = 0.3
 """Default step κ = βΔtMs [dimensionless] of the explicit dynamics: none of the larger ones measured converges in weak
 and in strong fields alike (``bench.paper``, Fig. 8)."""
@@ -32,6 +34,9 @@ class Inducibles:
 
     Attributes:
         rows: Work list, inducible moments on inducible moments.
+        applied: Work list, permanent moments on inducible ones.
+        applied_partial: Sums of the field loop over it.
+        external_field: External field [A/m], shape [n].
         packed: All moments, packed.
         material: What they are made of.
         moments: Moments [A·m²], shape [n]; the inducible ones are written.
@@ -41,6 +46,9 @@ class Inducibles:
     """
 
     rows: Rows
+    applied: Rows
+    applied_partial: wp.array
+    external_field: wp.array
     packed: PackedMoments
     material: Material
     moments: wp.array
@@ -54,28 +62,44 @@ class ThetaFlow:
 
     def __init__(self, target: Inducibles):
         """Move ``target``."""
-        self._target = target
-        self.sums_field = theta_flow.sums_field(target.rows)
+        self._target = t = target
+        self.sums_field = theta_flow.sums_field(t.rows)
+        self._passes = None
+        if t.packed.device.is_cpu and VECTOR_PASSES:
+            self._passes = theta_flow_cpu.allocate(
+                t.applied, t.applied_partial, t.rows, t.packed, t.external_field, t.material, t.state, t.moments
+            )
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
         t = self._target
         theta_flow.launch_set_state(t.rows, magnetizations, t.material, t.state)
 
-    def start(self, applied, partial, external_field):
+    def start(self):
         """Begin a solve."""
         t = self._target
-        theta_flow.launch_begin(applied, partial, t.rows, t.packed, external_field, t.material, t.state, t.moments)
+        if self._passes:
+            theta_flow_cpu.launch_begin(self._passes)
+        else:
+            theta_flow.launch_begin(
+                t.applied, t.applied_partial, t.rows, t.packed, t.external_field, t.material, t.state, t.moments
+            )
 
     def refine(self):
         """Sweep over neighbours."""
         t = self._target
-        theta_flow.launch_sweeps(t.rows, t.packed, t.material, t.state, t.moments)
+        if self._passes:
+            theta_flow_cpu.launch_sweeps(self._passes)
+        else:
+            theta_flow.launch_sweeps(t.rows, t.packed, t.material, t.state, t.moments)
 
     def iterate(self):
         """Judge the field just summed and move."""
         t = self._target
-        theta_flow.launch_iteration(t.rows, t.packed, t.material, t.state, t.rtol, t.max_evaluations, t.moments)
+        if self._passes:
+            theta_flow_cpu.launch_iteration(self._passes, t.rtol, t.max_evaluations)
+        else:
+            theta_flow.launch_iteration(t.rows, t.packed, t.material, t.state, t.rtol, t.max_evaluations, t.moments)
 
 
 class SubmagnetizationPairs:
@@ -114,12 +138,13 @@ class SubmagnetizationPairs:
             t.rows, magnetizations, t.material, t.state, self.first, self.second
         )
 
-    def start(self, applied, partial, external_field):
+    def start(self):
         """Begin a solve."""
         t = self._target
         submagnetization.launch_begin(
-            applied, partial, t.packed, external_field, t.material, t.state, self.first, self.second, t.moments
-        )
+            t.applied, t.applied_partial, t.packed, t.external_field, t.material, t.state, self.first, self.second,
+            t.moments,
+        )  # fmt: skip
 
     def refine(self):
         """Nothing to do."""

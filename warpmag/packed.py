@@ -16,6 +16,7 @@ class PackedMoments:
         moments: The moments among them, a view, shape [3, n].
         neighbors: Moments that overlap each, or nearly do, shape [n, capacity], valid after :meth:`find_overlaps`.
         neighbor_counts: How many they are, shape [n]; zero until then.
+        searching: Whether the last :meth:`find_overlaps` made those lists anew, shape [1].
         overlaps: Those of them that do overlap it, shape [n, capacity].
         overlap_counts: How many they are, shape [n].
     """
@@ -48,6 +49,7 @@ class PackedMoments:
         self.moments = self.packed[4:7] if n else self.packed
         self._lists = neighbors.allocate(n, dtype, device)
         self.neighbors, self.neighbor_counts = self._lists.neighbor, self._lists.count
+        self.searching = self._lists.searching
         self.overlaps, self.overlap_counts = wp.zeros_like(self.neighbors), wp.zeros_like(self.neighbor_counts)
 
     def pack(self, positions, moments):

@@ -147,6 +147,9 @@ class MomentSystem:
         self.converged = self._induction.converged
         target = Inducibles(
             self._induced,
+            self._applied,
+            self._applied_partial,
+            self.external_field,
             self._packed,
             self._material,
             self.moments,
@@ -242,7 +245,7 @@ class MomentSystem:
             return
         if self._applied.pair_count:
             pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
-        self.dynamics.start(self._applied, self._applied_partial, self.external_field)
+        self.dynamics.start()
         if self._near is not None:
             near_contact.wait(self._near)
 
