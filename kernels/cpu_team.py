@@ -17,12 +17,14 @@ from functools import cache
 import numpy as np
 import warp as wp
 
+VECTORS = True
+"""Whether a CPU makes passes over neighbours in vectors and by threads; else they are plain Warp, as on a GPU."""
 MOST_THREADS = 64
 """Threads that may work on one launch, and shares that its work may be cut into."""
 _GONE, _WAITING, _CLAIMED, _POSTED, _WORKING = range(5)
 _STATE, _CALL, _JOB, _NUMBER, _WORDS = 0, 1, 2, 3, 8
-_PATIENCE = 400
-"""Times that a member looks for work before it leaves; some 0.5 µs each, and others may have its core instead."""
+_PATIENCE = 4000
+"""Times that a member looks for work before it leaves, about 1 ms; each time others may have its core instead."""
 
 TOGETHER = f"""
     // together(team, threads, work) calls work(member) on as many threads, member 0 being the caller, and returns when

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpmag.kernels import cpu_team, neighbors_cpu
 from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction, pair_factors
 
 CAPACITY = 64
@@ -32,6 +33,8 @@ less often, and spare induction evaluations (see ``theta_flow``): what moves nea
 _LANES = 8
 """Threads of a GPU that share out the neighbours of a moment; a part of a warp."""
 _BUCKETS_PER_MOMENT = 4
+_PADDING = 16
+"""Entries that vectors may read beyond the last."""
 _FARTHEST_CELL = 1.0e9
 """Cells from the origin beyond which a moment is left out: its cell would be no integer."""
 
@@ -207,6 +210,21 @@ def _sort_kernel(dtype, shares: int, capacity: int):
 
 
 @dataclass(frozen=True)
+class SortedByCell:
+    """Moments in the order of their cells, as a CPU searches them; arrays of nothing on a GPU.
+
+    Attributes:
+        begin: Where each bucket begins, shape [2ᵏ + 1].
+        entries: Number, cell's x and y, and world of each, and the bucket of each moment, shape [5, n padded].
+        places: Position and radius of each [m], shape [4, n padded].
+    """
+
+    begin: wp.array
+    entries: wp.array
+    places: wp.array
+
+
+@dataclass(frozen=True)
 class NeighborLists:
     """Neighbours of n moments, and what their search keeps.
 
@@ -220,6 +238,7 @@ class NeighborLists:
         cell: Cell (x, y, z, group) of each moment, shape [n].
         last: Moment that was last put into each bucket, shape [2ᵏ].
         before: Moment that was put into its bucket before each, shape [n].
+        by_cell: What a CPU has in the place of these three.
     """
 
     ratio: float
@@ -231,11 +250,18 @@ class NeighborLists:
     cell: wp.array
     last: wp.array
     before: wp.array
+    by_cell: SortedByCell
 
 
 def allocate(count: int, dtype, device, *, ratio=1.0 + SKIN, capacity=CAPACITY) -> NeighborLists:
     """Allocate the lists of ``count`` moments, empty."""
     buckets = 2 ** int(np.ceil(np.log2(_BUCKETS_PER_MOMENT * max(count, 1))))
+    padded = count + _PADDING if wp.get_device(device).is_cpu else 0
+    by_cell = SortedByCell(
+        begin=wp.zeros(buckets + 1 if padded else 0, dtype=int, device=device),
+        entries=wp.zeros((5, padded), dtype=int, device=device),
+        places=wp.zeros((4, padded), dtype=dtype, device=device),
+    )
     return NeighborLists(
         ratio=ratio,
         neighbor=wp.zeros((count, capacity), dtype=int, device=device),
@@ -246,6 +272,7 @@ def allocate(count: int, dtype, device, *, ratio=1.0 + SKIN, capacity=CAPACITY) 
         cell=wp.zeros(count, dtype=wp.vec4i, device=device),
         last=wp.zeros(buckets, dtype=int, device=device),
         before=wp.zeros(count, dtype=int, device=device),
+        by_cell=by_cell,
     )
 
 
@@ -265,6 +292,11 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
     device, dtype = targets.device, targets.dtype
     # what is near is nearer than a cell is wide, however the quotient is rounded
     width = wp.float64((lists.ratio + 1e-6) * reach)
+    if device.is_cpu and cpu_team.VECTORS:
+        neighbors_cpu.launch_search(
+            targets, sources, target_group, source_group, width, lists, source_lists, _FARTHEST_CELL
+        )
+        return
     wp.launch(
         empty_lists,
         dim=max(source_lists.last.shape[0], targets.shape[1]),
@@ -374,6 +406,9 @@ def launch_list_overlaps(targets, sources, lists, overlap, overlap_count):
         overlap: Out, indices of what overlaps each, ascending, shape [t, CAPACITY].
         overlap_count: Out, how many they are, shape [t]; where a list was full, its count, beyond the capacity.
     """
+    if targets.device.is_cpu and cpu_team.VECTORS:
+        neighbors_cpu.launch_overlaps(targets, sources, lists, overlap, overlap_count)
+        return
     shares = lanes(targets.device)
     wp.launch(
         _overlap_kernel(targets.dtype),

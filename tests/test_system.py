@@ -6,8 +6,8 @@ import warp as wp
 from arrangements import overlapping, pile, relative
 
 import warpmag
-from warpmag import dynamics, oracle
-from warpmag.kernels import pair_loops
+from warpmag import oracle
+from warpmag.kernels import cpu_team, pair_loops
 from warpmag.kernels.neighbors import CAPACITY
 from warpmag.kernels.pair_code import FIELD, KELVIN
 from warpmag.system import MomentSystem
@@ -254,7 +254,7 @@ def test_vector_passes_do_what_plain_ones_do(dtype, curve, device, monkeypatch):
     permanent = np.isin(np.arange(211), [60, 210])
     systems = []
     for vectors in (False, True):
-        monkeypatch.setattr(dynamics, "VECTOR_PASSES", vectors)
+        monkeypatch.setattr(cpu_team, "VECTORS", vectors)
         systems.append(MomentSystem(
             radii=np.r_[radii, np.random.default_rng(4).uniform(0.005, 0.01, 150)], worlds=np.repeat([0, 1], [61, 150]),
             permanent=permanent, saturation=MS, curve=curve, external_field=[0.0, 0.0, 1e5], dtype=dtype, device=device,

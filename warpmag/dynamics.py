@@ -12,15 +12,13 @@ import numpy as np
 import warp as wp
 
 from warpmag.errors import InputError
-from warpmag.kernels import submagnetization, theta_flow, theta_flow_cpu
+from warpmag.kernels import cpu_team, submagnetization, theta_flow, theta_flow_cpu
 from warpmag.kernels.induction import InductionBuffers
 from warpmag.kernels.pair_loops import Rows
 from warpmag.kernels.wrench import Material
 from warpmag.magnets import DYNAMICS, check_positive, check_token
 from warpmag.packed import PackedMoments
 
-VECTOR_PASSES = True
-"""Whether a CPU makes the θ flow's passes in vectors and by threads; else they are plain Warp, as on a GPU."""
 STEP = 0.3
 """Default step κ = βΔtMs [dimensionless] of the explicit dynamics: none of the larger ones measured converges in weak
 and in strong fields alike (``bench.paper``, Fig. 8)."""
@@ -65,7 +63,7 @@ class ThetaFlow:
         self._target = t = target
         self.sums_field = theta_flow.sums_field(t.rows)
         self._passes = None
-        if t.packed.device.is_cpu and VECTOR_PASSES:
+        if t.packed.device.is_cpu and cpu_team.VECTORS:
             self._passes = theta_flow_cpu.allocate(
                 t.applied, t.applied_partial, t.rows, t.packed, t.external_field, t.material, t.state, t.moments
             )
