@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from warpmag.kernels import cpu_team, finish_cpu
 from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
 from warpmag.kernels.pair_code import FIELD
 from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share
@@ -174,6 +175,8 @@ def launch_field(rows, partial, targets, sources, same_set, base, h):
             block_dim=rows.shape.threads,
             device=targets.device,
         )
+    elif targets.device.is_cpu and cpu_team.VECTORS:
+        finish_cpu.launch_finish(rows, partial, targets, sources, same_set, base, h, INVERSE_4PI=INVERSE_4PI)
     else:
         shares = lanes(targets.device)
         wp.launch(

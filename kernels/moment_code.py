@@ -90,6 +90,9 @@ _ARRAYS = """
     auto sum = [](Vector a, Vector b) -> Vector { return {a.x + b.x, a.y + b.y, a.z + b.z}; };
     auto less = [](Vector a, Vector b) -> Vector { return {a.x - b.x, a.y - b.y, a.z - b.z}; };
     auto scaled = [](NUMBER k, Vector a) -> Vector { return {k * a.x, k * a.y, k * a.z}; };
+    auto cross = [](Vector a, Vector b) -> Vector {
+        return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+    };
     auto length = [=](Vector a) -> NUMBER { return root(dot(a, a)); };
 """
 
@@ -145,15 +148,27 @@ _PAIRS = f"""
         const Factors other = averaged(d, a, b);
         return {{equal ? same.g1 : other.g1 + 1, equal ? same.g2 : other.g2 - 3, equal ? same.g3 : other.g3 + 15}};
     }};
+    auto add_where = [](MASK wanted, Vector& to, Vector a) {{
+        to.x += wanted ? a.x : 0;
+        to.y += wanted ? a.y : 0;
+        to.z += wanted ? a.z : 0;
+    }};
     // adds 4π times what the fields of moments m at separations r have beyond those of clamped dipoles
     auto add_lacking = [=](Vector& h, Vector r, NUMBER a, NUMBER b, Vector m, MASK overlapping) {{
         const NUMBER unit = 1 / (overlapping ? a + b : NUMBER(1));
         const Vector apart = scaled(unit, r), moment = scaled(unit * unit * unit, m);
         const Factors g = lacking(root(dot(apart, apart)), unit * a, unit * b);
-        const NUMBER along = g.g2 * dot(apart, moment);
-        h.x += overlapping ? g.g1 * moment.x + along * apart.x : 0;
-        h.y += overlapping ? g.g1 * moment.y + along * apart.y : 0;
-        h.z += overlapping ? g.g1 * moment.z + along * apart.z : 0;
+        add_where(overlapping, h, sum(scaled(g.g1, moment), scaled(g.g2 * dot(apart, moment), apart)));
+    }};
+    // and the same of (e·∇)H
+    auto add_lacking_force = [=](Vector& f, Vector r, NUMBER a, NUMBER b, Vector m, Vector e, MASK overlapping) {{
+        const NUMBER unit = 1 / (overlapping ? a + b : NUMBER(1));
+        const Vector apart = scaled(unit, r), moment = scaled(unit * unit * unit, m);
+        const Factors g = lacking(root(dot(apart, apart)), unit * a, unit * b);
+        const NUMBER along = dot(apart, e), of = dot(apart, moment);
+        const Vector across = sum(scaled(along, moment), scaled(of, e));
+        const NUMBER radial = g.g2 * dot(moment, e) + g.g3 * of * along;
+        add_where(overlapping, f, scaled(unit, sum(scaled(g.g2, across), scaled(radial, apart))));
     }};
     // adds 4π times their whole field, see neighbors.near_pair
     auto add_field = [=](Vector& h, Vector r, NUMBER a, NUMBER b, Vector m, MASK wanted) {{
@@ -173,21 +188,23 @@ _PAIRS = f"""
         const NUMBER lens = e * e * (d2 + 2 * d * s - 3 * apart * apart) / (16 * d * p * root(p));
         return (wanted & (d2 < s * s) & (p > 0)) ? (d <= apart ? ratio * root(ratio) : lens) : 0;
     }};
-    // calls meet(j, listed) for slot after slot of lists of ``CAPACITY``; where one is full, for all of begin to end
-    auto walk = [=](const int* lists, const int* counts, int i, int held, int begin, int end, auto meet) {{
-        INDEX self, count = 0, full = 0;
+    // calls meet(j, listed) for slot after slot of the lists of ``CAPACITY`` of moments i, as far as they name some of
+    // begin to end; where a list is full, for all of these
+    auto walk = [=](const int* lists, const int* counts, INDEX i, int held, INDEX begin, INDEX end, auto meet) {{
+        INDEX first = 0, count = 0, full = 0;
         int most = 0;
-        for (int l = 0; l < WIDTH; ++l) self[l] = l < held ? i + l : i;
         for (int l = 0; l < held; ++l) {{
-            full[l] = counts[i + l] > {CAPACITY};
-            count[l] = full[l] ? end - begin : counts[i + l];
+            if (end[l] <= begin[l]) continue;
+            first[l] = begin[l];
+            full[l] = counts[i[l]] > {CAPACITY};
+            count[l] = full[l] ? end[l] - begin[l] : counts[i[l]];
             most = count[l] > most ? count[l] : most;
         }}
         for (int s = 0; s < most; ++s) {{
-            INDEX j = self;
+            INDEX j = first;
             for (int l = 0; l < held; ++l)
-                if (s < count[l]) j[l] = full[l] ? begin + s : lists[(size_t){CAPACITY} * (i + l) + s];
-            meet(j, mask_of((j != self) & (j >= begin) & (j < end)));
+                if (s < count[l]) j[l] = full[l] ? begin[l] + s : lists[(size_t){CAPACITY} * i[l] + s];
+            meet(j, mask_of((count > s) & (j >= begin) & (j < end)));
         }}
     }};
 """
@@ -196,5 +213,5 @@ _PAIRS = f"""
 def moment_text(real: str) -> str:
     """Text that defines all of these, for floats or doubles."""
     width = 16 if real == "float" else 8
-    text = _ARRAYS.replace("PARTED", _parted(width)).replace("JOINED_VECTORS", _joined(width)) + _CURVES
-    return text + _PAIRS.replace("INVERSE_ROOT", INVERSE_ROOT[real])
+    text = _ARRAYS.replace("PARTED", _parted(width)).replace("JOINED_VECTORS", _joined(width))
+    return text + _CURVES + _PAIRS.replace("INVERSE_ROOT", INVERSE_ROOT[real])

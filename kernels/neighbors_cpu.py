@@ -12,53 +12,45 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.cpu_team import MOST_THREADS, TOGETHER, cores, team
+from warpmag.kernels.vector_passes import COLLECT
 
 _TARGETS_PER_THREAD = 250
 """Targets that make another thread worth its start."""
 
-_VECTORS = """
+_VECTORS = f"""
     constexpr int WIDTH = 64 / (int)sizeof(REAL);
     typedef REAL NUMBER __attribute__((ext_vector_type(WIDTH)));
     typedef int INDEX __attribute__((ext_vector_type(WIDTH)));
     typedef bool BITS __attribute__((ext_vector_type(WIDTH)));
-    auto numbers = [](const REAL* row) -> NUMBER { NUMBER n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
-    auto indices = [](const int* row) -> INDEX { INDEX n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
+    auto numbers = [](const REAL* row) -> NUMBER {{ NUMBER n; __builtin_memcpy(&n, row, sizeof(n)); return n; }};
+    auto indices = [](const int* row) -> INDEX {{ INDEX n; __builtin_memcpy(&n, row, sizeof(n)); return n; }};
     INDEX lanes;
     for (int l = 0; l < WIDTH; ++l) lanes[l] = l;
-    auto bits_of = [](auto mask) -> unsigned {
+    auto bits_of = [](auto mask) -> unsigned {{
         const BITS wanted = __builtin_convertvector(mask, BITS);
         unsigned bits = 0;
         __builtin_memcpy(&bits, &wanted, WIDTH / 8);
         return bits;
-    };
+    }};
     // puts the lanes of a mask at ``list``, and whatever behind them, and returns how many they are; without branches,
     // since nobody can foretell them
-    auto append = [=](int* list, auto j, auto mask) -> int {
+    auto append = [=](int* list, auto j, auto mask) -> int {{
     #if defined(__AVX512F__)
-        if constexpr (WIDTH == 16) {
+        if constexpr (WIDTH == 16) {{
             const unsigned short bits = (unsigned short)bits_of(mask);
             const INDEX kept = __builtin_ia32_compresssi512_mask(j, j, bits);
             __builtin_memcpy(list, &kept, sizeof(kept));
             return __builtin_popcount(bits);
-        }
+        }}
     #endif
         int count = 0;
-        for (int l = 0; l < WIDTH; ++l) {
+        for (int l = 0; l < WIDTH; ++l) {{
             list[count] = j[l];
             count += mask[l] != 0;
-        }
+        }}
         return count;
-    };
-    auto gather = [](const REAL* row, auto j) -> NUMBER {
-    #if defined(__AVX512F__)
-        if constexpr (WIDTH == 16) return __builtin_ia32_gathersiv16sf(NUMBER(0), row, j, (unsigned short)-1, 4);
-        else return __builtin_ia32_gathersiv8df(NUMBER(0), row, j, (unsigned char)-1, 8);
-    #else
-        NUMBER n;
-        for (int l = 0; l < WIDTH; ++l) n[l] = row[j[l]];
-        return n;
-    #endif
-    };
+    }};
+    {COLLECT}
     const size_t target_pitch = targets.strides[0] / sizeof(REAL), source_pitch = sources.strides[0] / sizeof(REAL);
     const REAL* const target = (const REAL*)targets.data;
     const REAL* const source = (const REAL*)sources.data;
@@ -183,10 +175,10 @@ _OVERLAPS = f"""
         for (int first = 0; first < count && count <= CAPACITY; first += WIDTH) {{
             const auto listed = lanes < count - first;
             const INDEX j = listed ? indices(list + first) : INDEX(0);
-            const NUMBER rx = target[i] - gather(source, j);
-            const NUMBER ry = target[target_pitch + i] - gather(source + source_pitch, j);
-            const NUMBER rz = target[2 * target_pitch + i] - gather(source + 2 * source_pitch, j);
-            const NUMBER s = target[3 * target_pitch + i] + gather(source + 3 * source_pitch, j);
+            const NUMBER rx = target[i] - collect(source, j);
+            const NUMBER ry = target[target_pitch + i] - collect(source + source_pitch, j);
+            const NUMBER rz = target[2 * target_pitch + i] - collect(source + 2 * source_pitch, j);
+            const NUMBER s = target[3 * target_pitch + i] + collect(source + 3 * source_pitch, j);
             const auto near = __builtin_convertvector(rx * rx + ry * ry + rz * rz < s * s, INDEX) & listed;
             overlapping += append(found + overlapping, j, near);
         }}

@@ -132,13 +132,14 @@ _BEGIN = f"""
         const REAL ahead = (REAL)worlds[at.world].ahead;
         const Four own = own_four(shown, 0, at.row);
         const NUMBER radius = own.w, limit = some(saturation + at.i, at.held, 1), k = some(slope + at.i, at.held, 0);
+        INDEX self = 0;
+        for (int l = 0; l < at.held; ++l) self[l] = at.i + l;
         auto meet_overlapping = [&](int begin, int end, auto meet) {{
-            walk(overlap, overlap_count, at.i, at.held, begin, end, [&](INDEX index, MASK listed) {{
-                const Places j = places(index);
-                auto row = [&](int c) {{ return gather(packed + c * pitch, j.at); }};
+            walk(overlap, overlap_count, self, at.held, begin, end, [&](INDEX j, MASK listed) {{
+                auto row = [&](int c) {{ return collect(packed + c * pitch, j); }};
                 const Vector r = {{own.x - row(0), own.y - row(1), own.z - row(2)}};
-                const NUMBER other = row(3);
-                meet(row, r, other, listed & (dot(r, r) < (radius + other) * (radius + other)));
+                const NUMBER other = row(3), contact = radius + other;
+                meet(row, r, other, listed & mask_of(j != self) & (dot(r, r) < contact * contact));
             }});
         }};
         Vector applied = {{0, 0, 0}};

@@ -18,6 +18,21 @@ LANES = 16
 BLOCK = 16
 """Numbers in a block."""
 
+COLLECT = """
+    // the numbers of a row at places j
+    auto collect = [](const REAL* row, auto j) -> NUMBER {
+    #if defined(__AVX512F__)
+        if constexpr (WIDTH == 16) return __builtin_ia32_gathersiv16sf(NUMBER(0), row, j, (unsigned short)-1, 4);
+        else return __builtin_ia32_gathersiv8df(NUMBER(0), row, j, (unsigned char)-1, 8);
+    #else
+        NUMBER n;
+        for (int l = 0; l < WIDTH; ++l) n[l] = row[j[l]];
+        return n;
+    #endif
+    };
+"""
+"""Text that defines ``collect``, for functions that have vectors NUMBER of WIDTH reals."""
+
 _PRELUDE = """
 #if defined(__CUDA_ARCH__)
     typedef REAL NUMBER;
@@ -93,6 +108,7 @@ _PRELUDE = """
         for (int l = 0; l < WIDTH; ++l) n[l] = row[j[l]];
         return n;
     };
+COLLECT
     // rows and columns of each group of four lanes change places
     auto turned = [](NUMBER a, NUMBER b, NUMBER c, NUMBER d) -> Four {
         const NUMBER ab = __builtin_shufflevector(a, b, LOW), cd = __builtin_shufflevector(c, d, LOW);
@@ -238,7 +254,7 @@ def passes_text(
         [f"int* const {name} = arrays.{name}.data;" for name in integer_arrays]
         + [f"REAL* const {name} = (REAL*)arrays.{name}.data;" for name in real_arrays]
     )
-    prelude = _PRELUDE
+    prelude = _PRELUDE.replace("COLLECT", COLLECT)
     for name, text in _vector_text(16 if real == "float" else 8).items():
         prelude = prelude.replace(name, text)
     return f"""

@@ -18,6 +18,7 @@ from functools import cache
 
 import warp as wp
 
+from warpmag.kernels import cpu_team, finish_cpu
 from warpmag.kernels.curves import curve_derivative_times
 from warpmag.kernels.field import INVERSE_4PI
 from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
@@ -252,6 +253,11 @@ def launch_wrench(rows, partial, moments, effective, external_field, twisted, fo
             block_dim=rows.shape.threads,
             device=moments.device,
         )
+    elif moments.device.is_cpu and cpu_team.VECTORS:
+        finish_cpu.launch_finish(
+            rows, partial, moments, moments, True, external_field, forces, effective=effective, twisted=twisted,
+            torques=torques, INVERSE_4PI=INVERSE_4PI, MU0=MU0,
+        )  # fmt: skip
     else:
         ends = [rows.target, rows.begin, rows.end]
         shares = lanes(moments.device)
