@@ -1,11 +1,11 @@
 """Threads of a CPU that help with the work of a launch.
 
 Warp launches serially on a CPU, and a launch may sit inside a graph, where Python's threads cannot help. So native code
-starts threads of the process's own library. To wake a core takes as long as many a launch: a thread that has helped
-therefore stays for a while, at the disposal of whatever is launched next, and leaves if nothing is.
+shares its work with threads of the process's own library. They are started once, since to start one takes longer than
+many a launch. One that has helped looks for more to do for a while, as launches follow each other, and then sleeps.
 
-A member of the team is a cache line of memory that all launches share: its state, and what it is to do. A launch claims
-members that wait, or starts a thread for them, and takes back what they have not begun when it is done itself; so it
+A member of the team is some memory that all launches share: its state, what it is to do, and what it sleeps with. A
+launch claims members that have nothing to do, and takes back what they have not begun when it is done itself. So it
 never waits for a thread that does not come, and several that run at once share the members.
 """
 
@@ -21,10 +21,73 @@ VECTORS = True
 """Whether a CPU makes passes over neighbours in vectors and by threads; else they are plain Warp, as on a GPU."""
 MOST_THREADS = 64
 """Threads that may work on one launch, and shares that its work may be cut into."""
-_GONE, _WAITING, _CLAIMED, _POSTED, _WORKING = range(5)
-_STATE, _CALL, _JOB, _NUMBER, _WORDS = 0, 1, 2, 3, 8
+_GONE, _WAITING, _ASLEEP, _CLAIMED, _POSTED, _WORKING = range(6)
+_STATE, _CALL, _JOB, _NUMBER, _LOCK, _BELL, _WORDS = 0, 1, 2, 3, 8, 16, 24
 _PATIENCE = 4000
-"""Times that a member looks for work before it leaves, about 1 ms; each time others may have its core instead."""
+"""Times that a member looks for work before it sleeps, about 1 ms; each time others may have its core instead."""
+
+_LIBRARY = f"""
+#if defined(__APPLE__)
+    #define SYMBOL(name) "_" name
+#else
+    #define SYMBOL(name) name
+#endif
+    typedef unsigned long long Word;
+    typedef void* (*Start)(void*);
+    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
+    extern int detach_thread(unsigned long) __asm__(SYMBOL("pthread_detach"));
+    extern int yield_thread() __asm__(SYMBOL("sched_yield"));
+    extern int make_lock(void*, const void*) __asm__(SYMBOL("pthread_mutex_init"));
+    extern int lock(void*) __asm__(SYMBOL("pthread_mutex_lock"));
+    extern int unlock(void*) __asm__(SYMBOL("pthread_mutex_unlock"));
+    extern int make_bell(void*, const void*) __asm__(SYMBOL("pthread_cond_init"));
+    extern int sleep(void*, void*) __asm__(SYMBOL("pthread_cond_wait"));
+    extern int ring(void*) __asm__(SYMBOL("pthread_cond_signal"));
+    #undef SYMBOL
+    static constexpr auto change = [](Word* member, Word from, Word to) -> bool {{
+        return __atomic_compare_exchange_n(member + {_STATE}, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
+    }};
+    static constexpr auto state_of = [](Word* member) -> Word {{
+        return __atomic_load_n(member + {_STATE}, __ATOMIC_ACQUIRE);
+    }};
+    static constexpr auto set = [](Word* member, Word state) {{
+        __atomic_store_n(member + {_STATE}, state, __ATOMIC_RELEASE);
+    }};
+"""
+
+_START = f"""
+#if !defined(_WIN32)
+    {_LIBRARY}
+    auto serve = [](void* argument) -> void* {{
+        Word* const member = (Word*)argument;
+        for (int idle = 0;; ++idle) {{
+            if (change(member, {_POSTED}, {_WORKING})) {{
+                ((void (*)(Word, int))member[{_CALL}])(member[{_JOB}], (int)member[{_NUMBER}]);
+                set(member, {_WAITING});
+                idle = 0;
+            }} else if (idle < {_PATIENCE}) {{
+                yield_thread();
+            }} else {{
+                lock(member + {_LOCK});
+                if (change(member, {_WAITING}, {_ASLEEP}))
+                    while (state_of(member) == {_ASLEEP}) sleep(member + {_BELL}, member + {_LOCK});
+                unlock(member + {_LOCK});
+                idle = 0;
+            }}
+        }}
+    }};
+    for (int m = 0; m < count; ++m) {{
+        Word* const member = (Word*)team.data + {_WORDS} * m;
+        if (!change(member, {_GONE}, {_CLAIMED})) continue;
+        make_lock(member + {_LOCK}, nullptr);
+        make_bell(member + {_BELL}, nullptr);
+        set(member, {_WAITING});
+        unsigned long id;
+        if (start_thread(&id, nullptr, serve, member) == 0) detach_thread(id);
+        else set(member, {_GONE});
+    }}
+#endif
+"""
 
 TOGETHER = f"""
     // together(team, threads, work) calls work(member) on as many threads, member 0 being the caller, and returns when
@@ -33,67 +96,49 @@ TOGETHER = f"""
     auto together = [](unsigned long long*, int, auto& work) {{ work(0); }};
     auto yield_thread = [] {{}};
 #else
-#if defined(__APPLE__)
-    #define SYMBOL(name) "_" name
-#else
-    #define SYMBOL(name) name
-#endif
-    typedef void* (*Start)(void*);
-    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
-    extern int detach_thread(unsigned long) __asm__(SYMBOL("pthread_detach"));
-    extern int yield_thread() __asm__(SYMBOL("sched_yield"));
-    #undef SYMBOL
-    typedef unsigned long long Word;
-    static constexpr auto change = [](Word* state, Word from, Word to) -> bool {{
-        return __atomic_compare_exchange_n(state, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
-    }};
-    auto serve = [](void* argument) -> void* {{
-        Word* const member = (Word*)argument;
-        for (int idle = 0;; ++idle) {{
-            if (change(member + {_STATE}, {_POSTED}, {_WORKING})) {{
-                ((void (*)(Word, int))member[{_CALL}])(member[{_JOB}], (int)member[{_NUMBER}]);
-                __atomic_store_n(member + {_STATE}, {_WAITING}, __ATOMIC_RELEASE);
-                idle = 0;
-            }} else if (idle > {_PATIENCE} && change(member + {_STATE}, {_WAITING}, {_GONE})) {{
-                return nullptr;
-            }}
-            yield_thread();
-        }}
-    }};
-    auto together = [serve](Word* team, int threads, auto& work) {{
+    {_LIBRARY}
+    auto together = [](Word* team, int threads, auto& work) {{
         typedef decltype(&work) Work;
         auto call = [](Word job, int number) {{ (*(Work)job)(number); }};
         Word* claimed[{MOST_THREADS}];
         int count = 0;
         for (int m = 0; m < {MOST_THREADS} && count < threads - 1; ++m) {{
             Word* const member = team + {_WORDS} * m;
-            const bool waiting = change(member + {_STATE}, {_WAITING}, {_CLAIMED});
-            if (!waiting && !change(member + {_STATE}, {_GONE}, {_CLAIMED})) continue;
+            if (state_of(member) == {_GONE}) break;
+            const bool asleep = change(member, {_ASLEEP}, {_CLAIMED});
+            if (!asleep && !change(member, {_WAITING}, {_CLAIMED})) continue;
+            claimed[count++] = member;
             member[{_CALL}] = (Word)(void (*)(Word, int))call;
             member[{_JOB}] = (Word)&work;
-            member[{_NUMBER}] = count + 1;
-            __atomic_store_n(member + {_STATE}, {_POSTED}, __ATOMIC_RELEASE);
-            claimed[count++] = member;
-            if (waiting) continue;
-            unsigned long id;
-            if (start_thread(&id, nullptr, serve, member) == 0) {{
-                detach_thread(id);
-            }} else {{
-                __atomic_store_n(member + {_STATE}, {_GONE}, __ATOMIC_RELEASE);
-                --count;
-                break;
-            }}
+            member[{_NUMBER}] = count;
+            if (asleep) lock(member + {_LOCK});
+            set(member, {_POSTED});
+            if (!asleep) continue;
+            unlock(member + {_LOCK});
+            ring(member + {_BELL});
         }}
         work(0);
         // to sleep until a thread has ended would take longer than to wait for it to say so
         for (int t = 0; t < count; ++t)
-            while (!change(claimed[t] + {_STATE}, {_POSTED}, {_WAITING})
-                   && __atomic_load_n(claimed[t] + {_STATE}, __ATOMIC_ACQUIRE) == {_WORKING})
-                yield_thread();
+            while (!change(claimed[t], {_POSTED}, {_WAITING}) && state_of(claimed[t]) == {_WORKING}) yield_thread();
     }};
 #endif
 """
 """Text that defines ``together``, for native functions."""
+
+
+@wp.func_native(_START)
+def _start(count: int, team: wp.array2d[wp.uint64]): ...
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _start_members(
+    # inputs:
+    count: int,
+    # outputs:
+    team: wp.array2d[wp.uint64],
+):
+    _start(count, team)
 
 
 def cores() -> int:
@@ -105,13 +150,22 @@ def cores() -> int:
 def team() -> wp.array:
     """The members' memory, one for the process; it is what ``together`` takes."""
     members = wp.zeros((MOST_THREADS, _WORDS), dtype=wp.uint64, device="cpu")
-    atexit.register(_wait_until_all_have_left, members.numpy())
+    wp.launch(_start_members, dim=1, inputs=[min(cores(), MOST_THREADS) - 1], outputs=[members], device="cpu")
+    atexit.register(_wait_until_asleep, members.numpy())
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: _forget(members.numpy()))
     return members
 
 
-def _wait_until_all_have_left(members: np.ndarray) -> None:
-    """Wait for threads that still look for work: the code that they run goes with the process's last modules."""
+def _wait_until_asleep(members: np.ndarray) -> None:
+    """Wait for members that look for work: the code that they run goes when the process ends."""
     for _ in range(100):
-        if np.all(members[:, _STATE] == _GONE):
+        if np.isin(members[:, _STATE], (_GONE, _ASLEEP)).all():
             return
         time.sleep(1e-3)
+
+
+def _forget(members: np.ndarray) -> None:
+    """Do without the members, which a process that was forked has not."""
+    members[:] = _GONE
+    team.cache_clear()
