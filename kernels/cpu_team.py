@@ -21,6 +21,8 @@ VECTORS = True
 """Whether a CPU makes passes over neighbours in vectors and by threads; else they are plain Warp, as on a GPU."""
 MOST_THREADS = 64
 """Threads that may work on one launch, and shares that its work may be cut into."""
+MOMENTS_PER_THREAD = 2500
+"""Moments that make another thread worth waking for a pass over them and their neighbours: 0.1 to 0.2 ms."""
 _GONE, _WAITING, _ASLEEP, _CLAIMED, _POSTED, _WORKING = range(6)
 _STATE, _CALL, _JOB, _NUMBER, _LOCK, _BELL, _WORDS = 0, 1, 2, 3, 8, 16, 24
 _PATIENCE = 4000
@@ -144,6 +146,11 @@ def _start_members(
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads_for(count: int, each: int) -> int:
+    """Threads that share ``count`` pieces of work, ``each`` of which make another one worth waking."""
+    return max(1, min(int(count) // each, cores(), MOST_THREADS))
 
 
 @cache

@@ -5,16 +5,12 @@ Rows may be anybody's: what belongs to a moment is looked up.
 
 from functools import cache
 
-import numpy as np
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOST_THREADS, cores, team
+from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for
 from warpmag.kernels.moment_code import moment_text
 from warpmag.kernels.pair_code import FIELD, WIDTHS
 from warpmag.kernels.vector_passes import passes_text
-
-_ROWS_PER_THREAD = 500
-"""Rows that make another thread worth its start."""
 
 _ROWS = """
     const int rows = arrays.target.shape[0], parts = arrays.partial.shape[0];
@@ -188,10 +184,9 @@ def launch_finish(
     arrays.base, arrays.out = base, out
     if effective is not None:
         arrays.effective, arrays.twisted, arrays.torques = effective, twisted, torques
-    threads = int(np.clip(rows.count // _ROWS_PER_THREAD, 1, min(cores(), MOST_THREADS)))
     wp.launch(
         _kernel(targets.dtype, rows.quantity, tuple(numbers.items())),
         dim=1,
-        inputs=[threads, team(), arrays],
+        inputs=[threads_for(rows.count, MOMENTS_PER_THREAD), team(), arrays],
         device="cpu",
     )

@@ -40,7 +40,7 @@ import warp as wp
 
 from warpmag import near_contact as model
 from warpmag.kernels import neighbors
-from warpmag.kernels.cpu_team import cores, team
+from warpmag.kernels.cpu_team import team, threads_for
 from warpmag.kernels.near_contact_code import (
     CANDIDATES,
     CHANGE_ROWS,
@@ -247,7 +247,7 @@ def allocate(
         lists=lists,
         arrays=arrays,
         reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
-        threads=max(1, min(cores(), n // _BALLS_PER_THREAD)),
+        threads=threads_for(n, _BALLS_PER_THREAD),
         ways=8 if n < _MANY_BALLS else 4,
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),

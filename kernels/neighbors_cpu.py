@@ -8,14 +8,10 @@ to another column.
 
 from functools import cache
 
-import numpy as np
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOST_THREADS, TOGETHER, cores, team
+from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, TOGETHER, team, threads_for
 from warpmag.kernels.vector_passes import COLLECT
-
-_TARGETS_PER_THREAD = 250
-"""Targets that make another thread worth its start."""
 
 _VECTORS = f"""
     constexpr int WIDTH = 64 / (int)sizeof(REAL);
@@ -302,10 +298,6 @@ def _overlap_kernel(dtype, capacity: int):
     return find_overlaps
 
 
-def _threads(targets: int) -> int:
-    return int(np.clip(targets // _TARGETS_PER_THREAD, 1, min(cores(), MOST_THREADS)))
-
-
 def launch_search(targets, sources, target_group, source_group, width, lists, source_lists, farthest: float):
     """Search, if moments have moved, in cells of some width [m]; see ``neighbors.launch_find_neighbors``."""
     dtype, by_cell = targets.dtype, source_lists.by_cell
@@ -320,7 +312,7 @@ def launch_search(targets, sources, target_group, source_group, width, lists, so
             width,
             dtype(lists.ratio),
             int(lists is source_lists),
-            _threads(targets.shape[1]),
+            threads_for(targets.shape[1], MOMENTS_PER_THREAD),
             team(),
             lists.moved,
         ],
@@ -342,7 +334,14 @@ def launch_overlaps(targets, sources, lists, overlap, overlap_count):
     wp.launch(
         _overlap_kernel(targets.dtype, lists.neighbor.shape[1]),
         dim=1,
-        inputs=[targets, sources, lists.neighbor, lists.count, _threads(targets.shape[1]), team()],
+        inputs=[
+            targets,
+            sources,
+            lists.neighbor,
+            lists.count,
+            threads_for(targets.shape[1], MOMENTS_PER_THREAD),
+            team(),
+        ],
         outputs=[overlap, overlap_count],
         device="cpu",
     )

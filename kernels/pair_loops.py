@@ -30,7 +30,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels import pair_mirror_cuda, pair_sums_cuda
-from warpmag.kernels.cpu_team import MOST_THREADS, cores
+from warpmag.kernels.cpu_team import threads_for
 from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS, WRENCH
 from warpmag.kernels.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
 from warpmag.kernels.pair_loops_cpu import STRIPE, launch_pair_loop_cpu
@@ -139,7 +139,7 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
         shape = choose_shape(quantity, count)
         tiles, splits = _cuda_tiles(segments, starts, shape, device.sm_count)
     elif form == LOOP:
-        threads = int(np.clip(pair_count // (2 * _PAIRS_PER_START), 1, min(cores(), MOST_THREADS)))
+        threads = threads_for(pair_count, 2 * _PAIRS_PER_START)
         tiles, shares = _cpu_tiles(segments, starts, threads)
         splits = len(shares) - 1
 

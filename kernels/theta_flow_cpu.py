@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.anderson import DEPTH
-from warpmag.kernels.cpu_team import MOST_THREADS, cores, team
+from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for
 from warpmag.kernels.field import INVERSE_4PI
 from warpmag.kernels.induction import (
     COLUMNS,
@@ -51,8 +51,6 @@ from warpmag.kernels.theta_flow import (
 )
 from warpmag.kernels.vector_passes import BLOCK, LANES, passes_text
 
-_ROWS_PER_THREAD = 250
-"""Rows that make another thread worth its start."""
 SHOW, START, FIRST_SWEEP, LAST_SWEEP, JUDGE, ADVANCE = range(6)
 """The passes, in order."""
 
@@ -456,8 +454,7 @@ def allocate(applied, partial, induced, moments, external_field, material, b: In
     arrays.past, arrays.shown, arrays.next_shown = (zeros(LANES * count, BLOCK) for _ in range(3))
     arrays.largest = zeros(vectors * count, 2, kind=wp.float64)
     arrays.sums = zeros(vectors * count, COLUMNS, kind=wp.float64)
-    threads = int(np.clip(len(target) // _ROWS_PER_THREAD, 1, min(cores(), MOST_THREADS)))
-    return Passes(arrays, put(first_vector, wp.int32), b, dtype, threads, {})
+    return Passes(arrays, put(first_vector, wp.int32), b, dtype, threads_for(len(target), MOMENTS_PER_THREAD), {})
 
 
 # ---------------------------------------------------------------------------------------------------------------------

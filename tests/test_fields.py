@@ -8,7 +8,7 @@ from arrangements import as_float32, overlapping, pile, relative
 
 import warpmag
 from warpmag import oracle
-from warpmag.kernels import pair_loops, pair_mirror_cuda, pair_sums_cuda
+from warpmag.kernels import cpu_team, pair_loops, pair_mirror_cuda, pair_sums_cuda
 from warpmag.kernels.field import launch_field
 from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, WRENCH
 from warpmag.kernels.pair_loops import FUSED, LOOP, MIRRORED
@@ -98,7 +98,7 @@ def test_as_many_targets_as_moments(dtype, device):
 @pytest.mark.parametrize("threads", [1, 3])
 def test_segments(dtype, threads, device, monkeypatch):
     """Two worlds of one radius each, more than a tile of moments, and some moments that see all of them."""
-    monkeypatch.setattr(pair_loops, "cores", lambda: threads)
+    monkeypatch.setattr(cpu_team, "cores", lambda: threads)
     x, _, m = pile(count=1500)
     radii = as_float32(np.where(np.arange(1500) < 900, 0.0049, 0.0045))[0]
     segments = [(0, 901, 0, 901), (901, 1490, 901, 1490), (1490, 1500, 3, 1489)]

@@ -280,6 +280,26 @@ def test_vector_passes_do_what_plain_ones_do(dtype, curve, device, monkeypatch):
     assert relative(vectored, plain) < 1e-3  # both within rtol
 
 
+def test_threads_do_not_show(device, monkeypatch):
+    """Balls enough for three threads to share every pass, on the move: the same bits again, and what one finds."""
+    x = 0.01 * np.stack(np.meshgrid(*[np.arange(20.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    velocities = np.random.default_rng(5).normal(size=x.shape) * 2e-4
+    results = []
+    for cores in (3, 3, 1):
+        monkeypatch.setattr(cpu_team, "cores", lambda cores=cores: cores)
+        system = MomentSystem(
+            radii=np.full(len(x), 0.005), saturation=MS, external_field=[0.0, 0.0, 1e5], rtol=1e-5, device=device
+        )
+        for step in range(4):
+            system.positions.assign(x + step * velocities)
+            system.solve()
+        system.apply_forces()
+        results.append((system.moments.numpy().copy(), system.forces.numpy().copy()))
+    for first, second, alone in zip(*results, strict=True):
+        assert np.array_equal(first, second)
+        assert relative(first, alone) < 1e-4  # iterates that differ by rounding end within rtol of each other
+
+
 def test_magnet_that_goes_away(device):
     """Without a field the only solution is no magnetization, from a warm start too."""
     system, _, moments, _ = two_worlds(device)
