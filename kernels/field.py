@@ -1,4 +1,7 @@
-"""Field at targets: the sums of the pair loop, or of this very kernel's blocks, with overlapping pairs corrected."""
+"""Field at targets: the sums of the pair loop, or of this very kernel's blocks, with overlapping pairs corrected.
+
+On a CPU ``finish_cpu`` does so.
+"""
 
 from functools import cache
 

@@ -11,7 +11,8 @@ every arrangement, and is what the passes over the pairs walk.
 The search sorts moments into cubic cells as wide as the farthest pair of a list. A hash table holds for each cell the
 last moment that was put in, and each moment knows the one before it. A target meets its neighbours in its own cell and
 the 26 around it, on a GPU by a thread for each. The lists are then sorted, so that the order in which threads came does
-not show.
+not show. A CPU has a search of its own, ``neighbors_cpu``, and ``moment_code`` for what is done with the lists; what
+stands here is what it falls back to, see ``cpu_team.VECTORS``.
 """
 
 import math

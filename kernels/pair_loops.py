@@ -52,7 +52,7 @@ _LEAST_MUTUAL = 0.75
 """Least part of the sources that are targets, for both ends of a pair to be worth what the mirrored form costs."""
 
 _PAIRS_PER_START = 200_000
-"""Pairs that a CPU sums while another of its threads starts: 50 µs, most of it to wake a core."""
+"""Pairs that a CPU sums while another of its threads wakes: 50 to 100 µs."""
 _TILES_PER_THREAD = 16
 """Tiles that a thread should have, so that they can be shared out evenly."""
 _ROUNDS, _MOST_SHARES = 3, 12

@@ -28,6 +28,8 @@ one before it, β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a 
 changes Δs_j, Δr_j outlive a solve, since what they tell of the coupling hardly changes: a slow mode, as of long columns
 of balls, costs one evaluation instead of three. All that leaves 1.5 evaluations a solve where 2,500 balls jump (Balls
 Up). A start is only a start, and whatever it is worth the solve converges to the one solution.
+
+``theta_flow_cpu`` does the same on a CPU.
 """
 
 from functools import cache
