@@ -10,7 +10,7 @@ import warp as wp
 from warpmag.kernels import cpu_team, finish_cpu
 from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
 from warpmag.kernels.pair_code import FIELD
-from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share
+from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
 
 INVERSE_4PI = 0.07957747154594767
 
@@ -128,7 +128,7 @@ def _sum_kernel(dtype, shape: Shape):
     vec3 = wp.types.vector(3, dtype)
     field_of_tile = summed_field(dtype, shape)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=shape.launch_bounds(dtype))
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(shape.threads, 1))
     def sum_field(
         # inputs:
         tiles: wp.array2d[int],
@@ -141,8 +141,8 @@ def _sum_kernel(dtype, shape: Shape):
         # outputs:
         h_out: wp.array[vec3],
     ):
-        tile = wp.tid() // wp.static(shape.threads)
-        thread = wp.tid() % wp.static(shape.threads)
+        tile = this_block()
+        thread = this_thread()
         i = own_target(tile, thread, tiles)
         start = vec3()
         if i >= 0:

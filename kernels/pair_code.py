@@ -24,9 +24,10 @@ FIELD, FORCE, WRENCH, KELVIN = "field", "force", "wrench", "kelvin"
 WIDTHS = {FIELD: 3, FORCE: 3, WRENCH: 6, KELVIN: 3}
 """Numbers per target that a loop leaves."""
 
-TILE_COLUMNS = 7
+TILE_COLUMNS = 8
 """A tile is: target rows begin and end, packed column of the first of them, sources begin and end, the split that its
-sums belong to, and whether it is mirrored, that is stands also for the tile with sources and targets exchanged."""
+sums belong to, whether it is mirrored, that is stands also for the tile with sources and targets exchanged, and
+nothing: so much a GPU reads at once."""
 
 _FIELD_SUMS = ("hx", "hy", "hz")
 _FORCE_SUMS = ("fx", "fy", "fz", "along")

@@ -195,7 +195,7 @@ def _cuda_tiles(segments, starts, shape: Shape, multiprocessors: int):
 def _block_tiles(segments, starts, width: int, splits: int):
     """Tiles of at most ``width`` targets, each for every part of the sources."""
     tiles = [
-        (row, min(row + width, starts[k + 1]), t0 + row - starts[k], *source, split, 0)
+        (row, min(row + width, starts[k + 1]), t0 + row - starts[k], *source, split, 0, 0)
         for k, (t0, _, s0, s1) in enumerate(segments)
         for row in range(starts[k], starts[k + 1], width)
         for split, source in enumerate(_cut(s0, s1, splits))
@@ -218,7 +218,7 @@ def _cpu_tiles(segments, starts, threads: int):
             for a, (i0, i1) in enumerate(targets):
                 for b, (j0, j1) in enumerate(sources):
                     if not mirrored or a <= b:
-                        tiles.append((row + i0 - t0, row + i1 - t0, i0, j0, j1, 0, mirrored))
+                        tiles.append((row + i0 - t0, row + i1 - t0, i0, j0, j1, 0, mirrored, 0))
                         work.append((i1 - i0) * (j1 - j0) * (2.0 if mirrored and a < b else 1.0))
     rounds = int(np.clip(_MOST_SHARES // threads, 1, _ROUNDS)) if threads > 1 else 1
     sizes = np.repeat(0.5 ** np.arange(rounds), threads)

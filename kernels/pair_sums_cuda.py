@@ -1,14 +1,15 @@
 """Sums over pairs on a GPU, made by the very kernel that needs them: no second launch waits for the first.
 
-Some warps share out the sources of a few targets: each lane takes some of them at a time, and meets all the targets
-with them. What the lanes have summed is added up by shuffles, each of which halves the values that a lane keeps, and
-what the warps have summed in shared memory, in an order that depends on nothing. Other threads of the block meanwhile
-bring what these leave out: the targets among themselves, and the correction of overlapping pairs. Thread k of a block
-ends with the whole sum of target k, for the kernel to go on with.
+A block has a tile of a few targets. Each of its warps holds all of them, some in every lane, and as often as there are
+lanes for it; the warps share out the sources, stage them through shared memory, 32 at a time, and groups of lanes share
+out what is staged. What the groups have summed is added up by shuffles, most of which halve the values that a lane
+keeps, and what the warps have summed in shared memory, in an order that depends on nothing. Other threads of the block
+meanwhile bring the correction of overlapping pairs. Thread k of a block ends with the whole sum of target k, for the
+kernel to go on with.
 
-Where all sources that a warp takes have one radius, and none of them is left out for one of the targets, the clamp is
-a constant of the target and nothing is masked: 20 instructions a pair for the field and 31 for the force, next to the
-ten or so that a source takes once for all targets.
+Where the sources that a group meets in one go have one radius, and none of them is left out for one of the targets,
+the clamp is a constant of the target and nothing is masked: 20 instructions a pair for the field and 31 for the force,
+next to the four or so that a source takes once for all targets of a lane, and the sixty that a warp takes to stage 32.
 """
 
 import math
@@ -36,28 +37,31 @@ class Shape:
     """Shape of the blocks that walk a work list.
 
     Attributes:
-        targets: Targets of a block.
-        groups: Groups of them that each have warps of their own, which hold up to 16 targets.
-        warps: Warps of a group that share out the sources.
-        sources: Sources that a lane takes at a time; 1, 2 or 4.
-        blocks: Blocks that a multiprocessor holds at once, in float32.
+        held: Targets that a lane holds.
+        lanes: Lanes of a warp that hold other targets than each other.
+        warps: Warps of a block that share out the sources.
+        unrolled: Sources that a lane meets in one go.
     """
 
-    targets: int
-    groups: int
+    held: int
+    lanes: int
     warps: int
-    sources: int
-    blocks: int
+    unrolled: int
+
+    @property
+    def targets(self) -> int:
+        """Targets of a block."""
+        return self.held * self.lanes
 
     @property
     def summing(self) -> int:
         """Threads of a block that sum."""
-        return 32 * self.groups * self.warps
+        return 32 * self.warps
 
     @property
     def correcting(self) -> int:
         """Threads of a block that correct, after those that sum."""
-        return 32 * math.ceil(self.targets / 16)
+        return 32 * max(min(4, math.ceil(self.targets / 8)), math.ceil(self.targets / 32))
 
     @property
     def threads(self) -> int:
@@ -69,16 +73,18 @@ class Shape:
         """Threads that share out the corrections of a target, a power of two."""
         return min(32, 1 << (self.correcting // self.targets).bit_length() - 1)
 
-    def launch_bounds(self, dtype) -> tuple[int, int]:
-        """Bounds of a kernel: threads of a block, and blocks that a multiprocessor holds at once."""
-        return self.threads, self.blocks if dtype is wp.float32 else 1
-
 
 # Measured on an H200: the shape, and the most targets that it is best for.
 SHAPES = {
-    FIELD: ((350, Shape(2, 1, 4, 2, 6)), (1500, Shape(4, 1, 8, 2, 2)), (None, Shape(5, 1, 3, 4, 4))),
-    FORCE: ((700, Shape(2, 1, 4, 2, 4)), (1500, Shape(4, 1, 4, 2, 2)), (None, Shape(20, 5, 2, 4, 1))),
-    WRENCH: ((700, Shape(2, 1, 4, 2, 4)), (1500, Shape(4, 1, 4, 2, 2)), (None, Shape(4, 1, 3, 2, 4))),
+    FIELD: (
+        (350, Shape(2, 1, 8, 1)),
+        (1500, Shape(4, 2, 8, 2)),
+        (2700, Shape(5, 4, 16, 4)),
+        (3700, Shape(7, 4, 12, 2)),
+        (None, Shape(5, 8, 16, 4)),
+    ),
+    FORCE: ((700, Shape(2, 2, 8, 1)), (1500, Shape(2, 4, 16, 1)), (None, Shape(5, 4, 8, 4))),
+    WRENCH: ((700, Shape(2, 2, 8, 1)), (None, Shape(5, 4, 8, 2))),
 }
 
 
@@ -89,154 +95,180 @@ def choose_shape(quantity: str, count: int) -> Shape:
 
 _W = 1.0  # see pair_code
 
+_SOURCE = """
+                        const Quad qa = staged_a[k], qb = staged_b[k];
+                        const REAL ax = qa.x, ay = qa.y, az = qa.z, bx = qa.w, by = qb.x, bz = qb.y;
+                        const REAL ux = qb.z, uy = qb.w, uz = SCALE * bz;
+"""
+
+
+def _folds(values: int, lanes: int) -> tuple[int, str, str]:
+    """Text that adds up the ``values`` of the lanes that are ``lanes`` apart, in as few shuffles as may be.
+
+    Returns:
+        The number of values to begin with, the last of them nothing; the text; and text that stores what a lane ends
+        with at its place.
+    """
+    steps = [step for step in (16, 8, 4, 2, 1) if step >= lanes]
+    halvings = min(len(steps), (values - 1).bit_length())
+    padded = -(-values >> halvings) << halvings
+    left, text, first = padded, "", ["0"]
+    for step in steps[:halvings]:
+        left //= 2
+        text += f"halve({left}, {step});"
+        first.append(f"(lane & {step} ? {left} : 0)")
+    for step in steps[halvings:]:
+        text += f"for (int i = 0; i < {left}; ++i) r[i] += __shfl_xor_sync(~0u, r[i], {step});"
+    idle = sum(steps[halvings:])
+    stores = "".join(f"warp_sums[at + {i}] = r[{i}];" for i in range(left))
+    place = f"const int at = own * {padded} + {' + '.join(first)};"
+    return padded, text, f"if ((lane & {idle}) == 0) {{ {place} {stores} }}"
+
 
 def _snippet(real: str, quantity: str, shape: Shape) -> str:
     """One thread of a block."""
-    field = quantity == FIELD
-    groups, warps, width, taken = shape.groups, shape.warps, WIDTHS[quantity], shape.sources
-    held = shape.targets // groups
-    padded = 1 << (held - 1).bit_length()  # targets, so many that halving ends with one
-    ks, vs = [str(k) for k in range(held)], range(taken)
-    # what is read of a source, and in which packed row it is
-    rows = {"ax": 0, "ay": 1, "az": 2, "radius": 3, "bx": 4, "by": 5, "bz": 6, **({} if field else {"label": 7})}
+    field, width = quantity == FIELD, WIDTHS[quantity]
+    held, lanes, warps, ks = shape.held, shape.lanes, shape.warps, [str(k) for k in range(shape.held)]
+    groups = 32 // lanes
+    stride = groups * shape.unrolled
+    padded, folds, stores = _folds(held * width, lanes)
 
     def each(text: str) -> str:
         return "".join(text.replace("@", k) for k in ks)
 
-    # what is read of a target, and where it is
-    target = {"tx": "tgt[0 * nt", "ty": "tgt[1 * nt", "tz": "tgt[2 * nt", "tr": "tgt[3 * nt"}
-    if not field:
-        target |= {"tl": "tgt[7 * nt", "ex": "eff[0 * ne", "ey": "eff[1 * ne", "ez": "eff[2 * ne"}
-    target_loaded = "".join(f"const REAL {name} = {place} + column];" for name, place in target.items())
-    targets_shared = each(
-        "".join(f"const REAL {name}@ = __shfl_sync(~0u, {name}, @);" for name in target)
-        + f"REAL {', '.join(f'{name}@ = 0' for name in SUMS[quantity])};"
-        + "const REAL clamp@ = (tr@ + one_radius) * (tr@ + one_radius);"
-    )
     if field:
-        bounds, apart, left_out, own_left_out = "", [], "false", "i == column"
+        apart = "(unsigned)(j - own_begin) >= own_count"
+        left_out, bounds = f"same && base + k == column_begin + own + {lanes} * @", ""
     else:
-        bounds = "REAL lowest = tl0, highest = tl0;" + "".join(
-            f"lowest = min(lowest, tl{k}); highest = max(highest, tl{k});" for k in ks[1:]
+        apart, left_out = "(label < lowest || label > highest)", "qc.y == tl@"
+        bounds = (
+            "REAL lowest = tl0, highest = tl0;"
+            + "".join(f"lowest = min(lowest, tl{k}); highest = max(highest, tl{k});" for k in ks[1:])
+            + f"""
+        for (int step = {lanes // 2}; step > 0; step /= 2) {{
+            lowest = min(lowest, __shfl_xor_sync(~0u, lowest, step));
+            highest = max(highest, __shfl_xor_sync(~0u, highest, step));
+        }}"""
         )
-        apart = [f"(p_label.at[{v}] < lowest || p_label.at[{v}] > highest)" for v in vs]
-        left_out, own_left_out = "label == tl@", "label == tl"
-    apart += [f"p_radius.at[{v}] == one_radius" for v in vs]
-    packs_loaded = "".join(f"p_{name} = *(const Pack*)(src + {row} * ns + j);" for name, row in rows.items())
-    scaled = "const REAL ux = SCALE * bx, uy = SCALE * by, uz = SCALE * bz;"
-    fast_pairs = each("{" + pair(quantity, "inverse_root(max(d2, clamp@))", "@") + "}")
-    fast_sources = "".join(
-        "{" + "".join(f"const REAL {name} = p_{name}.at[{v}];" for name in rows) + scaled + fast_pairs + "}" for v in vs
+    # what a lane reads beyond the last target is there, and not wanted; but what a table of another pitch holds, or
+    # what decides whether a source is left out, is that of the last again
+    loads = "".join(
+        f"{{ const REAL* row = tgt + {row} * nt + column_begin + own;" + each(f"{name}@ = row[{lanes} * @];") + "}"
+        for row, name in enumerate(("tx", "ty", "tz", "tr"))
     )
-    source = "".join(f"const REAL {name} = src[{row} * ns + i];" for name, row in rows.items() if name[0] != "b")
-    moment = "".join(f"const REAL b{c} = there ? src[{row} * ns + i] : 0;" for row, c in enumerate("xyz", 4)) + scaled
-    careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + radius, {left_out})", "@") + "}")
-    own_pair = pair(quantity, f"careful(d2, tr + radius, {own_left_out})")
-    own_sums = "".join(f"r[{c}] += {text};" for c, text in enumerate(results(quantity, _W)))
+    if not field:
+        loads += each(
+            f"{{ const int column = column_begin + min(own + {lanes} * @, count - 1); tl@ = tgt[7 * nt + column];"
+            + "".join(f"e{c}@ = eff[{row} * ne + column];" for row, c in enumerate("xyz"))
+            + "}"
+        )
+    target = ["tx", "ty", "tz", "tr", *([] if field else ["tl", "ex", "ey", "ez"])]
+    read = ", ".join(f"{name}{k}" for k in ks for name in target)
+    cleared = ", ".join(f"{name}{k} = 0" for k in ks for name in SUMS[quantity])
+    fast_pairs = each("{" + pair(quantity, "inverse_root(max(d2, clamp@))", "@") + "}")
+    careful_pairs = each("{" + pair(quantity, f"careful(d2, tr@ + qc.x, {left_out})", "@") + "}")
     sums = "".join(
         f"r[{int(k) * width + c}] = {text};" for k in ks for c, text in enumerate(results(quantity, _W, k))
-    ) + "".join(f"r[{c}] = 0;" for c in range(held * width, padded * width))
-    halvings = "".join(f"halve({padded * width >> level}, {32 >> level});" for level in range(1, padded.bit_length()))
+    ) + "".join(f"r[{c}] = 0;" for c in range(held * width, padded))
     return f"""
     {cuda_head(real)}
     constexpr REAL SCALE = {scaled_moment(quantity, _W)!r};
-    struct alignas({taken} * sizeof(REAL)) Pack {{ REAL at[{taken}]; }};
-    __shared__ REAL sums[{groups * warps}][{padded}][{width}], corrections[{shape.targets}][{width}];
+    struct alignas(16) Quad {{ REAL x, y, z, w; }};
+    struct alignas(8) Pair {{ REAL x, y; }};
+    __shared__ Quad staging[{warps}][{max(80, lanes * padded // 4)}];  // of each warp: its sources, and then its sums
+    __shared__ REAL corrections[{shape.targets}][{width}];
     const int lane = thread % 32, warp = thread / 32;
-    const bool summing = thread < {shape.summing};
     const int* t = tiles.data + {TILE_COLUMNS} * tile;
-    const int count = t[1] - t[0], column_begin = t[2], source_begin = t[3], source_end = t[4];
+    const int count = t[1] - t[0], column_begin = t[2], range_begin = t[3], range = t[4] - range_begin;
     const size_t ns = sources.strides[0] / sizeof(REAL), nt = targets.strides[0] / sizeof(REAL);
     const size_t ne = effective.strides[0] / sizeof(REAL);
     const REAL *src = (const REAL*)sources.data, *tgt = (const REAL*)targets.data, *eff = (const REAL*)effective.data;
-    // a lane reads one target; those beyond the last are the last again
-    const int group = warp / {warps};
-    const int own = summing ? group * {held} + min(lane, {held - 1}) : (thread - {shape.summing}) / {shape.shares};
-    const int column = column_begin + min(own, count - 1);
-    {target_loaded}
-    // the targets of a group, with what else is taken with them, are left to the correcting threads
-    const int first = source_begin / {taken} * {taken}, group_begin = column_begin + own / {held} * {held};
-    const int group_end = min(group_begin + {held}, column_begin + count);
-    const int own_begin = src == tgt ? min(max(group_begin / {taken} * {taken}, first), source_end) : source_end;
-    const int own_end = min(max((group_end + {taken - 1}) / {taken} * {taken}, own_begin), source_end);
-    const int skipped = (own_end - own_begin + {taken - 1}) / {taken} * {taken};
-    REAL r[{padded * width}];  // of all targets, target by target; then of fewer and fewer
-    #pragma unroll
-    for (int c = 0; c < {width}; ++c) r[c] = summing ? REAL(0) : correction[c];
-    if (summing && group_begin < group_end && source_begin < source_end) {{
-        const REAL one_radius = src[3 * ns + source_begin];
-        // the last moment is followed by moments of nothing
-        const int readable_end = source_end < sources.shape[1] ? source_end : (int)ns;
-        int walk = first + {taken} * (thread % {32 * warps}), j;
-        bool loaded;
-        Pack {", ".join("p_" + name for name in rows)};
-        auto load = [&]() {{
-            j = walk < own_begin ? walk : walk + skipped;
-            loaded = j >= source_begin && j + {taken} <= readable_end;
-            if (loaded) {{
-                {packs_loaded}
-            }}
+    if (thread < {shape.summing}) {{
+        const bool same = src == tgt;
+        const int own_begin = same ? column_begin : 0;
+        const unsigned own_count = same ? count : 0;
+        const int own = lane % {lanes}, group = lane / {lanes};
+        const int source_begin = range_begin + range * warp / {warps};
+        const int source_end = range_begin + range * (warp + 1) / {warps};
+        Quad *staged_a = staging[warp], *staged_b = staged_a + 32;
+        Pair* staged_c = (Pair*)(staged_a + 64);
+        REAL x, y, z, radius, bx, by, bz, label = 0;
+        // the moments of nothing that follow the last one are there to be read
+        auto load = [&](int base) {{
+            const REAL* s = src + base + lane;
+            const bool there = base + lane < source_end;
+            x = s[0], y = s[ns], z = s[2 * ns], radius = s[3 * ns];
+            bx = there ? s[4 * ns] : 0, by = there ? s[5 * ns] : 0, bz = there ? s[6 * ns] : 0;
+            {"" if field else "label = s[7 * ns];"}
         }};
-        load();  // before the targets are wanted, so that both are waited for at once
-        {targets_shared}
+        const REAL one_radius = src[3 * ns + range_begin];
+        if (source_begin < source_end) load(source_begin);
+        REAL {read}, {cleared};
+        {loads}
         {bounds}
+        {each("const REAL clamp@ = (tr@ + one_radius) * (tr@ + one_radius);")}
         #pragma unroll 1
-        for (; walk - {taken} * lane < source_end - skipped; walk += {32 * taken * warps}, load()) {{
-            const bool fast = loaded && one_radius > 0 && {" && ".join(apart)};
-            if (__all_sync(~0u, fast)) {{
-                {fast_sources}
-            }} else {{
-                #pragma unroll 1
-                for (int v = 0; v < {taken}; ++v) {{
-                    // beyond the ends stand the first or the last source again, without a moment
-                    const int i = min(max(j + v, source_begin), source_end - 1);
-                    const bool there = i == j + v;
-                    {source}
-                    {moment}
-                    {careful_pairs}
+        for (int base = source_begin; base < source_end; base += 32) {{
+            const int j = base + lane, staged = min(32, source_end - base);
+            const bool plain = radius == one_radius && radius > 0 && {apart};
+            const unsigned odd = __ballot_sync(~0u, !plain);
+            staged_a[lane] = Quad{{x, y, z, bx}};
+            staged_b[lane] = Quad{{by, bz, SCALE * bx, SCALE * by}};
+            staged_c[lane] = Pair{{radius, label}};
+            __syncwarp();
+            if (base + 32 < source_end) load(base + 32);
+            #pragma unroll 1
+            for (int first = 0; first < staged; first += {stride}) {{
+                if ((odd >> first & {(1 << stride) - 1}u) == 0) {{
+                    #pragma unroll
+                    for (int step = 0; step < {shape.unrolled}; ++step) {{
+                        const int k = first + {groups} * step + group;
+                        {_SOURCE}
+                        {fast_pairs}
+                    }}
+                }} else {{
+                    #pragma unroll 1
+                    for (int k = first + group; k < first + {stride}; k += {groups}) {{
+                        const Pair qc = staged_c[k];
+                        {_SOURCE}
+                        {careful_pairs}
+                    }}
                 }}
             }}
+            __syncwarp();
         }}
+        REAL r[{padded}];
         {sums}
         auto halve = [&](int half, int step) {{
             const bool upper = lane & step;
+            #pragma unroll
             for (int i = 0; i < half; ++i) {{
                 const REAL sent = upper ? r[i] : r[i + half], kept = upper ? r[i + half] : r[i];
                 r[i] = kept + __shfl_xor_sync(~0u, sent, step);
             }}
         }};
-        {halvings}
-    }} else if (!summing && own < count) {{
-        REAL {", ".join(f"{name} = 0" for name in SUMS[quantity])};
-        for (int i = max(own_begin, source_begin) + thread % {shape.shares}; i < own_end; i += {shape.shares}) {{
-            const bool there = true;
-            {source}
-            {moment}
-            {own_pair}
-        }}
-        {own_sums}
-    }}
-    auto add_lanes = [&](int lanes) {{
-        #pragma unroll
-        for (int step = lanes / 2; step > 0; step /= 2)
-            #pragma unroll
-            for (int c = 0; c < {width}; ++c) r[c] += __shfl_xor_sync(~0u, r[c], step);
-    }};
-    if (summing) {{
-        add_lanes({32 // padded});
-        if (lane % {32 // padded} == 0)
-            for (int c = 0; c < {width}; ++c) sums[warp][lane / {32 // padded}][c] = r[c];
+        {folds}
+        REAL* warp_sums = (REAL*)staging[warp];
+        {stores}
     }} else {{
-        add_lanes({shape.shares});
-        if (thread % {shape.shares} == 0 && own < count)
-            for (int c = 0; c < {width}; ++c) corrections[own][c] = r[c];
+        const int k = (thread - {shape.summing}) / {shape.shares};
+        #pragma unroll
+        for (int c = 0; c < {width}; ++c) {{
+            REAL total = correction[c];
+            #pragma unroll
+            for (int step = {shape.shares // 2}; step > 0; step /= 2) total += __shfl_xor_sync(~0u, total, step);
+            if (thread % {shape.shares} == 0 && k < {shape.targets}) corrections[k][c] = total;
+        }}
     }}
     __syncthreads();
     wp::vec_t<{width}, REAL> total;
     if (thread < count) {{
+        const int at = thread % {lanes} * {padded} + thread / {lanes} * {width};
+        #pragma unroll
         for (int c = 0; c < {width}; ++c) {{
             total[c] = corrections[thread][c];
-            for (int w = 0; w < {warps}; ++w) total[c] += sums[thread / {held} * {warps} + w][thread % {held}][c];
+            #pragma unroll
+            for (int w = 0; w < {warps}; ++w) total[c] += ((const REAL*)staging[w])[at + c];
         }}
     }}
     return total;
@@ -266,12 +298,25 @@ def pair_summation(dtype, quantity: str, shape: Shape):
     return sum_pairs
 
 
+# what Warp makes of its index takes a division, and all else waits for it
+@wp.func_native("return blockIdx.x;")
+def this_block() -> int:
+    """Block of this thread, and so its tile."""
+    ...
+
+
+@wp.func_native("return threadIdx.x;")
+def this_thread() -> int:
+    """Thread of the block."""
+    ...
+
+
 @wp.func
 def own_target(tile: int, thread: int, tiles: wp.array2d[int]):
     """Packed column of the target whose sum a thread gets; -1 for none."""
-    if thread < tiles[tile, 1] - tiles[tile, 0]:
-        return tiles[tile, 2] + thread
-    return -1
+    # all of it is read at once, whether it is wanted or not: a block begins with what waits for this
+    column = tiles[tile, 2] + thread
+    return wp.where(thread < tiles[tile, 1] - tiles[tile, 0], column, -1)
 
 
 @cache
@@ -281,9 +326,8 @@ def target_share(shape: Shape):
     @wp.func
     def share_of(tile: int, thread: int, tiles: wp.array2d[int]):
         k = (thread - wp.static(shape.summing)) // wp.static(shape.shares)
-        i = -1
-        if thread >= wp.static(shape.summing) and k < tiles[tile, 1] - tiles[tile, 0]:
-            i = tiles[tile, 2] + k
-        return i, thread % wp.static(shape.shares)
+        column = tiles[tile, 2] + k
+        wanted = thread >= wp.static(shape.summing) and k < tiles[tile, 1] - tiles[tile, 0]
+        return wp.where(wanted, column, -1), thread % wp.static(shape.shares)
 
     return share_of

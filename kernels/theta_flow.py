@@ -381,7 +381,7 @@ def _judgement_kernel(dtype, shape: Shape | None):
     measure = _measured(dtype)
     sum_group = group_sum(columns)
     group = 1 << (shape.targets - 1).bit_length() if fused else 0
-    bounds = {"grid_stride": False, "launch_bounds": (shape.threads, min(shape.blocks, 2))} if fused else {}
+    bounds = {"grid_stride": False, "launch_bounds": (shape.threads, 1)} if fused else {}
 
     @wp.kernel(module="unique", enable_backward=False, **bounds)
     def judge_iterates(

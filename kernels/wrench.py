@@ -25,7 +25,7 @@ from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
 from warpmag.kernels.packing import ball_volume
 from warpmag.kernels.pair_code import WIDTHS, WRENCH
 from warpmag.kernels.pair_law import gradient_times
-from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share
+from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
 
 MU0 = 1.2566370614359173e-06
 """Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
@@ -196,7 +196,7 @@ def _sum_kernel(dtype, quantity: str, shape: Shape):
     share_of = target_share(shape)
     sum_pairs = pair_summation(dtype, quantity, shape)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=shape.launch_bounds(dtype))
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(shape.threads, 1))
     def sum_wrench(
         # inputs:
         tiles: wp.array2d[int],
@@ -210,8 +210,8 @@ def _sum_kernel(dtype, quantity: str, shape: Shape):
         force_out: wp.array[vec3],
         torque_out: wp.array[vec3],
     ):
-        tile = wp.tid() // wp.static(shape.threads)
-        thread = wp.tid() % wp.static(shape.threads)
+        tile = this_block()
+        thread = this_thread()
         correction = sums()
         i, share = share_of(tile, thread, tiles)
         if i >= 0:
