@@ -84,7 +84,7 @@ SHAPES = {
         (None, Shape(5, 8, 16, 4)),
     ),
     FORCE: ((700, Shape(2, 2, 8, 1)), (1500, Shape(2, 4, 16, 1)), (None, Shape(5, 4, 8, 4))),
-    WRENCH: ((700, Shape(2, 2, 8, 1)), (None, Shape(5, 4, 8, 2))),
+    WRENCH: ((700, Shape(2, 2, 8, 1)), (1500, Shape(4, 2, 8, 2)), (None, Shape(5, 4, 8, 2))),
 }
 
 
