@@ -126,6 +126,11 @@ class InductionBuffers:
     converged: wp.array
     condition: wp.array
 
+    @property
+    def fused(self) -> bool:
+        """Whether what judges the moments sums their field itself."""
+        return self.part is not self.chunk
+
 
 def allocate(worlds, inducible, tiles, dtype, device) -> InductionBuffers:
     """Allocate the buffers.
@@ -156,11 +161,12 @@ def allocate(worlds, inducible, tiles, dtype, device) -> InductionBuffers:
     def zeros(shape, kind):
         return wp.zeros(shape, dtype=kind, device=device)
 
+    chunk = put(np.reshape(chunks, (-1, 3)), wp.vec3i)
     return InductionBuffers(
         world=put(worlds, wp.int32),
-        chunk=put(np.reshape(chunks, (-1, 3)), wp.vec3i),
+        chunk=chunk,
         chunk_begin=put(chunk_begin, wp.int32),
-        part=put(np.reshape(parts, (-1, 3)), wp.vec3i),
+        part=chunk if tiles is None else put(np.reshape(parts, (-1, 3)), wp.vec3i),
         part_begin=put(part_begin, wp.int32),
         **{name: zeros(n, vec3) for name in ("h0", "h", "s", "best_s", "best_r")},
         **{name: zeros(n, vec3) for name in ("mixed_g", "mixed_moment", "change", "next_change")},

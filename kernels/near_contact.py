@@ -23,10 +23,12 @@ row of an array is.
 | mirror | [chunks, slots, LANES] | place in ``halves`` of the other ball's half |
 | contact, last_contact | [chunks, rows, LANES] | n and Θ̃, those of the sweep before |
 | placed, seen, driven | [balls, BLOCK] | what others read of a ball: place; ã and m; e |
-| outer | [chunks, rows, LANES] | what the first pass keeps for the others |
-| field | [chunks, 3, LANES] | 4π H_near [A/m] |
+| outer | [chunks, rows, LANES] | what passes keep for those that follow |
+| halves | [chunks, slots, 3, LANES] | what a ball sees of its contacts' forces |
+| field, pulled | [chunks, 3, LANES] | 4π H_near [A/m]; on a GPU with few balls also forces [N] over μ0/4π |
 
-Ball i is number i mod LANES of chunk i div LANES.
+Ball i is number i mod LANES of chunk i div LANES. On a GPU what balls tell others stands in packets of four numbers,
+the last a mark, in place of rows of three; ``seen`` and ``driven`` hold it as it was in the last turns, too.
 """
 
 from contextlib import contextmanager
@@ -46,16 +48,18 @@ from warpmag.kernels.near_contact_code import (
     CHANGE_ROWS,
     CONTACT_ROWS,
     CONTACTS,
+    FORCES,
+    INTEGER_ARRAYS,
     NEAR,
     OUTER_ROWS,
     PAIR_ROWS,
+    REAL_ARRAYS,
     SKIN,
     SLOPE_ROWS,
     STATE_ROWS,
-    SWEEPS,
-    force_text,
+    WAYS,
+    contact_text,
     place_text,
-    sweep_text,
     tabulate_text,
 )
 from warpmag.kernels.vector_passes import BLOCK, LANES
@@ -65,56 +69,20 @@ KINDS = 16
 """Susceptibilities that are told apart."""
 _BALLS_PER_THREAD = 500
 """Balls that make another thread of a CPU worth its start."""
-_MANY_BALLS = 5000
-"""Balls that keep a GPU busy with half as many threads for each."""
+_SIZES = ("balls", "moment_stride", "kinds", "curve")
 
-
-@cache
-def _arrays_type(dtype):
-    """Type of what kernels of a precision are given."""
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.struct
-    class NearContactArrays:
-        packed: wp.array2d[dtype]
-        group: wp.array[int]
-        kind: wp.array[int]
-        candidate: wp.array2d[int]
-        candidate_count: wp.array[int]
-        found_at: wp.array[vec3]
-        moved: wp.array[int]
-        tables: wp.array2d[dtype]
-        near: wp.array3d[int]
-        count: wp.array[int]
-        contact_count: wp.array[int]
-        used: wp.array2d[int]
-        mirror: wp.array3d[int]
-        radius: wp.array[dtype]
-        saturation: wp.array[dtype]
-        curve_slope: wp.array[dtype]
-        ease: wp.array2d[dtype]
-        placed: wp.array2d[dtype]
-        pairs: wp.array4d[dtype]
-        changes: wp.array4d[dtype]
-        contacts: wp.array4d[dtype]
-        slopes: wp.array4d[dtype]
-        contact: wp.array3d[dtype]
-        last_contact: wp.array3d[dtype]
-        seen: wp.array2d[dtype]
-        driven: wp.array2d[dtype]
-        outer: wp.array3d[dtype]
-        halves: wp.array4d[dtype]
-        field: wp.array3d[dtype]
-        row_of: wp.array[int]
-        partial: wp.array3d[dtype]
-        movable: wp.array[int]
-        twisted: wp.array[int]
-        forces: wp.array[vec3]
-        torques: wp.array[vec3]
-        kinds: int
-        curve: int
-
-    return NearContactArrays
+ContactArrays = wp.struct(
+    type(
+        "ContactArrays",
+        (),
+        {
+            "__doc__": "What passes are given: where arrays begin, side by side, for a GPU to read at once; and sizes.",
+            "__annotations__": dict.fromkeys(INTEGER_ARRAYS, wp.uint64)
+            | dict.fromkeys(_SIZES, int)
+            | dict.fromkeys(REAL_ARRAYS, wp.uint64),
+        },
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -122,45 +90,57 @@ class NearContactBuffers:
     """All that the model keeps on the device, for n moments; balls are moments padded to ``LANES``.
 
     Attributes:
+        dtype: Warp scalar type.
+        balls: How many there are.
         group: World of each moment, −1 if it may not take part, shape [balls].
         lists: Balls that are near, or about to be.
-        arrays: What passes over the pairs work on, a Warp struct. Besides what the module names:
+        arrays: What passes over the pairs work on. Besides what the module names:
             packed: The packed moments.
             group, kind: World, and kind of material, shape [balls].
             candidate, candidate_count, found_at, moved: Of ``lists``.
             tables: Spline coefficients of A to P by gap for each pair of kinds, shape [kinds² (gaps + 2), BLOCK].
             count, contact_count: Near balls of each, and those of them that nearly touch, shape [balls].
             used: Slots of both kinds that hold something, shape [2, balls].
-            radius, saturation, curve_slope: Radii [m], Ms [A/m] and slopes k of the curve, shape [balls].
+            radius, unsaturated: Radii [m] and 1/(V Ms) [1/(A·m²)], shape [balls].
+            curve_slope, hardness: Slopes k of the curve, and (2χ + 5)/2χ, shape [balls].
             ease: Inverse diagonals s of a ball's q and N, shape [2, balls].
-            halves: What each ball sees of its contacts' forces, then zeros, shape [chunks + 1, CONTACTS, 3, LANES].
             row_of: Row of each ball among the targets of the field loop, −1 if it has none, shape [balls].
             partial: Sums of that loop, of which the last part is the near contacts', shape [parts, rows, 3].
+            turns: How often drives have been told, shape [balls].
             movable, twisted: Whether a ball's force is wanted, and its torque, shape [balls].
             forces, torques: What they are added to [N, N·m], shape [n].
-            kinds, curve: Number of kinds of material; the magnetization curve.
+        given: Where these are, their sizes and what else passes are given: kinds, the number of kinds of material, and
+            the magnetization curve.
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
         threads: Threads of a CPU.
-        ways: Threads of a GPU that share a ball.
+        at_once: Whether all passes go in one launch of a GPU, with the sums of the field (see ``near_contact_cuda``).
         stream: Stream of a GPU for what is done beside the pair loops.
         events: There, when it starts, when the field is summed, and when all is done.
         commands: Launches as they were recorded, which spares packing the arrays each time.
     """
 
+    dtype: Any
+    balls: int
     group: wp.array
     lists: neighbors.NeighborLists
-    arrays: Any
+    arrays: dict[str, wp.array]
+    given: Any
     reach: float
     threads: int
-    ways: int
+    at_once: bool
     stream: wp.Stream | None
     events: tuple[wp.Event, ...]
     commands: dict
 
+    @property
+    def device(self):
+        """Where it is."""
+        return self.group.device
+
     def forget(self):
         """Start cold, from no contact sources."""
-        for array in (self.arrays.contact, self.arrays.last_contact, self.arrays.seen):
-            array.zero_()
+        for name in ("contact", "last_contact", "seen"):
+            self.arrays[name].zero_()
 
 
 def allocate(
@@ -176,7 +156,7 @@ def allocate(
         saturation: Saturation magnetization of each [A/m], shape [n].
         curve: Their magnetization curve, of ``curves.CURVE_IDS``.
         rows: Work list of the field loop (``pair_loops.Rows``).
-        partial: Its sums, and one part more, to be written by sweeps.
+        partial: Its sums, and one part more, to be written by sweeps; no part, if the sums are fused.
         movable: Whether the force on a moment is wanted, shape [n].
         twisted: Whether its torque is, shape [n].
         forces: What forces are added to [N], Warp array, shape [n].
@@ -203,52 +183,70 @@ def allocate(
         """Values of balls that take part, and another of the rest."""
         return put(np.pad(np.where(eligible, values, other), (0, balls - n), constant_values=other), kind)
 
+    slope = 3.0 / (1.0 + 3.0 / np.asarray(susceptibility, float))
+    saturated = 4.0 / 3.0 * np.pi * np.where(eligible, radii, 1.0).astype(float) ** 3 * saturation
     chunks = balls // LANES
     ratio = 0.5 * model.REACH + SKIN
     lists = neighbors.allocate(n, dtype, device, ratio=ratio, capacity=CANDIDATES)
-    group = padded(worlds, -1, wp.int32)
-    arrays = _arrays_type(dtype)()
-    arrays.packed = packed.packed
-    arrays.group, arrays.kind = group, padded(kind, 0, wp.int32)
-    arrays.candidate, arrays.candidate_count = lists.neighbor, lists.count
-    arrays.found_at, arrays.moved = lists.found_at, lists.moved
-    arrays.tables = put(np.pad(tables, ((0, 0), (0, BLOCK - FUNCTIONS))), dtype)
-    arrays.near = zeros(chunks, NEAR, LANES, kind=wp.int32)
-    arrays.count = zeros(balls, kind=wp.int32)
-    arrays.contact_count = zeros(balls, kind=wp.int32)
-    arrays.used = zeros(2, balls, kind=wp.int32)
-    arrays.mirror = zeros(chunks, CONTACTS, LANES, kind=wp.int32)
-    arrays.radius = padded(radii, 1.0)
-    arrays.saturation = padded(saturation, 1.0)
-    arrays.curve_slope = padded(3.0 / (1.0 + 3.0 / np.asarray(susceptibility, float)), 1.0)
-    arrays.ease = zeros(2, balls)
-    arrays.placed = zeros(balls, BLOCK)
-    arrays.pairs = zeros(chunks, NEAR, PAIR_ROWS, LANES)
-    arrays.changes = zeros(chunks, NEAR, CHANGE_ROWS, LANES)
-    arrays.contacts = zeros(chunks, CONTACTS, CONTACT_ROWS, LANES)
-    arrays.slopes = zeros(chunks, CONTACTS, SLOPE_ROWS, LANES)
-    arrays.contact = zeros(chunks, STATE_ROWS, LANES)
-    arrays.last_contact = zeros(chunks, STATE_ROWS, LANES)
-    arrays.seen = zeros(balls, BLOCK)
-    arrays.driven = zeros(balls, BLOCK)
-    arrays.outer = zeros(chunks, OUTER_ROWS, LANES)
-    arrays.halves = zeros(chunks + 1, CONTACTS, 3, LANES)
-    arrays.field = zeros(chunks, 3, LANES)
     row_of = np.full(n, -1)
-    row_of[rows.target.numpy()] = np.arange(rows.count)
-    arrays.row_of = padded(row_of, -1, wp.int32)
-    arrays.partial = partial
-    arrays.movable, arrays.twisted = padded(movable, 0, wp.int32), padded(twisted, 0, wp.int32)
-    arrays.forces, arrays.torques = forces, torques
-    arrays.kinds = len(levels)
-    arrays.curve = curve
+    if len(partial):
+        row_of[rows.target.numpy()] = np.arange(rows.count)
+    seen, driven, width = (4, 2, 4) if device.is_cuda else (1, 1, 3)
+    arrays = {
+        "packed": packed.packed,
+        "group": padded(worlds, -1, wp.int32),
+        "kind": padded(kind, 0, wp.int32),
+        "candidate": lists.neighbor,
+        "candidate_count": lists.count,
+        "found_at": lists.found_at,
+        "moved": lists.moved,
+        "tables": put(np.pad(tables, ((0, 0), (0, BLOCK - FUNCTIONS))), dtype),
+        "near": zeros(chunks, NEAR, LANES, kind=wp.int32),
+        "count": zeros(balls, kind=wp.int32),
+        "contact_count": zeros(balls, kind=wp.int32),
+        "used": zeros(2, balls, kind=wp.int32),
+        "mirror": zeros(chunks, CONTACTS, LANES, kind=wp.int32),
+        "radius": padded(radii, 1.0),
+        "unsaturated": padded(1.0 / saturated, 1.0),
+        "curve_slope": padded(slope, 1.0),
+        "hardness": padded(2.5 / slope + 1.0 / 6.0, 1.0),
+        "ease": zeros(2, balls),
+        "placed": zeros(balls, BLOCK),
+        "pairs": zeros(chunks, NEAR, PAIR_ROWS, LANES),
+        "changes": zeros(chunks, NEAR, CHANGE_ROWS, LANES),
+        "contacts": zeros(chunks, CONTACTS, CONTACT_ROWS, LANES),
+        "slopes": zeros(chunks, CONTACTS, SLOPE_ROWS, LANES),
+        "contact": zeros(chunks, STATE_ROWS, LANES),
+        "last_contact": zeros(chunks, STATE_ROWS, LANES),
+        "seen": zeros(seen, balls, BLOCK),
+        "driven": zeros(driven, balls, BLOCK),
+        "turns": zeros(balls, kind=wp.int32),
+        "outer": zeros(chunks, OUTER_ROWS, LANES),
+        "halves": zeros(chunks + 1, CONTACTS, width, LANES),  # the last are zeros
+        "field": zeros(chunks, width, LANES),
+        "pulled": zeros(chunks, width, LANES),
+        "row_of": padded(row_of, -1, wp.int32),
+        "partial": partial[-1] if len(partial) else partial,
+        "movable": padded(movable, 0, wp.int32),
+        "twisted": padded(twisted, 0, wp.int32),
+        "forces": forces,
+        "torques": torques,
+    }
+    given = ContactArrays()
+    for name in (*INTEGER_ARRAYS, *REAL_ARRAYS):
+        setattr(given, name, arrays[name].ptr or 0)
+    given.balls, given.kinds, given.curve = balls, len(levels), curve
+    given.moment_stride = packed.packed.strides[0] // wp.types.type_size_in_bytes(dtype)
     return NearContactBuffers(
-        group=group,
+        dtype=dtype,
+        balls=balls,
+        group=arrays["group"],
         lists=lists,
         arrays=arrays,
+        given=given,
         reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
         threads=threads_for(n, _BALLS_PER_THREAD),
-        ways=8 if n < _MANY_BALLS else 4,
+        at_once=rows.fused,
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
         commands={},
@@ -261,40 +259,51 @@ def allocate(
 
 
 @cache
-def _kernel(dtype, text, ways: int):
-    """Kernel that makes passes of ``near_contact_code``."""
-    arrays_type = _arrays_type(dtype)
+def passes(dtype, text, *options):
+    """Warp function that makes passes of ``near_contact_code``."""
 
-    @wp.func_native(text("float" if dtype is wp.float32 else "double", ways))
+    @wp.func_native(text("float" if dtype is wp.float32 else "double", *options))
     def make_passes(
-        thread: int, first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type
+        thread: int, first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: ContactArrays
     ): ...
+
+    return make_passes
+
+
+@cache
+def _kernel(dtype, text, *options):
+    make_passes = passes(dtype, text, *options)
 
     # registers as wide as the CPU has
     flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
-    def near_contact_passes(first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type):
+    def near_contact_passes(first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: ContactArrays):
         make_passes(wp.tid(), first, last, threads, team, arrays)
 
     return near_contact_passes
 
 
-def _launch(text, first: int, last: int, b: NearContactBuffers):
-    """Launch passes ``first`` to ``last``; one by one on a GPU, where a launch is what they meet at."""
-    device = b.arrays.radius.device
-    for begin, end in [(first, last)] if device.is_cpu else pairwise(range(first, last + 1)):
-        key = text, begin, end
-        if key not in b.commands:
-            b.commands[key] = wp.launch(
-                _kernel(b.arrays.radius.dtype, text, b.ways),
-                dim=1 if device.is_cpu else b.ways * b.arrays.radius.shape[0],
-                inputs=[begin, end, b.threads, team() if device.is_cpu else None, b.arrays],
-                device=device,
-                block_dim=128,
-                record_cmd=True,
-            )
-        b.commands[key].launch()
+def _launch(b: NearContactBuffers, first: int, last: int, text, *options):
+    """Launch passes ``first`` to ``last``."""
+    device = b.device
+    key = first, last, text, *options
+    if key not in b.commands:
+        b.commands[key] = wp.launch(
+            _kernel(b.dtype, text, *options),
+            dim=1 if device.is_cpu else WAYS * b.balls,
+            inputs=[first, last, b.threads, team() if device.is_cpu else None, b.given],
+            device=device,
+            block_dim=128,
+            record_cmd=True,
+        )
+    b.commands[key].launch()
+
+
+def _launch_each(b: NearContactBuffers, first: int, last: int, text, *options):
+    """Launch passes ``first`` to ``last``, one by one on a GPU, where a launch is what they meet at."""
+    for begin, end in [(first, last)] if b.device.is_cpu else pairwise(range(first, last + 1)):
+        _launch(b, begin, end, text, *options)
 
 
 @contextmanager
@@ -318,9 +327,9 @@ def launch_find_pairs(moments, b: NearContactBuffers):
         return
     packed = moments.packed
     with _beside(b):
-        _launch(place_text, 0, 1, b)
+        _launch_each(b, 0, 1, place_text)
         neighbors.launch_find_neighbors(packed, packed, b.group, b.group, b.reach, b.lists, b.lists)
-        _launch(tabulate_text, 0, 2, b)
+        _launch_each(b, 0, 2, tabulate_text)
 
 
 def launch_sweeps(b: NearContactBuffers):
@@ -332,11 +341,11 @@ def launch_sweeps(b: NearContactBuffers):
         return
     with _beside(b):
         if b.stream is None:
-            _launch(sweep_text, 0, 1 + 2 * SWEEPS, b)
+            _launch(b, 0, FORCES, contact_text, True)  # as a part of what finds forces, to compile that only
         else:
-            _launch(sweep_text, 1, 2 * SWEEPS, b)
+            _launch_each(b, 1, FORCES - 1, contact_text, False)
             b.stream.record_event(b.events[1])  # the field needs no more
-            _launch(sweep_text, 2 * SWEEPS, 1 + 2 * SWEEPS, b)
+            _launch(b, FORCES - 1, FORCES, contact_text, False)
 
 
 def wait_for_field(b: NearContactBuffers):
@@ -352,6 +361,9 @@ def wait(b: NearContactBuffers):
 
 
 def launch_add_forces(b: NearContactBuffers):
-    """Add the forces [N] of near pairs, and the torques [N·m] where they are wanted, to those of ``allocate``."""
+    """Add the forces [N] of near pairs, and the torques [N·m] where they are wanted, to those of ``allocate``.
+
+    On a CPU after sweeps, on a GPU :func:`launch_sweeps` goes before.
+    """
     if b.reach > 0.0:
-        _launch(force_text, 0, 2, b)
+        _launch_each(b, 0 if b.stream is None else FORCES, FORCES + 2, contact_text, True)

@@ -102,7 +102,7 @@ class Rows:
         return self.form == FUSED
 
 
-def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
+def make_rows(segments, device, quantity=FIELD, *, forms=FORMS, fused_shapes=pair_sums_cuda.SHAPES) -> Rows:
     """Build the work list of target ranges that each see one source range.
 
     Args:
@@ -112,6 +112,7 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
         forms: Ways in which the sums may be made. ``MIRRORED`` is for targets that are most of one range of sources,
             and brings the sums of the rest, too; ``FUSED`` for kernels that call ``pair_sums_cuda`` themselves. A CPU
             has a ``LOOP`` only.
+        fused_shapes: Shapes of the blocks of the fused form, see ``pair_sums_cuda``.
     """
     segments = np.asarray(segments, np.int64).reshape(-1, 4)
     device = wp.get_device(device)
@@ -133,7 +134,7 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
     if quantity == KELVIN and device.is_cuda:
         quantity = FORCE
     if form == FUSED:
-        shape = pair_sums_cuda.choose_shape(quantity, count)
+        shape = pair_sums_cuda.choose_shape(quantity, count, fused_shapes)
         tiles, splits = _block_tiles(segments, starts, shape.targets, 1), 0
     elif form == LOOP and device.is_cuda:
         shape = choose_shape(quantity, count)

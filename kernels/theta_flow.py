@@ -753,7 +753,7 @@ def launch_iteration(rows, moments, material, b: InductionBuffers, rtol, max_eva
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
     device, dtype = moments.device, moments.dtype
-    shape = rows.shape if sums_field(rows) else None
+    shape = rows.shape if b.fused else None
     wp.launch_tiled(
         _judgement_kernel(dtype, shape),
         dim=[b.part.shape[0]],

@@ -33,18 +33,65 @@ COLLECT = """
 """
 """Text that defines ``collect``, for functions that have vectors NUMBER of WIDTH reals."""
 
+HEAR = """
+    // three numbers, and a mark by which a reader knows that they are new: 16 bytes, written and read at once
+    struct Told { REAL x, y, z; int mark; };
+    auto hear = [](const REAL* place) -> Told {
+        unsigned long long low, high;
+        asm volatile("{ .reg .b128 r; ld.relaxed.gpu.global.b128 r, [%2]; mov.b128 {%0, %1}, r; }"
+            : "=l"(low), "=l"(high) : "l"(__cvta_generic_to_global(place)) : "memory");
+        return {__uint_as_float((unsigned)low), __uint_as_float((unsigned)(low >> 32)), __uint_as_float((unsigned)high),
+                (int)(high >> 32)};
+    };
+"""
+"""Text by which a GPU reads in float32 what another thread of the launch tells."""
+
+# How balls tell each other what a pass has found, on a GPU: within a launch, or to the next one. Threads of a warp wait
+# for what all of them want, since those that go on alone are not to be had together again.
+_TELL_AT_ONCE = f"""
+    {HEAR}
+    auto tell = [](REAL* place, REAL x, REAL y, REAL z, int mark) {{
+        const unsigned long long low = (unsigned long long)__float_as_uint(y) << 32 | __float_as_uint(x);
+        const unsigned long long high = (unsigned long long)(unsigned)mark << 32 | __float_as_uint(z);
+        asm volatile("{{ .reg .b128 r; mov.b128 r, {{%1, %2}}; st.relaxed.gpu.global.b128 [%0], r; }}"
+            :: "l"(__cvta_generic_to_global(place)), "l"(low), "l"(high) : "memory");
+    }};
+    bool fresh;  // whether a pass wants what this launch tells
+    auto come = [&](bool here) -> bool {{ return !fresh || __all_sync(~0u, here); }};
+    constexpr bool AT_ONCE = true;
+"""
+_TELL_LATER = """
+    struct Told { REAL x, y, z; int mark; };
+    auto hear = [](const REAL* place) -> Told {
+        const Four f = *(const Four*)place;
+        return {f.x, f.y, f.z, 0};
+    };
+    auto tell = [](REAL* place, REAL x, REAL y, REAL z, int) { *(Four*)place = {x, y, z, 0}; };
+    bool fresh;
+    auto come = [](bool) -> bool { return true; };
+    constexpr bool AT_ONCE = false;
+"""
+
 _PRELUDE = """
 #if defined(__CUDA_ARCH__)
     typedef REAL NUMBER;
     typedef int INDEX;
     struct alignas(4 * sizeof(REAL)) Four { REAL x, y, z, w; };
     const int way = threadIdx.x % WAYS;
+    const unsigned mates = ((1u << WAYS) - 1u) << (threadIdx.x % 32 / WAYS * WAYS);
     auto total_of = [](NUMBER part) -> NUMBER {
-        const unsigned mates = ((1u << WAYS) - 1u) << (threadIdx.x % 32 / WAYS * WAYS);
-        for (int other = 1; other < WAYS; other *= 2) part += __shfl_xor_sync(mates, part, other);
+        for (int other = 1; other < WAYS; other *= 2) part += __shfl_xor_sync(~0u, part, other);
         return part;
     };
-    auto most = [](const int* counts) -> int { return *counts; };
+    // the largest number of a warp's balls
+    auto most = [](const int* counts) -> int {
+        int largest = *counts;
+        for (int other = WAYS; other < 32; other *= 2) {
+            const int its = __shfl_xor_sync(~0u, largest, other);
+            largest = its > largest ? its : largest;
+        }
+        return largest;
+    };
     auto any = [](bool mask) -> bool { return mask; };
     auto root = [](NUMBER x) -> NUMBER { return sqrt(x); };
     auto logarithm = [](NUMBER x) -> NUMBER { return log(x); };
@@ -64,7 +111,41 @@ _PRELUDE = """
         return ((const Four*)blocks)[4 * (size_t)i + quarter];
     };
     auto put_four = [](REAL* blocks, int quarter, int i, Four f) { ((Four*)blocks)[4 * (size_t)i + quarter] = f; };
-    constexpr int AT_ONCE = 1;
+TELL    // Of a ball's numbers thread c mod WAYS keeps number c, as its part c / WAYS.
+    #define PART(count) (((count) + WAYS - 1) / WAYS)
+    auto number = [](const REAL* part, int c) -> REAL { return __shfl_sync(~0u, part[c / WAYS], c % WAYS, WAYS); };
+    // of 16 numbers those that are used: their sums over the threads of a ball, number c in sum[c / WAYS * WAYS] of its
+    // thread, by exchanges each of which halves what a thread has
+    auto add_up = [=](REAL* sum, unsigned used) {
+        #pragma unroll
+        for (int step = WAYS / 2; step > 0; step /= 2) {
+            const bool upper = way & step;
+            #pragma unroll
+            for (int c = 0; c < 16; ++c) {
+                if (c % WAYS >= step || !((used >> c | used >> (c + step)) & 1)) continue;
+                const REAL sent = upper ? sum[c] : sum[c + step], kept = upper ? sum[c + step] : sum[c];
+                sum[c] = kept + __shfl_xor_sync(~0u, sent, step);
+            }
+            used |= used >> step;
+        }
+    };
+    auto recall = [=](REAL* part, const REAL* rows, int count) {
+        for (int c = way; c < count; c += WAYS) part[c / WAYS] = rows[c * LANES];
+    };
+    auto remember = [=](const REAL* part, REAL* rows, int count) {
+        for (int c = way; c < count; c += WAYS) rows[c * LANES] = part[c / WAYS];
+    };
+    // what a ball keeps for one of its slots: on a GPU all of it is read at once, on a CPU what is used when it is used
+    struct SlotRows {
+        REAL at[MOST_ROWS];
+        REAL operator[](int row) const { return at[row]; }
+    };
+    auto slot_rows = [](const REAL* place, int count) -> SlotRows {
+        SlotRows rows;
+        for (int row = 0; row < count; ++row) rows.at[row] = place[row * LANES];
+        return rows;
+    };
+    constexpr int WIDTH = 1;
     struct Places { int at[1]; };
     auto places = [](INDEX j) -> Places { return {{j}}; };
     auto lane_of = [](NUMBER x, int) -> REAL { return x; };
@@ -99,6 +180,9 @@ _PRELUDE = """
     auto smaller = [](NUMBER a, NUMBER b) -> NUMBER { return __builtin_elementwise_min(a, b); };
     auto number_of = [](INDEX n) -> NUMBER { return __builtin_convertvector(n, NUMBER); };
     auto whole = [](NUMBER x) -> INDEX { return __builtin_convertvector(x, INDEX); };
+    #define PART(count) (count)
+    auto number = [](const NUMBER* part, int c) -> NUMBER { return part[c]; };
+    auto add_up = [](NUMBER*, unsigned) {};
     auto numbers = [](const REAL* row) -> NUMBER { NUMBER n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
     auto indices = [](const int* row) -> INDEX { INDEX n; __builtin_memcpy(&n, row, sizeof(n)); return n; };
     auto put = [](REAL* row, NUMBER n) { __builtin_memcpy(row, &n, sizeof(n)); };
@@ -135,20 +219,28 @@ COLLECT
             PARTS
         }
     };
-    constexpr int AT_ONCE = WIDTH;
+    struct SlotRows {
+        const REAL* place;
+        NUMBER operator[](int row) const {
+            NUMBER n;
+            __builtin_memcpy(&n, place + row * LANES, sizeof(n));
+            return n;
+        }
+    };
+    auto slot_rows = [](const REAL* place, int) -> SlotRows { return {place}; };
     struct Places { int at[WIDTH]; };
     auto places = [](INDEX j) -> Places { Places p; __builtin_memcpy(p.at, &j, sizeof(j)); return p; };
     auto lane_of = [](NUMBER x, int l) -> REAL { return x[l]; };
 #endif
     // where the rows of an array stand for ball i, or for one of its slots, each LANES numbers from the last
     auto rows_at = [](REAL* array, int rows, int i) -> REAL* {
-        return array + (size_t)(i / LANES) * rows * LANES + i % LANES;
+        return array + (unsigned)i / LANES * (rows * LANES) + (unsigned)i % LANES;
     };
     auto slot_at = [=](REAL* array, int slots, int rows, int s, int i) -> REAL* {
         return rows_at(array, slots * rows, i) + s * rows * LANES;
     };
     auto list_at = [](int* lists, int slots, int s, int i) -> int* {
-        return lists + ((size_t)(i / LANES) * slots + s) * LANES + i % LANES;
+        return lists + ((unsigned)i / LANES * slots + s) * LANES + (unsigned)i % LANES;
     };
     struct Vector { NUMBER x, y, z; };
     struct Tensor { NUMBER xx, yy, xy, yz, zx; };  // symmetric, traceless
@@ -167,11 +259,20 @@ COLLECT
     };
 """
 
-# A launch makes passes ``first`` to ``last``: one on a GPU. On a CPU threads take chunks of balls as they come, and go
-# on to the next pass when one is done.
+# A launch makes passes ``first`` to ``last``: on a GPU one, or several that hear from each other. On a CPU threads take
+# chunks of balls as they come, and go on to the next pass when one is done.
 _RUN = f"""
 #if defined(__CUDA_ARCH__)
-    make_pass(first, thread / WAYS);
+    {{
+        const int i = thread / WAYS;
+        RECALL
+        #pragma unroll 1
+        for (int pass = first; pass < last; ++pass) {{
+            fresh = AT_ONCE && pass > first;
+            make_pass(pass, i);
+        }}
+        REMEMBER
+    }}
 #else
     constexpr int CHUNK = 4 * WIDTH, MOST_PASSES = 16;
     const int chunks = (stride + CHUNK - 1) / CHUNK;
@@ -234,6 +335,10 @@ def passes_text(
     body: str,
     passes: str,
     balls: str = "arrays.radius.shape[0]",
+    pointer: str = "arrays.{}.data",
+    at_once: bool = False,
+    recall: str = "",
+    remember: str = "",
 ) -> str:
     """Text of a native function (thread, first, last, threads, team, arrays) that makes passes ``first`` to ``last``.
 
@@ -247,14 +352,18 @@ def passes_text(
         body: Definitions of the passes.
         passes: Statement that makes pass ``pass`` for ball ``i``.
         balls: How many balls there are, a multiple of ``LANES``.
+        pointer: What an array of a name is.
+        at_once: Whether passes of one launch of a GPU hear from each other, in float32.
+        recall: Statements that go before passes ``first`` to ``last`` for ball ``i`` on a GPU.
+        remember: Those that follow them.
     """
     integers = "\n".join(f"constexpr int {name} = {value};" for name, value in constants.items())
     reals = "\n".join(f"constexpr REAL {name} = {value!r};" for name, value in numbers.items())
     pointers = "\n".join(
-        [f"int* const {name} = arrays.{name}.data;" for name in integer_arrays]
-        + [f"REAL* const {name} = (REAL*)arrays.{name}.data;" for name in real_arrays]
+        [f"int* const {name} = (int*){pointer.format(name)};" for name in integer_arrays]
+        + [f"REAL* const {name} = (REAL*){pointer.format(name)};" for name in real_arrays]
     )
-    prelude = _PRELUDE.replace("COLLECT", COLLECT)
+    prelude = _PRELUDE.replace("COLLECT", COLLECT).replace("TELL", _TELL_AT_ONCE if at_once else _TELL_LATER)
     for name, text in _vector_text(16 if real == "float" else 8).items():
         prelude = prelude.replace(name, text)
     return f"""
@@ -275,5 +384,5 @@ def passes_text(
     {pointers}
     {prelude}{body}
     auto make_pass = [&](int pass, int i) {{ {passes} }};
-    {_RUN}
+    {_RUN.replace("RECALL", recall).replace("REMEMBER", remember)}
     }}"""

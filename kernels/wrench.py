@@ -98,7 +98,7 @@ def launch_zeeman_moments(moments, h, material: Material, effective):
 
 
 @cache
-def _wrench_functions(dtype, quantity: str):
+def wrench_functions(dtype, quantity: str):
     """Warp functions that correct a target's sums, and that make force and torque of what they come to."""
     vec3 = wp.types.vector(3, dtype)
     sums = wp.types.vector(WIDTHS[quantity], dtype)
@@ -153,7 +153,7 @@ def _wrench_functions(dtype, quantity: str):
 @cache
 def _finish_kernel(dtype, quantity: str):
     vec3 = wp.types.vector(3, dtype)
-    correct, store = _wrench_functions(dtype, quantity)
+    correct, store = wrench_functions(dtype, quantity)
     sum_group = group_sum(wp.types.vector(WIDTHS[quantity], dtype))
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -192,7 +192,7 @@ def _finish_kernel(dtype, quantity: str):
 def _sum_kernel(dtype, quantity: str, shape: Shape):
     vec3 = wp.types.vector(3, dtype)
     sums = wp.types.vector(WIDTHS[quantity], dtype)
-    correct, store = _wrench_functions(dtype, quantity)
+    correct, store = wrench_functions(dtype, quantity)
     share_of = target_share(shape)
     sum_pairs = pair_summation(dtype, quantity, shape)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from arrangements import as_float32, fcc_block, relative
 
 import warpmag
@@ -288,6 +289,77 @@ def test_device_runs_repeat_bit_by_bit(device):
     x = as_float32(fcc_block((3, 3, 3)))[0]
     first, second = (solve(x, 0.00499, 1e4 * ALONG, device, "float32", rtol=1e-3).wrench()[0] for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_device_precisions_agree_before_a_solve_has_ended(device):
+    """Sweep by sweep the same field, forces and torques, with a magnet and a ball that cannot move among the others.
+
+    On a GPU float32 takes another way than float64: all passes in the launch that sums the pairs.
+    """
+    x = np.concatenate([MIXED, [[0.02, 0.01, 0.0]]])
+    magnet = np.zeros((6, 3))
+    magnet[5] = [0.3, 0.0, 0.4]
+    found = {}
+    for dtype in ("float64", "float32"):
+        system = MomentSystem(
+            radii=np.append(MIXED_RADII, 0.005), permanent=np.arange(6) == 5, movable=np.arange(6) != 1,
+            saturation=IRON, susceptibility=np.append(MIXED_SUSCEPTIBILITIES, 1.0), contact_model="multipole",
+            external_field=1e5 * np.array([0.4, -0.3, 0.9]), lone_torque=True, max_evaluations=2, dtype=dtype,
+            device=device,
+        )  # fmt: skip
+        system.positions.assign(x)
+        system.moments.assign(magnet)
+        steps = []
+        for _ in range(3):
+            system.solve()
+            system.apply_forces()
+            steps.append([getattr(system, name).numpy() for name in ("h", "forces", "torques")])
+            system.positions.assign(1.01 * x)
+        found[dtype] = steps
+    for single, double in zip(found["float32"], found["float64"], strict=True):
+        for one, other in zip(single, double, strict=True):
+            assert relative(one, other) < 1e-4  # roundings, and what they make of a torque near equilibrium
+        assert np.abs(single[1][1]).max() == 0.0 and np.abs(single[2]).max() > 0.0
+
+
+def test_device_graph_gives_the_same_bits(device):
+    x = as_float32(fcc_block((3, 3, 3)))[0]
+    plain, captured = (
+        MomentSystem(
+            radii=np.full(len(x), 0.00499), saturation=IRON, contact_model="multipole",
+            external_field=1e4 * np.array([0.4, -0.3, 0.9]), device=device,
+        )
+        for _ in range(2)
+    )  # fmt: skip
+    for system in (plain, captured):
+        system.positions.assign(x)
+        system.solve()
+        system.apply_forces()
+    with wp.ScopedCapture(device=device) as capture:
+        captured.evaluate()
+        captured.solve()
+        captured.apply_forces()
+    for step in range(3):
+        for system in (plain, captured):
+            system.positions.assign((1.0 - 1e-3 * step) * x)
+        plain.evaluate()
+        plain.solve()
+        plain.apply_forces()
+        wp.capture_launch(capture.graph)
+        for name in ("h", "moments", "forces", "evaluations"):
+            np.testing.assert_array_equal(getattr(plain, name).numpy(), getattr(captured, name).numpy())
+
+
+@pytest.mark.parametrize("side", [7, 15, 20])
+def test_device_piles_of_any_size(side, device):
+    """Float32 against float64 in cubic grids at a gap of 1 %, few to many: on a GPU each takes another way."""
+    grid = np.stack(np.meshgrid(*[np.arange(float(side))] * 3, indexing="ij"), -1).reshape(-1, 3)
+    x = as_float32(0.005 * 2.01 * grid)[0]
+    field = 0.2 * IRON * np.array([0.4, -0.3, 0.9])
+    single, double = (solve(x, 0.005, field, device, dtype, rtol=1e-5) for dtype in ("float32", "float64"))
+    assert single.converged and double.converged
+    assert relative(single.magnetizations, double.magnetizations) < 1e-4  # both within rtol
+    assert relative(single.wrench()[0], double.wrench()[0]) < 1e-3
 
 
 def test_only_the_kelvin_law(device):

@@ -61,7 +61,7 @@ class ThetaFlow:
     def __init__(self, target: Inducibles):
         """Move ``target``."""
         self._target = t = target
-        self.sums_field = theta_flow.sums_field(t.rows)
+        self.sums_field = t.state.fused
         self._passes = None
         if t.packed.device.is_cpu and cpu_team.VECTORS:
             self._passes = theta_flow_cpu.allocate(

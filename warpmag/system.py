@@ -8,7 +8,7 @@ import warp as wp
 from warpmag.arrays import ACCURACY, check_radii, resolve_device, resolve_dtype, vec3_type
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
-from warpmag.kernels import induction, near_contact, pair_loops, theta_flow
+from warpmag.kernels import induction, near_contact, near_contact_cuda, pair_loops, pair_sums_cuda, theta_flow
 from warpmag.kernels.curves import CURVE_IDS
 from warpmag.kernels.field import launch_field
 from warpmag.kernels.packing import launch_divide_by_volume
@@ -128,7 +128,7 @@ class MomentSystem:
         self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
         self._make_rows(worlds, permanent, movable, twisted, near=contact_model == "multipole")
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
-        fused = dynamics == "theta" and theta_flow.sums_field(self._induced)
+        fused = contact_model == "dipole" and dynamics == "theta" and theta_flow.sums_field(self._induced)
         tiles = self._induced.tiles if fused else None
         self._induction = induction.allocate(worlds, ~permanent, tiles, self.dtype, self.device)
         self._near = None
@@ -184,14 +184,16 @@ class MomentSystem:
             for felt, which in ((pushed, movable & ~twisted), (turned, movable & twisted)):
                 edges = np.flatnonzero(np.diff(np.concatenate([[0], which[first:last].astype(int), [0]])))
                 felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
-        # near contacts add to partial sums
-        forms = (pair_loops.LOOP, pair_loops.MIRRORED) if near else pair_loops.FORMS
-        self._induced = pair_loops.make_rows(induced, self.device, forms=forms)
+        # near contacts go with the fused sums, or add to partial ones
+        apart = near and not near_contact_cuda.fits(int(np.count_nonzero(~permanent)), self.dtype, self.device)
+        forms = (pair_loops.LOOP, pair_loops.MIRRORED) if apart else pair_loops.FORMS
+        shapes = near_contact_cuda.SHAPES if near else pair_sums_cuda.SHAPES
+        self._induced = pair_loops.make_rows(induced, self.device, forms=forms, fused_shapes=shapes)
         self._applied = pair_loops.make_rows(applied, self.device, forms=(pair_loops.LOOP,))
         # those that are turned, too, come last: the loop over the others may bring what pushes them
         self._felt = {
             law: [
-                pair_loops.make_rows(segments, self.device, quantity)
+                pair_loops.make_rows(segments, self.device, quantity, fused_shapes=shapes)
                 for segments, quantity in ((pushed, push), (turned, WRENCH))
                 if segments
             ]
@@ -202,7 +204,8 @@ class MomentSystem:
             splits, count, width = pair_loops.partial_shape(rows)
             return wp.zeros((splits + more, count, width), dtype=self.dtype, device=self.device)
 
-        self._induced_partial = partial(self._induced, int(near))  # and one of the near contacts
+        # and one of the near contacts
+        self._induced_partial = partial(self._induced, int(near and not self._induced.fused))
         self._applied_partial = partial(self._applied)
         self._felt_partial = {law: [partial(rows) for rows in passes] for law, passes in self._felt.items()}
 
@@ -255,24 +258,30 @@ class MomentSystem:
         if not self.dynamics.sums_field:
             self._sum_field()
         self.dynamics.iterate()
-        if self._near is not None:
-            near_contact.wait(self._near)
+        self._end_sweeps()
 
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""
         self._sum_field()
-        if self._near is not None:
-            near_contact.wait(self._near)
+        self._end_sweeps()
 
     def _sum_field(self):
-        """Launch the sums of the field at the inducible moments."""
-        packed = self._packed
-        if self._near is not None:
-            near_contact.launch_sweeps(self._near)
+        """Launch the sums of the field at the inducible moments; :meth:`_end_sweeps` follows."""
+        packed, near, h0 = self._packed, self._near, self._induction.h0
+        if near is not None and near.at_once:
+            near_contact_cuda.launch_field(self._induced, packed, h0, self.h, near)
+            return
+        if near is not None:
+            near_contact.launch_sweeps(near)
         pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
-        if self._near is not None:
-            near_contact.wait_for_field(self._near)
-        launch_field(self._induced, self._induced_partial, packed, packed, True, self._induction.h0, self.h)
+        if near is not None:
+            near_contact.wait_for_field(near)
+        launch_field(self._induced, self._induced_partial, packed, packed, True, h0, self.h)
+
+    def _end_sweeps(self):
+        """Have what is launched next wait for what near contacts do beside."""
+        if self._near is not None and not self._near.at_once:
+            near_contact.wait(self._near)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
@@ -282,17 +291,23 @@ class MomentSystem:
 
     def apply_forces(self, force=None):
         """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""
-        packed = self._packed
+        packed, near = self._packed, self._near
         law = self._force_law if force is None else FORCE_IDS[force]
-        if self._near is not None and law == ZEEMAN:
+        felt = self._felt[law]
+        if near is not None and law == ZEEMAN:
             raise InputError("force: the contact model 'multipole' goes with the force law 'kelvin' only")
         effective = packed.moments
         if law == ZEEMAN:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
-        if self._near is not None:
-            near_contact.launch_sweeps(self._near)
-        for rows, partial in zip(self._felt[law], self._felt_partial[law], strict=True):
+        if near is not None and near.at_once and all(rows.fused for rows in felt):
+            near_contact_cuda.launch_wrench(
+                felt, packed, self.external_field, self._twisted, self.forces, self.torques, near
+            )
+            return
+        if near is not None and self.device.is_cuda:
+            near_contact.launch_sweeps(near)
+        for rows, partial in zip(felt, self._felt_partial[law], strict=True):
             pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
             launch_wrench(
                 rows,
@@ -304,6 +319,6 @@ class MomentSystem:
                 self.forces,
                 self.torques,
             )
-        if self._near is not None:
-            near_contact.wait(self._near)
-            near_contact.launch_add_forces(self._near)
+        if near is not None:
+            near_contact.wait(near)
+            near_contact.launch_add_forces(near)
