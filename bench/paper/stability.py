@@ -9,7 +9,7 @@ from bench.paper.output import Output, table
 from bench.paper.trials import SCENES, Trial, outcome_cells, outcome_head, run_trials
 
 SECONDS, SMALL_SECONDS = 5.0, 0.1
-PATIENCE = 120.0
+PATIENCE = 300.0
 """Time after which a run is ended [s]."""
 SATURATED = {
     "balls_up": {"saturation": 5e4},
@@ -24,7 +24,7 @@ VARIANTS = {
     "warpmag, Eq. 4, saturated": ("zeeman", SATURATED),
 }
 """The runs of each scene: force law, parameters of the scenes."""
-_AT_ONCE = 3
+_AT_ONCE = 6
 """Runs that share a GPU: nobody looks at their time."""
 
 
