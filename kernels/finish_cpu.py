@@ -7,7 +7,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for
+from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
 from warpmag.kernels.moment_code import moment_text
 from warpmag.kernels.pair_code import FIELD, WIDTHS
 from warpmag.kernels.vector_passes import passes_text
@@ -149,10 +149,7 @@ def _kernel(dtype, quantity: str, numbers: tuple):
         thread: int, first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type
     ): ...
 
-    # registers as wide as the CPU has
-    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    @wp.kernel(module="unique", enable_backward=False, module_options=wide_registers())
     def finish_sums(threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type):
         make_passes(0, 0, 1, threads, team, arrays)
 

@@ -42,7 +42,7 @@ import warp as wp
 
 from warpmag import near_contact as model
 from warpmag.kernels import neighbors
-from warpmag.kernels.cpu_team import team, threads_for
+from warpmag.kernels.cpu_team import team, threads_for, wide_registers
 from warpmag.kernels.near_contact_code import (
     CANDIDATES,
     CHANGE_ROWS,
@@ -274,10 +274,7 @@ def passes(dtype, text, *options):
 def _kernel(dtype, text, *options):
     make_passes = passes(dtype, text, *options)
 
-    # registers as wide as the CPU has
-    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    @wp.kernel(module="unique", enable_backward=False, module_options=wide_registers())
     def near_contact_passes(first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: ContactArrays):
         make_passes(wp.tid(), first, last, threads, team, arrays)
 

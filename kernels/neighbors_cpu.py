@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, TOGETHER, team, threads_for
+from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, TOGETHER, team, threads_for, wide_registers
 from warpmag.kernels.vector_passes import COLLECT
 
 _VECTORS = f"""
@@ -190,11 +190,6 @@ def _text(real: str, text: str, **constants) -> str:
     return f"{{\n#pragma clang fp contract(fast)\ntypedef {real} REAL;\n{names}{text}\n}}"
 
 
-def _flags() -> dict:
-    # registers as wide as the CPU has
-    return {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"}
-
-
 @cache
 def _search_kernel(dtype, capacity: int, farthest: float):
     vec3 = wp.types.vector(3, dtype)
@@ -220,7 +215,7 @@ def _search_kernel(dtype, capacity: int, farthest: float):
         found_at_out: wp.array[vec3],
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_flags())
+    @wp.kernel(module="unique", enable_backward=False, module_options=wide_registers())
     def search_neighbors(
         # inputs:
         targets: wp.array2d[dtype],
@@ -280,7 +275,7 @@ def _overlap_kernel(dtype, capacity: int):
         overlap_count_out: wp.array[int],
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_flags())
+    @wp.kernel(module="unique", enable_backward=False, module_options=wide_registers())
     def find_overlaps(
         # inputs:
         targets: wp.array2d[dtype],

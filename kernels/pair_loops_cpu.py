@@ -17,7 +17,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOST_THREADS, TOGETHER, team
+from warpmag.kernels.cpu_team import MOST_THREADS, TOGETHER, team, wide_registers
 from warpmag.kernels.pair_code import (
     FIELD,
     FORCE,
@@ -360,10 +360,7 @@ def _kernel(dtype, quantity: str):
         partial_out: wp.array3d[dtype],
     ): ...
 
-    # Warp's flags, and registers as wide as there are: clang's default stops at half of AVX-512
-    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    @wp.kernel(module="unique", enable_backward=False, module_options=wide_registers())
     def pair_loop_cpu(
         # inputs:
         targets: wp.array2d[dtype],

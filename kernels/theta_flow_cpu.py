@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.anderson import DEPTH
-from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for
+from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
 from warpmag.kernels.field import INVERSE_4PI
 from warpmag.kernels.induction import (
     COLUMNS,
@@ -475,10 +475,7 @@ def _kernel(dtype):
         thread: int, first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type
     ): ...
 
-    # registers as wide as the CPU has
-    flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
+    @wp.kernel(module="unique", enable_backward=False, module_options=wide_registers())
     def theta_flow_passes(first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_type):
         make_passes(0, first, last, threads, team, arrays)
 
