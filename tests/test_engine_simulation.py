@@ -15,7 +15,7 @@ from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.statistics import find_held
 from warpmag.engine.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
-from warpmag.kernels.scan import launch_scan
+from warpmag.kernels.shared.scan import launch_scan
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, balls_up
 from warpmag.usd import author_magnet

@@ -8,11 +8,14 @@ from arrangements import as_float32, overlapping, pile, relative
 
 import warpmag
 from warpmag import oracle
-from warpmag.kernels import cpu_team, pair_loops, pair_mirror_cuda, pair_sums_cuda
-from warpmag.kernels.field import launch_field
-from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, WRENCH
-from warpmag.kernels.pair_loops import FUSED, LOOP, MIRRORED
-from warpmag.kernels.wrench import launch_wrench
+from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
+from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
+from warpmag.kernels.pairs import work_list as pair_loops
+from warpmag.kernels.pairs.field import launch_field
+from warpmag.kernels.pairs.pair_terms import FIELD, FORCE, KELVIN, WRENCH
+from warpmag.kernels.pairs.work_list import FUSED, LOOP, MIRRORED
+from warpmag.kernels.pairs.wrench import launch_wrench
+from warpmag.kernels.shared import team as cpu_team
 from warpmag.packed import PackedMoments
 
 # Sums of n terms in float32 carry about √n·2⁻²⁴ ≈ 2.7e-6·√(n/2000) in the worst case and 3e-7 in lanes; issue: 1e-6.

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from warpmag.arrays import vec3_type
-from warpmag.kernels.neighbors import CAPACITY, SKIN
+from warpmag.kernels.pairs.neighbors import CAPACITY, SKIN
 from warpmag.packed import PackedMoments
 
 

@@ -9,7 +9,7 @@ import pytest
 from arrangements import relative
 
 from warpmag import oracle
-from warpmag.kernels.curves import TANH
+from warpmag.kernels.material.curves import TANH
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.paper import __main__ as command

@@ -16,7 +16,7 @@ RIVALS = ("theta-euler", "llg", "llg-damping")
 @pytest.fixture(scope="module")
 def step_kernel():
     """Kernel that makes many steps of one submagnetization in a fixed effective field, float64."""
-    from warpmag.kernels.submagnetization import llg_step, step_submagnetization  # noqa: PLC0415 - after the device
+    from warpmag.kernels.induction.submagnetization import llg_step, step_submagnetization  # noqa: PLC0415 - after the device
 
     @wp.kernel(module="unique", enable_backward=False)
     def march(

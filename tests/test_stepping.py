@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag.kernels import monitor, stepping
+from warpmag.kernels.rigid import monitor, stepping
 
 TRAVEL, SHARED_TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 1.0, 0.008, 0.8, 0.8, 2, 100
 

@@ -7,9 +7,10 @@ from arrangements import overlapping, pile, relative
 
 import warpmag
 from warpmag import oracle
-from warpmag.kernels import cpu_team, pair_loops
-from warpmag.kernels.neighbors import CAPACITY
-from warpmag.kernels.pair_code import FIELD, KELVIN
+from warpmag.kernels.pairs import work_list as pair_loops
+from warpmag.kernels.pairs.neighbors import CAPACITY
+from warpmag.kernels.pairs.pair_terms import FIELD, KELVIN
+from warpmag.kernels.shared import team as cpu_team
 from warpmag.system import MomentSystem
 
 MS = 1.7e6

@@ -3,7 +3,7 @@
 This is the one place where a dynamics is chosen. Each is an object with the same four methods, all of which only launch
 kernels: ``start`` begins a solve in the field of the permanent moments just summed, ``refine`` improves the moments by
 what their neighbours tell, before the field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the
-magnetizations that the next solve starts from. ``sums_field`` tells whether ``iterate`` sums the field itself.
+magnetizations that the next solve starts from.
 """
 
 from dataclasses import dataclass
@@ -12,10 +12,11 @@ import numpy as np
 import warp as wp
 
 from warpmag.errors import InputError
-from warpmag.kernels import cpu_team, submagnetization, theta_flow, theta_flow_cpu
-from warpmag.kernels.induction import InductionBuffers
-from warpmag.kernels.pair_loops import Rows
-from warpmag.kernels.wrench import Material
+from warpmag.kernels.induction import submagnetization, theta_flow, theta_flow_cpu
+from warpmag.kernels.induction.solve_state import InductionBuffers
+from warpmag.kernels.pairs.work_list import Rows
+from warpmag.kernels.pairs.wrench import Material
+from warpmag.kernels.shared import team as cpu_team
 from warpmag.magnets import DYNAMICS, check_positive, check_token
 from warpmag.packed import PackedMoments
 
@@ -61,7 +62,6 @@ class ThetaFlow:
     def __init__(self, target: Inducibles):
         """Move ``target``."""
         self._target = t = target
-        self.sums_field = t.state.fused
         self._passes = None
         if t.packed.device.is_cpu and cpu_team.VECTORS:
             self._passes = theta_flow_cpu.allocate(
@@ -107,8 +107,6 @@ class SubmagnetizationPairs:
         first: Directions M1/Ms, shape [n].
         second: Directions M2/Ms, shape [n].
     """
-
-    sums_field = False
 
     def __init__(self, target: Inducibles, law: str, step: float, damping: float):
         """Move ``target`` by the law ``theta-euler``, ``llg`` or ``llg-damping``."""

@@ -5,10 +5,10 @@ import warp as wp
 
 from warpmag.arrays import ACCURACY, Kind, check_radii, resolve_kind, vec3_type
 from warpmag.errors import InputError
-from warpmag.kernels import pair_loops
-from warpmag.kernels.field import launch_field
-from warpmag.kernels.pair_code import WRENCH
-from warpmag.kernels.wrench import launch_wrench
+from warpmag.kernels.pairs import work_list as pair_loops
+from warpmag.kernels.pairs.field import launch_field
+from warpmag.kernels.pairs.pair_terms import WRENCH
+from warpmag.kernels.pairs.wrench import launch_wrench
 from warpmag.packed import PackedMoments
 
 METHODS = ("auto", "vectorized", "reference")

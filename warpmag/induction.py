@@ -9,7 +9,7 @@ import warp as wp
 
 from warpmag.arrays import Kind, resolve_kind
 from warpmag.errors import ConvergenceWarning, InputError
-from warpmag.kernels.wrench import FORCE_IDS
+from warpmag.kernels.pairs.wrench import FORCE_IDS
 from warpmag.magnets import check_positive, check_token
 from warpmag.system import MomentSystem
 

@@ -3,8 +3,9 @@
 import numpy as np
 import warp as wp
 
-from warpmag.kernels import neighbors, pair_loops
-from warpmag.kernels.packing import launch_pack
+from warpmag.kernels.pairs import neighbors
+from warpmag.kernels.pairs import work_list as pair_loops
+from warpmag.kernels.pairs.packing import launch_pack
 
 
 class PackedMoments:

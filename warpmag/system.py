@@ -8,12 +8,14 @@ import warp as wp
 from warpmag.arrays import ACCURACY, check_radii, resolve_device, resolve_dtype, vec3_type
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
-from warpmag.kernels import induction, near_contact, near_contact_cuda, pair_loops, pair_sums_cuda, theta_flow
-from warpmag.kernels.curves import CURVE_IDS
-from warpmag.kernels.field import launch_field
-from warpmag.kernels.packing import launch_divide_by_volume
-from warpmag.kernels.pair_code import FORCE, KELVIN, WRENCH
-from warpmag.kernels.wrench import FORCE_IDS, ZEEMAN, Material, launch_wrench, launch_zeeman_moments
+from warpmag.kernels.induction import solve_state
+from warpmag.kernels.material.curves import CURVE_IDS
+from warpmag.kernels.near_contact import near_contact
+from warpmag.kernels.pairs import work_list as pair_loops
+from warpmag.kernels.pairs.field import launch_field
+from warpmag.kernels.pairs.packing import launch_divide_by_volume
+from warpmag.kernels.pairs.pair_terms import FORCE, KELVIN, WRENCH
+from warpmag.kernels.pairs.wrench import FORCE_IDS, ZEEMAN, Material, launch_wrench, launch_zeeman_moments
 from warpmag.magnets import FORCES, check_contact_model, check_token
 from warpmag.packed import PackedMoments
 
@@ -128,9 +130,7 @@ class MomentSystem:
         self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
         self._make_rows(worlds, permanent, movable, twisted, near=contact_model == "multipole")
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
-        fused = contact_model == "dipole" and dynamics == "theta" and theta_flow.sums_field(self._induced)
-        tiles = self._induced.tiles if fused else None
-        self._induction = induction.allocate(worlds, ~permanent, tiles, self.dtype, self.device)
+        self._induction = solve_state.allocate(worlds, ~permanent, self.dtype, self.device)
         self._near = None
         if contact_model == "multipole":
             lone = ~permanent & (size[body] == 1) & (radii > 0.0)
@@ -184,16 +184,14 @@ class MomentSystem:
             for felt, which in ((pushed, movable & ~twisted), (turned, movable & twisted)):
                 edges = np.flatnonzero(np.diff(np.concatenate([[0], which[first:last].astype(int), [0]])))
                 felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
-        # near contacts go with the fused sums, or add to partial ones
-        apart = near and not near_contact_cuda.fits(int(np.count_nonzero(~permanent)), self.dtype, self.device)
-        forms = (pair_loops.LOOP, pair_loops.MIRRORED) if apart else pair_loops.FORMS
-        shapes = near_contact_cuda.SHAPES if near else pair_sums_cuda.SHAPES
-        self._induced = pair_loops.make_rows(induced, self.device, forms=forms, fused_shapes=shapes)
+        # near contacts add to partial sums
+        forms = (pair_loops.LOOP, pair_loops.MIRRORED) if near else pair_loops.FORMS
+        self._induced = pair_loops.make_rows(induced, self.device, forms=forms)
         self._applied = pair_loops.make_rows(applied, self.device, forms=(pair_loops.LOOP,))
         # those that are turned, too, come last: the loop over the others may bring what pushes them
         self._felt = {
             law: [
-                pair_loops.make_rows(segments, self.device, quantity, fused_shapes=shapes)
+                pair_loops.make_rows(segments, self.device, quantity)
                 for segments, quantity in ((pushed, push), (turned, WRENCH))
                 if segments
             ]
@@ -205,7 +203,7 @@ class MomentSystem:
             return wp.zeros((splits + more, count, width), dtype=self.dtype, device=self.device)
 
         # and one of the near contacts
-        self._induced_partial = partial(self._induced, int(near and not self._induced.fused))
+        self._induced_partial = partial(self._induced, int(near))
         self._applied_partial = partial(self._applied)
         self._felt_partial = {law: [partial(rows) for rows in passes] for law, passes in self._felt.items()}
 
@@ -255,8 +253,7 @@ class MomentSystem:
     def iterate(self):
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
         self.dynamics.refine()
-        if not self.dynamics.sums_field:
-            self._sum_field()
+        self._sum_field()
         self.dynamics.iterate()
         self._end_sweeps()
 
@@ -268,9 +265,6 @@ class MomentSystem:
     def _sum_field(self):
         """Launch the sums of the field at the inducible moments; :meth:`_end_sweeps` follows."""
         packed, near, h0 = self._packed, self._near, self._induction.h0
-        if near is not None and near.at_once:
-            near_contact_cuda.launch_field(self._induced, packed, h0, self.h, near)
-            return
         if near is not None:
             near_contact.launch_sweeps(near)
         pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
@@ -280,7 +274,7 @@ class MomentSystem:
 
     def _end_sweeps(self):
         """Have what is launched next wait for what near contacts do beside."""
-        if self._near is not None and not self._near.at_once:
+        if self._near is not None:
             near_contact.wait(self._near)
 
     def magnetizations(self):
@@ -300,11 +294,6 @@ class MomentSystem:
         if law == ZEEMAN:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
-        if near is not None and near.at_once and all(rows.fused for rows in felt):
-            near_contact_cuda.launch_wrench(
-                felt, packed, self.external_field, self._twisted, self.forces, self.torques, near
-            )
-            return
         if near is not None and self.device.is_cuda:
             near_contact.launch_sweeps(near)
         for rows, partial in zip(felt, self._felt_partial[law], strict=True):

@@ -13,10 +13,10 @@ import numpy as np
 import warp as wp
 from matplotlib.colors import LogNorm
 
+from bench.paper.isolated_moment import MOST_ITERATIONS, launch_sweep
 from bench.paper.output import Output, table
 from warpmag.dynamics import STEP
-from warpmag.kernels.curves import CLAMPED, TANH
-from warpmag.kernels.isolated_moment import MOST_ITERATIONS, launch_sweep
+from warpmag.kernels.material.curves import CLAMPED, TANH
 
 FLOW_STEP = 3.0
 ROWS_AT_ONCE = 40

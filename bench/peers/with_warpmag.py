@@ -4,8 +4,8 @@ import warp as wp
 
 from bench.cases import RADIUS
 from bench.peers import Evaluation
-from warpmag.kernels.field import launch_field
-from warpmag.kernels.pair_loops import launch_pair_loop, make_rows, partial_shape
+from warpmag.kernels.pairs.field import launch_field
+from warpmag.kernels.pairs.work_list import launch_pair_loop, make_rows, partial_shape
 from warpmag.packed import PackedMoments
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import warp as wp
 
-from warpmag.kernels.scan import launch_scan
+from warpmag.kernels.shared.scan import launch_scan
 
 
 class Workspace:

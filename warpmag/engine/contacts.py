@@ -15,7 +15,7 @@ import warp as wp
 
 from warpmag.engine.xpbd import OrderedXPBD, PileXPBD
 from warpmag.errors import InputError
-from warpmag.kernels.monitor import watch_capacity, watch_flags
+from warpmag.kernels.rigid.monitor import watch_capacity, watch_flags
 
 _NEWTON_GAP = 0.1
 """``ModelBuilder.rigid_gap`` [m] as Newton sets it: the gap of a shape for which nobody chose one."""

@@ -9,7 +9,7 @@ import warp as wp
 from warpmag.engine.attributes import marked_shapes
 from warpmag.engine.sampling import BodyLattice, ShapeSampler
 from warpmag.errors import InputError
-from warpmag.kernels.bodies import gather_moments, scatter_wrenches, sum_moments
+from warpmag.kernels.rigid.bodies import gather_moments, scatter_wrenches, sum_moments
 from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_token
 from warpmag.system import MomentSystem
 

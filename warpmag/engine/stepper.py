@@ -23,8 +23,8 @@ from warpmag.engine.capture import Workspace, without_allocations
 from warpmag.engine.contacts import BodySizes, RigidSolver
 from warpmag.engine.magnetics import Magnetics
 from warpmag.errors import SimulationError
-from warpmag.kernels import monitor, stepping
-from warpmag.kernels.bodies import predict_poses
+from warpmag.kernels.rigid import monitor, stepping
+from warpmag.kernels.rigid.bodies import predict_poses
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""

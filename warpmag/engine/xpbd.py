@@ -18,10 +18,10 @@ import numpy as np
 import warp as wp
 from newton._src.solvers.xpbd.kernels import solve_body_contact_positions
 
-from warpmag.kernels import contact_sides
-from warpmag.kernels.contact_levers import launch_correct_levers, launch_take_mean
-from warpmag.kernels.contact_sides import ContactBodies
-from warpmag.kernels.mass_splitting import launch_split_masses
+from warpmag.kernels.rigid import contact_sides
+from warpmag.kernels.rigid.contact_sides import ContactBodies
+from warpmag.kernels.rigid.levers import launch_correct_levers, launch_take_mean
+from warpmag.kernels.rigid.mass_splitting import launch_split_masses
 
 
 class PileXPBD(newton.solvers.SolverXPBD):

@@ -18,14 +18,16 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels import cpu_team, finish_cpu
-from warpmag.kernels.curves import curve_derivative_times
-from warpmag.kernels.field import INVERSE_4PI
-from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
-from warpmag.kernels.packing import ball_volume
-from warpmag.kernels.pair_code import WIDTHS, WRENCH
-from warpmag.kernels.pair_law import gradient_times
-from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
+from warpmag.kernels.material.curves import curve_derivative_times
+from warpmag.kernels.pairs import finish_cpu
+from warpmag.kernels.pairs.field import INVERSE_4PI
+from warpmag.kernels.pairs.fused_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
+from warpmag.kernels.pairs.neighbors import pair_correction
+from warpmag.kernels.pairs.packing import ball_volume
+from warpmag.kernels.pairs.pair_law import gradient_times
+from warpmag.kernels.pairs.pair_terms import WIDTHS, WRENCH
+from warpmag.kernels.shared import team as cpu_team
+from warpmag.kernels.shared.reductions import group_sum, group_threads
 
 MU0 = 1.2566370614359173e-06
 """Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
@@ -260,7 +262,7 @@ def launch_wrench(rows, partial, moments, effective, external_field, twisted, fo
         )  # fmt: skip
     else:
         ends = [rows.target, rows.begin, rows.end]
-        shares = lanes(moments.device)
+        shares = group_threads(moments.device)
         wp.launch(
             _finish_kernel(moments.dtype, rows.quantity),
             dim=shares * rows.count,

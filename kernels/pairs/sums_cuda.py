@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pair_code import (
+from warpmag.kernels.pairs.pair_terms import (
     FIELD,
     FORCE,
     SUMS,

@@ -11,7 +11,7 @@ each ball, ``Four`` four numbers of a block; ``slot_at`` and ``list_at`` find wh
 
 from collections.abc import Iterable
 
-from warpmag.kernels.cpu_team import TOGETHER
+from warpmag.kernels.shared.team import TOGETHER
 
 LANES = 16
 """Multiple that the number of balls is padded to: lanes of the widest vectors."""

@@ -18,7 +18,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pair_code import (
+from warpmag.kernels.pairs.pair_terms import (
     FIELD,
     FORCE,
     SUMS,
@@ -104,9 +104,9 @@ SHAPES = {
 }
 
 
-def choose_shape(quantity: str, count: int, shapes: dict = SHAPES) -> Shape:
-    """Shape for a number of targets, of a table like ``SHAPES``."""
-    return next(shape for most, shape in shapes[quantity] if most is None or count <= most)
+def choose_shape(quantity: str, count: int) -> Shape:
+    """Shape for a number of targets."""
+    return next(shape for most, shape in SHAPES[quantity] if most is None or count <= most)
 
 
 _W = 1.0  # see pair_code

@@ -19,7 +19,7 @@ body.
 
 import warp as wp
 
-from warpmag.kernels.neighbors import group_sum
+from warpmag.kernels.shared.reductions import group_sum
 
 wp.set_module_options({"enable_backward": False})
 

@@ -17,8 +17,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOST_THREADS, TOGETHER, team, wide_registers
-from warpmag.kernels.pair_code import (
+from warpmag.kernels.pairs.pair_terms import (
     FIELD,
     FORCE,
     KELVIN,
@@ -31,6 +30,7 @@ from warpmag.kernels.pair_code import (
     results,
     scaled_moment,
 )
+from warpmag.kernels.shared.team import MOST_THREADS, TOGETHER, team, wide_registers
 
 STRIPE = 512
 """Most sources, and most targets, of a tile."""

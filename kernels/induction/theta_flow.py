@@ -37,10 +37,8 @@ from typing import Any
 
 import warp as wp
 
-from warpmag.kernels.anderson import DEPTH, anderson_solver, matrix_column, slot_of
-from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio, theta_flow
-from warpmag.kernels.field import INVERSE_4PI, summed_field
-from warpmag.kernels.induction import (
+from warpmag.kernels.induction.anderson import DEPTH, anderson_solver, matrix_column, slot_of
+from warpmag.kernels.induction.solve_state import (
     CHUNK,
     COLUMNS,
     EARLIER,
@@ -55,23 +53,21 @@ from warpmag.kernels.induction import (
     World,
     applied_field,
     begin_world,
-    block_max,
-    block_sum,
     relative_error,
     step_length,
     world_summation,
 )
-from warpmag.kernels.neighbors import extrapolated_near_field, group_sum, lanes, near_field, shared_volume
-from warpmag.kernels.packing import ball_volume, store_magnetization
-from warpmag.kernels.pair_sums_cuda import Shape, own_target
+from warpmag.kernels.material.curves import curve_ratio, inverse_curve_ratio, theta_flow
+from warpmag.kernels.pairs.field import INVERSE_4PI
+from warpmag.kernels.pairs.neighbors import extrapolated_near_field, near_field, shared_volume
+from warpmag.kernels.pairs.packing import ball_volume, store_magnetization
+from warpmag.kernels.shared.reductions import block_max, block_sum, group_sum, group_threads
 
 PLAIN_STEPS = DEPTH + 1
 """Plain steps after an accelerated one was taken back, before the next is tried."""
 REST, VANISH, RETREAT, ADVANCE, SWEEP = 0, 1, 2, 3, 4
 """What a world does next: nothing; no magnetization, where there is no field; a plain step from the best iterate; a
 step; a step and sweeps over neighbours."""
-MOST_FUSED = 1500
-"""Moments up to which the kernel that judges them had better sum their field itself, on an H200."""
 STEADY = 3
 """Solves in a row that make two changes to extrapolate from."""
 _BEGINNERS = 4
@@ -373,27 +369,18 @@ def decide(
 
 
 @cache
-def _judgement_kernel(dtype, shape: Shape | None):
-    """Kernel whose blocks judge a part of a world each, with a ``shape`` tiles whose field they sum themselves."""
+def _judgement_kernel(dtype):
+    """Kernel whose blocks judge a chunk of a world each."""
     vec3 = wp.types.vector(3, dtype)
-    fused = shape is not None
-    field_of_tile = summed_field(dtype, shape) if fused else None
     measure = _measured(dtype)
-    sum_group = group_sum(columns)
-    group = 1 << (shape.targets - 1).bit_length() if fused else 0
-    bounds = {"grid_stride": False, "launch_bounds": (shape.threads, 1)} if fused else {}
 
-    @wp.kernel(module="unique", enable_backward=False, **bounds)
+    @wp.kernel(module="unique", enable_backward=False)
     def judge_iterates(
         # inputs:
-        part: wp.array[wp.vec3i],
-        part_begin: wp.array[int],
-        tiles: wp.array2d[int],
-        packed: wp.array2d[dtype],
+        chunk: wp.array[wp.vec3i],
+        chunk_begin: wp.array[int],
         row_target: wp.array[int],
-        neighbor: wp.array2d[int],
-        neighbor_count: wp.array[int],
-        h0: wp.array[vec3],
+        h: wp.array[vec3],
         s_in: wp.array[vec3],
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
@@ -401,7 +388,6 @@ def _judgement_kernel(dtype, shape: Shape | None):
         rtol: wp.float64,
         max_evaluations: int,
         # in and out:
-        h_inout: wp.array[vec3],
         worlds: wp.array[World],
         start: wp.array2d[wp.float64],
         warm: wp.array[int],
@@ -418,71 +404,23 @@ def _judgement_kernel(dtype, shape: Shape | None):
         converged_out: wp.array[int],
         condition_out: wp.array[int],
     ):
-        p, lane = wp.tid()
-        w = part[p][2]
-        first_part = part_begin[w]
+        c, lane = wp.tid()
+        w = chunk[c][2]
         if worlds[w].active == 0:
-            if p == first_part and lane == 0:
+            if c == chunk_begin[w] and lane == 0:
                 worlds[w].mode = wp.static(REST)
             return
         linked = worlds[w].linked
         newest = (worlds[w].newest + linked) % wp.static(DEPTH)
         kept = wp.min(worlds[w].kept + linked, wp.static(DEPTH))
         mine = columns()
-        if wp.static(fused):
-            i = own_target(p, lane, tiles)
-            k = wp.max(i, 0)
-            # here, so that nothing waits for them behind the sum
-            base = h0[k]
-            s = s_in[k]
-            limit = saturation[k]
-            initial_slope = slope[k]
-            law = curve[k]
-            h = base + field_of_tile(p, lane, tiles, packed, packed, 1, neighbor, neighbor_count)
-            if i >= 0:
-                h_inout[i] = h
-                mine = measure(
-                    i,
-                    h,
-                    s,
-                    limit,
-                    initial_slope,
-                    law,
-                    linked,
-                    newest,
-                    kept,
-                    past_g,
-                    iterate_s,
-                    iterate_r,
-                    history_s,
-                    history_r,
-                )
-        else:
-            for row in range(part[p][0] + lane, part[p][1], wp.block_dim()):
-                i = row_target[row]
-                mine += measure(
-                    i,
-                    h_inout[i],
-                    s_in[i],
-                    saturation[i],
-                    slope[i],
-                    curve[i],
-                    linked,
-                    newest,
-                    kept,
-                    past_g,
-                    iterate_s,
-                    iterate_r,
-                    history_s,
-                    history_r,
-                )
-        total = columns()
-        if wp.static(fused):
-            if lane < wp.static(group):
-                total = sum_group(mine, wp.static(group))
-        else:
-            total = block_sum(mine)
-        last, total = _sum_world(total, p, lane, w, first_part, part_begin[w + 1], sums, arrived)
+        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
+            i = row_target[row]
+            mine += measure(
+                i, h[i], s_in[i], saturation[i], slope[i], curve[i], linked, newest, kept, past_g, iterate_s,
+                iterate_r, history_s, history_r,
+            )  # fmt: skip
+        last, total = _sum_world(block_sum(mine), c, lane, w, chunk_begin[w], chunk_begin[w + 1], sums, arrived)
         if last and lane == 0:
             decide(
                 w,
@@ -662,7 +600,7 @@ def launch_begin(applied, partial, induced, moments, external_field, material, b
         b: The buffers.
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
-    shares = lanes(moments.device)
+    shares = group_threads(moments.device)
     wp.launch_tiled(
         _begin_kernel(moments.dtype),
         dim=[_BEGINNERS * b.chunk.shape[0]],
@@ -709,7 +647,7 @@ def launch_begin(applied, partial, induced, moments, external_field, material, b
 
 def launch_sweeps(rows, moments, material, b: InductionBuffers, moments_out):
     """Two sweeps over neighbours, before the field is summed, in worlds that want them; see the module."""
-    shares = lanes(moments.device)
+    shares = group_threads(moments.device)
     for change, next_change in ((b.change, b.next_change), (b.next_change, b.change)):
         wp.launch(
             _sweep_kernel(moments.dtype),
@@ -735,16 +673,11 @@ def launch_sweeps(rows, moments, material, b: InductionBuffers, moments_out):
         )
 
 
-def sums_field(rows) -> bool:
-    """Whether :func:`launch_iteration` sums the field over ``rows`` itself."""
-    return rows.fused and rows.count <= MOST_FUSED
-
-
 def launch_iteration(rows, moments, material, b: InductionBuffers, rtol, max_evaluations, moments_out):
     """Judge the field at the inducible moments, and move every world that has not ended; see the module.
 
     Args:
-        rows: Work list whose targets are the inducible moments, and whose field stands in ``b.h``, or is summed here.
+        rows: Work list whose targets are the inducible moments; their field stands in ``b.h``.
         moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``).
         material: What they are made of (``kernels.wrench.Material``).
         b: The buffers; ``b.condition`` tells whether another evaluation is wanted.
@@ -753,26 +686,20 @@ def launch_iteration(rows, moments, material, b: InductionBuffers, rtol, max_eva
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
     device, dtype = moments.device, moments.dtype
-    shape = rows.shape if b.fused else None
     wp.launch_tiled(
-        _judgement_kernel(dtype, shape),
-        dim=[b.part.shape[0]],
+        _judgement_kernel(dtype),
+        dim=[b.chunk.shape[0]],
         inputs=[
-            b.part,
-            b.part_begin,
-            rows.tiles,
-            moments.packed,
+            b.chunk,
+            b.chunk_begin,
             rows.target,
-            moments.overlaps,
-            moments.overlap_counts,
-            b.h0,
+            b.h,
             b.s,
             material.saturation,
             material.slope,
             material.curve,
             wp.float64(rtol),
             max_evaluations,
-            b.h,
             b.worlds,
             b.start,
             b.warm,
@@ -785,7 +712,7 @@ def launch_iteration(rows, moments, material, b: InductionBuffers, rtol, max_eva
             b.history_r,
         ],
         outputs=[b.error, b.evaluations, b.converged, b.condition],
-        block_dim=shape.threads if shape else CHUNK,
+        block_dim=CHUNK,
         device=device,
     )
     wp.launch(

@@ -7,10 +7,12 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels import cpu_team, finish_cpu
-from warpmag.kernels.neighbors import group_sum, lanes, pair_correction
-from warpmag.kernels.pair_code import FIELD
-from warpmag.kernels.pair_sums_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
+from warpmag.kernels.pairs import finish_cpu
+from warpmag.kernels.pairs.fused_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
+from warpmag.kernels.pairs.neighbors import pair_correction
+from warpmag.kernels.pairs.pair_terms import FIELD
+from warpmag.kernels.shared import team as cpu_team
+from warpmag.kernels.shared.reductions import group_sum, group_threads
 
 INVERSE_4PI = 0.07957747154594767
 
@@ -181,7 +183,7 @@ def launch_field(rows, partial, targets, sources, same_set, base, h):
     elif targets.device.is_cpu and cpu_team.VECTORS:
         finish_cpu.launch_finish(rows, partial, targets, sources, same_set, base, h, INVERSE_4PI=INVERSE_4PI)
     else:
-        shares = lanes(targets.device)
+        shares = group_threads(targets.device)
         wp.launch(
             _finish_kernel(targets.dtype),
             dim=shares * rows.count,

@@ -2,9 +2,9 @@
 
 import math
 
-from warpmag.kernels.curves import CLAMPED, LANGEVIN
-from warpmag.kernels.vector_passes import passes_text
-from warpmag.kernels.wrench import MU0
+from warpmag.kernels.material.curves import CLAMPED, LANGEVIN
+from warpmag.kernels.pairs.wrench import MU0
+from warpmag.kernels.shared.passes import passes_text
 from warpmag.near_contact import (
     CONTACT_GAP,
     DEEPEST,

@@ -29,12 +29,13 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from warpmag.kernels import pair_mirror_cuda, pair_sums_cuda
-from warpmag.kernels.cpu_team import threads_for
-from warpmag.kernels.pair_code import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS, WRENCH
-from warpmag.kernels.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
-from warpmag.kernels.pair_loops_cpu import STRIPE, launch_pair_loop_cpu
-from warpmag.kernels.pair_loops_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
+from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
+from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
+from warpmag.kernels.pairs.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
+from warpmag.kernels.pairs.pair_terms import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS, WRENCH
+from warpmag.kernels.pairs.sums_cpu import STRIPE, launch_pair_loop_cpu
+from warpmag.kernels.pairs.sums_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
+from warpmag.kernels.shared.team import threads_for
 
 PACKED_ROWS = 8
 PITCH = 128
@@ -102,7 +103,7 @@ class Rows:
         return self.form == FUSED
 
 
-def make_rows(segments, device, quantity=FIELD, *, forms=FORMS, fused_shapes=pair_sums_cuda.SHAPES) -> Rows:
+def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
     """Build the work list of target ranges that each see one source range.
 
     Args:
@@ -112,7 +113,6 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS, fused_shapes=pai
         forms: Ways in which the sums may be made. ``MIRRORED`` is for targets that are most of one range of sources,
             and brings the sums of the rest, too; ``FUSED`` for kernels that call ``pair_sums_cuda`` themselves. A CPU
             has a ``LOOP`` only.
-        fused_shapes: Shapes of the blocks of the fused form, see ``pair_sums_cuda``.
     """
     segments = np.asarray(segments, np.int64).reshape(-1, 4)
     device = wp.get_device(device)
@@ -134,7 +134,7 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS, fused_shapes=pai
     if quantity == KELVIN and device.is_cuda:
         quantity = FORCE
     if form == FUSED:
-        shape = pair_sums_cuda.choose_shape(quantity, count, fused_shapes)
+        shape = pair_sums_cuda.choose_shape(quantity, count)
         tiles, splits = _block_tiles(segments, starts, shape.targets, 1), 0
     elif form == LOOP and device.is_cuda:
         shape = choose_shape(quantity, count)

@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from warpmag.kernels.neighbors import SKIN
+from warpmag.kernels.pairs.neighbors import SKIN
 
 
 @wp.func

@@ -4,9 +4,9 @@ Arrays of the public buffers have a vector for each moment, or a number. What a 
 world, where a vector has more lanes than moments are left, is found lane by lane.
 """
 
-from warpmag.kernels.curves import CLAMPED, LANGEVIN
-from warpmag.kernels.neighbors import CAPACITY
-from warpmag.kernels.pair_loops_cpu import INVERSE_ROOT
+from warpmag.kernels.material.curves import CLAMPED, LANGEVIN
+from warpmag.kernels.pairs.neighbors import CAPACITY
+from warpmag.kernels.pairs.sums_cpu import INVERSE_ROOT
 
 _TANH_ABOVE = (1.0, 0.13380975, 0.0034955274, 2.0608056e-05, 1.3353217e-08)
 _TANH_BELOW = (1.0, 0.46714291, 0.025876754, 0.00032855341, 7.7759703e-07)

@@ -18,10 +18,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.anderson import DEPTH
-from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
-from warpmag.kernels.field import INVERSE_4PI
-from warpmag.kernels.induction import (
+from warpmag.kernels.induction.anderson import DEPTH
+from warpmag.kernels.induction.solve_state import (
     COLUMNS,
     EARLIER,
     FIELD,
@@ -36,9 +34,7 @@ from warpmag.kernels.induction import (
     World,
     begin_world,
 )
-from warpmag.kernels.moment_code import moment_text
-from warpmag.kernels.neighbors import CAPACITY
-from warpmag.kernels.theta_flow import (
+from warpmag.kernels.induction.theta_flow import (
     REST,
     RETREAT,
     STEADY,
@@ -49,7 +45,11 @@ from warpmag.kernels.theta_flow import (
     decide,
     open_world,
 )
-from warpmag.kernels.vector_passes import BLOCK, LANES, passes_text
+from warpmag.kernels.pairs.field import INVERSE_4PI
+from warpmag.kernels.pairs.moment_code import moment_text
+from warpmag.kernels.pairs.neighbors import CAPACITY
+from warpmag.kernels.shared.passes import BLOCK, LANES, passes_text
+from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
 
 SHOW, START, FIRST_SWEEP, LAST_SWEEP, JUDGE, ADVANCE = range(6)
 """The passes, in order."""

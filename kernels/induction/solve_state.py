@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.kernels import anderson
-from warpmag.kernels.anderson import DEPTH
-from warpmag.kernels.field import finished_field
+from warpmag.kernels.induction import anderson
+from warpmag.kernels.induction.anderson import DEPTH
+from warpmag.kernels.pairs.field import finished_field
+from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 CHUNK = 128
 """Moments whose sums one block adds up, on a GPU each of them by a thread of its own."""
@@ -72,7 +73,6 @@ class InductionBuffers:
         world: World of each moment, shape [n].
         chunk: Rows of the inducible moments' work list from and to, and world, of each chunk, shape [c].
         chunk_begin: First chunk of each world, shape [w + 1].
-        part, part_begin: The same of what a block judges: tiles, if it sums their field itself, else chunks.
         h0: Applied field [A/m]: external and from permanent magnets, shape [n].
         h: Whole field [A/m], shape [n].
         s: Dual variable [dimensionless], shape [n].
@@ -85,8 +85,8 @@ class InductionBuffers:
         mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
         change, next_change: What a step adds to them [A·m²], shape [n].
         start: Largest applied field [A/m] and stiffness k (2/3 + o_i) of each world until it is judged, shape [w, 2].
-        sums: Sums of each part, shape [parts, COLUMNS].
-        arrived: Parts of each world whose sums are done, shape [w].
+        sums: Sums of each chunk, shape [c, COLUMNS].
+        arrived: Chunks of each world whose sums are done, shape [w].
         worlds: How each world stands, shape [w].
         warm: Solves of each world since it began cold, as far as it matters, shape [w].
         error: Relative residual of each world, shape [w].
@@ -97,8 +97,6 @@ class InductionBuffers:
     world: wp.array
     chunk: wp.array
     chunk_begin: wp.array
-    part: wp.array
-    part_begin: wp.array
     h0: wp.array
     h: wp.array
     s: wp.array
@@ -126,19 +124,13 @@ class InductionBuffers:
     converged: wp.array
     condition: wp.array
 
-    @property
-    def fused(self) -> bool:
-        """Whether what judges the moments sums their field itself."""
-        return self.part is not self.chunk
 
-
-def allocate(worlds, inducible, tiles, dtype, device) -> InductionBuffers:
+def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
     """Allocate the buffers.
 
     Args:
         worlds: World of each moment, non-decreasing, shape [n].
         inducible: Whether a moment is inducible, shape [n]; in each world these come first.
-        tiles: Tiles of inducible moments on inducible ones, if what judges them sums their field itself, else None.
         dtype: Warp scalar type.
         device: Warp device.
     """
@@ -149,10 +141,6 @@ def allocate(worlds, inducible, tiles, dtype, device) -> InductionBuffers:
         chunks += [(a, min(a + CHUNK, last), w) for a in range(first, last, CHUNK)]
         chunk_begin.append(len(chunks))
         first = last
-    parts = chunks
-    if tiles is not None:
-        parts = [(tile[0], tile[1], worlds[tile[2]]) for tile in tiles.numpy()]
-    part_begin = np.searchsorted([part[2] for part in parts], np.arange(world_count + 1))
     vec3 = wp.types.vector(3, dtype)
 
     def put(values, kind):
@@ -161,20 +149,17 @@ def allocate(worlds, inducible, tiles, dtype, device) -> InductionBuffers:
     def zeros(shape, kind):
         return wp.zeros(shape, dtype=kind, device=device)
 
-    chunk = put(np.reshape(chunks, (-1, 3)), wp.vec3i)
     return InductionBuffers(
         world=put(worlds, wp.int32),
-        chunk=chunk,
+        chunk=put(np.reshape(chunks, (-1, 3)), wp.vec3i),
         chunk_begin=put(chunk_begin, wp.int32),
-        part=chunk if tiles is None else put(np.reshape(parts, (-1, 3)), wp.vec3i),
-        part_begin=put(part_begin, wp.int32),
         **{name: zeros(n, vec3) for name in ("h0", "h", "s", "best_s", "best_r")},
         **{name: zeros(n, vec3) for name in ("mixed_g", "mixed_moment", "change", "next_change")},
         **{name: zeros((2, n), vec3) for name in ("past_positions", "past_moments", "past_field", "past_g")},
         **{name: zeros(n, vec3) for name in ("iterate_s", "iterate_r")},
         **{name: zeros((DEPTH, n), vec3) for name in ("history_s", "history_r")},
         start=zeros((world_count, 2), wp.float64),
-        sums=zeros((len(parts), COLUMNS), wp.float64),
+        sums=zeros((len(chunks), COLUMNS), wp.float64),
         worlds=zeros(world_count, World),
         error=zeros(world_count, wp.float64),
         **{name: zeros(world_count, wp.int32) for name in ("arrived", "warm", "evaluations")},
@@ -183,23 +168,11 @@ def allocate(worlds, inducible, tiles, dtype, device) -> InductionBuffers:
     )
 
 
-@wp.func
-def block_sum(mine: Any):
-    """Sum of a value over the threads of a block, in a fixed order; the same for all of them."""
-    return wp.tile_extract(wp.tile_sum(wp.tile(mine, preserve_type=True)), 0)
-
-
-@wp.func
-def block_max(mine: Any):
-    """Largest value of the threads of a block."""
-    return wp.tile_extract(wp.tile_max(wp.tile(mine)), 0)
-
-
 @cache
 def applied_field(dtype):
     """Warp function that returns the applied field [A/m] at a row's target: external and from permanent magnets.
 
-    Thread ``share`` of ``shares`` gets its share of it, for ``neighbors.group_sum`` to add up.
+    Thread ``share`` of ``shares`` gets its share of it, for ``reductions.group_sum`` to add up.
     """
     vec3 = wp.types.vector(3, dtype)
     finish = finished_field(dtype)
@@ -260,16 +233,6 @@ def relative_error(sums: Any):
     lack = wp.sqrt(sums[wp.static(LACK)])
     goal = wp.sqrt(sums[wp.static(GOAL)])
     return wp.where(goal > wp.float64(0.0), lack / goal, lack)
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __threadfence();
-#endif
-""")
-def fence():
-    """Let what a thread has written be seen by other blocks before what it writes next."""
-    ...
 
 
 @wp.func

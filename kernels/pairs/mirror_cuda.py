@@ -20,7 +20,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pair_code import FIELD, KELVIN, cuda_head, mirrored_pair, scaled_moment
+from warpmag.kernels.pairs.pair_terms import FIELD, KELVIN, cuda_head, mirrored_pair, scaled_moment
 
 
 @dataclass(frozen=True)

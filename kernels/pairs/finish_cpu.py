@@ -7,10 +7,10 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
-from warpmag.kernels.moment_code import moment_text
-from warpmag.kernels.pair_code import FIELD, WIDTHS
-from warpmag.kernels.vector_passes import passes_text
+from warpmag.kernels.pairs.moment_code import moment_text
+from warpmag.kernels.pairs.pair_terms import FIELD, WIDTHS
+from warpmag.kernels.shared.passes import passes_text
+from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
 
 _ROWS = """
     const int rows = arrays.target.shape[0], parts = arrays.partial.shape[0];

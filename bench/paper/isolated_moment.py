@@ -18,13 +18,13 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.curves import TANH, curve_ratio, inverse_curve_ratio, theta_flow
-from warpmag.kernels.submagnetization import (
+from warpmag.kernels.induction.submagnetization import (
     LAW_IDS,
     effective_field,
     llg_step,
     step_submagnetization,
 )
+from warpmag.kernels.material.curves import TANH, curve_ratio, inverse_curve_ratio, theta_flow
 
 MOST_ITERATIONS = 999
 _SLOPE = 3.0
@@ -126,7 +126,7 @@ def _sweep_kernel(flow: bool, scaled: bool):
         across = wp.sqrt(1.0 - z * z)
         h = strengths[row] * wp.vec3(across * wp.cos(angle), across * wp.sin(angle), z)
         kappa = kappa0 * multipliers[column]
-        count = int(0)
+        count = 0
         if wp.static(flow):
             m = 0.5 * (first + second)
             s = inverse_curve_ratio(wp.length(m), curve) * m

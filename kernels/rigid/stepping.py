@@ -26,7 +26,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.monitor import (
+from warpmag.kernels.rigid.monitor import (
     COUNT_BAD_BODY,
     COUNT_CAPACITIES,
     COUNT_EVALUATIONS,

@@ -41,9 +41,7 @@ import numpy as np
 import warp as wp
 
 from warpmag import near_contact as model
-from warpmag.kernels import neighbors
-from warpmag.kernels.cpu_team import team, threads_for, wide_registers
-from warpmag.kernels.near_contact_code import (
+from warpmag.kernels.near_contact.near_contact_code import (
     CANDIDATES,
     CHANGE_ROWS,
     CONTACT_ROWS,
@@ -62,7 +60,9 @@ from warpmag.kernels.near_contact_code import (
     place_text,
     tabulate_text,
 )
-from warpmag.kernels.vector_passes import BLOCK, LANES
+from warpmag.kernels.pairs import neighbors
+from warpmag.kernels.shared.passes import BLOCK, LANES
+from warpmag.kernels.shared.team import team, threads_for, wide_registers
 from warpmag.near_contact import FUNCTIONS
 
 KINDS = 16
@@ -113,7 +113,6 @@ class NearContactBuffers:
             the magnetization curve.
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
         threads: Threads of a CPU.
-        at_once: Whether all passes go in one launch of a GPU, with the sums of the field (see ``near_contact_cuda``).
         stream: Stream of a GPU for what is done beside the pair loops.
         events: There, when it starts, when the field is summed, and when all is done.
         commands: Launches as they were recorded, which spares packing the arrays each time.
@@ -127,7 +126,6 @@ class NearContactBuffers:
     given: Any
     reach: float
     threads: int
-    at_once: bool
     stream: wp.Stream | None
     events: tuple[wp.Event, ...]
     commands: dict
@@ -246,7 +244,6 @@ def allocate(
         given=given,
         reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
         threads=threads_for(n, _BALLS_PER_THREAD),
-        at_once=rows.fused,
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
         commands={},

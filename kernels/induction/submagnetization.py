@@ -26,8 +26,7 @@ from typing import Any
 
 import warp as wp
 
-from warpmag.kernels.curves import curve_ratio, inverse_curve_ratio
-from warpmag.kernels.induction import (
+from warpmag.kernels.induction.solve_state import (
     CHUNK,
     FIELD,
     GOAL,
@@ -36,12 +35,12 @@ from warpmag.kernels.induction import (
     World,
     applied_field,
     begin_world,
-    block_max,
-    block_sum,
     relative_error,
     world_summation,
 )
-from warpmag.kernels.packing import store_magnetization
+from warpmag.kernels.material.curves import curve_ratio, inverse_curve_ratio
+from warpmag.kernels.pairs.packing import store_magnetization
+from warpmag.kernels.shared.reductions import block_max, block_sum
 
 THETA_EULER, LLG, LLG_DAMPING = 0, 1, 2
 LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}

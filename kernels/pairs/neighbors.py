@@ -23,16 +23,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.kernels import cpu_team, neighbors_cpu
-from warpmag.kernels.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction, pair_factors
+from warpmag.kernels.pairs import neighbors_cpu
+from warpmag.kernels.pairs.pair_law import field_of, gradient_of, overlap_factors, overlap_fraction, pair_factors
+from warpmag.kernels.shared import team as cpu_team
+from warpmag.kernels.shared.reductions import group_threads, places_in_group, wait_for_warp
 
 CAPACITY = 64
 """Neighbours a list can hold before its target falls back to walking all its sources."""
 SKIN = 0.6
 """Part of its radius that a moment may move before the lists are made anew. Longer lists are walked longer, but made
 less often, and spare induction evaluations (see ``theta_flow``): what moves nearby is known best where it is listed."""
-_LANES = 8
-"""Threads of a GPU that share out the neighbours of a moment; a part of a warp."""
 _BUCKETS_PER_MOMENT = 4
 _PADDING = 16
 """Entries that vectors may read beyond the last."""
@@ -159,16 +159,6 @@ def _search_kernel(dtype, cells: int):
                 j = before[j]
 
     return search_cells
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncwarp();
-#endif
-""")
-def wait_for_warp():
-    """Wait until the other threads of a warp are here, too."""
-    ...
 
 
 @cache
@@ -341,20 +331,6 @@ def launch_find_neighbors(targets, sources, target_group, source_group, reach, l
     )
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned group = (width == 32 ? ~0u : (1u << width) - 1u) << (threadIdx.x & (32 - width));
-    const unsigned wanted = __ballot_sync(group, wants);
-    return wp::vec_t<2, wp::int32>(__popc(wanted & ((1u << (threadIdx.x & 31)) - 1u)), __popc(wanted));
-#else
-    return wp::vec_t<2, wp::int32>(0, wants);
-#endif
-""")
-def places_in_group(wants: int, width: int) -> wp.vec2i:
-    """Of 2ᵏ threads of a warp, how many before this one want a place, 1 or 0 each, and how many do in all."""
-    ...
-
-
 @cache
 def _overlap_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
@@ -410,7 +386,7 @@ def launch_list_overlaps(targets, sources, lists, overlap, overlap_count):
     if targets.device.is_cpu and cpu_team.VECTORS:
         neighbors_cpu.launch_overlaps(targets, sources, lists, overlap, overlap_count)
         return
-    shares = lanes(targets.device)
+    shares = group_threads(targets.device)
     wp.launch(
         _overlap_kernel(targets.dtype),
         dim=shares * targets.shape[1],
@@ -423,29 +399,6 @@ def launch_list_overlaps(targets, sources, lists, overlap, overlap_count):
 # ---------------------------------------------------------------------------------------------------------------------
 # What is done with the lists
 # ---------------------------------------------------------------------------------------------------------------------
-
-
-def lanes(device) -> int:
-    """Threads that share out the neighbours of a moment; each takes every so many of them."""
-    return _LANES if device.is_cuda else 1
-
-
-@cache
-def group_sum(vector):
-    """Warp function that adds up a vector over groups of 2ᵏ threads of a warp, for each of them."""
-
-    @wp.func_native(f"""
-    auto total = value;
-    #if defined(__CUDA_ARCH__)
-    const unsigned group = (width == 32 ? ~0u : (1u << width) - 1u) << (threadIdx.x & (32 - width));
-    for (int step = width / 2; step > 0; step /= 2)
-        for (int c = 0; c < {vector._length_}; ++c) total[c] += __shfl_xor_sync(group, total[c], step);
-    #endif
-    return total;
-    """)
-    def sum_group(value: vector, width: int) -> vector: ...
-
-    return sum_group
 
 
 @wp.func

@@ -10,8 +10,8 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.cpu_team import MOMENTS_PER_THREAD, TOGETHER, team, threads_for, wide_registers
-from warpmag.kernels.vector_passes import COLLECT
+from warpmag.kernels.shared.passes import COLLECT
+from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, TOGETHER, team, threads_for, wide_registers
 
 _VECTORS = f"""
     constexpr int WIDTH = 64 / (int)sizeof(REAL);
