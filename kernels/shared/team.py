@@ -17,18 +17,19 @@ from functools import cache
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.shared.native import native_options
+
 VECTORS = True
 """Whether a CPU makes passes over neighbours in vectors and by threads; else they are plain Warp, as on a GPU."""
 MOST_THREADS = 64
 """Threads that may work on one launch, and shares that its work may be cut into."""
 MOMENTS_PER_THREAD = 2500
 """Moments that make another thread worth waking for a pass over them and their neighbours: 0.1 to 0.2 ms."""
-_GONE, _WAITING, _ASLEEP, _CLAIMED, _POSTED, _WORKING = range(6)
-_STATE, _CALL, _JOB, _NUMBER, _LOCK, _BELL, _WORDS = 0, 1, 2, 3, 8, 16, 24
-_PATIENCE = 4000
-"""Times that a member looks for work before it sleeps, about 1 ms; each time others may have its core instead."""
+_STATE, _WORDS = 0, 24
+_GONE, _ASLEEP = 0, 2
+"""Place of a member's state among its words, how many these are, and two of its values; as in ``team.h``."""
 
-_LIBRARY = f"""
+_LIBRARY = """
 #if defined(__APPLE__)
     #define SYMBOL(name) "_" name
 #else
@@ -46,49 +47,15 @@ _LIBRARY = f"""
     extern int sleep(void*, void*) __asm__(SYMBOL("pthread_cond_wait"));
     extern int ring(void*) __asm__(SYMBOL("pthread_cond_signal"));
     #undef SYMBOL
-    static constexpr auto change = [](Word* member, Word from, Word to) -> bool {{
-        return __atomic_compare_exchange_n(member + {_STATE}, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
-    }};
-    static constexpr auto state_of = [](Word* member) -> Word {{
-        return __atomic_load_n(member + {_STATE}, __ATOMIC_ACQUIRE);
-    }};
-    static constexpr auto set = [](Word* member, Word state) {{
-        __atomic_store_n(member + {_STATE}, state, __ATOMIC_RELEASE);
-    }};
-"""
-
-_START = f"""
-#if !defined(_WIN32)
-    {_LIBRARY}
-    auto serve = [](void* argument) -> void* {{
-        Word* const member = (Word*)argument;
-        for (int idle = 0;; ++idle) {{
-            if (change(member, {_POSTED}, {_WORKING})) {{
-                ((void (*)(Word, int))member[{_CALL}])(member[{_JOB}], (int)member[{_NUMBER}]);
-                set(member, {_WAITING});
-                idle = 0;
-            }} else if (idle < {_PATIENCE}) {{
-                yield_thread();
-            }} else {{
-                lock(member + {_LOCK});
-                if (change(member, {_WAITING}, {_ASLEEP}))
-                    while (state_of(member) == {_ASLEEP}) sleep(member + {_BELL}, member + {_LOCK});
-                unlock(member + {_LOCK});
-                idle = 0;
-            }}
-        }}
-    }};
-    for (int m = 0; m < count; ++m) {{
-        Word* const member = (Word*)team.data + {_WORDS} * m;
-        if (!change(member, {_GONE}, {_CLAIMED})) continue;
-        make_lock(member + {_LOCK}, nullptr);
-        make_bell(member + {_BELL}, nullptr);
-        set(member, {_WAITING});
-        unsigned long id;
-        if (start_thread(&id, nullptr, serve, member) == 0) detach_thread(id);
-        else set(member, {_GONE});
-    }}
-#endif
+    static constexpr auto change = [](Word* member, Word from, Word to) -> bool {
+        return __atomic_compare_exchange_n(member + 0, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
+    };
+    static constexpr auto state_of = [](Word* member) -> Word {
+        return __atomic_load_n(member + 0, __ATOMIC_ACQUIRE);
+    };
+    static constexpr auto set = [](Word* member, Word state) {
+        __atomic_store_n(member + 0, state, __ATOMIC_RELEASE);
+    };
 """
 
 TOGETHER = f"""
@@ -106,34 +73,34 @@ TOGETHER = f"""
         int count = 0;
         for (int m = 0; m < {MOST_THREADS} && count < threads - 1; ++m) {{
             Word* const member = team + {_WORDS} * m;
-            if (state_of(member) == {_GONE}) break;
-            const bool asleep = change(member, {_ASLEEP}, {_CLAIMED});
-            if (!asleep && !change(member, {_WAITING}, {_CLAIMED})) continue;
+            if (state_of(member) == 0) break;
+            const bool asleep = change(member, 2, 3);
+            if (!asleep && !change(member, 1, 3)) continue;
             claimed[count++] = member;
-            member[{_CALL}] = (Word)(void (*)(Word, int))call;
-            member[{_JOB}] = (Word)&work;
-            member[{_NUMBER}] = count;
-            if (asleep) lock(member + {_LOCK});
-            set(member, {_POSTED});
+            member[1] = (Word)(void (*)(Word, int))call;
+            member[2] = (Word)&work;
+            member[3] = count;
+            if (asleep) lock(member + 8);
+            set(member, 4);
             if (!asleep) continue;
-            unlock(member + {_LOCK});
-            ring(member + {_BELL});
+            unlock(member + 8);
+            ring(member + 16);
         }}
         work(0);
         // to sleep until a thread has ended would take longer than to wait for it to say so
         for (int t = 0; t < count; ++t)
-            while (!change(claimed[t], {_POSTED}, {_WAITING}) && state_of(claimed[t]) == {_WORKING}) yield_thread();
+            while (!change(claimed[t], 4, 1) && state_of(claimed[t]) == 5) yield_thread();
     }};
 #endif
 """
 """Text that defines ``together``, for native functions."""
 
 
-@wp.func_native(_START)
+@wp.func_native("warpmag::start_members(count, team.data);")
 def _start(count: int, team: wp.array2d[wp.uint64]): ...
 
 
-@wp.kernel(module="unique", enable_backward=False)
+@wp.kernel(module="unique", enable_backward=False, module_options=native_options("shared/team.h", dtype=wp.float32))
 def _start_members(
     # inputs:
     count: int,

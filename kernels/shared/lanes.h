@@ -1,0 +1,172 @@
+// Numbers of several balls at a time: on a CPU vectors as wide as the machine's registers, on a GPU one number a
+// thread. A pass written with these runs on both.
+//
+// ``Number``, ``Index`` and ``Mask`` hold a Real, an int and a truth value for each of ``WIDTH`` balls, ``Four`` four
+// numbers of each ball's cache line. On a GPU ``GROUP`` threads (from Python, a power of two) share a ball. Arrays of
+// passes have ``CHUNK`` balls along their last axis, so that what a vector of balls needs follows in memory.
+#pragma once
+
+namespace warpmag {
+
+constexpr int CHUNK = 16,
+              LINE = 16; // balls side by side in an array, and numbers of a ball's cache line; as in lanes.py
+
+#if defined(__CUDA_ARCH__)
+constexpr int WIDTH = 1;
+typedef Real Number;
+typedef int Index;
+typedef bool Mask;
+struct alignas(4 * sizeof(Real)) Four {
+    Number x, y, z, w;
+};
+
+CUDA_CALLABLE inline bool any(Mask mask) { return mask; }
+CUDA_CALLABLE inline Number root(Number x) { return sqrt(x); }
+CUDA_CALLABLE inline Number logarithm(Number x) { return log(x); }
+CUDA_CALLABLE inline Number larger(Number a, Number b) { return a > b ? a : b; }
+CUDA_CALLABLE inline Number smaller(Number a, Number b) { return a < b ? a : b; }
+CUDA_CALLABLE inline Number number_of(Index n) { return (Number)n; }
+CUDA_CALLABLE inline Index whole(Number x) { return (int)x; }
+CUDA_CALLABLE inline Mask mask_of(bool condition) { return condition; }
+CUDA_CALLABLE inline Number numbers(const Real* row) { return *row; }
+CUDA_CALLABLE inline Index indices(const int* row) { return *row; }
+CUDA_CALLABLE inline void put(Real* row, Number n) { *row = n; }
+CUDA_CALLABLE inline void put_indices(int* row, Index n) { *row = n; }
+CUDA_CALLABLE inline Number gather(const Real* row, const int* j) { return row[*j]; }
+CUDA_CALLABLE inline Number collect(const Real* row, Index j) { return row[j]; }
+CUDA_CALLABLE inline Real lane_of(Number x, int) { return x; }
+
+CUDA_CALLABLE inline Four four_at(const Real* lines, int quarter, const int* j) {
+    return ((const Four*)lines)[4 * (size_t)*j + quarter];
+}
+CUDA_CALLABLE inline Four own_four(const Real* lines, int quarter, int i) {
+    return ((const Four*)lines)[4 * (size_t)i + quarter];
+}
+CUDA_CALLABLE inline void put_four(Real* lines, int quarter, int i, Four f) {
+    ((Four*)lines)[4 * (size_t)i + quarter] = f;
+}
+#else
+constexpr int WIDTH = 64 / (int)sizeof(Real);
+typedef Real Number __attribute__((ext_vector_type(WIDTH)));
+typedef int Index __attribute__((ext_vector_type(WIDTH)));
+typedef Real Quarter __attribute__((ext_vector_type(4)));
+typedef decltype(Number() < Number()) Mask;
+struct Four {
+    Number x, y, z, w;
+};
+
+inline bool any(Mask mask) { return __builtin_reduce_or(mask) != 0; }
+inline Number root(Number x) { return __builtin_elementwise_sqrt(x); }
+inline Number logarithm(Number x) {
+    if constexpr (sizeof(Real) == 8) return __builtin_elementwise_log(x); // one by one
+    // x = 2ⁿ m, m between √½ and √2, of which the series in s = (m − 1)/(m + 1) is good to float32
+    Index bits;
+    __builtin_memcpy(&bits, &x, sizeof(bits));
+    const Index n = (bits - 0x3f3504f3) >> 23;
+    bits -= n << 23;
+    Number m;
+    __builtin_memcpy(&m, &bits, sizeof(bits));
+    const Number s = (m - 1) / (m + 1), z = s * s;
+    const Number series = 1 + z * (Real(1.0 / 3) + z * (Real(1.0 / 5) + z * (Real(1.0 / 7) + z * Real(1.0 / 9))));
+    return __builtin_convertvector(n, Number) * Real(0.693147180559945) + 2 * s * series;
+}
+inline Number larger(Number a, Number b) { return __builtin_elementwise_max(a, b); }
+inline Number smaller(Number a, Number b) { return __builtin_elementwise_min(a, b); }
+inline Number number_of(Index n) { return __builtin_convertvector(n, Number); }
+inline Index whole(Number x) { return __builtin_convertvector(x, Index); }
+template <class Condition> inline Mask mask_of(Condition condition) { return __builtin_convertvector(condition, Mask); }
+inline Number numbers(const Real* row) {
+    Number n;
+    __builtin_memcpy(&n, row, sizeof(n));
+    return n;
+}
+inline Index indices(const int* row) {
+    Index n;
+    __builtin_memcpy(&n, row, sizeof(n));
+    return n;
+}
+inline void put(Real* row, Number n) { __builtin_memcpy(row, &n, sizeof(n)); }
+inline void put_indices(int* row, Index n) { __builtin_memcpy(row, &n, sizeof(n)); }
+inline Number gather(const Real* row, const int* j) {
+    Number n = 0;
+    for (int l = 0; l < WIDTH; ++l) n[l] = row[j[l]];
+    return n;
+}
+template <class Places> inline Number collect(const Real* row, Places j) {
+#if defined(__AVX512F__)
+    if constexpr (WIDTH == 16) return __builtin_ia32_gathersiv16sf(Number(0), row, j, (unsigned short)-1, 4);
+    else return __builtin_ia32_gathersiv8df(Number(0), row, j, (unsigned char)-1, 8);
+#else
+    Number n;
+    for (int l = 0; l < WIDTH; ++l) n[l] = row[j[l]];
+    return n;
+#endif
+}
+inline Real lane_of(Number x, int l) { return x[l]; }
+
+template <class T, T... L> struct Sequence {};
+typedef __make_integer_seq<Sequence, int, WIDTH> AllLanes;
+
+// In each group of four lanes, those of two vectors by a pattern, the second's counted from four on.
+template <int A, int B, int C, int D, int... L> inline Number by_fours(Number a, Number b, Sequence<int, L...>) {
+    constexpr int pattern[4] = {A, B, C, D};
+    return __builtin_shufflevector(a, b, (L / 4 * 4 + pattern[L % 4] % 4 + WIDTH * (pattern[L % 4] > 3))...);
+}
+
+// Rows and columns of each group of four lanes exchanged.
+inline Four transposed(Number a, Number b, Number c, Number d) {
+    const AllLanes all;
+    const Number ab = by_fours<0, 4, 1, 5>(a, b, all), cd = by_fours<0, 4, 1, 5>(c, d, all);
+    const Number top_ab = by_fours<2, 6, 3, 7>(a, b, all), top_cd = by_fours<2, 6, 3, 7>(c, d, all);
+    return {by_fours<0, 1, 4, 5>(ab, cd, all), by_fours<2, 3, 6, 7>(ab, cd, all),
+            by_fours<0, 1, 4, 5>(top_ab, top_cd, all), by_fours<2, 3, 6, 7>(top_ab, top_cd, all)};
+}
+
+template <class Half, int... L> inline auto joined(Half a, Half b, Sequence<int, L...>) {
+    return __builtin_shufflevector(a, b, L...);
+}
+
+// Four numbers of each ball, found at place(lane), as vectors.
+template <class Place> inline Four fours(Place place) {
+    typedef __make_integer_seq<Sequence, int, 8> Eight;
+    auto part = [=](int l) -> Quarter {
+        Quarter q;
+        __builtin_memcpy(&q, place(l), sizeof(q));
+        return q;
+    };
+    auto row = [=](int l) -> Number {
+        const auto low = joined(part(l), part(l + 4), Eight());
+        if constexpr (WIDTH == 8) return low;
+        else return joined(low, joined(part(l + 8), part(l + 12), Eight()), AllLanes());
+    };
+    return transposed(row(0), row(1), row(2), row(3));
+}
+inline Four four_at(const Real* lines, int quarter, const int* j) {
+    return fours([=](int l) { return lines + LINE * (size_t)j[l] + 4 * quarter; });
+}
+inline Four own_four(const Real* lines, int quarter, int i) {
+    return fours([=](int l) { return lines + LINE * (size_t)(i + l) + 4 * quarter; });
+}
+template <int FIRST> inline void put_quarters(Real* place, Number row) {
+    const Quarter q = __builtin_shufflevector(row, row, FIRST, FIRST + 1, FIRST + 2, FIRST + 3);
+    __builtin_memcpy(place + FIRST * LINE, &q, sizeof(q));
+    if constexpr (FIRST + 4 < WIDTH) put_quarters<FIRST + 4>(place, row);
+}
+inline void put_four(Real* lines, int quarter, int i, Four f) {
+    const Four rows = transposed(f.x, f.y, f.z, f.w);
+    const Number row[4] = {rows.x, rows.y, rows.z, rows.w};
+    for (int r = 0; r < 4; ++r) put_quarters<0>(lines + LINE * (size_t)(i + r) + 4 * quarter, row[r]);
+}
+#endif
+
+// Where the rows of an array stand for ball i, or for one of its slots, each CHUNK numbers from the last.
+CUDA_CALLABLE inline Real* rows_at(Real* array, int rows, int i) {
+    return array + (unsigned)i / CHUNK * (rows * CHUNK) + (unsigned)i % CHUNK;
+}
+CUDA_CALLABLE inline Real* slot_at(Real* array, int slots, int rows, int s, int i) {
+    return rows_at(array, slots * rows, i) + s * rows * CHUNK;
+}
+CUDA_CALLABLE inline int* list_at(int* lists, int slots, int s, int i) {
+    return lists + ((unsigned)i / CHUNK * slots + s) * CHUNK + (unsigned)i % CHUNK;
+}
+}

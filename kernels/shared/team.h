@@ -1,0 +1,155 @@
+// Threads of a CPU that share the work of one launch; team.py says how they live.
+#pragma once
+
+#if !defined(__CUDA_ARCH__)
+
+#if !defined(_WIN32)
+extern "C" {
+int pthread_create(unsigned long*, const void*, void* (*)(void*), void*);
+int pthread_detach(unsigned long);
+int pthread_mutex_init(void*, const void*);
+int pthread_mutex_lock(void*);
+int pthread_mutex_unlock(void*);
+int pthread_cond_init(void*, const void*);
+int pthread_cond_wait(void*, void*);
+int pthread_cond_signal(void*);
+int sched_yield();
+}
+#endif
+
+namespace warpmag {
+
+typedef unsigned long long Word;
+
+constexpr int MOST_THREADS = 64; // as in team.py
+constexpr int PATIENCE = 4000; // looks for work before a member sleeps, about 1 ms; others may have its core meanwhile
+
+enum State : Word { GONE, WAITING, ASLEEP, CLAIMED, POSTED, WORKING }; // GONE and ASLEEP as in team.py
+
+struct Member {
+    Word state;
+    void (*call)(void* job, int number);
+    void* job;
+    Word number;
+    Word padding[4];
+    Word lock[8], wake[8]; // room for a mutex and for a condition variable
+};
+
+inline bool change(Member* member, Word from, Word to) {
+    return __atomic_compare_exchange_n(&member->state, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
+}
+
+inline Word state_of(Member* member) { return __atomic_load_n(&member->state, __ATOMIC_ACQUIRE); }
+
+inline void set_state(Member* member, Word state) { __atomic_store_n(&member->state, state, __ATOMIC_RELEASE); }
+
+inline void yield_thread() {
+#if !defined(_WIN32)
+    sched_yield();
+#endif
+}
+
+#if defined(_WIN32)
+inline void start_members(int, Word*) {}
+
+template <class Work> void run_together(Word*, int, Work& work) { work(0); }
+#else
+// What a member does for as long as the process lives.
+inline void* serve(void* argument) {
+    Member* const member = (Member*)argument;
+    for (int idle = 0;; ++idle) {
+        if (change(member, POSTED, WORKING)) {
+            member->call(member->job, (int)member->number);
+            set_state(member, WAITING);
+            idle = 0;
+        } else if (idle < PATIENCE) {
+            sched_yield();
+        } else {
+            pthread_mutex_lock(member->lock);
+            if (change(member, WAITING, ASLEEP))
+                while (state_of(member) == ASLEEP) pthread_cond_wait(member->wake, member->lock);
+            pthread_mutex_unlock(member->lock);
+            idle = 0;
+        }
+    }
+}
+
+inline void start_members(int count, Word* team) {
+    for (int m = 0; m < count; ++m) {
+        Member* const member = (Member*)team + m;
+        if (!change(member, GONE, CLAIMED)) continue;
+        pthread_mutex_init(member->lock, nullptr);
+        pthread_cond_init(member->wake, nullptr);
+        set_state(member, WAITING);
+        unsigned long id;
+        if (pthread_create(&id, nullptr, serve, member) == 0) pthread_detach(id);
+        else set_state(member, GONE);
+    }
+}
+
+// Calls work(number) on up to ``threads`` threads, number 0 being the caller, and returns when all of those that began
+// have returned; one that cannot be had, or is late, leaves its part to the others.
+template <class Work> void run_together(Word* team, int threads, Work& work) {
+    Member* claimed[MOST_THREADS];
+    int count = 0;
+    for (int m = 0; m < MOST_THREADS && count < threads - 1; ++m) {
+        Member* const member = (Member*)team + m;
+        if (state_of(member) == GONE) break;
+        const bool asleep = change(member, ASLEEP, CLAIMED);
+        if (!asleep && !change(member, WAITING, CLAIMED)) continue;
+        claimed[count++] = member;
+        member->call = [](void* job, int number) { (*(Work*)job)(number); };
+        member->job = &work;
+        member->number = count;
+        if (asleep) pthread_mutex_lock(member->lock);
+        set_state(member, POSTED);
+        if (!asleep) continue;
+        pthread_mutex_unlock(member->lock);
+        pthread_cond_signal(member->wake);
+    }
+    work(0);
+    // to sleep until a thread has ended would take longer than to wait for its state to change
+    for (int t = 0; t < count; ++t)
+        while (!change(claimed[t], POSTED, WAITING) && state_of(claimed[t]) == WORKING) sched_yield();
+}
+#endif
+
+// Calls visit(i) for each of ``count`` items, by threads that take ``share`` of them at a time.
+template <class Visit> void share_out(Word* team, int threads, int count, int share, Visit visit) {
+    int next = 0;
+    auto work = [&](int) {
+        for (;;) {
+            const int first = share * __atomic_fetch_add(&next, 1, __ATOMIC_RELAXED);
+            if (first >= count) return;
+            for (int i = first; i < count && i < first + share; ++i) visit(i);
+        }
+    };
+    run_together(team, threads, work);
+}
+
+// Calls make_pass(pass, i) for passes ``first`` to ``last`` and the vectors of ``width`` balls that begin at ball i, by
+// threads that take chunks of balls and go on to the next pass when one is done.
+template <class MakePass>
+void run_passes(Word* team, int threads, int first, int last, int balls, int width, MakePass make_pass) {
+    constexpr int MOST_PASSES = 16;
+    const int taken_at_once = 4 * width, chunks = (balls + taken_at_once - 1) / taken_at_once;
+    auto make_chunk = [&](int pass, int chunk) {
+        const int begin = chunk * taken_at_once, end = begin + taken_at_once < balls ? begin + taken_at_once : balls;
+        for (int i = begin; i < end; i += width) make_pass(pass, i);
+    };
+    // the caller takes chunks from the first on, others from the last: each finds its own in its cache next time
+    int taken[MOST_PASSES] = {}, ahead[MOST_PASSES] = {}, behind[MOST_PASSES] = {}, done[MOST_PASSES] = {};
+    auto work = [&](int member) {
+        for (int pass = first; pass < last; ++pass) {
+            while (__atomic_fetch_add(&taken[pass], 1, __ATOMIC_RELAXED) < chunks) {
+                const int n = __atomic_fetch_add(member == 0 ? &ahead[pass] : &behind[pass], 1, __ATOMIC_RELAXED);
+                make_chunk(pass, member == 0 ? n : chunks - 1 - n);
+                __atomic_fetch_add(&done[pass], 1, __ATOMIC_RELEASE);
+            }
+            while (__atomic_load_n(&done[pass], __ATOMIC_ACQUIRE) < chunks) yield_thread();
+        }
+    };
+    run_together(team, threads, work);
+}
+}
+#endif

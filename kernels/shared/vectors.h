@@ -1,0 +1,106 @@
+// Three-vectors and symmetric tensors of several balls at a time, and how arrays of vectors are read and written.
+#pragma once
+#include "shared/lanes.h"
+
+namespace warpmag {
+
+struct Vector {
+    Number x, y, z;
+};
+struct Tensor {
+    Number xx, yy, xy, yz, zx; // symmetric, traceless
+};
+
+CUDA_CALLABLE inline Number dot(Vector a, Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+CUDA_CALLABLE inline Vector sum(Vector a, Vector b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+CUDA_CALLABLE inline Vector less(Vector a, Vector b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+CUDA_CALLABLE inline Vector scaled(Number k, Vector a) { return {k * a.x, k * a.y, k * a.z}; }
+CUDA_CALLABLE inline Vector cross(Vector a, Vector b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+CUDA_CALLABLE inline Number length(Vector a) { return root(dot(a, a)); }
+CUDA_CALLABLE inline Vector times(Tensor t, Vector a) {
+    return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
+            t.zx * a.x + t.yz * a.y - (t.xx + t.yy) * a.z};
+}
+CUDA_CALLABLE inline void add_where(Mask wanted, Vector& to, Vector a) {
+    to.x += wanted ? a.x : 0;
+    to.y += wanted ? a.y : 0;
+    to.z += wanted ? a.z : 0;
+}
+
+// Vectors of balls whose components are rows of CHUNK.
+CUDA_CALLABLE inline Vector own_vector(const Real* rows) {
+    return {numbers(rows), numbers(rows + CHUNK), numbers(rows + 2 * CHUNK)};
+}
+CUDA_CALLABLE inline void put_vector(Real* rows, Vector v) {
+    put(rows, v.x);
+    put(rows + CHUNK, v.y);
+    put(rows + 2 * CHUNK, v.z);
+}
+
+// Arrays of the public buffers have a vector (x, y, z) or a number for each moment. What a pass needs of the last
+// moments of a world, where a vector has more lanes than moments are left, is found lane by lane: ``held`` are there.
+#if defined(__CUDA_ARCH__)
+CUDA_CALLABLE inline Number some(const Real* row, int held, Real other) { return held > 0 ? *row : other; }
+CUDA_CALLABLE inline void put_some(Real* row, int held, Number n) {
+    if (held > 0) *row = n;
+}
+CUDA_CALLABLE inline Vector vectors(const Real* rows, int held) {
+    return held > 0 ? Vector{rows[0], rows[1], rows[2]} : Vector{0, 0, 0};
+}
+CUDA_CALLABLE inline void put_vectors(Real* rows, int held, Vector v) {
+    if (held > 0) rows[0] = v.x, rows[1] = v.y, rows[2] = v.z;
+}
+#else
+inline Number some(const Real* row, int held, Real other) {
+    Number n = other;
+    if (held >= WIDTH) __builtin_memcpy(&n, row, sizeof(n));
+    else
+        for (int l = 0; l < held; ++l) n[l] = row[l];
+    return n;
+}
+inline void put_some(Real* row, int held, Number n) {
+    if (held >= WIDTH) __builtin_memcpy(row, &n, sizeof(n));
+    else
+        for (int l = 0; l < held; ++l) row[l] = n[l];
+}
+
+// Component C of vectors that follow each other in (a, b, c).
+template <int C, int... L> inline Number component(Number a, Number b, Number c, Sequence<int, L...>) {
+    const Number low = __builtin_shufflevector(a, b, (3 * L + C < 2 * WIDTH ? 3 * L + C : 0)...);
+    return __builtin_shufflevector(low, c, (3 * L + C < 2 * WIDTH ? L : 3 * L + C - WIDTH)...);
+}
+// Part N of three of the numbers of vectors, one vector after the other.
+template <int N, int... L> inline Number interleaved(Vector v, Sequence<int, L...>) {
+    constexpr int F = N * WIDTH;
+    const Number low = __builtin_shufflevector(v.x, v.y,
+                                               ((F + L) % 3 == 0   ? (F + L) / 3
+                                                : (F + L) % 3 == 1 ? WIDTH + (F + L) / 3
+                                                                   : 0)...);
+    return __builtin_shufflevector(low, v.z, ((F + L) % 3 == 2 ? WIDTH + (F + L) / 3 : L)...);
+}
+
+inline Vector vectors(const Real* rows, int held) {
+    Number a = 0, b = 0, c = 0;
+    if (held >= WIDTH) {
+        const AllLanes all;
+        __builtin_memcpy(&a, rows, sizeof(a));
+        __builtin_memcpy(&b, rows + WIDTH, sizeof(b));
+        __builtin_memcpy(&c, rows + 2 * WIDTH, sizeof(c));
+        return {component<0>(a, b, c, all), component<1>(a, b, c, all), component<2>(a, b, c, all)};
+    }
+    for (int l = 0; l < held; ++l) a[l] = rows[3 * l], b[l] = rows[3 * l + 1], c[l] = rows[3 * l + 2];
+    return {a, b, c};
+}
+inline void put_vectors(Real* rows, int held, Vector v) {
+    if (held >= WIDTH) {
+        const AllLanes all;
+        const Number parts[3] = {interleaved<0>(v, all), interleaved<1>(v, all), interleaved<2>(v, all)};
+        __builtin_memcpy(rows, parts, sizeof(parts));
+        return;
+    }
+    for (int l = 0; l < held; ++l) rows[3 * l] = v.x[l], rows[3 * l + 1] = v.y[l], rows[3 * l + 2] = v.z[l];
+}
+#endif
+}
