@@ -14,8 +14,8 @@ import warp as wp
 from warpmag.errors import InputError
 from warpmag.kernels.induction import submagnetization, theta_flow, theta_flow_cpu
 from warpmag.kernels.induction.solve_state import InductionBuffers
+from warpmag.kernels.material.curves import CurveParameters
 from warpmag.kernels.pairs.work_list import Rows
-from warpmag.kernels.pairs.wrench import Material
 from warpmag.kernels.shared import team as cpu_team
 from warpmag.magnets import DYNAMICS, check_positive, check_token
 from warpmag.packed import PackedMoments
@@ -49,7 +49,7 @@ class Inducibles:
     applied_partial: wp.array
     external_field: wp.array
     packed: PackedMoments
-    material: Material
+    material: CurveParameters
     moments: wp.array
     state: InductionBuffers
     rtol: float

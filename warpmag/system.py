@@ -9,13 +9,13 @@ from warpmag.arrays import ACCURACY, check_radii, resolve_device, resolve_dtype,
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
-from warpmag.kernels.material.curves import CURVE_IDS
+from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
 from warpmag.kernels.near_contact import near_contact
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.field import launch_field
 from warpmag.kernels.pairs.packing import launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import FORCE, KELVIN, WRENCH
-from warpmag.kernels.pairs.wrench import FORCE_IDS, ZEEMAN, Material, launch_wrench, launch_zeeman_moments
+from warpmag.kernels.pairs.wrench import FORCE_IDS, ZEEMAN, launch_wrench, launch_zeeman_moments
 from warpmag.magnets import FORCES, check_contact_model, check_token
 from warpmag.packed import PackedMoments
 
@@ -166,7 +166,7 @@ class MomentSystem:
         def put(values, dtype):
             return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=dtype, device=self.device)
 
-        self._material = Material(
+        self._material = CurveParameters(
             inducible=put((~permanent).astype(np.int32), wp.int32),
             saturation=put(np.asarray(saturation, float), self.dtype),
             slope=put(3.0 / (1.0 + 3.0 / susceptibility), self.dtype),

@@ -381,7 +381,7 @@ def launch_begin(applied, partial, moments, external_field, material, b: Inducti
         partial: Sums of the native field loop over ``applied``.
         moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
         external_field: External field [A/m], shape [n].
-        material: What the moments are made of (``kernels.wrench.Material``).
+        material: What the moments are made of (``kernels.material.curves.CurveParameters``).
         b: Fields and world state.
         first: Directions of M1, shape [n].
         second: Directions of M2, shape [n].
@@ -434,7 +434,7 @@ def launch_step_pairs(
     Args:
         moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``).
         rows: Work list whose targets are the inducible moments, whose field stands in ``b.h``.
-        material: What they are made of (``kernels.wrench.Material``).
+        material: What they are made of (``kernels.material.curves.CurveParameters``).
         b: Fields and world state; ``b.condition`` tells whether another evaluation is wanted.
         first: Directions of M1, shape [n].
         second: Directions of M2, shape [n].

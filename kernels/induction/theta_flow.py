@@ -596,7 +596,7 @@ def launch_begin(applied, partial, induced, moments, external_field, material, b
         induced: Work list, inducible moments on inducible ones, with the same targets.
         moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``); gets the starting moments.
         external_field: External field [A/m], shape [n].
-        material: What the moments are made of (``kernels.wrench.Material``).
+        material: What the moments are made of (``kernels.material.curves.CurveParameters``).
         b: The buffers.
         moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
     """
@@ -679,7 +679,7 @@ def launch_iteration(rows, moments, material, b: InductionBuffers, rtol, max_eva
     Args:
         rows: Work list whose targets are the inducible moments; their field stands in ``b.h``.
         moments: Packed moments with their neighbours (``warpmag.packed.PackedMoments``).
-        material: What they are made of (``kernels.wrench.Material``).
+        material: What they are made of (``kernels.material.curves.CurveParameters``).
         b: The buffers; ``b.condition`` tells whether another evaluation is wanted.
         rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
         max_evaluations: Field evaluations after which a world gives up.

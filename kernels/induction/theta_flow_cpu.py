@@ -48,7 +48,7 @@ from warpmag.kernels.induction.theta_flow import (
 from warpmag.kernels.pairs.field import INVERSE_4PI
 from warpmag.kernels.pairs.moment_code import moment_text
 from warpmag.kernels.pairs.neighbors import CAPACITY
-from warpmag.kernels.shared.passes import BLOCK, LANES, passes_text
+from warpmag.kernels.shared.vector_text import BLOCK, LANES, passes_text
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
 
 SHOW, START, FIRST_SWEEP, LAST_SWEEP, JUDGE, ADVANCE = range(6)

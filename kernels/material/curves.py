@@ -11,12 +11,30 @@ With the reduced field s = k‖H‖/Ms every curve reads ‖M‖ = Ms c(s), c(0)
 k = 3χ/(3+χ) is the initial slope of a ball of susceptibility χ. The functions are generic over float32 and float64.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 TANH, LANGEVIN, CLAMPED = 0, 1, 2
 CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED}
+
+
+@dataclass(frozen=True)
+class CurveParameters:
+    """Magnetization curve of each moment, on one device.
+
+    Attributes:
+        inducible: 1 for inducible moments, 0 for permanent ones, shape [n].
+        saturation: Saturation magnetization Ms [A/m], shape [n].
+        slope: Initial slope k = 3χ/(3+χ) [dimensionless], shape [n].
+        curve: Curve id, one of ``CURVE_IDS``, shape [n].
+    """
+
+    inducible: wp.array
+    saturation: wp.array
+    slope: wp.array
+    curve: wp.array
 
 
 @wp.func

@@ -61,7 +61,7 @@ from warpmag.kernels.near_contact.near_contact_code import (
     tabulate_text,
 )
 from warpmag.kernels.pairs import neighbors
-from warpmag.kernels.shared.passes import BLOCK, LANES
+from warpmag.kernels.shared.vector_text import BLOCK, LANES
 from warpmag.kernels.shared.team import team, threads_for, wide_registers
 from warpmag.near_contact import FUNCTIONS
 

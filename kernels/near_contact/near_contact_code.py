@@ -4,7 +4,7 @@ import math
 
 from warpmag.kernels.material.curves import CLAMPED, LANGEVIN
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.shared.passes import passes_text
+from warpmag.kernels.shared.vector_text import passes_text
 from warpmag.near_contact import (
     CONTACT_GAP,
     DEEPEST,

@@ -9,7 +9,7 @@ import warp as wp
 
 from warpmag.kernels.pairs.moment_code import moment_text
 from warpmag.kernels.pairs.pair_terms import FIELD, WIDTHS
-from warpmag.kernels.shared.passes import passes_text
+from warpmag.kernels.shared.vector_text import passes_text
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
 
 _ROWS = """

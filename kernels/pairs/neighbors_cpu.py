@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.shared.passes import COLLECT
+from warpmag.kernels.shared.vector_text import COLLECT
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, TOGETHER, team, threads_for, wide_registers
 
 _VECTORS = f"""

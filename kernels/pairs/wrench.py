@@ -13,12 +13,11 @@ m is parallel to the whole field, so that the body's own pairs turn it by −λm
 number in the body; where it is not, they also push it, which no body can do to itself.
 """
 
-from dataclasses import dataclass
 from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.material.curves import curve_derivative_times
+from warpmag.kernels.material.curves import CurveParameters, curve_derivative_times
 from warpmag.kernels.pairs import finish_cpu
 from warpmag.kernels.pairs.field import INVERSE_4PI
 from warpmag.kernels.pairs.fused_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
@@ -34,23 +33,6 @@ MU0 = 1.2566370614359173e-06
 
 KELVIN, ZEEMAN = 0, 1
 FORCE_IDS = {"kelvin": KELVIN, "zeeman": ZEEMAN}
-
-
-@dataclass(frozen=True)
-class Material:
-    """What each moment is made of, on one device.
-
-    Attributes:
-        inducible: 1 for inducible moments, 0 for permanent ones, shape [n].
-        saturation: Saturation magnetization Ms [A/m], shape [n].
-        slope: Initial slope k = 3χ/(3+χ) [dimensionless], shape [n].
-        curve: Curve id of ``kernels.curves``, shape [n].
-    """
-
-    inducible: wp.array
-    saturation: wp.array
-    slope: wp.array
-    curve: wp.array
 
 
 @cache
@@ -81,7 +63,7 @@ def _effective_kernel(dtype):
     return zeeman_moments
 
 
-def launch_zeeman_moments(moments, h, material: Material, effective):
+def launch_zeeman_moments(moments, h, material: CurveParameters, effective):
     """Write the effective moments of the Zeeman law.
 
     Args:

@@ -9,7 +9,7 @@
 namespace warpmag {
 
 constexpr int CHUNK = 16,
-              LINE = 16; // balls side by side in an array, and numbers of a ball's cache line; as in lanes.py
+              LINE = 16; // balls side by side in an array, and numbers of a ball's cache line; as in passes.py
 
 #if defined(__CUDA_ARCH__)
 constexpr int WIDTH = 1;
