@@ -48,10 +48,9 @@ class PackedMoments:
         pitched = wp.array(pitched, dtype=dtype, device=device)
         self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
-        self._lists = neighbors.allocate(n, dtype, device)
-        self.neighbors, self.neighbor_counts = self._lists.neighbor, self._lists.count
-        self.searching = self._lists.searching
-        self.overlaps, self.overlap_counts = wp.zeros_like(self.neighbors), wp.zeros_like(self.neighbor_counts)
+        lists = self._lists = neighbors.allocate(n, self.packed, self.groups)
+        self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
+        self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
 
     def pack(self, positions, moments):
         """Launch the packing of positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
@@ -67,7 +66,5 @@ class PackedMoments:
         reach = sources.largest_radius + self.largest_radius
         if reach == 0.0 or self.count == 0 or sources.count == 0:
             return
-        neighbors.launch_find_neighbors(
-            self.packed, sources.packed, self.groups, sources.groups, reach, self._lists, sources._lists
-        )
-        neighbors.launch_list_overlaps(self.packed, sources.packed, self._lists, self.overlaps, self.overlap_counts)
+        neighbors.launch_find_neighbors(self._lists, sources._lists, reach)
+        neighbors.launch_list_overlaps(self._lists, sources._lists)

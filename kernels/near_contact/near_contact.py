@@ -121,7 +121,7 @@ class NearContactBuffers:
     dtype: Any
     balls: int
     group: wp.array
-    lists: neighbors.NeighborLists
+    lists: Any
     arrays: dict[str, wp.array]
     given: Any
     reach: float
@@ -185,14 +185,15 @@ def allocate(
     saturated = 4.0 / 3.0 * np.pi * np.where(eligible, radii, 1.0).astype(float) ** 3 * saturation
     chunks = balls // LANES
     ratio = 0.5 * model.REACH + SKIN
-    lists = neighbors.allocate(n, dtype, device, ratio=ratio, capacity=CANDIDATES)
+    group = padded(worlds, -1, wp.int32)
+    lists = neighbors.allocate(n, packed.packed, group, ratio=ratio, capacity=CANDIDATES)
     row_of = np.full(n, -1)
     if len(partial):
         row_of[rows.target.numpy()] = np.arange(rows.count)
     seen, driven, width = (4, 2, 4) if device.is_cuda else (1, 1, 3)
     arrays = {
         "packed": packed.packed,
-        "group": padded(worlds, -1, wp.int32),
+        "group": group,
         "kind": padded(kind, 0, wp.int32),
         "candidate": lists.neighbor,
         "candidate_count": lists.count,
@@ -238,7 +239,7 @@ def allocate(
     return NearContactBuffers(
         dtype=dtype,
         balls=balls,
-        group=arrays["group"],
+        group=group,
         lists=lists,
         arrays=arrays,
         given=given,
@@ -319,10 +320,9 @@ def launch_find_pairs(moments, b: NearContactBuffers):
     """
     if b.reach == 0.0:
         return
-    packed = moments.packed
     with _beside(b):
         _launch_each(b, 0, 1, place_text)
-        neighbors.launch_find_neighbors(packed, packed, b.group, b.group, b.reach, b.lists, b.lists)
+        neighbors.launch_find_neighbors(b.lists, b.lists, b.reach)
         _launch_each(b, 0, 2, tabulate_text)
 
 

@@ -1,0 +1,145 @@
+// The neighbour search on a CPU: candidates a vector at a time, by several threads.
+//
+// A counting sort puts sources in the order of their buckets, so that a target finds its candidates in nine runs of
+// memory, columns of three cells each. What other cells have in those buckets, and is near enough, is of other columns.
+#pragma once
+#include "pairs/cells.h"
+#include "shared/team.h"
+
+namespace warpmag {
+
+constexpr int TARGETS = 64; // that a thread takes at a time
+
+// Sources in the order of their buckets: where each bucket begins; index, column, group and ball of each source. The
+// bucket is of source j.
+struct SortedSources {
+    int buckets, *begin, *index, *column_x, *column_y, *group, *bucket;
+    Real *x, *y, *z, *radius;
+};
+
+template <class Lists> inline SortedSources sorted_sources(const Lists& sources) {
+    const int pitch = sources.entries.shape[1];
+    int* const e = sources.entries.data;
+    Real* const p = (Real*)sources.places.data;
+    return {sources.bucket.shape[0] - 1,
+            sources.bucket.data,
+            e,
+            e + pitch,
+            e + 2 * pitch,
+            e + 3 * pitch,
+            e + 4 * pitch,
+            p,
+            p + pitch,
+            p + 2 * pitch,
+            p + 3 * pitch};
+}
+
+template <class Lists> inline void sort_sources(const Lists& sources, double cells_per_meter, SortedSources s) {
+    const Balls balls = balls_of(sources);
+    const int count = sources.packed.shape[1];
+    int* const first = s.begin;
+    __builtin_memset(first, 0, (s.buckets + 1) * sizeof(int));
+    for (int j = 0; j < count; ++j) {
+        const Cell cell = cell_of(balls, j, sources.group.data[j], cells_per_meter);
+        s.bucket[j] = cell.group >= 0 ? bucket_of(cell, s.buckets) : -1;
+        if (s.bucket[j] >= 0) ++first[s.bucket[j]];
+    }
+    for (int b = 0, sum = 0; b <= s.buckets; ++b) {
+        const int held = first[b];
+        first[b] = sum;
+        sum += held;
+    }
+    for (int j = 0; j < count; ++j) {
+        if (s.bucket[j] < 0) continue;
+        const Cell cell = cell_of(balls, j, sources.group.data[j], cells_per_meter);
+        const int e = first[s.bucket[j]]++;
+        s.index[e] = j;
+        s.column_x[e] = cell.x;
+        s.column_y[e] = cell.y;
+        s.group[e] = cell.group;
+        s.x[e] = balls.x[j];
+        s.y[e] = balls.y[j];
+        s.z[e] = balls.z[j];
+        s.radius[e] = balls.radius[j];
+    }
+    for (int b = s.buckets; b > 0; --b) first[b] = first[b - 1];
+    first[0] = 0;
+}
+
+struct Target {
+    Real x, y, z, radius, ratio;
+    int self; // index among the sources, −1 if it is none of them
+};
+
+// Puts sources ``begin`` to ``end`` of a column that are near a target into a list, of which it needs the first
+// CAPACITY, and returns how many there are with those before.
+inline int find_in_run(const SortedSources& s, const Target& t, Cell column, int begin, int end, int* list, int count) {
+    for (int e = begin; e < end; e += WIDTH) {
+        const Vector r = {t.x - numbers(s.x + e), t.y - numbers(s.y + e), t.z - numbers(s.z + e)};
+        const Number reach = t.ratio * (t.radius + numbers(s.radius + e));
+        const Index j = indices(s.index + e);
+        const auto near = __builtin_convertvector(dot(r, r) < reach * reach, Index) & (lanes() < end - e)
+                          & (j != t.self) & (indices(s.column_x + e) == column.x)
+                          & (indices(s.column_y + e) == column.y) & (indices(s.group + e) == column.group);
+        count += append(list + (count < CAPACITY ? count : CAPACITY), j, near);
+    }
+    return count;
+}
+
+// Neighbours of a target in its cell and the 26 around it, as ``find_in_run`` lists them.
+inline int find_around(const SortedSources& s, const Target& t, Cell cell, int* list) {
+    int count = 0;
+    for (int c = 0; c < 9 && cell.group >= 0; ++c) {
+        const Cell column = {cell.x + c / 3 - 1, cell.y + c % 3 - 1, cell.z - 1, cell.group};
+        const int b = bucket_of(column, s.buckets);
+        if (b + 3 <= s.buckets) {
+            count = find_in_run(s, t, column, s.begin[b], s.begin[b + 3], list, count);
+            continue;
+        }
+        for (int k = b; k < b + 3; ++k) {
+            const int* const begin = s.begin + (k & (s.buckets - 1));
+            count = find_in_run(s, t, column, begin[0], begin[1], list, count);
+        }
+    }
+    return count;
+}
+
+// Writes a list in ascending order: each entry comes behind as many as are smaller. Its last vector is filled up.
+inline void write_sorted(int* list, int count, int* out) {
+    const int vectors = (count + WIDTH - 1) / WIDTH;
+    put_indices(list + count, Index(__INT_MAX__));
+    for (int k = 0; k < count; ++k) {
+        int place = 0;
+        for (int v = 0; v < vectors; ++v) place += __builtin_popcount(bits_of(indices(list + WIDTH * v) < list[k]));
+        out[place] = list[k];
+    }
+}
+
+// Lists each target's neighbours anew if moments have moved too far.
+template <class Lists>
+inline void search_neighbors(const Lists& targets, const Lists& sources, double cells_per_meter, int threads,
+                             Word* team) {
+    targets.searching.data[0] = targets.moved.data[0];
+    if (targets.moved.data[0] == 0) return;
+    targets.moved.data[0] = 0;
+    const SortedSources sorted = sorted_sources(sources);
+    sort_sources(sources, cells_per_meter, sorted);
+    const Balls balls = balls_of(targets);
+    share_out(team, threads, targets.packed.shape[1], TARGETS, [&](int i) {
+        int list[CAPACITY + WIDTH];
+        const Target target = {balls.x[i],          balls.y[i],
+                               balls.z[i],          balls.radius[i],
+                               (Real)targets.ratio, targets.found_at.data == sources.found_at.data ? i : -1};
+        const int count = find_around(sorted, target, cell_of(balls, i, targets.group.data[i], cells_per_meter), list);
+        write_sorted(list, count < CAPACITY ? count : CAPACITY, targets.neighbor.data + (size_t)CAPACITY * i);
+        targets.count.data[i] = count;
+        Real* const found_at = (Real*)targets.found_at.data + 3 * i;
+        found_at[0] = target.x, found_at[1] = target.y, found_at[2] = target.z;
+    });
+}
+
+template <class Lists>
+inline void list_overlaps_of_all(const Lists& targets, const Lists& sources, int threads, Word* team) {
+    share_out(team, threads, targets.packed.shape[1], TARGETS, [&](int i) { list_overlaps(targets, sources, i); });
+}
+}
