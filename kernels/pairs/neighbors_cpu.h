@@ -1,7 +1,7 @@
 // The neighbour search on a CPU: candidates a vector at a time, by several threads.
 //
 // A counting sort puts sources in the order of their buckets, so that a target finds its candidates in nine runs of
-// memory, columns of three cells each. What other cells have in those buckets, and is near enough, is of other columns.
+// memory, columns of three cells each. Of what else is in their buckets, all that is near is of other columns.
 #pragma once
 #include "pairs/cells.h"
 #include "shared/team.h"
@@ -10,60 +10,36 @@ namespace warpmag {
 
 constexpr int TARGETS = 64; // that a thread takes at a time
 
-// Sources in the order of their buckets: where each bucket begins; index, column, group and ball of each source. The
-// bucket is of source j.
+// Sources in the order of their buckets, ``begin[b]`` being the first of bucket b: index, column, group, position and
+// radius; and the bucket of each source, −1 if none, in the order of sources.
 struct SortedSources {
-    int buckets, *begin, *index, *column_x, *column_y, *group, *bucket;
-    Real *x, *y, *z, *radius;
+    int buckets, pitch, *begin, *index;
+    Real* x;
+    int *column_x = index + pitch, *column_y = column_x + pitch, *group = column_y + pitch, *bucket = group + pitch;
+    Real *y = x + pitch, *z = y + pitch, *radius = z + pitch;
 };
 
-template <class Lists> inline SortedSources sorted_sources(const Lists& sources) {
-    const int pitch = sources.entries.shape[1];
-    int* const e = sources.entries.data;
-    Real* const p = (Real*)sources.places.data;
-    return {sources.bucket.shape[0] - 1,
-            sources.bucket.data,
-            e,
-            e + pitch,
-            e + 2 * pitch,
-            e + 3 * pitch,
-            e + 4 * pitch,
-            p,
-            p + pitch,
-            p + 2 * pitch,
-            p + 3 * pitch};
-}
-
-template <class Lists> inline void sort_sources(const Lists& sources, double cells_per_meter, SortedSources s) {
+template <class Lists> inline SortedSources sort_sources(const Lists& sources, double cells_per_meter) {
+    const SortedSources s = {sources.bucket.shape[0] - 1, sources.entries.shape[1], sources.bucket.data,
+                             sources.entries.data, (Real*)sources.places.data};
     const Balls balls = balls_of(sources);
     const int count = sources.packed.shape[1];
-    int* const first = s.begin;
-    __builtin_memset(first, 0, (s.buckets + 1) * sizeof(int));
+    __builtin_memset(s.begin, 0, (s.buckets + 1) * sizeof(int));
     for (int j = 0; j < count; ++j) {
         const Cell cell = cell_of(balls, j, sources.group.data[j], cells_per_meter);
         s.bucket[j] = cell.group >= 0 ? bucket_of(cell, s.buckets) : -1;
-        if (s.bucket[j] >= 0) ++first[s.bucket[j]];
+        if (s.bucket[j] >= 0) ++s.begin[s.bucket[j]];
     }
-    for (int b = 0, sum = 0; b <= s.buckets; ++b) {
-        const int held = first[b];
-        first[b] = sum;
-        sum += held;
-    }
-    for (int j = 0; j < count; ++j) {
+    for (int b = 0; b < s.buckets; ++b) s.begin[b + 1] += s.begin[b]; // where each bucket ends
+    for (int j = count - 1; j >= 0; --j) {
         if (s.bucket[j] < 0) continue;
         const Cell cell = cell_of(balls, j, sources.group.data[j], cells_per_meter);
-        const int e = first[s.bucket[j]]++;
+        const int e = --s.begin[s.bucket[j]];
         s.index[e] = j;
-        s.column_x[e] = cell.x;
-        s.column_y[e] = cell.y;
-        s.group[e] = cell.group;
-        s.x[e] = balls.x[j];
-        s.y[e] = balls.y[j];
-        s.z[e] = balls.z[j];
-        s.radius[e] = balls.radius[j];
+        s.column_x[e] = cell.x, s.column_y[e] = cell.y, s.group[e] = cell.group;
+        s.x[e] = balls.x[j], s.y[e] = balls.y[j], s.z[e] = balls.z[j], s.radius[e] = balls.radius[j];
     }
-    for (int b = s.buckets; b > 0; --b) first[b] = first[b - 1];
-    first[0] = 0;
+    return s;
 }
 
 struct Target {
@@ -92,13 +68,10 @@ inline int find_around(const SortedSources& s, const Target& t, Cell cell, int* 
     for (int c = 0; c < 9 && cell.group >= 0; ++c) {
         const Cell column = {cell.x + c / 3 - 1, cell.y + c % 3 - 1, cell.z - 1, cell.group};
         const int b = bucket_of(column, s.buckets);
-        if (b + 3 <= s.buckets) {
-            count = find_in_run(s, t, column, s.begin[b], s.begin[b + 3], list, count);
-            continue;
-        }
-        for (int k = b; k < b + 3; ++k) {
+        const int run = b + 3 <= s.buckets ? 3 : 1; // the last cells of a column may be in the first buckets
+        for (int k = b; k < b + 3; k += run) {
             const int* const begin = s.begin + (k & (s.buckets - 1));
-            count = find_in_run(s, t, column, begin[0], begin[1], list, count);
+            count = find_in_run(s, t, column, begin[0], begin[run], list, count);
         }
     }
     return count;
@@ -122,14 +95,12 @@ inline void search_neighbors(const Lists& targets, const Lists& sources, double 
     targets.searching.data[0] = targets.moved.data[0];
     if (targets.moved.data[0] == 0) return;
     targets.moved.data[0] = 0;
-    const SortedSources sorted = sorted_sources(sources);
-    sort_sources(sources, cells_per_meter, sorted);
+    const SortedSources sorted = sort_sources(sources, cells_per_meter);
     const Balls balls = balls_of(targets);
+    const bool same = targets.count.data == sources.count.data;
     share_out(team, threads, targets.packed.shape[1], TARGETS, [&](int i) {
         int list[CAPACITY + WIDTH];
-        const Target target = {balls.x[i],          balls.y[i],
-                               balls.z[i],          balls.radius[i],
-                               (Real)targets.ratio, targets.found_at.data == sources.found_at.data ? i : -1};
+        const Target target = {balls.x[i], balls.y[i], balls.z[i], balls.radius[i], (Real)targets.ratio, same ? i : -1};
         const int count = find_around(sorted, target, cell_of(balls, i, targets.group.data[i], cells_per_meter), list);
         write_sorted(list, count < CAPACITY ? count : CAPACITY, targets.neighbor.data + (size_t)CAPACITY * i);
         targets.count.data[i] = count;

@@ -32,30 +32,6 @@ def group_sum(vector):
     return sum_group
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned group = (width == 32 ? ~0u : (1u << width) - 1u) << (threadIdx.x & (32 - width));
-    const unsigned wanted = __ballot_sync(group, wants);
-    return wp::vec_t<2, wp::int32>(__popc(wanted & ((1u << (threadIdx.x & 31)) - 1u)), __popc(wanted));
-#else
-    return wp::vec_t<2, wp::int32>(0, wants);
-#endif
-""")
-def places_in_group(wants: int, width: int) -> wp.vec2i:
-    """Of 2ᵏ threads of a warp, how many before this one want a place, 1 or 0 each, and how many do in all."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncwarp();
-#endif
-""")
-def wait_for_warp():
-    """Wait until the other threads of a warp are here, too."""
-    ...
-
-
 @wp.func
 def block_sum(mine: Any):
     """Sum of a value over the threads of a block, in a fixed order; the same for all of them."""
