@@ -4,6 +4,7 @@
 // memory, columns of three cells each. Of what else is in their buckets, all that is near is of other columns.
 #pragma once
 #include "pairs/cells.h"
+#include "pairs/overlaps.h"
 #include "shared/team.h"
 
 namespace warpmag {

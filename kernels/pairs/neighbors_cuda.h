@@ -3,6 +3,7 @@
 // threads came does not show.
 #pragma once
 #include "pairs/cells.h"
+#include "pairs/overlaps.h"
 
 #if defined(__CUDA_ARCH__)
 namespace warpmag {

@@ -61,7 +61,7 @@ def launch_pack(positions, moments, radii, labels, lists, packed):
         moments: Moments [A·m²], shape [n].
         radii: Radii [m], shape [n].
         labels: Body labels, shape [n]; exact in float32 up to 2²⁴.
-        lists: Their neighbours (``neighbors.NeighborLists``); its ``moved`` is set.
+        lists: Their neighbours (``neighbors.allocate``); its ``moved`` is set.
         packed: Out, shape [8, n].
     """
     wp.launch(
