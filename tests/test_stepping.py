@@ -50,70 +50,71 @@ class Rules:
 
 @pytest.fixture
 def machine(device):
-    buffers = stepping.allocate(16, 1, device)
-    capacities = wp.array([CAPACITY], dtype=wp.int32, device=device)
-    return buffers, stepping.Limits(TRAVEL, SHARED_TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, capacities)
+    limits = {"travel": TRAVEL, "shared_travel": SHARED_TRAVEL, "overlap": OVERLAP, "ease": EASE, "futile": FUTILE}
+    machine = stepping.StepMachine(16, 1, device, **limits, fewest=FEWEST)
+    machine.arrays.capacities.fill_(CAPACITY)
+    return machine
 
 
-def report(buffers, travel, long_travel, overlap, lost, fill):
+def report(arrays, travel, long_travel, overlap, lost, fill):
     """Stand in for the monitor."""
-    peaks, counts = buffers.peaks.numpy(), buffers.counts.numpy()
+    peaks, counts = arrays.peaks.numpy(), arrays.counts.numpy()
     assert (peaks == 0.0).all() and counts[monitor.COUNT_BAD_BODY] == monitor.NO_BODY
     peaks[[monitor.PEAK_TRAVEL, monitor.PEAK_LONG_TRAVEL]] = travel, long_travel
     peaks[[monitor.PEAK_OVERLAP, monitor.PEAK_ERROR]] = overlap, 0.125
     counts[monitor.COUNT_EVALUATIONS], counts[monitor.COUNT_CAPACITIES] = 7, fill
     if lost:
         counts[monitor.COUNT_BAD_BODY] = 3
-    buffers.peaks.assign(peaks)
-    buffers.counts.assign(counts)
+    arrays.peaks.assign(peaks)
+    arrays.counts.assign(counts)
 
 
 def test_the_device_follows_the_rules(machine):
-    buffers, limits = machine
+    arrays = machine.arrays
     rules, rng = Rules(), np.random.default_rng(7)
     seen, shared = set(), set()
     for _ in range(300):
-        stepping.launch_begin_step(buffers)
-        while buffers.attempting.numpy()[0]:
-            stepping.launch_begin_attempt(limits, buffers)
-            wanted = [buffers.remaining(level).numpy()[0] for level in range(stepping.LEVELS)]
+        machine.begin_step()
+        while machine.attempting.numpy()[0]:
+            machine.begin_attempt()
+            wanted = [machine.remaining[level].numpy()[0] for level in range(stepping.LEVELS)]
             assert wanted == [level == rules.level for level in range(stepping.LEVELS)]
             pairs = 0
-            while buffers.remaining(rules.level).numpy()[0]:
+            while machine.remaining[rules.level].numpy()[0]:
                 if rules.level:
-                    assert buffers.sharing.numpy()[0] == rules.sharing
-                    assert buffers.forces_due.numpy()[0] == (2 * pairs % rules.sharing == 0)
+                    assert machine.sharing.numpy()[0] == rules.sharing
+                    assert machine.forces_due.numpy()[0] == (2 * pairs % rules.sharing == 0)
                     shared.add((rules.level, rules.sharing))
-                stepping.launch_end_pair(rules.level, buffers)
+                machine.end_pair(rules.level)
                 pairs += 1
             assert 2 * pairs == FEWEST * 2**rules.level
             travel = np.float32(rng.choice([0.01, 0.08, 0.3]))
             long_travel = np.float32(travel * rng.uniform(2.0, 4.0))  # 0.2 is the limit of easing
             overlap = np.float32(rng.choice([0.001, 0.005, 0.01, 0.02], p=[0.6, 0.2, 0.1, 0.1]))
             lost, fill = rng.random() < 0.05, int(rng.choice([50, CAPACITY, 101], p=[0.8, 0.15, 0.05]))
-            report(buffers, travel, long_travel, overlap, lost, fill)
+            report(arrays, travel, long_travel, overlap, lost, fill)
             record_at = rules.done % 16
             outcome, record = rules.judge(float(travel), float(long_travel), float(overlap), lost, fill)
-            stepping.launch_judge(limits, buffers)
-            assert buffers.attempting.numpy()[0] == (outcome == "again")
-            assert buffers.flags.numpy()[stepping.FLAG_REJECTED] == (outcome != "done")
+            machine.judge()
+            assert machine.attempting.numpy()[0] == (outcome == "again")
+            assert arrays.flags.numpy()[stepping.FLAG_REJECTED] == (outcome != "done")
             if record:
-                logged = buffers.log.numpy()[record_at]
+                logged = arrays.log.numpy()[record_at]
                 fields = (stepping.LOG_SUBSTEPS, stepping.LOG_ATTEMPTS, stepping.LOG_CAPPED, stepping.LOG_REGROWN)
                 assert tuple(logged[list(fields)]) == record
                 assert logged[stepping.LOG_EVALUATIONS] == 7
                 assert logged[int(stepping.LOG_PEAKS) + int(monitor.PEAK_TRAVEL)] == travel
                 assert logged[int(stepping.LOG_PEAKS) + int(monitor.PEAK_ERROR)] == 0.125
             seen.add((outcome, rules.level))
-        status = buffers.status.numpy()
+        status = arrays.status.numpy()
         halts = {"no": stepping.RUNNING, "overflow": stepping.OVERFLOW, "lost": stepping.NOT_FINITE}
         assert status[stepping.STATUS_HALT] == halts[rules.halt]
         assert status[stepping.STATUS_DONE] == rules.done
         if rules.halt != "no":
-            stepping.launch_begin_step(buffers)
-            assert not buffers.attempting.numpy()[0]  # steps do nothing now
-            stepping.launch_set_status(stepping.STATUS_HALT, stepping.RUNNING, buffers)
-            stepping.launch_set_status(stepping.STATUS_REGROWN, 1, buffers)
+            machine.begin_step()
+            assert not machine.attempting.numpy()[0]  # steps do nothing now
+            machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
+            machine.set_status(stepping.STATUS_REGROWN, 1)
             rules.halt, rules.regrown = "no", 1
     assert {level for _, level in seen} == set(range(stepping.LEVELS))
     assert {outcome for outcome, _ in seen} == {"done", "again", "halted"}
@@ -121,26 +122,26 @@ def test_the_device_follows_the_rules(machine):
 
 
 def test_time_is_counted_for_the_stage_that_it_was_spent_in(machine):
-    buffers, limits = machine
-    stepping.launch_begin_attempt(limits, buffers)
-    work = wp.zeros(1 << 20, dtype=float, device=buffers.ticks.device)
+    arrays = machine.arrays
+    machine.begin_attempt()
+    work = wp.zeros(1 << 20, dtype=float, device=arrays.ticks.device)
     for _ in range(20):
         wp.copy(work, wp.ones_like(work))
-    stepping.launch_mark(1, buffers)
-    stepping.launch_mark(2, buffers)
-    ticks = buffers.ticks.numpy().astype(float)
+    machine.mark(1)
+    machine.mark(2)
+    ticks = arrays.ticks.numpy().astype(float)
     assert ticks[0] == 0.0
     assert ticks[1] > 0.0
 
 
 def test_arrays_of_any_type_are_copied_where_a_flag_stands(machine):
-    buffers, _ = machine
+    arrays = machine.arrays
     rng = np.random.default_rng(1)
     for dtype, width in ((wp.transform, 7), (wp.spatial_vector, 6), (wp.float32, 1), (wp.vec3, 3)):
         values = rng.normal(size=(50, width)).astype(np.float32).squeeze()
-        source = wp.array(values, dtype=dtype, device=buffers.flags.device)
+        source = wp.array(values, dtype=dtype, device=arrays.flags.device)
         target = wp.zeros_like(source)
         for flag, expected in ((0, np.zeros_like(values)), (1, values)):
-            buffers.flags.fill_(flag)
-            stepping.launch_copy_where(stepping.FLAG_REJECTED, source, target, buffers)
+            arrays.flags.fill_(flag)
+            machine.copy_where(stepping.FLAG_REJECTED, source, target)
             np.testing.assert_array_equal(target.numpy(), expected)

@@ -1,92 +1,94 @@
 """Between rigid bodies and their magnetic moments.
 
-A magnet's moments are fixed in the frame of its body. Every substep they are gathered into the world, and the force F
-and torque τ on each of them are added to the wrench of its body about the centre of mass c (Newton's convention):
+A magnet's moments are fixed in the frame of its body. Every substep they are transformed to the world frame, and the
+force F and torque τ on each are added to the wrench of its body about the centre of mass c (Newton's convention):
 
     F_body = Σ F_i,    τ_body = Σ τ_i + (x_i − c) × F_i
 
 Sums run in a fixed order and without atomics, so that a run repeats bit by bit: on a GPU a warp sums the moments of a
 body.
-
-| variable | shape | dtype | meaning |
-|---|---|---|---|
-| positions, moments | [moment_count] | vec3 | [m], [A·m²], world frame |
-| local_positions, local_moments | [moment_count] | vec3 | the same in the frame of the body |
-| moment_body | [moment_count] | int32 | body, −1 where the magnet is fixed in the world |
-| body_list, body_run_start | [n], [n + 1] | int32 | bodies that take forces, first run of moments of each |
-| runs | [run_count] | vec2i | first moment of each run, and the one after its last |
 """
 
 import warp as wp
 
+from warpmag.kernels.rigid.newton_views import BodyView
 from warpmag.kernels.shared.reductions import group_sum
 
 wp.set_module_options({"enable_backward": False})
 
 _SHARES = 32
-"""Threads of a GPU that share out the moments of a body: a warp."""
+"""Threads of a GPU that sum the moments of a body: a warp."""
 _sum_group = group_sum(wp.spatial_vectord)
+
+
+@wp.struct
+class BodyMoments:
+    """Which moments belong to which body, for n moments in r runs on b bodies.
+
+    Attributes:
+        body: Body of each moment, -1 where the magnet is fixed in the world, shape [n].
+        permanent: Whether the moment is permanent, shape [n].
+        local_positions, local_moments: Position [m] and permanent moment [A·m²] in the body's frame, shape [n].
+        body_list, body_run_start: Bodies with moments, and the first run of each, shape [b] and [b + 1].
+        runs: First moment of each run, and the one after its last, shape [r].
+        kinematic_flag: Newton's flag of bodies that forces do not move.
+    """
+
+    body: wp.array[wp.int32]
+    permanent: wp.array[wp.bool]
+    local_positions: wp.array[wp.vec3]
+    local_moments: wp.array[wp.vec3]
+    body_list: wp.array[wp.int32]
+    body_run_start: wp.array[wp.int32]
+    runs: wp.array[wp.vec2i]
+    kinematic_flag: int
 
 
 @wp.kernel
 def _gather_moments(
     # inputs:
     body_q_in: wp.array[wp.transform],
-    moment_body_in: wp.array[wp.int32],
-    permanent_in: wp.array[wp.bool],
-    local_positions_in: wp.array[wp.vec3],
-    local_moments_in: wp.array[wp.vec3],
+    magnets: BodyMoments,
     # outputs:
     positions_out: wp.array[wp.vec3],
     moments_out: wp.array[wp.vec3],
 ):
     i = wp.tid()
     frame = wp.transform_identity()
-    body = moment_body_in[i]
+    body = magnets.body[i]
     if body >= 0:
         frame = body_q_in[body]
-    positions_out[i] = wp.transform_point(frame, local_positions_in[i])
-    if permanent_in[i]:
-        moments_out[i] = wp.transform_vector(frame, local_moments_in[i])
+    positions_out[i] = wp.transform_point(frame, magnets.local_positions[i])
+    if magnets.permanent[i]:
+        moments_out[i] = wp.transform_vector(frame, magnets.local_moments[i])
 
 
-def gather_moments(body_q, moment_body, permanent, local_positions, local_moments, positions, moments):
+def gather_moments(body_q, magnets: BodyMoments, positions, moments):
     """Write the world positions of all moments, and the world moments of the permanent ones."""
-    wp.launch(
-        _gather_moments,
-        dim=len(positions),
-        inputs=[body_q, moment_body, permanent, local_positions, local_moments],
-        outputs=[positions, moments],
-        device=positions.device,
-    )
+    outputs = [positions, moments]
+    wp.launch(_gather_moments, len(positions), inputs=[body_q, magnets], outputs=outputs, device=positions.device)
 
 
 @wp.kernel
-def _add_to_bodies(
+def _add_wrenches(
     # inputs:
-    body_q_in: wp.array[wp.transform],
-    body_com_in: wp.array[wp.vec3],
-    body_flags_in: wp.array[wp.int32],
-    kinematic_flag: int,
-    body_list_in: wp.array[wp.int32],
-    body_run_start_in: wp.array[wp.int32],
-    run_in: wp.array[wp.vec2i],
+    magnets: BodyMoments,
     positions_in: wp.array[wp.vec3],
     forces_in: wp.array[wp.vec3],
     torques_in: wp.array[wp.vec3],
     shares: int,
     # outputs:
-    body_f_out: wp.array[wp.spatial_vector],
+    bodies: BodyView,
 ):
     k = wp.tid() // shares
     share = wp.tid() % shares
-    body = body_list_in[k]
-    if (body_flags_in[body] & kinematic_flag) != 0:
+    body = magnets.body_list[k]
+    if (bodies.flags[body] & magnets.kinematic_flag) != 0:
         return
-    center = wp.transform_point(body_q_in[body], body_com_in[body])
+    center = wp.transform_point(bodies.q[body], bodies.com[body])
     mine = wp.spatial_vectord()
-    for run in range(body_run_start_in[k], body_run_start_in[k + 1]):
-        for i in range(run_in[run][0] + share, run_in[run][1], shares):
+    for run in range(magnets.body_run_start[k], magnets.body_run_start[k + 1]):
+        for i in range(magnets.runs[run][0] + share, magnets.runs[run][1], shares):
             force = forces_in[i]
             torque = torques_in[i] + wp.cross(positions_in[i] - center, force)
             for c in range(3):
@@ -96,44 +98,21 @@ def _add_to_bodies(
     if share == 0:
         force = wp.vec3(float(total[0]), float(total[1]), float(total[2]))
         torque = wp.vec3(float(total[3]), float(total[4]), float(total[5]))
-        body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
+        bodies.f[body] = bodies.f[body] + wp.spatial_vector(force, torque)
 
 
-def scatter_wrenches(
-    body_q, body_com, body_flags, kinematic_flag, body_list, body_run_start, runs, positions, forces, torques, body_f
-):
-    """Add the force and torque of every moment to the wrench of its body.
-
-    Bodies that carry ``kinematic_flag`` take none.
-    """
-    shares = _SHARES if body_f.device.is_cuda else 1
-    wp.launch(
-        _add_to_bodies,
-        dim=shares * len(body_list),
-        inputs=[
-            body_q,
-            body_com,
-            body_flags,
-            kinematic_flag,
-            body_list,
-            body_run_start,
-            runs,
-            positions,
-            forces,
-            torques,
-            shares,
-        ],
-        outputs=[body_f],
-        device=body_f.device,
-    )
+def add_wrenches(magnets: BodyMoments, positions, forces, torques, bodies: BodyView):
+    """Add the force and torque of every moment to the wrench of its body, unless that is kinematic."""
+    device = positions.device
+    shares = _SHARES if device.is_cuda else 1
+    inputs = [magnets, positions, forces, torques, shares]
+    wp.launch(_add_wrenches, shares * len(magnets.body_list), inputs=inputs, outputs=[bodies], device=device)
 
 
 @wp.kernel
 def _predict_poses(
     # inputs:
-    body_q_in: wp.array[wp.transform],
-    body_qd_in: wp.array[wp.spatial_vector],
-    body_com_in: wp.array[wp.vec3],
+    bodies: BodyView,
     substeps_in: wp.array[wp.int32],
     dt: float,
     # outputs:
@@ -141,22 +120,17 @@ def _predict_poses(
 ):
     body = wp.tid()
     seconds = 0.5 * float(substeps_in[0] - 1) * dt
-    center = wp.transform_point(body_q_in[body], body_com_in[body]) + seconds * wp.spatial_top(body_qd_in[body])
-    rotation = wp.transform_get_rotation(body_q_in[body])
-    turn = 0.5 * seconds * wp.spatial_bottom(body_qd_in[body])
+    center = wp.transform_point(bodies.q[body], bodies.com[body]) + seconds * wp.spatial_top(bodies.qd[body])
+    rotation = wp.transform_get_rotation(bodies.q[body])
+    turn = 0.5 * seconds * wp.spatial_bottom(bodies.qd[body])
     rotation = wp.normalize(rotation + wp.quat(turn, 0.0) * rotation)
-    body_q_out[body] = wp.transform(center - wp.quat_rotate(rotation, body_com_in[body]), rotation)
+    body_q_out[body] = wp.transform(center - wp.quat_rotate(rotation, bodies.com[body]), rotation)
 
 
-def predict_poses(state, body_com, substeps, dt, body_q):
-    """Write poses half-way between those that the next ``substeps`` [1] of ``dt`` each start from, by velocities."""
-    wp.launch(
-        _predict_poses,
-        dim=state.body_q.shape[0],
-        inputs=[state.body_q, state.body_qd, body_com, substeps, dt],
-        outputs=[body_q],
-        device=body_q.device,
-    )
+def predict_poses(bodies: BodyView, substeps, dt: float, body_q):
+    """Write the poses, by velocities, half-way between those that ``substeps`` [1] of ``dt`` each start from."""
+    inputs = [bodies, substeps, dt]
+    wp.launch(_predict_poses, dim=len(body_q), inputs=inputs, outputs=[body_q], device=body_q.device)
 
 
 @wp.kernel

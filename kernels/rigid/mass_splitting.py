@@ -1,61 +1,41 @@
-"""Masses split among contacts, for bodies that many contacts push the same way.
+"""Masses split among contacts, for bodies with many contacts that push the same way.
 
 XPBD relaxes all contacts at once and adds up their corrections. Those on a ball point in different directions, but the
-corners of boxes face to face all make good the same gap: n of them overshoot it 0.35 n times (0.35 is the relaxation),
-and from some ten on each iteration is worse than the one before. A contact that sees only its share of each body's mass
-makes good its share of the gap (Tonge, Benevolenski and Voroshilov 2012, "Mass Splitting for Jitter-Free Parallel Rigid
-Body Simulation"). Its impulses on both bodies stay opposite, so that momentum is kept, which dividing each body's sum
-by its number of contacts would not do.
-
-| variable | shape | meaning |
-|---|---|---|
-| splits | [body_count] | 1 for bodies whose mass is split |
-| counts | [body_count] | contacts of each of them that touch or nearly do |
-| inv_mass, inv_inertia | [body_count] | as contacts see them [1/kg, 1/(kg·m²)] |
+corners of boxes face to face all close the same gap: n of them overshoot it 0.35 n times (0.35 is the relaxation), and
+from some ten on iterations diverge. A contact that acts on its share of each body's mass closes its share of the gap
+(Tonge, Benevolenski and Voroshilov 2012, "Mass Splitting for Jitter-Free Parallel Rigid Body Simulation"). Its impulses
+on both bodies stay opposite, so that momentum is kept, which dividing each body's sum by its number of contacts would
+not do.
 """
 
 import warp as wp
 
+from warpmag.kernels.rigid.newton_views import ContactView, contact_bodies, contact_count, contact_depth
+
 wp.set_module_options({"enable_backward": False})
 
-UNSPLIT = wp.constant(4)
+_UNSPLIT = wp.constant(4)
 """Contacts that share a body without splitting it."""
-NEAR = wp.constant(0.1)
+_TOUCHING_GAP = wp.constant(0.1)
 """Distance up to which contacts count, over the sum of their shapes' contact gaps."""
 
 
 @wp.kernel
 def _count_contacts(
     # inputs:
-    count_in: wp.array[wp.int32],
-    shape0_in: wp.array[wp.int32],
-    shape1_in: wp.array[wp.int32],
-    point0_in: wp.array[wp.vec3],
-    point1_in: wp.array[wp.vec3],
-    margin0_in: wp.array[float],
-    margin1_in: wp.array[float],
-    normal_in: wp.array[wp.vec3],
-    shape_body_in: wp.array[wp.int32],
-    shape_gap_in: wp.array[float],
+    contacts: ContactView,
     body_q_in: wp.array[wp.transform],
     splits_in: wp.array[wp.int32],
     # outputs:
     counts_out: wp.array[wp.int32],
 ):
     i = wp.tid()
-    if i >= wp.min(count_in[0], shape0_in.shape[0]):
+    if i >= contact_count(contacts):
         return
-    body0 = shape_body_in[shape0_in[i]]
-    body1 = shape_body_in[shape1_in[i]]
-    point0 = point0_in[i]
-    point1 = point1_in[i]
-    if body0 >= 0:
-        point0 = wp.transform_point(body_q_in[body0], point0)
-    if body1 >= 0:
-        point1 = wp.transform_point(body_q_in[body1], point1)
-    distance = wp.dot(normal_in[i], point1 - point0) - margin0_in[i] - margin1_in[i]
-    if distance > NEAR * (shape_gap_in[shape0_in[i]] + shape_gap_in[shape1_in[i]]):
+    gaps = contacts.shape_gap[contacts.shape0[i]] + contacts.shape_gap[contacts.shape1[i]]
+    if contact_depth(contacts, body_q_in, i) < -_TOUCHING_GAP * gaps:
         return
+    body0, body1 = contact_bodies(contacts, i)
     if body0 >= 0 and splits_in[body0] == 1:
         wp.atomic_add(counts_out, body0, 1)
     if body1 >= 0 and splits_in[body1] == 1:
@@ -73,52 +53,23 @@ def _split_masses(
     inv_inertia_out: wp.array[wp.mat33],
 ):
     body = wp.tid()
-    shares = wp.max(1.0, float(counts_in[body]) / float(UNSPLIT))
+    shares = wp.max(1.0, float(counts_in[body]) / float(_UNSPLIT))
     inv_mass_out[body] = shares * inv_mass_in[body]
     inv_inertia_out[body] = shares * inv_inertia_in[body]
 
 
-def launch_split_masses(
-    model, state, contacts, splits, inv_mass, inv_inertia, counts, split_inv_mass, split_inv_inertia
-):
-    """Write the inverse masses and inertias that contacts see.
+def launch_split_masses(contacts: ContactView, body_q, splits, whole, counts, shares):
+    """Write the inverse masses [1/kg] and inertias [1/(kg·m²)] of the share of each body that one contact acts on.
 
     Args:
-        model: Newton's model.
-        state: State that ``contacts`` were found at.
-        contacts: Its contacts.
-        splits: Which bodies may be split.
-        inv_mass: Inverse masses [1/kg].
-        inv_inertia: Inverse inertias [1/(kg·m²)].
-        counts: Out, contacts counted.
-        split_inv_mass: Out, inverse masses of a contact's share.
-        split_inv_inertia: Out, inverse inertias of a contact's share.
+        contacts: The contacts.
+        body_q: Poses that they were found at, shape [body_count].
+        splits: 1 for bodies whose mass may be split, shape [body_count].
+        whole: Inverse masses and inertias of the bodies, each of shape [body_count].
+        counts: Out, contacts of each body to split that touch or nearly do, shape [body_count].
+        shares: Out, inverse masses and inertias of a share, each of shape [body_count].
     """
     counts.zero_()
-    wp.launch(
-        _count_contacts,
-        dim=contacts.rigid_contact_max,
-        inputs=[
-            contacts.rigid_contact_count,
-            contacts.rigid_contact_shape0,
-            contacts.rigid_contact_shape1,
-            contacts.rigid_contact_point0,
-            contacts.rigid_contact_point1,
-            contacts.rigid_contact_margin0,
-            contacts.rigid_contact_margin1,
-            contacts.rigid_contact_normal,
-            model.shape_body,
-            model.shape_gap,
-            state.body_q,
-            splits,
-        ],
-        outputs=[counts],
-        device=counts.device,
-    )
-    wp.launch(
-        _split_masses,
-        dim=model.body_count,
-        inputs=[counts, inv_mass, inv_inertia],
-        outputs=[split_inv_mass, split_inv_inertia],
-        device=counts.device,
-    )
+    inputs = [contacts, body_q, splits]
+    wp.launch(_count_contacts, dim=contacts.shape0.shape[0], inputs=inputs, outputs=[counts], device=counts.device)
+    wp.launch(_split_masses, dim=len(counts), inputs=[counts, *whole], outputs=[*shares], device=counts.device)

@@ -15,7 +15,8 @@ import warp as wp
 
 from warpmag.engine.xpbd import OrderedXPBD, PileXPBD
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.monitor import watch_capacity, watch_flags
+from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, watch_capacity, watch_contacts, watch_flags
+from warpmag.kernels.rigid.newton_views import view_contacts
 
 _NEWTON_GAP = 0.1
 """``ModelBuilder.rigid_gap`` [m] as Newton sets it: the gap of a shape for which nobody chose one."""
@@ -219,6 +220,7 @@ class RigidSolver:
                 verify_buffers=False,  # would only print; the counters are read instead
             )
             self.contacts = self._pipeline.contacts()
+            self._contact_view = view_contacts(self._model, self.contacts)
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:
                 options = {"ordered": True} if self._ordered else {}
@@ -247,11 +249,12 @@ class RigidSolver:
         """Advance by ``dt`` [s] with the contacts of the last :meth:`collide`; capturable in a graph."""
         self._solver.step(state_in, state_out, None, self.contacts, dt)
 
-    def watch(self, first: int, counts: wp.array) -> None:
-        """Fold how full each buffer is into ``counts``, from index ``first`` on; capturable in a graph."""
+    def watch(self, state: newton.State, thickness: wp.array, overlap_threshold: float, peaks, counts) -> None:
+        """Let ``monitor`` see the contacts at ``state`` and how full each buffer is; capturable in a graph."""
+        watch_contacts(self._contact_view, state.body_q, thickness, overlap_threshold, self.overlaps, peaks, counts)
         for index, buffer in enumerate(self.buffers):
             watch = watch_flags if buffer.fill.dtype is wp.bool else watch_capacity
-            watch(buffer.fill, first + index, counts)
+            watch(buffer.fill, int(COUNT_CAPACITIES) + index, counts)
 
     def grow(self, fills: np.ndarray) -> bool:
         """Enlarge the buffers that overflowed; contacts and graphs are void afterwards.

@@ -9,7 +9,8 @@ import warp as wp
 from warpmag.engine.attributes import marked_shapes
 from warpmag.engine.sampling import BodyLattice, ShapeSampler
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.bodies import gather_moments, scatter_wrenches, sum_moments
+from warpmag.kernels.rigid.bodies import BodyMoments, add_wrenches, gather_moments, sum_moments
+from warpmag.kernels.rigid.newton_views import view_bodies
 from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_token
 from warpmag.system import MomentSystem
 
@@ -120,7 +121,7 @@ class Magnetics:
         )
 
     def _map_bodies(self) -> None:
-        """Lay out who belongs to whom for the kernels."""
+        """List for the kernels which moments belong to which body and to which shape."""
         device = self._model.device
         lattices = [one.lattice for one in self.magnets]
         counts = [len(one.volumes) for one in lattices]
@@ -138,12 +139,14 @@ class Magnetics:
         def put(values, dtype):
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        self._moment_body, self._permanent = put(body, wp.int32), put(permanent, wp.bool)
-        self._local_positions = put(np.concatenate([one.positions for one in lattices]), wp.vec3)
-        self._local_moments = put(local, wp.vec3)
-        self._body_list = put(bodies[dynamic], wp.int32)
-        self._body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
-        self._runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
+        self._body_moments = moments = BodyMoments()
+        moments.body, moments.permanent = put(body, wp.int32), put(permanent, wp.bool)
+        moments.local_positions = put(np.concatenate([one.positions for one in lattices]), wp.vec3)
+        moments.local_moments = put(local, wp.vec3)
+        moments.body_list = put(bodies[dynamic], wp.int32)
+        moments.body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
+        moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
+        moments.kinematic_flag = _KINEMATIC
 
         self.shapes = np.concatenate([one.shapes for one in self.magnets])
         self._parts = np.concatenate([[0], np.cumsum(np.concatenate([one.counts for one in lattices]))])
@@ -163,33 +166,14 @@ class Magnetics:
 
     def induce(self, state: newton.State) -> None:
         """Bring the inducible magnets to equilibrium at the poses of ``state``, starting from where they were."""
-        gather_moments(
-            state.body_q,
-            self._moment_body,
-            self._permanent,
-            self._local_positions,
-            self._local_moments,
-            self.system.positions,
-            self.system.moments,
-        )
+        gather_moments(state.body_q, self._body_moments, self.system.positions, self.system.moments)
         self.system.solve()
 
     def add_forces(self, state: newton.State) -> None:
         """Add the forces of the present moments to ``state.body_f``: the second half of :meth:`apply`."""
         self.system.apply_forces()
-        scatter_wrenches(
-            state.body_q,
-            self._model.body_com,
-            self._model.body_flags,
-            _KINEMATIC,
-            self._body_list,
-            self._body_run_start,
-            self._runs,
-            self.system.positions,
-            self.system.forces,
-            self.system.torques,
-            state.body_f,
-        )
+        system, bodies = self.system, view_bodies(self._model, state)
+        add_wrenches(self._body_moments, system.positions, system.forces, system.torques, bodies)
 
     def shape_moments(self) -> np.ndarray:
         """Return the total moment of each magnetic shape [A·m²], world frame, rows as :attr:`shapes`, shape [n, 3].
@@ -206,7 +190,7 @@ class Magnetics:
             magnetizations: Magnetization [A/m], world frame, of inducible shapes; of the others zero.
         """
         start = np.zeros((len(self._volumes), 3))
-        inducible = ~self._permanent.numpy()
+        inducible = ~self._body_moments.permanent.numpy()
         for part, shape in enumerate(self.shapes.tolist()):
             rows = slice(self._parts[part], self._parts[part + 1])
             if shape in magnetizations and inducible[rows].all():

@@ -1,11 +1,11 @@
 """Advances a model by the step that the user asked for, in as many substeps as its motion needs.
 
 A substep is: clear forces, induction, magnetic forces, collision, solver; substeps shorter than the longest ones share
-their forces with others. A step is tried and then judged: if a body moved too far in a substep, or bodies were pressed
-into each other, the state is put back and the step done again with shorter substeps. All of that is decided on the
-device (``kernels.stepping``), so that a step is one graph that the host launches and does not wait for. The host looks
-every so many steps. Where it has to act, because a buffer overflowed or the state is not finite any more, the device
-has halted, and steps launched since did nothing.
+their forces with others. A step is attempted and then judged: if a body moved too far in a substep, or bodies were
+pressed into each other, the state is restored and the step done again with shorter substeps. All of that is decided on
+the device (``kernels.rigid.stepping``), so that a step is one graph that the host launches and does not wait for. The
+host looks every so many steps. Where it has to act, because a buffer overflowed or the state is not finite any more,
+the device has halted, and steps launched since did nothing.
 
 What cannot be captured in a graph is launched from Python, by the same code.
 """
@@ -25,6 +25,7 @@ from warpmag.engine.magnetics import Magnetics
 from warpmag.errors import SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
+from warpmag.kernels.rigid.newton_views import view_bodies
 
 TRAVEL_LIMIT = 0.25
 """How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
@@ -116,11 +117,23 @@ class Stepper:
         self._shared = model.state()  # between the poses that some substeps start from, and the forces there
         self._thickness = wp.array(sizes.thickness, dtype=float, device=self._device)
         self._reach = wp.array(sizes.reach, dtype=float, device=self._device)
-        self._buffers = stepping.allocate(_RECORDS, len(solver.buffers), self._device)
-        self._mirrors = {
-            name: array if self._device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
-            for name, array in vars(self._buffers).items()
-        }
+        self._machine = stepping.StepMachine(
+            _RECORDS,
+            len(solver.buffers),
+            self._device,
+            travel=TRAVEL_LIMIT,
+            shared_travel=_SHARED_TRAVEL_LIMIT,
+            overlap=OVERLAP_LIMIT,
+            ease=_EASE,
+            futile=_FUTILE,
+            fewest=self._fewest,
+        )
+        self._arrays = self._machine.arrays
+        self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
+        if self._device.is_cuda:
+            self._mirrors = {
+                name: wp.empty_like(array, device="cpu", pinned=True) for name, array in self._mirrors.items()
+            }
         self._clock = _Clock(self._device)
         self._workspace = Workspace(self._device) if self._device.is_cuda else None
         self._capture, self._graph = graphs, None
@@ -131,11 +144,7 @@ class Stepper:
 
     def _prepare(self) -> None:
         """Fit everything to the solver's buffers, whose number does not change."""
-        sizes = [buffer.limit for buffer in self._solver.buffers]
-        capacities = wp.array(sizes, dtype=wp.int32, device=self._device)
-        self._limits = stepping.Limits(
-            TRAVEL_LIMIT, _SHARED_TRAVEL_LIMIT, OVERLAP_LIMIT, _EASE, _FUTILE, self._fewest, capacities
-        )
+        self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -176,8 +185,8 @@ class Stepper:
                 assert status[stepping.STATUS_HALT] == stepping.OVERFLOW, "the device left steps undone"
                 self._solver.grow(self._fills())
                 self._prepare()
-                stepping.launch_set_status(stepping.STATUS_REGROWN, 1, self._buffers)
-                stepping.launch_set_status(stepping.STATUS_HALT, stepping.RUNNING, self._buffers)
+                self._machine.set_status(stepping.STATUS_REGROWN, 1)
+                self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
                 for _ in range(self.steps - self._reported):
                     self._launch()
 
@@ -219,7 +228,7 @@ class Stepper:
 
     def _read(self, name: str) -> np.ndarray:
         """Wait for the device and return one of the state machine's buffers."""
-        source, mirror = getattr(self._buffers, name), self._mirrors[name]
+        source, mirror = getattr(self._arrays, name), self._mirrors[name]
         if mirror is not source:
             wp.copy(mirror, source)
             wp.synchronize_stream(self._device.stream)
@@ -243,13 +252,13 @@ class Stepper:
             with wp.ScopedCapture(self._device) as capture:
                 self._run_step()
             # the first launch makes the graph executable, or fails to; paused, it does nothing else
-            stepping.launch_set_status(stepping.STATUS_HALT, stepping.PAUSED, self._buffers)
+            self._machine.set_status(stepping.STATUS_HALT, stepping.PAUSED)
             wp.capture_launch(capture.graph)
             self._graph = capture.graph
         except Exception as error:  # whatever a solver does that cannot be captured, it can still be launched
             self._capture, self.capture_failure = False, " ".join(str(error).split()) or type(error).__name__
             _clear_error(self._device)
-        stepping.launch_set_status(stepping.STATUS_HALT, stepping.RUNNING, self._buffers)
+        self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
         """Find the contacts of the present state; :meth:`look` first.
@@ -258,17 +267,17 @@ class Stepper:
             Deepest penetration over the thickness of the thinner body, the same [m], and the number of contacts deeper
             than ``overlap_threshold`` of the thickness.
         """
-        b = self._buffers
+        a = self._arrays
         while True:
-            b.peaks.zero_()
-            b.counts.zero_()
+            a.peaks.zero_()
+            a.counts.zero_()
             self._find_contacts(self.state, 0.0, overlap_threshold)
             if not self._solver.grow(self._fills()):
                 break
             self._prepare()
         peaks, counts = self._read("peaks"), self._read("counts")
         overlap = float(peaks[monitor.PEAK_OVERLAP])
-        b.last_overlap.assign(np.array([overlap, math.inf], np.float32))
+        a.last_overlap.assign(np.array([overlap, math.inf], np.float32))
         return overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -276,18 +285,19 @@ class Stepper:
     # -----------------------------------------------------------------------------------------------------------------
 
     def _run_step(self) -> None:
-        stepping.launch_begin_step(self._buffers)
+        self._machine.begin_step()
         self._copy_state(stepping.FLAG_ATTEMPT, self.state, self._saved)
-        wp.capture_while(self._buffers.attempting, self._attempt)
+        wp.capture_while(self._machine.attempting, self._attempt)
 
     def _attempt(self) -> None:
-        stepping.launch_begin_attempt(self._limits, self._buffers)
-        for level in range(int(stepping.LEVELS)):
-            wp.capture_while(self._buffers.remaining(level), self._advance_twice, level=level)
+        machine = self._machine
+        machine.begin_attempt()
+        for level, remaining in enumerate(machine.remaining):
+            wp.capture_while(remaining, self._advance_twice, level=level)
         self._find_contacts(self.state, 0.0, 0.0)
-        stepping.launch_watch_finite(0, self.state, self._limits, self._buffers)
-        stepping.launch_mark(RIGID, self._buffers)
-        stepping.launch_judge(self._limits, self._buffers)
+        machine.watch_finite(0, self.state)
+        machine.mark(RIGID)
+        machine.judge()
         self._copy_state(stepping.FLAG_REJECTED, self._saved, self.state)
 
     def _advance_twice(self, level: int) -> None:
@@ -295,43 +305,40 @@ class Stepper:
         if level == 1:  # two substeps are all that share
             self._share_forces(dt)
         elif level > 1:
-            wp.capture_if(self._buffers.forces_due, self._share_forces, dt=dt)
+            wp.capture_if(self._machine.forces_due, self._share_forces, dt=dt)
         for half, (now, then) in enumerate(((self.state, self._other), (self._other, self.state))):
-            stepping.launch_watch_finite(half, now, self._limits, self._buffers)
+            self._machine.watch_finite(half, now)
             if level == 0:
                 self._magnetize(now)
             else:
                 wp.copy(now.body_f, self._shared.body_f)
-            monitor.watch_motion(self._model, now, self._thickness, self._reach, dt, self._buffers.peaks)
+            bodies, peaks = view_bodies(self._model, now), self._arrays.peaks
+            monitor.watch_motion(bodies, self._model.gravity, self._thickness, self._reach, dt, peaks)
             self._find_contacts(now, dt, 0.0)
             self._solver.step(now, then, dt)
-        stepping.launch_end_pair(level, self._buffers)
+        self._machine.end_pair(level)
 
     def _share_forces(self, dt: float) -> None:
-        predict_poses(self.state, self._model.body_com, self._buffers.sharing, dt, self._shared.body_q)
+        predict_poses(view_bodies(self._model, self.state), self._machine.sharing, dt, self._shared.body_q)
         self._magnetize(self._shared)
 
     def _magnetize(self, state: newton.State) -> None:
-        b, system = self._buffers, self._magnetics.system
+        a, machine, system = self._arrays, self._machine, self._magnetics.system
         state.clear_forces()
-        stepping.launch_mark(RIGID, b)
+        machine.mark(RIGID)
         self._magnetics.induce(state)
-        monitor.watch_induction(system.error, system.evaluations, system.converged, b.peaks, b.counts)
-        stepping.launch_mark(INDUCTION, b)
+        monitor.watch_induction(system.error, system.evaluations, system.converged, a.peaks, a.counts)
+        machine.mark(INDUCTION)
         self._magnetics.add_forces(state)
-        stepping.launch_mark(FORCE, b)
+        machine.mark(FORCE)
 
     def _find_contacts(self, state: newton.State, dt: float, overlap_threshold: float) -> None:
-        solver, b = self._solver, self._buffers
-        solver.collide(state, dt)
-        solver.watch(int(monitor.COUNT_CAPACITIES), b.counts)
-        monitor.watch_contacts(
-            self._model, state, solver.contacts, self._thickness, overlap_threshold, solver.overlaps, b.peaks, b.counts
-        )
+        self._solver.collide(state, dt)
+        self._solver.watch(state, self._thickness, overlap_threshold, self._arrays.peaks, self._arrays.counts)
 
     def _copy_state(self, flag: int, source: newton.State, target: newton.State) -> None:
         for one, other in zip(_arrays(source), _arrays(target), strict=True):
-            stepping.launch_copy_where(flag, one, other, self._buffers)
+            self._machine.copy_where(flag, one, other)
 
 
 def _clear_error(device) -> None:

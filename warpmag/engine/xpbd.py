@@ -1,13 +1,13 @@
-"""Newton's XPBD, mended for bodies that are pressed together, and one whose every run gives the same bits.
+"""Newton's XPBD, corrected for bodies that are pressed together, and one whose every run gives the same bits.
 
-Corners of boxes that lie face to face overshoot together what each of them corrects, and turn the boxes by themselves.
-Bodies that are no balls are therefore split among their contacts (``kernels.mass_splitting``), and the levers of these
-are put right (``kernels.contact_levers``).
+Corners of boxes that lie face to face together overshoot what each of them corrects, and turn the boxes by themselves.
+Bodies that are no balls are therefore split among their contacts (``kernels.rigid.mass_splitting``), and the lever arms
+of contact impulses are corrected (``kernels.rigid.lever_arms``).
 
 Newton's solver adds up contacts with float atomics. Warp can make those ordered, by writing every term to memory and
 sorting it, in each of the 60 iterations of each substep. But which contacts a body has does not change between
 iterations: here they are sorted once a substep, and Newton's own kernel runs on a copy of the body for each side of
-each contact (``kernels.contact_sides``).
+each contact (``kernels.rigid.ordered_sums``).
 """
 
 import contextlib
@@ -18,16 +18,17 @@ import numpy as np
 import warp as wp
 from newton._src.solvers.xpbd.kernels import solve_body_contact_positions
 
-from warpmag.kernels.rigid import contact_sides
-from warpmag.kernels.rigid.contact_sides import ContactBodies
-from warpmag.kernels.rigid.levers import launch_correct_levers, launch_take_mean
+from warpmag.kernels.rigid import ordered_sums
+from warpmag.kernels.rigid.lever_arms import launch_average_velocities, launch_correct_lever_arms
 from warpmag.kernels.rigid.mass_splitting import launch_split_masses
+from warpmag.kernels.rigid.newton_views import BodyView, ContactView, view_contacts
 
 
 class PileXPBD(newton.solvers.SolverXPBD):
-    """Newton's XPBD with masses split among contacts, and with their levers put right.
+    """Newton's XPBD with masses split among contacts, and with corrected lever arms of their impulses.
 
-    Levers are left as they are in models with joints, particles, tendons or restitution, which take Newton's own steps.
+    Lever arms are not corrected in models with joints, particles, tendons or restitution, which take Newton's own
+    steps.
     """
 
     def __init__(self, model: newton.Model, contact_max: int, **settings):
@@ -45,11 +46,12 @@ class PileXPBD(newton.solvers.SolverXPBD):
         self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         others = model.joint_count, model.particle_count, model.tendon_segment_count, self.enable_restitution
         self._rigid_only = not any(others)
-        self._deltas = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
+        self._bodies = BodyView()
+        self._bodies.deltas = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=model.device)
         self._impulses = self._velocities = None
         if splits.any() and self._rigid_only:
             self._impulses = wp.zeros(contact_max, dtype=wp.spatial_vector, device=model.device)
-            self._velocities = wp.zeros_like(self._deltas)
+            self._velocities = wp.zeros_like(self._bodies.deltas)
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; as Newton's."""
@@ -66,93 +68,67 @@ class PileXPBD(newton.solvers.SolverXPBD):
         self.integrate_bodies(model, state_in, state_out, dt, self.angular_damping)
         motion = state_out.body_q, state_out.body_qd
         with self._splitting(state_in, contacts):
-            self._take_apart(contacts)
+            found, bodies = self._begin_contacts(contacts)
             if self._impulses is not None:
                 self._impulses.zero_()
                 self._velocities.assign(motion[1])
             for _ in range(self.iterations):
-                bodies = self._contact_bodies(*motion, contacts)
-                self._launch_contacts(bodies, contacts, dt)
-                motion = self._apply_body_deltas(model, state_in, state_out, self._add_up(bodies), dt)
+                self._set_motion(*motion)
+                self._relax(contacts, found, bodies, dt)
+                motion = self._apply_body_deltas(model, state_in, state_out, self._sum_deltas(), dt)
             if self._impulses is not None:
-                launch_take_mean(motion[1], self._velocities)
-                bodies = self._contact_bodies(motion[0], self._velocities, contacts)
-                launch_correct_levers(contacts, self._impulses, bodies, dt)
-                motion = self._apply_body_deltas(model, state_in, state_out, self._add_up(bodies), dt)
+                launch_average_velocities(motion[1], self._velocities)
+                self._set_motion(motion[0], self._velocities)
+                launch_correct_lever_arms(found, self._impulses, dt, bodies)
+                motion = self._apply_body_deltas(model, state_in, state_out, self._sum_deltas(), dt)
         if motion[0].ptr != state_out.body_q.ptr:
             state_out.body_q.assign(motion[0])
             state_out.body_qd.assign(motion[1])
         self.copy_kinematic_body_state(model, state_in, state_out)
 
-    def _launch_contacts(self, bodies: ContactBodies, contacts, dt) -> None:
-        """Relax all contacts once."""
+    def _relax(self, contacts, found: ContactView, bodies: BodyView, dt) -> None:
+        """Add what one relaxation of all contacts does to ``bodies.deltas`` and to the impulses."""
+        body_arrays = bodies.q, bodies.qd, bodies.flags, bodies.com, bodies.inv_mass, bodies.inv_inertia
+        names = "count point0 point1 surface_velocity offset0 offset1 normal margin0 margin1"
+        contact_arrays = [getattr(contacts, f"rigid_contact_{name}") for name in names.split()]
+        friction = found.mu, found.mu_torsional, found.mu_rolling
         wp.launch(
             solve_body_contact_positions,
             dim=contacts.rigid_contact_max,
             inputs=[
-                bodies.q,
-                bodies.qd,
-                bodies.flags,
-                bodies.com,
-                bodies.inv_mass,
-                bodies.inv_inertia,
-                bodies.shape_body,
-                contacts.rigid_contact_count,
-                contacts.rigid_contact_point0,
-                contacts.rigid_contact_point1,
-                contacts.rigid_contact_surface_velocity,
-                contacts.rigid_contact_offset0,
-                contacts.rigid_contact_offset1,
-                contacts.rigid_contact_normal,
-                contacts.rigid_contact_margin0,
-                contacts.rigid_contact_margin1,
-                bodies.first,
-                bodies.second,
-                bodies.mu,
-                bodies.mu_torsional,
-                bodies.mu_rolling,
-                self.rigid_contact_relaxation,
-                dt,
+                *(*body_arrays, found.shape_body),
+                *(*contact_arrays, found.shape0, found.shape1),
+                *(*friction, self.rigid_contact_relaxation, dt),
             ],
             outputs=[bodies.deltas, None, self._impulses],
             device=self.model.device,
         )
 
-    def _take_apart(self, contacts) -> None:
-        """Prepare what :meth:`_contact_bodies` returns, once a substep."""
+    def _begin_contacts(self, contacts) -> tuple[ContactView, BodyView]:
+        """Return the contacts of a substep and the bodies that they act on."""
+        bodies, model = self._bodies, self.model
+        bodies.com, bodies.flags = model.body_com, model.body_flags
+        bodies.inv_mass, bodies.inv_inertia = self.body_inv_mass_effective, self.body_inv_inertia_effective
+        return view_contacts(model, contacts), bodies
 
-    def _contact_bodies(self, q, qd, contacts) -> ContactBodies:
-        """Return what contacts act on, where ``q`` and ``qd`` are, with nothing added up yet."""
-        model = self.model
-        self._deltas.zero_()
-        return ContactBodies(
-            q=q,
-            qd=qd,
-            com=model.body_com,
-            inv_mass=self.body_inv_mass_effective,
-            inv_inertia=self.body_inv_inertia_effective,
-            flags=model.body_flags,
-            first=contacts.rigid_contact_shape0,
-            second=contacts.rigid_contact_shape1,
-            shape_body=model.shape_body,
-            mu=model.shape_material_mu,
-            mu_torsional=model.shape_material_mu_torsional,
-            mu_rolling=model.shape_material_mu_rolling,
-            deltas=self._deltas,
-        )
+    def _set_motion(self, q, qd) -> None:
+        """Let contacts act on bodies with poses ``q`` and velocities ``qd``, with no impulses yet."""
+        self._bodies.q, self._bodies.qd = q, qd
+        self._bodies.deltas.zero_()
 
-    def _add_up(self, bodies: ContactBodies) -> wp.array:
+    def _sum_deltas(self) -> wp.array:
         """Return what contacts did to each body of the model, shape [body_count]."""
-        return bodies.deltas
+        return self._bodies.deltas
 
     @contextlib.contextmanager
     def _splitting(self, state, contacts) -> Iterator[None]:
-        """Let contacts see their share of each body's mass."""
+        """Let contacts act on their share of each body's mass."""
         if self._splits is None:
             yield
             return
         whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
-        launch_split_masses(self.model, state, contacts, self._splits, *whole, self._counts, *self._split)
+        found = view_contacts(self.model, contacts)
+        launch_split_masses(found, state.body_q, self._splits, whole, self._counts, self._split)
         with self._masses(self._split):
             self._whole = whole
             yield
@@ -194,32 +170,16 @@ class OrderedXPBD(PileXPBD):
     def __init__(self, model: newton.Model, contact_max: int, **settings):
         """Set up the solver; arguments as those of :class:`PileXPBD`."""
         super().__init__(model, contact_max, **settings)
-        self._sides = contact_sides.allocate(contact_max, model.body_count, model.device)
+        self._sides = ordered_sums.allocate(contact_max, model.body_count, model.device)
 
-    def _take_apart(self, contacts) -> None:
-        contact_sides.launch_split_contacts(
-            self.model, contacts, self.body_inv_mass_effective, self.body_inv_inertia_effective, self._sides
-        )
+    def _begin_contacts(self, contacts) -> tuple[ContactView, BodyView]:
+        ordered_sums.launch_split_contacts(*super()._begin_contacts(contacts), self._sides)
+        return self._sides.contacts, self._sides.bodies
 
-    def _contact_bodies(self, q, qd, contacts) -> ContactBodies:
-        sides = self._sides
-        contact_sides.launch_copy_motion(q, qd, sides)
-        return ContactBodies(
-            q=sides.q,
-            qd=sides.qd,
-            com=sides.com,
-            inv_mass=sides.inv_mass,
-            inv_inertia=sides.inv_inertia,
-            flags=sides.flags,
-            first=sides.first,
-            second=sides.second,
-            shape_body=sides.side_body,
-            mu=sides.mu,
-            mu_torsional=sides.mu_torsional,
-            mu_rolling=sides.mu_rolling,
-            deltas=sides.deltas,
-        )
+    def _set_motion(self, q, qd) -> None:
+        self._bodies.q, self._bodies.qd = q, qd
+        ordered_sums.launch_copy_motion(self._bodies, self._sides)
 
-    def _add_up(self, bodies: ContactBodies) -> wp.array:
-        contact_sides.launch_sum_sides(self._sides, self._deltas)
-        return self._deltas
+    def _sum_deltas(self) -> wp.array:
+        ordered_sums.launch_sum_sides(self._sides, self._bodies.deltas)
+        return self._bodies.deltas

@@ -1,0 +1,113 @@
+"""Newton's bodies and contacts as structs of arrays, and what several kernels compute from them.
+
+The structs copy nothing. They are filled at launch: states alternate, and contact buffers are replaced when they grow.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class BodyView:
+    """Bodies in one state, or copies of bodies, arrays of shape [bodies].
+
+    Attributes:
+        q: Pose.
+        qd: Velocity of the centre of mass and angular velocity [m/s, rad/s].
+        f: Force and torque about the centre of mass [N, N·m].
+        com: Centre of mass in the body's frame [m].
+        inv_mass: Inverse mass, zero for bodies that forces do not move [1/kg].
+        inv_inertia: Inverse inertia in the body's frame [1/(kg·m²)].
+        flags: Newton's ``BodyFlags``.
+        world: World of the body.
+        deltas: Sum of the impulses and angular impulses of contacts [N·s, N·m·s].
+    """
+
+    q: wp.array[wp.transform]
+    qd: wp.array[wp.spatial_vector]
+    f: wp.array[wp.spatial_vector]
+    com: wp.array[wp.vec3]
+    inv_mass: wp.array[float]
+    inv_inertia: wp.array[wp.mat33]
+    flags: wp.array[wp.int32]
+    world: wp.array[wp.int32]
+    deltas: wp.array[wp.spatial_vector]
+
+
+@wp.struct
+class ContactView:
+    """Contacts of rigid bodies and the shapes that touch.
+
+    Attributes:
+        count: Contacts found, more than ``contact_max`` if some were dropped, shape [1].
+        shape0, shape1: Shapes of each contact, shape [contact_max].
+        point0, point1: Contact points in the frames of the two bodies [m], shape [contact_max].
+        margin0, margin1: Distance of the surface from each point [m], shape [contact_max].
+        normal: Unit vector from the first shape to the second, shape [contact_max].
+        shape_body: Body of each shape, -1 for the world, shape [shapes].
+        shape_gap: Distance up to which contacts are found [m], shape [shapes].
+        mu, mu_torsional, mu_rolling: Coefficients of friction of each shape, shape [shapes].
+    """
+
+    count: wp.array[wp.int32]
+    shape0: wp.array[wp.int32]
+    shape1: wp.array[wp.int32]
+    point0: wp.array[wp.vec3]
+    point1: wp.array[wp.vec3]
+    margin0: wp.array[float]
+    margin1: wp.array[float]
+    normal: wp.array[wp.vec3]
+    shape_body: wp.array[wp.int32]
+    shape_gap: wp.array[float]
+    mu: wp.array[float]
+    mu_torsional: wp.array[float]
+    mu_rolling: wp.array[float]
+
+
+def view_bodies(model, state) -> BodyView:
+    """Return the bodies of ``model`` in ``state``, without ``deltas``."""
+    view = BodyView()
+    view.q, view.qd, view.f = state.body_q, state.body_qd, state.body_f
+    view.com, view.inv_mass, view.inv_inertia = model.body_com, model.body_inv_mass, model.body_inv_inertia
+    view.flags, view.world = model.body_flags, model.body_world
+    return view
+
+
+def view_contacts(model, contacts) -> ContactView:
+    """Return Newton's ``contacts`` between the shapes of ``model``."""
+    view = ContactView()
+    view.count = contacts.rigid_contact_count
+    for name in ("shape0", "shape1", "point0", "point1", "margin0", "margin1", "normal"):
+        setattr(view, name, getattr(contacts, f"rigid_contact_{name}"))
+    view.shape_body, view.shape_gap = model.shape_body, model.shape_gap
+    for name in ("mu", "mu_torsional", "mu_rolling"):
+        setattr(view, name, getattr(model, f"shape_material_{name}"))
+    return view
+
+
+@wp.func
+def contact_count(contacts: ContactView) -> int:
+    """Contacts that the buffers hold."""
+    return wp.min(contacts.count[0], contacts.shape0.shape[0])
+
+
+@wp.func
+def contact_bodies(contacts: ContactView, i: int):
+    """The two bodies of contact i, -1 for the world."""
+    return contacts.shape_body[contacts.shape0[i]], contacts.shape_body[contacts.shape1[i]]
+
+
+@wp.func
+def _world_point(body_q: wp.array[wp.transform], body: int, point: wp.vec3) -> wp.vec3:
+    if body < 0:
+        return point
+    return wp.transform_point(body_q[body], point)
+
+
+@wp.func
+def contact_depth(contacts: ContactView, body_q: wp.array[wp.transform], i: int) -> float:
+    """Penetration of contact i at the poses ``body_q`` [m], negative where there is a gap."""
+    body0, body1 = contact_bodies(contacts, i)
+    apart = _world_point(body_q, body1, contacts.point1[i]) - _world_point(body_q, body0, contacts.point0[i])
+    return contacts.margin0[i] + contacts.margin1[i] - wp.dot(contacts.normal[i], apart)
