@@ -46,20 +46,22 @@ def _watch_motion(
 ):
     """Bound how far the surface of each body moves without contacts: |v| dt + |a| dt²/2, and the same of turning."""
     body = wp.tid()
-    if thickness_in[body] == wp.inf:
+    thickness = thickness_in[body]
+    if thickness == wp.inf:
         return
     speed = wp.length(wp.spatial_top(bodies.qd[body]))
     gravity = gravity_in[bodies.world[body]]
     acceleration = wp.length(wp.spatial_top(bodies.f[body]) * bodies.inv_mass[body] + gravity)
     steady = speed * dt
     gained = 0.5 * acceleration * dt * dt
-    if reach_in[body] > 0.0:
+    reach = reach_in[body]
+    if reach > 0.0:
         rotation = wp.transform_get_rotation(bodies.q[body])
         torque = wp.quat_rotate_inv(rotation, wp.spatial_bottom(bodies.f[body]))
-        steady += reach_in[body] * wp.length(wp.spatial_bottom(bodies.qd[body])) * dt
-        gained += 0.5 * reach_in[body] * wp.length(bodies.inv_inertia[body] * torque) * dt * dt
-    wp.atomic_max(peaks_out, PEAK_TRAVEL, (steady + gained) / thickness_in[body])
-    wp.atomic_max(peaks_out, PEAK_LONG_TRAVEL, (2.0 * steady + 4.0 * gained) / thickness_in[body])
+        steady += reach * wp.length(wp.spatial_bottom(bodies.qd[body])) * dt
+        gained += 0.5 * reach * wp.length(bodies.inv_inertia[body] * torque) * dt * dt
+    wp.atomic_max(peaks_out, PEAK_TRAVEL, (steady + gained) / thickness)
+    wp.atomic_max(peaks_out, PEAK_LONG_TRAVEL, (2.0 * steady + 4.0 * gained) / thickness)
     wp.atomic_max(peaks_out, PEAK_SPEED, speed)
 
 
