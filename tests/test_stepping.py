@@ -103,8 +103,8 @@ def test_the_device_follows_the_rules(machine):
                 fields = (stepping.LOG_SUBSTEPS, stepping.LOG_ATTEMPTS, stepping.LOG_CAPPED, stepping.LOG_REGROWN)
                 assert tuple(logged[list(fields)]) == record
                 assert logged[stepping.LOG_EVALUATIONS] == 7
-                assert logged[int(stepping.LOG_PEAKS) + int(monitor.PEAK_TRAVEL)] == travel
-                assert logged[int(stepping.LOG_PEAKS) + int(monitor.PEAK_ERROR)] == 0.125
+                assert logged[stepping.LOG_PEAKS + monitor.PEAK_TRAVEL] == travel
+                assert logged[stepping.LOG_PEAKS + monitor.PEAK_ERROR] == 0.125
             seen.add((outcome, rules.level))
         status = arrays.status.numpy()
         halts = {"no": stepping.RUNNING, "overflow": stepping.OVERFLOW, "lost": stepping.NOT_FINITE}

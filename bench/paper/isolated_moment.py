@@ -1,4 +1,4 @@
-"""Iterations that one moment needs in a fixed field, for many steps, strengths and directions of the field at once.
+"""Warp kernels of ``fig9``: iterations that one moment needs in fixed fields of many strengths and directions.
 
 One thread runs one test of Kim and Han 2022, Fig. 9: a moment of slope k = 3 in a field of ‖H‖ = strength · Ms, in a
 random direction, from the same start, until ‖M − f(H)‖ ≤ tolerance ‖f(H)‖. Without a field, where f(H) = 0, the
@@ -6,9 +6,9 @@ tolerance is of Ms. The step is κ = multiplier · κ0. A test that does not end
 
 | dynamics | iteration |
 |---|---|
-| theta | exact θ flow with ω = κ/k, Anderson-accelerated with the last iterate as in ``induction`` |
+| theta | exact θ flow with ω = κ/k, Anderson-accelerated with the last iterate as in ``warpmag.kernels.induction`` |
 | theta-flow | the same flow, not accelerated |
-| theta-euler, llg, llg-damping | one step of each submagnetization, see ``submagnetization`` |
+| theta-euler, llg, llg-damping | one step of each submagnetization, as in ``warpmag.kernels.induction`` |
 | llg-unscaled, llg-damping-unscaled | LLG without scaling M_i back to Ms |
 
 The start is a pair M1, M2 open by an angle; the flow starts from the pair's mean.
@@ -18,12 +18,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.induction.submagnetization import (
-    LAW_IDS,
-    effective_field,
-    llg_step,
-    step_submagnetization,
-)
+from warpmag.kernels.induction.submagnetization import LAW_IDS, effective_field, llg_step, step_submagnetization
 from warpmag.kernels.material.curves import TANH, curve_ratio, inverse_curve_ratio, theta_flow
 
 MOST_ITERATIONS = 999
@@ -34,8 +29,8 @@ DYNAMICS = (*_FLOWS, *LAW_IDS, *_UNSCALED)
 
 
 @wp.func
-def lacking(m: wp.vec3, goal: wp.vec3, tolerance: float):
-    """Whether reduced magnetization ``m`` is farther from ``goal`` than allowed, or is no number."""
+def exceeds_tolerance(m: wp.vec3, goal: wp.vec3, tolerance: float):
+    """Whether reduced magnetization ``m`` is farther from ``goal`` than allowed, or not a number."""
     size = wp.length(goal)
     return not wp.length(m - goal) <= tolerance * wp.where(size > 0.0, size, 1.0)
 
@@ -58,7 +53,7 @@ def flow_iterations(start: wp.vec3, target: wp.vec3, omega: float, accelerated: 
                 s -= (wp.dot(r, dr) / size) * ((now - old_s) + omega * dr)
         old_s = now
         old_r = r
-        if not lacking(curve_ratio(wp.length(s), curve) * s, goal, tolerance):
+        if not exceeds_tolerance(curve_ratio(wp.length(s), curve) * s, goal, tolerance):
             return n + 1
     return wp.static(MOST_ITERATIONS + 1)
 
@@ -88,7 +83,7 @@ def _pair_iterations(scaled: bool):
             else:
                 u = llg_step(u, h_eff, kappa, precession)
                 v = llg_step(v, h_eff, kappa, precession)
-            if not lacking(0.5 * (u + v), goal, tolerance):
+            if not exceeds_tolerance(0.5 * (u + v), goal, tolerance):
                 return n + 1
             if not wp.isfinite(wp.dot(u, v)):
                 break
@@ -174,7 +169,7 @@ def launch_sweep(
         second: Direction of M2 at the start.
         kappa: Step κ0 [dimensionless].
         damping: Damping α of LLG.
-        curve: Curve id of ``kernels.curves``.
+        curve: Curve id of ``warpmag.kernels.material.curves``.
         tolerance: Magnetization error (Eq. 12) at which a test ends.
         seed: Seed of the directions.
     """
@@ -182,21 +177,11 @@ def launch_sweep(
     name = dynamics.removesuffix("-unscaled")
     law = int(name == "theta") if flow else LAW_IDS[name]
     precession = 1.0 / damping if name == "llg" else 0.0
+    start = wp.vec3(*first), wp.vec3(*second)
     wp.launch(
         _sweep_kernel(flow, scaled),
         dim=(strengths.shape[0], multipliers.shape[0], directions),
-        inputs=[
-            multipliers,
-            strengths,
-            wp.vec3(*first),
-            wp.vec3(*second),
-            law,
-            kappa,
-            precession,
-            curve,
-            tolerance,
-            seed,
-        ],
+        inputs=[multipliers, strengths, *start, law, kappa, precession, curve, tolerance, seed],
         outputs=[iteration_sum, most, failed],
         device=strengths.device,
     )

@@ -46,10 +46,8 @@ class BodyMoments:
 
 @wp.kernel
 def _gather_moments(
-    # inputs:
     body_q_in: wp.array[wp.transform],
     magnets: BodyMoments,
-    # outputs:
     positions_out: wp.array[wp.vec3],
     moments_out: wp.array[wp.vec3],
 ):
@@ -110,14 +108,7 @@ def add_wrenches(magnets: BodyMoments, positions, forces, torques, bodies: BodyV
 
 
 @wp.kernel
-def _predict_poses(
-    # inputs:
-    bodies: BodyView,
-    substeps_in: wp.array[wp.int32],
-    dt: float,
-    # outputs:
-    body_q_out: wp.array[wp.transform],
-):
+def _predict_poses(bodies: BodyView, substeps_in: wp.array[wp.int32], dt: float, body_q_out: wp.array[wp.transform]):
     body = wp.tid()
     seconds = 0.5 * float(substeps_in[0] - 1) * dt
     center = wp.transform_point(bodies.q[body], bodies.com[body]) + seconds * wp.spatial_top(bodies.qd[body])
@@ -134,13 +125,7 @@ def predict_poses(bodies: BodyView, substeps, dt: float, body_q):
 
 
 @wp.kernel
-def _sum_moments(
-    # inputs:
-    part_start_in: wp.array[wp.int32],
-    moments_in: wp.array[wp.vec3],
-    # outputs:
-    totals_out: wp.array[wp.vec3],
-):
+def _sum_moments(part_start_in: wp.array[wp.int32], moments_in: wp.array[wp.vec3], totals_out: wp.array[wp.vec3]):
     part = wp.tid()
     total = wp.vec3(0.0)
     for i in range(part_start_in[part], part_start_in[part + 1]):

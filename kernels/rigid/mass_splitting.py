@@ -14,19 +14,17 @@ from warpmag.kernels.rigid.newton_views import ContactView, contact_bodies, cont
 
 wp.set_module_options({"enable_backward": False})
 
-_UNSPLIT = wp.constant(4)
+_UNSPLIT = 4
 """Contacts that share a body without splitting it."""
-_TOUCHING_GAP = wp.constant(0.1)
+_TOUCHING_GAP = 0.1
 """Distance up to which contacts count, over the sum of their shapes' contact gaps."""
 
 
 @wp.kernel
 def _count_contacts(
-    # inputs:
     contacts: ContactView,
     body_q_in: wp.array[wp.transform],
     splits_in: wp.array[wp.int32],
-    # outputs:
     counts_out: wp.array[wp.int32],
 ):
     i = wp.tid()

@@ -16,21 +16,21 @@ from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bo
 
 wp.set_module_options({"enable_backward": False})
 
-PEAK_TRAVEL = wp.constant(0)  # predicted motion of a body in one substep over its thickness [1]
-PEAK_LONG_TRAVEL = wp.constant(1)  # the same in a substep twice as long
-PEAK_SPEED = wp.constant(2)  # speed of a body's centre of mass [m/s]
-PEAK_OVERLAP = wp.constant(3)  # penetration over the thickness of the thinner body [1]
-PEAK_DEPTH = wp.constant(4)  # penetration [m]
-PEAK_ERROR = wp.constant(5)  # magnetization error [1]
+PEAK_TRAVEL = 0  # predicted motion of a body in one substep over its thickness [1]
+PEAK_LONG_TRAVEL = 1  # the same in a substep twice as long
+PEAK_SPEED = 2  # speed of a body's centre of mass [m/s]
+PEAK_OVERLAP = 3  # penetration over the thickness of the thinner body [1]
+PEAK_DEPTH = 4  # penetration [m]
+PEAK_ERROR = 5  # magnetization error [1]
 PEAKS = 6
 
-COUNT_BAD_BODY = wp.constant(0)  # first body whose state was not finite, see ``stepping``; else NO_BODY
-COUNT_EVALUATIONS = wp.constant(1)  # field evaluations, summed over substeps
-COUNT_UNCONVERGED = wp.constant(2)  # substeps whose induction did not converge
-COUNT_OVERLAPS = wp.constant(3)  # contacts deeper than a threshold
-COUNT_CAPACITIES = wp.constant(4)
+COUNT_BAD_BODY = 0  # first body whose state was not finite, see ``stepping``; else NO_BODY
+COUNT_EVALUATIONS = 1  # field evaluations, summed over substeps
+COUNT_UNCONVERGED = 2  # substeps whose induction did not converge
+COUNT_OVERLAPS = 3  # contacts deeper than a threshold
+COUNT_CAPACITIES = 4
 
-NO_BODY = wp.constant(2**31 - 1)
+NO_BODY = 2**31 - 1
 
 
 @wp.kernel

@@ -106,12 +106,7 @@ def _split(
 
 
 @wp.kernel
-def _find_starts(
-    # inputs:
-    sorted_keys_in: wp.array[wp.int32],
-    # outputs:
-    start_out: wp.array[wp.int32],
-):
+def _find_starts(sorted_keys_in: wp.array[wp.int32], start_out: wp.array[wp.int32]):
     body = wp.tid()
     start_out[body] = wp.lower_bound(sorted_keys_in, body)
 
@@ -128,13 +123,7 @@ def launch_split_contacts(contacts: ContactView, bodies: BodyView, sides: Contac
 
 
 @wp.kernel
-def _copy_motion(
-    # inputs:
-    body_in: wp.array[wp.int32],
-    bodies: BodyView,
-    # outputs:
-    sides: BodyView,
-):
+def _copy_motion(body_in: wp.array[wp.int32], bodies: BodyView, sides: BodyView):
     side = wp.tid()
     body = body_in[side]
     if body >= 0:
@@ -151,21 +140,16 @@ def launch_copy_motion(bodies: BodyView, sides: ContactSides):
 
 @wp.kernel
 def _sum_sides(
-    # inputs:
-    start_in: wp.array[wp.int32],
-    order_in: wp.array[wp.int32],
-    side_deltas_in: wp.array[wp.spatial_vector],
-    # outputs:
-    deltas_out: wp.array[wp.spatial_vector],
+    start_in: wp.array[wp.int32], order_in: wp.array[wp.int32], sides: BodyView, deltas_out: wp.array[wp.spatial_vector]
 ):
     body = wp.tid()
     total = wp.spatial_vector()
     for k in range(start_in[body], start_in[body + 1]):
-        total += side_deltas_in[order_in[k]]
+        total += sides.deltas[order_in[k]]
     deltas_out[body] = total
 
 
 def launch_sum_sides(sides: ContactSides, deltas):
     """Add up the impulses on each body, in the order of its contacts, into ``deltas`` [b]."""
-    inputs = [sides.start, sides.order, sides.bodies.deltas]
+    inputs = [sides.start, sides.order, sides.bodies]
     wp.launch(_sum_sides, dim=len(deltas), inputs=inputs, outputs=[deltas], device=deltas.device)

@@ -17,55 +17,37 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.rigid.monitor import (
-    COUNT_BAD_BODY,
-    COUNT_CAPACITIES,
-    COUNT_EVALUATIONS,
-    COUNT_UNCONVERGED,
-    NO_BODY,
-    PEAK_LONG_TRAVEL,
-    PEAK_OVERLAP,
-    PEAK_TRAVEL,
-    PEAKS,
-)
+from warpmag.kernels.rigid import monitor
 
 wp.set_module_options({"enable_backward": False})
 
-LEVELS = wp.constant(5)
+LEVELS = 5
 """Lengths of substeps, each half the one before."""
 
-FLAG_ATTEMPT = wp.constant(0)  # the step is to be attempted (again)
-FLAG_REJECTED = wp.constant(1)  # the last attempt was rejected
-FLAG_FORCES = wp.constant(2)  # the next substeps need forces of their own
-FLAG_LEVEL = wp.constant(3)  # first of LEVELS: substeps of this level remain to be done
+FLAG_ATTEMPT = 0  # the step is to be attempted (again)
+FLAG_REJECTED = 1  # the last attempt was rejected
+FLAG_FORCES = 2  # the next substeps need forces of their own
+FLAG_LEVEL = 3  # first of LEVELS: substeps of this level remain to be done
 FLAGS = 8
 
-STATUS_HALT = wp.constant(0)  # why steps do nothing: one of the reasons below
-STATUS_DONE = wp.constant(1)  # steps done
-STATUS_LEVEL = wp.constant(2)  # level of the substeps
-STATUS_ATTEMPTS = wp.constant(3)  # attempts at the step under way
-STATUS_REMAINING = wp.constant(4)  # pairs of substeps that this attempt still has to do
-STATUS_REGROWN = wp.constant(5)  # buffers grew since the last step; set by the host
-STATUS_SHARING = wp.constant(6)  # substeps that share their forces, a power of two; beyond the first level
+STATUS_HALT = 0  # why steps do nothing: one of the reasons below
+STATUS_DONE = 1  # steps done
+STATUS_LEVEL = 2  # level of the substeps
+STATUS_ATTEMPTS = 3  # attempts at the step under way
+STATUS_REMAINING = 4  # pairs of substeps that this attempt still has to do
+STATUS_REGROWN = 5  # buffers grew since the last step; set by the host
+STATUS_SHARING = 6  # substeps that share their forces, a power of two; beyond the first level
 STATUSES = 7
 
-RUNNING = wp.constant(0)
-OVERFLOW = wp.constant(1)
-NOT_FINITE = wp.constant(2)
-PAUSED = wp.constant(3)  # by the host
-
-STAGES = wp.constant(3)
+RUNNING, OVERFLOW, NOT_FINITE, PAUSED = range(4)
+"""Values of ``STATUS_HALT``; the host pauses."""
+STAGES = 3
 """Stages whose time is measured: induction, forces, rigid bodies."""
 
-LOG_SUBSTEPS = wp.constant(0)
-LOG_ATTEMPTS = wp.constant(1)
-LOG_CAPPED = wp.constant(2)
-LOG_REGROWN = wp.constant(3)
-LOG_EVALUATIONS = wp.constant(4)
-LOG_UNCONVERGED = wp.constant(5)
-LOG_PEAKS = wp.constant(6)  # first of monitor.PEAKS
-LOG_TICKS = wp.constant(LOG_PEAKS + PEAKS)  # first of STAGES
-LOG_FIELDS = int(LOG_TICKS) + int(STAGES)
+LOG_SUBSTEPS, LOG_ATTEMPTS, LOG_CAPPED, LOG_REGROWN, LOG_EVALUATIONS, LOG_UNCONVERGED = range(6)
+LOG_PEAKS = 6  # first of monitor.PEAKS
+LOG_TICKS = LOG_PEAKS + monitor.PEAKS  # first of STAGES
+LOG_FIELDS = LOG_TICKS + STAGES
 
 
 @wp.struct
@@ -136,14 +118,7 @@ def _set_status(a: StepArrays, index: int, value: int):
 def _copy_kernel(dtype):
     # A generic kernel would do, but graphs on the CPU replay the wrong one of its overloads (Warp 1.19).
     @wp.kernel(module="unique", enable_backward=False)
-    def copy_where(
-        # inputs:
-        flags_in: wp.array[wp.int32],
-        flag: int,
-        source_in: wp.array[dtype],
-        # outputs:
-        target_out: wp.array[dtype],
-    ):
+    def copy_where(flags_in: wp.array[wp.int32], flag: int, source_in: wp.array[dtype], target_out: wp.array[dtype]):
         i = wp.tid()
         if flags_in[flag] != 0:
             target_out[i] = source_in[i]
@@ -163,7 +138,7 @@ def _begin_attempt(a: StepArrays):
         a.peaks[k] = 0.0
     for k in range(a.counts.shape[0]):
         a.counts[k] = 0
-    a.counts[COUNT_BAD_BODY] = NO_BODY
+    a.counts[monitor.COUNT_BAD_BODY] = monitor.NO_BODY
     a.ticks[STAGES] = now()
 
 
@@ -184,7 +159,7 @@ def _watch_finite(a: StepArrays, half: int, body_q_in: wp.array[wp.transform], b
         total += wp.abs(body_qd_in[body][k])
     if not wp.isfinite(total):
         pair = ((a.fewest // 2) << a.status[STATUS_LEVEL]) - a.status[STATUS_REMAINING]
-        wp.atomic_min(a.counts, COUNT_BAD_BODY, (2 * pair + half) * body_q_in.shape[0] + body)
+        wp.atomic_min(a.counts, monitor.COUNT_BAD_BODY, (2 * pair + half) * body_q_in.shape[0] + body)
 
 
 @wp.kernel
@@ -211,13 +186,13 @@ def _sharing(level: int, long_travel: float, seen_at: int, limit: float) -> int:
 def _log_step(a: StepArrays, level: int):
     """Write the record of a step that was done at ``level``."""
     record = a.status[STATUS_DONE] % a.log.shape[0]
-    capped = a.peaks[PEAK_TRAVEL] > a.travel
+    capped = a.peaks[monitor.PEAK_TRAVEL] > a.travel
     a.log[record, LOG_SUBSTEPS] = wp.float64(a.fewest << level)
     a.log[record, LOG_ATTEMPTS] = wp.float64(a.status[STATUS_ATTEMPTS])
     a.log[record, LOG_CAPPED] = wp.where(capped, wp.float64(1.0), wp.float64(0.0))
     a.log[record, LOG_REGROWN] = wp.float64(a.status[STATUS_REGROWN])
-    a.log[record, LOG_EVALUATIONS] = wp.float64(a.counts[COUNT_EVALUATIONS])
-    a.log[record, LOG_UNCONVERGED] = wp.float64(a.counts[COUNT_UNCONVERGED])
+    a.log[record, LOG_EVALUATIONS] = wp.float64(a.counts[monitor.COUNT_EVALUATIONS])
+    a.log[record, LOG_UNCONVERGED] = wp.float64(a.counts[monitor.COUNT_UNCONVERGED])
     for k in range(a.peaks.shape[0]):
         a.log[record, LOG_PEAKS + k] = wp.float64(a.peaks[k])
     for k in range(STAGES):
@@ -233,17 +208,17 @@ def _judge(a: StepArrays):
     a.flags[FLAG_ATTEMPT] = 0
     a.flags[FLAG_REJECTED] = 1
     for k in range(a.capacities.shape[0]):
-        if a.counts[COUNT_CAPACITIES + k] > a.capacities[k]:
+        if a.counts[monitor.COUNT_CAPACITIES + k] > a.capacities[k]:
             a.status[STATUS_HALT] = OVERFLOW
             return
     level = a.status[STATUS_LEVEL]
-    overlap = a.peaks[PEAK_OVERLAP]
-    long_travel = a.peaks[PEAK_LONG_TRAVEL]
+    overlap = a.peaks[monitor.PEAK_OVERLAP]
+    long_travel = a.peaks[monitor.PEAK_LONG_TRAVEL]
     pressed = overlap > wp.max(a.overlap, a.last_overlap[0])
     # shorter substeps undo what was pressed too fast, but not a contact that found another normal
     helped = overlap < a.futile * a.last_overlap[1]
-    lost = a.counts[COUNT_BAD_BODY] != NO_BODY
-    if (a.peaks[PEAK_TRAVEL] > a.travel or (pressed and helped) or lost) and level + 1 < LEVELS:
+    lost = a.counts[monitor.COUNT_BAD_BODY] != monitor.NO_BODY
+    if (a.peaks[monitor.PEAK_TRAVEL] > a.travel or (pressed and helped) or lost) and level + 1 < LEVELS:
         a.status[STATUS_LEVEL] = level + 1
         a.status[STATUS_SHARING] = _sharing(level + 1, long_travel, level, a.shared_travel)
         a.flags[FLAG_ATTEMPT] = 1
@@ -302,16 +277,16 @@ class StepMachine:
 
         self.arrays = a = StepArrays()
         a.flags, a.status = zeros(FLAGS, wp.int32), zeros(STATUSES, wp.int32)
-        a.peaks, a.counts = zeros(PEAKS, wp.float32), zeros(int(COUNT_CAPACITIES) + capacities, wp.int32)
+        a.peaks, a.counts = zeros(monitor.PEAKS, wp.float32), zeros(monitor.COUNT_CAPACITIES + capacities, wp.int32)
         a.last_overlap = wp.array([0.0, np.inf], dtype=wp.float32, device=device)
-        a.ticks, a.log = zeros(int(STAGES) + 1, wp.uint64), zeros((records, LOG_FIELDS), wp.float64)
+        a.ticks, a.log = zeros(STAGES + 1, wp.uint64), zeros((records, LOG_FIELDS), wp.float64)
         a.capacities = zeros(capacities, wp.int32)
         for name, limit in limits.items():
             setattr(a, name, limit)
         self.attempting, self.forces_due, *self.remaining = (
-            a.flags[k : k + 1] for k in map(int, (FLAG_ATTEMPT, FLAG_FORCES, *range(FLAG_LEVEL, FLAG_LEVEL + LEVELS)))
+            a.flags[k : k + 1] for k in (FLAG_ATTEMPT, FLAG_FORCES, *range(FLAG_LEVEL, FLAG_LEVEL + LEVELS))
         )
-        self.sharing = a.status[int(STATUS_SHARING) : int(STATUS_SHARING) + 1]
+        self.sharing = a.status[STATUS_SHARING : STATUS_SHARING + 1]
 
     def _launch(self, kernel, *inputs, dim: int = 1) -> None:
         wp.launch(kernel, dim=dim, inputs=[self.arrays, *inputs], device=self.arrays.status.device)

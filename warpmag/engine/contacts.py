@@ -254,7 +254,7 @@ class RigidSolver:
         watch_contacts(self._contact_view, state.body_q, thickness, overlap_threshold, self.overlaps, peaks, counts)
         for index, buffer in enumerate(self.buffers):
             watch = watch_flags if buffer.fill.dtype is wp.bool else watch_capacity
-            watch(buffer.fill, int(COUNT_CAPACITIES) + index, counts)
+            watch(buffer.fill, COUNT_CAPACITIES + index, counts)
 
     def grow(self, fills: np.ndarray) -> bool:
         """Enlarge the buffers that overflowed; contacts and graphs are void afterwards.

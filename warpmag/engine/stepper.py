@@ -40,7 +40,7 @@ _FUTILE = 0.8
 _RECORDS = 64
 """Steps that may be done before the host looks; on a CPU, which it waits for anyway, it looks after each."""
 
-INDUCTION, FORCE, RIGID = range(int(stepping.STAGES))
+INDUCTION, FORCE, RIGID = range(stepping.STAGES)
 
 
 @dataclass(frozen=True)
@@ -199,8 +199,8 @@ class Stepper:
         return [self._report(log[number % _RECORDS], number not in self._cold) for number in numbers]
 
     def _report(self, record: np.ndarray, timed: bool) -> StepReport:
-        peaks = record[int(stepping.LOG_PEAKS) :]
-        ticks = record[int(stepping.LOG_TICKS) :]
+        peaks = record[stepping.LOG_PEAKS :]
+        ticks = record[stepping.LOG_TICKS :]
         return StepReport(
             substeps=int(record[stepping.LOG_SUBSTEPS]),
             attempts=int(record[stepping.LOG_ATTEMPTS]),
@@ -224,7 +224,7 @@ class Stepper:
         )
 
     def _fills(self) -> np.ndarray:
-        return self._read("counts")[int(monitor.COUNT_CAPACITIES) :]
+        return self._read("counts")[monitor.COUNT_CAPACITIES :]
 
     def _read(self, name: str) -> np.ndarray:
         """Wait for the device and return one of the state machine's buffers."""

@@ -88,18 +88,14 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
     def _relax(self, contacts, found: ContactView, bodies: BodyView, dt) -> None:
         """Add what one relaxation of all contacts does to ``bodies.deltas`` and to the impulses."""
-        body_arrays = bodies.q, bodies.qd, bodies.flags, bodies.com, bodies.inv_mass, bodies.inv_inertia
+        inputs = [bodies.q, bodies.qd, bodies.flags, bodies.com, bodies.inv_mass, bodies.inv_inertia, found.shape_body]
         names = "count point0 point1 surface_velocity offset0 offset1 normal margin0 margin1"
-        contact_arrays = [getattr(contacts, f"rigid_contact_{name}") for name in names.split()]
-        friction = found.mu, found.mu_torsional, found.mu_rolling
+        inputs += [getattr(contacts, f"rigid_contact_{name}") for name in names.split()]
+        inputs += [found.shape0, found.shape1, found.mu, found.mu_torsional, found.mu_rolling]
         wp.launch(
             solve_body_contact_positions,
             dim=contacts.rigid_contact_max,
-            inputs=[
-                *(*body_arrays, found.shape_body),
-                *(*contact_arrays, found.shape0, found.shape1),
-                *(*friction, self.rigid_contact_relaxation, dt),
-            ],
+            inputs=[*inputs, self.rigid_contact_relaxation, dt],
             outputs=[bodies.deltas, None, self._impulses],
             device=self.model.device,
         )
