@@ -71,19 +71,22 @@ def gather_moments(body_q, magnets: BodyMoments, positions, moments):
 def _add_wrenches(
     # inputs:
     magnets: BodyMoments,
+    body_q_in: wp.array[wp.transform],
+    body_com_in: wp.array[wp.vec3],
+    body_flags_in: wp.array[wp.int32],
     positions_in: wp.array[wp.vec3],
     forces_in: wp.array[wp.vec3],
     torques_in: wp.array[wp.vec3],
     shares: int,
     # outputs:
-    bodies: BodyView,
+    body_f_out: wp.array[wp.spatial_vector],
 ):
     k = wp.tid() // shares
     share = wp.tid() % shares
     body = magnets.body_list[k]
-    if (bodies.flags[body] & magnets.kinematic_flag) != 0:
+    if (body_flags_in[body] & magnets.kinematic_flag) != 0:
         return
-    center = wp.transform_point(bodies.q[body], bodies.com[body])
+    center = wp.transform_point(body_q_in[body], body_com_in[body])
     mine = wp.spatial_vectord()
     for run in range(magnets.body_run_start[k], magnets.body_run_start[k + 1]):
         for i in range(magnets.runs[run][0] + share, magnets.runs[run][1], shares):
@@ -96,15 +99,15 @@ def _add_wrenches(
     if share == 0:
         force = wp.vec3(float(total[0]), float(total[1]), float(total[2]))
         torque = wp.vec3(float(total[3]), float(total[4]), float(total[5]))
-        bodies.f[body] = bodies.f[body] + wp.spatial_vector(force, torque)
+        body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
 
 
-def add_wrenches(magnets: BodyMoments, positions, forces, torques, bodies: BodyView):
-    """Add the force and torque of every moment to the wrench of its body, unless that is kinematic."""
+def add_wrenches(magnets: BodyMoments, model, state, positions, forces, torques):
+    """Add the force and torque of every moment to the wrench of its body in ``state``, unless that is kinematic."""
     device = positions.device
     shares = _SHARES if device.is_cuda else 1
-    inputs = [magnets, positions, forces, torques, shares]
-    wp.launch(_add_wrenches, shares * len(magnets.body_list), inputs=inputs, outputs=[bodies], device=device)
+    inputs = [magnets, state.body_q, model.body_com, model.body_flags, positions, forces, torques, shares]
+    wp.launch(_add_wrenches, shares * len(magnets.body_list), inputs=inputs, outputs=[state.body_f], device=device)
 
 
 @wp.kernel

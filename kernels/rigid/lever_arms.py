@@ -61,6 +61,5 @@ def launch_correct_lever_arms(contacts: ContactView, impulses, dt: float, bodies
         dt: Substep [s].
         bodies: The bodies, with mean velocities.
     """
-    wp.launch(
-        _correct_lever_arms, dim=impulses.shape[0], inputs=[contacts, impulses, dt, bodies], device=impulses.device
-    )
+    inputs = [contacts, impulses, dt, bodies]
+    wp.launch(_correct_lever_arms, dim=len(impulses), inputs=inputs, device=impulses.device)

@@ -123,18 +123,20 @@ def launch_split_contacts(contacts: ContactView, bodies: BodyView, sides: Contac
 
 
 @wp.kernel
-def _copy_motion(body_in: wp.array[wp.int32], bodies: BodyView, sides: BodyView):
+def _copy_motion(
+    body_in: wp.array[wp.int32], q_in: wp.array[wp.transform], qd_in: wp.array[wp.spatial_vector], sides: BodyView
+):
     side = wp.tid()
     body = body_in[side]
     if body >= 0:
-        sides.q[side] = bodies.q[body]
-        sides.qd[side] = bodies.qd[body]
+        sides.q[side] = q_in[body]
+        sides.qd[side] = qd_in[body]
         sides.deltas[side] = wp.spatial_vector()
 
 
-def launch_copy_motion(bodies: BodyView, sides: ContactSides):
-    """Copy the present poses and velocities to the sides, and clear their impulses."""
-    inputs = [sides.body, bodies]
+def launch_copy_motion(q, qd, sides: ContactSides):
+    """Copy the bodies' poses and velocities to the sides, and clear their impulses."""
+    inputs = [sides.body, q, qd]
     wp.launch(_copy_motion, dim=len(sides.body), inputs=inputs, outputs=[sides.bodies], device=sides.body.device)
 
 

@@ -101,7 +101,6 @@ class StepArrays:
 """)
 def now() -> wp.uint64:
     """Time of the device: nanoseconds on a GPU, clock cycles on a CPU."""
-    ...
 
 
 @wp.kernel

@@ -10,7 +10,6 @@ from warpmag.engine.attributes import marked_shapes
 from warpmag.engine.sampling import BodyLattice, ShapeSampler
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import BodyMoments, add_wrenches, gather_moments, sum_moments
-from warpmag.kernels.rigid.newton_views import view_bodies
 from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_token
 from warpmag.system import MomentSystem
 
@@ -172,8 +171,8 @@ class Magnetics:
     def add_forces(self, state: newton.State) -> None:
         """Add the forces of the present moments to ``state.body_f``: the second half of :meth:`apply`."""
         self.system.apply_forces()
-        system, bodies = self.system, view_bodies(self._model, state)
-        add_wrenches(self._body_moments, system.positions, system.forces, system.torques, bodies)
+        system = self.system
+        add_wrenches(self._body_moments, self._model, state, system.positions, system.forces, system.torques)
 
     def shape_moments(self) -> np.ndarray:
         """Return the total moment of each magnetic shape [A·m²], world frame, rows as :attr:`shapes`, shape [n, 3].

@@ -69,16 +69,19 @@ class PileXPBD(newton.solvers.SolverXPBD):
         motion = state_out.body_q, state_out.body_qd
         with self._splitting(state_in, contacts):
             found, bodies = self._begin_contacts(contacts)
+            arguments = self._relaxation_arguments(contacts, found, bodies, dt)
+            outputs = [bodies.deltas, None, self._impulses]
             if self._impulses is not None:
                 self._impulses.zero_()
                 self._velocities.assign(motion[1])
             for _ in range(self.iterations):
-                self._set_motion(*motion)
-                self._relax(contacts, found, bodies, dt)
+                inputs = [*self._begin_iteration(*motion), *arguments]
+                dim = contacts.rigid_contact_max
+                wp.launch(solve_body_contact_positions, dim, inputs=inputs, outputs=outputs, device=model.device)
                 motion = self._apply_body_deltas(model, state_in, state_out, self._sum_deltas(), dt)
             if self._impulses is not None:
                 launch_average_velocities(motion[1], self._velocities)
-                self._set_motion(motion[0], self._velocities)
+                bodies.q, bodies.qd = self._begin_iteration(motion[0], self._velocities)
                 launch_correct_lever_arms(found, self._impulses, dt, bodies)
                 motion = self._apply_body_deltas(model, state_in, state_out, self._sum_deltas(), dt)
         if motion[0].ptr != state_out.body_q.ptr:
@@ -86,19 +89,15 @@ class PileXPBD(newton.solvers.SolverXPBD):
             state_out.body_qd.assign(motion[1])
         self.copy_kinematic_body_state(model, state_in, state_out)
 
-    def _relax(self, contacts, found: ContactView, bodies: BodyView, dt) -> None:
-        """Add what one relaxation of all contacts does to ``bodies.deltas`` and to the impulses."""
-        inputs = [bodies.q, bodies.qd, bodies.flags, bodies.com, bodies.inv_mass, bodies.inv_inertia, found.shape_body]
+    def _relaxation_arguments(self, contacts, found: ContactView, bodies: BodyView, dt) -> list:
+        """Return the inputs of Newton's kernel that follow poses and velocities."""
         names = "count point0 point1 surface_velocity offset0 offset1 normal margin0 margin1"
-        inputs += [getattr(contacts, f"rigid_contact_{name}") for name in names.split()]
-        inputs += [found.shape0, found.shape1, found.mu, found.mu_torsional, found.mu_rolling]
-        wp.launch(
-            solve_body_contact_positions,
-            dim=contacts.rigid_contact_max,
-            inputs=[*inputs, self.rigid_contact_relaxation, dt],
-            outputs=[bodies.deltas, None, self._impulses],
-            device=self.model.device,
-        )
+        return [
+            *(bodies.flags, bodies.com, bodies.inv_mass, bodies.inv_inertia, found.shape_body),
+            *(getattr(contacts, f"rigid_contact_{name}") for name in names.split()),
+            *(found.shape0, found.shape1, found.mu, found.mu_torsional, found.mu_rolling),
+            *(self.rigid_contact_relaxation, dt),
+        ]
 
     def _begin_contacts(self, contacts) -> tuple[ContactView, BodyView]:
         """Return the contacts of a substep and the bodies that they act on."""
@@ -107,10 +106,10 @@ class PileXPBD(newton.solvers.SolverXPBD):
         bodies.inv_mass, bodies.inv_inertia = self.body_inv_mass_effective, self.body_inv_inertia_effective
         return view_contacts(model, contacts), bodies
 
-    def _set_motion(self, q, qd) -> None:
-        """Let contacts act on bodies with poses ``q`` and velocities ``qd``, with no impulses yet."""
-        self._bodies.q, self._bodies.qd = q, qd
+    def _begin_iteration(self, q, qd) -> tuple[wp.array, wp.array]:
+        """Clear impulses; return poses and velocities of what contacts act on, for bodies with ``q`` and ``qd``."""
         self._bodies.deltas.zero_()
+        return q, qd
 
     def _sum_deltas(self) -> wp.array:
         """Return what contacts did to each body of the model, shape [body_count]."""
@@ -172,9 +171,9 @@ class OrderedXPBD(PileXPBD):
         ordered_sums.launch_split_contacts(*super()._begin_contacts(contacts), self._sides)
         return self._sides.contacts, self._sides.bodies
 
-    def _set_motion(self, q, qd) -> None:
-        self._bodies.q, self._bodies.qd = q, qd
-        ordered_sums.launch_copy_motion(self._bodies, self._sides)
+    def _begin_iteration(self, q, qd) -> tuple[wp.array, wp.array]:
+        ordered_sums.launch_copy_motion(q, qd, self._sides)
+        return self._sides.bodies.q, self._sides.bodies.qd
 
     def _sum_deltas(self) -> wp.array:
         ordered_sums.launch_sum_sides(self._sides, self._bodies.deltas)
