@@ -1,4 +1,4 @@
-"""Lets what Newton launches in a substep stand inside conditional nodes of a CUDA graph.
+"""Makes what Newton launches in a substep fit into conditional nodes of a CUDA graph.
 
 The body of such a node may hold kernels, copies and further conditional nodes, but nothing that allocates memory.
 Newton allocates in two places: solvers make temporary arrays, and collision adds up counts with Warp's ``array_scan``,
@@ -16,9 +16,9 @@ from warpmag.kernels.shared.scan import launch_scan
 
 
 class Workspace:
-    """Memory for temporary arrays, handed out again and again: an allocator for Warp.
+    """Memory for temporary arrays that is reused: an allocator for Warp.
 
-    A step that runs once finds out what is needed; while a graph is captured, nothing new is allocated.
+    The first run of a step finds out what is needed; while a graph is captured, nothing new is allocated.
     """
 
     def __init__(self, device):

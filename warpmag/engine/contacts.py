@@ -250,7 +250,15 @@ class RigidSolver:
         self._solver.step(state_in, state_out, None, self.contacts, dt)
 
     def watch(self, state: newton.State, thickness: wp.array, overlap_threshold: float, peaks, counts) -> None:
-        """Let ``monitor`` see the contacts at ``state`` and how full each buffer is; capturable in a graph."""
+        """Report to the monitor the contacts at ``state`` and how full each buffer is; capturable in a graph.
+
+        Args:
+            state: The state that was collided.
+            thickness: Thickness of each body [m], infinite for bodies that forces do not move.
+            overlap_threshold: Overlap from which a contact is counted, over the thickness of the thinner body.
+            peaks: Maxima, see ``kernels.rigid.monitor``.
+            counts: Counts, see ``kernels.rigid.monitor``.
+        """
         watch_contacts(self._contact_view, state.body_q, thickness, overlap_threshold, self.overlaps, peaks, counts)
         for index, buffer in enumerate(self.buffers):
             watch = watch_flags if buffer.fill.dtype is wp.bool else watch_capacity

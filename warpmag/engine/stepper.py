@@ -34,7 +34,7 @@ _SHARED_TRAVEL_LIMIT = 1.0
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
 _EASE = 0.8
-"""Substeps double in length once the motion in twice their length would stay within this part of the limit."""
+"""Substeps double in length once the motion in twice their length would be below this part of the limit."""
 _FUTILE = 0.8
 """Substeps of half the length that leave more than this part of a penetration do not press less, however short."""
 _RECORDS = 64
@@ -342,7 +342,7 @@ class Stepper:
 
 
 def _clear_error(device) -> None:
-    """Let a sort of nothing meet the error that a failed graph leaves behind: the next sort on a GPU does nothing."""
+    """Clear the error that a failed graph leaves behind by sorting nothing: the next sort on a GPU does nothing."""
     if device.is_cuda:
         nothing = wp.zeros(2, dtype=wp.int32, device=device)
         wp.utils.radix_sort_pairs(nothing, wp.zeros_like(nothing), 1)
