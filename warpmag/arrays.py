@@ -8,9 +8,6 @@ import warp as wp
 from warpmag.errors import InputError
 
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
-ACCURACY = {"float32": 2e-6, "float64": 1e-13}
-"""Relative L2 error of all-pairs sums in each precision that tests hold them to: no tolerance below it is met."""
-
 RADIUS_RANGE = {wp.float32: (5e-8, 2e4), wp.float64: (0.0, np.inf)}
 """Smallest and largest radius [m] of a ball by Warp scalar type: neither r⁻⁵ nor products of moments may overflow."""
 

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import math
 import os
 import sys
 import tempfile
@@ -10,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from warpmag.errors import InputError, SimulationError
-from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS
+from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, check_rtol
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 """Exit codes; 0 where all went well."""
@@ -147,8 +146,8 @@ def _render(options) -> int:
 def _run(options) -> int:
     if options.frames is not None and options.frames < 1:
         raise InputError(f"frames: must be positive, got {options.frames}")
-    if options.rtol is not None and not (options.rtol > 0.0 and math.isfinite(options.rtol)):
-        raise InputError(f"rtol: must be positive and finite, got {options.rtol}")
+    if options.rtol is not None:
+        check_rtol("rtol", options.rtol)
     path, is_bundled = _find_scene(options.scene)
     output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
     _quiet_warp()

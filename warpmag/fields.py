@@ -3,12 +3,13 @@
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import ACCURACY, Kind, check_radii, resolve_kind, vec3_type
+from warpmag.arrays import Kind, check_radii, resolve_kind, vec3_type
 from warpmag.errors import InputError
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.field import launch_field
 from warpmag.kernels.pairs.pair_terms import WRENCH
 from warpmag.kernels.pairs.wrench import launch_wrench
+from warpmag.magnets import check_rtol, check_token
 from warpmag.packed import PackedMoments
 
 METHODS = ("auto", "vectorized", "reference")
@@ -170,10 +171,9 @@ def _largest_radius(name, radii, dtype) -> float:
 
 
 def _check_method(method, rtol, dtype):
-    if method not in METHODS:
-        raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
-    if rtol is not None and not rtol >= ACCURACY[dtype]:
-        raise InputError(f"rtol: {dtype} sums are good to {ACCURACY[dtype]:g}, got {rtol}")
+    check_token("method", method, METHODS)
+    if rtol is not None:
+        check_rtol("rtol", rtol, dtype)
 
 
 def _check_smoothing(smoothing, radii):

@@ -9,8 +9,7 @@ import warp as wp
 
 from warpmag.arrays import Kind, resolve_kind
 from warpmag.errors import ConvergenceWarning, InputError
-from warpmag.kernels.pairs.wrench import FORCE_IDS
-from warpmag.magnets import check_positive, check_token
+from warpmag.magnets import check_positive
 from warpmag.system import MomentSystem
 
 
@@ -48,7 +47,6 @@ class InductionResult:
         Raises:
             InputError: Unknown force law.
         """
-        check_token("force", force, tuple(FORCE_IDS))
         system = self._system
         system.apply_forces(force)
         return self._kind.finish(system.forces, self._count), self._kind.finish(system.torques, self._count)

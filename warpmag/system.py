@@ -5,7 +5,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import ACCURACY, check_radii, resolve_device, resolve_dtype, vec3_type
+from warpmag.arrays import check_radii, resolve_device, resolve_dtype, vec3_type
 from warpmag.dynamics import Inducibles, make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
@@ -16,7 +16,7 @@ from warpmag.kernels.pairs.field import launch_field
 from warpmag.kernels.pairs.packing import launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import FORCE, KELVIN, WRENCH
 from warpmag.kernels.pairs.wrench import FORCE_IDS, ZEEMAN, launch_wrench, launch_zeeman_moments
-from warpmag.magnets import FORCES, check_contact_model, check_token
+from warpmag.magnets import CONTACT_MODELS, check_force, check_rtol, check_token
 from warpmag.packed import PackedMoments
 
 
@@ -94,12 +94,11 @@ class MomentSystem:
         Raises:
             InputError: An argument is out of range.
         """
-        check_token("force", force, FORCES)
+        check_token("contact_model", contact_model, CONTACT_MODELS)
+        check_force("force", force, contact_model)
         check_token("curve", curve, tuple(CURVE_IDS))
-        check_contact_model("contact_model", contact_model, force)
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
-        if not ACCURACY[dtype] <= rtol < math.inf:
-            raise InputError(f"rtol: must be at least {ACCURACY[dtype]:g} in {dtype}, got {rtol}")
+        check_rtol("rtol", rtol, dtype)
         if max_evaluations < 1:
             raise InputError(f"max_evaluations: must be at least 1, got {max_evaluations}")
         n = len(radii)
@@ -286,10 +285,10 @@ class MomentSystem:
     def apply_forces(self, force=None):
         """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""
         packed, near = self._packed, self._near
+        if force is not None:
+            check_force("force", force, "dipole" if near is None else "multipole")
         law = self._force_law if force is None else FORCE_IDS[force]
         felt = self._felt[law]
-        if near is not None and law == ZEEMAN:
-            raise InputError("force: the contact model 'multipole' goes with the force law 'kelvin' only")
         effective = packed.moments
         if law == ZEEMAN:
             effective = self._effective
