@@ -16,6 +16,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.lines import Line2D
 
 OPERATIONS_PER_PAIR = 20
 """Operations that the limit is reckoned with."""
@@ -45,7 +46,7 @@ def draw_pareto(lines, path: Path) -> None:
     figure, axes = plt.subplots(rows, columns, squeeze=False, sharex=True, sharey=True, layout="constrained")
     figure.set_size_inches(3.4 * columns, 3.2 * rows)
     peers = sorted({x["peer"] for x in lines}, key=lambda name: (name != "warpmag", name))
-    colors = dict(zip(peers, plt.get_cmap("tab20").colors, strict=False))
+    colors = dict(zip(peers, matplotlib.color_sequences["tab20"], strict=False))
     for axis in axes.flat[len(sizes) :]:
         axis.set_visible(False)
     for axis, size in zip(axes.flat, sizes, strict=False):
@@ -60,7 +61,7 @@ def draw_pareto(lines, path: Path) -> None:
     axes[0, 0].invert_xaxis()
     figure.supxlabel("relative error of the field (smaller to the right)")
     figure.supylabel("pairs a second")
-    handles = [plt.Line2D([], [], color=colors[p], marker="o", linestyle="", label=p) for p in peers]
+    handles = [Line2D([], [], color=colors[p], marker="o", linestyle="", label=p) for p in peers]
     figure.legend(handles=handles, loc="outside right upper")
     figure.suptitle(machine_of(lines[0]))
     figure.savefig(path, dpi=130)

@@ -230,7 +230,7 @@ def run(author: Callable) -> None:
     The options' types, defaults and help texts are those of its signature and its docstring.
     """
     summary, _, arguments = inspect.getdoc(inspect.getmodule(author)).partition("\n")
-    arguments = dict(re.findall(r"^ {4}(\w+): (.+?)\.?$", inspect.getdoc(author), re.MULTILINE))
+    arguments = dict(re.findall(r"^ {4}(\w+): (.+?)\.?$", inspect.getdoc(author) or "", re.MULTILINE))
     parser = argparse.ArgumentParser(description=summary)
     parser.add_argument("-o", "--output", required=True, help=arguments.pop("path"))
     for name, parameter in inspect.signature(author).parameters.items():

@@ -15,6 +15,7 @@ import warp as wp
 
 import warpmag
 from warpmag import lattice
+from warpmag.dynamics import SubmagnetizationPairs
 from warpmag.magnets import SATURATION_OF_IRON
 from warpmag.system import MomentSystem
 
@@ -99,7 +100,17 @@ def set_pairs(system: MomentSystem, start: str, seed: int = 0):
     else:
         axis = np.tile([0.0, 0.0, 1.0] if start == "across" else [0.0, 1.0, 0.0], (system.count, 1))
     axis /= np.linalg.norm(axis, axis=1)[:, None]
-    system.dynamics.set_pairs(axis, -axis)
+    _pairs(system).set_pairs(axis, -axis)
+
+
+def directions(system: MomentSystem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the directions of M1 and M2 of a system's pairs, each of shape [n, 3]."""
+    return _pairs(system).first.numpy(), _pairs(system).second.numpy()
+
+
+def _pairs(system: MomentSystem) -> SubmagnetizationPairs:
+    assert isinstance(system.dynamics, SubmagnetizationPairs)
+    return system.dynamics
 
 
 def trace(system: MomentSystem, iterations: int) -> np.ndarray:

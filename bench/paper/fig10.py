@@ -11,6 +11,7 @@ The paper gives neither sizes nor what the force acts on. Two readings are measu
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.patches import Circle
 
 from bench.paper.output import Output, table
 from warpmag import lattice
@@ -130,7 +131,7 @@ def _draw(axis, points, values, pitch, norm, label):
     shown[tuple(cells.T)] = values
     edges = [corner[k] + pitch * (np.arange(shown.shape[k] + 1) - 0.5) for k in (0, 1)]
     image = axis.pcolormesh(*edges, shown.T, cmap="rainbow", norm=norm, rasterized=True)
-    axis.add_patch(plt.Circle((0.0, 0.0), RADIUS, fill=False, ec="k", lw=0.8))
+    axis.add_patch(Circle((0.0, 0.0), RADIUS, fill=False, ec="k", lw=0.8))
     axis.set_aspect("equal")
     axis.set_xticks([])
     axis.set_yticks([])

@@ -2,6 +2,7 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Circle, Rectangle
 
 from bench.paper import crystal_balls
 from bench.paper.output import Output, table
@@ -46,7 +47,7 @@ strengths. Where the two lie on each other, the ball is saturated.
 def _before(device: str):
     system = crystal_balls.make_system(0.0, "llg", device)
     crystal_balls.set_pairs(system, "across")
-    return system.dynamics.first.numpy(), system.dynamics.second.numpy()
+    return crystal_balls.directions(system)
 
 
 def _settle(dynamics: str, curve: str, strength: float, device: str):
@@ -58,7 +59,7 @@ def _settle(dynamics: str, curve: str, strength: float, device: str):
     if dynamics == "theta":
         pairs = _symmetric_pair(system.magnetizations().numpy() / SATURATION_OF_IRON)
     else:
-        pairs = system.dynamics.first.numpy(), system.dynamics.second.numpy()
+        pairs = crystal_balls.directions(system)
     return pairs, float(errors[-1]), len(errors)
 
 
@@ -76,12 +77,12 @@ def _draw(axis, pairs, title: str):
     at = 1e3 * balls @ _TILT.T
     length = 1.1e3 * crystal_balls.BALL_RADIUS
     a, b, _ = 1e3 * np.array(place.bar_half_extents)
-    axis.add_patch(plt.Rectangle((-a, -b), a, 2 * b, color="0.35"))
-    axis.add_patch(plt.Rectangle((0.0, -b), a, 2 * b, color="0.6"))
+    axis.add_patch(Rectangle((-a, -b), a, 2 * b, color="0.35"))
+    axis.add_patch(Rectangle((0.0, -b), a, 2 * b, color="0.6"))
     axis.text(0.5 * a, 0.0, "N", ha="center", va="center", color="w", fontsize=16)
     axis.text(-0.5 * a, 0.0, "S", ha="center", va="center", color="w", fontsize=16)
     for ball in at:
-        axis.add_patch(plt.Circle(ball, 1e3 * crystal_balls.BALL_RADIUS, fc="#dbe9f4", ec="0.7", lw=0.5))
+        axis.add_patch(Circle(ball, 1e3 * crystal_balls.BALL_RADIUS, fc="#dbe9f4", ec="0.7", lw=0.5))
     for directions, color in zip(pairs, ("#d62728", "#1f4fd8"), strict=True):
         arrow = length * directions[:count] @ _TILT.T
         axis.quiver(*at.T, *arrow.T, color=color, angles="xy", scale_units="xy", scale=1.0, width=0.0028)

@@ -5,6 +5,7 @@ Shapes carry the magnet, not bodies, so that a static shape can be one and so th
 """
 
 import math
+from typing import Any
 
 import newton
 import numpy as np
@@ -126,7 +127,8 @@ def add_permanent(
     for index in magnet_shapes(builder, body, shape):
         in_shape = magnetization
         if builder.shape_body[index] >= 0:
-            in_shape = wp.quat_rotate_inv(builder.shape_transform[index].q, wp.vec3(*magnetization))
+            place: Any = builder.shape_transform[index]  # Newton declares a tuple where it holds a transform
+            in_shape = wp.quat_rotate_inv(place.q, wp.vec3(*magnetization))
         mark_shape(builder, index, Magnet("permanent", magnetization=tuple(in_shape), moment_spacing=moment_spacing))
 
 

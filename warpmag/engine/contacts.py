@@ -107,7 +107,7 @@ def scale_gaps(model: newton.Model, sizes: BodySizes) -> None:
     moving = np.isfinite(sizes.thickness)
     if not (unchosen.any() and moving.any()):
         return
-    body = model.shape_body.numpy()
+    body: np.ndarray = model.shape_body.numpy()
     scale = np.full(model.shape_count, sizes.thickness[moving].max())
     on_moving = (body >= 0) & np.isfinite(sizes.thickness[body])
     scale[on_moving] = sizes.thickness[body[on_moving]]

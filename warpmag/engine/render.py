@@ -5,11 +5,15 @@ traces the model; of the stage it takes shapes, colours and the first camera, or
 front where there is none.
 """
 
+# Warp declares vectors, but not that its functions take them
+# pyright: reportCallIssue=false
+
 import math
 import os
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import newton
 import numpy as np
@@ -67,7 +71,7 @@ def render(
         camera.create_default_light(direction=wp.normalize(wp.vec3(*_SUN)))
         camera.set_ambient_light(_AMBIENT)
         rays, places = _view(scene, model, camera, width, height)
-        color = camera.allocate_image_color(1, width, height)
+        color: Any = camera.allocate_image_color(1, width, height)
         config = SensorCamera.RenderConfig(enable_shadows=True, anti_aliasing=SensorCamera.AntiAliasing.SSAA)
         camera.update(model.state(), places, rays, color_image=color, render_config=config)
         pixels = color.numpy()[0].view(np.uint8).reshape(height, width, 4).astype(float)

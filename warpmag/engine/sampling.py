@@ -1,6 +1,7 @@
 """From Newton's shapes to the moments that stand for them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import newton
 import numpy as np
@@ -97,6 +98,6 @@ class ShapeSampler:
         if kind == kinds.CONE:
             return lattice.cone(scale[0], scale[1])
         if kind in (kinds.MESH, kinds.CONVEX_MESH):
-            source = self._sources[shape]
+            source: Any = self._sources[shape]
             return lattice.mesh(np.asarray(source.vertices, float) * scale, np.asarray(source.indices).reshape(-1, 3))
         raise InputError("a cylinder with a barrel side cannot be magnetized")

@@ -83,9 +83,10 @@ class Simulation:
         """
         self.device = resolve_device(device)
         self._scene = None
-        builder, settings = scene, MagneticSettings()
         self.frame_rate, self.frame_count = _FRAME_RATE, None
-        if not isinstance(scene, newton.ModelBuilder):
+        if isinstance(scene, newton.ModelBuilder):
+            builder, settings = scene, MagneticSettings()
+        else:
             from warpmag.engine.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
 
             self._scene = import_scene(scene, visuals=visuals)

@@ -370,7 +370,7 @@ class _Clock:
         self._time = wp.zeros(1, dtype=wp.uint64, device=device)
         self._fixed = device.is_cuda
         self.seconds_per_tick = 1e-9
-        self._began = None if self._fixed else self._read()
+        self._began = (0, 0.0) if self._fixed else self._read()
 
     def _read(self) -> tuple[int, float]:
         stepping.launch_read_clock(self._time)
