@@ -215,48 +215,56 @@ def print_table(rows: list[dict]) -> None:
         print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
 
 
+def _line(axis, rows, x, y, label) -> None:
+    axis.loglog([row[x] for row in rows], [row[y] for row in rows], "o-", label=label, markersize=4)
+
+
+def _draw_rounding(axis, rows) -> None:
+    for of, dtype in sorted({(row["of"], row["dtype"]) for row in rows}):
+        part = [row for row in rows if (row["of"], row["dtype"]) == (of, dtype)]
+        _line(axis, part, "ms", "error", f"{of}, {dtype}, {part[0]['balls']} to {part[-1]['balls']} balls")
+    axis.set(xlabel="time of an evaluation [ms]", ylabel="relative error")
+
+
+def _draw_iteration(axis, rows) -> None:
+    for dtype in ("float32", "float64"):
+        _line(axis, [row for row in rows if row["dtype"] == dtype], "ms", "error", f"{dtype}, rtol 0.1 to 1e-5")
+    axis.set(xlabel=f"time of a cold solve, {BLOCK} balls [ms]", ylabel="relative error")
+
+
+def _draw_model(axis, rows) -> None:
+    for kind in CONTACT_MODELS:
+        for field, style in (("in line", "-"), ("across", "--")):
+            part = [row for row in rows if row["field"] == field and row["permeability"] == np.inf]
+            axis.semilogx([row["gap"] for row in part], [row[kind] for row in part], style, label=f"{kind}, {field}")
+    axis.set(xlabel="gap over radius, μr = ∞", ylabel="force over the exact one")
+
+
+def _draw_clusters(axis, rows) -> None:
+    for kind, style in zip(CONTACT_MODELS, ("--", "-"), strict=True):
+        for which in clusters.FIELDS:
+            worst = [
+                max(row[kind] for row in rows if (row["cluster"], row["gap"]) == (which, gap)) for gap in clusters.GAPS
+            ]
+            axis.loglog(clusters.GAPS, worst, style, label=f"{kind}, {which}, the worst of μr and fields")
+    axis.set(xlabel="gap over radius", ylabel="relative error of forces")
+
+
+def _draw_drift(axis, rows) -> None:
+    _line(axis, rows, "steps", "error", "energy drift over kinetic energy")
+    axis.set(xlabel="steps", ylabel="relative error")
+
+
 def draw(results: dict[str, list[dict]], path: Path) -> None:
     """Draw error against cost, a panel for each of the first five of ``ERRORS``."""
     import matplotlib.pyplot as plt  # noqa: PLC0415 - slow to import, and --help does without it
 
-    drawn = list(results.items())[:5]
-    figure, axes = plt.subplots(1, len(drawn), figsize=(4.8 * len(drawn), 4.5))
-
-    def line(axis, rows, x, y, label):
-        axis.loglog([row[x] for row in rows], [row[y] for row in rows], "o-", label=label, markersize=4)
-
-    for axis, (name, rows) in zip(axes, drawn, strict=True):
+    panels = (_draw_rounding, _draw_iteration, _draw_model, _draw_clusters, _draw_drift)
+    figure, axes = plt.subplots(1, len(panels), figsize=(4.8 * len(panels), 4.5))
+    for axis, panel, (name, rows) in zip(axes, panels, results.items(), strict=False):
         axis.set_title(f"{name} error")
         axis.grid(alpha=0.3)
-        if name == "rounding":
-            for of, dtype in sorted({(row["of"], row["dtype"]) for row in rows}):
-                part = [row for row in rows if (row["of"], row["dtype"]) == (of, dtype)]
-                line(axis, part, "ms", "error", f"{of}, {dtype}, {part[0]['balls']} to {part[-1]['balls']} balls")
-            axis.set(xlabel="time of an evaluation [ms]", ylabel="relative error")
-        elif name == "iteration":
-            for dtype in ("float32", "float64"):
-                line(axis, [row for row in rows if row["dtype"] == dtype], "ms", "error", f"{dtype}, rtol 0.1 to 1e-5")
-            axis.set(xlabel=f"time of a cold solve, {BLOCK} balls [ms]", ylabel="relative error")
-        elif name == "model":
-            for kind in CONTACT_MODELS:
-                for field, style in (("in line", "-"), ("across", "--")):
-                    part = [row for row in rows if row["field"] == field and row["permeability"] == np.inf]
-                    axis.semilogx(
-                        [row["gap"] for row in part], [row[kind] for row in part], style, label=f"{kind}, {field}"
-                    )
-            axis.set(xlabel="gap over radius, μr = ∞", ylabel="force over the exact one")
-        elif name == "clusters":
-            for kind, style in zip(CONTACT_MODELS, ("--", "-"), strict=True):
-                for which in clusters.FIELDS:
-                    worst = [
-                        max(row[kind] for row in rows if (row["cluster"], row["gap"]) == (which, gap))
-                        for gap in clusters.GAPS
-                    ]
-                    axis.loglog(clusters.GAPS, worst, style, label=f"{kind}, {which}, the worst of μr and fields")
-            axis.set(xlabel="gap over radius", ylabel="relative error of forces")
-        else:
-            line(axis, rows, "steps", "error", "energy drift over kinetic energy")
-            axis.set(xlabel="steps", ylabel="relative error")
+        panel(axis, rows)
         axis.legend(fontsize=7)
     figure.savefig(path, dpi=110, bbox_inches="tight")
 
