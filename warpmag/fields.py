@@ -12,7 +12,7 @@ from warpmag.kernels.pairs.wrench import launch_wrench
 from warpmag.magnets import check_rtol, check_token
 from warpmag.packed import PackedMoments
 
-METHODS = ("auto", "vectorized", "reference")
+_METHODS = ("auto", "vectorized", "reference")
 
 
 def h_field(
@@ -171,7 +171,7 @@ def _largest_radius(name, radii, dtype) -> float:
 
 
 def _check_method(method, rtol, dtype):
-    check_token("method", method, METHODS)
+    check_token("method", method, _METHODS)
     if rtol is not None:
         check_rtol("rtol", rtol, dtype)
 

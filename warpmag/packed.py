@@ -1,7 +1,5 @@
 """Moments packed on one device, and the pairs of them that overlap: what every pass over the pairs starts from."""
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
@@ -48,7 +46,7 @@ class PackedMoments:
         pitched = np.zeros((pair_loops.PACKED_ROWS, (1 + -(-n // pair_loops.PITCH)) * pair_loops.PITCH))
         pitched[3], pitched[7] = largest_radius, -1.0
         pitched = wp.array(pitched, dtype=dtype, device=device)
-        self.packed: Any = pitched[:, :n] if n else pitched
+        self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
         lists = self._lists = neighbors.allocate(n, self.packed, self.groups)
         self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching

@@ -1,0 +1,197 @@
+"""The structure that the code is to keep: who may import whom, how long things may be, and that names exist once."""
+
+import ast
+import re
+import sys
+import tomllib
+from collections import defaultdict
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+from warpmag import magnets
+
+ROOT = Path(__file__).resolve().parents[1]
+KERNELS = ROOT / "kernels"
+ROOMS = ("shared", "material", "pairs", "induction", "near_contact", "rigid")
+"""Rooms of ``kernels/``; each may import those before it that its ``__init__`` names."""
+LONGEST_FUNCTION, LONGEST_FILE, LONGEST_STRING = 60, 450, 10
+"""[lines]; a longer string is text of another language, which belongs into a file of its own."""
+REPEATED = {
+    "MU0": "the oracle is independent of what it tests",
+    "allocate": "of each set of buffers, called as its module's",
+}
+"""Public names that several modules may have, and why."""
+OWNERS = {
+    "newton": ("warpmag/engine", "warpmag/cli.py"),  # the command opens Newton's viewers
+    "pxr": ("warpmag/usd",),
+    "warp": (
+        "warpmag/engine",
+        "warpmag/cli.py",
+        *(f"warpmag/{name}.py" for name in ("arrays", "dynamics", "fields", "induction", "system")),
+    ),
+}
+"""What of ``warpmag/`` may import a library."""
+
+SOURCES = {path.relative_to(KERNELS): path.read_text(encoding="utf-8") for path in sorted(KERNELS.rglob("*.py"))}
+HEADERS = {path.relative_to(KERNELS): path.read_text(encoding="utf-8") for path in sorted(KERNELS.rglob("*.h"))}
+TREES = {path: ast.parse(text) for path, text in SOURCES.items()}
+HOST_TREES = {
+    path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"))
+    for path in sorted((ROOT / "warpmag").rglob("*.py"))
+}
+MODULES = {".".join(("warpmag.kernels", *path.with_suffix("").parts)): path for path in SOURCES}
+
+
+def imports(tree) -> list[tuple[str, int]]:
+    """Every dotted name that is imported anywhere in a tree, and its line: ``a.b`` for ``from a import b``."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, node.lineno) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found += [("." * node.level + f"{node.module or ''}.{alias.name}", node.lineno) for alias in node.names]
+    return found
+
+
+def functions(tree):
+    """Every function of a tree, those within others, too."""
+    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def line_count(node) -> int:
+    """Lines of a node, decorators included."""
+    decorators = getattr(node, "decorator_list", [])
+    return node.end_lineno - min([node.lineno, *(one.lineno for one in decorators)]) + 1
+
+
+def public_names(tree):
+    """Public classes, functions and constants of a module that it defines itself, not in a function."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names = [node.name]
+        elif isinstance(node, ast.Assign):
+            names = [name.id for target in node.targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            names = [node.target.id]
+        else:
+            continue
+        yield from (name for name in names if not name.startswith("_"))
+
+
+def rooms_named_in(docstring: str) -> set[str]:
+    """Rooms that a room may import, by what its docstring says."""
+    sentence = re.search(r"May import (.*?)\.(\s|$)", docstring, re.DOTALL)
+    return set(re.findall(r"``(\w+)``", sentence.group(1))) if sentence else set()
+
+
+MAY_IMPORT = {room: rooms_named_in(ast.get_docstring(TREES[Path(room, "__init__.py")]) or "") for room in ROOMS}
+
+
+def test_rooms_form_a_line():
+    assert {path.parts[0] for path in SOURCES} == {*ROOMS, "__init__.py"}
+    installed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    assert {f"warpmag.kernels.{room}" for room in ROOMS} < set(installed)
+    for place, room in enumerate(ROOMS):
+        assert MAY_IMPORT[room] <= set(ROOMS[:place]), room
+
+
+def test_kernels_import_warp_numpy_and_rooms_before_them():
+    wrong = []
+    for path, tree in TREES.items():
+        may = {path.parts[0]} | MAY_IMPORT.get(path.parts[0], set())
+        for name, line in imports(tree):
+            library, *rest = name.split(".")
+            if name.startswith("warpmag.kernels."):
+                allowed = rest[1] in may
+            else:
+                allowed = library in ("warp", "numpy") or library in sys.stdlib_module_names
+            if not allowed:
+                wrong.append(f"{path}:{line} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_headers_include_headers_of_rooms_before_them():
+    wrong = []
+    for path, text in HEADERS.items():
+        may = {path.parts[0]} | MAY_IMPORT[path.parts[0]]
+        for included in re.findall(r'^#include "(.+)"', text, re.MULTILINE):
+            if Path(included) not in HEADERS or Path(included).parts[0] not in may:
+                wrong.append(f"{path} includes {included}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_circles():
+    graph = {}
+    for path, tree in TREES.items():
+        names = {name for name, _ in imports(tree)}
+        # ``from a import b`` imports module a.b if there is one, else module a
+        graph[path] = {
+            MODULES[n] for name in names for n in [name if name in MODULES else name.rpartition(".")[0]] if n in MODULES
+        }
+    for path, text in HEADERS.items():
+        graph[path] = {Path(included) for included in re.findall(r'^#include "(.+)"', text, re.MULTILINE)}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"circle: {' ← '.join(map(str, error.args[1]))}")
+
+
+def test_functions_files_and_strings_are_short():
+    long = [
+        f"{path}: {lines} lines"
+        for path, text in (SOURCES | HEADERS).items()
+        if (lines := text.count("\n")) > LONGEST_FILE
+    ]
+    for path, tree in TREES.items():
+        long += [
+            f"{path}:{f.lineno} {f.name}: {line_count(f)} lines"
+            for f in functions(tree)
+            if line_count(f) > LONGEST_FUNCTION
+        ]
+        inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        long += [
+            f"{path}:{node.lineno} string: {line_count(node)} lines"
+            for node in ast.walk(tree)
+            if (isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str)))
+            and id(node) not in inner | docstrings
+            and line_count(node) > LONGEST_STRING
+        ]
+    assert not long, "\n".join(long)
+
+
+def test_names_exist_once():
+    homes = defaultdict(list)
+    for path, tree in TREES.items():
+        for name in set(public_names(tree)) - set(REPEATED):
+            homes[name].append(f"kernels/{path}")
+    for path, tree in HOST_TREES.items():
+        defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        for name in (
+            set(public_names(tree)) - defined - set(REPEATED)
+        ):  # functions are called as their module's: oracle.h_field
+            homes[name].append(str(path))
+    wrong = [f"{name}: {', '.join(paths)}" for name, paths in sorted(homes.items()) if len(paths) > 1]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_only_their_owners_import_libraries():
+    wrong = []
+    for path, tree in HOST_TREES.items():
+        for name, line in imports(tree):
+            owners = OWNERS.get(name.partition(".")[0])
+            if owners is not None and not path.as_posix().startswith(owners):
+                wrong.append(f"{path}:{line} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_tokens_have_their_numbers_in_kernels(device):
+    from warpmag.kernels.induction.submagnetization import LAW_IDS  # noqa: PLC0415 - imports Warp
+    from warpmag.kernels.material.curves import CURVE_IDS  # noqa: PLC0415
+    from warpmag.kernels.pairs.wrench import FORCE_IDS  # noqa: PLC0415
+
+    assert tuple(CURVE_IDS) == magnets.CURVES
+    assert tuple(FORCE_IDS) == magnets.FORCES
+    assert {"theta", *LAW_IDS} == set(magnets.DYNAMICS)
