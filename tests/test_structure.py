@@ -187,6 +187,13 @@ def test_only_their_owners_import_libraries():
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.parametrize("page", ["ARCHITECTURE.md", "README.md", "bench/README.md"])
+def test_pages_name_files_that_exist(page):
+    names = set(re.findall(r"`((?:[\w.]+/)+[\w.]*)`", (ROOT / page).read_text(encoding="utf-8")))
+    folders = ROOT, ROOT / "warpmag", KERNELS
+    assert {name for name in names if not any((folder / name).exists() for folder in folders)} == set()
+
+
 def test_tokens_have_their_numbers_in_kernels(device):
     from warpmag.kernels.induction.submagnetization import LAW_IDS  # noqa: PLC0415 - imports Warp
     from warpmag.kernels.material.curves import CURVE_IDS  # noqa: PLC0415
