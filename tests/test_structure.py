@@ -66,6 +66,18 @@ def line_count(node) -> int:
     return node.end_lineno - min([node.lineno, *(one.lineno for one in decorators)]) + 1
 
 
+def strings(path):
+    """Line and number of lines of every string that is no docstring, without its quotes."""
+    tree = TREES[path]
+    skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    skipped |= {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str)):
+            if id(node) not in skipped and node.end_lineno > node.lineno:
+                source = ast.get_source_segment(SOURCES[path], node) or ""
+                yield node.lineno, source.strip("frb\"' \n").count("\n") + 1
+
+
 def public_names(tree):
     """Public classes, functions and constants of a module that it defines itself, not in a function."""
     for node in tree.body:
@@ -150,15 +162,7 @@ def test_functions_files_and_strings_are_short():
             for f in functions(tree)
             if line_count(f) > LONGEST_FUNCTION
         ]
-        inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
-        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-        long += [
-            f"{path}:{node.lineno} string: {line_count(node)} lines"
-            for node in ast.walk(tree)
-            if (isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str)))
-            and id(node) not in inner | docstrings
-            and line_count(node) > LONGEST_STRING
-        ]
+        long += [f"{path}:{line} string: {lines} lines" for line, lines in strings(path) if lines > LONGEST_STRING]
     assert not long, "\n".join(long)
 
 
