@@ -12,7 +12,7 @@ from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
 from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.field import launch_field
-from warpmag.kernels.pairs.pair_terms import FIELD, FORCE, KELVIN, WRENCH
+from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.work_list import FUSED, LOOP, MIRRORED
 from warpmag.kernels.pairs.wrench import launch_wrench
 from warpmag.kernels.shared import team as cpu_team
@@ -106,7 +106,7 @@ def test_segments(dtype, threads, device, monkeypatch):
     radii = as_float32(np.where(np.arange(1500) < 900, 0.0049, 0.0045))[0]
     segments = [(0, 901, 0, 901), (901, 1490, 901, 1490), (1490, 1500, 3, 1489)]
     for form in forms(device):
-        (h,) = sums(x, radii, m, segments, FIELD, dtype, device, form=form)
+        (h,) = sums(x, radii, m, segments, Quantity.FIELD, dtype, device, form=form)
         for t0, t1, s0, s1 in segments:
             own = {} if t0 == s0 else {"targets": x[t0:t1], "target_radii": radii[t0:t1]}
             expected = oracle.h_field(x[s0:s1], m[s0:s1], radii=radii[s0:s1], **own)
@@ -114,7 +114,7 @@ def test_segments(dtype, threads, device, monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("quantity", [KELVIN, FORCE, WRENCH])
+@pytest.mark.parametrize("quantity", [Quantity.MUTUAL_FORCE, Quantity.FORCE, Quantity.WRENCH])
 def test_moments_of_one_body_leave_each_other_alone(quantity, dtype, device):
     """Bodies of seven moments each, out of order."""
     x, radii, m = pile(count=1100)
@@ -122,10 +122,10 @@ def test_moments_of_one_body_leave_each_other_alone(quantity, dtype, device):
     bodies = np.random.default_rng(4).permutation(1100) // 7
     force = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii, bodies=bodies))
     torque = oracle.torque(m, oracle.h_field(x, m, radii=radii, bodies=bodies))
-    for form in forms(device, *[MIRRORED] * (quantity == KELVIN)):
+    for form in forms(device, *[MIRRORED] * (quantity == Quantity.MUTUAL_FORCE)):
         found = sums(x, radii, m, [(0, 1100, 0, 1100)], quantity, dtype, device, bodies, form=form)
         assert relative(found[0], force) < TOLERANCE[dtype]
-        if quantity == WRENCH:
+        if quantity == Quantity.WRENCH:
             assert relative(found[1], torque) < TOLERANCE[dtype]
 
 
@@ -138,11 +138,11 @@ def test_any_count_of_touching_balls(count, dtype, device):
     h = oracle.h_field(x, m, radii=radii)
     force, torque = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii)), oracle.torque(m, h)
     for form in forms(device, MIRRORED):
-        found = [*sums(x, radii, m, every, FIELD, dtype, device, form=form)]
+        found = [*sums(x, radii, m, every, Quantity.FIELD, dtype, device, form=form)]
         if form == MIRRORED:  # which has forces alone
-            found += [sums(x, radii, m, every, KELVIN, dtype, device, form=form)[0], torque]
+            found += [sums(x, radii, m, every, Quantity.MUTUAL_FORCE, dtype, device, form=form)[0], torque]
         else:
-            found += sums(x, radii, m, every, WRENCH, dtype, device, form=form)
+            found += sums(x, radii, m, every, Quantity.WRENCH, dtype, device, form=form)
         for value, expected in zip(found, (h, force, torque), strict=True):
             # not as a ratio: a lone ball feels nothing at all
             assert np.linalg.norm(value - expected) <= TOLERANCE[dtype] * np.linalg.norm(expected)
@@ -165,7 +165,7 @@ def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
     x, radii, m = pile(count=1103)
     radii[40:] = 0.005
     (found, *_) = sums(x, radii, m, [(0, 1103, 0, 1103)], quantity, "float32", device, form=form)
-    if quantity == FIELD:
+    if quantity == Quantity.FIELD:
         expected = oracle.h_field(x, m, radii=radii)
     else:
         expected = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii))
@@ -173,7 +173,7 @@ def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("quantity", [FIELD, KELVIN])
+@pytest.mark.parametrize("quantity", [Quantity.FIELD, Quantity.MUTUAL_FORCE])
 @pytest.mark.parametrize("slabs", [1, 3, 100])
 def test_mirrored_passes(slabs, quantity, dtype, device, monkeypatch):
     """Tiles of moments in as many passes as little memory asks for; bodies of three."""
@@ -182,7 +182,7 @@ def test_mirrored_passes(slabs, quantity, dtype, device, monkeypatch):
     radii, bodies = as_float32(np.where(np.arange(2001) < 1500, 0.0049, 0.004))[0], np.arange(2001) // 3
     form = MIRRORED if device != "cpu" else LOOP
     (found, *_) = sums(x, radii, m, [(0, 2001, 0, 2001)], quantity, dtype, device, bodies, form=form)
-    if quantity == FIELD:
+    if quantity == Quantity.FIELD:
         assert relative(found, oracle.h_field(x, m, radii=radii)) < TOLERANCE[dtype]
     else:
         gradient = oracle.field_gradient(x, m, radii=radii, bodies=bodies)
@@ -206,7 +206,7 @@ def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, form):
     partial = wp.full(pair_loops.partial_shape(rows), np.nan, dtype=kind, device=device)
     pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=packed.moments)
     none, *out = (wp.zeros_like(vectors[0]) for _ in range(3))
-    if quantity == FIELD:
+    if quantity == Quantity.FIELD:
         launch_field(rows, partial, packed, packed, True, none, out[0])
         return [out[0].numpy().astype(float)]
     twisted = wp.ones(len(x), dtype=int, device=device)

@@ -9,7 +9,7 @@ import warpmag
 from warpmag import oracle
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.neighbors import CAPACITY
-from warpmag.kernels.pairs.pair_terms import FIELD, KELVIN
+from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared import team as cpu_team
 from warpmag.system import MomentSystem
 
@@ -117,7 +117,7 @@ def test_a_body_is_turned_as_by_all_pairs_of_moments(force, strength, tolerance,
 
 def test_forces_on_balls_and_on_magnets(device, monkeypatch):
     """Balls, a fixed magnet and a free one, which is turned, too; on a GPU by both ends of each pair."""
-    monkeypatch.setattr(pair_loops, "_LEAST_MIRRORED", dict.fromkeys((FIELD, KELVIN), 1))
+    monkeypatch.setattr(pair_loops, "_LEAST_MIRRORED", dict.fromkeys((Quantity.FIELD, Quantity.MUTUAL_FORCE), 1))
     x, radii, m = pile(count=700)
     balls, fixed, free = np.arange(700) < 600, slice(600, 660), slice(660, 700)
     bodies, movable = np.where(balls, np.arange(700), 600), np.ones(700, bool)

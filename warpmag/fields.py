@@ -7,7 +7,7 @@ from warpmag.arrays import Kind, check_radii, resolve_kind, vec3_type
 from warpmag.errors import InputError
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.field import launch_field
-from warpmag.kernels.pairs.pair_terms import WRENCH
+from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import launch_wrench
 from warpmag.magnets import check_rtol, check_token
 from warpmag.packed import PackedMoments
@@ -122,7 +122,7 @@ def wrench(
     packed = _packed(kind, "radii", radii, x, m)
     exact = method == "reference" or smoothing > 0.0
     forms = (pair_loops.LOOP,) if exact else pair_loops.FORMS
-    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, WRENCH, forms=forms)
+    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, Quantity.WRENCH, forms=forms)
     partial = _pair_sums(rows, packed, packed, pair_loops.EXCLUDE_BODY if exact else None, smoothing)
     if not exact:
         packed.find_overlaps()

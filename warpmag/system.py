@@ -14,7 +14,7 @@ from warpmag.kernels.near_contact import near_contact
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.field import launch_field
 from warpmag.kernels.pairs.packing import launch_divide_by_volume
-from warpmag.kernels.pairs.pair_terms import FORCE, KELVIN, WRENCH
+from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import FORCE_IDS, ZEEMAN, launch_wrench, launch_zeeman_moments
 from warpmag.magnets import CONTACT_MODELS, check_force, check_rtol, check_token
 from warpmag.packed import PackedMoments
@@ -191,10 +191,10 @@ class MomentSystem:
         self._felt = {
             law: [
                 pair_loops.make_rows(segments, self.device, quantity)
-                for segments, quantity in ((pushed, push), (turned, WRENCH))
+                for segments, quantity in ((pushed, push), (turned, Quantity.WRENCH))
                 if segments
             ]
-            for law, push in ((FORCE_IDS["kelvin"], KELVIN), (ZEEMAN, FORCE))
+            for law, push in ((FORCE_IDS["kelvin"], Quantity.MUTUAL_FORCE), (ZEEMAN, Quantity.FORCE))
         }
 
         def partial(rows, more=0):

@@ -10,7 +10,7 @@ import warp as wp
 from warpmag.kernels.pairs import finish_cpu
 from warpmag.kernels.pairs.fused_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
 from warpmag.kernels.pairs.neighbors import pair_correction
-from warpmag.kernels.pairs.pair_terms import FIELD
+from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared import team as cpu_team
 from warpmag.kernels.shared.reductions import group_sum, group_threads
 
@@ -61,7 +61,7 @@ def summed_field(dtype, shape: Shape):
     vec3 = wp.types.vector(3, dtype)
     share_of = target_share(shape)
     correct_pairs = pair_correction(dtype, gradient=False, exclude_body=False)
-    sum_pairs = pair_summation(dtype, FIELD, shape)
+    sum_pairs = pair_summation(dtype, Quantity.FIELD, shape)
 
     @wp.func
     def field_of_tile(

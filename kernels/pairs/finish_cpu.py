@@ -8,7 +8,7 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.pairs.moment_code import moment_text
-from warpmag.kernels.pairs.pair_terms import FIELD, WIDTHS
+from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
 from warpmag.kernels.shared.vector_text import passes_text
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for, wide_registers
 
@@ -129,7 +129,7 @@ def _arrays_type(dtype):
 
 
 @cache
-def _kernel(dtype, quantity: str, numbers: tuple):
+def _kernel(dtype, quantity: Quantity, numbers: tuple):
     arrays_type = _arrays_type(dtype)
     real = "float" if dtype is wp.float32 else "double"
     text = passes_text(
@@ -140,7 +140,7 @@ def _kernel(dtype, quantity: str, numbers: tuple):
         ("target", "begin", "end", "overlap", "overlap_count", "twisted"),
         ("partial", "targets", "sources", "base", "effective", "out", "torques"),
         moment_text(real) + _ROWS,
-        _FINISH_FIELD if quantity == FIELD else _FINISH_WRENCH,
+        _FINISH_FIELD if quantity == Quantity.FIELD else _FINISH_WRENCH,
         balls="(arrays.target.shape[0] + LANES - 1) / LANES * LANES",
     )
 

@@ -19,12 +19,10 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.pairs.pair_terms import (
-    FIELD,
-    FORCE,
     SUMS,
     TILE_COLUMNS,
     WIDTHS,
-    WRENCH,
+    Quantity,
     cuda_head,
     pair,
     results,
@@ -79,7 +77,7 @@ class Shape:
 # through each other's shared memory, gained nothing: of two blocks, 10.4 µs where one takes 10.0 for a field at 2,560;
 # of four or eight, only 124 or 120 multiprocessors find partners.
 SHAPES = {
-    FIELD: (
+    Quantity.FIELD: (
         (528, Shape(2, 2, 8, 1)),
         (1056, Shape(4, 2, 8, 2)),
         (1584, Shape(3, 4, 16, 4)),
@@ -89,13 +87,13 @@ SHAPES = {
         (5280, Shape(5, 8, 12, 4)),
         (None, Shape(7, 8, 12, 4)),
     ),
-    FORCE: (
+    Quantity.FORCE: (
         (528, Shape(2, 2, 8, 1)),
         (1056, Shape(2, 4, 16, 2)),
         (2112, Shape(4, 4, 8, 4)),
         (None, Shape(5, 4, 8, 4)),
     ),
-    WRENCH: (
+    Quantity.WRENCH: (
         (528, Shape(2, 2, 8, 1)),
         (1056, Shape(4, 2, 8, 2)),
         (2112, Shape(4, 4, 8, 2)),
@@ -104,7 +102,7 @@ SHAPES = {
 }
 
 
-def choose_shape(quantity: str, count: int) -> Shape:
+def choose_shape(quantity: Quantity, count: int) -> Shape:
     """Shape for a number of targets."""
     return next(shape for most, shape in SHAPES[quantity] if most is None or count <= most)
 
@@ -141,9 +139,9 @@ def _folds(values: int, lanes: int) -> tuple[int, str, str]:
     return padded, text, f"if ((lane & {idle}) == 0) {{ {place} {stores} }}"
 
 
-def _snippet(real: str, quantity: str, shape: Shape) -> str:
+def _snippet(real: str, quantity: Quantity, shape: Shape) -> str:
     """One thread of a block."""
-    field, width = quantity == FIELD, WIDTHS[quantity]
+    field, width = quantity == Quantity.FIELD, WIDTHS[quantity]
     held, lanes, warps, ks = shape.held, shape.lanes, shape.warps, [str(k) for k in range(shape.held)]
     groups = 32 // lanes
     stride = groups * shape.unrolled
@@ -292,7 +290,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
 
 
 @cache
-def pair_summation(dtype, quantity: str, shape: Shape):
+def pair_summation(dtype, quantity: Quantity, shape: Shape):
     """Warp function by which a block sums a quantity, see ``pair_loops``, over a tile's pairs.
 
     All threads of the block call it. Those that have a :func:`target_share` bring something to add to the sum of that

@@ -20,7 +20,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.pair_terms import FIELD, KELVIN, cuda_head, mirrored_pair, scaled_moment
+from warpmag.kernels.pairs.pair_terms import Quantity, cuda_head, mirrored_pair, scaled_moment
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Shape:
 
 # Measured on an H200 at 5,000 to 131,072 moments: the shape, and the most moments that it is best for.
 SHAPES = {
-    FIELD: ((7000, Shape(2, 4, 6, 2)), (30000, Shape(3, 4, 4, 2)), (None, Shape(6, 4, 3, 2))),
-    KELVIN: ((7000, Shape(2, 4, 6, 2)), (None, Shape(4, 4, 4, 1))),
+    Quantity.FIELD: ((7000, Shape(2, 4, 6, 2)), (30000, Shape(3, 4, 4, 2)), (None, Shape(6, 4, 3, 2))),
+    Quantity.MUTUAL_FORCE: ((7000, Shape(2, 4, 6, 2)), (None, Shape(4, 4, 4, 1))),
 }
 _SLAB_BYTES = 2**28
 """Memory that slabs may take."""
@@ -58,7 +58,7 @@ class Mirror:
     """Work list of moments among themselves, on one device.
 
     Attributes:
-        quantity: What is summed: ``FIELD`` or ``KELVIN``.
+        quantity: What is summed: ``FIELD`` or ``MUTUAL_FORCE``.
         shape: Shape of the blocks.
         origin: Packed column of the first moment.
         edges: First moment of each tile, and the end, shape [tiles + 1].
@@ -69,7 +69,7 @@ class Mirror:
         splits: Blocks of a pass that share out the walk of a home tile.
     """
 
-    quantity: str
+    quantity: Quantity
     shape: Shape
     origin: int
     edges: wp.array
@@ -80,7 +80,7 @@ class Mirror:
     splits: int
 
 
-def make_mirror(origin: int, count: int, quantity: str, device) -> Mirror:
+def make_mirror(origin: int, count: int, quantity: Quantity, device) -> Mirror:
     """Plan the walk of ``count`` moments from packed column ``origin`` on."""
     shape = next(shape for most, shape in SHAPES[quantity] if most is None or count <= most)
     tiles = max(math.ceil(count / (32 * shape.moments)), 3)
@@ -124,9 +124,9 @@ def _choose_splits(shape: Shape, tiles: int, walk: int, multiprocessors: int) ->
     return min(range(least, max(least, min(_MOST_SPLITS, walk)) + 1), key=cost)
 
 
-def _snippet(real: str, quantity: str, shape: Shape) -> str:
+def _snippet(real: str, quantity: Quantity, shape: Shape) -> str:
     """One thread of a block."""
-    field = quantity == FIELD
+    field = quantity == Quantity.FIELD
     held, warps = shape.moments, shape.warps
     ks = [str(k) for k in range(held)]
 
@@ -175,7 +175,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
     )
     return f"""
     {cuda_head(real)}
-    constexpr REAL SCALE = {scaled_moment(FIELD, 1.0)!r};
+    constexpr REAL SCALE = {scaled_moment(Quantity.FIELD, 1.0)!r};
     struct alignas(16) Quad {{ REAL x, y, z, w; }};
     // of each warp, for the moments of a stage, twice over, and at the end for its sums
     __shared__ Quad staging[{warps}][{max(192, 24 * held)}];
@@ -254,7 +254,7 @@ def _snippet(real: str, quantity: str, shape: Shape) -> str:
 
 
 @cache
-def _kernel(dtype, quantity: str, shape: Shape):
+def _kernel(dtype, quantity: Quantity, shape: Shape):
     single = dtype is wp.float32
 
     @wp.func_native(_snippet("float" if single else "double", quantity, shape))

@@ -18,20 +18,36 @@ of its choice (a Newton step for 1/√c is an operation shorter if it ends at 2/
 The products are ordered so that no factor beyond r⁻³ leaves the float32 range before it meets r.
 """
 
-FIELD, FORCE, WRENCH, KELVIN = "field", "force", "wrench", "kelvin"
-"""What a loop sums: H; (e·∇)H for an effective moment e of the target; both of them; (e·∇)H where e is its moment."""
+from enum import IntEnum
 
-WIDTHS = {FIELD: 3, FORCE: 3, WRENCH: 6, KELVIN: 3}
-"""Numbers per target that a loop leaves."""
+
+class Quantity(IntEnum):
+    """What is summed over pairs: H; (e·∇)H for an effective moment e of the target; both; (m·∇)H for its moment m.
+
+    The values are those of ``pair_terms.h``.
+    """
+
+    FIELD = 0
+    FORCE = 1
+    WRENCH = 2
+    MUTUAL_FORCE = 3
+
+
+WIDTHS = {Quantity.FIELD: 3, Quantity.FORCE: 3, Quantity.WRENCH: 6, Quantity.MUTUAL_FORCE: 3}
+"""Numbers that are stored for a target."""
 
 TILE_COLUMNS = 8
-"""A tile is: target rows begin and end, packed column of the first of them, sources begin and end, the split that its
-sums belong to, whether it is mirrored, that is stands also for the tile with sources and targets exchanged, and
-nothing: so much a GPU reads at once."""
+"""Columns of a work list of tiles, ``TileEntry`` of ``pair_terms.h``: target rows begin and end, packed column of the
+first of them, sources begin and end, partial sums that the tile is added to, whether it stands also for the tile with
+sources and targets exchanged, and nothing, so that a GPU reads a row as two vectors."""
 
 _FIELD_SUMS = ("hx", "hy", "hz")
 _FORCE_SUMS = ("fx", "fy", "fz", "along")
-SUMS = {FIELD: _FIELD_SUMS, FORCE: _FORCE_SUMS, WRENCH: (*_FORCE_SUMS, *_FIELD_SUMS, "gx", "gy", "gz")}
+SUMS = {
+    Quantity.FIELD: _FIELD_SUMS,
+    Quantity.FORCE: _FORCE_SUMS,
+    Quantity.WRENCH: (*_FORCE_SUMS, *_FIELD_SUMS, "gx", "gy", "gz"),
+}
 """Names of what a loop sums up."""
 
 _SEPARATION = """
@@ -69,23 +85,23 @@ _FIELD_BESIDE_FORCE = """
     gy{k} += inv3 * by;
     gz{k} += inv3 * bz;
 """
-_ADDED = {FIELD: _FIELD, FORCE: _FORCE + _ALONG, WRENCH: _FORCE + _FIELD_BESIDE_FORCE}
+_ADDED = {Quantity.FIELD: _FIELD, Quantity.FORCE: _FORCE + _ALONG, Quantity.WRENCH: _FORCE + _FIELD_BESIDE_FORCE}
 
 
-def pair(quantity: str, inverse: str, k: str = "") -> str:
+def pair(quantity: Quantity, inverse: str, k: str = "") -> str:
     """Text of one pair; ``inverse`` computes W/d from the squared distance ``d2``, clamped and masked."""
     return (_SEPARATION + f"const NUMBER inv = {inverse};" + _POWERS + _ADDED[quantity]).format(k=k)
 
 
 _MIRRORED = {
-    FIELD: _FIELD
+    Quantity.FIELD: _FIELD
     + """
     const NUMBER back = inv2 * (rx * mx{k} + ry * my{k} + rz * mz{k});
     gx += inv3 * (back * rx - nx{k});
     gy += inv3 * (back * ry - ny{k});
     gz += inv3 * (back * rz - nz{k});
 """,
-    KELVIN: """
+    Quantity.MUTUAL_FORCE: """
     const NUMBER inv5 = inv3 * inv2;
     const NUMBER rb = rx * bx + ry * by + rz * bz;
     const NUMBER rm = rx * mx{k} + ry * my{k} + rz * mz{k};
@@ -104,7 +120,7 @@ _MIRRORED = {
 }
 
 
-def mirrored_pair(quantity: str, inverse: str, k: str = "", w: float = 1.0) -> str:
+def mirrored_pair(quantity: Quantity, inverse: str, k: str = "", w: float = 1.0) -> str:
     """Text of one pair for both of its ends, the target's moment being m, for a field scaled n as well.
 
     What is done to the target is added to the sums h, what is done to the source to g; of a force, both are the force
@@ -113,27 +129,27 @@ def mirrored_pair(quantity: str, inverse: str, k: str = "", w: float = 1.0) -> s
     return (_SEPARATION + f"const NUMBER inv = {inverse};").format(k=k) + mirrored_sums(quantity, k, w)
 
 
-def mirrored_sums(quantity: str, k: str = "", w: float = 1.0) -> str:
+def mirrored_sums(quantity: Quantity, k: str = "", w: float = 1.0) -> str:
     """Text of :func:`mirrored_pair` after its separation and inverse distance."""
     return (_POWERS + _MIRRORED[quantity]).format(k=k, five=5.0 / w**2)
 
 
-def scaled_moment(quantity: str, w: float) -> float:
+def scaled_moment(quantity: Quantity, w: float) -> float:
     """Ratio u/b of the scaled moment."""
-    return w**2 / (3.0 if quantity == FIELD else 5.0)
+    return w**2 / (3.0 if quantity == Quantity.FIELD else 5.0)
 
 
-def results(quantity: str, w: float, k: str = "") -> list[str]:
+def results(quantity: Quantity, w: float, k: str = "") -> list[str]:
     """Expressions of the numbers that a loop leaves, from its sums: the field, or the force and then the field.
 
-    Those of ``KELVIN`` are from the sums of :func:`mirrored_sums`.
+    Those of ``MUTUAL_FORCE`` are from the sums of :func:`mirrored_sums`.
     """
     h, f, a, g = 3.0 * w**-5, 15.0 * w**-7, 3.0 * w**-5, w**-3
-    if quantity in (FIELD, KELVIN):
+    if quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE):
         return [f"REAL({h!r}) * h{c}{k}" for c in "xyz"]
     force = [f"REAL({f!r}) * f{c}{k} + REAL({a!r}) * along{k} * e{c}{k}" for c in "xyz"]
     field = [f"REAL({h!r}) * h{c}{k} - REAL({g!r}) * g{c}{k}" for c in "xyz"]
-    return force if quantity == FORCE else force + field
+    return force if quantity == Quantity.FORCE else force + field
 
 
 def cuda_head(real: str) -> str:

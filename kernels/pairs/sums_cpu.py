@@ -18,12 +18,10 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.pairs.pair_terms import (
-    FIELD,
-    FORCE,
-    KELVIN,
     SUMS,
     TILE_COLUMNS,
     WIDTHS,
+    Quantity,
     mirrored_pair,
     mirrored_sums,
     pair,
@@ -129,11 +127,11 @@ _SOURCES = """
 """
 
 
-def _add_rows(quantity: str) -> str:
+def _add_rows(quantity: Quantity) -> str:
     """Text of ``add`` for a target's sums, and of ``add_rows`` for those of some target rows over a tile."""
-    quantity = FORCE if quantity == KELVIN else quantity
+    quantity = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
     sums = SUMS[quantity]
-    field = quantity == FIELD
+    field = quantity == Quantity.FIELD
     effective = "" if field else "REAL ex, REAL ey, REAL ez, "
     target = {"tx": 0, "ty": 1, "tz": 2, "radius": 3, "label": 7}
     loads = [f"{name} = share.targets[{row} * share.target_stride + column]" for name, row in target.items()]
@@ -176,7 +174,7 @@ def _add_rows(quantity: str) -> str:
 
 # Three vectors of sources are under way at a time, so that nothing waits for its inverse root: one has its separations
 # computed, the one before its root, and the one before that is summed.
-def _add_both_ways(quantity: str) -> str:
+def _add_both_ways(quantity: Quantity) -> str:
     """Text of ``deposit`` for what is summed at a moment, and of ``add_both_ways`` for the pairs of two tiles."""
     return f"""
     auto deposit = [](REAL* out, REAL hx, REAL hy, REAL hz) {{
@@ -246,10 +244,10 @@ _ENTER_HOME = """
 """
 
 
-def _walk_home(quantity: str) -> str:
+def _walk_home(quantity: Quantity) -> str:
     """Text that sums a mirrored tile."""
     strangers = "home.radius > 0 && other.radius > 0"
-    if quantity == KELVIN:
+    if quantity == Quantity.MUTUAL_FORCE:
         strangers += " && (diagonal ? home.distinct : home.last < other.first || other.last < home.first)"
     return f"""
         if (mirrored && share.targets == share.sources) {{
@@ -272,9 +270,9 @@ def _walk_home(quantity: str) -> str:
     """
 
 
-def _walk(quantity: str) -> str:
+def _walk(quantity: Quantity) -> str:
     """Text that sums the tiles of a share."""
-    both_ways = quantity in (FIELD, KELVIN)
+    both_ways = quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
     return f"""
     __builtin_memset(share.out, 0, share.rows * {WIDTHS[quantity]} * sizeof(REAL));
     Tile tile;
@@ -298,7 +296,7 @@ def _walk(quantity: str) -> str:
     """
 
 
-def _snippet(real: str, quantity: str) -> str:
+def _snippet(real: str, quantity: Quantity) -> str:
     """All tiles of a work list, by several threads."""
     return f"""
     typedef {real} REAL;
@@ -322,7 +320,7 @@ def _snippet(real: str, quantity: str) -> str:
         {_VECTORS}
         {INVERSE_ROOT[real]}
         {_add_rows(quantity)}
-        {_add_both_ways(quantity) if quantity in (FIELD, KELVIN) else ""}
+        {_add_both_ways(quantity) if quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE) else ""}
         auto sum = [=](const Share& share) {{
             {_walk(quantity)}
         }};
@@ -347,7 +345,7 @@ def _snippet(real: str, quantity: str) -> str:
 
 
 @cache
-def _kernel(dtype, quantity: str):
+def _kernel(dtype, quantity: Quantity):
     @wp.func_native(_snippet("float" if dtype is wp.float32 else "double", quantity))
     def sum_tiles(
         targets: wp.array2d[dtype],
@@ -378,7 +376,7 @@ def _kernel(dtype, quantity: str):
     return pair_loop_cpu
 
 
-def launch_pair_loop_cpu(quantity: str, targets, sources, effective, tiles, shares, threads, partial):
+def launch_pair_loop_cpu(quantity: Quantity, targets, sources, effective, tiles, shares, threads, partial):
     """Sum a quantity over all tiles; see ``pair_loops.launch_pair_loop``."""
     wp.launch(
         _kernel(partial.dtype, quantity),

@@ -15,12 +15,10 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.pairs.pair_terms import (
-    FIELD,
-    FORCE,
     SUMS,
     TILE_COLUMNS,
     WIDTHS,
-    WRENCH,
+    Quantity,
     cuda_head,
     pair,
     results,
@@ -45,16 +43,16 @@ class Shape:
 
 # Measured on an H200 at 243 to 131,072 targets: the shape, and the most targets that it is best for.
 _SHAPES = {
-    FIELD: ((6144, Shape(4, 8, 2)), (65536, Shape(6, 4, 3)), (None, Shape(8, 4, 2))),
-    FORCE: ((None, Shape(4, 4, 3)),),
-    WRENCH: ((None, Shape(3, 4, 3)),),
+    Quantity.FIELD: ((6144, Shape(4, 8, 2)), (65536, Shape(6, 4, 3)), (None, Shape(8, 4, 2))),
+    Quantity.FORCE: ((None, Shape(4, 4, 3)),),
+    Quantity.WRENCH: ((None, Shape(3, 4, 3)),),
 }
 _MOST_SPLITS = 32
 _FIXED_COST = 16
 """Sources a block could sum in the time that it takes to start and to end."""
 
 
-def choose_shape(quantity: str, count: int) -> Shape:
+def choose_shape(quantity: Quantity, count: int) -> Shape:
     """Shape for a number of targets."""
     return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
 
@@ -93,9 +91,9 @@ _SOURCE = """
 """
 
 
-def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
+def _snippet(real: str, quantity: Quantity, targets: int, warps: int) -> str:
     """One thread of a block: ``targets`` targets a lane, ``warps`` warps."""
-    field = quantity == FIELD
+    field = quantity == Quantity.FIELD
     sums, width, ks = SUMS[quantity], WIDTHS[quantity], [str(k) for k in range(targets)]
     unroll = max(2, 8 // targets)
     staging = max(64, 8 * targets * width)
@@ -213,7 +211,7 @@ def _snippet(real: str, quantity: str, targets: int, warps: int) -> str:
 
 
 @cache
-def _kernel(dtype, quantity: str, shape: Shape):
+def _kernel(dtype, quantity: Quantity, shape: Shape):
     single = dtype is wp.float32
 
     @wp.func_native(_snippet("float" if single else "double", quantity, shape.targets, shape.warps))
@@ -243,7 +241,7 @@ def _kernel(dtype, quantity: str, shape: Shape):
     return pair_loop_cuda
 
 
-def launch_pair_loop_cuda(quantity: str, shape: Shape, targets, sources, effective, tiles, partial):
+def launch_pair_loop_cuda(quantity: Quantity, shape: Shape, targets, sources, effective, tiles, partial):
     """Sum a quantity over all tiles; see ``pair_loops.launch_pair_loop``."""
     wp.launch(
         _kernel(partial.dtype, quantity, shape),

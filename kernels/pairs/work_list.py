@@ -32,7 +32,7 @@ import warp as wp
 from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
 from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
 from warpmag.kernels.pairs.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
-from warpmag.kernels.pairs.pair_terms import FIELD, FORCE, KELVIN, TILE_COLUMNS, WIDTHS, WRENCH
+from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.sums_cpu import STRIPE, launch_pair_loop_cpu
 from warpmag.kernels.pairs.sums_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
 from warpmag.kernels.shared.team import threads_for
@@ -47,8 +47,8 @@ LOOP, FUSED, MIRRORED = FORMS = "loop", "fused", "mirrored"
 each pair of moments once, for both of its ends."""
 
 # Measured on an H200: the most targets for which the fused form is best, and the fewest for which the mirrored is.
-_MOST_FUSED = {FIELD: 7000, FORCE: 2640, KELVIN: 2640, WRENCH: 2640}
-_LEAST_MIRRORED = {FIELD: 5281, KELVIN: 2641}
+_MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE: 2640, Quantity.WRENCH: 2640}
+_LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
 _LEAST_MUTUAL = 0.75
 """Least part of the sources that are targets, for both ends of a pair to be worth what the mirrored form costs."""
 
@@ -68,7 +68,7 @@ class Rows:
     """Which target rows see which sources, on one device.
 
     Attributes:
-        quantity: What is summed: ``FIELD``, ``FORCE`` or ``WRENCH``, on a CPU also ``KELVIN``.
+        quantity: What is summed: ``FIELD``, ``FORCE`` or ``WRENCH``, on a CPU also ``MUTUAL_FORCE``.
         count: Number of target rows.
         target: Packed column of each target row, shape [count].
         begin: First source of each target row, shape [count].
@@ -83,7 +83,7 @@ class Rows:
         pair_count: Pairs that the loop evaluates.
     """
 
-    quantity: str
+    quantity: Quantity
     count: int
     target: wp.array
     begin: wp.array
@@ -103,7 +103,7 @@ class Rows:
         return self.form == FUSED
 
 
-def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
+def make_rows(segments, device, quantity=Quantity.FIELD, *, forms=FORMS) -> Rows:
     """Build the work list of target ranges that each see one source range.
 
     Args:
@@ -131,8 +131,8 @@ def make_rows(segments, device, quantity=FIELD, *, forms=FORMS) -> Rows:
     if form == MIRRORED:
         mirror = pair_mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, device)
         splits = mirror.slabs + mirror.splits
-    if quantity == KELVIN and device.is_cuda:
-        quantity = FORCE
+    if quantity == Quantity.MUTUAL_FORCE and device.is_cuda:
+        quantity = Quantity.FORCE
     if form == FUSED:
         shape = pair_sums_cuda.choose_shape(quantity, count)
         tiles, splits = _block_tiles(segments, starts, shape.targets, 1), 0
@@ -247,9 +247,9 @@ def _stripes(begin, end, wanted):
 
 
 @cache
-def _reference_kernel(dtype, quantity: str):
+def _reference_kernel(dtype, quantity: Quantity):
     vec3 = wp.types.vector(3, dtype)
-    summed_field, summed_force = quantity in (FIELD, WRENCH), quantity != FIELD
+    summed_field, summed_force = quantity in (Quantity.FIELD, Quantity.WRENCH), quantity != Quantity.FIELD
 
     @wp.kernel(module="unique", enable_backward=False)
     def pair_loop_reference(

@@ -24,7 +24,7 @@ from warpmag.kernels.pairs.fused_cuda import Shape, own_target, pair_summation, 
 from warpmag.kernels.pairs.neighbors import pair_correction
 from warpmag.kernels.pairs.packing import ball_volume
 from warpmag.kernels.pairs.pair_law import gradient_times
-from warpmag.kernels.pairs.pair_terms import WIDTHS, WRENCH
+from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
 from warpmag.kernels.shared import team as cpu_team
 from warpmag.kernels.shared.reductions import group_sum, group_threads
 
@@ -82,11 +82,11 @@ def launch_zeeman_moments(moments, h, material: CurveParameters, effective):
 
 
 @cache
-def wrench_functions(dtype, quantity: str):
+def wrench_functions(dtype, quantity: Quantity):
     """Warp functions that correct a target's sums, and that make force and torque of what they come to."""
     vec3 = wp.types.vector(3, dtype)
     sums = wp.types.vector(WIDTHS[quantity], dtype)
-    summed_field = quantity == WRENCH
+    summed_field = quantity == Quantity.WRENCH
     correct_pairs = pair_correction(dtype, gradient=True, exclude_body=True)
 
     @wp.func
@@ -135,7 +135,7 @@ def wrench_functions(dtype, quantity: str):
 
 
 @cache
-def _finish_kernel(dtype, quantity: str):
+def _finish_kernel(dtype, quantity: Quantity):
     vec3 = wp.types.vector(3, dtype)
     correct, store = wrench_functions(dtype, quantity)
     sum_group = group_sum(wp.types.vector(WIDTHS[quantity], dtype))
@@ -173,7 +173,7 @@ def _finish_kernel(dtype, quantity: str):
 
 
 @cache
-def _sum_kernel(dtype, quantity: str, shape: Shape):
+def _sum_kernel(dtype, quantity: Quantity, shape: Shape):
     vec3 = wp.types.vector(3, dtype)
     sums = wp.types.vector(WIDTHS[quantity], dtype)
     correct, store = wrench_functions(dtype, quantity)

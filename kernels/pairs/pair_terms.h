@@ -1,0 +1,143 @@
+#pragma once
+// The terms that one pair of moments adds to the sums of its target, or of both its ends. A number N is a scalar on a
+// GPU and a vector of them on a CPU; Real is its scalar type.
+//
+// A pair is described by its separation r from the source to the target, its inverse distance, clamped and masked by
+// the caller, the source's moment b with a multiple u of it, and for a force the target's effective moment e. The
+// caller computes the inverse distance as W/d, for which a CPU's last Newton step is shortest at W = 2. Constant
+// factors are applied to the sums at their end:
+//
+// | quantity     | u     | sums over the pairs                                           | result |
+// |--------------|-------|---------------------------------------------------------------|-------------------------------|
+// | FIELD        | W²b/3 | h = (W/d)³ [(W/d)² (r·b) r − u]                               | 4πH = 3 W⁻⁵ h | | FORCE |
+// W²b/5 | f = (W/d)⁵ [(r·e) u + (u·e) r − (W/d)² (r·e)(r·b) r],         |                               | | |       | a
+// = (W/d)⁵ (r·b)                                              | 4π(e·∇)H = 15 W⁻⁷ f + 3 W⁻⁵ ae | | WRENCH       | W²b/5
+// | f and a, and h = (W/d)⁵ (r·b) r, g = (W/d)³ b                 | also 4πH = 3 W⁻⁵ h − W⁻³ g    | | MUTUAL_FORCE |
+// none  | h = (W/d)⁵ [(r·b) m + (r·m) b + (b·m − 5 W⁻² (W/d)² (r·b)(r·m)) r] | 4π(m·∇)H = 3 W⁻⁵ h       |
+//
+// The products are ordered so that no factor beyond r⁻³ leaves the float32 range before it is multiplied by r.
+
+namespace warpmag {
+
+// What is summed: H; (e·∇)H for an effective moment e of the target; both of them; (m·∇)H for its moment m.
+// The values are those of pair_terms.Quantity.
+enum class Quantity { FIELD, FORCE, WRENCH, MUTUAL_FORCE };
+
+// Numbers that are stored for a target.
+constexpr int width(Quantity q) { return q == Quantity::WRENCH ? 6 : 3; }
+
+#if defined(__CUDA_ARCH__)
+constexpr Real W = 1;
+#else
+constexpr Real W = 2;
+#endif
+
+// Ratio u/b of a source's scaled moment to its moment.
+constexpr Real scaled_moment(Quantity q) { return Real(double(W) * W / (q == Quantity::FIELD ? 3.0 : 5.0)); }
+
+// An entry of the work list of tiles: the target rows, the packed column of the first of them, the sources, the partial
+// sums that it is added to, and whether it stands also for the tile with sources and targets exchanged.
+struct TileEntry {
+    int row_begin, row_end, column_begin, source_begin, source_end, split, mirrored, unused;
+};
+
+template <class N> struct Vec3 {
+    N x, y, z;
+};
+
+template <class N> CUDA_CALLABLE inline Vec3<N> operator-(const Vec3<N>& a, const Vec3<N>& b) {
+    return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+
+template <class N> CUDA_CALLABLE inline Vec3<N> operator*(N factor, const Vec3<N>& v) {
+    return {factor * v.x, factor * v.y, factor * v.z};
+}
+
+template <class N> CUDA_CALLABLE inline Vec3<N>& operator+=(Vec3<N>& sum, const Vec3<N>& v) {
+    sum.x += v.x;
+    sum.y += v.y;
+    sum.z += v.z;
+    return sum;
+}
+
+template <class N> CUDA_CALLABLE inline N dot(const Vec3<N>& a, const Vec3<N>& b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+// Sums of a target, as in the table; those that a quantity lacks stay zero and are optimized away.
+template <class N> struct Sums {
+    Vec3<N> f{}, h{}, g{};
+    N a{};
+};
+
+template <class N> struct Source {
+    Vec3<N> x, b, u; // position, moment, scaled moment
+};
+
+// Adds a source at separation r, with inv = W/d, to the sums of a target of effective moment e.
+template <Quantity Q, class N>
+CUDA_CALLABLE inline void add_pair(Sums<N>& sums, const Vec3<N>& r, N inv, const Source<N>& source, const Vec3<N>& e) {
+    const Vec3<N>&b = source.b, &u = source.u;
+    const N inv2 = inv * inv, inv3 = inv2 * inv;
+    if constexpr (Q == Quantity::FIELD) {
+        const N w = inv2 * dot(r, b);
+        sums.h += inv3 * (w * r - u);
+    } else {
+        const N inv5 = inv3 * inv2, rb = dot(r, b);
+        const N p = inv2 * dot(r, e), c = inv3 * p, q = inv5 * (dot(u, e) - p * rb);
+        sums.f += c * u;
+        sums.f += q * r;
+        const N a = inv5 * rb;
+        sums.a += a;
+        if constexpr (Q == Quantity::WRENCH) {
+            sums.h += a * r;
+            sums.g += inv3 * b;
+        }
+    }
+}
+
+// Adds a pair to the sums h of its target, of moment m and scaled moment n, and to the sums g of its source.
+template <Quantity Q, class N>
+CUDA_CALLABLE inline void add_mirrored_pair(Vec3<N>& h, Vec3<N>& g, const Vec3<N>& r, N inv, const Source<N>& source,
+                                            const Vec3<N>& m, const Vec3<N>& n) {
+    const Vec3<N>& b = source.b;
+    const N inv2 = inv * inv, inv3 = inv2 * inv;
+    if constexpr (Q == Quantity::FIELD) {
+        const N w = inv2 * dot(r, b);
+        h += inv3 * (w * r - source.u);
+        const N back = inv2 * dot(r, m);
+        g += inv3 * (back * r - n);
+    } else {
+        constexpr Real FIVE = Real(5.0 / (double(W) * W));
+        const N inv5 = inv3 * inv2, rb = dot(r, b), rm = dot(r, m), bm = dot(b, m);
+        const N c = inv5 * rb, e = inv5 * rm, q = inv5 * (bm - FIVE * (inv2 * rb) * rm);
+        const Vec3<N> f = {c * m.x + e * b.x + q * r.x, c * m.y + e * b.y + q * r.y, c * m.z + e * b.z + q * r.z};
+        h += f;
+        g = g - f;
+    }
+}
+
+// Factors of h, f and g in the results.
+constexpr double W3 = double(W) * W * W, W5 = W3 * W * W, W7 = W5 * W * W;
+constexpr Real H_FACTOR = Real(3.0 / W5), F_FACTOR = Real(15.0 / W7), G_FACTOR = Real(1.0 / W3);
+
+// Writes the results of a target, width(Q) numbers: the force and then the field.
+template <Quantity Q> CUDA_CALLABLE inline void results(const Sums<Real>& sums, const Vec3<Real>& e, Real* out) {
+    const Vec3<Real>&f = sums.f, &h = sums.h, &g = sums.g;
+    if constexpr (Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE) {
+        out[0] = H_FACTOR * h.x;
+        out[1] = H_FACTOR * h.y;
+        out[2] = H_FACTOR * h.z;
+    } else {
+        out[0] = F_FACTOR * f.x + H_FACTOR * sums.a * e.x;
+        out[1] = F_FACTOR * f.y + H_FACTOR * sums.a * e.y;
+        out[2] = F_FACTOR * f.z + H_FACTOR * sums.a * e.z;
+    }
+    if constexpr (Q == Quantity::WRENCH) {
+        out[3] = H_FACTOR * h.x - G_FACTOR * g.x;
+        out[4] = H_FACTOR * h.y - G_FACTOR * g.y;
+        out[5] = H_FACTOR * h.z - G_FACTOR * g.z;
+    }
+}
+
+}
