@@ -68,6 +68,14 @@ template <class N> CUDA_CALLABLE inline N dot(const Vec3<N>& a, const Vec3<N>& b
 template <class N> struct Sums {
     Vec3<N> f{}, h{}, g{};
     N a{};
+
+    CUDA_CALLABLE inline Sums& operator+=(const Sums& other) {
+        f += other.f;
+        h += other.h;
+        g += other.g;
+        a += other.a;
+        return *this;
+    }
 };
 
 template <class N> struct Source {

@@ -34,7 +34,7 @@ from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
 from warpmag.kernels.pairs.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.sums_cpu import STRIPE, launch_pair_loop_cpu
-from warpmag.kernels.pairs.sums_cuda import Shape, choose_shape, choose_splits, launch_pair_loop_cuda
+from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_shape, choose_splits, launch_pair_loop_cuda
 from warpmag.kernels.shared.team import threads_for
 
 PACKED_ROWS = 8
@@ -92,7 +92,7 @@ class Rows:
     shares: wp.array
     threads: int
     form: str
-    shape: pair_sums_cuda.Shape | Shape | None
+    shape: pair_sums_cuda.Shape | LoopShape | None
     mirror: pair_mirror_cuda.Mirror | None
     splits: int
     pair_count: int
@@ -184,7 +184,7 @@ def _are_mutual(segments, count: int) -> bool:
     return bool(inside and count >= _LEAST_MUTUAL * (end - begin))
 
 
-def _cuda_tiles(segments, starts, shape: Shape, multiprocessors: int):
+def _cuda_tiles(segments, starts, shape: LoopShape, multiprocessors: int):
     """Tiles of as many targets as a block holds, each for every part of the sources; and the number of parts."""
     width = 32 * shape.targets
     sizes = segments[:, 1] - segments[:, 0]

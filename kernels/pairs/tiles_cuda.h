@@ -1,0 +1,109 @@
+#pragma once
+// Common parts of the three forms of all-pairs sums on a GPU: reading and staging moments, the inverse distance, and
+// sums over the warps of a block.
+
+#include "pairs/pair_terms.h"
+
+namespace warpmag {
+
+constexpr unsigned ALL_LANES = ~0u;
+
+// 1/√c. The library's rsqrtf spends as many instructions on denormal numbers as the pair law has left.
+CUDA_CALLABLE inline float inverse_root(float c) {
+    float y;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c));
+    return y;
+}
+
+CUDA_CALLABLE inline double inverse_root(double c) { return rsqrt(c); }
+
+// Inverse of a distance d that is at least the contact distance; zero for a masked pair, and for points at d = 0.
+CUDA_CALLABLE inline Real masked_inverse(Real d2, Real contact, bool masked) {
+    const Real c = max(d2, contact * contact);
+    return c > 0 && !masked ? inverse_root(c) : Real(0);
+}
+
+// A column of a packed table of moments.
+struct Moment {
+    Vec3<Real> x;
+    Real radius;
+    Vec3<Real> m;
+    Real label;
+};
+
+// Rows of a table, of which the native code reads columns.
+struct Table {
+    const Real* data;
+    size_t stride;
+
+    CUDA_CALLABLE Table(const wp::array_t<Real>& rows) : data(rows.data), stride(rows.strides[0] / sizeof(Real)) {}
+
+    CUDA_CALLABLE Vec3<Real> vector(int row, int column) const {
+        const Real* p = data + row * stride + column;
+        return {p[0], p[stride], p[2 * stride]};
+    }
+
+    // A packed moment; with the others' place, radius and label, but no moment, unless it is wanted.
+    CUDA_CALLABLE Moment moment(int column, bool wanted = true) const {
+        const Real* p = data + column;
+        return {vector(0, column), p[3 * stride], wanted ? vector(4, column) : Vec3<Real>{}, p[7 * stride]};
+    }
+};
+
+// Four numbers that are read at once.
+struct alignas(16) Quad {
+    Real x, y, z, w;
+};
+
+// A target of a lane, and for a force its effective moment.
+struct Target {
+    Vec3<Real> x;
+    Real radius, label;
+    Vec3<Real> e;
+};
+
+// Adds a source to the sums of all targets of a lane; inverse(k, d2) is the inverse distance to the k-th.
+template <Quantity Q, int TARGETS, class Inverse>
+CUDA_CALLABLE inline void add_source(Sums<Real> (&sums)[TARGETS], const Target (&targets)[TARGETS],
+                                     const Source<Real>& source, Inverse inverse) {
+#pragma unroll
+    for (int k = 0; k < TARGETS; ++k) {
+        const Vec3<Real> r = targets[k].x - source.x;
+        add_pair<Q>(sums[k], r, inverse(k, dot(r, r)), source, targets[k].e);
+    }
+}
+
+// Lowest and highest label among the targets of some lanes; a source of another label is of no target's body.
+struct LabelRange {
+    Real lowest, highest;
+
+    template <int LANES, int TARGETS, class T> static CUDA_CALLABLE LabelRange of(const T (&targets)[TARGETS]) {
+        LabelRange range{targets[0].label, targets[0].label};
+#pragma unroll
+        for (int k = 1; k < TARGETS; ++k) {
+            range.lowest = min(range.lowest, targets[k].label);
+            range.highest = max(range.highest, targets[k].label);
+        }
+#pragma unroll
+        for (int step = LANES / 2; step > 0; step /= 2) {
+            range.lowest = min(range.lowest, __shfl_xor_sync(ALL_LANES, range.lowest, step));
+            range.highest = max(range.highest, __shfl_xor_sync(ALL_LANES, range.highest, step));
+        }
+        return range;
+    }
+
+    CUDA_CALLABLE bool excludes(Real label) const { return label < lowest || label > highest; }
+};
+
+// Adds up what the warps of a block left in shared memory, in their order; store(item, total) is called for each item.
+template <int WARPS, int QUADS, class Store>
+CUDA_CALLABLE inline void sum_warps(const Quad (&staging)[WARPS][QUADS], int thread, int items, Store store) {
+    for (int item = thread; item < items; item += 32 * WARPS) {
+        Real total = 0;
+#pragma unroll
+        for (int w = 0; w < WARPS; ++w) total += ((const Real*)staging[w])[item];
+        store(item, total);
+    }
+}
+
+}
