@@ -8,10 +8,18 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.pairs import finish_cpu
-from warpmag.kernels.pairs.fused_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
+from warpmag.kernels.pairs.fused_cuda import (
+    FusedShape,
+    own_target,
+    pair_summation,
+    target_share,
+    this_block,
+    this_thread,
+)
 from warpmag.kernels.pairs.neighbors import pair_correction
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared import team as cpu_team
+from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.reductions import group_sum, group_threads
 
 INVERSE_4PI = 0.07957747154594767
@@ -53,7 +61,7 @@ def finished_field(dtype):
 
 
 @cache
-def summed_field(dtype, shape: Shape):
+def summed_field(dtype, shape: FusedShape):
     """Warp function by which a block sums the field [A/m] of a tile's sources at its targets.
 
     All threads of the block call it. A thread that has a target, see ``pair_sums_cuda.own_target``, gets its field.
@@ -126,11 +134,17 @@ def _finish_kernel(dtype):
 
 
 @cache
-def _sum_kernel(dtype, shape: Shape):
+def _sum_kernel(dtype, shape: FusedShape):
     vec3 = wp.types.vector(3, dtype)
     field_of_tile = summed_field(dtype, shape)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(shape.threads, 1))
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(shape.threads, 1),
+        module_options=native_options("pairs/fused_cuda.h", dtype=dtype),
+    )
     def sum_field(
         # inputs:
         tiles: wp.array2d[int],

@@ -38,21 +38,25 @@ struct Table {
 
     CUDA_CALLABLE Table(const wp::array_t<Real>& rows) : data(rows.data), stride(rows.strides[0] / sizeof(Real)) {}
 
+    CUDA_CALLABLE Real operator()(int row, int column) const { return data[row * stride + column]; }
+
     CUDA_CALLABLE Vec3<Real> vector(int row, int column) const {
-        const Real* p = data + row * stride + column;
-        return {p[0], p[stride], p[2 * stride]};
+        return {(*this)(row, column), (*this)(row + 1, column), (*this)(row + 2, column)};
     }
 
     // A packed moment; with the others' place, radius and label, but no moment, unless it is wanted.
     CUDA_CALLABLE Moment moment(int column, bool wanted = true) const {
-        const Real* p = data + column;
-        return {vector(0, column), p[3 * stride], wanted ? vector(4, column) : Vec3<Real>{}, p[7 * stride]};
+        return {vector(0, column), (*this)(3, column), wanted ? vector(4, column) : Vec3<Real>{}, (*this)(7, column)};
     }
 };
 
-// Four numbers that are read at once.
+// Numbers that are read at once.
 struct alignas(16) Quad {
     Real x, y, z, w;
+};
+
+struct alignas(2 * sizeof(Real)) Pair {
+    Real x, y;
 };
 
 // A target of a lane, and for a force its effective moment.

@@ -92,7 +92,7 @@ class Rows:
     shares: wp.array
     threads: int
     form: str
-    shape: pair_sums_cuda.Shape | LoopShape | None
+    shape: pair_sums_cuda.FusedShape | LoopShape | None
     mirror: pair_mirror_cuda.Mirror | None
     splits: int
     pair_count: int

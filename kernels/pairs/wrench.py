@@ -20,12 +20,20 @@ import warp as wp
 from warpmag.kernels.material.curves import CurveParameters, curve_derivative_times
 from warpmag.kernels.pairs import finish_cpu
 from warpmag.kernels.pairs.field import INVERSE_4PI
-from warpmag.kernels.pairs.fused_cuda import Shape, own_target, pair_summation, target_share, this_block, this_thread
+from warpmag.kernels.pairs.fused_cuda import (
+    FusedShape,
+    own_target,
+    pair_summation,
+    target_share,
+    this_block,
+    this_thread,
+)
 from warpmag.kernels.pairs.neighbors import pair_correction
 from warpmag.kernels.pairs.packing import ball_volume
 from warpmag.kernels.pairs.pair_law import gradient_times
 from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
 from warpmag.kernels.shared import team as cpu_team
+from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.reductions import group_sum, group_threads
 
 MU0 = 1.2566370614359173e-06
@@ -173,14 +181,20 @@ def _finish_kernel(dtype, quantity: Quantity):
 
 
 @cache
-def _sum_kernel(dtype, quantity: Quantity, shape: Shape):
+def _sum_kernel(dtype, quantity: Quantity, shape: FusedShape):
     vec3 = wp.types.vector(3, dtype)
     sums = wp.types.vector(WIDTHS[quantity], dtype)
     correct, store = wrench_functions(dtype, quantity)
     share_of = target_share(shape)
     sum_pairs = pair_summation(dtype, quantity, shape)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(shape.threads, 1))
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(shape.threads, 1),
+        module_options=native_options("pairs/fused_cuda.h", dtype=dtype),
+    )
     def sum_wrench(
         # inputs:
         tiles: wp.array2d[int],
