@@ -66,16 +66,36 @@ struct Target {
     Vec3<Real> e;
 };
 
-// Adds a source to the sums of all targets of a lane; inverse(k, d2) is the inverse distance to the k-th.
-template <Quantity Q, int TARGETS, class Inverse>
-CUDA_CALLABLE inline void add_source(Sums<Real> (&sums)[TARGETS], const Target (&targets)[TARGETS],
-                                     const Source<Real>& source, Inverse inverse) {
+// The targets of a lane, and their sums.
+template <Quantity Q, int TARGETS> struct LaneTargets {
+    Target targets[TARGETS];
+    Sums<Real> sums[TARGETS];
+    Real clamp[TARGETS];
+
+    // Takes the squared contact distances with sources of one radius, for add.
+    CUDA_CALLABLE void clamp_for(Real radius) {
 #pragma unroll
-    for (int k = 0; k < TARGETS; ++k) {
-        const Vec3<Real> r = targets[k].x - source.x;
-        add_pair<Q>(sums[k], r, inverse(k, dot(r, r)), source, targets[k].e);
+        for (int k = 0; k < TARGETS; ++k) clamp[k] = (targets[k].radius + radius) * (targets[k].radius + radius);
     }
-}
+
+    // Adds a source that is masked for none of the targets.
+    CUDA_CALLABLE void add(const Source<Real>& source) {
+        add(source, [&](int k, Real d2) { return inverse_root(max(d2, clamp[k])); });
+    }
+
+    // Adds a source of any radius, unless masked(k) for the k-th target.
+    template <class Masked> CUDA_CALLABLE void add_masked(const Source<Real>& source, Real radius, Masked masked) {
+        add(source, [&](int k, Real d2) { return masked_inverse(d2, targets[k].radius + radius, masked(k)); });
+    }
+
+    template <class Inverse> CUDA_CALLABLE void add(const Source<Real>& source, Inverse inverse) {
+#pragma unroll
+        for (int k = 0; k < TARGETS; ++k) {
+            const Vec3<Real> r = targets[k].x - source.x;
+            add_pair<Q>(sums[k], r, inverse(k, dot(r, r)), source, targets[k].e);
+        }
+    }
+};
 
 // Lowest and highest label among the targets of some lanes; a source of another label is of no target's body.
 struct LabelRange {
