@@ -50,8 +50,8 @@ CUDA_CALLABLE inline void fold(Real (&r)[SIZE], int lane, Real* out, bool writes
 // is set where source i has another radius or is masked for a target of any lane: that is one with the target's label,
 // or for the field the source that is the lane's target k, own + LANES k.
 template <int UNROLLED, int LANES, Quantity Q, int HELD>
-CUDA_CALLABLE inline void add_stage(LaneTargets<Q, HELD>& held, const Quad* staged, int count, unsigned odd, int group,
-                                    int own) {
+CUDA_CALLABLE inline void add_shared_stage(LaneTargets<Q, HELD>& held, const Quad* staged, int count, unsigned odd,
+                                           int group, int own) {
     constexpr int GROUPS = 32 / LANES, STRIDE = GROUPS * UNROLLED;
     constexpr unsigned STEP = STRIDE < 32 ? (1u << STRIDE) - 1 : ~0u;
     const auto source_at = [&](int i) -> Source<Real> {
@@ -118,8 +118,8 @@ CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_
         ((Pair*)(staging + 64))[lane] = {s.radius, FIELD ? 0 : s.label};
         __syncwarp();
         if (base + 32 < source_end) s = load(j + 32);
-        add_stage<UNROLLED, LANES>(held, staging, min(32, source_end - base), odd, lane / LANES,
-                                   same ? column_begin + own - base : 32);
+        add_shared_stage<UNROLLED, LANES>(held, staging, min(32, source_end - base), odd, lane / LANES,
+                                          same ? column_begin + own - base : 32);
         __syncwarp();
     }
     Real r[VALUES] = {};
