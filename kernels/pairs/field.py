@@ -64,7 +64,7 @@ def finished_field(dtype):
 def summed_field(dtype, shape: FusedShape):
     """Warp function by which a block sums the field [A/m] of a tile's sources at its targets.
 
-    All threads of the block call it. A thread that has a target, see ``pair_sums_cuda.own_target``, gets its field.
+    All threads of the block call it. A thread that has a target, see ``fused_cuda.own_target``, gets its field.
     """
     vec3 = wp.types.vector(3, dtype)
     share_of = target_share(shape)

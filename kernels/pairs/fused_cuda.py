@@ -1,16 +1,4 @@
-"""Sums over pairs on a GPU, made by the very kernel that needs them: no second launch waits for the first.
-
-A block has a tile of a few targets. Each of its warps holds all of them, some in every lane, and as often as there are
-lanes for it; the warps share out the sources, stage them through shared memory, 32 at a time, and groups of lanes share
-out what is staged. What the groups have summed is added up by shuffles, most of which halve the values that a lane
-keeps, and what the warps have summed in shared memory, in an order that depends on nothing. Other threads of the block
-meanwhile bring the correction of overlapping pairs. Thread k of a block ends with the whole sum of target k, for the
-kernel to go on with.
-
-Where the sources that a group meets in one go have one radius, and none of them is left out for one of the targets,
-the clamp is a constant of the target and nothing is masked: 20 instructions a pair for the field and 31 for the force,
-next to the four or so that a source takes once for all targets of a lane, and the sixty that a warp takes to stage 32.
-"""
+"""All-pairs sums of few moments on a GPU, ``fused_cuda.h``: the kernel that needs the sums computes them itself."""
 
 import math
 from dataclasses import dataclass
@@ -23,13 +11,13 @@ from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
 
 @dataclass(frozen=True)
 class FusedShape:
-    """Shape of the blocks that walk a work list.
+    """Shape of the blocks.
 
     Attributes:
         held: Targets that a lane holds.
-        lanes: Lanes of a warp that hold other targets than each other.
+        lanes: Lanes of a warp that hold different targets.
         warps: Warps of a block that share out the sources.
-        unrolled: Sources that a lane meets in one go.
+        unrolled: Sources that the compiler interleaves.
     """
 
     held: int
@@ -63,10 +51,10 @@ class FusedShape:
         return min(32, 1 << (self.correcting // self.targets).bit_length() - 1)
 
 
-# Measured on an H200, of 132 multiprocessors: the shape, and the most targets that it is best for. Those are what the
-# multiprocessors hold at a block each. Blocks in clusters, which share out the sources of a larger tile and add up
-# through each other's shared memory, gained nothing: of two blocks, 10.4 µs where one takes 10.0 for a field at 2,560;
-# of four or eight, only 124 or 120 multiprocessors find partners.
+# Measured on an H200: the most targets that a shape is best for, those of a block on each of 132 multiprocessors, and
+# the shape. Clusters of blocks, which share out the sources of a larger tile and add up through each other's shared
+# memory, gained nothing: clusters of two take 10.4 µs for a field at 2,560 targets, single blocks 10.0; clusters of four
+# or eight use only 124 or 120 multiprocessors.
 SHAPES = {
     Quantity.FIELD: (
         (528, FusedShape(2, 2, 8, 1)),
@@ -100,13 +88,12 @@ def choose_shape(quantity: Quantity, count: int) -> FusedShape:
 
 @cache
 def pair_summation(dtype, quantity: Quantity, shape: FusedShape):
-    """Warp function by which a block sums a quantity, see ``pair_loops``, over a tile's pairs.
+    """Warp function by which a block sums a quantity over the pairs of a tile.
 
-    All threads of the block call it. Those that have a :func:`target_share` bring something to add to the sum of that
-    target. Thread k gets the sum of target k.
+    All threads of the block call it. Those that have a :func:`target_share` give a correction to add to the sum of that
+    target. Thread k gets the sum of target k. Its kernel needs ``native_options("pairs/fused_cuda.h", ...)``.
     """
     vector = wp.types.vector(WIDTHS[quantity], dtype)
-
     parameters = f"{shape.held}, {shape.lanes}, {shape.warps}, {shape.unrolled}, {shape.shares}"
 
     @wp.func_native(

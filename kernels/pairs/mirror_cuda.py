@@ -1,16 +1,7 @@
-"""The native pair loop on a GPU for many moments among themselves: a pair is met once, for both of its ends.
+"""Plan and launch of the sums of many moments among themselves on a GPU, each pair once, ``mirror_cuda.h``.
 
-The moments are cut into an odd number of equal tiles, set in a circle, and each meets the half of the others that
-follows it. A block of warps holds a home tile in registers, lane l its moments l, l + 32, ..., and walks stages of 32
-moments of the others. At step s of a stage lane l meets the moment (l + s) mod 32 with all it holds, and passes what
-it has summed for that moment on to the lane that meets it next, so that after 32 steps lane l has what the home tile
-does to moment l: 30 instructions for both ends of a field's pair and 41 of a force's, next to the eight or so that a
-moment takes once for all that a lane holds.
-
-That goes to a slab of sums that belongs to the distance between the two tiles in the circle, to which no other block
-writes; what is summed for the home tile goes to a slab of the block's own share of the walk. The finishing kernel adds
-up the slabs in order, so that nothing depends on scheduling. Slabs that would take more memory than they may are made
-in passes, each of which adds to the slabs of the last.
+The finishing kernel adds up the partial sums in order, so that results do not depend on the order in which blocks run.
+Where they would take too much memory, several passes each add to the partial sums of the one before.
 """
 
 import math
@@ -21,17 +12,18 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.sums_cuda import launch_time
 from warpmag.kernels.shared.native import native_options
 
 
 @dataclass(frozen=True)
 class MirrorShape:
-    """Shape of the blocks that walk the tiles.
+    """Shape of the blocks.
 
     Attributes:
-        moments: Moments a lane holds; a tile has at most 32 times as many.
-        warps: Warps a block.
-        blocks: Blocks that a multiprocessor holds at once, in float32.
+        moments: Moments that a lane holds; a tile has at most 32 times as many.
+        warps: Warps of a block.
+        blocks: Blocks that a multiprocessor holds together, in float32.
         unrolled: Steps of a stage that the compiler interleaves.
     """
 
@@ -41,7 +33,7 @@ class MirrorShape:
     unrolled: int
 
 
-# Measured on an H200 at 5,000 to 131,072 moments: the shape, and the most moments that it is best for.
+# Measured on an H200 at 5,000 to 131,072 moments: the most moments that a shape is best for, and the shape.
 SHAPES = {
     Quantity.FIELD: (
         (7000, MirrorShape(2, 4, 6, 2)),
@@ -123,14 +115,12 @@ def make_mirror(origin: int, count: int, quantity: Quantity, device) -> Mirror:
 
 
 def _choose_splits(shape: MirrorShape, tiles: int, walk: int, multiprocessors: int) -> int:
-    """Blocks that share the walk of a tile, of so many stages; see ``pair_loops_cuda.choose_splits``."""
+    """Number of blocks that share the ``walk`` of a tile, in stages, for which a launch is fastest."""
 
     def cost(splits):
-        waves, rest = divmod(tiles * splits, multiprocessors * shape.blocks)
-        # a multiprocessor with few blocks goes through each of them faster, but does less in all
-        share = -(-rest // multiprocessors) / shape.blocks
         work = shape.blocks * math.ceil(walk / splits / shape.warps)
-        return waves * work + (0.4 + 0.6 * share) * work * (rest > 0) + (waves + (rest > 0) + splits) * _FIXED_COST
+        time, waves = launch_time(tiles * splits, shape.blocks, work, multiprocessors)
+        return time + (waves + splits) * _FIXED_COST
 
     least = math.ceil(walk / shape.warps / _MOST_STAGES)
     return min(range(least, max(least, min(_MOST_SPLITS, walk)) + 1), key=cost)
@@ -174,7 +164,7 @@ def _kernel(dtype, quantity: Quantity, shape: MirrorShape):
 
 
 def launch_pair_loop_mirrored(m: Mirror, packed, partial):
-    """Sum a quantity over all pairs; see ``pair_loops.launch_pair_loop``."""
+    """Sum a quantity over all pairs; see ``work_list.launch_pair_loop``."""
     for first_block, blocks, nearest in m.passes:
         wp.launch_tiled(
             _kernel(partial.dtype, m.quantity, m.shape),

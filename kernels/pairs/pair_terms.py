@@ -150,18 +150,3 @@ def results(quantity: Quantity, w: float, k: str = "") -> list[str]:
     force = [f"REAL({f!r}) * f{c}{k} + REAL({a!r}) * along{k} * e{c}{k}" for c in "xyz"]
     field = [f"REAL({h!r}) * h{c}{k} - REAL({g!r}) * g{c}{k}" for c in "xyz"]
     return force if quantity == Quantity.FORCE else force + field
-
-
-def cuda_head(real: str) -> str:
-    """Text at the top of what sums on a GPU: its types, 1/√c, and 1/d of a pair that is clamped and may be left out."""
-    # the library's rsqrtf spends as many slots on denormal distances as the pair law has left
-    single = 'float y; asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c)); return y;'
-    return f"""
-    typedef {real} REAL;
-    typedef REAL NUMBER;
-    auto inverse_root = [](REAL c) {{ {single if real == "float" else "return rsqrt(c);"} }};
-    auto careful = [&](REAL d2, REAL s, bool left_out) {{
-        const REAL c = max(d2, s * s);
-        return c > 0 && !left_out ? inverse_root(c) : REAL(0);
-    }};
-    """

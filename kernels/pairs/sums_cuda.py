@@ -1,12 +1,7 @@
-"""The native pair loop on a GPU: a block of warps holds a tile of targets in registers and walks its sources.
+"""Shapes and launch of the all-pairs sums of a work list of tiles on a GPU, ``sums_cuda.h``.
 
-Each lane of a warp holds the tile's targets ``lane``, ``lane + 32``, ...; the block's warps share out the sources,
-stage them through shared memory, 32 at a time, and at the end add up their sums in order. Sources of few targets are
-also split over blocks, whose sums the finishing kernel adds up in order, so that nothing depends on scheduling.
-
-Where a stage's sources have one radius, and none of them is left out for one of the targets, the clamp is a constant of
-the target and nothing is masked: 20 instructions a pair for the field and 31 for the force, next to the five or so that
-a source takes once for all targets of a lane.
+Sources of few targets are split over blocks, each of which writes partial sums of its own, so that results do not
+depend on the order in which blocks run.
 """
 
 from dataclasses import dataclass
@@ -14,20 +9,18 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pairs.pair_terms import (
-    Quantity,
-)
+from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared.native import native_options
 
 
 @dataclass(frozen=True)
 class LoopShape:
-    """Shape of the blocks that walk a work list.
+    """Shape of the blocks.
 
     Attributes:
-        targets: Targets a lane; a tile has 32 times as many.
-        warps: Warps a block.
-        blocks: Blocks that a multiprocessor holds at once, in float32.
+        targets: Targets of a lane; a tile has 32 times as many.
+        warps: Warps of a block.
+        blocks: Blocks that a multiprocessor holds together, in float32.
     """
 
     targets: int
@@ -35,7 +28,7 @@ class LoopShape:
     blocks: int
 
 
-# Measured on an H200 at 243 to 131,072 targets: the shape, and the most targets that it is best for.
+# Measured on an H200 at 243 to 131,072 targets: the most targets that a shape is best for, and the shape.
 _SHAPES = {
     Quantity.FIELD: ((6144, LoopShape(4, 8, 2)), (65536, LoopShape(6, 4, 3)), (None, LoopShape(8, 4, 2))),
     Quantity.FORCE: ((None, LoopShape(4, 4, 3)),),
@@ -43,7 +36,7 @@ _SHAPES = {
 }
 _MOST_SPLITS = 32
 _FIXED_COST = 16
-"""Sources a block could sum in the time that it takes to start and to end."""
+"""Sources that a block sums in the time that it takes to start and to end."""
 
 
 def choose_shape(quantity: Quantity, count: int) -> LoopShape:
@@ -52,24 +45,38 @@ def choose_shape(quantity: Quantity, count: int) -> LoopShape:
 
 
 def choose_splits(shape: LoopShape, tiles: int, longest: int, multiprocessors: int) -> int:
-    """Blocks that share the sources of a tile: as many as make the last wave of blocks end with the rest.
+    """Number of blocks that share the sources of a tile, for which a launch is fastest.
 
     Args:
-        shape: LoopShape of the blocks.
+        shape: Shape of the blocks.
         tiles: Tiles before splitting.
         longest: Sources of the longest tile.
         multiprocessors: Of the device.
     """
 
     def cost(splits):
-        waves, rest = divmod(tiles * splits, multiprocessors * shape.blocks)
-        # a multiprocessor with few blocks goes through each of them faster, but does less in all
-        share = -(-rest // multiprocessors) / shape.blocks
-        work = shape.blocks * longest / splits
-        return waves * work + (0.4 + 0.6 * share) * work * (rest > 0) + (waves + (rest > 0)) * _FIXED_COST
+        time, waves = launch_time(tiles * splits, shape.blocks, shape.blocks * longest / splits, multiprocessors)
+        return time + waves * _FIXED_COST
 
     most = max(1, min(_MOST_SPLITS, longest // (2 * shape.warps)))
     return min(range(1, most + 1), key=cost)
+
+
+def launch_time(blocks: int, together: int, work: float, multiprocessors: int) -> tuple[float, int]:
+    """Time that equal blocks take, and the waves in which they run.
+
+    Args:
+        blocks: Number of blocks.
+        together: Blocks that a multiprocessor holds together.
+        work: Time that so many blocks take on a multiprocessor.
+        multiprocessors: Of the device.
+    """
+    waves, rest = divmod(blocks, multiprocessors * together)
+    if rest == 0:
+        return waves * work, waves
+    # a multiprocessor with few blocks runs each of them faster, but all of them together slower
+    share = -(-rest // multiprocessors) / together
+    return waves * work + (0.4 + 0.6 * share) * work, waves + 1
 
 
 @cache
@@ -109,7 +116,7 @@ def _kernel(dtype, quantity: Quantity, shape: LoopShape):
 
 
 def launch_pair_loop_cuda(quantity: Quantity, shape: LoopShape, targets, sources, effective, tiles, partial):
-    """Sum a quantity over all tiles; see ``pair_loops.launch_pair_loop``."""
+    """Sum a quantity over all tiles; see ``work_list.launch_pair_loop``."""
     wp.launch(
         _kernel(partial.dtype, quantity, shape),
         dim=tiles.shape[0] * 32 * shape.warps,

@@ -8,7 +8,7 @@ loads on a GPU:
 | content | position [m] | radius [m] | moment [A·m²] | body label |
 
 A ``Rows`` object says which target sees which contiguous range of sources, and what is summed over them (the quantities
-of ``pair_code``): 4π times the field H [A/m], or 4π times (e·∇)H [A²] for an effective moment e of the target, or both,
+of ``pair_terms``): 4π times the field H [A/m], or 4π times (e·∇)H [A²] for an effective moment e of the target, or both,
 the latter first. There are the plain Warp loop, readable, exact for overlapping balls, and kept as the reference; and
 native code, which evaluates the dipole clamped at contact (see ``pair_law``) and leaves overlapping pairs to
 ``neighbors``. Sums leave in ``partial`` rows, several per target where threads or blocks share out the pairs; the
@@ -17,9 +17,9 @@ three forms, of which ``Rows`` holds the fastest that a caller allows:
 
 | form | native code | for |
 |---|---|---|
-| ``FUSED`` | ``pair_sums_cuda`` | few moments: no loop, the kernel that needs the sums makes them itself |
-| ``MIRRORED`` | ``pair_mirror_cuda`` | many moments among themselves: each pair is met once, for both of its ends |
-| ``LOOP`` | ``pair_loops_cuda``, ``pair_loops_cpu`` | anything |
+| ``FUSED`` | ``fused_cuda`` | few moments: no loop, the kernel that needs the sums makes them itself |
+| ``MIRRORED`` | ``mirror_cuda`` | many moments among themselves: each pair is met once, for both of its ends |
+| ``LOOP`` | ``sums_cuda``, ``sums_cpu`` | anything |
 """
 
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ class Rows:
         target: Packed column of each target row, shape [count].
         begin: First source of each target row, shape [count].
         end: One past the last source of each target row, shape [count].
-        tiles: Work list of the native loop, see ``pair_code``, shape [tiles, TILE_COLUMNS].
+        tiles: Work list of the native loop, see ``pair_terms``, shape [tiles, TILE_COLUMNS].
         shares: On a CPU the tile at which each share begins, and the end, shape [splits + 1].
         threads: On a CPU the threads that take them.
         form: How the sums are made: ``LOOP``, ``FUSED`` or ``MIRRORED``.
@@ -111,7 +111,7 @@ def make_rows(segments, device, quantity=Quantity.FIELD, *, forms=FORMS) -> Rows
         device: Warp device.
         quantity: What is to be summed.
         forms: Ways in which the sums may be made. ``MIRRORED`` is for targets that are most of one range of sources,
-            and brings the sums of the rest, too; ``FUSED`` for kernels that call ``pair_sums_cuda`` themselves. A CPU
+            and brings the sums of the rest, too; ``FUSED`` for kernels that call ``fused_cuda`` themselves. A CPU
             has a ``LOOP`` only.
     """
     segments = np.asarray(segments, np.int64).reshape(-1, 4)
