@@ -46,82 +46,27 @@ CUDA_CALLABLE inline void fold(Real (&r)[SIZE], int lane, Real* out, bool writes
     }
 }
 
-// Adds up to 32 staged sources to the sums of a lane's targets, which share them out in GROUPS of lanes. Bit i of odd
-// is set where source i has another radius or is masked for a target of any lane: that is one with the target's label,
-// or for the field the source that is the lane's target k, own + LANES k.
-template <int UNROLLED, int LANES, Quantity Q, int HELD>
-CUDA_CALLABLE inline void add_shared_stage(LaneTargets<Q, HELD>& held, const Quad* staged, int count, unsigned odd,
-                                           int group, int own) {
-    constexpr int GROUPS = 32 / LANES, STRIDE = GROUPS * UNROLLED;
-    constexpr unsigned STEP = STRIDE < 32 ? (1u << STRIDE) - 1 : ~0u;
-    const auto source_at = [&](int i) -> Source<Real> {
-        const Quad a = staged[i], b = staged[i + 32];
-        return {{a.x, a.y, a.z}, {a.w, b.x, b.y}, {b.z, b.w, scaled_moment(Q) * b.y}};
-    };
-#pragma unroll 1
-    for (int first = 0; first < count; first += STRIDE) {
-        if ((odd >> first & STEP) == 0) {
-#pragma unroll
-            for (int i = 0; i < UNROLLED; ++i) held.add(source_at(first + GROUPS * i + group));
-        } else {
-#pragma unroll 1
-            for (int i = first + group; i < first + STRIDE; i += GROUPS) {
-                const Pair c = ((const Pair*)(staged + 64))[i];
-                held.add_masked(source_at(i), c.x, [&](int k) {
-                    return Q == Quantity::FIELD ? i - own == LANES * k : c.y == held.targets[k].label;
-                });
-            }
-        }
-    }
-}
-
 // Sums of a warp's share of the sources of a tile, written to staging: lane l has targets l, l + LANES, ...
 template <Quantity Q, int HELD, int LANES, int UNROLLED>
 CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_begin, int source_end,
                                     const Table& target_rows, const Table& sources, const Table& effective_rows,
                                     Quad* staging) {
     constexpr bool FIELD = Q == Quantity::FIELD;
-    constexpr Real SCALE = scaled_moment(Q);
     constexpr int VALUES = padded(HELD * width(Q), LANES);
     const int column_begin = tile.column_begin, count = tile.row_end - tile.row_begin, own = lane % LANES;
     const bool same = sources.data == target_rows.data;
-    const unsigned own_begin = same ? column_begin : 0, own_count = same ? count : 0;
-    // moments of zero follow the last one and may be read
-    const auto load = [&](int j) { return sources.moment(j, j < source_end); };
-    const Real radius = sources(3, tile.source_begin);
-    Moment s;
-    if (source_begin < source_end) s = load(source_begin + lane);
-
-    LaneTargets<Q, HELD> held;
-#pragma unroll
-    for (int k = 0; k < HELD; ++k) {
-        // beyond the last target others are read, and not written; but the label, which masks, and the effective
-        // moment, whose table may end, are those of the last
+    // beyond the last target others are read, and not written; but the label, which masks, and the effective moment,
+    // whose table may end, are those of the last
+    const auto target_at = [&](int k) -> Target {
         const Moment t = target_rows.moment(column_begin + own + LANES * k);
         const int column = column_begin + min(own + LANES * k, count - 1);
-        held.targets[k] = {t.x, t.radius};
-        if constexpr (!FIELD) held.targets[k].label = target_rows(7, column);
-        if constexpr (!FIELD) held.targets[k].e = effective_rows.vector(0, column);
-    }
-    held.clamp_for(radius);
-    LabelRange labels;
-    if constexpr (!FIELD) labels = LabelRange::of<LANES>(held.targets);
-
-#pragma unroll 1
-    for (int base = source_begin; base < source_end; base += 32) {
-        const int j = base + lane;
-        const unsigned odd =
-            ~__ballot_sync(ALL_LANES, s.radius == radius && s.radius > 0
-                                          && (FIELD ? j - own_begin >= own_count : labels.excludes(s.label)));
-        staging[lane] = {s.x.x, s.x.y, s.x.z, s.m.x};
-        staging[lane + 32] = {s.m.y, s.m.z, SCALE * s.m.x, SCALE * s.m.y};
-        ((Pair*)(staging + 64))[lane] = {s.radius, FIELD ? 0 : s.label};
-        __syncwarp();
-        if (base + 32 < source_end) s = load(j + 32);
-        add_shared_stage<UNROLLED, LANES>(held, staging, min(32, source_end - base), odd, lane / LANES,
-                                          same ? column_begin + own - base : 32);
-        __syncwarp();
-    }
+        if constexpr (FIELD) return {t.x, t.radius};
+        else return {t.x, t.radius, target_rows(7, column), effective_rows.vector(0, column)};
+    };
+    LaneTargets<Q, HELD> held;
+    add_sources<LANES, UNROLLED, false>(held, target_at, sources, source_begin, source_end,
+                                        sources(3, tile.source_begin), same ? column_begin : FAR, same ? count : 0,
+                                        lane, staging);
     Real r[VALUES] = {};
 #pragma unroll
     for (int k = 0; k < HELD; ++k) results<Q>(held.sums[k], held.targets[k].e, r + k * width(Q));

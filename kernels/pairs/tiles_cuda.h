@@ -7,6 +7,7 @@
 namespace warpmag {
 
 constexpr unsigned ALL_LANES = ~0u;
+constexpr int FAR = 1 << 30; // beyond all columns
 
 // 1/√c. The library's rsqrtf spends as many instructions on denormal numbers as the pair law has left.
 CUDA_CALLABLE inline float inverse_root(float c) {
@@ -118,6 +119,78 @@ struct LabelRange {
 
     CUDA_CALLABLE bool excludes(Real label) const { return label < lowest || label > highest; }
 };
+
+// Adds the sources `begin` to `end` to the sums of a warp's targets, which lanes LANES apart hold in common. The
+// sources are staged in shared memory, 32 at a time; 32 / LANES groups of lanes share them out, and a lane takes
+// UNROLLED of them in a step. Steps whose sources have one radius, and none of which is masked, take fewer
+// instructions: a source is masked for a target of its label, or for the field if it is the target, of which there are
+// own_count from column own_begin on. The radius is that of a LONG sum's stage, or of all sources; a LONG sum is by
+// parts, to keep its digits.
+template <int LANES, int UNROLLED, bool LONG, Quantity Q, int HELD, class TargetAt>
+CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt target_at, const Table& sources, int begin,
+                                      int end, Real radius, int own_begin, unsigned own_count, int lane, Quad* staged) {
+    constexpr bool FIELD = Q == Quantity::FIELD;
+    constexpr Real SCALE = scaled_moment(Q);
+    constexpr int GROUPS = 32 / LANES, STRIDE = GROUPS * UNROLLED, STAGES_PER_PART = 16;
+    constexpr int RUN = LONG ? 32 : STRIDE;
+    constexpr unsigned RUN_MASK = RUN < 32 ? (1u << RUN) - 1 : ~0u;
+    // packed rows may be read beyond the last moment, but for what follows to be of another radius
+    const auto load = [&](int j) { return sources.moment(LONG ? min(j, end - 1) : j, j < end); };
+    const auto source_at = [&](int i) -> Source<Real> {
+        const Quad a = staged[i], b = staged[i + 32];
+        return {{a.x, a.y, a.z}, {a.w, b.x, b.y}, {b.z, b.w, SCALE * b.y}};
+    };
+    Moment s;
+    if (begin < end) s = load(begin + lane);
+#pragma unroll
+    for (int k = 0; k < HELD; ++k) held.targets[k] = target_at(k);
+    LabelRange labels;
+    if constexpr (!FIELD) labels = LabelRange::of<LANES>(held.targets);
+    if constexpr (!LONG) held.clamp_for(radius);
+    Sums<Real> long_sums[HELD];
+#pragma unroll 1
+    for (int base = begin; base < end; base += 32) {
+        const int j = base + lane, count = min(32, end - base);
+        if constexpr (LONG) radius = __shfl_sync(ALL_LANES, s.radius, 0);
+        const bool plain = s.radius == radius && s.radius > 0
+                           && (FIELD ? unsigned(j - own_begin) >= own_count : labels.excludes(s.label));
+        const unsigned odd = ~__ballot_sync(ALL_LANES, plain);
+        staged[lane] = {s.x.x, s.x.y, s.x.z, s.m.x};
+        staged[lane + 32] = {s.m.y, s.m.z, SCALE * s.m.x, SCALE * s.m.y};
+        ((Pair*)(staged + 64))[lane] = {s.radius, FIELD ? 0 : s.label};
+        __syncwarp();
+        if (base + 32 < end) s = load(j + 32);
+        if constexpr (LONG) held.clamp_for(radius);
+#pragma unroll 1
+        for (int first = 0; first < count; first += RUN) {
+            const int last = LONG ? count : first + RUN;
+            if ((odd >> first & RUN_MASK) == 0) {
+#pragma unroll 1
+                for (int step = first; step < last; step += STRIDE)
+#pragma unroll
+                    for (int i = 0; i < UNROLLED; ++i) held.add(source_at(step + GROUPS * i + lane / LANES));
+            } else {
+#pragma unroll 1
+                for (int i = first + lane / LANES; i < last; i += GROUPS) {
+                    const Pair c = ((const Pair*)(staged + 64))[i];
+                    const int offset = base + i - own_begin - lane % LANES;
+                    held.add_masked(source_at(i), c.x,
+                                    [&](int k) { return FIELD ? offset == LANES * k : c.y == held.targets[k].label; });
+                }
+            }
+        }
+        __syncwarp();
+        if (LONG && (base - begin) % (32 * STAGES_PER_PART) == 32 * (STAGES_PER_PART - 1)) {
+#pragma unroll
+            for (int k = 0; k < HELD; ++k) {
+                long_sums[k] += held.sums[k];
+                held.sums[k] = {};
+            }
+        }
+    }
+#pragma unroll
+    for (int k = 0; k < HELD && LONG; ++k) held.sums[k] += long_sums[k];
+}
 
 // Adds up what the warps of a block left in shared memory, in their order; store(item, total) is called for each item.
 template <int WARPS, int QUADS, class Store>
