@@ -45,6 +45,10 @@ template <class N> struct Vec3 {
     N x, y, z;
 };
 
+template <class N> CUDA_CALLABLE inline Vec3<N> operator+(const Vec3<N>& a, const Vec3<N>& b) {
+    return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+
 template <class N> CUDA_CALLABLE inline Vec3<N> operator-(const Vec3<N>& a, const Vec3<N>& b) {
     return {a.x - b.x, a.y - b.y, a.z - b.z};
 }
@@ -53,12 +57,7 @@ template <class N> CUDA_CALLABLE inline Vec3<N> operator*(N factor, const Vec3<N
     return {factor * v.x, factor * v.y, factor * v.z};
 }
 
-template <class N> CUDA_CALLABLE inline Vec3<N>& operator+=(Vec3<N>& sum, const Vec3<N>& v) {
-    sum.x += v.x;
-    sum.y += v.y;
-    sum.z += v.z;
-    return sum;
-}
+template <class N> CUDA_CALLABLE inline Vec3<N>& operator+=(Vec3<N>& sum, const Vec3<N>& v) { return sum = sum + v; }
 
 template <class N> CUDA_CALLABLE inline N dot(const Vec3<N>& a, const Vec3<N>& b) {
     return a.x * b.x + a.y * b.y + a.z * b.z;
@@ -69,13 +68,7 @@ template <class N> struct Sums {
     Vec3<N> f{}, h{}, g{};
     N a{};
 
-    CUDA_CALLABLE inline Sums& operator+=(const Sums& other) {
-        f += other.f;
-        h += other.h;
-        g += other.g;
-        a += other.a;
-        return *this;
-    }
+    CUDA_CALLABLE Sums& operator+=(const Sums& s) { return *this = {f + s.f, h + s.h, g + s.g, a + s.a}; }
 };
 
 template <class N> struct Source {
@@ -119,7 +112,7 @@ CUDA_CALLABLE inline void add_mirrored_pair(Vec3<N>& h, Vec3<N>& g, const Vec3<N
         constexpr Real FIVE = Real(5.0 / (double(W) * W));
         const N inv5 = inv3 * inv2, rb = dot(r, b), rm = dot(r, m), bm = dot(b, m);
         const N c = inv5 * rb, e = inv5 * rm, q = inv5 * (bm - FIVE * (inv2 * rb) * rm);
-        const Vec3<N> f = {c * m.x + e * b.x + q * r.x, c * m.y + e * b.y + q * r.y, c * m.z + e * b.z + q * r.z};
+        const Vec3<N> f = c * m + e * b + q * r;
         h += f;
         g = g - f;
     }
@@ -129,23 +122,13 @@ CUDA_CALLABLE inline void add_mirrored_pair(Vec3<N>& h, Vec3<N>& g, const Vec3<N
 constexpr double W3 = double(W) * W * W, W5 = W3 * W * W, W7 = W5 * W * W;
 constexpr Real H_FACTOR = Real(3.0 / W5), F_FACTOR = Real(15.0 / W7), G_FACTOR = Real(1.0 / W3);
 
+CUDA_CALLABLE inline void put(Real* out, const Vec3<Real>& v) { out[0] = v.x, out[1] = v.y, out[2] = v.z; }
+
 // Writes the results of a target, width(Q) numbers: the force and then the field.
 template <Quantity Q> CUDA_CALLABLE inline void results(const Sums<Real>& sums, const Vec3<Real>& e, Real* out) {
-    const Vec3<Real>&f = sums.f, &h = sums.h, &g = sums.g;
-    if constexpr (Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE) {
-        out[0] = H_FACTOR * h.x;
-        out[1] = H_FACTOR * h.y;
-        out[2] = H_FACTOR * h.z;
-    } else {
-        out[0] = F_FACTOR * f.x + H_FACTOR * sums.a * e.x;
-        out[1] = F_FACTOR * f.y + H_FACTOR * sums.a * e.y;
-        out[2] = F_FACTOR * f.z + H_FACTOR * sums.a * e.z;
-    }
-    if constexpr (Q == Quantity::WRENCH) {
-        out[3] = H_FACTOR * h.x - G_FACTOR * g.x;
-        out[4] = H_FACTOR * h.y - G_FACTOR * g.y;
-        out[5] = H_FACTOR * h.z - G_FACTOR * g.z;
-    }
+    if constexpr (Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE) put(out, H_FACTOR * sums.h);
+    else put(out, F_FACTOR * sums.f + H_FACTOR * sums.a * e);
+    if constexpr (Q == Quantity::WRENCH) put(out + 3, H_FACTOR * sums.h - G_FACTOR * sums.g);
 }
 
 }
