@@ -53,7 +53,7 @@ class FusedShape:
 
 # Measured on an H200: the most targets that a shape is best for, those of a block on each of 132 multiprocessors, and
 # the shape. Clusters of blocks, which share out the sources of a larger tile and add up through each other's shared
-# memory, gained nothing: clusters of two take 10.4 µs for a field at 2,560 targets, single blocks 10.0; clusters of four
+# memory, gained nothing: clusters of two take 10.4 µs for a field at 2,560 targets, single blocks 10.0; those of four
 # or eight use only 124 or 120 multiprocessors.
 SHAPES = {
     Quantity.FIELD: (

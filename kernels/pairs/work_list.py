@@ -7,8 +7,8 @@ loads on a GPU:
 |---|---|---|---|---|
 | content | position [m] | radius [m] | moment [A·m²] | body label |
 
-A ``Rows`` object says which target sees which contiguous range of sources, and what is summed over them (the quantities
-of ``pair_terms``): 4π times the field H [A/m], or 4π times (e·∇)H [A²] for an effective moment e of the target, or both,
+A ``Rows`` object says which target sees which contiguous range of sources, and what is summed over them (quantities of
+``pair_terms``): 4π times the field H [A/m], or 4π times (e·∇)H [A²] for an effective moment e of the target, or both,
 the latter first. There are the plain Warp loop, readable, exact for overlapping balls, and kept as the reference; and
 native code, which evaluates the dipole clamped at contact (see ``pair_law``) and leaves overlapping pairs to
 ``neighbors``. Sums leave in ``partial`` rows, several per target where threads or blocks share out the pairs; the
