@@ -154,13 +154,13 @@ def test_any_count_of_touching_balls(count, dtype, device):
     [
         (module, quantity, shape)
         for module in (pair_sums_cuda, pair_mirror_cuda)
-        for quantity, table in module.SHAPES.items()
+        for quantity, table in module._SHAPES.items()
         for _, shape in table
     ],
 )
 def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
     """Those for many moments too, with some moments that fill no tile; of one radius but for a few."""
-    monkeypatch.setitem(module.SHAPES, quantity, ((None, shape),))
+    monkeypatch.setitem(module._SHAPES, quantity, ((None, shape),))
     form = MIRRORED if module is pair_mirror_cuda else FUSED
     x, radii, m = pile(count=1103)
     radii[40:] = 0.005

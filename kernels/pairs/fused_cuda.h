@@ -1,17 +1,11 @@
-#pragma once
-// All-pairs sums of few moments on a GPU, for a fused kernel: the kernel that needs the sums computes them itself, and
-// no second launch waits for the first.
+// All-pairs sums of few moments on a GPU, for a kernel that computes the sums that it needs itself, so that no second
+// launch waits for the first: field (Eq. 1) and force (Eqs. 4, 13 and 14).
 //
 // A block has a tile of a few targets. Each of its warps holds all of them, some in every lane, and as often as there
-// are lanes for it; the warps share out the sources, stage them in shared memory, 32 at a time, and groups of lanes
-// share out the staged sources. The sums of the groups are added up by shuffles, most of which halve the values that a
-// lane keeps, and the sums of the warps in shared memory, in a fixed order. Other threads of the block meanwhile
-// compute the correction of overlapping pairs. Thread k of a block ends with the whole sum of target k.
-//
-// Where the sources of a step have one radius, and none of them is masked for one of the targets, the clamp is a
-// constant of the target: 20 instructions a pair for the field and 31 for the force, next to the four or so that a
-// source takes once for all targets of a lane, and the sixty that a warp takes to stage 32.
-
+// are lanes for it; the warps share out the sources. The sums of a warp's lanes are added up by shuffles, and the sums
+// of the warps in shared memory, in a fixed order. Other threads of the block meanwhile compute the correction of
+// overlapping pairs. Thread k of a block ends with the total of target k.
+#pragma once
 #include "pairs/tiles_cuda.h"
 
 namespace warpmag {

@@ -55,7 +55,7 @@ class FusedShape:
 # the shape. Clusters of blocks, which share out the sources of a larger tile and add up through each other's shared
 # memory, gained nothing: clusters of two take 10.4 µs for a field at 2,560 targets, single blocks 10.0; those of four
 # or eight use only 124 or 120 multiprocessors.
-SHAPES = {
+_SHAPES = {
     Quantity.FIELD: (
         (528, FusedShape(2, 2, 8, 1)),
         (1056, FusedShape(4, 2, 8, 2)),
@@ -81,9 +81,9 @@ SHAPES = {
 }
 
 
-def choose_shape(quantity: Quantity, count: int) -> FusedShape:
+def choose_fused_shape(quantity: Quantity, count: int) -> FusedShape:
     """Shape for a number of targets."""
-    return next(shape for most, shape in SHAPES[quantity] if most is None or count <= most)
+    return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
 
 
 @cache

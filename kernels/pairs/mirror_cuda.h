@@ -1,5 +1,5 @@
-#pragma once
-// All-pairs sums of many moments among themselves on a GPU: each pair is evaluated once, for both of its ends.
+// All-pairs sums of many moments among themselves on a GPU, field (Eq. 1) or force (Eqs. 13 and 14): each pair is
+// evaluated once, for both of its ends.
 //
 // The moments are cut into an odd number of equal tiles, arranged in a circle, and each tile takes the half of the
 // others that follows it. A block of warps holds a home tile in registers, lane l its moments l, l + 32, ..., and takes
@@ -10,7 +10,7 @@
 //
 // Those go to partial sums that belong to the distance between the two tiles in the circle, to which no other block
 // writes; the sums of the home tile go to partial sums of the block's share of the walk.
-
+#pragma once
 #include "pairs/tiles_cuda.h"
 
 namespace warpmag {

@@ -34,7 +34,7 @@ class MirrorShape:
 
 
 # Measured on an H200 at 5,000 to 131,072 moments: the most moments that a shape is best for, and the shape.
-SHAPES = {
+_SHAPES = {
     Quantity.FIELD: (
         (7000, MirrorShape(2, 4, 6, 2)),
         (30000, MirrorShape(3, 4, 4, 2)),
@@ -92,7 +92,7 @@ class Mirror:
 
 def make_mirror(origin: int, count: int, quantity: Quantity, device) -> Mirror:
     """Plan the walk of ``count`` moments from packed column ``origin`` on."""
-    shape = next(shape for most, shape in SHAPES[quantity] if most is None or count <= most)
+    shape = next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
     tiles = max(math.ceil(count / (32 * shape.moments)), 3)
     tiles += 1 - tiles % 2
     stages = math.ceil(math.ceil(count / tiles) / 32)

@@ -1,21 +1,22 @@
-#pragma once
-// The terms that one pair of moments adds to the sums of its target, or of both its ends. A number N is a scalar on a
-// GPU and a vector of them on a CPU; Real is its scalar type.
+// The terms that one pair of moments adds to the sums of its target, or of both its ends: field (Eq. 1) and force
+// (Eqs. 4, 13 and 14). A number N is a scalar on a GPU and a vector of them on a CPU; Real is its scalar type.
 //
 // A pair is described by its separation r from the source to the target, its inverse distance, clamped and masked by
-// the caller, the source's moment b with a multiple u of it, and for a force the target's effective moment e. The
-// caller computes the inverse distance as W/d, for which a CPU's last Newton step is shortest at W = 2. Constant
-// factors are applied to the sums at their end:
+// the caller, the source's moment b with a multiple u of it, and for a force the target's effective moment e, or for a
+// MUTUAL_FORCE its moment m. The caller computes the inverse distance as i = W/d, for which a CPU's last Newton step is
+// shortest at W = 2. Constant factors are applied to the sums at their end:
 //
-// | quantity     | u     | sums over the pairs                                           | result |
-// |--------------|-------|---------------------------------------------------------------|-------------------------------|
-// | FIELD        | W²b/3 | h = (W/d)³ [(W/d)² (r·b) r − u]                               | 4πH = 3 W⁻⁵ h | | FORCE |
-// W²b/5 | f = (W/d)⁵ [(r·e) u + (u·e) r − (W/d)² (r·e)(r·b) r],         |                               | | |       | a
-// = (W/d)⁵ (r·b)                                              | 4π(e·∇)H = 15 W⁻⁷ f + 3 W⁻⁵ ae | | WRENCH       | W²b/5
-// | f and a, and h = (W/d)⁵ (r·b) r, g = (W/d)³ b                 | also 4πH = 3 W⁻⁵ h − W⁻³ g    | | MUTUAL_FORCE |
-// none  | h = (W/d)⁵ [(r·b) m + (r·m) b + (b·m − 5 W⁻² (W/d)² (r·b)(r·m)) r] | 4π(m·∇)H = 3 W⁻⁵ h       |
+// | quantity     | u     | sums over the pairs                                  | result                          |
+// |--------------|-------|------------------------------------------------------|---------------------------------|
+// | FIELD        | W²b/3 | h = i³ [i² (r·b) r − u]                              | 4πH = 3 W⁻⁵ h                   |
+// | FORCE        | W²b/5 | f = i⁵ [(r·e) u + (u·e) r − i² (r·e)(r·b) r]         |                                 |
+// |              |       | a = i⁵ (r·b)                                         | 4π(e·∇)H = 15 W⁻⁷ f + 3 W⁻⁵ a e |
+// | WRENCH       | W²b/5 | f and a, and h = i⁵ (r·b) r, g = i³ b                | also 4πH = 3 W⁻⁵ h − W⁻³ g      |
+// | MUTUAL_FORCE |       | h = i⁵ [(r·b) m + (r·m) b + (b·m) r                  |                                 |
+// |              |       |         − 5 W⁻² i² (r·b)(r·m) r]                     | 4π(m·∇)H = 3 W⁻⁵ h              |
 //
 // The products are ordered so that no factor beyond r⁻³ leaves the float32 range before it is multiplied by r.
+#pragma once
 
 namespace warpmag {
 
@@ -75,7 +76,7 @@ template <class N> struct Source {
     Vec3<N> x, b, u; // position, moment, scaled moment
 };
 
-// Adds a source at separation r, with inv = W/d, to the sums of a target of effective moment e.
+// Adds a source at separation r, with inv = i of the table, to the sums of a target of effective moment e.
 template <Quantity Q, class N>
 CUDA_CALLABLE inline void add_pair(Sums<N>& sums, const Vec3<N>& r, N inv, const Source<N>& source, const Vec3<N>& e) {
     const Vec3<N>&b = source.b, &u = source.u;

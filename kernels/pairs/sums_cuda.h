@@ -1,14 +1,7 @@
+// All-pairs sums of a work list of tiles on a GPU: field (Eq. 1) and force (Eqs. 4, 13 and 14). A block of warps holds
+// a tile of targets in registers, lane l of each warp the targets l, l + 32, ... The warps share out the tile's sources
+// and at the end add up their sums in order.
 #pragma once
-// All-pairs sums of a work list of tiles on a GPU: a block of warps holds a tile of targets in registers and passes
-// over its sources.
-//
-// Each lane of a warp holds the tile's targets lane, lane + 32, ...; the warps share out the sources, stage them in
-// shared memory, 32 at a time, and at the end add up their sums in order.
-//
-// Where the sources of a stage have one radius, and none of them is masked for one of the targets, the clamp is a
-// constant of the target: 20 instructions a pair for the field and 31 for the force, next to the five or so that a
-// source takes once for all targets of a lane.
-
 #include "pairs/tiles_cuda.h"
 
 namespace warpmag {

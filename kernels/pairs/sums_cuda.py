@@ -39,7 +39,7 @@ _FIXED_COST = 16
 """Sources that a block sums in the time that it takes to start and to end."""
 
 
-def choose_shape(quantity: Quantity, count: int) -> LoopShape:
+def choose_loop_shape(quantity: Quantity, count: int) -> LoopShape:
     """Shape for a number of targets."""
     return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
 

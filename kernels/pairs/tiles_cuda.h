@@ -1,7 +1,6 @@
+// Common parts of all-pairs sums on a GPU: reading and staging moments, the inverse distance, the passage of a warp
+// over its sources, and sums over the warps of a block.
 #pragma once
-// Common parts of the three forms of all-pairs sums on a GPU: reading and staging moments, the inverse distance, and
-// sums over the warps of a block.
-
 #include "pairs/pair_terms.h"
 
 namespace warpmag {
@@ -120,12 +119,15 @@ struct LabelRange {
     CUDA_CALLABLE bool excludes(Real label) const { return label < lowest || label > highest; }
 };
 
-// Adds the sources `begin` to `end` to the sums of a warp's targets, which lanes LANES apart hold in common. The
-// sources are staged in shared memory, 32 at a time; 32 / LANES groups of lanes share them out, and a lane takes
-// UNROLLED of them in a step. Steps whose sources have one radius, and none of which is masked, take fewer
-// instructions: a source is masked for a target of its label, or for the field if it is the target, of which there are
-// own_count from column own_begin on. The radius is that of a LONG sum's stage, or of all sources; a LONG sum is by
-// parts, to keep its digits.
+// Adds the sources `begin` to `end` to the sums of a warp's targets; lanes that are a multiple of LANES apart hold the
+// same. The sources are staged in shared memory, 32 at a time; 32 / LANES groups of lanes share them out, and a lane
+// takes UNROLLED of them in a step.
+//
+// A source is masked for targets of its label, or for the field if it is the target itself; own_count targets are
+// sources, from column own_begin on. Where the sources of a step have the given radius, and none of them is masked, the
+// clamp is a constant of the target: 20 instructions a pair for the field and 31 for the force, next to the four or so
+// that a source takes once for all targets of a lane, and the sixty that a warp takes to stage 32. A LONG sum takes the
+// radius from each stage, decides for the whole stage, and is by parts, so that it keeps its digits.
 template <int LANES, int UNROLLED, bool LONG, Quantity Q, int HELD, class TargetAt>
 CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt target_at, const Table& sources, int begin,
                                       int end, Real radius, int own_begin, unsigned own_count, int lane, Quad* staged) {
@@ -134,7 +136,7 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt targe
     constexpr int GROUPS = 32 / LANES, STRIDE = GROUPS * UNROLLED, STAGES_PER_PART = 16;
     constexpr int RUN = LONG ? 32 : STRIDE;
     constexpr unsigned RUN_MASK = RUN < 32 ? (1u << RUN) - 1 : ~0u;
-    // packed rows may be read beyond the last moment, but for what follows to be of another radius
+    // packed rows may be read beyond the last moment, whose place a LONG sum repeats so that its radius does not differ
     const auto load = [&](int j) { return sources.moment(LONG ? min(j, end - 1) : j, j < end); };
     const auto source_at = [&](int i) -> Source<Real> {
         const Quad a = staged[i], b = staged[i + 32];

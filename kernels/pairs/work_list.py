@@ -34,7 +34,7 @@ from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
 from warpmag.kernels.pairs.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.sums_cpu import STRIPE, launch_pair_loop_cpu
-from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_shape, choose_splits, launch_pair_loop_cuda
+from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_loop_shape, choose_splits, launch_pair_loop_cuda
 from warpmag.kernels.shared.team import threads_for
 
 PACKED_ROWS = 8
@@ -134,10 +134,10 @@ def make_rows(segments, device, quantity=Quantity.FIELD, *, forms=FORMS) -> Rows
     if quantity == Quantity.MUTUAL_FORCE and device.is_cuda:
         quantity = Quantity.FORCE
     if form == FUSED:
-        shape = pair_sums_cuda.choose_shape(quantity, count)
+        shape = pair_sums_cuda.choose_fused_shape(quantity, count)
         tiles, splits = _block_tiles(segments, starts, shape.targets, 1), 0
     elif form == LOOP and device.is_cuda:
-        shape = choose_shape(quantity, count)
+        shape = choose_loop_shape(quantity, count)
         tiles, splits = _cuda_tiles(segments, starts, shape, device.sm_count)
     elif form == LOOP:
         threads = threads_for(pair_count, 2 * _PAIRS_PER_START)
