@@ -33,7 +33,7 @@ from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
 from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
 from warpmag.kernels.pairs.pair_law import field_of, gradient_of, gradient_times, pair_factors, smoothed_factors
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
-from warpmag.kernels.pairs.sums_cpu import STRIPE, launch_pair_loop_cpu
+from warpmag.kernels.pairs.sums_cpu import TILE_SIZE, launch_pair_loop_cpu
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_loop_shape, choose_splits, launch_pair_loop_cuda
 from warpmag.kernels.shared.team import threads_for
 
@@ -235,8 +235,8 @@ def _cut(begin, end, parts):
 
 
 def _stripes(begin, end, wanted):
-    """Ranges of at most ``STRIPE`` that cut one into about as many equal parts as wanted, or more."""
-    parts = max(wanted, -(-(end - begin) // STRIPE), 1)
+    """Ranges of at most ``TILE_SIZE`` that cut one into about as many equal parts as wanted, or more."""
+    parts = max(wanted, -(-(end - begin) // TILE_SIZE), 1)
     width = max(-(-(end - begin) // (parts * _LANES)) * _LANES, _LANES)
     return [(a, min(a + width, end)) for a in range(begin, end, width)]
 
