@@ -52,7 +52,7 @@ template <int N> inline Vec3<Real> numbers(Simd (*rows)[N], int i) {
 
 template <int N> inline Vec3<Simd> vectors(Simd (*rows)[N], int v) { return {rows[0][v], rows[1][v], rows[2][v]}; }
 
-// Rows of an array of packed moments, and of a tile; the last are of a tile only.
+// Rows of an array of packed moments, and of a tile, which has scaled moments, too.
 enum Row { POSITION = 0, RADIUS = 3, MOMENT = 4, LABEL = 7, PACKED_ROWS, SCALED_MOMENT = PACKED_ROWS, TILE_ROWS = 11 };
 
 struct Table {
@@ -66,7 +66,7 @@ struct Table {
     Vec3<Real> vector(int r, int column) const { return {row(r)[column], row(r + 1)[column], row(r + 2)[column]}; }
 };
 
-// Tiles that one thread sums, and where: partial sums, shape [rows, width(Q)].
+// Tiles that one thread sums, and its partial sums, shape [row_count, width(Q)].
 struct Share {
     Table targets, sources, effective;
     const TileEntry *begin, *end;
@@ -77,7 +77,7 @@ struct Share {
 struct Tile {
     Simd rows[TILE_ROWS][VECTORS + 2]; // two vectors more than are summed, for a loop that reads ahead
     Simd sums[3][VECTORS];             // mirrored sums h at the sources themselves
-    int begin, count, vectors;
+    int begin = -1, count = 0, vectors = 0;
     Real radius; // the one radius of all moments, or 0
     Real lowest_label, highest_label;
     bool ascending; // whether labels ascend, so that no two moments are of one body
@@ -132,18 +132,13 @@ __attribute__((noinline)) void add_rows(const Share& share, int row_begin, int r
     const bool among_sources = Q == Quantity::FIELD && targets.data == share.sources.data;
     for (int row = row_begin; row < row_end; ++row) {
         const int column = column_begin + row - row_begin, own = column - tile.begin;
-        // a moment's own field is left out: its moment is zero while its row is summed
+        // a moment's own field is left out: its moment is zero, and its label, while its row is summed
         const bool masked = among_sources && own >= 0 && own < tile.count;
-        Real other[TILE_ROWS] = {};
-        const auto swap_moment = [&] {
-            for (int r = MOMENT; r < TILE_ROWS; ++r) {
-                Real& moment = number(tile.rows[r], own);
-                const Real kept = moment;
-                moment = other[r];
-                other[r] = kept;
-            }
-        };
-        if (masked) swap_moment();
+        Real kept[TILE_ROWS];
+        for (int r = MOMENT; r < TILE_ROWS && masked; ++r) {
+            kept[r] = number(tile.rows[r], own);
+            number(tile.rows[r], own) = 0;
+        }
         const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column);
         const Vec3<Simd> x = splat(targets.vector(POSITION, column)), all_e = splat(e);
         const Real radius = targets.row(RADIUS)[column], label = targets.row(LABEL)[column];
@@ -157,7 +152,7 @@ __attribute__((noinline)) void add_rows(const Share& share, int row_begin, int r
             add_pair<Q>(sums, r, wanted ? twice_inverse_root(c) : 0, source, all_e);
         }
         add_results<Q>(share, row, {total(sums.f), total(sums.h), total(sums.g), total(sums.a)}, e);
-        if (masked) swap_moment();
+        for (int r = MOMENT; r < TILE_ROWS && masked; ++r) number(tile.rows[r], own) = kept[r];
     }
 }
 
@@ -190,7 +185,7 @@ template <Quantity Q> __attribute__((noinline)) void add_both_ends(TargetTile& t
         Vec3<Simd> h{};
         int v = 0;
         if (diagonal) {
-            // pairs with earlier vectors are summed already; of its own, the target has its own half, without itself
+            // pairs with earlier vectors are summed already; those within a vector are summed for each end apart
             v = i / LANES;
             auto others = clamp > 0;
             others[i % LANES] = 0;
@@ -216,9 +211,8 @@ template <Quantity Q> __attribute__((noinline)) void add_both_ends(TargetTile& t
 template <Quantity Q> __attribute__((noinline)) void add_target_sums(const Share& share, TargetTile& targets) {
     for (int i = 0; i < targets.tile.count; ++i) {
         const auto& sums = targets.sums;
-        Vec3<Real> h = {total(sums[0][i]), total(sums[1][i]), total(sums[2][i])};
-        h += numbers(targets.tile.sums, i);
-        add_results<Q>(share, targets.row + i, {.h = h});
+        const Vec3<Real> h = {total(sums[0][i]), total(sums[1][i]), total(sums[2][i])};
+        add_results<Q>(share, targets.row + i, {.h = h + numbers(targets.tile.sums, i)});
     }
 }
 
@@ -256,8 +250,6 @@ template <Quantity Q> inline void sum_share(const Share& share) {
     __builtin_memset(share.out, 0, share.row_count * width(Q) * sizeof(Real));
     Tile tile;
     TargetTile targets;
-    targets.tile.begin = -1;
-    targets.tile.count = 0;
     for (const TileEntry* entry = share.begin; entry < share.end; ++entry) {
         if (entry->mirrored) {
             sum_mirrored<Q>(share, *entry, targets, tile);
