@@ -1,5 +1,5 @@
-#pragma once
-// All-pairs sums of a work list of tiles on a CPU, in vectors as wide as the machine has them, by several threads.
+// All-pairs sums, field (Eq. 1) and force (Eqs. 4, 13 and 14), of a work list of tiles on a CPU: in vectors as wide as
+// the machine has them, by several threads.
 //
 // A tile holds up to TILE_SIZE sources (from Python) in the first-level cache, and as many targets. There are two loops
 // over its pairs:
@@ -12,7 +12,7 @@
 // Threads take shares of the tiles, the largest first; one that starts late or is interrupted leaves more to the
 // others. Each share has partial sums of its own, which the finishing kernel adds up in order, so that results do not
 // depend on which thread took which share.
-
+#pragma once
 #include "pairs/pair_terms.h"
 #include "shared/inverse_root.h"
 #include "shared/team.h"
@@ -28,6 +28,7 @@ constexpr int BYTES = 16;
 #endif
 constexpr int LANES = BYTES / (int)sizeof(Real), VECTORS = TILE_SIZE / LANES;
 typedef Real Simd __attribute__((ext_vector_type(LANES)));
+static_assert(W == 2); // inverse distances are twice_inverse_root(d²)
 
 // Whether a pair may be summed for both its ends, and what is summed otherwise.
 template <Quantity Q> constexpr bool MUTUAL = Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE;

@@ -1,5 +1,5 @@
-#pragma once
 // The inverse root of a vector N of positive numbers on a CPU.
+#pragma once
 
 namespace warpmag {
 
