@@ -19,7 +19,8 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.induction.submagnetization import LAW_IDS, effective_field, llg_step, step_submagnetization
-from warpmag.kernels.material.curves import TANH, curve_ratio, inverse_curve_ratio, theta_flow
+from warpmag.kernels.material.curves import TANH, curve_ratio, inverse_curve_ratio
+from warpmag.kernels.shared.native import native_options
 
 MOST_ITERATIONS = 999
 _SLOPE = 3.0
@@ -45,7 +46,7 @@ def flow_iterations(start: wp.vec3, target: wp.vec3, omega: float, accelerated: 
     for n in range(wp.static(MOST_ITERATIONS)):
         r = target - s
         now = s
-        s = theta_flow(now, target, omega)
+        s = now + omega * r  # exact, see theta_flow
         if accelerated == 1 and n > 0:
             dr = r - old_r
             size = wp.dot(dr, dr)
@@ -96,7 +97,9 @@ def _pair_iterations(scaled: bool):
 def _sweep_kernel(flow: bool, scaled: bool):
     pair_iterations = _pair_iterations(scaled)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(
+        module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=wp.float32)
+    )
     def sweep(
         # inputs:
         multipliers: wp.array[float],

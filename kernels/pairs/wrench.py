@@ -47,7 +47,7 @@ FORCE_IDS = {"kelvin": KELVIN, "zeeman": ZEEMAN}
 def _effective_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
     def zeeman_moments(
         # inputs:
         packed: wp.array2d[dtype],

@@ -1,0 +1,91 @@
+// Magnetization curves in reduced form (Kim and Han 2022, Eqs. 7, 10); curves.py has their table and the curves'
+// numbers.
+//
+// The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments.
+#pragma once
+#include "shared/lanes.h"
+
+namespace warpmag {
+
+enum Curve { TANH, LANGEVIN, CLAMPED }; // as in curves.py
+
+// tanh(s)/s, 1 at s = 0; below the root of the smallest normal number the quotient of two denormals says nothing.
+CUDA_CALLABLE inline Real tanh_ratio(Real s) { return s < Real(1e-18) ? Real(1) : wp::tanh(s) / s; }
+#if !defined(__CUDA_ARCH__)
+// Vectors have no hyperbolic functions. In float32 the quotient of two polynomials in s², fitted up to s = 9 where tanh
+// is 1, is off by 3e-7 at most and by 4e-8 in the mean.
+inline Number tanh_ratio(Number s) {
+    if constexpr (sizeof(Real) == 8) {
+        Number ratio;
+        for (int l = 0; l < WIDTH; ++l) ratio[l] = tanh_ratio(s[l]);
+        return ratio;
+    }
+    constexpr Real above[5] = {1.0, 0.13380975, 0.0034955274, 2.0608056e-05, 1.3353217e-08};
+    constexpr Real below[5] = {1.0, 0.46714291, 0.025876754, 0.00032855341, 7.7759703e-07};
+    const Number z = s * s;
+    Number over = above[4], under = below[4];
+    for (int k = 3; k >= 0; --k) over = over * z + above[k], under = under * z + below[k];
+    const Mask saturated = s > Real(9);
+    return (saturated ? Number(1) : over) / (saturated ? s : under);
+}
+#endif
+
+// 3 L(x)/x of Langevin's L(x) = coth x − 1/x, by its series below 0.3, where the closed form cancels.
+template <class N> CUDA_CALLABLE inline N langevin_ratio(N x) {
+    const N z = x * x, safe = x > Real(0.3) ? x : N(Real(0.3));
+    const N series = 1 - z * (Real(1.0 / 15) - z * (Real(2.0 / 315) - z * (Real(1.0 / 1575) - z * Real(3 / 46777.5))));
+    return x > Real(0.3) ? 3 * (1 / tanh_ratio(safe) - 1) / (safe * safe) : series;
+}
+
+// c(s)/s, 1 at s = 0: the factor between a reduced field and its reduced magnetization.
+template <class N> CUDA_CALLABLE inline N curve_ratio(N s, int curve) {
+    if (curve == CLAMPED) return s > Real(1) ? 1 / s : N(Real(1));
+    return curve == LANGEVIN ? langevin_ratio(3 * s) : tanh_ratio(s);
+}
+
+// 3 L'(x) = 3 (1/x² − 1/sinh² x).
+CUDA_CALLABLE inline Real langevin_slope(Real x) {
+    const Real z = x * x, sinh = wp::sinh(x < 40 ? x : Real(40));
+    const Real series = 1 - z * (Real(1.0 / 5) - z * (Real(2.0 / 63) - z * (Real(1.0 / 225) - z * Real(27 / 46777.5))));
+    return x < Real(0.3) ? series : 3 * (1 / z - 1 / (sinh * sinh));
+}
+
+// Derivative c'(s).
+CUDA_CALLABLE inline Real curve_slope(Real s, int curve) {
+    if (curve == CLAMPED) return s < 1 ? Real(1) : Real(0);
+    if (curve == LANGEVIN) return langevin_slope(3 * s);
+    const Real cosh = wp::cosh(s < 40 ? s : Real(40));
+    return 1 / (cosh * cosh);
+}
+
+// Derivative c'(s) where the reduced magnetization c(s) has a given square.
+CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
+    const Number zero = reduced_square * Real(0), one = zero + 1;
+    Number steepness = one - reduced_square; // of tanh
+    if (curve == CLAMPED) steepness = reduced_square < one ? one : zero;
+    if (curve == LANGEVIN) {
+        // Cohen's approximation, corrected by a polynomial in 2c − 1 that is good to 2e-4
+        constexpr Real fitted[13] = {
+            0.36476878046223565,  0.33269381936319425, -1.063990432535928,  -1.092334636112763,   0.9658571775659215,
+            1.264510831049312,    -0.0960163093945858, -0.4838736226305589, -0.21565177679233247, -0.11643126163366144,
+            -0.00807874082630003, 0.09545970643540323, 1.0531288294918555};
+        steepness *= 3 * steepness / (3 + reduced_square * reduced_square);
+        const Number x = 2 * root(reduced_square) - 1;
+        Number fit = zero;
+        for (int k = 0; k < 13; ++k) fit = fit * x + fitted[k];
+        steepness *= fit;
+    }
+    return steepness;
+}
+
+// s/c of the reduced field s that makes reduced magnetization c; a saturated one gets a large finite s.
+CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve) {
+    const Real bounded = c < Real(0.999999) ? c : Real(0.999999), z = bounded * bounded;
+    if (bounded < Real(1e-18) || curve == CLAMPED) return 1;
+    if (curve == TANH) return Real(0.5) * wp::log((1 + bounded) / (1 - bounded)) / bounded;
+    // Newton on L(3s) = c from Cohen's rational start; the curve is concave, so it converges from any start below
+    Real x = bounded * (3 - z) / (1 - z);
+    for (int step = 0; step < 8; ++step) x += (3 * bounded - x * langevin_ratio(x)) / langevin_slope(x);
+    return x / (3 * bounded);
+}
+}
