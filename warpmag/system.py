@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import check_radii, resolve_device, resolve_dtype, vec3_type
-from warpmag.dynamics import Inducibles, make_dynamics
+from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
@@ -144,19 +144,10 @@ class MomentSystem:
         self.error = self._induction.error
         self.evaluations = self._induction.evaluations
         self.converged = self._induction.converged
-        target = Inducibles(
-            self._induced,
-            self._applied,
-            self._applied_partial,
-            self.external_field,
-            self._packed,
-            self._material,
-            self.moments,
-            self._induction,
-            rtol=self.rtol,
-            max_evaluations=self.max_evaluations,
-        )
-        self.dynamics = make_dynamics(dynamics, target, step=step, damping=damping)
+        solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
+        if not self._applied.pair_count:
+            self._induction.h0 = self.external_field
+        self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
 
     def _make_material(self, permanent, saturation, susceptibility, curve):
         n = len(permanent)
@@ -245,6 +236,8 @@ class MomentSystem:
             return
         if self._applied.pair_count:
             pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
+            h0 = self._induction.h0
+            launch_field(self._applied, self._applied_partial, packed, packed, False, self.external_field, h0)
         self.dynamics.start()
         if self._near is not None:
             near_contact.wait(self._near)

@@ -1,49 +1,43 @@
-"""Induction: what every magnetization dynamics shares on the device.
+"""State of an induction solve on the device, which every magnetization dynamics shares.
 
-The state of a solve, the field that it starts from, and the sums over a world's moments that convergence is judged by.
-How the moments move is another matter: ``theta_flow`` is the product, ``submagnetization`` its rivals.
-
-Each world iterates for itself, with its own convergence. Sums go by fixed chunks in a fixed order, in float64: a block
-sums a chunk, and a block a world's chunks.
+How the moments move is another matter: ``theta_flow`` is the product, ``submagnetization`` its rivals. Each world
+iterates for itself, with its own convergence (Kim and Han 2022, Eq. 12), see ``solve_state.h``. Sums go by fixed chunks
+of a world's moments in a fixed order, in float64.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.induction import anderson
-from warpmag.kernels.induction.anderson import DEPTH
-from warpmag.kernels.pairs.field import finished_field
+from warpmag.kernels.pairs.neighbors import CAPACITY
+from warpmag.kernels.shared.passes import CHUNK, LINE
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
-CHUNK = 128
-"""Moments whose sums one block adds up, on a GPU each of them by a thread of its own."""
-LACK, GOAL, MERIT, FOLLOWED, EARLIER, TERMS = range(6)
-"""Sums ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ⟨φΔg, φΔg'⟩ and ‖φΔg'‖² of a chunk or world, and how many they are."""
-COLUMNS = TERMS + anderson.COLUMNS
-"""All sums of a chunk or world; those of ``anderson`` stand behind."""
-FIELD, STIFFNESS = 0, 1
-FLOW_STEP = 0.9
-"""Share of the largest convergent step length that is used."""
+DEPTH = 5
+"""Changes between iterates that are kept and mixed, see ``anderson.h``."""
+COLUMNS = 5 + DEPTH + DEPTH * (DEPTH + 1) // 2
+"""Sums over the moments of a chunk or world; as in ``theta_step.h``."""
+BLOCK_CHUNK = 128
+"""Moments in a chunk on a GPU, each of them for a thread of a block; on a CPU a chunk has ``passes.CHUNK``."""
 
 
 @wp.struct
 class World:
-    """How a world stands between evaluations: one cache line, where a GPU would wait for an array after another.
+    """State of a world between evaluations, in one cache line, where a GPU would wait for one array after another.
 
     Attributes:
         active: Whether it still iterates.
         evaluations: Field evaluations of this solve.
-        mode: What it does next, see ``theta_flow``.
+        in_field: Whether there is an applied field, until its first evaluation.
+        next: What it does next, of ``Next`` in ``solve_state.h``.
         linked: Whether the next iterate's change from the last one is worth keeping.
         kept: Changes that are kept, in ``history``.
         newest: Slot of the newest of them.
         used: How many of them the next step mixes.
         improved: Whether the last iterate is the best so far.
         plain_steps: Steps to be taken without mixing.
+        stiffness: Largest k (2/3 + o_i) of its moments, until its first evaluation.
         omega: Step length.
         ahead: Part of the last change from solve to solve that the next start adds.
         best: Smallest merit of this solve, negative before the first.
@@ -52,81 +46,109 @@ class World:
 
     active: int
     evaluations: int
-    mode: int
+    in_field: int
+    next: int
     linked: int
     kept: int
     newest: int
     used: int
     improved: int
     plain_steps: int
+    stiffness: wp.float64
     omega: wp.float64
     ahead: wp.float64
     best: wp.float64
-    alpha: anderson.coefficients
+    alpha: wp.types.vector(DEPTH, wp.float64)
 
 
-@dataclass(frozen=True)
-class InductionBuffers:
-    """Everything an induction solve keeps on the device, for n moments, w worlds and c chunks.
+@cache
+def state_type(dtype):
+    """Type of the state of a solve of n moments, m of them inducible, in w worlds and c chunks."""
+    vec3 = wp.types.vector(3, dtype)
 
-    Attributes:
-        world: World of each moment, shape [n].
-        chunk: Rows of the inducible moments' work list from and to, and world, of each chunk, shape [c].
-        chunk_begin: First chunk of each world, shape [w + 1].
-        h0: Applied field [A/m]: external and from permanent magnets, shape [n].
-        h: Whole field [A/m], shape [n].
-        s: Dual variable [dimensionless], shape [n].
-        past_positions, past_moments, past_field, past_g: Where the last two solves were done [m], the moments [A·m²]
-            that they ended at, what fields these make [A/m], and the reduced whole field; the last first, shape [2, n].
-        iterate_s, iterate_r: The last iterate judged, and its residual, shape [n].
-        history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
-        best_s, best_r: Those of the smallest merit, shape [n].
-        mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
-        mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
-        change, next_change: What a step adds to them [A·m²], shape [n].
-        start: Largest applied field [A/m] and stiffness k (2/3 + o_i) of each world until it is judged, shape [w, 2].
-        sums: Sums of each chunk, shape [c, COLUMNS].
-        arrived: Chunks of each world whose sums are done, shape [w].
-        worlds: How each world stands, shape [w].
-        warm: Solves of each world since it began cold, as far as it matters, shape [w].
-        error: Relative residual of each world, shape [w].
-        evaluations, converged: What a solve took, and whether it reached its goal, shape [w].
-        condition: Whether any world still iterates, shape [1].
-    """
+    @wp.struct
+    class SolveState:
+        """What a solve works on and keeps.
 
-    world: wp.array
-    chunk: wp.array
-    chunk_begin: wp.array
-    h0: wp.array
-    h: wp.array
-    s: wp.array
-    past_positions: wp.array
-    past_moments: wp.array
-    past_field: wp.array
-    past_g: wp.array
-    iterate_s: wp.array
-    iterate_r: wp.array
-    history_s: wp.array
-    history_r: wp.array
-    best_s: wp.array
-    best_r: wp.array
-    mixed_g: wp.array
-    mixed_moment: wp.array
-    change: wp.array
-    next_change: wp.array
-    start: wp.array
-    sums: wp.array
-    arrived: wp.array
-    worlds: wp.array
-    warm: wp.array
-    error: wp.array
-    evaluations: wp.array
-    converged: wp.array
-    condition: wp.array
+        Attributes:
+            packed, moments: Moments, packed and plain [A·m²], shapes [8, n] and [n]; the inducible ones are written.
+            neighbor, neighbor_count, overlap, overlap_count, searching: Their lists (``warpmag.packed.PackedMoments``).
+            saturation, slope, curve: What they are made of (``curves.CurveParameters``).
+            rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
+            max_evaluations: Field evaluations after which a world gives up.
+            row: Number, world, and the world's inducible moments from and to, of each inducible moment, shape [m].
+            chunk: Rows from and to, and world, of each chunk, shape [c].
+            chunk_begin: First chunk of each world, shape [w + 1].
+            near: On a CPU rows of the neighbours of a chunk's moments, shape [c, CAPACITY, CHUNK].
+            near_count: How many the longest list of each vector has.
+            h0: Applied field [A/m]: external and from permanent magnets, shape [n].
+            h: Whole field [A/m], shape [n].
+            s: Dual variable [dimensionless], shape [n].
+            iterate_s, iterate_r: The last iterate, and its residual, shape [n].
+            history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
+            best_s, best_r: Those of the smallest merit, shape [n].
+            mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
+            mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
+            past_field, past_g: Fields that all but the neighbours made at the last two solutions [A/m], and the reduced
+                whole field; the last first, shape [2, n].
+            past: Place [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
+            now, swept: Place [m], radius and what a step or a first sweep adds to the moment, shape [rows, LINE].
+            sums: Sums of each chunk, on a CPU of each vector, shape [c, COLUMNS].
+            arrived: Chunks of each world whose sums are done, shape [w].
+            worlds: State of each world, shape [w].
+            warm: Solves of each world since it began cold, as far as it matters, shape [w].
+            error: Relative residual of each world, shape [w].
+            evaluations, converged: What a solve took, and whether it reached its goal, shape [w].
+            condition: Whether any world still iterates, shape [1].
+        """
+
+        packed: wp.array2d[dtype]
+        moments: wp.array[vec3]
+        neighbor: wp.array2d[int]
+        neighbor_count: wp.array[int]
+        overlap: wp.array2d[int]
+        overlap_count: wp.array[int]
+        searching: wp.array[int]
+        saturation: wp.array[dtype]
+        slope: wp.array[dtype]
+        curve: wp.array[int]
+        rtol: wp.float64
+        max_evaluations: int
+        row: wp.array[wp.vec4i]
+        chunk: wp.array[wp.vec3i]
+        chunk_begin: wp.array[int]
+        near: wp.array3d[int]
+        near_count: wp.array[int]
+        h0: wp.array[vec3]
+        h: wp.array[vec3]
+        s: wp.array[vec3]
+        iterate_s: wp.array[vec3]
+        iterate_r: wp.array[vec3]
+        history_s: wp.array2d[vec3]
+        history_r: wp.array2d[vec3]
+        best_s: wp.array[vec3]
+        best_r: wp.array[vec3]
+        mixed_g: wp.array[vec3]
+        mixed_moment: wp.array[vec3]
+        past_field: wp.array2d[vec3]
+        past_g: wp.array2d[vec3]
+        past: wp.array2d[dtype]
+        now: wp.array2d[dtype]
+        swept: wp.array2d[dtype]
+        sums: wp.array2d[wp.float64]
+        arrived: wp.array[int]
+        worlds: wp.array[World]
+        warm: wp.array[int]
+        error: wp.array[wp.float64]
+        evaluations: wp.array[int]
+        converged: wp.array[int]
+        condition: wp.array[int]
+
+    return SolveState
 
 
-def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
-    """Allocate the buffers.
+def allocate(worlds, inducible, dtype, device):
+    """Allocate the state of a solve; :func:`bind` has what is not its own.
 
     Args:
         worlds: World of each moment, non-decreasing, shape [n].
@@ -135,104 +157,63 @@ def allocate(worlds, inducible, dtype, device) -> InductionBuffers:
         device: Warp device.
     """
     n, world_count = len(worlds), int(worlds[-1]) + 1 if len(worlds) else 0
-    chunks, chunk_begin, first = [], [0], 0
-    for w in range(world_count):
-        last = first + int(np.count_nonzero(inducible[worlds == w]))
-        chunks += [(a, min(a + CHUNK, last), w) for a in range(first, last, CHUNK)]
-        chunk_begin.append(len(chunks))
-        first = last
+    on_cpu = wp.get_device(device).is_cpu
+    size = CHUNK if on_cpu else BLOCK_CHUNK
+    target = np.flatnonzero(inducible)
+    world, held = worlds[target], np.bincount(worlds[target], minlength=world_count)
+    begin = np.searchsorted(worlds, np.arange(world_count))
+    rows = np.stack([target, world, begin[world], (begin + held)[world]], axis=1)
+    ends = np.cumsum(held)
+    chunks = [(a, min(a + size, end), w) for w, end in enumerate(ends) for a in range(end - held[w], end, size)]
+    chunk_begin = np.append(0, np.cumsum(-(-held // size)))
     vec3 = wp.types.vector(3, dtype)
 
     def put(values, kind):
         return wp.array(np.asarray(values, np.int32), dtype=kind, device=device)
 
-    def zeros(shape, kind):
-        return wp.zeros(shape, dtype=kind, device=device)
+    def zeros(names, shape, kind=wp.int32):
+        return {name: wp.zeros(shape, dtype=kind, device=device) for name in names.split()}
 
-    return InductionBuffers(
-        world=put(worlds, wp.int32),
-        chunk=put(np.reshape(chunks, (-1, 3)), wp.vec3i),
-        chunk_begin=put(chunk_begin, wp.int32),
-        **{name: zeros(n, vec3) for name in ("h0", "h", "s", "best_s", "best_r")},
-        **{name: zeros(n, vec3) for name in ("mixed_g", "mixed_moment", "change", "next_change")},
-        **{name: zeros((2, n), vec3) for name in ("past_positions", "past_moments", "past_field", "past_g")},
-        **{name: zeros(n, vec3) for name in ("iterate_s", "iterate_r")},
-        **{name: zeros((DEPTH, n), vec3) for name in ("history_s", "history_r")},
-        start=zeros((world_count, 2), wp.float64),
-        sums=zeros((len(chunks), COLUMNS), wp.float64),
-        worlds=zeros(world_count, World),
-        error=zeros(world_count, wp.float64),
-        **{name: zeros(world_count, wp.int32) for name in ("arrived", "warm", "evaluations")},
-        converged=put(np.ones(world_count), wp.int32),  # a world without inducible moments has nothing to converge
-        condition=zeros(1, wp.int32),
-    )
+    count, vectors = len(chunks), CHUNK // (64 // wp.types.type_size_in_bytes(dtype)) if on_cpu else 1
+    arrays = {
+        "row": put(rows, wp.vec4i),
+        "chunk": put(np.reshape(chunks, (-1, 3)), wp.vec3i),
+        "chunk_begin": put(chunk_begin, wp.int32),
+        "converged": put(np.ones(world_count), wp.int32),  # without inducible moments there is nothing to converge
+        **zeros("near", (count if on_cpu else 0, CAPACITY, CHUNK)),
+        **zeros("near_count", count * vectors),
+        **zeros("h0 h s iterate_s iterate_r best_s best_r mixed_g mixed_moment", n, vec3),
+        **zeros("history_s history_r", (DEPTH, n), vec3),
+        **zeros("past_field past_g", (2, n), vec3),
+        **zeros("past now swept", (count * size if on_cpu else len(rows), LINE), dtype),
+        **zeros("sums", (count * vectors, COLUMNS), wp.float64),
+        **zeros("worlds", world_count, World),
+        **zeros("error", world_count, wp.float64),
+        **zeros("arrived warm evaluations", world_count),
+        **zeros("condition", 1),
+    }
+    state = state_type(dtype)()
+    for name, array in arrays.items():
+        setattr(state, name, array)
+    return state
 
 
-@cache
-def applied_field(dtype):
-    """Warp function that returns the applied field [A/m] at a row's target: external and from permanent magnets.
+def bind(state, packed, material, moments, rtol: float, max_evaluations: int) -> None:
+    """Let a solve move moments.
 
-    Thread ``share`` of ``shares`` gets its share of it, for ``reductions.group_sum`` to add up.
+    Args:
+        state: State of the solve.
+        packed: All moments, packed (``warpmag.packed.PackedMoments``).
+        material: What they are made of (``curves.CurveParameters``).
+        moments: Moments [A·m²], shape [n].
+        rtol: Relative residual at which a world ends.
+        max_evaluations: Field evaluations after which a world gives up.
     """
-    vec3 = wp.types.vector(3, dtype)
-    finish = finished_field(dtype)
-
-    @wp.func
-    def apply_field(
-        partial: wp.array3d[dtype],
-        packed: wp.array2d[dtype],
-        row: int,
-        i: int,
-        begin: int,
-        end: int,
-        neighbor: wp.array2d[int],
-        neighbor_count: wp.array[int],
-        external_field: wp.array[vec3],
-        share: int,
-        shares: int,
-    ):
-        h0 = vec3()
-        if share == 0:
-            h0 = external_field[i]
-        if end > begin:
-            h0 += finish(partial, packed, packed, row, i, begin, end, 1, neighbor, neighbor_count, share, shares)
-        return h0
-
-    return apply_field
-
-
-@wp.func
-def begin_world(
-    w: int,
-    field: wp.float64,
-    stiffness: wp.float64,
-    start: wp.array2d[wp.float64],
-    worlds: wp.array[World],
-    condition: wp.array[int],
-):
-    """Let a world iterate; ``field`` and ``stiffness`` are the largest of one of its chunks."""
-    wp.atomic_max(start, w, wp.static(FIELD), field)
-    wp.atomic_max(start, w, wp.static(STIFFNESS), stiffness)
-    worlds[w].active = 1
-    worlds[w].evaluations = 0
-    worlds[w].linked = 0
-    worlds[w].plain_steps = 0
-    worlds[w].best = wp.float64(-1.0)
-    condition[0] = 1
-
-
-@wp.func
-def step_length(stiffness: wp.float64):
-    """Step length ω = κ/k that converges at the largest k (2/3 + o_i) of a world; see ``theta_flow``."""
-    return wp.min(wp.float64(1.0), wp.float64(wp.static(2.0 * FLOW_STEP)) / (wp.float64(1.0) + stiffness))
-
-
-@wp.func
-def relative_error(sums: Any):
-    """Relative residual ‖M − f(H)‖/‖f(H)‖ of a world's sums; not relative where there is no field."""
-    lack = wp.sqrt(sums[wp.static(LACK)])
-    goal = wp.sqrt(sums[wp.static(GOAL)])
-    return wp.where(goal > wp.float64(0.0), lack / goal, lack)
+    state.packed, state.moments, state.searching = packed.packed, moments, packed.searching
+    state.neighbor, state.neighbor_count = packed.neighbors, packed.neighbor_counts
+    state.overlap, state.overlap_count = packed.overlaps, packed.overlap_counts
+    state.saturation, state.slope, state.curve = material.saturation, material.slope, material.curve
+    state.rtol, state.max_evaluations = rtol, max_evaluations
 
 
 @wp.func
@@ -249,35 +230,29 @@ def is_last_of_world(lane: int, w: int, chunks: int, arrived: wp.array[int]):
 
 
 @cache
-def world_summation(columns: int):
+def world_summation(dtype, columns: int):
     """Warp function by which the last block of a world adds up its sums.
 
-    The first thread of every block brings its block's; that of the last one gets all of them, and others ``False``.
+    Every thread of a block brings its own; the first one of the last block gets all of them, and others ``False``.
     """
     vector = wp.types.vector(columns, wp.float64)
 
     @wp.func
-    def sum_world(
-        total: vector,
-        c: int,
-        lane: int,
-        w: int,
-        begin: int,
-        end: int,
-        sums: wp.array2d[wp.float64],
-        arrived: wp.array[int],
-    ):
+    def sum_world(mine: vector, c: int, lane: int, w: int, state: state_type(dtype)):
+        total = block_sum(mine)
+        begin = state.chunk_begin[w]
+        end = state.chunk_begin[w + 1]
         if end - begin == 1:
-            return True, total
+            return lane == 0, total
         if lane == 0:
             for column in range(wp.static(columns)):
-                sums[c, column] = total[column]
-        if not is_last_of_world(lane, w, end - begin, arrived):
+                state.sums[c, column] = total[column]
+        if not is_last_of_world(lane, w, end - begin, state.arrived):
             return False, total
-        mine = vector()
+        rest = vector()
         for chunk in range(begin + lane, end, wp.block_dim()):
             for column in range(wp.static(columns)):
-                mine[column] += sums[chunk, column]
-        return True, block_sum(mine)
+                rest[column] += state.sums[chunk, column]
+        return lane == 0, block_sum(rest)
 
     return sum_world

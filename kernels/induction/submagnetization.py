@@ -1,4 +1,4 @@
-"""Pairs of submagnetizations: the magnetization dynamics that ``theta_flow`` replaces.
+"""Pairs of submagnetizations (Kim and Han 2022, Eqs. 5, 6, 8, 9, 11): the dynamics that ``theta_flow`` replaces.
 
 Every inducible moment is the mean of two submagnetizations of length Ms, M = (M1 + M2)/2, held here as unit vectors
 u = M_i/Ms. With the reduced effective field h = H_eff/Ms, one explicit step of each dynamics is
@@ -26,21 +26,10 @@ from typing import Any
 
 import warp as wp
 
-from warpmag.kernels.induction.solve_state import (
-    CHUNK,
-    FIELD,
-    GOAL,
-    LACK,
-    InductionBuffers,
-    World,
-    applied_field,
-    begin_world,
-    relative_error,
-    world_summation,
-)
+from warpmag.kernels.induction.solve_state import BLOCK_CHUNK, state_type, world_summation
 from warpmag.kernels.material.curves import curve_ratio, inverse_curve_ratio
 from warpmag.kernels.pairs.packing import store_magnetization
-from warpmag.kernels.shared.reductions import block_max, block_sum
+from warpmag.kernels.shared.native import native_options
 
 THETA_EULER, LLG, LLG_DAMPING = 0, 1, 2
 LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
@@ -108,249 +97,139 @@ def step_submagnetization(u: Any, h_eff: Any, kappa: Any, precession: Any, side:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def _options(dtype) -> dict:
+    return native_options("induction/solve_state.h", "material/curves.h", dtype=dtype)
+
+
+@cache
+def pairs_type(dtype):
+    """Type of the pairs of submagnetizations of n moments, and of how they move."""
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.struct
+    class Pairs:
+        """Pairs of submagnetizations.
+
+        Attributes:
+            first: Directions M1/Ms, shape [n].
+            second: Directions M2/Ms, shape [n].
+            law: ``THETA_EULER``, ``LLG`` or ``LLG_DAMPING``.
+            kappa: Step κ = βΔtMs [dimensionless].
+            precession: Precession over damping, 1/α or 0 [dimensionless].
+        """
+
+        first: wp.array[vec3]
+        second: wp.array[vec3]
+        law: int
+        kappa: dtype
+        precession: dtype
+
+    return Pairs
+
+
 @cache
 def _begin_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-    apply_field = applied_field(dtype)
+    state_struct = state_type(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def begin_pairs(
-        # inputs:
-        chunk: wp.array[wp.vec3i],
-        partial: wp.array3d[dtype],
-        packed: wp.array2d[dtype],
-        row_target: wp.array[int],
-        source_begin: wp.array[int],
-        source_end: wp.array[int],
-        neighbor: wp.array2d[int],
-        neighbor_count: wp.array[int],
-        external_field: wp.array[vec3],
-        # outputs:
-        h0_out: wp.array[vec3],
-        start_out: wp.array2d[wp.float64],
-        worlds_out: wp.array[World],
-        condition_out: wp.array[int],
-    ):
-        c, lane = wp.tid()
-        field = wp.float64(0.0)
-        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
-            i = row_target[row]
-            h0 = apply_field(
-                partial,
-                packed,
-                row,
-                i,
-                source_begin[row],
-                source_end[row],
-                neighbor,
-                neighbor_count,
-                external_field,
-                0,
-                1,
-            )
-            h0_out[i] = h0
-            field = wp.max(field, wp.float64(wp.length(h0)))
-        field = block_max(field)
-        if lane == 0:
-            begin_world(chunk[c][2], field, wp.float64(0.0), start_out, worlds_out, condition_out)
+    @wp.func_native("warpmag::begin_world(state, w, 0.0);")
+    def begin_world(state: state_struct, w: int): ...
 
-    return begin_pairs
+    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype))
+    def begin_worlds(state: state_struct):
+        row = state.row[wp.tid()]
+        if row[0] == row[2]:
+            begin_world(state, row[1])
+        if wp.length(state.h0[row[0]]) > dtype(0.0):
+            state.worlds[row[1]].in_field = 1
+
+    return begin_worlds
 
 
 @cache
 def _start_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
     @wp.kernel(module="unique", enable_backward=False)
-    def start_pairs(
-        # inputs:
-        row_target: wp.array[int],
-        world: wp.array[int],
-        warm: wp.array[int],
-        start: wp.array2d[wp.float64],
-        h0: wp.array[vec3],
-        saturation: wp.array[dtype],
-        # in and out:
-        first: wp.array[vec3],
-        second: wp.array[vec3],
-        # outputs:
-        moments_out: wp.array[vec3],
-        packed_out: wp.array2d[dtype],
-    ):
-        i = row_target[wp.tid()]
-        # without a field the one solution is no magnetization, which a cold start hits
-        if warm[world[i]] == 0 or start[world[i], wp.static(FIELD)] == wp.float64(0.0):
-            u = across(wp.normalize(h0[i]))
-            first[i] = u
-            second[i] = -u
-        store_magnetization(i, (dtype(0.5) * saturation[i]) * (first[i] + second[i]), moments_out, packed_out)
+    def start_pairs(state: state_type(dtype), pairs: pairs_type(dtype)):
+        row = state.row[wp.tid()]
+        i = row[0]
+        # without a field the one solution is no magnetization, where a cold start begins
+        if state.warm[row[1]] == 0 or state.worlds[row[1]].in_field == 0:
+            u = across(wp.normalize(state.h0[i]))
+            pairs.first[i] = u
+            pairs.second[i] = -u
+        mean = dtype(0.5) * state.saturation[i] * (pairs.first[i] + pairs.second[i])
+        store_magnetization(i, mean, state.moments, state.packed)
 
     return start_pairs
 
 
 @cache
 def _split_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
     @wp.kernel(module="unique", enable_backward=False)
     def split_magnetizations(
-        # inputs:
-        row_target: wp.array[int],
-        world: wp.array[int],
-        magnetizations: wp.array[vec3],
-        saturation: wp.array[dtype],
-        # outputs:
-        first_out: wp.array[vec3],
-        second_out: wp.array[vec3],
-        warm_out: wp.array[int],
+        magnetizations: wp.array[wp.types.vector(3, dtype)], state: state_type(dtype), pairs: pairs_type(dtype)
     ):
-        i = row_target[wp.tid()]
-        m = magnetizations[i] / saturation[i]
+        row = state.row[wp.tid()]
+        i = row[0]
+        m = magnetizations[i] / state.saturation[i]
         length = wp.length(m)
         if length > dtype(1.0):
             m = m / length
             length = dtype(1.0)
         half = wp.sqrt(dtype(1.0) - length * length) * across(wp.normalize(m))
-        first_out[i] = m + half
-        second_out[i] = m - half
-        warm_out[world[i]] = 1
+        pairs.first[i] = m + half
+        pairs.second[i] = m - half
+        state.warm[row[1]] = 1
 
     return split_magnetizations
 
 
-_columns = wp.types.vector(2, wp.float64)
-_sum_world = world_summation(2)
-
-
-@wp.func
-def judge(
-    w: int,
-    sums: _columns,
-    rtol: wp.float64,
-    max_evaluations: int,
-    worlds: wp.array[World],
-    start_out: wp.array2d[wp.float64],
-    error_out: wp.array[wp.float64],
-    evaluations_out: wp.array[int],
-    converged_out: wp.array[int],
-    warm_out: wp.array[int],
-    condition_out: wp.array[int],
-):
-    """Tell whether a world has converged, given up or come to nothing; else it steps on."""
-    evaluations = worlds[w].evaluations + 1
-    error = relative_error(sums)
-    lost = not wp.isfinite(error)
-    worlds[w].evaluations = evaluations
-    evaluations_out[w] = evaluations
-    error_out[w] = error
-    converged_out[w] = wp.where(error <= rtol, 1, 0)
-    start_out[w, wp.static(FIELD)] = wp.float64(0.0)
-    if error <= rtol or evaluations >= max_evaluations or lost:
-        worlds[w].active = 0
-        # a state that is not finite must not be the next start
-        warm_out[w] = wp.where(lost, 0, 1)
-    else:
-        condition_out[0] = 1
-
-
 @cache
-def _evaluate_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
+def _convergence_kernel(dtype):
+    """Kernel whose blocks sum a chunk of a world each, the last of which ends its world if it has converged."""
+    state_struct = state_type(dtype)
+    sum_world = world_summation(dtype, 2)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def evaluate_pairs(
-        # inputs:
-        chunk: wp.array[wp.vec3i],
-        chunk_begin: wp.array[int],
-        row_target: wp.array[int],
-        h: wp.array[vec3],
-        first: wp.array[vec3],
-        second: wp.array[vec3],
-        saturation: wp.array[dtype],
-        slope: wp.array[dtype],
-        curve: wp.array[int],
-        rtol: wp.float64,
-        max_evaluations: int,
-        # in and out:
-        worlds: wp.array[World],
-        sums: wp.array2d[wp.float64],
-        arrived: wp.array[int],
-        # outputs:
-        start_out: wp.array2d[wp.float64],
-        error_out: wp.array[wp.float64],
-        evaluations_out: wp.array[int],
-        converged_out: wp.array[int],
-        warm_out: wp.array[int],
-        condition_out: wp.array[int],
-    ):
+    @wp.func_native("warpmag::check_convergence(state, w, deviation2, goal2, finite, !finite);")
+    def end_world(state: state_struct, w: int, deviation2: wp.float64, goal2: wp.float64, finite: bool): ...
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype))
+    def check_convergence(state: state_struct, pairs: pairs_type(dtype)):
         c, lane = wp.tid()
-        w = chunk[c][2]
-        if worlds[w].active == 0:
+        chunk = state.chunk[c]
+        if state.worlds[chunk[2]].active == 0:
             return
-        mine = _columns()
-        for row in range(chunk[c][0] + lane, chunk[c][1], wp.block_dim()):
-            i = row_target[row]
-            g = (slope[i] / saturation[i]) * h[i]
-            goal = (saturation[i] * curve_ratio(wp.length(g), curve[i])) * g
+        mine = wp.vec2d()
+        for row in range(chunk[0] + lane, chunk[1], wp.block_dim()):
+            i = state.row[row][0]
+            limit = state.saturation[i]
+            g = (state.slope[i] / limit) * state.h[i]
+            goal = (limit * curve_ratio(wp.length(g), state.curve[i])) * g
             # lengths, not squares: a field of 1e-20 A/m squared is no float32
-            goal_length = wp.float64(wp.length(goal))
-            lack_length = wp.float64(wp.length(goal - (dtype(0.5) * saturation[i]) * (first[i] + second[i])))
-            mine[wp.static(LACK)] += lack_length * lack_length
-            mine[wp.static(GOAL)] += goal_length * goal_length
-        last, total = _sum_world(block_sum(mine), c, lane, w, chunk_begin[w], chunk_begin[w + 1], sums, arrived)
-        if last and lane == 0:
-            judge(
-                w,
-                total,
-                rtol,
-                max_evaluations,
-                worlds,
-                start_out,
-                error_out,
-                evaluations_out,
-                converged_out,
-                warm_out,
-                condition_out,
-            )
+            deviation = wp.float64(wp.length(goal - (dtype(0.5) * limit) * (pairs.first[i] + pairs.second[i])))
+            mine += wp.vec2d(deviation * deviation, wp.float64(wp.length(goal)) * wp.float64(wp.length(goal)))
+        last, total = sum_world(mine, c, lane, chunk[2], state)
+        if last:
+            end_world(state, chunk[2], total[0], total[1], wp.isfinite(total[0]) and wp.isfinite(total[1]))
 
-    return evaluate_pairs
+    return check_convergence
 
 
 @cache
 def _step_kernel(dtype):
-    vec3 = wp.types.vector(3, dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def step_pairs(
-        # inputs:
-        row_target: wp.array[int],
-        world: wp.array[int],
-        worlds: wp.array[World],
-        h: wp.array[vec3],
-        saturation: wp.array[dtype],
-        slope: wp.array[dtype],
-        curve: wp.array[int],
-        law: int,
-        kappa: dtype,
-        precession: dtype,
-        # in and out:
-        first: wp.array[vec3],
-        second: wp.array[vec3],
-        # outputs:
-        moments_out: wp.array[vec3],
-        packed_out: wp.array2d[dtype],
-    ):
-        i = row_target[wp.tid()]
-        if worlds[world[i]].active == 0:
+    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype))
+    def step_pairs(state: state_type(dtype), pairs: pairs_type(dtype)):
+        row = state.row[wp.tid()]
+        if state.worlds[row[1]].active == 0:
             return
-        u = first[i]
-        v = second[i]
-        h_eff = effective_field(h[i] / saturation[i], dtype(0.5) * (u + v), slope[i], curve[i])
-        u = step_submagnetization(u, h_eff, kappa, precession, dtype(1.0), law)
-        v = step_submagnetization(v, h_eff, kappa, precession, dtype(-1.0), law)
-        first[i] = u
-        second[i] = v
-        store_magnetization(i, (dtype(0.5) * saturation[i]) * (u + v), moments_out, packed_out)
+        i = row[0]
+        u = pairs.first[i]
+        v = pairs.second[i]
+        h_eff = effective_field(state.h[i] / state.saturation[i], dtype(0.5) * (u + v), state.slope[i], state.curve[i])
+        u = step_submagnetization(u, h_eff, pairs.kappa, pairs.precession, dtype(1.0), pairs.law)
+        v = step_submagnetization(v, h_eff, pairs.kappa, pairs.precession, dtype(-1.0), pairs.law)
+        pairs.first[i] = u
+        pairs.second[i] = v
+        store_magnetization(i, (dtype(0.5) * state.saturation[i]) * (u + v), state.moments, state.packed)
 
     return step_pairs
 
@@ -360,131 +239,38 @@ def _step_kernel(dtype):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def launch_split_magnetizations(rows, magnetizations, material, b: InductionBuffers, first, second):
+def make_pairs(state, law: str, kappa: float, precession: float):
+    """Return the pairs that stand for the moments of ``state``, of a dynamics in ``LAW_IDS``."""
+    dtype = state.packed.dtype
+    pairs = pairs_type(dtype)()
+    pairs.first, pairs.second = wp.zeros_like(state.h), wp.zeros_like(state.h)
+    pairs.law, pairs.kappa, pairs.precession = LAW_IDS[law], kappa, precession
+    return pairs
+
+
+def _launch(kernel, state, *inputs):
+    wp.launch(kernel(state.packed.dtype), dim=state.row.shape[0], inputs=[*inputs], device=state.h.device)
+
+
+def launch_split(state, pairs, magnetizations):
     """Let pairs, symmetric about them, stand for given magnetizations [A/m], shape [n]; ends the worlds' cold start."""
-    if rows.count == 0:
-        return
-    wp.launch(
-        _split_kernel(material.saturation.dtype),
-        dim=rows.count,
-        inputs=[rows.target, b.world, magnetizations, material.saturation],
-        outputs=[first, second, b.warm],
-        device=b.h.device,
-    )
+    _launch(_split_kernel, state, magnetizations, state, pairs)
 
 
-def launch_begin(applied, partial, moments, external_field, material, b: InductionBuffers, first, second, moments_out):
-    """Begin a solve from the applied field and, in worlds that are warm, from the pairs as they are.
+def launch_begin(state, pairs):
+    """Begin a solve from the applied field and, in worlds that are warm, from the pairs as they are."""
+    _launch(_begin_kernel, state, state)
+    _launch(_start_kernel, state, state, pairs)
 
-    Args:
-        applied: Work list, permanent moments on inducible ones.
-        partial: Sums of the native field loop over ``applied``.
-        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``); gets the starting moments.
-        external_field: External field [A/m], shape [n].
-        material: What the moments are made of (``kernels.material.curves.CurveParameters``).
-        b: Fields and world state.
-        first: Directions of M1, shape [n].
-        second: Directions of M2, shape [n].
-        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
-    """
+
+def launch_iteration(state, pairs):
+    """Check the convergence of every world in the field ``state.h``, and step the pairs of those that have not ended."""
+    state.condition.zero_()  # until a world wants another evaluation
     wp.launch_tiled(
-        _begin_kernel(moments.dtype),
-        dim=[b.chunk.shape[0]],
-        inputs=[
-            b.chunk,
-            partial,
-            moments.packed,
-            applied.target,
-            applied.begin,
-            applied.end,
-            moments.overlaps,
-            moments.overlap_counts,
-            external_field,
-        ],
-        outputs=[b.h0, b.start, b.worlds, b.condition],
-        block_dim=CHUNK,
-        device=moments.device,
+        _convergence_kernel(state.packed.dtype),
+        dim=[state.chunk.shape[0]],
+        inputs=[state, pairs],
+        block_dim=BLOCK_CHUNK,
+        device=state.h.device,
     )
-    wp.launch(
-        _start_kernel(moments.dtype),
-        dim=applied.count,
-        inputs=[applied.target, b.world, b.warm, b.start, b.h0, material.saturation],
-        outputs=[first, second, moments_out, moments.packed],
-        device=moments.device,
-    )
-
-
-def launch_step_pairs(
-    moments,
-    rows,
-    material,
-    b: InductionBuffers,
-    first,
-    second,
-    moments_out,
-    *,
-    law: int,
-    kappa: float,
-    precession: float,
-    rtol: float,
-    max_evaluations: int,
-):
-    """Judge the field at the inducible moments and step the pairs of every world that has not ended.
-
-    Args:
-        moments: Packed moments with their overlaps (``warpmag.packed.PackedMoments``).
-        rows: Work list whose targets are the inducible moments, whose field stands in ``b.h``.
-        material: What they are made of (``kernels.material.curves.CurveParameters``).
-        b: Fields and world state; ``b.condition`` tells whether another evaluation is wanted.
-        first: Directions of M1, shape [n].
-        second: Directions of M2, shape [n].
-        moments_out: Moments [A·m²], shape [n]; the inducible ones are written.
-        law: ``THETA_EULER``, ``LLG`` or ``LLG_DAMPING``.
-        kappa: Step κ = βΔtMs [dimensionless].
-        precession: Precession over damping, 1/α or 0 [dimensionless].
-        rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
-        max_evaluations: Field evaluations after which a world gives up.
-    """
-    device, dtype = moments.device, moments.dtype
-    b.condition.zero_()  # until a world wants another evaluation
-    wp.launch_tiled(
-        _evaluate_kernel(dtype),
-        dim=[b.chunk.shape[0]],
-        inputs=[
-            b.chunk,
-            b.chunk_begin,
-            rows.target,
-            b.h,
-            first,
-            second,
-            material.saturation,
-            material.slope,
-            material.curve,
-            wp.float64(rtol),
-            max_evaluations,
-            b.worlds,
-            b.sums,
-            b.arrived,
-        ],
-        outputs=[b.start, b.error, b.evaluations, b.converged, b.warm, b.condition],
-        block_dim=CHUNK,
-        device=device,
-    )
-    wp.launch(
-        _step_kernel(dtype),
-        dim=rows.count,
-        inputs=[
-            rows.target,
-            b.world,
-            b.worlds,
-            b.h,
-            material.saturation,
-            material.slope,
-            material.curve,
-            law,
-            dtype(kappa),
-            dtype(precession),
-        ],
-        outputs=[first, second, moments_out, moments.packed],
-        device=device,
-    )
+    _launch(_step_kernel, state, state, pairs)

@@ -3,6 +3,7 @@
 // The functions are templates of the number type, a scalar or a vector of them, with ``any`` of a mask and ``larger``,
 // ``smaller`` and ``root`` of numbers found for it.
 #pragma once
+#include "shared/inverse_root.h"
 #include "shared/vectors.h"
 
 namespace warpmag {
@@ -69,7 +70,19 @@ CUDA_CALLABLE inline void add_overlap_field(Vector& h, Vector r, Number a, Numbe
     add_where(overlapping, h, sum(scaled(g.g1, moment), scaled(g.g2 * dot(apart, moment), apart)));
 }
 
-// The same of (e·∇)H.
+// Adds 4π times the fields of moments m at separations r, of balls of radii a and b.
+CUDA_CALLABLE inline void add_pair_field(Vector& h, Vector r, Number a, Number b, Vector m, Mask wanted) {
+    const Number d2 = dot(r, r), s = a + b, s2 = s * s, c = larger(d2, s2), zero = Number(Real(0));
+    const Number i = (wanted & (c > zero)) ? Real(0.5) * twice_inverse_root(c) : zero, i2 = i * i, i3 = i2 * i;
+    const Number along = 3 * i3 * i2 * dot(r, m);
+    h.x += along * r.x - i3 * m.x;
+    h.y += along * r.y - i3 * m.y;
+    h.z += along * r.z - i3 * m.z;
+    const Mask overlapping = wanted & (d2 < s2);
+    if (any(overlapping)) add_overlap_field(h, r, a, b, m, overlapping);
+}
+
+// The overlap field's counterpart in (e·∇)H.
 CUDA_CALLABLE inline void add_overlap_force(Vector& f, Vector r, Number a, Number b, Vector m, Vector e,
                                             Mask overlapping) {
     const Number unit = 1 / (overlapping ? a + b : Number(Real(1)));

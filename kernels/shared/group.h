@@ -16,6 +16,11 @@ CUDA_CALLABLE inline Number group_total(Number part) {
     for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(~0u, part, other);
     return part;
 }
+// The same, of a group that goes its own way in the warp.
+CUDA_CALLABLE inline Number group_sum(Number part) {
+    for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(group_mask(), part, other);
+    return part;
+}
 // The largest count of a warp's balls.
 CUDA_CALLABLE inline int most(const int* counts) {
     int largest = *counts;
@@ -29,6 +34,7 @@ CUDA_CALLABLE inline int most(const int* counts) {
 constexpr int SHARES = 1;
 inline constexpr int share() { return 0; }
 inline Number group_total(Number part) { return part; }
+inline Number group_sum(Number part) { return part; }
 // The largest count of a vector's balls.
 inline int most(const int* counts) {
     int largest = 0;

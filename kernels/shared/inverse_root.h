@@ -1,9 +1,12 @@
-// The inverse root of a vector N of positive numbers on a CPU.
+// The inverse root of positive numbers.
 #pragma once
 
 namespace warpmag {
 
 // 2/√c. On AVX-512 by Newton's steps from an estimate good to 2⁻¹⁴: a root and a quotient take twice the time.
+#if defined(__CUDA_ARCH__)
+CUDA_CALLABLE inline Real twice_inverse_root(Real c) { return 2 * rsqrt(c); }
+#else
 template <class N> inline N twice_inverse_root(N c) {
 #if defined(__AVX512F__)
     if constexpr (sizeof(N) == 64) {
@@ -19,5 +22,5 @@ template <class N> inline N twice_inverse_root(N c) {
 #endif
     return Real(2) / __builtin_elementwise_sqrt(c);
 }
-
+#endif
 }

@@ -1,0 +1,60 @@
+// Anderson acceleration: the small least squares that mixes the last few iterates.
+//
+// With the differences Δr_j of the present residual r to the last few, the coefficients are
+// α = argmin ‖φ (r − Σ_j α_j Δr_j)‖, j = 0 the latest. Their normal equations are sums over all moments in float64: the
+// right side ⟨φΔr_a, φr⟩, then the upper triangle of the matrix ⟨φΔr_a, φΔr_b⟩, row by row. Takes DEPTH, the changes
+// between iterates that are kept, in a ring, and mixed.
+#pragma once
+
+namespace warpmag {
+
+constexpr double RIDGE = 1.0e-9;  // relative; below it differences of float32 residuals are rounding
+constexpr double LARGEST = 1.0e4; // sum of |α_j| beyond which the iterates are as good as dependent
+
+// Slot of the change ``age`` before the one in slot ``newest``.
+CUDA_CALLABLE inline int slot_of(int newest, int age) { return (newest - age + DEPTH) % DEPTH; }
+
+// Place of the product of changes a ≤ b among the sums.
+CUDA_CALLABLE inline constexpr int matrix_column(int a, int b) { return DEPTH + a * DEPTH - a * (a - 1) / 2 + b - a; }
+
+// Coefficients α_j of the last ``kept`` changes; zeros if they are of no use.
+CUDA_CALLABLE inline wp::vec_t<DEPTH, double> solve_anderson(const double* sums, int kept) {
+#if !defined(__CUDA_ARCH__)
+#pragma clang fp contract(off) // no rounding of a compiler's choice where changes are nearly dependent
+#endif
+    double m[DEPTH][DEPTH], x[DEPTH], size = 0.0;
+    bool regular = true;
+#pragma unroll
+    for (int a = 0, column = DEPTH; a < DEPTH; ++a) {
+        x[a] = a < kept ? sums[a] : 0.0;
+#pragma unroll
+        for (int b = a; b < DEPTH; ++b, ++column)
+            m[a][b] = b < kept ? sums[column] * (a == b ? 1.0 + RIDGE : 1.0) : (a == b ? 1.0 : 0.0);
+    }
+    // elimination in the upper triangle of a symmetric positive definite matrix
+#pragma unroll
+    for (int p = 0; p < DEPTH; ++p) {
+        regular = regular && m[p][p] > 0.0;
+        const double inverse = 1.0 / m[p][p];
+#pragma unroll
+        for (int row = p + 1; row < DEPTH; ++row) {
+            const double factor = m[p][row] * inverse;
+#pragma unroll
+            for (int column = row; column < DEPTH; ++column) m[row][column] -= factor * m[p][column];
+            x[row] -= factor * x[p];
+        }
+        m[p][p] = inverse;
+    }
+#pragma unroll
+    for (int p = DEPTH - 1; p >= 0; --p) {
+#pragma unroll
+        for (int column = p + 1; column < DEPTH; ++column) x[p] -= m[p][column] * x[column];
+        x[p] *= m[p][p];
+        size += x[p] < 0.0 ? -x[p] : x[p];
+    }
+    wp::vec_t<DEPTH, double> alpha;
+#pragma unroll
+    for (int a = 0; a < DEPTH; ++a) alpha[a] = regular && size < LARGEST ? x[a] : 0.0;
+    return alpha;
+}
+}

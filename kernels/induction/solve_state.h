@@ -1,0 +1,55 @@
+// Worlds of an induction solve: how one begins, and when it has converged (Kim and Han 2022, Eq. 12).
+//
+// ``State`` is the struct of solve_state.py.
+#pragma once
+
+namespace warpmag {
+
+constexpr int STEADY = 3; // solves in a row that make two changes to extrapolate from
+enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // what a world does next
+
+// Lets a world iterate; ``stiffness`` is that of some of its moments.
+template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w, double stiffness) {
+    auto& world = state.worlds.data[w];
+    // of positive numbers the larger has the larger bits
+#if defined(__CUDA_ARCH__)
+    atomicMax((long long*)&world.stiffness, __double_as_longlong(stiffness));
+#else
+    __atomic_fetch_max((long long*)&world.stiffness, __builtin_bit_cast(long long, stiffness), __ATOMIC_RELAXED);
+#endif
+    world.active = 1;
+    world.evaluations = 0;
+    world.next = state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
+    world.linked = 0;
+    world.plain_steps = 0;
+    world.best = -1.0;
+    if (state.warm.data[w] == 0) world.kept = 0;
+    state.condition.data[0] = 1;
+}
+
+// Whether a world ends after another evaluation, from its sums ‖M − f(H)‖² and ‖f(H)‖². Its residual is relative, save
+// where there is no field. A state that is not finite is no start for the next solve.
+template <class State>
+CUDA_CALLABLE inline bool check_convergence(State& state, int w, double deviation2, double goal2, bool finite,
+                                            bool hopeless) {
+    auto& world = state.worlds.data[w];
+    const double deviation = wp::sqrt(deviation2), goal = wp::sqrt(goal2),
+                 residual = goal > 0.0 ? deviation / goal : deviation;
+    const bool converged = residual <= state.rtol;
+    world.evaluations += 1;
+    world.stiffness = 0.0;
+    world.in_field = 0;
+    state.error.data[w] = residual;
+    state.evaluations.data[w] = world.evaluations;
+    state.converged.data[w] = converged;
+    const bool done = converged || world.evaluations >= state.max_evaluations || hopeless;
+    if (done) {
+        int& warm = state.warm.data[w];
+        warm = !finite ? 0 : warm < STEADY ? warm + 1 : STEADY;
+        world.active = 0;
+    } else {
+        state.condition.data[0] = 1;
+    }
+    return done;
+}
+}

@@ -1,0 +1,381 @@
+// The accelerated θ flow (Kim and Han 2022, Eqs. 8, 9 and 11, exact in time), in passes over the inducible moments;
+// theta_flow.py has its equations, theta_step.h what a world does next.
+//
+// On a CPU a pass works on a vector of moments, which are all of one world; on a GPU a group of threads has a moment.
+// Takes CAPACITY, DEPTH, GROUP and INVERSE_4PI; ``State`` is the struct of solve_state.py.
+#pragma once
+#include "induction/theta_step.h"
+#include "material/curves.h"
+#include "pairs/neighbor_lists.h"
+#include "pairs/pair_law.h"
+#include "shared/group.h"
+#include "shared/team.h"
+
+namespace warpmag {
+
+constexpr double SWEEP_STEP = 1.4; // step length of a sweep over that of a step: long chains of balls want more
+
+enum Pass { START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE }; // as in theta_flow.py
+
+// Inducible moments of one world from number i on, ``held`` of them; their lists and lines stand at ``row``, and the
+// world's inducible moments are those from begin to end.
+struct Place {
+    int row, i, held, world, begin, end;
+};
+
+#if defined(__CUDA_ARCH__)
+typedef double Wide;
+CUDA_CALLABLE inline Wide wide(Number x) { return x; }
+
+template <class State> CUDA_CALLABLE inline Place place(const State& state, int row) {
+    const int4 moment = ((const int4*)state.row.data)[row];
+    return {row, moment.x, 1, moment.y, moment.z, moment.w};
+}
+#else
+typedef double Wide __attribute__((ext_vector_type(WIDTH)));
+inline Wide wide(Number x) { return __builtin_convertvector(x, Wide); }
+
+template <class State> inline Place place(const State& state, int row) {
+    const auto& chunk = state.chunk.data[row / CHUNK]; // first and last row of the work list, world
+    const auto& first = state.row.data[chunk[0]];
+    const int offset = row % CHUNK, left = chunk[1] - chunk[0] - offset;
+    return {row, first[0] + offset, left < 0 ? 0 : left > WIDTH ? WIDTH : left, chunk[2], first[2], first[3]};
+}
+#endif
+
+// Vectors of moments in row ``number`` of an array, and numbers of them.
+template <class Array> CUDA_CALLABLE inline Real* entries(const Array& array, const Place& at, int number = 0) {
+    return (Real*)((char*)array.data + number * (size_t)array.strides[0]) + sizeof(*array.data) / sizeof(Real) * at.i;
+}
+template <class Array> CUDA_CALLABLE inline Vector get(const Array& array, const Place& at, int number = 0) {
+    return vectors(entries(array, at, number), at.held);
+}
+template <class Array> CUDA_CALLABLE inline void set(const Array& array, const Place& at, Vector v, int number = 0) {
+    put_vectors(entries(array, at, number), at.held, v);
+}
+CUDA_CALLABLE inline Vector vector_of(Four f) { return {f.x, f.y, f.z}; }
+
+CUDA_CALLABLE inline Vector group_sums(Vector part) {
+    return {group_sum(part.x), group_sum(part.y), group_sum(part.z)};
+}
+
+struct Material {
+    Number saturation, slope;
+    int curve;
+};
+template <class State> CUDA_CALLABLE inline Material material_of(const State& state, const Place& at) {
+    return {some(entries(state.saturation, at), at.held, 1), some(entries(state.slope, at), at.held, 1),
+            state.curve.data[at.i]};
+}
+
+// Positions and radii [m].
+template <class State> CUDA_CALLABLE inline Four balls_at(const State& state, const Place& at) {
+    Number x[4];
+    for (int c = 0; c < 4; ++c) x[c] = some(entries(state.packed, at, c), at.held, 0);
+    return {x[0], x[1], x[2], x[3]};
+}
+
+// Moments [A·m²] of balls of given radii [m] for dual variables s.
+CUDA_CALLABLE inline Vector moments_of(Material material, Number radius, Vector s) {
+    const Number volume = Real(4.18879020478639) * radius * radius * radius;
+    return scaled(volume * material.saturation * curve_ratio(length(s), material.curve), s);
+}
+
+template <class State> CUDA_CALLABLE inline void store_moments(State& state, const Place& at, Vector m) {
+    set(state.moments, at, m);
+    put_some(entries(state.packed, at, 4), at.held, m.x);
+    put_some(entries(state.packed, at, 5), at.held, m.y);
+    put_some(entries(state.packed, at, 6), at.held, m.z);
+}
+
+// Calls visit(row, listed) for the inducible neighbours of moments; a moment whose list is full has none.
+#if defined(__CUDA_ARCH__)
+template <class State, class Visit>
+CUDA_CALLABLE inline void visit_neighbors(const State& state, const Place& at, Visit visit) {
+    const int* const list = state.neighbor.data + (size_t)CAPACITY * at.i;
+    const int count = state.neighbor_count.data[at.i];
+    for (int s = share(); s < (count > CAPACITY ? 0 : count); s += SHARES) {
+        const int j = list[s], row = j - at.i + at.row;
+        if (j >= at.begin && j < at.end) visit(&row, true);
+    }
+}
+#else
+template <class State, class Visit> inline void visit_neighbors(const State& state, const Place& at, Visit visit) {
+    Index self;
+    for (int l = 0; l < WIDTH; ++l) self[l] = at.row + l;
+    for (int s = 0; s < state.near_count.data[at.row / WIDTH]; ++s) {
+        const int* const rows = list_at(state.near.data, CAPACITY, s, at.row);
+        visit(rows, mask_of(indices(rows) != self));
+    }
+}
+
+// Lists the rows of neighbours side by side for a vector; shorter lists are filled up with the moment itself.
+template <class State> inline void list_neighbors(State& state, const Place& at) {
+    int* const lists = list_at(state.near.data, CAPACITY, 0, at.row);
+    int counts[WIDTH] = {};
+    for (int l = 0; l < at.held; ++l) {
+        const int i = at.i + l, found = state.neighbor_count.data[i];
+        for (int s = 0; s < found && found <= CAPACITY; ++s) {
+            const int j = state.neighbor.data[(size_t)CAPACITY * i + s];
+            if (j >= at.begin && j < at.end) lists[CHUNK * counts[l]++ + l] = j - at.i + at.row;
+        }
+    }
+    const int longest = most(counts);
+    for (int l = 0; l < WIDTH; ++l)
+        for (int s = counts[l]; s < longest; ++s) lists[CHUNK * s + l] = at.row + l;
+    state.near_count.data[at.row / WIDTH] = longest;
+}
+#endif
+
+// Volume that balls share with other inducible ones, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
+//
+// Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
+// above 1/3 − (1 + max o_i), which is −2/3 without overlap. From it follows a step length that converges for any
+// arrangement.
+template <class State> CUDA_CALLABLE inline Number overlap_of(const State& state, const Place& at, Four ball) {
+    const Real* const packed = (const Real*)state.packed.data;
+    const size_t pitch = state.packed.strides[0] / sizeof(Real);
+    Index self = Index(at.i);
+#if !defined(__CUDA_ARCH__)
+    for (int l = 0; l < at.held; ++l) self[l] += l;
+#endif
+    Number volume = 0;
+    auto add = [&](Index j, Mask listed) {
+        auto row = [&](int c) { return collect(packed + c * pitch, j); };
+        const Vector r = {ball.x - row(0), ball.y - row(1), ball.z - row(2)};
+        volume += shared_volume(dot(r, r), ball.w, row(3), listed & mask_of(j != self));
+    };
+    walk_lists(state.overlap.data, state.overlap_count.data, self, at.held, Index(at.begin), Index(at.end), add);
+    return group_sum(volume);
+}
+
+// 4π times what the field [A/m] of neighbours was at the last solution, and ``ahead`` of its change from the one
+// before.
+template <class State>
+CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& at, Number radius, Real ahead) {
+    const Real* const past = (const Real*)state.past.data;
+    const Vector x0 = vector_of(own_four(past, 0, at.row)), x1 = vector_of(own_four(past, 2, at.row));
+    Vector total = {0, 0, 0};
+    visit_neighbors(state, at, [&](const int* j, Mask listed) {
+        const Four y0 = four_at(past, 0, j), y1 = four_at(past, 2, j);
+        Vector last = {0, 0, 0}, earlier = {0, 0, 0};
+        add_pair_field(last, less(x0, vector_of(y0)), radius, y0.w, vector_of(four_at(past, 1, j)), listed);
+        add_pair_field(earlier, less(x1, vector_of(y1)), radius, y1.w, vector_of(four_at(past, 3, j)), listed);
+        total = sum(total, sum(last, scaled(ahead, less(last, earlier))));
+    });
+    return group_sums(total);
+}
+
+// Starts a solve: first moments from the applied field and from what the last solves left. Returns the stiffness.
+template <class State> CUDA_CALLABLE inline Number start(State& state, const Place& at) {
+    auto& world = state.worlds.data[at.world];
+    const int warm = state.warm.data[at.world];
+    const Real ahead = (Real)world.ahead;
+    const Four ball = balls_at(state, at);
+    const Material material = material_of(state, at);
+    const Number stiffness = material.slope * (overlap_of(state, at, ball) + Real(2.0 / 3.0));
+    Vector near = {0, 0, 0};
+    if (warm == STEADY) near = extrapolated_field(state, at, ball.w, ahead);
+    if (share() != 0) return stiffness;
+    const Vector h0 = get(state.h0, at);
+    if (any(mask_of(length(h0) > Real(0)))) world.in_field = 1;
+    Vector s = get(state.s, at);
+    // the θ flow with κ = k from no magnetization: exact for a lone ball; shorter where balls overlap deeply
+    if (warm == 0) {
+        const Number one = 1, step = smaller(one, step_length<Real>(stiffness) / Real(0.6));
+        s = scaled(step * material.slope / material.saturation, h0);
+    }
+    if (warm == STEADY) s = sum(s, scaled(ahead, less(get(state.past_g, at), get(state.past_g, at, 1))));
+    set(state.s, at, s);
+    const Vector m = moments_of(material, ball.w, s);
+    store_moments(state, at, m);
+    put_four(state.now.data, 0, at.row, ball);
+    put_four(state.swept.data, 0, at.row, ball);
+    if (warm != STEADY) return stiffness;
+    const Vector field = get(state.past_field, at), change = less(field, get(state.past_field, at, 1));
+    const Vector far = less(sum(field, scaled(ahead, change)), scaled(INVERSE_4PI, near));
+    set(state.mixed_g, at, scaled(material.slope / material.saturation, sum(h0, far)));
+    set(state.mixed_moment, at, {0, 0, 0});
+    put_four(state.now.data, 1, at.row, {m.x, m.y, m.z, 0});
+    return stiffness;
+}
+
+// Sweeps once over neighbours, whose changes stand with their places in lines of cache; the last sweep stores moments.
+template <class State> CUDA_CALLABLE inline void sweep(State& state, const Place& at, bool last) {
+    if (at.row == 0 && share() == 0) state.condition.data[0] = 0; // until a world wants another evaluation
+    const auto& world = state.worlds.data[at.world];
+    if (world.next != STEP_AND_SWEEP) return;
+    Real* const from = last ? state.swept.data : state.now.data;
+    const Four ball = own_four(from, 0, at.row);
+    Vector h = {0, 0, 0};
+    visit_neighbors(state, at, [&](const int* j, Mask listed) {
+        const Four other = four_at(from, 0, j), change = four_at(from, 1, j);
+        add_pair_field(h, less(vector_of(ball), vector_of(other)), ball.w, other.w, vector_of(change), listed);
+    });
+    h = group_sums(h);
+    if (share() != 0) return;
+    const Material material = material_of(state, at);
+    const Vector s = get(state.s, at);
+    const Vector g = sum(get(state.mixed_g, at), scaled(INVERSE_4PI * material.slope / material.saturation, h));
+    const Real wanted = Real(SWEEP_STEP) * (Real)world.omega;
+    const Vector next = sum(s, scaled(wanted < 1 ? wanted : Real(1), less(g, s)));
+    set(state.s, at, next);
+    const Vector m = moments_of(material, ball.w, next);
+    if (last) {
+        store_moments(state, at, m);
+    } else {
+        const Vector change = less(m, get(state.mixed_moment, at));
+        put_four(state.swept.data, 1, at.row, {change.x, change.y, change.z, 0});
+    }
+}
+
+CUDA_CALLABLE inline Wide wide_dot(Vector a, Vector b) {
+    return wide(a.x) * wide(b.x) + wide(a.y) * wide(b.y) + wide(a.z) * wide(b.z);
+}
+
+// Keeps an iterate and its residual, and calls put(column, value) for what moments add to the sums of their world.
+template <class State, class Put> CUDA_CALLABLE inline void measure(State& state, const Place& at, Put put) {
+    const auto& world = state.worlds.data[at.world];
+    const History history = history_of(world);
+    const Material material = material_of(state, at);
+    const Vector s = get(state.s, at), g = scaled(material.slope / material.saturation, get(state.h, at));
+    const Vector r = less(g, s);
+    if (world.linked) {
+        set(state.history_s, at, less(s, get(state.iterate_s, at)), history.newest);
+        set(state.history_r, at, less(r, get(state.iterate_r, at)), history.newest);
+    }
+    set(state.iterate_s, at, s);
+    set(state.iterate_r, at, r);
+    const Number length_s = length(s), length_g = length(g);
+    const Number worth_s = material.saturation * curve_ratio(length_s, material.curve);
+    const Number worth_g = material.saturation * curve_ratio(length_g, material.curve);
+    // lengths, not squares: a field of 1e-20 A/m squared is no float32
+    const Wide goal = wide(worth_g * length_g), deviation = wide(length(less(scaled(worth_g, g), scaled(worth_s, s))));
+    const Wide weight = wide(length_s > length_g ? worth_s : worth_g), square = weight * weight;
+    const Wide merit = weight * wide(length(r));
+    put(DEVIATION, deviation * deviation);
+    put(GOAL, goal * goal);
+    put(MERIT, merit * merit);
+    const Vector past = get(state.past_g, at), earlier = less(past, get(state.past_g, at, 1));
+    put(FOLLOWED, square * wide_dot(less(g, past), earlier));
+    put(EARLIER, square * wide_dot(earlier, earlier));
+    Vector change[DEPTH];
+#pragma unroll
+    for (int a = 0; a < DEPTH; ++a) {
+        if (a >= history.kept) continue;
+        change[a] = get(state.history_r, at, slot_of(history.newest, a));
+        put(PRODUCTS + a, square * wide_dot(change[a], r));
+#pragma unroll
+        for (int b = 0; b <= a; ++b) put(PRODUCTS + matrix_column(b, a), square * wide_dot(change[b], change[a]));
+    }
+}
+
+// Keeps what the start of the next solve needs of a world's last iterate: its mixture, which is nearer to the solution.
+template <class State>
+CUDA_CALLABLE inline void keep_solution(State& state, const Place& at, Material material, Vector mixed, Vector g) {
+    const Four ball = own_four(state.now.data, 0, at.row);
+    const Vector m = moments_of(material, ball.w, mixed), h = scaled(material.saturation / material.slope, g);
+    Real* const past = state.past.data;
+    for (int quarter = 0; quarter < 2; ++quarter) put_four(past, 2 + quarter, at.row, own_four(past, quarter, at.row));
+    put_four(past, 0, at.row, ball);
+    put_four(past, 1, at.row, {m.x, m.y, m.z, 0});
+    set(state.past_field, at, get(state.past_field, at), 1);
+    set(state.past_g, at, get(state.past_g, at), 1);
+    set(state.past_field, at, less(h, get(state.h0, at)));
+    set(state.past_g, at, g);
+}
+
+// Takes the step that the world has chosen.
+template <class State> CUDA_CALLABLE inline void advance(State& state, const Place& at) {
+    const auto& world = state.worlds.data[at.world];
+    if (world.next == NOTHING) return;
+    Vector mixed = {0, 0, 0}, r = {0, 0, 0};
+    if (world.next == STEP_FROM_BEST) {
+        mixed = get(state.best_s, at);
+        r = get(state.best_r, at);
+    } else if (world.next != DEMAGNETIZE) {
+        mixed = get(state.iterate_s, at);
+        r = get(state.iterate_r, at);
+        if (world.improved) {
+            set(state.best_s, at, mixed);
+            set(state.best_r, at, r);
+        }
+        for (int a = 0; a < world.used; ++a) {
+            const int old = slot_of(world.newest, a);
+            const Real alpha = (Real)world.alpha[a];
+            mixed = less(mixed, scaled(alpha, get(state.history_s, at, old)));
+            r = less(r, scaled(alpha, get(state.history_r, at, old)));
+        }
+    }
+    const Vector g = sum(mixed, r), next = sum(mixed, scaled((Real)world.omega, r));
+    const Material material = material_of(state, at);
+    set(state.s, at, next);
+    // what has ended keeps the moments that its error was measured at, and s is the next solve's start
+    if (!world.active) return keep_solution(state, at, material, mixed, g);
+    const Number radius = some(entries(state.packed, at, 3), at.held, 0);
+    const Vector m = moments_of(material, radius, next);
+    store_moments(state, at, m);
+    if (world.next != STEP_AND_SWEEP) return;
+    const Vector before = moments_of(material, radius, mixed), change = less(m, before);
+    set(state.mixed_g, at, g);
+    set(state.mixed_moment, at, before);
+    put_four(state.now.data, 1, at.row, {change.x, change.y, change.z, 0});
+}
+
+#if defined(__CUDA_ARCH__)
+// What moment ``row`` adds to the sums of its world.
+template <class State> CUDA_CALLABLE inline wp::vec_t<COLUMNS, double> measured(State& state, int row) {
+    wp::vec_t<COLUMNS, double> sums;
+    measure(state, place(state, row), [&](int column, Wide value) { sums[column] = value; });
+    return sums;
+}
+#else
+// Sums of a vector of moments.
+template <class State> inline void measure_vector(State& state, const Place& at) {
+    double* const sums = state.sums.data + (size_t)COLUMNS * (at.row / WIDTH);
+    for (int column = 0; column < COLUMNS; ++column) sums[column] = 0;
+    measure(state, at, [=](int column, Wide lanes) {
+#pragma clang fp reassociate(on)
+        double total = 0;
+        for (int l = 0; l < WIDTH; ++l) total += lanes[l];
+        sums[column] = total;
+    });
+}
+
+// Adds up the sums of a world's vectors and lets it choose its next step.
+template <class State> inline void choose_for_world(State& state, int w) {
+    constexpr int VECTORS = CHUNK / WIDTH;
+    double total[COLUMNS] = {};
+    for (int v = VECTORS * state.chunk_begin.data[w]; v < VECTORS * state.chunk_begin.data[w + 1]; ++v)
+        for (int column = 0; column < COLUMNS; ++column) total[column] += state.sums.data[(size_t)COLUMNS * v + column];
+    choose_step(state, w, total);
+}
+
+template <class State> inline void make_pass(State& state, int pass, int row) {
+    const Place at = place(state, row);
+    if (at.held == 0) return;
+    auto& world = state.worlds.data[at.world];
+    if (pass == START) {
+        if (state.searching.data[0]) list_neighbors(state, at);
+        const Number stiffness = start(state, at);
+        Real most = 0;
+        for (int l = 0; l < at.held; ++l) most = stiffness[l] > most ? stiffness[l] : most;
+        begin_world(state, at.world, most);
+    } else if (pass == FIRST_SWEEP || pass == LAST_SWEEP) {
+        sweep(state, at, pass == LAST_SWEEP);
+    } else if (pass == MEASURE) {
+        if (world.active) measure_vector(state, at);
+    } else if (pass == ADVANCE) {
+        advance(state, at);
+    } else if (row == CHUNK * state.chunk_begin.data[at.world]) {
+        if (world.active) choose_for_world(state, at.world);
+        else world.next = NOTHING;
+    }
+}
+
+template <class State> inline void theta_flow(int first, int last, int threads, Word* team, State& state) {
+    run_passes(team, threads, first, last, CHUNK * state.chunk.shape[0], WIDTH,
+               [&](int pass, int row) { make_pass(state, pass, row); });
+}
+#endif
+}
