@@ -50,6 +50,9 @@ START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)
 _BEGINNERS = 4
 """Blocks of a GPU that share the moments of a chunk at the start of a solve, where a moment takes a group of threads."""
 
+_RESIDENT = {wp.float32: (3, 5), wp.float64: (2, 3)}
+"""Blocks of 256 threads that a multiprocessor is to hold at the start and in sweeps: compilers take more registers."""
+
 
 def _options(dtype, group: int) -> dict:
     return native_options(
@@ -74,7 +77,12 @@ def _begin_kernel(dtype, group: int):
     @wp.func_native("warpmag::begin_world(state, w, stiffness);")
     def begin_world(state: state_struct, w: int, stiffness: wp.float64): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group))
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        module_options=_options(dtype, group),
+        launch_bounds=(256, _RESIDENT[dtype][0]),
+    )
     def begin_flow(state: state_struct):
         block, lane = wp.tid()
         chunk = state.chunk[block // wp.static(_BEGINNERS)]
@@ -97,7 +105,12 @@ def _sweep_kernel(dtype, group: int):
     @wp.func_native("warpmag::sweep(state, warpmag::place(state, row), last == 1);")
     def sweep_neighbors(state: state_struct, row: int, last: int): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group))
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        module_options=_options(dtype, group),
+        launch_bounds=(256, _RESIDENT[dtype][1]),
+    )
     def sweep(last: int, state: state_struct):
         sweep_neighbors(state, wp.tid() // wp.static(group), last)
 
