@@ -6,10 +6,9 @@ import warp as wp
 from arrangements import as_float32, fcc_block, overlapping, pile, relative
 
 import warpmag
-from warpmag import oracle
+from warpmag import magnets, oracle
 
 MS = 1.7e6
-CURVES = ("tanh", "langevin", "clamped")
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +23,7 @@ def block():
     return x, radius, (source, moment), exact
 
 
-@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("curve", magnets.CURVES)
 @pytest.mark.parametrize("susceptibility", [1.0, np.inf])
 @pytest.mark.parametrize("strength", [0.0, 1e-12, 1e-6, 1e-2, 0.3, 1.0, 10.0, 1e6])
 def test_isolated_ball_takes_one_iteration(curve, susceptibility, strength, device):
@@ -110,7 +109,7 @@ def test_fields_of_eight_decades_in_one_scene(device):
     assert relative(found.magnetizations, exact.magnetizations) < 1e-4
 
 
-@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("curve", magnets.CURVES)
 def test_curves_and_materials(curve, device):
     rng = np.random.default_rng(5)
     x, radii, _ = pile(count=200)

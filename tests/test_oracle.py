@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from warpmag import oracle
+from warpmag import magnets, oracle
 
 EYE = np.eye(3)
 
@@ -88,7 +88,7 @@ def test_gradient_is_traceless_outside_and_symmetric():
     assert np.abs(gradients - gradients.transpose(0, 2, 1)).max() == 0.0
 
 
-@pytest.mark.parametrize("curve", ["tanh", "langevin", "clamped"])
+@pytest.mark.parametrize("curve", magnets.CURVES)
 @pytest.mark.parametrize("susceptibility", [0.5, 3.0, np.inf])
 def test_curve_derivative(curve, susceptibility):
     rng = np.random.default_rng(3)

@@ -6,7 +6,7 @@ import warp as wp
 from arrangements import overlapping, pile, relative
 
 import warpmag
-from warpmag import oracle
+from warpmag import magnets, oracle
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_terms import Quantity
@@ -243,7 +243,7 @@ def test_starts_never_decide_the_solution(dtype, device):
         assert np.linalg.norm(found - exact) <= 100.0 * rtol * np.linalg.norm(exact), step
 
 
-@pytest.mark.parametrize("curve", ["tanh", "langevin", "clamped"])
+@pytest.mark.parametrize("curve", magnets.CURVES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_vector_passes_do_what_plain_ones_do(dtype, curve, device, monkeypatch):
     """What a CPU does in vectors: on the move, with magnets among the balls, and more neighbours than lists hold.

@@ -1,9 +1,9 @@
 """Magnetization dynamics: how inducible moments move from a field evaluation towards equilibrium.
 
 This is the one place where a dynamics is chosen. Each is an object with the same four methods, all of which only launch
-kernels: ``start`` begins a solve in the applied field, ``refine`` improves the moments by what their neighbours' changes
-make, before the field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the magnetizations that the
-next solve starts from. They work on the state of a solve (``kernels.induction.solve_state``), bound to its moments.
+kernels: ``start`` begins a solve in the applied field, ``refine`` improves the moments by the field of their neighbours
+before the whole field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the magnetizations of the
+next start. They work on the state of a solve (``kernels.induction.solve_state``), bound to its moments.
 """
 
 from functools import cached_property

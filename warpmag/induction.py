@@ -78,7 +78,7 @@ def solve_induction(
         radii: Ball radii [m], scalar or [n].
         saturation: Saturation magnetization Ms [A/m], scalar or [n].
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-        curve: Magnetization curve: ``tanh`` (Eq. 10), ``langevin`` or ``clamped`` (Eq. 7).
+        curve: Magnetization curve, one of ``magnets.CURVES``.
         external_field: Applied field H0 [A/m], shape [3] or [n, 3].
         sources: Permanent magnets as (positions [m], moments [A·m²]), each of shape [k, 3]; point dipoles.
         dynamics: ``theta``: the exact flow of Eqs. 8 and 9, accelerated; ``theta-euler``: their explicit step;

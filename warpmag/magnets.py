@@ -11,6 +11,7 @@ from warpmag.errors import InputError
 
 KINDS = ("inducible", "permanent")
 CURVES = ("tanh", "langevin", "clamped")
+"""Magnetization curves, see ``kernels.material.curves``; a model has the place in this list."""
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")
 DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
@@ -61,7 +62,7 @@ class Magnet:
         kind: ``inducible`` (magnetized by the field it is in) or ``permanent``.
         saturation: Saturation magnetization Ms [A/m], inducible only.
         susceptibility: Susceptibility χ [dimensionless], may be infinite, inducible only.
-        curve: Magnetization curve: ``tanh`` (Eq. 10), ``langevin`` or ``clamped`` (Eq. 7), inducible only.
+        curve: Magnetization curve, one of :data:`CURVES`, inducible only.
         magnetization: Magnetization of a permanent magnet [A/m], in its own frame.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
     """

@@ -183,7 +183,7 @@ def curve_slope(susceptibility):
 
 
 def reduced_curve(s, curve):
-    """Reduced magnetization ‖M‖/Ms of a reduced field s = k‖H‖/Ms, and its derivative, for one of the three curves."""
+    """Reduced magnetization ‖M‖/Ms of a reduced field s = k‖H‖/Ms, and its derivative, for one of the curves."""
     s = np.asarray(s, float)
     if curve == "tanh":  # Eq. 10
         return np.tanh(s), 1.0 / np.cosh(np.minimum(s, 300.0)) ** 2
@@ -285,7 +285,7 @@ def equilibrium(
         h0: Applied field [A/m], shape [3] or [n, 3].
         saturation: Saturation magnetization Ms [A/m], scalar or [n].
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-        curve: ``tanh``, ``langevin`` or ``clamped``.
+        curve: Magnetization curve, see :func:`reduced_curve`.
         extra_coupling: Added to the dipoles' coupling G, shape [3n, 3n]; None adds nothing.
         tolerance: Relative residual at which to stop.
         iterations: Newton iterations at the most.

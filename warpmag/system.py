@@ -75,7 +75,7 @@ class MomentSystem:
             movable: Whether the force on a moment is wanted, shape [n]; None means all.
             saturation: Saturation magnetization Ms [A/m], scalar or [n].
             susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-            curve: ``tanh``, ``langevin`` or ``clamped``, one for all.
+            curve: Magnetization curve, one of ``magnets.CURVES`` for all.
             external_field: Applied field [A/m], shape [3] or [n, 3].
             force: ``kelvin`` or ``zeeman``.
             dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of

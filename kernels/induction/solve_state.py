@@ -1,8 +1,40 @@
-"""State of an induction solve on the device, which every magnetization dynamics shares.
+"""State of an induction solve on the device and its convergence (Kim and Han 2022, Eq. 12), for every dynamics.
 
 How the moments move is another matter: ``theta_flow`` is the product, ``submagnetization`` its rivals. Each world
-iterates for itself, with its own convergence (Kim and Han 2022, Eq. 12), see ``solve_state.h``. Sums go by fixed chunks
-of a world's moments in a fixed order, in float64.
+iterates and converges for itself, see ``solve_state.h``. Sums go by fixed chunks of a world's moments in a fixed order,
+in float64.
+
+The state of n moments, m of them inducible, in w worlds and c chunks:
+
+    packed, moments: Moments, packed and plain [A·m²], shapes [8, n] and [n]; the inducible ones are written.
+    neighbor, neighbor_count, overlap, overlap_count, searching: Their lists (``PackedMoments``).
+    saturation, slope, curve: What they are made of (``curves.CurveParameters``).
+    rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
+    max_evaluations: Field evaluations after which a world gives up.
+    row: Number, world, and the world's inducible moments from and to, of each inducible moment, shape [m].
+    chunk: Rows from and to, and world, of each chunk, shape [c].
+    chunk_begin: First chunk of each world, shape [w + 1].
+    near: On a CPU rows of the neighbours of a chunk's moments, shape [c, CAPACITY, CHUNK].
+    near_count: How many the longest list of each vector has.
+    h0: Applied field [A/m]: external and from permanent magnets, shape [n].
+    h: Whole field [A/m], shape [n].
+    s: Dual variable [dimensionless], shape [n].
+    iterate_s, iterate_r: The last iterate, and its residual, shape [n].
+    history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
+    best_s, best_r: Those of the smallest merit, shape [n].
+    mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
+    mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
+    past_field, past_g: Field of the inducible moments at the last two solutions [A/m], and the reduced whole field; the
+        last first, shape [2, n].
+    past: Place [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
+    now, swept: Place [m], radius and what a step or a first sweep adds to the moment, shape [rows, LINE].
+    sums: Sums of each chunk, on a CPU of each vector, shape [c, COLUMNS].
+    arrived: Chunks of each world whose sums are done, shape [w].
+    worlds: State of each world, shape [w].
+    warm: Solves of each world since it began cold, as far as it matters, shape [w].
+    error: Relative residual of each world, shape [w].
+    evaluations, converged: What a solve took, and whether it reached its goal, shape [w].
+    condition: Whether any world still iterates, shape [1].
 """
 
 from functools import cache
@@ -63,45 +95,11 @@ class World:
 
 @cache
 def state_type(dtype):
-    """Type of the state of a solve of n moments, m of them inducible, in w worlds and c chunks."""
+    """Type of the state of a solve; the module says what its arrays are."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
     class SolveState:
-        """What a solve works on and keeps.
-
-        Attributes:
-            packed, moments: Moments, packed and plain [A·m²], shapes [8, n] and [n]; the inducible ones are written.
-            neighbor, neighbor_count, overlap, overlap_count, searching: Their lists (``warpmag.packed.PackedMoments``).
-            saturation, slope, curve: What they are made of (``curves.CurveParameters``).
-            rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
-            max_evaluations: Field evaluations after which a world gives up.
-            row: Number, world, and the world's inducible moments from and to, of each inducible moment, shape [m].
-            chunk: Rows from and to, and world, of each chunk, shape [c].
-            chunk_begin: First chunk of each world, shape [w + 1].
-            near: On a CPU rows of the neighbours of a chunk's moments, shape [c, CAPACITY, CHUNK].
-            near_count: How many the longest list of each vector has.
-            h0: Applied field [A/m]: external and from permanent magnets, shape [n].
-            h: Whole field [A/m], shape [n].
-            s: Dual variable [dimensionless], shape [n].
-            iterate_s, iterate_r: The last iterate, and its residual, shape [n].
-            history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
-            best_s, best_r: Those of the smallest merit, shape [n].
-            mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
-            mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
-            past_field, past_g: Fields that all but the neighbours made at the last two solutions [A/m], and the reduced
-                whole field; the last first, shape [2, n].
-            past: Place [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
-            now, swept: Place [m], radius and what a step or a first sweep adds to the moment, shape [rows, LINE].
-            sums: Sums of each chunk, on a CPU of each vector, shape [c, COLUMNS].
-            arrived: Chunks of each world whose sums are done, shape [w].
-            worlds: State of each world, shape [w].
-            warm: Solves of each world since it began cold, as far as it matters, shape [w].
-            error: Relative residual of each world, shape [w].
-            evaluations, converged: What a solve took, and whether it reached its goal, shape [w].
-            condition: Whether any world still iterates, shape [1].
-        """
-
         packed: wp.array2d[dtype]
         moments: wp.array[vec3]
         neighbor: wp.array2d[int]
@@ -203,7 +201,7 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
 
     Args:
         state: State of the solve.
-        packed: All moments, packed (``warpmag.packed.PackedMoments``).
+        packed: All moments, packed (``PackedMoments``).
         material: What they are made of (``curves.CurveParameters``).
         moments: Moments [A·m²], shape [n].
         rtol: Relative residual at which a world ends.

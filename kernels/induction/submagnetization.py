@@ -264,7 +264,7 @@ def launch_begin(state, pairs):
 
 
 def launch_iteration(state, pairs):
-    """Check the convergence of every world in the field ``state.h``, and step the pairs of those that have not ended."""
+    """Check the convergence of every world in the field ``state.h``, and step the pairs of those that go on."""
     state.condition.zero_()  # until a world wants another evaluation
     wp.launch_tiled(
         _convergence_kernel(state.packed.dtype),

@@ -200,7 +200,8 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     return stiffness;
 }
 
-// Sweeps once over neighbours, whose changes stand with their places in lines of cache; the last sweep stores moments.
+// Sweeps once over neighbours, whose changes are read with their places, a cache line each; the last sweep stores
+// moments.
 template <class State> CUDA_CALLABLE inline void sweep(State& state, const Place& at, bool last) {
     if (at.row == 0 && share() == 0) state.condition.data[0] = 0; // until a world wants another evaluation
     const auto& world = state.worlds.data[at.world];

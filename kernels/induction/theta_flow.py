@@ -1,18 +1,19 @@
 """The accelerated θ flow (Kim and Han 2022, Eqs. 8, 9 and 11, exact in time), kept wholly on the device.
 
-Unknown is the dual variable s = k f⁻¹(M)/Ms of every inducible moment, so that M = Ms c(‖s‖) ŝ. One field evaluation
-gives the target g = k H(M)/Ms and the residual r = g − s; the exact θ flow moves s by ω r (``curves.theta_flow``).
-With the last few changes Δs_j, Δr_j from one evaluation to the next, Anderson's step is
+With M1 and M2 symmetric about H_eff, ‖M‖ = Ms cos θ, and ln cot(θ/2) = artanh(‖M‖/Ms) grows linearly in time. Unknown
+is therefore the dual variable s = k f⁻¹(M)/Ms of every inducible moment, so that M = Ms c(‖s‖) ŝ: the exact flow over a
+step is s ← (1 − ω) s + ω k H/Ms, ω = κ/k, κ = βΔtMs. One field evaluation gives the target g = k H(M)/Ms and the
+residual r = g − s. With the last few changes Δs_j, Δr_j from one evaluation to the next, Anderson's step is
 
     s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖,
 
 weighted by φ = Ms c(a)/a, a = max(‖s‖, ‖g‖): what a residual is worth in magnetization, so that a saturated moment's
 huge s does not drown the rest. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, convex for the
 ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω ≤ 1/L, and close to the solution converges
-for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``neighbors``).
+for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``overlap_of`` in ``theta_flow.h``).
 
-What a step changes is felt most by neighbours. Their part of it is known without another field evaluation: with the
-coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
+A step changes most the field at near neighbours, and their part is known without another evaluation of the whole field:
+with the coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
 follow, ḡ = s̄ + r̄, ω' a little above ω. From cold they spare a pile of touching balls 1 or 2 of 8 to 10 evaluations to
 1e-3, and more where balls overlap.
 
@@ -20,16 +21,14 @@ An accelerated step or a swept one that leaves the merit ‖φ r‖ more than tw
 steps follow from the best iterate.
 
 The residual that ends a solve is good for one more step: that polished s, further by β Δg, is where the next solve
-starts, Δg the last change of g from solve to solve. Sweeps over neighbours go before its first evaluation: what these
-are to each other is known exactly where they stand now, and of the field of all others, F = H − H0 − G' M, it is
-F₁ + β (F₁ − F₂) that they use, F of the last solve and of the one before for the present neighbours. Both are those of
-s̄ and ḡ, which are nearer to the solution than what was judged. β is what would have predicted the last change from the
-one before it, β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth motion is followed, noise is not. The
-changes Δs_j, Δr_j outlive a solve, since what they tell of the coupling hardly changes: a slow mode, as of long columns
-of balls, costs one evaluation instead of three. All that leaves 1.5 evaluations a solve where 2,500 balls jump (Balls
-Up). A start is only a start, and whatever it is worth the solve converges to the one solution.
-
-``theta_flow_cpu`` does the same on a CPU.
+starts, Δg the last change of g from solve to solve. Sweeps over neighbours go before its first evaluation: the field of
+the neighbours is computed where they are now, and the field of all others, F = H − H0 − G' M, is extrapolated as
+F₁ + β (F₁ − F₂), F of the last solve and of the one before for the present neighbours. Both are those of s̄ and ḡ, which
+are nearer to the solution than the last iterate. β is what would have predicted the last change from the one before it,
+β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth motion is followed, noise is not. The changes Δs_j, Δr_j
+outlive a solve, since the coupling hardly changes: a slow mode, as of long columns of balls, costs one evaluation
+instead of three. All that leaves 1.5 evaluations a solve where 2,500 balls jump (Balls Up). Whatever a start is worth,
+the solve converges to the one solution.
 """
 
 from functools import cache
@@ -48,7 +47,7 @@ from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)
 """The passes, in order; as in ``theta_flow.h``."""
 _BEGINNERS = 4
-"""Blocks of a GPU that share the moments of a chunk at the start of a solve, where a moment takes a group of threads."""
+"""Blocks of a GPU that share a chunk of moments at the start of a solve, where a moment takes a group of threads."""
 
 _RESIDENT = {wp.float32: (3, 5), wp.float64: (2, 3)}
 """Blocks of 256 threads that a multiprocessor is to hold at the start and in sweeps: compilers take more registers."""

@@ -78,7 +78,7 @@ def add_inducible(
         material: Name of an inducible material of :mod:`warpmag.materials`, in place of the next two.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
-        curve: Magnetization curve: ``tanh``, ``langevin`` or ``clamped``.
+        curve: Magnetization curve, one of ``magnets.CURVES``.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
 
     Raises:

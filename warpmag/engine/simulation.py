@@ -71,7 +71,7 @@ class Simulation:
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
-            curve: ``tanh``, ``langevin`` or ``clamped`` for all magnets; by default each magnet's own.
+            curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
             device: Warp device; by default Warp's.
             graphs: Replay captured graphs instead of launching kernels one by one.
             deterministic: Give the same bits in every run on a GPU too, where rigid bodies then take up to 1.7 times as
