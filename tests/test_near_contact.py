@@ -214,7 +214,7 @@ def test_device_solution_is_the_reference(strength, dtype, error, device):
 
 
 @pytest.mark.parametrize(
-    "curve, strength", [("langevin", 1e-3), ("langevin", 0.2), ("langevin", 2.0), ("clamped", 1e-2)]
+    "curve, strength", [("langevin", 1e-3), ("langevin", 0.2), ("langevin", 2.0), ("clamped", 1e-2), ("frohlich", 0.2)]
 )
 def test_device_follows_the_curve(curve, strength, device):
     field = strength * IRON * np.array([0.4, -0.3, 0.9])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from warpmag.errors import InputError
 
 KINDS = ("inducible", "permanent")
-CURVES = ("tanh", "langevin", "clamped")
+CURVES = ("tanh", "langevin", "clamped", "frohlich")
 """Magnetization curves, see ``kernels.material.curves``; a model has the place in this list."""
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")

@@ -189,6 +189,8 @@ def reduced_curve(s, curve):
         return np.tanh(s), 1.0 / np.cosh(np.minimum(s, 300.0)) ** 2
     if curve == "clamped":  # Eq. 7
         return np.minimum(s, 1.0), np.where(s < 1.0, 1.0, 0.0)
+    if curve == "frohlich":
+        return s / (1.0 + s), 1.0 / (1.0 + s) ** 2
     if curve == "langevin":  # L(3s), so that the slope at zero is one
         x = 3.0 * s
         y = np.where(x < 0.1, 1.0, x)
@@ -198,7 +200,7 @@ def reduced_curve(s, curve):
             value = 1.0 / np.tanh(y) - 1.0 / y
             slope = 1.0 / y**2 - 1.0 / np.sinh(np.minimum(y, 300.0)) ** 2
         return np.where(x < 0.1, small, value), 3.0 * np.where(x < 0.1, dsmall, slope)
-    raise ValueError(f"curve: {curve!r} is not one of tanh, langevin, clamped")
+    raise ValueError(f"curve: {curve!r} is not one of tanh, langevin, clamped, frohlich")
 
 
 def magnetization(h, saturation, susceptibility=math.inf, curve="tanh"):

@@ -7,7 +7,7 @@
 
 namespace warpmag {
 
-enum Curve { TANH, LANGEVIN, CLAMPED }; // as in curves.py
+enum Curve { TANH, LANGEVIN, CLAMPED, FROHLICH }; // as in curves.py
 
 // tanh(s)/s, 1 at s = 0; below the root of the smallest normal number the quotient of two denormals says nothing.
 CUDA_CALLABLE inline Real tanh_ratio(Real s) { return s < Real(1e-18) ? Real(1) : wp::tanh(s) / s; }
@@ -40,6 +40,7 @@ template <class N> CUDA_CALLABLE inline N langevin_ratio(N x) {
 // c(s)/s, 1 at s = 0: the factor between a reduced field and its reduced magnetization.
 template <class N> CUDA_CALLABLE inline N curve_ratio(N s, int curve) {
     if (curve == CLAMPED) return s > Real(1) ? 1 / s : N(Real(1));
+    if (curve == FROHLICH) return 1 / (1 + s);
     return curve == LANGEVIN ? langevin_ratio(3 * s) : tanh_ratio(s);
 }
 
@@ -54,6 +55,7 @@ CUDA_CALLABLE inline Real langevin_slope(Real x) {
 CUDA_CALLABLE inline Real curve_slope(Real s, int curve) {
     if (curve == CLAMPED) return s < 1 ? Real(1) : Real(0);
     if (curve == LANGEVIN) return langevin_slope(3 * s);
+    if (curve == FROHLICH) return 1 / ((1 + s) * (1 + s));
     const Real cosh = wp::cosh(s < 40 ? s : Real(40));
     return 1 / (cosh * cosh);
 }
@@ -63,6 +65,7 @@ CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
     const Number zero = reduced_square * Real(0), one = zero + 1;
     Number steepness = one - reduced_square; // of tanh
     if (curve == CLAMPED) steepness = reduced_square < one ? one : zero;
+    if (curve == FROHLICH) steepness = (one - root(reduced_square)) * (one - root(reduced_square));
     if (curve == LANGEVIN) {
         // Cohen's approximation, corrected by a polynomial in 2c − 1 that is good to 2e-4
         constexpr Real fitted[13] = {
@@ -82,6 +85,7 @@ CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
 CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve) {
     const Real bounded = c < Real(0.999999) ? c : Real(0.999999), z = bounded * bounded;
     if (bounded < Real(1e-18) || curve == CLAMPED) return 1;
+    if (curve == FROHLICH) return 1 / (1 - bounded);
     if (curve == TANH) return Real(0.5) * wp::log((1 + bounded) / (1 - bounded)) / bounded;
     // Newton on L(3s) = c from Cohen's rational start; the curve is concave, so it converges from any start below
     Real x = bounded * (3 - z) / (1 - z);

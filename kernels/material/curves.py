@@ -7,6 +7,7 @@ With the reduced field s = k‖H‖/Ms every curve reads ‖M‖ = Ms c(s), c(0)
 | tanh | tanh s | Kim and Han 2022, Eq. 10 |
 | langevin | L(3s), L(x) = coth x − 1/x | their section 6.2 |
 | clamped | min(s, 1) | Eq. 7 |
+| frohlich | s/(1 + s) | Fröhlich 1881, Kennelly 1891 |
 
 k = 3χ/(3+χ) is the initial slope of a ball of susceptibility χ. ``curves.h`` has the functions. Kernels that call them
 from here, for float32 or float64, take ``native_options("material/curves.h", dtype=dtype)``.
@@ -17,9 +18,9 @@ from typing import Any
 
 import warp as wp
 
-TANH, LANGEVIN, CLAMPED = range(3)
+TANH, LANGEVIN, CLAMPED, FROHLICH = range(4)
 """Numbers of the curves; as in ``curves.h``."""
-CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED}
+CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED, "frohlich": FROHLICH}
 
 
 @dataclass(frozen=True)
