@@ -73,7 +73,3 @@ def test_langevins_steepness_is_fitted_to_the_oracle(evaluate):
     c, _ = oracle.reduced_curve(S, "langevin")
     found, tolerance = evaluate("langevin", c)
     assert np.abs(found[4] - cohen(c) * np.polyval(fit, 2.0 * c - 1.0)).max() < tolerance
-
-
-def test_curves_have_one_list():
-    assert tuple(CURVE_IDS) == magnets.CURVES
