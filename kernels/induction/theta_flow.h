@@ -132,7 +132,7 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
 // Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
 // above 1/3 − (1 + max o_i), which is −2/3 without overlap. From it follows a step length that converges for any
 // arrangement.
-template <class State> CUDA_CALLABLE inline Number overlap_of(const State& state, const Place& at, Four ball) {
+template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Place& at, Four ball) {
     const Real* const packed = (const Real*)state.packed.data;
     const size_t pitch = state.packed.strides[0] / sizeof(Real);
     Index self = Index(at.i);
@@ -173,7 +173,7 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     const Real ahead = (Real)world.ahead;
     const Four ball = balls_at(state, at);
     const Material material = material_of(state, at);
-    const Number stiffness = material.slope * (overlap_of(state, at, ball) + Real(2.0 / 3.0));
+    const Number stiffness = material.slope * (total_overlap(state, at, ball) + Real(2.0 / 3.0));
     Vector near = {0, 0, 0};
     if (warm == STEADY) near = extrapolated_field(state, at, ball.w, ahead);
     if (share() != 0) return stiffness;

@@ -10,7 +10,7 @@ residual r = g − s. With the last few changes Δs_j, Δr_j from one evaluation
 weighted by φ = Ms c(a)/a, a = max(‖s‖, ‖g‖): what a residual is worth in magnetization, so that a saturated moment's
 huge s does not drown the rest. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, convex for the
 ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω ≤ 1/L, and close to the solution converges
-for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``overlap_of`` in ``theta_flow.h``).
+for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``total_overlap`` in ``theta_flow.h``).
 
 A step changes most the field at near neighbours, and their part is known without another evaluation of the whole field:
 with the coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
