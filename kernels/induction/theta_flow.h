@@ -130,8 +130,7 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
 // Volume that balls share with other inducible ones, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
 //
 // Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
-// above 1/3 − (1 + max o_i), which is −2/3 without overlap. From it follows a step length that converges for any
-// arrangement.
+// above 1/3 − (1 + max o_i), which is −2/3 without overlap: hence a step length that converges for any arrangement.
 template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Place& at, Four ball) {
     const Real* const packed = (const Real*)state.packed.data;
     const size_t pitch = state.packed.strides[0] / sizeof(Real);
@@ -149,8 +148,7 @@ template <class State> CUDA_CALLABLE inline Number total_overlap(const State& st
     return group_sum(volume);
 }
 
-// 4π times what the field [A/m] of neighbours was at the last solution, and ``ahead`` of its change from the one
-// before.
+// 4π times the field [A/m] of neighbours at the last solution, further by ``ahead`` of its change from the one before.
 template <class State>
 CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& at, Number radius, Real ahead) {
     const Real* const past = (const Real*)state.past.data;
@@ -200,8 +198,7 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     return stiffness;
 }
 
-// Sweeps once over neighbours, whose changes are read with their places, a cache line each; the last sweep stores
-// moments.
+// Sweeps once over neighbours, whose changes stand in a cache line with their places; the last sweep stores moments.
 template <class State> CUDA_CALLABLE inline void sweep(State& state, const Place& at, bool last) {
     if (at.row == 0 && share() == 0) state.condition.data[0] = 0; // until a world wants another evaluation
     const auto& world = state.worlds.data[at.world];
