@@ -1,5 +1,4 @@
-// Magnetization curves in reduced form (Kim and Han 2022, Eqs. 7, 10); curves.py has their table and the curves'
-// numbers.
+// Magnetization curves in reduced form (Kim and Han 2022, Eqs. 7, 10); curves.py has their table and their numbers.
 //
 // The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments.
 #pragma once
