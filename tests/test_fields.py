@@ -10,13 +10,10 @@ import warpmag
 from warpmag import oracle
 from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
 from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
-from warpmag.kernels.pairs import work_list as pair_loops
-from warpmag.kernels.pairs.field import launch_field
+from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, field_evaluation, wrench_evaluation
+from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.pairs.work_list import FUSED, LOOP, MIRRORED
-from warpmag.kernels.pairs.wrench import launch_wrench
 from warpmag.kernels.shared import team as cpu_team
-from warpmag.packed import PackedMoments
 
 # Sums of n terms in float32 carry about √n·2⁻²⁴ ≈ 2.7e-6·√(n/2000) in the worst case and 3e-7 in lanes; issue: 1e-6.
 TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
@@ -201,16 +198,15 @@ def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, form):
     packed = PackedMoments(wp.array(radii, dtype=kind, device=device), largest_radius=radii.max(), labels=bodies)
     packed.pack(*vectors)
     packed.find_overlaps()
-    rows = pair_loops.make_rows(segments, device, quantity, forms=(form,))
-    assert rows.form == form
-    partial = wp.full(pair_loops.partial_shape(rows), np.nan, dtype=kind, device=device)
-    pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=packed.moments)
     none, *out = (wp.zeros_like(vectors[0]) for _ in range(3))
     if quantity == Quantity.FIELD:
-        launch_field(rows, partial, packed, packed, True, none, out[0])
-        return [out[0].numpy().astype(float)]
-    twisted = wp.ones(len(x), dtype=int, device=device)
-    launch_wrench(rows, partial, packed, packed.moments, none, twisted, *out)
+        out = out[:1]
+        evaluation = field_evaluation(segments, packed, packed, none, *out, form=form)
+    else:
+        turned = wp.ones(len(x), dtype=int, device=device)
+        evaluation = wrench_evaluation(quantity, segments, packed, none, turned, *out, form=form)
+    evaluation.partial.fill_(np.nan)
+    evaluation.launch()
     return [a.numpy().astype(float) for a in out]
 
 

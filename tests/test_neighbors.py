@@ -6,7 +6,7 @@ import warp as wp
 
 from warpmag.arrays import vec3_type
 from warpmag.kernels.pairs.neighbors import CAPACITY, SKIN
-from warpmag.packed import PackedMoments
+from warpmag.kernels.pairs.packing import PackedMoments
 
 
 def make(radii, device, dtype=wp.float32, groups=None):

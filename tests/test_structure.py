@@ -201,8 +201,6 @@ def test_pages_name_files_that_exist(page):
 def test_tokens_have_their_numbers_in_kernels(device):
     from warpmag.kernels.induction.submagnetization import LAW_IDS  # noqa: PLC0415 - imports Warp
     from warpmag.kernels.material.curves import CURVE_IDS  # noqa: PLC0415
-    from warpmag.kernels.pairs.wrench import FORCE_IDS  # noqa: PLC0415
 
     assert tuple(CURVE_IDS) == magnets.CURVES
-    assert tuple(FORCE_IDS) == magnets.FORCES
     assert {"theta", *LAW_IDS} == set(magnets.DYNAMICS)

@@ -5,12 +5,10 @@ import warp as wp
 
 from warpmag.arrays import Kind, check_radii, resolve_kind, vec3_type
 from warpmag.errors import InputError
-from warpmag.kernels.pairs import work_list as pair_loops
-from warpmag.kernels.pairs.field import launch_field
+from warpmag.kernels.pairs.evaluate import REFERENCE, field_evaluation, wrench_evaluation
+from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.pairs.wrench import launch_wrench
 from warpmag.magnets import check_rtol, check_token
-from warpmag.packed import PackedMoments
 
 _METHODS = ("auto", "vectorized", "reference")
 
@@ -64,16 +62,11 @@ def h_field(
     if not same_set:
         points = kind.vectors("targets", targets)
         at = _packed(kind, "target_radii", target_radii, points, wp.zeros_like(points))
-    exact = method == "reference" or smoothing > 0.0
-    forms = (pair_loops.LOOP,) if exact else pair_loops.FORMS if same_set else (pair_loops.LOOP, pair_loops.FUSED)
-    rows = pair_loops.make_rows([(0, at.count, 0, sources.count)], kind.device, forms=forms)
-    exclude = pair_loops.EXCLUDE_SELF if same_set else pair_loops.EXCLUDE_NOTHING
-    partial = _pair_sums(rows, at, sources, exclude if exact else None, smoothing)
-    if not exact:
-        at.find_overlaps(None if same_set else sources)
     base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
     h = wp.zeros_like(base)
-    launch_field(rows, partial, at, sources, same_set, base, h)
+    form = _prepare(at, sources, method, smoothing)
+    segments = [(0, at.count, 0, sources.count)]
+    field_evaluation(segments, at, sources, base, h, form=form, smoothing=smoothing).launch()
     return kind.finish(h)
 
 
@@ -120,15 +113,12 @@ def wrench(
     n = x.shape[0]
     external = kind.vectors("external_field", np.zeros(3) if external_field is None else external_field, n)
     packed = _packed(kind, "radii", radii, x, m)
-    exact = method == "reference" or smoothing > 0.0
-    forms = (pair_loops.LOOP,) if exact else pair_loops.FORMS
-    rows = pair_loops.make_rows([(0, n, 0, n)], kind.device, Quantity.WRENCH, forms=forms)
-    partial = _pair_sums(rows, packed, packed, pair_loops.EXCLUDE_BODY if exact else None, smoothing)
-    if not exact:
-        packed.find_overlaps()
     forces, torques = wp.zeros_like(x), wp.zeros_like(x)
-    twisted = wp.ones(n, dtype=int, device=kind.device)
-    launch_wrench(rows, partial, packed, packed.moments, external, twisted, forces, torques)
+    turned = wp.ones(n, dtype=int, device=kind.device)
+    form = _prepare(packed, packed, method, smoothing)
+    wrench_evaluation(
+        Quantity.WRENCH, [(0, n, 0, n)], packed, external, turned, forces, torques, form=form, smoothing=smoothing
+    ).launch()
     return kind.finish(forces), kind.finish(torques)
 
 
@@ -141,22 +131,12 @@ def _packed(kind: Kind, name, radii, positions, moments) -> PackedMoments:
     return packed
 
 
-def _pair_sums(rows, at, sources, exclude, smoothing):
-    """Sums of the pair loop: the native one, or with ``exclude`` the reference loop, in a fresh array."""
-    shape = pair_loops.partial_shape(rows)
-    if exclude is not None:
-        shape = (1, *shape[1:])
-    partial = wp.empty(shape, dtype=at.dtype, device=at.device)
-    pair_loops.launch_pair_loop(
-        rows,
-        at.packed,
-        sources.packed,
-        partial,
-        effective=at.moments,
-        reference_exclude=exclude,
-        epsilon2=smoothing**5,
-    )
-    return partial
+def _prepare(at, sources, method, smoothing):
+    """Form of the sums, None for the fastest, which wants overlapping pairs to be found."""
+    if method == "reference" or smoothing > 0.0:
+        return REFERENCE
+    at.find_overlaps(None if at is sources else sources)
+    return None
 
 
 def _largest_radius(name, radii, dtype) -> float:

@@ -1,6 +1,8 @@
 """All magnetic moments of a simulation on one device: induction and forces, every buffer allocated once."""
 
 import math
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -11,13 +13,53 @@ from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
 from warpmag.kernels.near_contact import near_contact
-from warpmag.kernels.pairs import work_list as pair_loops
-from warpmag.kernels.pairs.field import launch_field
-from warpmag.kernels.pairs.packing import launch_divide_by_volume
+from warpmag.kernels.pairs.evaluate import field_evaluation, wrench_evaluation
+from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.pairs.wrench import FORCE_IDS, ZEEMAN, launch_wrench, launch_zeeman_moments
+from warpmag.kernels.pairs.wrench import launch_zeeman_moments
 from warpmag.magnets import CONTACT_MODELS, check_force, check_rtol, check_token
-from warpmag.packed import PackedMoments
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What each moment is, NumPy arrays of shape [n].
+
+    Attributes:
+        radii: Radius of its ball [m].
+        worlds: Its world.
+        permanent: Whether it is permanent.
+        bodies: Its body.
+        movable: Whether the force on it is wanted.
+        lone: Whether it is inducible and its body's only one, which is parallel to the field that turns it.
+    """
+
+    radii: np.ndarray
+    worlds: np.ndarray
+    permanent: np.ndarray
+    bodies: np.ndarray
+    movable: np.ndarray
+    lone: np.ndarray
+
+    def ranges(self) -> list[tuple[int, int, int]]:
+        """For each world its first moment, its first permanent one, and the end."""
+        edges = np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))
+        return [
+            (int(first), int(last - np.count_nonzero(self.permanent[first:last])), int(last))
+            for first, last in pairwise(edges)
+        ]
+
+
+def _layout(radii, worlds, permanent, bodies, movable) -> _Layout:
+    """Layout of moments, of which all but the radii may be None; see :class:`MomentSystem`."""
+    n = len(radii)
+    worlds = np.zeros(n, int) if worlds is None else np.asarray(worlds)
+    permanent = np.zeros(n, bool) if permanent is None else np.asarray(permanent, bool)
+    bodies = np.arange(n) if bodies is None else np.asarray(bodies)
+    movable = np.ones(n, bool) if movable is None else np.asarray(movable, bool)
+    if (np.diff(2 * worlds + permanent) < 0).any():
+        raise InputError("worlds, permanent: moments must be ordered by world, the inducible ones of each first")
+    _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
+    return _Layout(np.asarray(radii, float), worlds, permanent, bodies, movable, ~permanent & (size[body] == 1))
 
 
 class MomentSystem:
@@ -26,6 +68,34 @@ class MomentSystem:
     Moments are ordered by world, and within a world inducible ones come first. Moments of different worlds never see
     each other. The methods only launch kernels: nothing is allocated, and nothing waits for the device, so that they
     can be captured in a graph; results stay on the device.
+
+    Args:
+        radii: Radii of the moments' balls [m], shape [n]. A moment's volume is its ball's.
+        worlds: World of each moment, non-decreasing from 0, shape [n]; None means one world.
+        permanent: Whether a moment is permanent, shape [n]; None means none is.
+        bodies: Body of each moment, shape [n]; moments of one body exert no force on each other. None means each
+            its own.
+        movable: Whether the force on a moment is wanted, shape [n]; None means all.
+        saturation: Saturation magnetization Ms [A/m], scalar or [n].
+        susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
+        curve: Magnetization curve, one of ``magnets.CURVES`` for all.
+        external_field: Applied field [A/m], shape [3] or [n, 3].
+        force: ``kelvin`` or ``zeeman``.
+        dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
+            submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
+        contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
+            nearly touch (see ``warpmag.near_contact``).
+        rtol: Relative residual at which induction ends.
+        max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
+        step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
+        damping: Damping α [dimensionless] of ``llg``; None means its default.
+        lone_torque: Whether an inducible body of one moment gets its torque m × H, which only tells how far the
+            solve is from converged: in equilibrium the two are parallel.
+        dtype: ``float32`` or ``float64``.
+        device: Warp device; None means Warp's default.
+
+    Raises:
+        InputError: An argument is out of range.
 
     Attributes:
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
@@ -64,36 +134,7 @@ class MomentSystem:
         dtype="float32",
         device=None,
     ):
-        """Allocate for n moments.
-
-        Args:
-            radii: Radii of the moments' balls [m], shape [n]. A moment's volume is its ball's.
-            worlds: World of each moment, non-decreasing from 0, shape [n]; None means one world.
-            permanent: Whether a moment is permanent, shape [n]; None means none is.
-            bodies: Body of each moment, shape [n]; moments of one body exert no force on each other. None means each
-                its own.
-            movable: Whether the force on a moment is wanted, shape [n]; None means all.
-            saturation: Saturation magnetization Ms [A/m], scalar or [n].
-            susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-            curve: Magnetization curve, one of ``magnets.CURVES`` for all.
-            external_field: Applied field [A/m], shape [3] or [n, 3].
-            force: ``kelvin`` or ``zeeman``.
-            dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
-                submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
-            contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
-                nearly touch (see ``warpmag.near_contact``).
-            rtol: Relative residual at which induction ends.
-            max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
-            step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
-            damping: Damping α [dimensionless] of ``llg``; None means its default.
-            lone_torque: Whether an inducible body of one moment gets its torque m × H, which only tells how far the
-                solve is from converged: in equilibrium the two are parallel.
-            dtype: ``float32`` or ``float64``.
-            device: Warp device; None means Warp's default.
-
-        Raises:
-            InputError: An argument is out of range.
-        """
+        """Allocate all buffers."""
         check_token("contact_model", contact_model, CONTACT_MODELS)
         check_force("force", force, contact_model)
         check_token("curve", curve, tuple(CURVE_IDS))
@@ -101,53 +142,35 @@ class MomentSystem:
         check_rtol("rtol", rtol, dtype)
         if max_evaluations < 1:
             raise InputError(f"max_evaluations: must be at least 1, got {max_evaluations}")
-        n = len(radii)
-        radii = np.asarray(radii, float)
-        check_radii("radii", radii, self.dtype)
-        worlds = np.zeros(n, int) if worlds is None else np.asarray(worlds)
-        permanent = np.zeros(n, bool) if permanent is None else np.asarray(permanent, bool)
-        bodies = np.arange(n) if bodies is None else np.asarray(bodies)
-        movable = np.ones(n, bool) if movable is None else np.asarray(movable, bool)
-        self.rtol, self.max_evaluations, self._force_law = float(rtol), int(max_evaluations), FORCE_IDS[force]
+        layout = _layout(radii, worlds, permanent, bodies, movable)
+        check_radii("radii", layout.radii, self.dtype)
+        self.rtol, self.max_evaluations, self._force = float(rtol), int(max_evaluations), force
+        self._allocate(layout, external_field)
+        self._make_material(layout.permanent, saturation, susceptibility, curve)
+        near = contact_model == "multipole"
+        turned = ~layout.lone | lone_torque
+        self._evaluate_field(layout, near)
+        self._evaluate_wrench(layout, turned)
+        self._near = self._make_near_contacts(layout, turned, saturation, susceptibility, curve) if near else None
+        solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
+        self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
 
-        vec3 = vec3_type(self.dtype)
-        self.positions = wp.zeros(n, dtype=vec3, device=self.device)
-        self.moments = wp.zeros(n, dtype=vec3, device=self.device)
-        self.forces = wp.zeros(n, dtype=vec3, device=self.device)
-        self.torques = wp.zeros(n, dtype=vec3, device=self.device)
+    def _allocate(self, layout: _Layout, external_field):
+        n, vec3 = len(layout.radii), vec3_type(self.dtype)
+        self.positions, self.moments, self.forces, self.torques = (
+            wp.zeros(n, dtype=vec3, device=self.device) for _ in range(4)
+        )
         self.external_field = wp.array(np.broadcast_to(external_field, (n, 3)), dtype=vec3, device=self.device)
         self._packed = PackedMoments(
-            wp.array(radii, dtype=self.dtype, device=self.device),
-            largest_radius=float(radii.max(initial=0.0)),
-            labels=bodies,
-            groups=worlds,
+            wp.array(layout.radii, dtype=self.dtype, device=self.device),
+            largest_radius=float(layout.radii.max(initial=0.0)),
+            labels=layout.bodies,
+            groups=layout.worlds,
         )
-        self._make_material(permanent, saturation, susceptibility, curve)
-        # the only moment of a body, if inducible, is parallel to the field that turns it
-        _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
-        twisted = permanent | (size[body] > 1) | lone_torque
-        self._twisted = wp.array(twisted.astype(np.int32), dtype=wp.int32, device=self.device)
-        self._make_rows(worlds, permanent, movable, twisted, near=contact_model == "multipole")
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
-        self._induction = solve_state.allocate(worlds, ~permanent, self.dtype, self.device)
-        self._near = None
-        if contact_model == "multipole":
-            lone = ~permanent & (size[body] == 1) & (radii > 0.0)
-            susceptibility = np.broadcast_to(np.asarray(susceptibility, float), n)
-            saturation = np.broadcast_to(np.asarray(saturation, float), n)
-            self._near = near_contact.allocate(
-                self._packed, worlds, lone, susceptibility, saturation, CURVE_IDS[curve], rows=self._induced,
-                partial=self._induced_partial, movable=movable, twisted=twisted, forces=self.forces,
-                torques=self.torques,
-            )  # fmt: skip
-        self.h = self._induction.h
-        self.error = self._induction.error
-        self.evaluations = self._induction.evaluations
-        self.converged = self._induction.converged
-        solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
-        if not self._applied.pair_count:
-            self._induction.h0 = self.external_field
-        self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
+        self._induction = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
+        self.h, self.error = self._induction.h, self._induction.error
+        self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
 
     def _make_material(self, permanent, saturation, susceptibility, curve):
         n = len(permanent)
@@ -163,39 +186,54 @@ class MomentSystem:
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
 
-    def _make_rows(self, worlds, permanent, movable, twisted, near):
-        """Work lists: inducible on inducible, permanent on inducible, everything on whatever moves."""
-        induced, applied, pushed, turned = [], [], [], []
-        for w in range(int(worlds[-1]) + 1 if len(worlds) else 0):
-            first, last = np.searchsorted(worlds, [w, w + 1])
-            middle = first + int(np.count_nonzero(~permanent[first:last]))
-            induced.append((first, middle, first, middle))
-            applied.append((first, middle, middle, last))
-            for felt, which in ((pushed, movable & ~twisted), (turned, movable & twisted)):
-                edges = np.flatnonzero(np.diff(np.concatenate([[0], which[first:last].astype(int), [0]])))
-                felt += [(first + a, first + b, first, last) for a, b in edges.reshape(-1, 2)]
-        # near contacts add to partial sums
-        forms = (pair_loops.LOOP, pair_loops.MIRRORED) if near else pair_loops.FORMS
-        self._induced = pair_loops.make_rows(induced, self.device, forms=forms)
-        self._applied = pair_loops.make_rows(applied, self.device, forms=(pair_loops.LOOP,))
-        # those that are turned, too, come last: the loop over the others may bring what pushes them
-        self._felt = {
-            law: [
-                pair_loops.make_rows(segments, self.device, quantity)
-                for segments, quantity in ((pushed, push), (turned, Quantity.WRENCH))
-                if segments
-            ]
-            for law, push in ((FORCE_IDS["kelvin"], Quantity.MUTUAL_FORCE), (ZEEMAN, Quantity.FORCE))
+    def _evaluate_field(self, layout: _Layout, near: bool):
+        """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
+        ranges, packed = layout.ranges(), self._packed
+        permanent = [(first, middle, middle, last) for first, middle, last in ranges]
+        if not layout.permanent.any():
+            self._induction.h0 = self.external_field
+        h0 = self._induction.h0
+        self._applied = field_evaluation(permanent, packed, packed, self.external_field, h0)
+        inducible = [(first, middle, first, middle) for first, middle, _ in ranges]
+        # near contacts write one more partial sum
+        self._mutual = field_evaluation(inducible, packed, packed, h0, self.h, extra_parts=int(near))
+
+    def _evaluate_wrench(self, layout: _Layout, turned):
+        """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
+        self._turned = wp.array(turned.astype(np.int32), dtype=wp.int32, device=self.device)
+        segments = [], []
+        for first, _, last in layout.ranges():
+            for k, which in enumerate((~turned[first:last], turned[first:last])):
+                wanted = np.concatenate([[0], (layout.movable[first:last] & which).astype(int), [0]])
+                edges = first + np.flatnonzero(np.diff(wanted)).reshape(-1, 2)
+                segments[k].extend((a, b, first, last) for a, b in edges)
+
+        def evaluations(force, effective):
+            # those with a torque come last, since the others' mirrored form writes forces on all moments
+            return [
+                wrench_evaluation(
+                    quantity, which, self._packed, self.external_field, self._turned, self.forces, self.torques,
+                    effective=effective,
+                )
+                for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
+                if which
+            ]  # fmt: skip
+
+        self._wrench = {
+            "kelvin": evaluations(Quantity.MUTUAL_FORCE, None),
+            "zeeman": evaluations(Quantity.FORCE, self._effective),
         }
 
-        def partial(rows, more=0):
-            splits, count, width = pair_loops.partial_shape(rows)
-            return wp.zeros((splits + more, count, width), dtype=self.dtype, device=self.device)
-
-        # and one of the near contacts
-        self._induced_partial = partial(self._induced, int(near))
-        self._applied_partial = partial(self._applied)
-        self._felt_partial = {law: [partial(rows) for rows in passes] for law, passes in self._felt.items()}
+    def _make_near_contacts(self, layout: _Layout, turned, saturation, susceptibility, curve):
+        n = len(layout.radii)
+        susceptibility, saturation = (
+            np.broadcast_to(np.asarray(values, float), n) for values in (susceptibility, saturation)
+        )
+        return near_contact.allocate(
+            self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, saturation,
+            CURVE_IDS[curve], rows=self._mutual.rows, partial=self._mutual.partial, movable=layout.movable,
+            twisted=turned, forces=self.forces, torques=self.torques,
+        )  # fmt: skip
 
     @property
     def radii(self):
@@ -220,7 +258,7 @@ class MomentSystem:
     def solve(self):
         """Launch the induction solve: inducible ``moments`` in equilibrium with the field at ``positions``."""
         self.begin()
-        if self._induced.count:
+        if self._mutual.rows.count:
             # no world is done before the first evaluation, and a loop costs a GPU more than what is in it
             self.iterate()
             wp.capture_while(self._induction.condition, self.iterate)
@@ -232,12 +270,10 @@ class MomentSystem:
         if self._near is not None:
             near_contact.launch_find_pairs(packed, self._near)
         packed.find_overlaps()
-        if self._induced.count == 0:
+        if self._mutual.rows.count == 0:
             return
         if self._applied.pair_count:
-            pair_loops.launch_pair_loop(self._applied, packed.packed, packed.packed, self._applied_partial)
-            h0 = self._induction.h0
-            launch_field(self._applied, self._applied_partial, packed, packed, False, self.external_field, h0)
+            self._applied.launch()
         self.dynamics.start()
         if self._near is not None:
             near_contact.wait(self._near)
@@ -255,14 +291,13 @@ class MomentSystem:
         self._end_sweeps()
 
     def _sum_field(self):
-        """Launch the sums of the field at the inducible moments; :meth:`_end_sweeps` follows."""
-        packed, near, h0 = self._packed, self._near, self._induction.h0
-        if near is not None:
-            near_contact.launch_sweeps(near)
-        pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
-        if near is not None:
-            near_contact.wait_for_field(near)
-        launch_field(self._induced, self._induced_partial, packed, packed, True, h0, self.h)
+        """Launch the evaluation of the field at the inducible moments; :meth:`_end_sweeps` follows."""
+        near = self._near
+        if near is None:
+            self._mutual.launch()
+            return
+        near_contact.launch_sweeps(near)
+        self._mutual.launch(wait=lambda: near_contact.wait_for_field(near))
 
     def _end_sweeps(self):
         """Have what is launched next wait for what near contacts do beside."""
@@ -277,29 +312,14 @@ class MomentSystem:
 
     def apply_forces(self, force=None):
         """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""
-        packed, near = self._packed, self._near
-        if force is not None:
-            check_force("force", force, "dipole" if near is None else "multipole")
-        law = self._force_law if force is None else FORCE_IDS[force]
-        felt = self._felt[law]
-        effective = packed.moments
-        if law == ZEEMAN:
-            effective = self._effective
-            launch_zeeman_moments(packed, self.h, self._material, effective)
+        near, force = self._near, force or self._force
+        check_force("force", force, "dipole" if near is None else "multipole")
+        if force == "zeeman":
+            launch_zeeman_moments(self._packed, self.h, self._material, self._effective)
         if near is not None and self.device.is_cuda:
             near_contact.launch_sweeps(near)
-        for rows, partial in zip(felt, self._felt_partial[law], strict=True):
-            pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
-            launch_wrench(
-                rows,
-                partial,
-                packed,
-                effective,
-                self.external_field,
-                self._twisted,
-                self.forces,
-                self.torques,
-            )
+        for evaluation in self._wrench[force]:
+            evaluation.launch()
         if near is not None:
             near_contact.wait(near)
             near_contact.launch_add_forces(near)

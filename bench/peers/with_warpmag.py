@@ -4,9 +4,8 @@ import warp as wp
 
 from bench.cases import RADIUS
 from bench.peers import Evaluation
-from warpmag.kernels.pairs.field import launch_field
-from warpmag.kernels.pairs.work_list import launch_pair_loop, make_rows, partial_shape
-from warpmag.packed import PackedMoments
+from warpmag.kernels.pairs.evaluate import field_evaluation
+from warpmag.kernels.pairs.packing import PackedMoments
 
 
 def prepare(positions, moments, device):
@@ -16,14 +15,8 @@ def prepare(positions, moments, device):
     packed = PackedMoments(wp.full(n, 0.9 * RADIUS, dtype=wp.float32, device=device), largest_radius=0.9 * RADIUS)
     packed.pack(x, m)
     packed.find_overlaps()
-    rows = make_rows([(0, n, 0, n)], device)
-    partial = wp.empty(partial_shape(rows), dtype=wp.float32, device=device)
-    base, h = wp.zeros_like(x), wp.zeros_like(x)
-
-    def evaluate():
-        launch_pair_loop(rows, packed.packed, packed.packed, partial)
-        launch_field(rows, partial, packed, packed, True, base, h)
-
+    h = wp.zeros_like(x)
+    evaluate = field_evaluation([(0, n, 0, n)], packed, packed, wp.zeros_like(x), h).launch
     evaluate()
     with wp.ScopedCapture(device) as capture:
         evaluate()

@@ -2,11 +2,8 @@
 
 import math
 from dataclasses import dataclass
-from functools import cache
 
-import warp as wp
-
-from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+from warpmag.kernels.pairs.pair_terms import Quantity
 
 
 @dataclass(frozen=True)
@@ -84,65 +81,3 @@ _SHAPES = {
 def choose_fused_shape(quantity: Quantity, count: int) -> FusedShape:
     """Shape for a number of targets."""
     return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
-
-
-@cache
-def pair_summation(dtype, quantity: Quantity, shape: FusedShape):
-    """Warp function by which a block sums a quantity over the pairs of a tile.
-
-    All threads of the block call it. Those that have a :func:`target_share` give a correction to add to the sum of that
-    target. Thread k gets the sum of target k. Its kernel needs ``native_options("pairs/fused_cuda.h", ...)``.
-    """
-    vector = wp.types.vector(WIDTHS[quantity], dtype)
-    parameters = f"{shape.held}, {shape.lanes}, {shape.warps}, {shape.unrolled}, {shape.shares}"
-
-    @wp.func_native(
-        f"return warpmag::sum_fused<warpmag::Quantity({quantity:d}), {parameters}>(tile, thread, tiles, targets, "
-        "sources, effective, [&](int, int) { return correction; });"
-    )
-    def sum_pairs(
-        tile: int,
-        thread: int,
-        tiles: wp.array2d[int],
-        targets: wp.array2d[dtype],
-        sources: wp.array2d[dtype],
-        effective: wp.array2d[dtype],
-        correction: vector,
-    ) -> vector: ...
-
-    return sum_pairs
-
-
-# what Warp makes of its index takes a division, and all else waits for it
-@wp.func_native("return blockIdx.x;")
-def this_block() -> int:
-    """Block of this thread, and so its tile."""
-    ...
-
-
-@wp.func_native("return threadIdx.x;")
-def this_thread() -> int:
-    """Thread of the block."""
-    ...
-
-
-@wp.func
-def own_target(tile: int, thread: int, tiles: wp.array2d[int]):
-    """Packed column of the target whose sum a thread gets; -1 for none."""
-    # all of it is read at once, whether it is wanted or not: a block begins with what waits for this
-    column = tiles[tile, 2] + thread
-    return wp.where(thread < tiles[tile, 1] - tiles[tile, 0], column, -1)
-
-
-@cache
-def target_share(shape: FusedShape):
-    """Warp function that says what a thread has to correct: packed column of its target, or -1, and its share of it."""
-
-    @wp.func
-    def share_of(tile: int, thread: int, tiles: wp.array2d[int]):
-        k = (thread - wp.static(shape.summing)) // wp.static(shape.shares)
-        column = tiles[tile, 2] + k
-        wanted = thread >= wp.static(shape.summing) and k < tiles[tile, 1] - tiles[tile, 0]
-        return wp.where(wanted, column, -1), thread % wp.static(shape.shares)
-
-    return share_of

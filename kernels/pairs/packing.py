@@ -1,11 +1,24 @@
-"""Packing of moments into the component rows that the pair loops read; see ``pair_loops``."""
+"""Moments packed for the sums over pairs, one row of scalars for each component.
+
+One layout serves vector loads on a CPU and coalesced loads on a GPU:
+
+| packed row | 0 1 2 | 3 | 4 5 6 | 7 |
+|---|---|---|---|---|
+| content | position [m] | radius [m] | moment [A·m²] | body label |
+"""
 
 from functools import cache
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.neighbors import SKIN
+from warpmag.kernels.pairs import neighbors
+
+PACKED_ROWS = 8
+PITCH = 128
+"""Packed rows are a multiple of so many columns apart, with as many columns of no moment after the last, for vector
+loads."""
 
 
 @wp.func
@@ -47,30 +60,81 @@ def _pack_kernel(dtype):
             packed_out[c + 4, i] = m[c]
         packed_out[3, i] = radii[i]
         packed_out[7, i] = dtype(labels[i])
-        if not wp.length(x - found_at[i]) <= dtype(wp.static(SKIN)) * radii[i]:
+        if not wp.length(x - found_at[i]) <= dtype(wp.static(neighbors.SKIN)) * radii[i]:
             moved_out[0] = 1
 
     return pack
 
 
-def launch_pack(positions, moments, radii, labels, lists, packed):
-    """Pack moments, and tell whether they have moved so far that their neighbours must be sought anew.
+class PackedMoments:
+    """Moments packed on one device, and the pairs of them that overlap: what every sum over pairs starts from.
 
-    Args:
-        positions: Positions [m], shape [n].
-        moments: Moments [A·m²], shape [n].
-        radii: Radii [m], shape [n].
-        labels: Body labels, shape [n]; exact in float32 up to 2²⁴.
-        lists: Their neighbours (``neighbors.allocate``); its ``moved`` is set.
-        packed: Out, shape [8, n].
+    Buffers are allocated once; both launches can be captured in a graph.
+
+    Attributes:
+        count: Number of moments n.
+        packed: Packed moments, shape [8, n].
+        moments: The moments among them, a view, shape [3, n].
+        neighbors: Moments that overlap each, or nearly do, shape [n, capacity], valid after :meth:`find_overlaps`.
+        neighbor_counts: How many they are, shape [n]; zero until then.
+        searching: Whether the last :meth:`find_overlaps` made those lists anew, shape [1].
+        overlaps: Those of them that do overlap it, shape [n, capacity].
+        overlap_counts: How many they are, shape [n].
     """
-    wp.launch(
-        _pack_kernel(packed.dtype),
-        dim=packed.shape[1],
-        inputs=[positions, moments, radii, labels, lists.found_at],
-        outputs=[packed, lists.moved],
-        device=packed.device,
-    )
+
+    def __init__(self, radii, *, largest_radius: float, labels=None, groups=None):
+        """Allocate for moments of given radii.
+
+        Args:
+            radii: Ball radii [m], Warp array, shape [n].
+            largest_radius: The largest of them [m].
+            labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means each its own.
+            groups: World of each moment, shape [n]; None means one world.
+        """
+        device, dtype, n = radii.device, radii.dtype, radii.shape[0]
+        self.count = n
+        self.device = device
+        self.dtype = dtype
+        self.radii = radii
+        self.largest_radius = largest_radius
+
+        def integers(values):
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
+
+        self.labels = integers(np.arange(n) if labels is None else labels)
+        self.groups = integers(np.zeros(n) if groups is None else groups)
+        pitched = np.zeros((PACKED_ROWS, (1 + -(-n // PITCH)) * PITCH))
+        pitched[3], pitched[7] = largest_radius, -1.0
+        pitched = wp.array(pitched, dtype=dtype, device=device)
+        self.packed: wp.array = pitched[:, :n] if n else pitched
+        self.moments = self.packed[4:7] if n else self.packed
+        lists = self._lists = neighbors.allocate(n, self.packed, self.groups)
+        self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
+        self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
+
+    def pack(self, positions, moments):
+        """Launch the packing of positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
+        if self.count:
+            lists = self._lists
+            wp.launch(
+                _pack_kernel(self.dtype),
+                dim=self.count,
+                inputs=[positions, moments, self.radii, self.labels, lists.found_at],
+                outputs=[self.packed, lists.moved],
+                device=self.device,
+            )
+
+    def find_overlaps(self, sources: "PackedMoments | None" = None):
+        """Launch the search for the ``sources`` that overlap these moments; None means these moments themselves."""
+        if sources is None:
+            sources = self
+        else:
+            self._lists.moved.fill_(1)  # only the motion of these moments is watched
+        reach = sources.largest_radius + self.largest_radius
+        if reach == 0.0 or self.count == 0 or sources.count == 0:
+            return
+        neighbors.launch_find_neighbors(self._lists, sources._lists, reach)
+        neighbors.launch_list_overlaps(self._lists, sources._lists)
 
 
 @cache

@@ -1,12 +1,18 @@
-// The pair law of two magnetic moments, each spread over a ball; pair_law.py has the equations and the names.
-//
-// The functions are templates of the number type, a scalar or a vector of them, with ``any`` of a mask and ``larger``,
-// ``smaller`` and ``root`` of numbers found for it.
+// The pair law of two magnetic moments, each spread over a ball, as far as native code needs it; pair_law.py has the
+// equations and the names. Radial factors are templates of the number type, a scalar or a vector of them.
 #pragma once
 #include "shared/inverse_root.h"
 #include "shared/vectors.h"
 
 namespace warpmag {
+
+#if !defined(__CUDA_ARCH__)
+// of scalars, as vectors.h has it of vectors
+inline bool any(bool mask) { return mask; }
+inline bool mask_of(bool condition) { return condition; }
+inline bool mask_of(int condition) { return condition; }
+inline Real larger(Real a, Real b) { return a > b ? a : b; }
+#endif
 
 template <class N> struct Factors {
     N g1, g2, g3;
@@ -18,28 +24,26 @@ template <class N> struct Factors {
 // different radii, the Laurent polynomial in d keeps them for nearly concentric balls.
 template <class N> CUDA_CALLABLE inline Factors<N> averaged_factors(N d, N a, N b) {
     const N p = a * b, s = a + b, i1 = 1 / d, i2 = i1 * i1, i3 = i2 * i1, c = 1 / (160 * p * p * p);
-    const N e = s - d, e2 = e * e, e3 = e2 * e, e4 = e2 * e2, q0 = 5 * (a * a + b * b) - 20 * p;
-    const N q = q0 * i1 - 4 * s - d, q1 = -q0 * i2 - 1, q2 = 2 * q0 * i3, q3 = -6 * q0 * i3 * i1;
-    const N w1 = c * (e4 * q1 - 4 * e3 * q) * i1, w2 = c * (12 * e2 * q - 8 * e3 * q1 + e4 * q2) * i2;
-    const N w3 = c * (36 * e2 * q1 - 24 * e * q - 12 * e3 * q2 + e4 * q3) * i3;
-    const Factors<N> far = {w1 - i3, w2 - (w1 - 3 * i3) * i2, w3 - 3 * (w2 - w1 * i2) * i2 - 15 * i3 * i2 * i2};
-    const N apart2 = (a - b) * (a - b), k = 5 * apart2 * apart2 * (apart2 + 6 * p);
-    const N u1 = 45 * s * s * apart2, u2 = -40 * s * (apart2 + p), u3 = 15 * (apart2 + 2 * p);
-    const Factors<N> near = {c * (2 * u2 + 3 * u3 * d - 5 * d * d * d + (u1 - k * i2) * i1),
-                             c * (3 * u3 * i1 - 15 * d + (3 * k * i2 - u1) * i3),
-                             c * ((3 * u1 - 15 * k * i2) * i3 * i2 - 3 * u3 * i3 - 15 * i1)};
-    const N large = larger(a, b), zero = N(Real(0));
-    const auto inside = (d * d <= apart2) | (d == zero);
-    const auto outside_half = d > Real(0.5) * s;
-    return {inside         ? -1 / (large * large * large)
-            : outside_half ? far.g1
-                           : near.g1,
-            inside         ? zero
-            : outside_half ? far.g2
-                           : near.g2,
-            inside         ? zero
-            : outside_half ? far.g3
-                           : near.g3};
+    const N large = larger(a, b), apart2 = (a - b) * (a - b), zero = N(Real(0));
+    const auto inside = mask_of((d * d <= apart2) | (d == zero)), outer_half = mask_of(d > Real(0.5) * s);
+    Factors<N> far = {}, near = {};
+    if (any(outer_half)) {
+        const N e = s - d, e2 = e * e, e3 = e2 * e, e4 = e2 * e2, q0 = 5 * (a * a + b * b) - 20 * p;
+        const N q = q0 * i1 - 4 * s - d, q1 = -q0 * i2 - 1, q2 = 2 * q0 * i3, q3 = -6 * q0 * i3 * i1;
+        const N w1 = c * (e4 * q1 - 4 * e3 * q) * i1, w2 = c * (12 * e2 * q - 8 * e3 * q1 + e4 * q2) * i2;
+        const N w3 = c * (36 * e2 * q1 - 24 * e * q - 12 * e3 * q2 + e4 * q3) * i3;
+        far = {w1 - i3, w2 - (w1 - 3 * i3) * i2, w3 - 3 * (w2 - w1 * i2) * i2 - 15 * i3 * i2 * i2};
+    }
+    if (any(mask_of(!outer_half))) {
+        const N k = 5 * apart2 * apart2 * (apart2 + 6 * p);
+        const N u1 = 45 * s * s * apart2, u2 = -40 * s * (apart2 + p), u3 = 15 * (apart2 + 2 * p);
+        near = {c * (2 * u2 + 3 * u3 * d - 5 * d * d * d + (u1 - k * i2) * i1),
+                c * (3 * u3 * i1 - 15 * d + (3 * k * i2 - u1) * i3),
+                c * ((3 * u1 - 15 * k * i2) * i3 * i2 - 3 * u3 * i3 - 15 * i1)};
+    }
+    const N g1 = outer_half ? far.g1 : near.g1, g2 = outer_half ? far.g2 : near.g2;
+    const N g3 = outer_half ? far.g3 : near.g3;
+    return {inside ? -1 / (large * large * large) : g1, inside ? zero : g2, inside ? zero : g3};
 }
 
 // What the clamped dipole lacks for an overlapping pair: averaged factors less those at the contact distance, with
@@ -62,12 +66,22 @@ CUDA_CALLABLE inline Number shared_volume(Number d2, Number a, Number b, Mask wa
     return (wanted & (d2 < s * s) & (p > zero)) ? (d <= apart ? ratio * root(ratio) : lens) : zero;
 }
 
-// Adds 4π times what the fields of moments m at separations r have beyond those of clamped dipoles.
-CUDA_CALLABLE inline void add_overlap_field(Vector& h, Vector r, Number a, Number b, Vector m, Mask overlapping) {
-    const Number unit = 1 / (overlapping ? a + b : Number(Real(1)));
-    const Vector apart = scaled(unit, r), moment = scaled(unit * unit * unit, m);
-    const Factors<Number> g = overlap_factors(root(dot(apart, apart)), unit * a, unit * b);
-    add_where(overlapping, h, sum(scaled(g.g1, moment), scaled(g.g2 * dot(apart, moment), apart)));
+// An overlapping pair in units of its contact distance, in which no power of r overflows: separation r, moment m and
+// the factors of what a clamped dipole lacks.
+struct Overlap {
+    Number unit;
+    Vector r, m;
+    Factors<Number> g;
+};
+CUDA_CALLABLE inline Overlap overlap_of(Vector r, Number a, Number b, Vector m, Mask wanted) {
+    const Number unit = 1 / (wanted ? a + b : Number(Real(1)));
+    const Vector apart = scaled(unit, r);
+    return {unit, apart, scaled(unit * unit * unit, m), overlap_factors(root(dot(apart, apart)), unit * a, unit * b)};
+}
+
+// 4π times the field that a clamped dipole lacks.
+CUDA_CALLABLE inline Vector field_of(const Overlap& p) {
+    return sum(scaled(p.g.g1, p.m), scaled(p.g.g2 * dot(p.r, p.m), p.r));
 }
 
 // Adds 4π times the fields of moments m at separations r, of balls of radii a and b.
@@ -79,18 +93,14 @@ CUDA_CALLABLE inline void add_pair_field(Vector& h, Vector r, Number a, Number b
     h.y += along * r.y - i3 * m.y;
     h.z += along * r.z - i3 * m.z;
     const Mask overlapping = wanted & (d2 < s2);
-    if (any(overlapping)) add_overlap_field(h, r, a, b, m, overlapping);
+    if (any(overlapping)) add_where(overlapping, h, field_of(overlap_of(r, a, b, m, overlapping)));
 }
 
-// The overlap field's counterpart in (e·∇)H.
-CUDA_CALLABLE inline void add_overlap_force(Vector& f, Vector r, Number a, Number b, Vector m, Vector e,
-                                            Mask overlapping) {
-    const Number unit = 1 / (overlapping ? a + b : Number(Real(1)));
-    const Vector apart = scaled(unit, r), moment = scaled(unit * unit * unit, m);
-    const Factors<Number> g = overlap_factors(root(dot(apart, apart)), unit * a, unit * b);
-    const Number along = dot(apart, e), of = dot(apart, moment);
-    const Vector across = sum(scaled(along, moment), scaled(of, e));
-    const Number radial = g.g2 * dot(moment, e) + g.g3 * of * along;
-    add_where(overlapping, f, scaled(unit, sum(scaled(g.g2, across), scaled(radial, apart))));
+// 4π times the (e·∇)H that a clamped dipole lacks.
+CUDA_CALLABLE inline Vector force_of(const Overlap& p, Vector e) {
+    const Number along = dot(p.r, e), of = dot(p.r, p.m);
+    const Vector across = sum(scaled(along, p.m), scaled(of, e));
+    const Number radial = p.g.g2 * dot(p.m, e) + p.g.g3 * of * along;
+    return scaled(p.unit, sum(scaled(p.g.g2, across), scaled(radial, p.r)));
 }
 }

@@ -19,8 +19,6 @@ import warp as wp
 
 from warpmag.kernels.shared.native import native_options
 
-VECTORS = True
-"""Whether a CPU makes passes over neighbours in vectors and by threads; else they are plain Warp, as on a GPU."""
 MOST_THREADS = 64
 """Threads that may work on one launch, and shares that its work may be cut into."""
 MOMENTS_PER_THREAD = 2500

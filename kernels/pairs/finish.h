@@ -1,0 +1,157 @@
+// Field (Eq. 1), and force and torque (Eqs. 4, 13 and 14), from sums over pairs of moments: the partial sums of a
+// target are added up, pairs that overlap are corrected, and the results stored.
+//
+// Takes INVERSE_4PI, MU0 [T·m/A], CAPACITY and GROUP from Python, see neighbor_lists.h; ``Arrays`` is the struct of
+// evaluate.py. A vector of target rows is finished at a time, on a GPU one row by a group of threads.
+#pragma once
+#include "pairs/neighbor_lists.h"
+#include "pairs/pair_law.h"
+#include "pairs/pair_terms.h"
+#include "shared/group.h"
+#include "shared/team.h"
+
+namespace warpmag {
+
+// Target rows: their numbers, packed columns and ranges of sources. What lanes beyond the ``held`` first have is not
+// stored.
+struct TargetRows {
+    int first, held;
+    Index row, i, begin, end;
+};
+
+// Rows of a table that has a column for each moment.
+struct Columns {
+    const Real* data;
+    size_t pitch;
+
+    CUDA_CALLABLE Columns(const wp::array_t<Real>& table) : data(table.data), pitch(table.strides[0] / sizeof(Real)) {}
+    CUDA_CALLABLE Number number(int row, Index i) const { return collect(data + row * pitch, i); }
+    CUDA_CALLABLE Vector vector(int row, Index i) const {
+        return {number(row, i), number(row + 1, i), number(row + 2, i)};
+    }
+};
+
+#if defined(__CUDA_ARCH__)
+template <class Arrays> CUDA_CALLABLE inline TargetRows target_rows(const Arrays& arrays, int first) {
+    const int row = min(first, arrays.target.shape[0] - 1); // all threads of a warp take part in sums over groups
+    return {
+        row, first == row && share() == 0, row, arrays.target.data[row], arrays.begin.data[row], arrays.end.data[row]};
+}
+CUDA_CALLABLE inline Vector vectors_at(const Real* vectors, int i) {
+    return {vectors[3 * i], vectors[3 * i + 1], vectors[3 * i + 2]};
+}
+CUDA_CALLABLE inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
+    if (at.held > 0) put_vectors(vectors + 3 * (size_t)at.i, 1, v);
+}
+CUDA_CALLABLE inline Mask nonzero_at(const int* values, const TargetRows& at) { return values[at.i] != 0; }
+#else
+template <class Arrays> inline TargetRows target_rows(const Arrays& arrays, int first) {
+    const int *target = arrays.target.data, *begin = arrays.begin.data, *end = arrays.end.data;
+    const int left = arrays.target.shape[0] - first, held = left < WIDTH ? left : WIDTH;
+    TargetRows at = {first, held, first, target[first], begin[first], begin[first]};
+    for (int l = 0; l < held; ++l) {
+        at.row[l] = first + l;
+        at.i[l] = target[first + l], at.begin[l] = begin[first + l], at.end[l] = end[first + l];
+    }
+    return at;
+}
+inline Vector vectors_at(const Real* vectors, Index i) {
+    return {collect(vectors, 3 * i), collect(vectors + 1, 3 * i), collect(vectors + 2, 3 * i)};
+}
+inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
+    for (int l = 0; l < at.held; ++l) {
+        Real* const own = vectors + 3 * (size_t)at.i[l];
+        own[0] = v.x[l], own[1] = v.y[l], own[2] = v.z[l];
+    }
+}
+inline Mask nonzero_at(const int* values, const TargetRows& at) {
+    Index found = 0;
+    for (int l = 0; l < at.held; ++l) found[l] = values[at.i[l]];
+    return mask_of(found != 0);
+}
+#endif
+
+// Three of the ROW sums of each target row, from number ``offset`` on, added up over parts; the threads of a group
+// share out the parts.
+template <int ROW, class Arrays>
+CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& at, int offset) {
+    Vector total = {0, 0, 0};
+#pragma unroll 4
+    for (int part = share(); part < arrays.partial.shape[0]; part += SHARES) {
+        const Real* const sums = arrays.partial.data + (size_t)part * arrays.partial.shape[1] * ROW + offset;
+        if constexpr (ROW == 3 && WIDTH > 1) {
+            total = sum(total, vectors(sums + 3 * (size_t)at.first, at.held));
+        } else {
+            const Index place = ROW * at.row;
+            total = sum(total, {collect(sums, place), collect(sums + 1, place), collect(sums + 2, place)});
+        }
+    }
+    return total;
+}
+
+// Adds to 4π times the fields h and (e·∇)H f of targets what those of their overlapping sources have beyond those of
+// clamped dipoles. A force leaves out the sources of the target's body, a field the target itself.
+template <Quantity Q, class Arrays>
+CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arrays& arrays, const TargetRows& at) {
+    const Columns targets(arrays.targets), sources(arrays.sources);
+    const Vector x = targets.vector(0, at.i);
+    const Number radius = targets.number(3, at.i), label = targets.number(7, at.i);
+    auto add = [&](Index j, Mask listed) {
+        const Vector r = less(x, sources.vector(0, j));
+        const Number other = sources.number(3, j), contact = radius + other;
+        Mask wanted = listed & (dot(r, r) < contact * contact);
+        if (Q != Quantity::FIELD) wanted &= label != sources.number(7, j);
+        else if (arrays.same_set) wanted &= mask_of(j != at.i);
+        if (WIDTH == 1 && !any(wanted)) return;
+        const Vector m = sources.vector(4, j);
+        auto pair = [&] { return overlap_of(r, radius, other, m, wanted); };
+        if (Q != Quantity::FIELD) add_where(wanted, f, force_of(pair(), e));
+        if (Q == Quantity::FIELD || Q == Quantity::WRENCH) add_where(wanted, h, field_of(pair()));
+    };
+    walk_lists(arrays.overlap.data, arrays.overlap_count.data, at.i, at.held, at.begin, at.end, add);
+}
+
+// Stores the field [A/m], or force [N] and torque [N·m], from 4π times the field h and (e·∇)H f.
+template <Quantity Q, class Arrays>
+CUDA_CALLABLE inline void store(const Arrays& arrays, const TargetRows& at, Vector h, Vector f, Vector e, Vector base) {
+    Real* const out = (Real*)arrays.out.data;
+    if constexpr (Q == Quantity::FIELD) {
+        put_vectors_at(out, at, sum(base, scaled(INVERSE_4PI, h)));
+    } else {
+        put_vectors_at(out, at, scaled(MU0 * INVERSE_4PI, f));
+        Vector torque = {0, 0, 0};
+        if (Q == Quantity::WRENCH) {
+            const Mask turned = nonzero_at(arrays.turned.data, at);
+            add_where(turned, torque, scaled(MU0, cross(e, sum(scaled(INVERSE_4PI, h), base))));
+        }
+        put_vectors_at((Real*)arrays.torques.data, at, torque);
+    }
+}
+
+CUDA_CALLABLE inline Vector group_total(Vector v) { return {group_total(v.x), group_total(v.y), group_total(v.z)}; }
+
+template <Quantity Q, class Arrays> CUDA_CALLABLE inline void finish_rows(const Arrays& arrays, int first) {
+    const TargetRows at = target_rows(arrays, first);
+    const Vector base = vectors_at((const Real*)arrays.base.data, at.i);
+    Vector h = {0, 0, 0}, f = h, e = h;
+    if constexpr (Q == Quantity::FIELD) {
+        h = added_parts<3>(arrays, at, 0);
+    } else {
+        e = Columns(arrays.effective).vector(0, at.i);
+        f = added_parts<width(Q)>(arrays, at, 0);
+        if (Q == Quantity::WRENCH) h = added_parts<6>(arrays, at, 3);
+    }
+    add_overlaps<Q>(h, f, e, arrays, at);
+    store<Q>(arrays, at, group_total(h), group_total(f), e, base);
+}
+
+// Finishes all target rows, of which a group of threads of a GPU has one.
+template <Quantity Q, class Word, class Arrays>
+CUDA_CALLABLE inline void finish(int thread, int threads, Word* team, const Arrays& arrays) {
+#if defined(__CUDA_ARCH__)
+    finish_rows<Q>(arrays, thread / GROUP);
+#else
+    run_passes(team, threads, 0, 1, arrays.target.shape[0], WIDTH, [&](int, int i) { finish_rows<Q>(arrays, i); });
+#endif
+}
+}

@@ -1,0 +1,69 @@
+"""Plain loop over pairs: readable, exact for overlapping balls, the reference for the native sums.
+
+It also has the paper's smoothing (section 5).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpmag.kernels.pairs.pair_law import field_of, force_of, pair_factors
+from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+from warpmag.kernels.pairs.work_list import arrays_type
+from warpmag.kernels.shared.native import native_options
+
+
+@cache
+def _kernel(dtype, quantity: Quantity):
+    vec3, sums_arrays = wp.types.vector(3, dtype), arrays_type(dtype)
+    factors = pair_factors(dtype)
+    field, force = quantity in (Quantity.FIELD, Quantity.WRENCH), quantity != Quantity.FIELD
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=native_options("pairs/pair_law.h", dtype=dtype))
+    def reference_sums(arrays: sums_arrays, epsilon2: dtype):
+        row = wp.tid()
+        i = arrays.target[row]
+        x = vec3(arrays.targets[0, i], arrays.targets[1, i], arrays.targets[2, i])
+        e = vec3()
+        if wp.static(force):
+            e = vec3(arrays.effective[0, i], arrays.effective[1, i], arrays.effective[2, i])
+        h = vec3()
+        f = vec3()
+        for j in range(arrays.begin[row], arrays.end[row]):
+            left_out = arrays.same_set == 1 and i == j
+            if wp.static(force):
+                left_out = arrays.targets[7, i] == arrays.sources[7, j]
+            if not left_out:
+                r = x - vec3(arrays.sources[0, j], arrays.sources[1, j], arrays.sources[2, j])
+                m = vec3(arrays.sources[4, j], arrays.sources[5, j], arrays.sources[6, j])
+                g = factors(wp.dot(r, r), arrays.targets[3, i], arrays.sources[3, j], epsilon2)
+                if wp.static(field):
+                    h += field_of(g, r, m)
+                if wp.static(force):
+                    f += force_of(g, r, m, e)
+        for c in range(3):
+            if wp.static(force):
+                arrays.partial[0, row, c] = f[c]
+            if wp.static(field):
+                arrays.partial[0, row, wp.static(WIDTHS[quantity] - 3) + c] = h[c]
+
+    return reference_sums
+
+
+def launch_reference_sums(quantity: Quantity, arrays, smoothing: float):
+    """Sum a quantity over all pairs of target rows and their sources.
+
+    A field leaves out the target itself, if targets and sources are the same; a force what has the target's label.
+
+    Args:
+        quantity: ``FIELD``, ``FORCE`` or ``WRENCH``.
+        arrays: Struct of ``work_list.arrays_type``, of one part of sums.
+        smoothing: Length ℓ [m] of the paper's smoothing; 0 for none.
+    """
+    dtype = arrays.partial.dtype
+    wp.launch(
+        _kernel(dtype, quantity),
+        dim=arrays.target.shape[0],
+        inputs=[arrays, dtype(smoothing**5)],
+        device=arrays.partial.device,
+    )
