@@ -10,7 +10,7 @@ import warpmag
 from warpmag import oracle
 from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
 from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
-from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, field_evaluation, wrench_evaluation
+from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared import team as cpu_team
@@ -198,16 +198,14 @@ def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, form):
     packed = PackedMoments(wp.array(radii, dtype=kind, device=device), largest_radius=radii.max(), labels=bodies)
     packed.pack(*vectors)
     packed.find_overlaps()
-    none, *out = (wp.zeros_like(vectors[0]) for _ in range(3))
-    if quantity == Quantity.FIELD:
-        out = out[:1]
-        evaluation = field_evaluation(segments, packed, packed, none, *out, form=form)
-    else:
-        turned = wp.ones(len(x), dtype=int, device=device)
-        evaluation = wrench_evaluation(quantity, segments, packed, none, turned, *out, form=form)
+    none, out, torques = (wp.zeros_like(vectors[0]) for _ in range(3))
+    turned = wp.ones(len(x), dtype=int, device=device)
+    evaluation = PairEvaluation(
+        quantity, segments, packed, packed, none, out, turned=turned, torques=torques, form=form
+    )
     evaluation.partial.fill_(np.nan)
     evaluation.launch()
-    return [a.numpy().astype(float) for a in out]
+    return [a.numpy().astype(float) for a in ([out] if quantity == Quantity.FIELD else [out, torques])]
 
 
 def test_runs_are_bitwise_equal(device):

@@ -5,7 +5,7 @@ import warp as wp
 
 from warpmag.arrays import Kind, check_radii, resolve_kind, vec3_type
 from warpmag.errors import InputError
-from warpmag.kernels.pairs.evaluate import REFERENCE, field_evaluation, wrench_evaluation
+from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import check_rtol, check_token
@@ -66,7 +66,7 @@ def h_field(
     h = wp.zeros_like(base)
     form = _prepare(at, sources, method, smoothing)
     segments = [(0, at.count, 0, sources.count)]
-    field_evaluation(segments, at, sources, base, h, form=form, smoothing=smoothing).launch()
+    PairEvaluation(Quantity.FIELD, segments, at, sources, base, h, form=form, smoothing=smoothing).launch()
     return kind.finish(h)
 
 
@@ -116,9 +116,10 @@ def wrench(
     forces, torques = wp.zeros_like(x), wp.zeros_like(x)
     turned = wp.ones(n, dtype=int, device=kind.device)
     form = _prepare(packed, packed, method, smoothing)
-    wrench_evaluation(
-        Quantity.WRENCH, [(0, n, 0, n)], packed, external, turned, forces, torques, form=form, smoothing=smoothing
-    ).launch()
+    PairEvaluation(
+        Quantity.WRENCH, [(0, n, 0, n)], packed, packed, external, forces, turned=turned, torques=torques, form=form,
+        smoothing=smoothing,
+    ).launch()  # fmt: skip
     return kind.finish(forces), kind.finish(torques)
 
 

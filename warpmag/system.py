@@ -13,7 +13,7 @@ from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
 from warpmag.kernels.near_contact import near_contact
-from warpmag.kernels.pairs.evaluate import field_evaluation, wrench_evaluation
+from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import launch_zeeman_moments
@@ -193,10 +193,11 @@ class MomentSystem:
         if not layout.permanent.any():
             self._induction.h0 = self.external_field
         h0 = self._induction.h0
-        self._applied = field_evaluation(permanent, packed, packed, self.external_field, h0)
+        self._applied = PairEvaluation(Quantity.FIELD, permanent, packed, packed, self.external_field, h0)
         inducible = [(first, middle, first, middle) for first, middle, _ in ranges]
         # near contacts write one more partial sum
-        self._mutual = field_evaluation(inducible, packed, packed, h0, self.h, extra_parts=int(near))
+        extra = int(near)
+        self._mutual = PairEvaluation(Quantity.FIELD, inducible, packed, packed, h0, self.h, extra_parts=extra)
 
     def _evaluate_wrench(self, layout: _Layout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
@@ -211,9 +212,9 @@ class MomentSystem:
         def evaluations(force, effective):
             # those with a torque come last, since the others' mirrored form writes forces on all moments
             return [
-                wrench_evaluation(
-                    quantity, which, self._packed, self.external_field, self._turned, self.forces, self.torques,
-                    effective=effective,
+                PairEvaluation(
+                    quantity, which, self._packed, self._packed, self.external_field, self.forces, effective=effective,
+                    turned=self._turned, torques=self.torques,
                 )
                 for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
                 if which

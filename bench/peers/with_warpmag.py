@@ -4,8 +4,9 @@ import warp as wp
 
 from bench.cases import RADIUS
 from bench.peers import Evaluation
-from warpmag.kernels.pairs.evaluate import field_evaluation
+from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.kernels.pairs.pair_terms import Quantity
 
 
 def prepare(positions, moments, device):
@@ -16,7 +17,7 @@ def prepare(positions, moments, device):
     packed.pack(x, m)
     packed.find_overlaps()
     h = wp.zeros_like(x)
-    evaluate = field_evaluation([(0, n, 0, n)], packed, packed, wp.zeros_like(x), h).launch
+    evaluate = PairEvaluation(Quantity.FIELD, [(0, n, 0, n)], packed, packed, wp.zeros_like(x), h).launch
     evaluate()
     with wp.ScopedCapture(device) as capture:
         evaluate()

@@ -37,8 +37,8 @@ import warp as wp
 
 from warpmag.kernels.induction.solve_state import BLOCK_CHUNK, COLUMNS, DEPTH, state_type, world_summation
 from warpmag.kernels.material.curves import inverse_curve_ratio
-from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.neighbors import CAPACITY
+from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
 from warpmag.kernels.shared.reductions import block_max, group_threads

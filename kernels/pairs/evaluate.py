@@ -25,7 +25,7 @@ from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
 from warpmag.kernels.pairs.sums_cpu import launch_pair_loop_cpu
-from warpmag.kernels.pairs.work_list import TargetRows, arrays_type, block_tiles, cpu_tiles, make_rows, pair_count
+from warpmag.kernels.pairs.work_list import arrays_type, block_tiles, cpu_tiles, loop_tiles, make_rows, pair_count
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
@@ -43,105 +43,40 @@ _GROUP = 8
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
 
 
-# Each form: the number of partial sums of a target row, its tiles, and a launch of its sums.
-
-
-class _CpuLoop:
-    def __init__(self, quantity, segments, device):
-        self.tiles, shares, self._threads = cpu_tiles(segments)
-        self.parts, self._quantity = len(shares) - 1, quantity
-        self._shares = wp.array(shares, dtype=wp.int32, device=device)
-
-    def launch(self, a):
-        launch_pair_loop_cpu(
-            self._quantity, a.targets, a.sources, a.effective, a.tiles, self._shares, self._threads, a.partial
-        )
-
-
-class _CudaLoop:
-    def __init__(self, quantity, segments, device):
-        sizes, longest = segments[:, 1] - segments[:, 0], int(np.max(segments[:, 3] - segments[:, 2], initial=0))
-        self._quantity, self._shape = quantity, sums_cuda.choose_loop_shape(quantity, int(sizes.sum()))
-        width = 32 * self._shape.targets
-        tiles = int(np.sum(-(-sizes // width)))
-        self.parts = sums_cuda.choose_splits(self._shape, tiles, longest, device.sm_count)
-        self.tiles = block_tiles(segments, width, self.parts)
-
-    def launch(self, a):
-        sums_cuda.launch_pair_loop_cuda(
-            self._quantity, self._shape, a.targets, a.sources, a.effective, a.tiles, a.partial
-        )
-
-
-class _MirroredSums:
-    tiles = ()
-
-    def __init__(self, quantity, segments, device):
-        begin, end = segments[0, :2]
-        self._mirror = mirror_cuda.make_mirror(int(begin), int(end - begin), quantity, device)
-        self.parts = self._mirror.slabs + self._mirror.splits
-
-    def launch(self, a):
-        mirror_cuda.launch_pair_loop_mirrored(self._mirror, a.sources, a.partial)
-
-
-class _FusedSums:
-    parts = 0
-
-    def __init__(self, quantity, segments, device):
-        self._quantity, self._device = quantity, device
-        self._shape = fused_cuda.choose_fused_shape(quantity, int(np.sum(segments[:, 1] - segments[:, 0])))
-        self.tiles = block_tiles(segments, self._shape.targets)
-
-    def launch(self, a):
-        threads = self._shape.threads
-        wp.launch(
-            _fused_kernel(a.targets.dtype, self._quantity, self._shape),
-            dim=len(self.tiles) * threads,
-            inputs=[a],
-            device=self._device,
-            block_dim=threads,
-        )
-
-
-class _ReferenceSums:
-    tiles, parts = (), 1
-
-    def __init__(self, quantity, smoothing):
-        self._quantity, self._smoothing = quantity, smoothing
-
-    def launch(self, a):
-        launch_reference_sums(self._quantity, a, self._smoothing)
-
-
 class PairEvaluation:
     """Field, or force and torque, of packed sources at packed targets, again and again in the same arrays.
 
+    The field is H, on top of a given one. A field at moments that are the sources, too, leaves out a moment's own. The
+    force is μ0 (e·∇)H, the torque μ0 e × H about the moment's position, of sources of other bodies.
+
+    Args:
+        quantity: What is summed: ``FIELD``; ``WRENCH``; ``FORCE``, with a torque of zero; or ``MUTUAL_FORCE``, the same
+            where e is the moment itself.
+        segments: Integers [k, 4]: packed column of targets begin and end, and of their sources begin and end.
+        targets: Packed targets with their overlapping sources (``packing.PackedMoments``), t of them.
+        sources: Packed sources.
+        base: Field to start from, or that turns moments, too [A/m], shape [t].
+        out: Out, field [A/m] or forces [N], shape [t]; that of the targets in ``segments``, in the form ``MIRRORED`` of
+            others, too.
+        effective: Effective moments e [A·m²], shape [3, t]; None means the moments.
+        turned: Whether the torque on a moment is wanted, shape [t].
+        torques: Out, torques [N·m], shape [t].
+        extra_parts: Partial sums that the caller writes.
+        smoothing: Length ℓ [m] of the paper's smoothing, with the form ``REFERENCE``.
+        form: Form of the sums; None means the fastest.
+
     Attributes:
-        form: How the sums are made: ``LOOP``, ``FUSED``, ``MIRRORED`` or ``REFERENCE``.
+        form: ``LOOP``, ``FUSED``, ``MIRRORED`` or ``REFERENCE``.
         rows: Target rows.
         pair_count: Pairs of a target and a source.
-        partial: Partial sums, shape [parts, rows, sums]; the last ``extra_parts`` of them are written by the caller.
+        partial: Partial sums, shape [parts, rows, sums], the caller's ``extra_parts`` last.
     """
 
-    rows: TargetRows
-
     def __init__(
-        self, quantity, segments, targets, sources, *, extra_parts=0, smoothing=0.0, form=None, effective=None, **given
-    ):
-        """Allocate for :func:`field_evaluation` or :func:`wrench_evaluation`, which see.
-
-        Args:
-            quantity: What is summed.
-            segments: Integers [k, 4]: packed column of targets begin and end, and of their sources begin and end.
-            targets: Packed targets with their overlapping sources (``packing.PackedMoments``).
-            sources: Packed sources.
-            extra_parts: Partial sums that the caller adds.
-            smoothing: Length ℓ [m] of the paper's smoothing, with the form ``REFERENCE``.
-            form: Form of the sums; None means the fastest.
-            effective: Effective moments [A·m²], shape [3, targets]; None means the targets' moments.
-            given: Other arrays of the struct.
-        """
+        self, quantity, segments, targets, sources, base, out, *, effective=None, turned=None, torques=None,
+        extra_parts=0, smoothing=0.0, form=None,
+    ):  # fmt: skip
+        """Allocate what the form needs."""
         segments = np.asarray(segments, np.int64).reshape(-1, 4)
         device, dtype = targets.device, targets.dtype
         self.form = form or _choose_form(quantity, segments, device, targets is sources, extra_parts)
@@ -149,33 +84,53 @@ class PairEvaluation:
             segments = segments[:1, [2, 3, 2, 3]]
         self.rows, self.pair_count = make_rows(segments, device), pair_count(segments)
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
-        if self.form == REFERENCE:
-            self._sums = _ReferenceSums(self._finished, smoothing)
-        elif self.form == MIRRORED:
-            self._sums = _MirroredSums(quantity, segments, device)
-        elif self.form == FUSED:
-            self._sums = _FusedSums(self._finished, segments, device)
-        elif device.is_cuda:
-            self._sums = _CudaLoop(self._finished, segments, device)
-        else:
-            self._sums = _CpuLoop(quantity, segments, device)
-        shape = self._sums.parts + extra_parts, max(self.rows.count, 1), WIDTHS[quantity]
+        parts, tiles = self._plan_sums(quantity, segments, device, smoothing)
+        shape = parts + extra_parts, max(self.rows.count, 1), WIDTHS[quantity]
         self.partial = wp.zeros(shape, dtype=dtype, device=device)
         self._arrays = a = arrays_type(dtype)()
         a.target, a.begin, a.end, a.partial = self.rows.target, self.rows.begin, self.rows.end, self.partial
-        a.tiles = wp.array(np.reshape(self._sums.tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
+        a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
         a.overlap, a.overlap_count = targets.overlaps, targets.overlap_counts
         a.effective = targets.moments if effective is None else effective
-        for name, array in given.items():
-            setattr(a, name, array)
+        a.base, a.out = base, out
+        if quantity != Quantity.FIELD:
+            a.turned, a.torques = turned, torques
         self._finish = None
+
+    def _plan_sums(self, quantity, segments, device, smoothing):
+        """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
+        finished, count = self._finished, self.rows.count
+        if self.form == REFERENCE:
+            self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
+            return 1, ()
+        if self.form == MIRRORED:
+            mirror = mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, device)
+            self._launch_sums = lambda a: mirror_cuda.launch_pair_loop_mirrored(mirror, a.sources, a.partial)
+            return mirror.slabs + mirror.splits, ()
+        if self.form == FUSED:
+            shape = fused_cuda.choose_fused_shape(finished, count)
+            self._launch_sums = lambda a: _launch_fused(finished, shape, a)
+            return 0, block_tiles(segments, shape.targets)
+        if device.is_cuda:
+            shape = sums_cuda.choose_loop_shape(finished, count)
+            tiles, parts = loop_tiles(segments, shape, device.sm_count)
+            self._launch_sums = lambda a: sums_cuda.launch_pair_loop_cuda(
+                finished, shape, a.targets, a.sources, a.effective, a.tiles, a.partial
+            )
+            return parts, tiles
+        tiles, ends, threads = cpu_tiles(segments)
+        shares = wp.array(ends, dtype=wp.int32, device=device)
+        self._launch_sums = lambda a: launch_pair_loop_cpu(
+            quantity, a.targets, a.sources, a.effective, a.tiles, shares, threads, a.partial
+        )
+        return len(ends) - 1, tiles
 
     def launch(self, wait=None):
         """Evaluate at all target rows; ``wait``, if given, is called before the partial sums are added up."""
         if self.rows.count == 0:
             return
-        self._sums.launch(self._arrays)
+        self._launch_sums(self._arrays)
         if wait is not None:
             wait()
         if self.form != FUSED:
@@ -194,41 +149,6 @@ class PairEvaluation:
                 record_cmd=True,
             )
         self._finish.launch()
-
-
-def field_evaluation(segments, targets, sources, base, h, **options) -> PairEvaluation:
-    """Evaluation of the field (Eq. 1) of the sources at the targets, on top of a given one.
-
-    Moments that are targets and sources have no field at their own place.
-
-    Args:
-        segments: See :class:`PairEvaluation`.
-        targets: Packed targets, t of them.
-        sources: Packed sources.
-        base: Field to start from [A/m], shape [t].
-        h: Out, field [A/m], shape [t]; written are the targets of ``segments``, in the form ``MIRRORED`` others, too.
-        options: See :class:`PairEvaluation`.
-    """
-    return PairEvaluation(Quantity.FIELD, segments, targets, sources, base=base, out=h, **options)
-
-
-def wrench_evaluation(
-    quantity, segments, moments, external_field, turned, forces, torques, **options
-) -> PairEvaluation:
-    """Evaluation of the force (e·∇)H (Eqs. 4, 13, 14) and the torque e × H on moments by those of other bodies.
-
-    Args:
-        quantity: ``WRENCH``; or ``FORCE``, with no torque; or ``MUTUAL_FORCE``, the same where e is the moment.
-        segments: See :class:`PairEvaluation`.
-        moments: Packed moments, n of them.
-        external_field: Applied field [A/m], shape [n].
-        turned: Whether the torque on a moment is wanted, shape [n].
-        forces: Out, forces [N], shape [n].
-        torques: Out, torques about each moment [N·m], shape [n].
-        options: See :class:`PairEvaluation`.
-    """
-    given = {"base": external_field, "turned": turned, "out": forces, "torques": torques}
-    return PairEvaluation(quantity, segments, moments, moments, **given, **options)
 
 
 def _choose_form(quantity, segments, device, among, extra_parts) -> str:
@@ -278,3 +198,13 @@ def _fused_kernel(dtype, quantity: Quantity, shape):
         run(arrays)
 
     return sum_and_finish
+
+
+def _launch_fused(quantity: Quantity, shape, arrays):
+    wp.launch(
+        _fused_kernel(arrays.targets.dtype, quantity, shape),
+        dim=arrays.tiles.shape[0] * shape.threads,
+        inputs=[arrays],
+        device=arrays.targets.device,
+        block_dim=shape.threads,
+    )

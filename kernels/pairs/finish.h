@@ -31,14 +31,15 @@ struct Columns {
     }
 };
 
+CUDA_CALLABLE inline Vector vectors_at(const Real* vectors, Index i) {
+    return {collect(vectors, 3 * i), collect(vectors + 1, 3 * i), collect(vectors + 2, 3 * i)};
+}
+
 #if defined(__CUDA_ARCH__)
 template <class Arrays> CUDA_CALLABLE inline TargetRows target_rows(const Arrays& arrays, int first) {
     const int row = min(first, arrays.target.shape[0] - 1); // all threads of a warp take part in sums over groups
     return {
         row, first == row && share() == 0, row, arrays.target.data[row], arrays.begin.data[row], arrays.end.data[row]};
-}
-CUDA_CALLABLE inline Vector vectors_at(const Real* vectors, int i) {
-    return {vectors[3 * i], vectors[3 * i + 1], vectors[3 * i + 2]};
 }
 CUDA_CALLABLE inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
     if (at.held > 0) put_vectors(vectors + 3 * (size_t)at.i, 1, v);
@@ -54,9 +55,6 @@ template <class Arrays> inline TargetRows target_rows(const Arrays& arrays, int 
         at.i[l] = target[first + l], at.begin[l] = begin[first + l], at.end[l] = end[first + l];
     }
     return at;
-}
-inline Vector vectors_at(const Real* vectors, Index i) {
-    return {collect(vectors, 3 * i), collect(vectors + 1, 3 * i), collect(vectors + 2, 3 * i)};
 }
 inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
     for (int l = 0; l < at.held; ++l) {

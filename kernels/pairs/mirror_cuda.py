@@ -164,7 +164,7 @@ def _kernel(dtype, quantity: Quantity, shape: MirrorShape):
 
 
 def launch_pair_loop_mirrored(m: Mirror, packed, partial):
-    """Sum a quantity over all pairs; see ``work_list.launch_pair_loop``."""
+    """Sum a quantity over all pairs; see ``evaluate``."""
     for first_block, blocks, nearest in m.passes:
         wp.launch_tiled(
             _kernel(partial.dtype, m.quantity, m.shape),

@@ -50,7 +50,7 @@ def _kernel(dtype, quantity: Quantity):
 
 
 def launch_pair_loop_cpu(quantity: Quantity, targets, sources, effective, tiles, shares, threads, partial):
-    """Sum a quantity over all tiles; see ``work_list.launch_pair_loop``."""
+    """Sum a quantity over all tiles; see ``evaluate``."""
     wp.launch(
         _kernel(partial.dtype, quantity),
         dim=1,

@@ -116,7 +116,7 @@ def _kernel(dtype, quantity: Quantity, shape: LoopShape):
 
 
 def launch_pair_loop_cuda(quantity: Quantity, shape: LoopShape, targets, sources, effective, tiles, partial):
-    """Sum a quantity over all tiles; see ``work_list.launch_pair_loop``."""
+    """Sum a quantity over all tiles; see ``evaluate``."""
     wp.launch(
         _kernel(partial.dtype, quantity, shape),
         dim=tiles.shape[0] * 32 * shape.warps,

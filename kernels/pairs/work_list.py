@@ -11,7 +11,8 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.sums_cpu import STRIPE
+from warpmag.kernels.pairs.sums_cpu import TILE_SIZE
+from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
 from warpmag.kernels.shared.team import threads_for
 
 _PAIRS_PER_START = 200_000
@@ -69,6 +70,14 @@ def block_tiles(segments, width: int, splits: int = 1):
     return np.array(tiles, np.int64)
 
 
+def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
+    """Tiles of the looped sums on a GPU, each for one part of the sources; and the number of these."""
+    width = 32 * shape.targets
+    longest = int(np.max(segments[:, 3] - segments[:, 2], initial=0))
+    splits = choose_splits(shape, len(block_tiles(segments, width)), longest, multiprocessors)
+    return block_tiles(segments, width, splits), splits
+
+
 def cpu_tiles(segments):
     """Tiles of stripes of targets and stripes of sources; where each share of them begins; and threads to take them.
 
@@ -101,8 +110,8 @@ def pair_count(segments) -> int:
 
 
 def _stripes(begin, end, wanted):
-    """Ranges of at most ``STRIPE`` that cut one into about as many equal parts as wanted, or more."""
-    parts = max(wanted, -(-(end - begin) // STRIPE), 1)
+    """Ranges of at most ``TILE_SIZE`` that cut one into about as many equal parts as wanted, or more."""
+    parts = max(wanted, -(-(end - begin) // TILE_SIZE), 1)
     width = max(-(-(end - begin) // (parts * _LANES)) * _LANES, _LANES)
     return [(a, min(a + width, end)) for a in range(begin, end, width)]
 
