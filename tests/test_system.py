@@ -297,6 +297,18 @@ def _host(array):
     return array.numpy().astype(float)
 
 
+def test_magnet_in_a_world_of_its_own(device):
+    """A ball in another world is in the external field alone."""
+    system = MomentSystem(
+        radii=np.full(2, 0.005), worlds=[0, 1], permanent=[False, True], saturation=MS, external_field=[0.0, 0.0, 1e5],
+        rtol=1e-5, device=device,
+    )  # fmt: skip
+    system.moments.assign([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    system.solve()
+    expected = oracle.magnetization(np.array([[0.0, 0.0, 1e5]]), MS)[0]
+    assert relative(system.magnetizations().numpy()[:1], expected) < 1e-5
+
+
 def test_moments_out_of_order_are_refused(device):
     """Inducible moments come first in each world, and worlds one after the other."""
     for wrong in ({"permanent": [True, False]}, {"worlds": [1, 0]}):

@@ -52,7 +52,7 @@ class _Layout:
 def _layout(radii, worlds, permanent, bodies, movable) -> _Layout:
     """Layout of moments, of which all but the radii may be None; see :class:`MomentSystem`."""
     n = len(radii)
-    worlds = np.zeros(n, int) if worlds is None else np.asarray(worlds)
+    worlds = np.zeros(n, int) if worlds is None else np.asarray(worlds, int)
     permanent = np.zeros(n, bool) if permanent is None else np.asarray(permanent, bool)
     bodies = np.arange(n) if bodies is None else np.asarray(bodies)
     movable = np.ones(n, bool) if movable is None else np.asarray(movable, bool)
@@ -188,16 +188,14 @@ class MomentSystem:
 
     def _evaluate_field(self, layout: _Layout, near: bool):
         """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
-        ranges, packed = layout.ranges(), self._packed
-        permanent = [(first, middle, middle, last) for first, middle, last in ranges]
-        if not layout.permanent.any():
-            self._induction.h0 = self.external_field
-        h0 = self._induction.h0
-        self._applied = PairEvaluation(Quantity.FIELD, permanent, packed, packed, self.external_field, h0)
-        inducible = [(first, middle, first, middle) for first, middle, _ in ranges]
+        ranges, packed, state = layout.ranges(), self._packed, self._induction
+        applied = [(first, middle, middle, last) for first, middle, last in ranges]
+        self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self.external_field, state.h0)
+        if self._applied.pair_count == 0:
+            state.h0 = self.external_field
+        mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
         # near contacts write one more partial sum
-        extra = int(near)
-        self._mutual = PairEvaluation(Quantity.FIELD, inducible, packed, packed, h0, self.h, extra_parts=extra)
+        self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
 
     def _evaluate_wrench(self, layout: _Layout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
