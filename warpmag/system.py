@@ -230,7 +230,7 @@ class MomentSystem:
         )
         return near_contact.allocate(
             self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, saturation,
-            CURVE_IDS[curve], rows=self._mutual.rows, partial=self._mutual.partial, movable=layout.movable,
+            CURVE_IDS[curve], rows=self._mutual, partial=self._mutual.partial, movable=layout.movable,
             twisted=turned, forces=self.forces, torques=self.torques,
         )  # fmt: skip
 
@@ -257,7 +257,7 @@ class MomentSystem:
     def solve(self):
         """Launch the induction solve: inducible ``moments`` in equilibrium with the field at ``positions``."""
         self.begin()
-        if self._mutual.rows.count:
+        if self._mutual.count:
             # no world is done before the first evaluation, and a loop costs a GPU more than what is in it
             self.iterate()
             wp.capture_while(self._induction.condition, self.iterate)
@@ -269,7 +269,7 @@ class MomentSystem:
         if self._near is not None:
             near_contact.launch_find_pairs(packed, self._near)
         packed.find_overlaps()
-        if self._mutual.rows.count == 0:
+        if self._mutual.count == 0:
             return
         if self._applied.pair_count:
             self._applied.launch()

@@ -153,7 +153,7 @@ def allocate(
         susceptibility: Susceptibility of each, shape [n], may be infinite.
         saturation: Saturation magnetization of each [A/m], shape [n].
         curve: Their magnetization curve, of ``curves.CURVE_IDS``.
-        rows: Work list of the field loop (``pair_loops.Rows``).
+        rows: Evaluation of their field (``evaluate.PairEvaluation``).
         partial: Its sums, and one part more, to be written by sweeps; no part, if the sums are fused.
         movable: Whether the force on a moment is wanted, shape [n].
         twisted: Whether its torque is, shape [n].

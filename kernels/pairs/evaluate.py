@@ -25,7 +25,7 @@ from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
 from warpmag.kernels.pairs.sums_cpu import launch_pair_loop_cpu
-from warpmag.kernels.pairs.work_list import arrays_type, block_tiles, cpu_tiles, loop_tiles, make_rows, pair_count
+from warpmag.kernels.pairs.work_list import arrays_type, block_tiles, cpu_tiles, loop_tiles, pair_count, target_rows
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
@@ -67,7 +67,8 @@ class PairEvaluation:
 
     Attributes:
         form: ``LOOP``, ``FUSED``, ``MIRRORED`` or ``REFERENCE``.
-        rows: Target rows.
+        count: Number of target rows.
+        target: Packed column of each, shape [count].
         pair_count: Pairs of a target and a source.
         partial: Partial sums, shape [parts, rows, sums], the caller's ``extra_parts`` last.
     """
@@ -82,13 +83,13 @@ class PairEvaluation:
         self.form = form or _choose_form(quantity, segments, device, targets is sources, extra_parts)
         if self.form == MIRRORED:
             segments = segments[:1, [2, 3, 2, 3]]
-        self.rows, self.pair_count = make_rows(segments, device), pair_count(segments)
+        self._arrays = a = arrays_type(dtype)()
+        a.target, a.begin, a.end = target_rows(segments, device)
+        self.target, self.count, self.pair_count = a.target, a.target.shape[0], pair_count(segments)
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         parts, tiles = self._plan_sums(quantity, segments, device, smoothing)
-        shape = parts + extra_parts, max(self.rows.count, 1), WIDTHS[quantity]
-        self.partial = wp.zeros(shape, dtype=dtype, device=device)
-        self._arrays = a = arrays_type(dtype)()
-        a.target, a.begin, a.end, a.partial = self.rows.target, self.rows.begin, self.rows.end, self.partial
+        shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
+        self.partial = a.partial = wp.zeros(shape, dtype=dtype, device=device)
         a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
         a.overlap, a.overlap_count = targets.overlaps, targets.overlap_counts
@@ -100,7 +101,7 @@ class PairEvaluation:
 
     def _plan_sums(self, quantity, segments, device, smoothing):
         """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
-        finished, count = self._finished, self.rows.count
+        finished, count = self._finished, self.count
         if self.form == REFERENCE:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
             return 1, ()
@@ -128,7 +129,7 @@ class PairEvaluation:
 
     def launch(self, wait=None):
         """Evaluate at all target rows; ``wait``, if given, is called before the partial sums are added up."""
-        if self.rows.count == 0:
+        if self.count == 0:
             return
         self._launch_sums(self._arrays)
         if wait is not None:
@@ -139,7 +140,7 @@ class PairEvaluation:
     def _launch_finish(self):
         """Launch what follows the sums, recorded, which spares packing the struct each time."""
         if self._finish is None:
-            device, count = self.partial.device, self.rows.count
+            device, count = self.partial.device, self.count
             self._finish = wp.launch(
                 _finish_kernel(self.partial.dtype, self._finished),
                 # whole warps, since all threads of one take part in sums over groups

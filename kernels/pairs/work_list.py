@@ -4,7 +4,6 @@ Segments say which range of packed targets has which range of packed sources; th
 other, are the target rows. A tile is a row of ``TILE_COLUMNS`` integers, see ``pair_terms``.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -26,31 +25,17 @@ _LANES = 16
 """Width of the widest vectors: a stripe of a multiple of it wastes none."""
 
 
-@dataclass(frozen=True)
-class TargetRows:
-    """Target rows on one device.
+def target_rows(segments, device):
+    """Packed column, first source and end of the sources of each target row, Warp arrays.
 
-    Attributes:
-        count: Number of target rows.
-        target: Packed column of each target row, shape [count].
-        begin: First source of each target row, shape [count].
-        end: One past the last source of each target row, shape [count].
+    Args:
+        segments: Integers [k, 4]: target column begin and end, source begin and end.
+        device: Warp device.
     """
-
-    count: int
-    target: wp.array
-    begin: wp.array
-    end: wp.array
-
-
-def make_rows(segments, device) -> TargetRows:
-    """Target rows of segments [k, 4]: target column begin and end, source begin and end."""
-    sizes = segments[:, 1] - segments[:, 0]
-    starts = row_starts(segments)
+    sizes, starts = segments[:, 1] - segments[:, 0], row_starts(segments)
     target = np.arange(starts[-1]) + np.repeat(segments[:, 0] - starts[:-1], sizes)
-    ends = (np.repeat(segments[:, column], sizes) for column in (2, 3))
-    arrays = (wp.array(values, dtype=wp.int32, device=device) for values in (target, *ends))
-    return TargetRows(int(starts[-1]), *arrays)
+    rows = target, np.repeat(segments[:, 2], sizes), np.repeat(segments[:, 3], sizes)
+    return [wp.array(values, dtype=wp.int32, device=device) for values in rows]
 
 
 def row_starts(segments):
