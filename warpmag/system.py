@@ -10,7 +10,7 @@ from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
-from warpmag.kernels.near_contact import near_contact
+from warpmag.kernels.near_contact import near_pairs as near_contact
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.field import launch_field
 from warpmag.kernels.pairs.packing import launch_divide_by_volume
@@ -286,7 +286,7 @@ class MomentSystem:
         if law == ZEEMAN:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
-        if near is not None and self.device.is_cuda:
+        if near is not None:
             near_contact.launch_sweeps(near)
         for rows, partial in zip(felt, self._felt_partial[law], strict=True):
             pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
