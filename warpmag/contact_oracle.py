@@ -6,7 +6,25 @@ Tests compare the device with it, and with the exact solutions of ``bench.refere
 import numpy as np
 
 from warpmag import oracle
-from warpmag.kernels.near_contact import contact_table
+from warpmag.kernels.near_contact.contact_table import (
+    CONTACT_GAP,
+    DEEPEST,
+    FUNCTIONS,
+    LEAST_RATIO,
+    LOG_GAPS,
+    MOST_SHARED,
+    QUADRUPOLE_OVERLAP,
+    QUADRUPOLE_REACH,
+    RANGE,
+    REACH,
+    SMALLEST_GAP,
+    SOFTNESS,
+    b_spline,
+    gap_table,
+    hardness,
+)
+
+
 def log_gap(gap):
     """Logarithm of the gap [radii] at which the table is read, and its derivative; levels off near contact."""
     depth = np.minimum(gap - SMALLEST_GAP, 0.0) / SOFTNESS
@@ -48,7 +66,7 @@ def conductances(gap, own, other):
     """
     gap = np.asarray(gap, float)
     u, du = log_gap(gap)
-    row, weights, slopes = _b_spline(u, LOG_GAPS)
+    row, weights, slopes = b_spline(u, LOG_GAPS)
     value, slope = np.zeros((len(gap), FUNCTIONS)), np.zeros((len(gap), FUNCTIONS))
     for kind in {*zip(own, other, strict=True)}:
         rows = np.flatnonzero((own == kind[0]) & (other == kind[1]))
@@ -160,9 +178,9 @@ class NearContacts:
         alike = crowding[i] * crowding[j] * similarity(a, b)
         self.quadrupole = [alike * factor for factor in quadrupole_window(self.distance, a, b)]
         share = (w[i] * w[j] * alike)[:, None]
-        seen = [conductances(gap, y[one], y[other]) for one, other in ((i, j), (j, i))]
-        self.value = [share * self.scale[:, None] * value for value, _ in seen]  # as ball i and as ball j sees them
-        self.slope = [share * slope for _, slope in seen]
+        functions = [conductances(gap, y[one], y[other]) for one, other in ((i, j), (j, i))]
+        self.value = [share * self.scale[:, None] * value for value, _ in functions]  # of ball i and of ball j
+        self.slope = [share * slope for _, slope in functions]
         self.short_range = self._short_range()
         self.conductance = self._conductance()
 
@@ -272,7 +290,7 @@ class NearContacts:
         unit = self.direction
         radial, turn = 0.0, 0.0
         for side, one, other, sign in ((0, self.i, self.j, 1.0), (1, self.j, self.i, -1.0)):
-            own, its = self._seen(drive, one, sign), self._seen(drive, other, -sign)
+            own, its = self._at_contact(drive, one, sign), self._at_contact(drive, other, -sign)
             phi, alpha, gamma, field, pull, square = own
             phi_j, alpha_j, gamma_j, field_j, _, _ = its
             # what both share counts half for each
@@ -296,7 +314,7 @@ class NearContacts:
         turn -= np.einsum("pk,pk->p", unit, turn)[:, None] * unit
         return radial[:, None] * unit + turn / self.distance[:, None]
 
-    def _seen(self, drive, ball, sign):
+    def _at_contact(self, drive, ball, sign):
         """φ, α and γ of a ball of each pair, its field R e_m, the vector R² e_Θ n, and what of R e_m is across."""
         size = self.radii[ball]
         field = size[:, None] * drive[ball, 1:4]

@@ -81,7 +81,7 @@ class MomentSystem:
             dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
                 submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
             contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
-                nearly touch (see ``warpmag.near_contact``).
+                nearly touch (see ``warpmag.kernels.near_contact``).
             rtol: Relative residual at which induction ends.
             max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
             step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.

@@ -8,8 +8,9 @@ namespace warpmag {
 
 // What a ball has of its contacts' forces: derivatives of ½ e ΔC e by the other ball's place. ``g`` are the derivatives
 // of A to P by the distance.
-CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductances& f, const Rows<CONDUCTANCE_SLOPE_ROWS>& g,
-                                          Vector u, Number inverse, const Drive& own, const Drive& other) {
+CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductances& f,
+                                          const Rows<CONDUCTANCE_SLOPE_ROWS>& g, Vector u, Number inverse,
+                                          const Drive& own, const Drive& other) {
     const Number w = own.weight * other.weight;
     const ContactDrive a = at_contact(own, u, 1), b = at_contact(other, u, -1);
     const Number square = dot(a.field, a.field) - a.alpha * a.alpha;
@@ -34,7 +35,7 @@ CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductanc
 CUDA_CALLABLE inline void find_contact_forces(const Arrays& a, int i) {
     Partners<CONTACT_SLOTS> partners(a.near, i);
     const int slots = most(a.contact_count + i);
-    const Drive own = own_drive(a, i);
+    const Drive own = drive_at(a, Own(i).at);
     for (int s = share(); s - share() < slots; s += SHARES) {
         const Conductances f(a.conductance(s, i));
         const Rows<CONDUCTANCE_SLOPE_ROWS> g(a.conductance_slope(s, i));
@@ -69,8 +70,8 @@ CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& i
 
 // Of quadrupoles with sources, dipoles and each other: derivatives of their energy by the distance and the direction,
 // with their window w and its ``slope``.
-CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& its, Vector u, Number g2, Number inverse,
-                                                Number third, Number w, Number slope) {
+CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& its, Vector u, Number g2,
+                                                Number inverse, Number third, Number w, Number slope) {
     const Vector t = own.t, t_j = its.t;
     const Tensor theta = own.theta, theta_j = its.theta;
     const Number q = own.q, q_j = its.q, a = dot(u, t), a_j = dot(u, t_j);
@@ -128,7 +129,7 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& ow
 
 // Adds forces, and torques m × 4π H_near, to those of the moments that move and turn.
 CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
-    const Sources own = own_sources(a, i);
+    const Sources own = sources_at(a, Own(i).at);
     const Vector force = sum_forces(a, i, own);
     if (share() > 0) return;
     const Vector torque = cross(own.m, own_vector(rows_at(a.field, 3, i)));
@@ -145,13 +146,11 @@ CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
 }
 
 // Two passes: what each ball has of its contacts' forces, then the sums with what the others have.
-template <class Addresses>
-CUDA_CALLABLE inline void make_forces(int thread, int first, int last, int threads, unsigned long long* team,
-                                      const Addresses& addresses) {
-    const Arrays a(addresses);
-    make_passes(thread, first, last, threads, team, a.balls, [&](int pass, int i) {
+struct Forces {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int pass, int i) const {
         if (pass == 0) find_contact_forces(a, i);
         else add_forces(a, i);
-    });
-}
+    }
+};
 }

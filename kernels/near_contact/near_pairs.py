@@ -23,20 +23,24 @@ kept as slots, those whose surfaces nearly touch first. ``select.h`` and ``tabul
 | radius, unsaturated | [balls] | radii [m] and 1/(V Ms) [1/(A·m²)] |
 | curve_slope, hardness | [balls] | slopes k of the curve, and (2χ + 5)/2χ |
 | places | [balls, LINE] | x, y, z, radius; how far a ball takes part, kind |
-| near | [chunks, slots, CHUNK] | near balls |
-| near_count, contact_count | [balls] | near balls of each, and those of them that nearly touch |
+| near, near_count, contact_count | [chunks, slots, CHUNK], [balls] | near balls, how many, and how many nearly touch |
 | used | [2, balls] | slots of both kinds that hold something |
-| pairs, pair_slopes, conductances, conductance_slopes | [chunks, slots, rows, CHUNK] | see the numbers of rows |
+| pairs | [chunks, slots, 8, CHUNK] | direction to the other ball; U_sr, g1 d, g2 d², 1/d, the quadrupoles' window |
+| pair_slopes | [chunks, slots, 2, CHUNK] | derivatives: g3 d³ and the window's |
+| conductances | [chunks, slots, 17, CHUNK] | of contacts: A to P, then D', J' and L' of the other ball |
+| conductance_slopes | [chunks, slots, 14, CHUNK] | derivatives of A to P by the distance |
 | relaxation | [2, balls] | s of a ball's q and N |
-| state, last_state | [chunks, rows, CHUNK] | Θ̃ and n, those of the sweep before |
+| state, last_state | [chunks, 16, CHUNK] | xx, yy, xy, yz, zx of Θ̃, N; n_Θ, q, two unused; those of the sweep before |
 | sources, drives | [balls, LINE] | what others read: Θ̃, N, q and m; R² e_Θ, R e_m, φ and the weight |
-| kept | [chunks, rows, CHUNK] | what passes keep for those that follow |
+| kept | [chunks, 24, CHUNK] | what passes keep for those that follow, see below |
 | pair_forces | [chunks + 1, slots, 3, CHUNK] | what a ball has of its contacts' forces; zeros at the end |
 | counterpart | [chunks, slots, CHUNK] | place in ``pair_forces`` of what the other ball has |
 | field | [chunks, 3, CHUNK] | 4π H_near [A/m] |
-| field_row, partial | [balls], [rows, 3] | row of each ball in the field sums, −1 if it has none; the part that is added |
+| field_row, partial | [balls], [rows, 3] | row of each ball in the field sums, −1 if it has none; the part to add |
 
-Ball i is number i mod CHUNK of chunk i div CHUNK.
+Rows of ``kept`` are 0 to 7 and 13 what balls make of the drive that do not touch (e_Θ, e_m, φ), 8 to 12 what Θ̃ moves
+towards, 16, 22 and 23 (M_sr a)_m, 17 and 18 the polarizability of the quadrupole and the weight that falls as a ball
+saturates. Ball i is number i mod CHUNK of chunk i div CHUNK.
 """
 
 import math
@@ -71,21 +75,9 @@ GROUP = 8
 SWEEPS = 2
 """Sweeps before each field evaluation, and before forces are taken: with one, a cold solve of a pile takes twice as
 many evaluations."""
-PAIR_ROWS = 8
-"""Rows of a near pair: direction to the other ball; U_sr, g1 d, g2 d², 1/d, the quadrupoles' window."""
-PAIR_SLOPE_ROWS = 2
-"""Rows of a near pair's derivatives: g3 d³ and the window's."""
-CONDUCTANCE_ROWS = 17
-"""Rows of a contact: A to P, then D', J' and L' that the other ball sees."""
-CONDUCTANCE_SLOPE_ROWS = 14
-"""Rows of a contact's derivatives: of A to P by the distance."""
-STATE_ROWS = 16
-"""Rows of what sweeps move: xx, yy, xy, yz, zx of Θ̃, and N; the same of n_Θ, and q. The last two are not used."""
-KEPT_ROWS = 24
-"""Rows of what a pass keeps for the next: 0 to 7 and 13 the drive (R² e_Θ, R e_m and φ, without the factors) that balls
-make which do not touch, 8 to 12 what Θ̃ moves towards; 16, 22 and 23 (M_sr a)_m; 17 and 18 the polarizability of the
-quadrupole, and the factor that falls as a ball saturates."""
-
+_ROWS = dict(
+    PAIR_ROWS=8, PAIR_SLOPE_ROWS=2, CONDUCTANCE_ROWS=17, CONDUCTANCE_SLOPE_ROWS=14, STATE_ROWS=16, KEPT_ROWS=24
+)  # fmt: skip
 _BALLS_PER_THREAD = 500
 """Balls that make another thread of a CPU worth its start."""
 _LEAST, _MOST = 0.4, 4.0
@@ -98,18 +90,17 @@ def _constants() -> dict[str, int | float]:
     fades = {name: getattr(contact_table, name) for name in ("MOST_SHARED", "LEAST_RATIO", "CONTACT_GAP", "DEEPEST")}
     fades["QUADRUPOLE_GAP"] = [distance - 2.0 for distance in contact_table.QUADRUPOLE_REACH]
     fades["QUADRUPOLE_OVERLAP"] = contact_table.QUADRUPOLE_OVERLAP
-    return dict(
+    return _ROWS | dict(
         GROUP=GROUP, CANDIDATES=CANDIDATES, NEAR_SLOTS=NEAR_SLOTS, CONTACT_SLOTS=CONTACT_SLOTS, SWEEPS=SWEEPS,
-        PAIR_ROWS=PAIR_ROWS, PAIR_SLOPE_ROWS=PAIR_SLOPE_ROWS, CONDUCTANCE_ROWS=CONDUCTANCE_ROWS,
-        CONDUCTANCE_SLOPE_ROWS=CONDUCTANCE_SLOPE_ROWS, STATE_ROWS=STATE_ROWS, KEPT_ROWS=KEPT_ROWS, MARGIN=MARGIN,
-        HALF_RANGE=0.5 * contact_table.RANGE, HALF_REACH=0.5 * contact_table.REACH,
+        MARGIN=MARGIN, HALF_RANGE=0.5 * contact_table.RANGE, HALF_REACH=0.5 * contact_table.REACH,
         SMALLEST_GAP=contact_table.SMALLEST_GAP, SOFTNESS=contact_table.SOFTNESS, NODES=nodes, FIRST_NODE=first,
         NODES_PER_UNIT=(nodes - 1) / (last - first), UNIT=MU0 / (4.0 * math.pi),
         # M of a ball of unit radius on itself
         OWN_SOURCE=1.0 - 1.2 * 2.0 / contact_table.RANGE, OWN_DIPOLE=1.0 - (2.0 / contact_table.RANGE) ** 3,
         PACE=4.0 / (_MOST**0.5 + _LEAST**0.5) ** 2,
         MOMENTUM=((_MOST**0.5 - _LEAST**0.5) / (_MOST**0.5 + _LEAST**0.5)) ** 2,
-        **{f"{name}_{end}": value for name, pair in fades.items() for end, value in zip(("LOW", "HIGH"), pair)},
+        **{f"{name}_LOW": low for name, (low, _) in fades.items()},
+        **{f"{name}_HIGH": high for name, (_, high) in fades.items()},
     )  # fmt: skip
 
 
@@ -121,22 +112,12 @@ _INTEGERS = (
 _SIZES = ("balls", "moment_stride", "kinds", "curve")
 _REALS = (
     *("packed", "radius", "unsaturated", "curve_slope", "hardness", "relaxation", "pairs", "conductances", "state"),
-    *("last_state", "sources", "drives", "field", "kept", "pair_slopes", "conductance_slopes", "pair_forces", "partial"),
-    *("found_at", "tables", "places", "forces", "torques"),
+    *("last_state", "sources", "drives", "field", "kept", "pair_slopes", "conductance_slopes", "pair_forces"),
+    *("partial", "found_at", "tables", "places", "forces", "torques"),
 )
-
-ContactArrays = wp.struct(
-    type(
-        "ContactArrays",
-        (),
-        {
-            "__doc__": "Where arrays begin, side by side, for a GPU to read together; and sizes. As in ``state.h``.",
-            "__annotations__": dict.fromkeys(_INTEGERS, wp.uint64)
-            | dict.fromkeys(_SIZES, int)
-            | dict.fromkeys(_REALS, wp.uint64),
-        },
-    )
-)
+_MEMBERS = dict.fromkeys(_INTEGERS, wp.uint64) | dict.fromkeys(_SIZES, int) | dict.fromkeys(_REALS, wp.uint64)
+_DOC = "Where arrays begin, side by side, for a GPU to read together; and sizes. As in ``state.h``."
+ContactArrays = wp.struct(type("ContactArrays", (), {"__doc__": _DOC, "__annotations__": _MEMBERS}))
 
 
 @dataclass(frozen=True)
@@ -145,7 +126,6 @@ class NearContactBuffers:
 
     Attributes:
         dtype: Warp scalar type.
-        balls: How many there are.
         lists: Balls that are near, or about to be.
         arrays: What passes over the pairs work on: those of the table above, and packed, candidate, candidate_count,
             found_at, moved, movable, twisted, forces and torques of others.
@@ -159,7 +139,6 @@ class NearContactBuffers:
     """
 
     dtype: Any
-    balls: int
     lists: neighbors.NeighborLists
     arrays: dict[str, wp.array]
     given: Any
@@ -207,46 +186,37 @@ def allocate(
     if len(partial):
         field_row[rows.target.numpy()] = np.arange(rows.count)
 
-    def padded(values, other, kind=wp.int32):
+    def padded(values, other):
         """Values of balls that take part, and another of the rest."""
         chosen = np.pad(np.where(eligible, values, other), (0, balls - n), constant_values=other)
-        return wp.array(chosen, dtype=kind, device=device)
+        return wp.array(chosen, dtype=dtype if isinstance(other, float) else wp.int32, device=device)
 
     radii = packed.radii.numpy()
-    kind, kinds, tables = _kinds(eligible, susceptibility)
-    slope = 3.0 / (1.0 + 3.0 / np.asarray(susceptibility, float))
-    saturated = 4.0 / 3.0 * np.pi * np.where(eligible, radii, 1.0).astype(float) ** 3 * saturation
-    arrays = _pair_arrays(balls, dtype, device) | {
-        "packed": packed.packed,
-        "group": padded(worlds, -1),
-        "kind": padded(kind, 0),
-        "candidate": lists.neighbor,
-        "candidate_count": lists.count,
-        "found_at": lists.found_at,
-        "moved": lists.moved,
-        "tables": wp.array(tables, dtype=dtype, device=device),
-        "radius": padded(radii, 1.0, dtype),
-        "unsaturated": padded(1.0 / saturated, 1.0, dtype),
-        "curve_slope": padded(slope, 1.0, dtype),
-        "hardness": padded(2.5 / slope + 1.0 / 6.0, 1.0, dtype),
-        "field_row": padded(field_row, -1),
-        "partial": partial[-1] if len(partial) else partial,
-        "movable": padded(movable, 0),
-        "twisted": padded(twisted, 0),
-        "forces": forces,
-        "torques": torques,
-    }
-    given = ContactArrays()
-    for name in (*_INTEGERS, *_REALS):
-        setattr(given, name, arrays[name].ptr or 0)
-    given.balls, given.kinds, given.curve = balls, kinds, curve
-    given.moment_stride = packed.packed.strides[0] // wp.types.type_size_in_bytes(dtype)
+    kinds, material = _material_arrays(radii, eligible, susceptibility, saturation, padded)
+    arrays = (
+        _pair_arrays(balls, dtype, device)
+        | material
+        | {
+            "packed": packed.packed,
+            "group": padded(worlds, -1),
+            "candidate": lists.neighbor,
+            "candidate_count": lists.count,
+            "found_at": lists.found_at,
+            "moved": lists.moved,
+            "field_row": padded(field_row, -1),
+            "partial": partial[-1] if len(partial) else partial,
+            "movable": padded(movable, 0),
+            "twisted": padded(twisted, 0),
+            "forces": forces,
+            "torques": torques,
+        }
+    )
+    stride = packed.packed.strides[0] // wp.types.type_size_in_bytes(dtype)
     return NearContactBuffers(
         dtype=dtype,
-        balls=balls,
         lists=lists,
         arrays=arrays,
-        given=given,
+        given=_addresses(arrays, balls=balls, moment_stride=stride, kinds=kinds, curve=curve),
         reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
@@ -255,15 +225,34 @@ def allocate(
     )
 
 
-def _kinds(eligible, susceptibility):
-    """Kind of material of each moment, shape [n], the number of kinds, and the tables of their pairs."""
+def _addresses(arrays: dict[str, wp.array], **sizes: int) -> Any:
+    given = ContactArrays()
+    for name in (*_INTEGERS, *_REALS):
+        setattr(given, name, arrays[name].ptr or 0)
+    for name, size in sizes.items():
+        setattr(given, name, size)
+    return given
+
+
+def _material_arrays(radii, eligible, susceptibility, saturation, padded) -> tuple[int, dict[str, wp.array]]:
+    """The number of kinds of material, and the arrays that describe what balls are made of."""
     hardness = contact_table.hardness(susceptibility)
     levels = np.unique(hardness[eligible]) if np.any(eligible) else np.zeros(1)
     if len(levels) > MOST_KINDS:
         levels = np.quantile(levels, np.linspace(0.0, 1.0, MOST_KINDS))
-    tables = [contact_table.gap_table(float(own), float(other)) for own in levels for other in levels]
-    kind = np.abs(hardness[:, None] - levels[None]).argmin(1)
-    return kind, len(levels), np.pad(np.concatenate(tables), ((0, 0), (0, LINE - contact_table.FUNCTIONS)))
+    tables = np.concatenate([contact_table.gap_table(float(own), float(other)) for own in levels for other in levels])
+    slope = 3.0 / (1.0 + 3.0 / np.asarray(susceptibility, float))
+    saturated = 4.0 / 3.0 * np.pi * np.where(eligible, radii, 1.0).astype(float) ** 3 * saturation
+    arrays = {
+        "kind": padded(np.abs(hardness[:, None] - levels[None]).argmin(1), 0),
+        "radius": padded(radii, 1.0),
+        "unsaturated": padded(1.0 / saturated, 1.0),
+        "curve_slope": padded(slope, 1.0),
+        "hardness": padded(2.5 / slope + 1.0 / 6.0, 1.0),
+    }
+    lines = np.pad(tables, ((0, 0), (0, LINE - contact_table.FUNCTIONS)))
+    arrays["tables"] = wp.array(lines, dtype=arrays["radius"].dtype, device=arrays["radius"].device)
+    return len(levels), arrays
 
 
 def _pair_arrays(balls: int, dtype, device) -> dict[str, wp.array]:
@@ -272,6 +261,9 @@ def _pair_arrays(balls: int, dtype, device) -> dict[str, wp.array]:
 
     def zeros(*shape, kind=dtype):
         return wp.zeros(shape, dtype=kind, device=device)
+
+    def slots(count, rows):
+        return zeros(chunks, count, _ROWS[rows], CHUNK)
 
     itself = np.broadcast_to(np.arange(balls).reshape(chunks, 1, CHUNK), (chunks, NEAR_SLOTS, CHUNK))
     none = np.full((chunks, CONTACT_SLOTS, CHUNK), chunks * CONTACT_SLOTS * 3 * CHUNK)
@@ -282,14 +274,13 @@ def _pair_arrays(balls: int, dtype, device) -> dict[str, wp.array]:
         "used": zeros(2, balls, kind=wp.int32),
         "relaxation": zeros(2, balls),
         **{name: zeros(balls, LINE) for name in ("places", "sources", "drives")},
-        "pairs": zeros(chunks, NEAR_SLOTS, PAIR_ROWS, CHUNK),
-        "pair_slopes": zeros(chunks, NEAR_SLOTS, PAIR_SLOPE_ROWS, CHUNK),
-        "conductances": zeros(chunks, CONTACT_SLOTS, CONDUCTANCE_ROWS, CHUNK),
-        "conductance_slopes": zeros(chunks, CONTACT_SLOTS, CONDUCTANCE_SLOPE_ROWS, CHUNK),
+        "pairs": slots(NEAR_SLOTS, "PAIR_ROWS"),
+        "pair_slopes": slots(NEAR_SLOTS, "PAIR_SLOPE_ROWS"),
+        "conductances": slots(CONTACT_SLOTS, "CONDUCTANCE_ROWS"),
+        "conductance_slopes": slots(CONTACT_SLOTS, "CONDUCTANCE_SLOPE_ROWS"),
         "pair_forces": zeros(chunks + 1, CONTACT_SLOTS, 3, CHUNK),
-        "state": zeros(chunks, STATE_ROWS, CHUNK),
-        "last_state": zeros(chunks, STATE_ROWS, CHUNK),
-        "kept": zeros(chunks, KEPT_ROWS, CHUNK),
+        **{name: zeros(chunks, _ROWS["STATE_ROWS"], CHUNK) for name in ("state", "last_state")},
+        "kept": zeros(chunks, _ROWS["KEPT_ROWS"], CHUNK),
         "field": zeros(chunks, 3, CHUNK),
     }
 
@@ -300,13 +291,12 @@ def _pair_arrays(balls: int, dtype, device) -> dict[str, wp.array]:
 
 
 @cache
-def kernel(dtype, function: str):
-    """Kernel that makes passes of ``publish_places``, ``find_pairs``, ``make_sweeps`` or ``make_forces``."""
-    header = {"make_sweeps": "sweeps", "make_forces": "forces"}.get(function, "tabulate")
+def kernel(dtype, passes: str):
+    """Kernel that makes passes ``Places``, ``Pairs``, ``Sweeps`` or ``Forces``."""
+    header = {"Places": "select", "Pairs": "tabulate", "Sweeps": "sweeps", "Forces": "forces"}[passes]
     options = native_options(f"near_contact/{header}.h", dtype=dtype, **_constants())
-    return passes_kernel(
-        f"warpmag::{function}(thread, first, last, threads, team.data, arrays);", ContactArrays, options
-    )
+    call = f"warpmag::make_passes<warpmag::{passes}>(thread, first, last, threads, team.data, arrays);"
+    return passes_kernel(call, ContactArrays, options)
 
 
 def _launch(b: NearContactBuffers, function: str, first: int, last: int):
@@ -317,7 +307,7 @@ def _launch(b: NearContactBuffers, function: str, first: int, last: int):
         if key not in b.commands:
             b.commands[key] = wp.launch(
                 kernel(b.dtype, function),
-                dim=1 if cpu else GROUP * b.balls,
+                dim=1 if cpu else GROUP * b.given.balls,
                 inputs=[begin, end, b.threads, team() if cpu else None, b.given],
                 device=b.device,
                 block_dim=128,
@@ -347,9 +337,9 @@ def launch_find_pairs(moments, b: NearContactBuffers):
         return
     packed, group = moments.packed, b.arrays["group"]
     with _beside(b):
-        _launch(b, "publish_places", 0, 1)
+        _launch(b, "Places", 0, 1)
         neighbors.launch_find_neighbors(packed, packed, group, group, b.reach, b.lists, b.lists)
-        _launch(b, "find_pairs", 0, 2)
+        _launch(b, "Pairs", 0, 2)
 
 
 def launch_sweeps(b: NearContactBuffers):
@@ -362,11 +352,11 @@ def launch_sweeps(b: NearContactBuffers):
     last = 2 * SWEEPS  # steps of all but the last pass find the field
     with _beside(b):
         if b.stream is None:
-            _launch(b, "make_sweeps", 0, last + 1)
+            _launch(b, "Sweeps", 0, last + 1)
         else:
-            _launch(b, "make_sweeps", 1, last)
+            _launch(b, "Sweeps", 1, last)
             b.stream.record_event(b.events[1])
-            _launch(b, "make_sweeps", last, last + 1)
+            _launch(b, "Sweeps", last, last + 1)
 
 
 def wait_for_field(b: NearContactBuffers):
@@ -387,4 +377,4 @@ def launch_add_forces(b: NearContactBuffers):
     :func:`launch_sweeps` goes before.
     """
     if b.reach > 0.0:
-        _launch(b, "make_forces", 0, 2)
+        _launch(b, "Forces", 0, 2)

@@ -1,12 +1,27 @@
 // Near balls of each ball, from candidates, those that nearly touch first; and how far a ball takes part in the model.
 //
-// From Python: MARGIN of a search, CANDIDATES and HALF_REACH of it, CONTACT_GAP_HIGH, MOST_SHARED_LOW and MOST_SHARED_HIGH.
+// From Python: MARGIN of a search, CANDIDATES and HALF_REACH of it, CONTACT_GAP_HIGH, MOST_SHARED_LOW and
+// MOST_SHARED_HIGH.
 #pragma once
 #include "near_contact/state.h"
-#include "near_contact/windows.h"
 #include "pairs/pair_law.h"
 
 namespace warpmag {
+
+// A factor that fades what near balls add, and its derivative.
+struct Fade {
+    Number value, slope;
+};
+CUDA_CALLABLE inline Fade smoothstep(Number x) {
+    const Number zero = x * Real(0), t = smaller(larger(x, zero), zero + 1);
+    return {t * t * (3 - 2 * t), 6 * t * (1 - t)};
+}
+// Fades from a gap ``near`` to ``far`` and from an overlap ``shallow`` to ``deep``.
+CUDA_CALLABLE inline Fade window(Number gap, Real near, Real far, Real shallow, Real deep) {
+    const Real width = 1 / (far - near), depth = 1 / (deep - shallow);
+    const Fade outer = smoothstep((far - gap) * width), inner = smoothstep((deep + gap) * depth);
+    return {outer.value * inner.value, outer.value * inner.slope * depth - outer.slope * inner.value * width};
+}
 
 // Places, radii and kinds as others read them, and whether a ball has moved so far that near ones are sought anew.
 CUDA_CALLABLE inline void publish_place(const Arrays& a, int i) {
@@ -33,9 +48,11 @@ CUDA_CALLABLE inline void append(const Arrays& a, int i, const int* j, Index cho
     if (chosen && s < slots) *list_at(a.near, NEAR_SLOTS, s, i) = *j;
     *filled += __popc(all);
 #else
+    int count[WIDTH];
+    put_indices(count, chosen);
     for (int l = 0; l < WIDTH; ++l) {
         if (filled[l] < slots) list_at(a.near, NEAR_SLOTS, filled[l], i)[l] = j[l];
-        filled[l] += chosen[l];
+        filled[l] += count[l];
     }
 #endif
 }
@@ -54,8 +71,7 @@ CUDA_CALLABLE inline void select(const Arrays& a, int i) {
         for (int first = 0; first < largest; first += SHARES) {
             const int k = first + share();
             int j[WIDTH];
-            for (int l = 0; l < WIDTH; ++l)
-                j[l] = k < own[l] ? a.candidate[(size_t)(i + l) * CANDIDATES + k] : i + l;
+            for (int l = 0; l < WIDTH; ++l) j[l] = k < own[l] ? a.candidate[(size_t)(i + l) * CANDIDATES + k] : i + l;
             const Four o = four_at(a.places, 0, j);
             const Vector r = {o.x - at.x, o.y - at.y, o.z - at.z};
             const Number d2 = dot(r, r), d = root(d2), sum = size + o.w;
@@ -77,4 +93,9 @@ CUDA_CALLABLE inline void select(const Arrays& a, int i) {
         a.places[LINE * (size_t)(i + l) + 4] = fits ? lane_of(part, l) : 0;
     }
 }
+
+struct Places {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int, int i) const { publish_place(a, i); }
+};
 }

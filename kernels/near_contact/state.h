@@ -23,7 +23,9 @@ struct Arrays {
     }
 
     CUDA_CALLABLE Real* pair(int s, int i) const { return slot_at(pairs, NEAR_SLOTS, PAIR_ROWS, s, i); }
-    CUDA_CALLABLE Real* pair_slope(int s, int i) const { return slot_at(pair_slopes, NEAR_SLOTS, PAIR_SLOPE_ROWS, s, i); }
+    CUDA_CALLABLE Real* pair_slope(int s, int i) const {
+        return slot_at(pair_slopes, NEAR_SLOTS, PAIR_SLOPE_ROWS, s, i);
+    }
     CUDA_CALLABLE Real* conductance(int s, int i) const {
         return slot_at(conductances, CONTACT_SLOTS, CONDUCTANCE_ROWS, s, i);
     }
@@ -53,76 +55,50 @@ struct Drive {
     Tensor t;
 };
 
-// Lines of sources: Θ̃, N, q as in the state, and m. On a GPU, which has no pass that writes m before the others, it is
-// read from where the moments are.
-CUDA_CALLABLE inline Sources sources_of(Four a, Four b, Vector m, Number q) {
-    return {{m.x - b.y, m.y - b.z, m.z - b.w}, m, -q, {a.x, a.y, a.z, a.w, b.x}};
-}
-// Lines of drives: R² e_Θ, R e_m, φ, weight.
-CUDA_CALLABLE inline Drive drive_of(Four a, Four b, Number phi, Number weight) {
-    return {phi, weight, {b.y, b.z, b.w}, {a.x, a.y, a.z, a.w, b.x}};
-}
-
+// Sources of balls j. On a GPU, which has no pass that publishes m before the others, it comes from where moments are.
+CUDA_CALLABLE inline Sources sources_at(const Arrays& arrays, const int* j) {
+    const Four a = four_at(arrays.sources, 0, j), b = four_at(arrays.sources, 1, j), c = four_at(arrays.sources, 2, j);
 #if defined(__CUDA_ARCH__)
-CUDA_CALLABLE inline Sources sources_at(const Arrays& a, const int* j) {
-    const Real q = a.sources[LINE * (size_t)*j + 8];
-    return sources_of(four_at(a.sources, 0, j), four_at(a.sources, 1, j), a.own_moment(*j), q);
-}
-CUDA_CALLABLE inline Sources own_sources(const Arrays& a, int i) { return sources_at(a, &i); }
-CUDA_CALLABLE inline void publish_sources(const Arrays& a, int i, const Number* state) {
-    Real* const line = a.sources + LINE * (size_t)i;
-    line[share()] = state[0];
-    if (share() == 5) line[8] = state[1];
-}
-CUDA_CALLABLE inline Drive drive_at(const Arrays& a, const int* j) {
-    const Four end = four_at(a.drives, 2, j);
-    return drive_of(four_at(a.drives, 0, j), four_at(a.drives, 1, j), end.x, end.y);
-}
-CUDA_CALLABLE inline Drive own_drive(const Arrays& a, int i) { return drive_at(a, &i); }
-CUDA_CALLABLE inline void publish_drive(const Arrays& a, int i, const Number* drive, Number weight) {
-    Real* const line = a.drives + LINE * (size_t)i;
-    line[share()] = drive[0];
-    if (share() == 5) line[8] = drive[1];
-    if (share() == 0) line[9] = weight;
-}
+    const Vector m = arrays.own_moment(*j);
 #else
-inline Sources sources_at(const Arrays& a, const int* j) {
-    const Four end = four_at(a.sources, 2, j);
-    return sources_of(four_at(a.sources, 0, j), four_at(a.sources, 1, j), {end.y, end.z, end.w}, end.x);
-}
-inline Sources own_sources(const Arrays& a, int i) {
-    const Four end = own_four(a.sources, 2, i);
-    return sources_of(own_four(a.sources, 0, i), own_four(a.sources, 1, i), {end.y, end.z, end.w}, end.x);
-}
-inline void publish_sources(const Arrays& a, int i, const Number* state) {
-    const Vector m = a.own_moment(i);
-    put_four(a.sources, 0, i, {state[0], state[1], state[2], state[3]});
-    put_four(a.sources, 1, i, {state[4], state[5], state[6], state[7]});
-    put_four(a.sources, 2, i, {state[13], m.x, m.y, m.z});
-}
-inline Drive drive_at(const Arrays& a, const int* j) {
-    const Four end = four_at(a.drives, 2, j);
-    return drive_of(four_at(a.drives, 0, j), four_at(a.drives, 1, j), end.x, end.y);
-}
-inline Drive own_drive(const Arrays& a, int i) {
-    const Four end = own_four(a.drives, 2, i);
-    return drive_of(own_four(a.drives, 0, i), own_four(a.drives, 1, i), end.x, end.y);
-}
-inline void publish_drive(const Arrays& a, int i, const Number* drive, Number weight) {
-    put_four(a.drives, 0, i, {drive[0], drive[1], drive[2], drive[3]});
-    put_four(a.drives, 1, i, {drive[4], drive[5], drive[6], drive[7]});
-    put_four(a.drives, 2, i, {drive[13], weight, weight, weight});
-}
+    const Vector m = {c.y, c.z, c.w};
 #endif
+    return {{m.x - b.y, m.y - b.z, m.z - b.w}, m, -c.x, {a.x, a.y, a.z, a.w, b.x}};
+}
+CUDA_CALLABLE inline Drive drive_at(const Arrays& arrays, const int* j) {
+    const Four a = four_at(arrays.drives, 0, j), b = four_at(arrays.drives, 1, j), c = four_at(arrays.drives, 2, j);
+    return {c.x, c.y, {b.y, b.z, b.w}, {a.x, a.y, a.z, a.w, b.x}};
+}
+// Balls i themselves, for the functions above.
+struct Own {
+    int at[WIDTH];
+    CUDA_CALLABLE explicit Own(int i) {
+        for (int l = 0; l < WIDTH; ++l) at[l] = i + l;
+    }
+};
 
-// Passes ``first`` to ``last``, of which a launch on a GPU makes one: a launch is where its threads wait for each other.
-template <class MakePass>
-CUDA_CALLABLE inline void make_passes(int thread, int first, int last, int threads, unsigned long long* team, int balls,
-                                      MakePass make_pass) {
+// Publishes numbers 0 to 7 and 13 of a ball, and more that goes with them.
+CUDA_CALLABLE inline void publish(Real* lines, int i, const Number* part, Vector more) {
 #if defined(__CUDA_ARCH__)
-    make_pass(first, thread / GROUP);
+    lines[LINE * (size_t)i + share()] = part[0];
+    if (share() == 5) put_four(lines, 2, i, {part[1], more.x, more.y, more.z});
 #else
-    run_passes(team, threads, first, last, balls, WIDTH, make_pass);
+    put_four(lines, 0, i, {part[0], part[1], part[2], part[3]});
+    put_four(lines, 1, i, {part[4], part[5], part[6], part[7]});
+    put_four(lines, 2, i, {part[13], more.x, more.y, more.z});
+#endif
+}
+
+// Passes ``first`` to ``last``, of which a launch on a GPU makes one: a launch is where its threads wait for each
+// other.
+template <class Passes, class Addresses>
+CUDA_CALLABLE inline void make_passes(int thread, int first, int last, int threads, unsigned long long* team,
+                                      const Addresses& addresses) {
+    const Passes passes = {Arrays(addresses)};
+#if defined(__CUDA_ARCH__)
+    passes(first, thread / GROUP);
+#else
+    run_passes(team, threads, first, last, passes.a.balls, WIDTH, [&](int pass, int i) { passes(pass, i); });
 #endif
 }
 }

@@ -14,7 +14,8 @@ struct Softness {
     Number p, weight;
 };
 
-// Polarizability p = 2χ_d/(2χ_d + 5) of a ball's higher multipoles, 1/χ_d = 1/k_d − 1/3, and p over that of a small field.
+// Polarizability p = 2χ_d/(2χ_d + 5) of a ball's higher multipoles, 1/χ_d = 1/k_d − 1/3, and p over that of a small
+// field.
 CUDA_CALLABLE inline Softness softness_of(const Arrays& a, int i) {
     const Number slope = numbers(a.curve_slope + i), zero = slope * Real(0);
     const Vector reduced = scaled(numbers(a.unsaturated + i), a.own_moment(i));
@@ -72,7 +73,8 @@ CUDA_CALLABLE inline void put_field(const Arrays& a, int i, Vector h) {
 
 // Sums e = M ã over near balls, those that nearly touch last. What the others make, and what moments make, is summed by
 // the first of an evaluation's passes and kept for those that follow.
-template <bool FIRST> CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<KEPT_ROWS>& kept) {
+template <bool FIRST>
+CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<KEPT_ROWS>& kept) {
     Partners<NEAR_SLOTS> partners(a.near, i);
     const int contact_end = whole_rounds(most(a.contact_count + i));
     const int end = FIRST ? whole_rounds(most(a.near_count + i)) : contact_end;
@@ -114,7 +116,11 @@ template <bool FIRST> CUDA_CALLABLE inline void find_drive(const Arrays& a, int 
     const Parts<STATE_ROWS> state(rows_at(a.state, STATE_ROWS, i));
     const Number size = numbers(a.radius + i), zero = size * Real(0);
     const Softness soft = FIRST ? softness_of(a, i) : Softness{number(kept, 17), number(kept, 18)};
-    Number sum[16], drive[parts(16)], difference[parts(16)];
+    Number sum[16], drive[parts(16)], difference[parts(16)], m[parts(8)];
+    for (int k = 0; k < parts(8); ++k) {
+        const int component = k * SHARES + share() - 5;
+        m[k] = component < 0 ? zero : numbers(a.moment(component < 0 ? 0 : component, i));
+    }
     sum_drive<FIRST>(a, i, sum, kept);
     const Number p = soft.p, square = size * size, inverse = 1 / size, cube = inverse * inverse * inverse;
     const Number source = OWN_SOURCE * inverse, dipole = OWN_DIPOLE * cube, fifth = cube * inverse * inverse;
@@ -128,12 +134,11 @@ template <bool FIRST> CUDA_CALLABLE inline void find_drive(const Arrays& a, int 
         }
         const bool quadrupole = c < 5;
         const Number own = quadrupole ? state[k + parts(8)] : state[k];
-        const Number m = quadrupole ? zero : numbers(a.moment(quadrupole ? 0 : c - 5, i));
         difference[k] = other - (quadrupole ? fifth : dipole) * own;
-        drive[k] = quadrupole ? square * (1 - p) * difference[k] : size * (difference[k] + dipole * m);
+        drive[k] = quadrupole ? square * (1 - p) * difference[k] : size * (difference[k] + dipole * m[k]);
         if (quadrupole) put(rows + (c + 8) * CHUNK, (p - 1) * own - p * square * square * size * other);
     }
-    publish_drive(a, i, drive, soft.weight);
+    publish(a.drives, i, drive, {soft.weight, zero, zero});
     if (FIRST && share() == 0) {
         put(rows + 17 * CHUNK, soft.p);
         put(rows + 18 * CHUNK, soft.weight);
@@ -156,29 +161,26 @@ CUDA_CALLABLE inline ContactDrive at_contact(const Drive& o, Vector u, int sign)
 typedef Rows<CONDUCTANCE_ROWS> Conductances;
 // D', J' or L' of the other ball, which balls of one kind have in common with D, J and L, rows 3, 9 and 11.
 CUDA_CALLABLE inline Number of_other(const Arrays& a, const Conductances& f, int row) {
-    const int other = row == 3 ? 14 : row == 9 ? 15 : 16;
-#if defined(__CUDA_ARCH__)
-    return a.kinds > 1 ? f[other] : f[row]; // no array of registers has an index
-#else
-    return f[a.kinds > 1 ? other : row];
-#endif
+    return a.kinds > 1 ? f[row == 3 ? 14 : row == 9 ? 15 : 16] : f[row];
 }
 
 // Adds the sources ΔC e of a contact that a ball of radius ``size`` has, driven as ``own``, with the other ball.
-CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum)[16], const Conductances& f, Vector u, Number size,
-                                 const Drive& own, const Drive& other) {
+CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum)[16], const Conductances& f, Vector u,
+                                              Number size, const Drive& own, const Drive& other) {
     const Number w = own.weight * other.weight;
     const ContactDrive a = at_contact(own, u, 1), b = at_contact(other, u, -1);
     sum[13] += w * (f[0] * a.phi + f[1] * b.phi + f[2] * a.alpha + f[3] * b.alpha + f[8] * a.gamma + f[9] * b.gamma);
     const Number g = f[6], h = f[7];
-    const Number along = w * (f[2] * a.phi + of_other(arrays, f, 3) * b.phi + (f[4] - g) * a.alpha + (f[5] + h) * b.alpha
-                              + f[10] * a.gamma + f[11] * b.gamma);
+    const Number along = w
+                         * (f[2] * a.phi + of_other(arrays, f, 3) * b.phi + (f[4] - g) * a.alpha + (f[5] + h) * b.alpha
+                            + f[10] * a.gamma + f[11] * b.gamma);
     const Number on = w * g, on_b = w * h;
     sum[5] += size * (along * u.x + on * a.field.x + on_b * b.field.x);
     sum[6] += size * (along * u.y + on * a.field.y + on_b * b.field.y);
     sum[7] += size * (along * u.z + on * a.field.z + on_b * b.field.z);
-    const Number axial = w * (f[8] * a.phi + of_other(arrays, f, 9) * b.phi + f[10] * a.alpha + of_other(arrays, f, 11) * b.alpha
-                              + f[12] * a.gamma + f[13] * b.gamma);
+    const Number axial = w
+                         * (f[8] * a.phi + of_other(arrays, f, 9) * b.phi + f[10] * a.alpha
+                            + of_other(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
     const Number turned = Real(1.5) * size * size * axial, third = Real(0.5) * size * size * axial;
     sum[0] += turned * u.x * u.x - third;
     sum[1] += turned * u.y * u.y - third;
@@ -195,7 +197,7 @@ CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
     const Parts<KEPT_ROWS> kept(rows_at(a.kept, KEPT_ROWS, i));
     const Number of_source = numbers(a.relaxation + i), of_dipole = numbers(a.relaxation + a.balls + i);
     const int slots = most(a.contact_count + i);
-    const Drive own = own_drive(a, i);
+    const Drive own = drive_at(a, Own(i).at);
     const Number size = numbers(a.radius + i), zero = size * Real(0), one = zero + 1;
     Number sum[16], moved[parts(16)];
 #pragma unroll
@@ -219,7 +221,7 @@ CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
         put(last_rows + c * CHUNK, now);
         put(rows + c * CHUNK, moved[k]);
     }
-    publish_sources(a, i, moved);
+    publish(a.sources, i, moved, SHARES == 1 ? a.own_moment(i) : Vector{zero, zero, zero});
 }
 
 // Moments beside the published sources.
@@ -228,17 +230,14 @@ CUDA_CALLABLE inline void publish_moment(const Arrays& a, int i) {
     put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
 }
 
-// On a CPU pass 0 publishes moments; then a drive and a step for each sweep. The last drive
-// gives the field.
-template <class Addresses>
-CUDA_CALLABLE inline void make_sweeps(int thread, int first, int last, int threads, unsigned long long* team,
-                                      const Addresses& addresses) {
-    const Arrays a(addresses);
-    make_passes(thread, first, last, threads, team, a.balls, [&](int pass, int i) {
+// On a CPU pass 0 publishes moments; then a drive and a step for each sweep. The last drive gives the field.
+struct Sweeps {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int pass, int i) const {
         if (SHARES == 1 && pass == 0) publish_moment(a, i);
         else if (pass % 2 == 0) relax(a, i);
         else if (pass == 1) find_drive<true>(a, i, false);
         else find_drive<false>(a, i, pass == 2 * SWEEPS - 1);
-    });
-}
+    }
+};
 }

@@ -13,39 +13,17 @@ struct NearPair {
     Mask live;
 };
 
-// U of two homogeneous balls and its radial factors.
+// U and its radial factors of two homogeneous balls.
 struct Potential {
     Number u, g1, g2, g3;
 };
-CUDA_CALLABLE inline Potential factors(Number d, Number i1, Number a, Number b) { // i1 = 1/d
-    const Number s = a + b, i2 = i1 * i1, i3 = i2 * i1;
-    Potential f = {i1, -i3, 3 * i3 * i2, -15 * i3 * i2 * i2};
-    if (!any(mask_of(d < s))) return f;
-    const Number p = a * b, c = 1 / (160 * p * p * p), squares = a * a + b * b;
-    Number e = s - d, e2 = e * e, q0 = 5 * squares - 20 * p;
-    const Number q = q0 * i1 - 4 * s - d, q1 = -q0 * i2 - 1, q2 = 2 * q0 * i3, q3 = -6 * q0 * i3 * i1;
-    const Number w1 = c * e2 * e * (e * q1 - 4 * q) * i1;
-    const Number w2 = c * e2 * (12 * q - 8 * e * q1 + e2 * q2) * i2;
-    const Number w3 = c * e * (36 * e * q1 - 24 * q - 12 * e2 * q2 + e2 * e * q3) * i3;
-    Number g1 = w1 - i3, g2 = w2 - (w1 - 3 * i3) * i2, g3 = w3 - 3 * (w2 - w1 * i2) * i2 - 15 * i3 * i2 * i2;
-    const auto deep = d <= Real(0.5) * s;
-    if (any(deep)) {
-        const Number delta = a - b, delta2 = delta * delta, k = 5 * delta2 * delta2 * (delta2 + 6 * p);
-        const Number u1 = 45 * s * s * delta2, u2 = -40 * s * (delta2 + p), u3 = 15 * (delta2 + 2 * p);
-        g1 = deep ? c * (2 * u2 + 3 * u3 * d - 5 * d * d * d + (u1 - k * i2) * i1) : g1;
-        g2 = deep ? c * (3 * u3 * i1 - 15 * d + (3 * k * i2 - u1) * i3) : g2;
-        g3 = deep ? c * ((3 * u1 - 15 * k * i2) * i3 * i2 - 3 * u3 * i3 - 15 * i1) : g3;
-        const auto within = d <= larger(delta, -delta);
-        const Number large = larger(a, b);
-        g1 = within ? -1 / (large * large * large) : g1;
-        g2 = within ? 0 * d : g2;
-        g3 = within ? 0 * d : g3;
-    }
-    const Number x = larger(d, Real(0.05) * s); // nearly concentric ones as touching
-    e = s - x;
-    e2 = e * e;
-    const Number u = (1 + e2 * e2 * (5 * squares - 20 * p - 4 * s * x - x * x) * c) / x;
-    return {d < s ? u : f.u, d < s ? g1 : f.g1, d < s ? g2 : f.g2, d < s ? g3 : f.g3};
+CUDA_CALLABLE inline Potential potential(Number d, Number a, Number b) {
+    const Number i1 = 1 / d, i2 = i1 * i1, i3 = i2 * i1;
+    const Mask overlap = d < a + b;
+    const Potential f = {i1, -i3, 3 * i3 * i2, -15 * i3 * i2 * i2};
+    if (!any(overlap)) return f;
+    const Factors<Number> g = averaged_factors(d, a, b);
+    return {averaged_potential(d, a, b), overlap ? g.g1 : f.g1, overlap ? g.g2 : f.g2, overlap ? g.g3 : f.g3};
 }
 
 // Writes the rows of slot s of ball i, a pair at separation r, zeros where none is.
@@ -57,16 +35,16 @@ CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vect
     keep(1, r.y * p.inverse);
     keep(2, r.z * p.inverse);
     // in units of the distance in contact: powers of metres overflow float32
-    const Number y = unit * p.d, over_y = p.sum * p.inverse, third = unit * unit * unit;
-    const Potential all = factors(y, over_y, unit * a, unit * b);
-    const Potential far = factors(y, over_y, HALF_RANGE * unit * a, HALF_RANGE * unit * b);
+    const Number y = unit * p.d, third = unit * unit * unit, x = HALF_RANGE * unit;
+    const Potential all = potential(y, unit * a, unit * b), far = potential(y, x * a, x * b);
     const Number short_range = y < HALF_RANGE ? zero + 1 : zero;
     keep(3, short_range * unit * (all.u - far.u));
     keep(4, short_range * unit * unit * ((all.g1 - far.g1) * y));
     keep(5, short_range * third * ((all.g2 - far.g2) * y * y));
     keep(6, p.inverse);
     put(slopes, p.live ? short_range * third * (unit * ((all.g3 - far.g3) * y * y * y)) : zero);
-    const Fade quadrupole = window(2 * y - 2, QUADRUPOLE_GAP_LOW, QUADRUPOLE_GAP_HIGH, QUADRUPOLE_OVERLAP_LOW, QUADRUPOLE_OVERLAP_HIGH);
+    const Fade quadrupole =
+        window(2 * y - 2, QUADRUPOLE_GAP_LOW, QUADRUPOLE_GAP_HIGH, QUADRUPOLE_OVERLAP_LOW, QUADRUPOLE_OVERLAP_HIGH);
     keep(7, p.weight * p.alike * quadrupole.value);
     put(slopes + CHUNK, p.live ? p.weight * p.alike * 2 * unit * quadrupole.slope : zero);
 }
@@ -95,27 +73,30 @@ struct Spline {
     }
 };
 
-// Four of the table's functions at nodes that begin at ``lines``.
-CUDA_CALLABLE inline Four interpolated(const Real* tables, int quarter, const int* lines, const Number* weight) {
-    const Number zero = weight[0] * Real(0);
-    Four value = {zero, zero, zero, zero};
+// Adds to values and to derivatives of four of the table's functions, at nodes that begin at ``lines``.
+CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int* lines, const Spline& spline,
+                                      Four& value, Four& change) {
+    const Number zero = spline.weight[0] * Real(0);
+    value = change = {zero, zero, zero, zero};
     for (int k = 0; k < 4; ++k) {
         const Four node = four_at(tables + LINE * k, quarter, lines);
-        value = {value.x + weight[k] * node.x, value.y + weight[k] * node.y, value.z + weight[k] * node.z,
-                 value.w + weight[k] * node.w};
+        const Number w = spline.weight[k], slope = spline.slope[k];
+        value = {value.x + w * node.x, value.y + w * node.y, value.z + w * node.z, value.w + w * node.w};
+        change = {change.x + slope * node.x, change.y + slope * node.y, change.z + slope * node.z,
+                  change.w + slope * node.w};
     }
-    return value;
 }
 
 // Writes the conductances of slot s of ball i and their derivatives, and adds those of its own sources and dipoles.
-CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both, Index kind,
-                                           Index its_kind, Number& sources, Number& dipoles) {
+CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both,
+                                           Index kind, Index its_kind, Number& sources, Number& dipoles) {
     const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit, gap = (p.d - p.sum) / scale;
     const auto touches = both > zero;
     Real *const rows = arrays.conductance(s, i), *const slopes = arrays.conductance_slope(s, i);
     const Spline spline(gap);
     const Fade fade = window(gap, CONTACT_GAP_LOW, CONTACT_GAP_HIGH, DEEPEST_LOW, DEEPEST_HIGH);
-    const Number part_value = scale * both * fade.value, part_slope = both * fade.slope, part_change = both * fade.value;
+    const Number part_value = scale * both * fade.value, part_slope = both * fade.slope,
+                 part_change = both * fade.value;
     auto keep = [=](int row, Number value) { put(rows + row * CHUNK, touches ? part_value * value : zero); };
     auto store = [=](int row, Number value, Number change) {
         keep(row, value);
@@ -123,9 +104,9 @@ CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, c
     };
     int lines[WIDTH];
     put_indices(lines, (kind * arrays.kinds + its_kind) * (NODES + 2) + spline.node);
+    Four value, change;
     for (int quarter = 0; quarter < 4; ++quarter) {
-        const Four value = interpolated(arrays.tables, quarter, lines, spline.weight);
-        const Four change = interpolated(arrays.tables, quarter, lines, spline.slope);
+        interpolate(arrays.tables, quarter, lines, spline, value, change);
         store(4 * quarter, value.x, change.x);
         store(4 * quarter + 1, value.y, change.y);
         if (quarter == 0) sources += touches ? part_value * value.x : zero;
@@ -136,11 +117,11 @@ CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, c
     }
     if (arrays.kinds == 1) return;
     put_indices(lines, (its_kind * arrays.kinds + kind) * (NODES + 2) + spline.node);
-    const Four of_fields = interpolated(arrays.tables, 0, lines, spline.weight);
-    const Four of_gradients = interpolated(arrays.tables, 2, lines, spline.weight);
-    keep(14, of_fields.w);
-    keep(15, of_gradients.y);
-    keep(16, of_gradients.w);
+    interpolate(arrays.tables, 0, lines, spline, value, change);
+    keep(14, value.w);
+    interpolate(arrays.tables, 2, lines, spline, value, change);
+    keep(15, value.y);
+    keep(16, value.w);
 }
 
 // Finds where the other ball of a contact has its part of the force; the last place, of zeros, is for none.
@@ -174,7 +155,8 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
     int *const used = a.used + i, *const used_contacts = used + a.balls;
     const int contact_slots = most(a.contact_count + i), counted = most(a.near_count + i), emptied = most(used);
     const int slots = counted > emptied ? counted : emptied, emptied_contacts = most(used_contacts);
-    const Number counts = number_of(indices(a.near_count + i)), contact_counts = number_of(indices(a.contact_count + i));
+    const Number counts = number_of(indices(a.near_count + i)),
+                 contact_counts = number_of(indices(a.contact_count + i));
     const Four own = own_four(a.places, 0, i), own_part = own_four(a.places, 1, i);
     const Number size = own.w, zero = size * Real(0), one = zero + 1;
     Number sources = zero, dipoles = zero;
@@ -207,21 +189,12 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
     forget_where_alone(a, i, counts == zero);
 }
 
-template <class Addresses>
-CUDA_CALLABLE inline void publish_places(int thread, int first, int last, int threads, unsigned long long* team,
-                                         const Addresses& addresses) {
-    const Arrays a(addresses);
-    make_passes(thread, first, last, threads, team, a.balls, [&](int, int i) { publish_place(a, i); });
-}
-
 // Two passes: select near balls, then tabulate them.
-template <class Addresses>
-CUDA_CALLABLE inline void find_pairs(int thread, int first, int last, int threads, unsigned long long* team,
-                                     const Addresses& addresses) {
-    const Arrays a(addresses);
-    make_passes(thread, first, last, threads, team, a.balls, [&](int pass, int i) {
+struct Pairs {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int pass, int i) const {
         if (pass == 0) select(a, i);
         else tabulate(a, i);
-    });
-}
+    }
+};
 }
