@@ -10,7 +10,7 @@ from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
-from warpmag.kernels.near_contact import near_pairs as near_contact
+from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs import work_list as pair_loops
 from warpmag.kernels.pairs.field import launch_field
 from warpmag.kernels.pairs.packing import launch_divide_by_volume
@@ -135,7 +135,7 @@ class MomentSystem:
             lone = ~permanent & (size[body] == 1) & (radii > 0.0)
             susceptibility = np.broadcast_to(np.asarray(susceptibility, float), n)
             saturation = np.broadcast_to(np.asarray(saturation, float), n)
-            self._near = near_contact.allocate(
+            self._near = near_pairs.allocate(
                 self._packed, worlds, lone, susceptibility, saturation, CURVE_IDS[curve], rows=self._induced,
                 partial=self._induced_partial, movable=movable, twisted=twisted, forces=self.forces,
                 torques=self.torques,
@@ -230,7 +230,7 @@ class MomentSystem:
         packed = self._packed
         packed.pack(self.positions, self.moments)
         if self._near is not None:
-            near_contact.launch_find_pairs(packed, self._near)
+            near_pairs.launch_find_pairs(self._near)
         packed.find_overlaps()
         if self._induced.count == 0:
             return
@@ -240,7 +240,7 @@ class MomentSystem:
             launch_field(self._applied, self._applied_partial, packed, packed, False, self.external_field, h0)
         self.dynamics.start()
         if self._near is not None:
-            near_contact.wait(self._near)
+            near_pairs.wait(self._near)
 
     def iterate(self):
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
@@ -258,16 +258,16 @@ class MomentSystem:
         """Launch the sums of the field at the inducible moments; :meth:`_end_sweeps` follows."""
         packed, near, h0 = self._packed, self._near, self._induction.h0
         if near is not None:
-            near_contact.launch_sweeps(near)
+            near_pairs.launch_sweeps(near)
         pair_loops.launch_pair_loop(self._induced, packed.packed, packed.packed, self._induced_partial)
         if near is not None:
-            near_contact.wait_for_field(near)
+            near_pairs.wait_for_field(near)
         launch_field(self._induced, self._induced_partial, packed, packed, True, h0, self.h)
 
     def _end_sweeps(self):
         """Have what is launched next wait for what near contacts do beside."""
         if self._near is not None:
-            near_contact.wait(self._near)
+            near_pairs.wait(self._near)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
@@ -287,7 +287,7 @@ class MomentSystem:
             effective = self._effective
             launch_zeeman_moments(packed, self.h, self._material, effective)
         if near is not None:
-            near_contact.launch_sweeps(near)
+            near_pairs.launch_sweeps(near)
         for rows, partial in zip(felt, self._felt_partial[law], strict=True):
             pair_loops.launch_pair_loop(rows, packed.packed, packed.packed, partial, effective=effective)
             launch_wrench(
@@ -301,5 +301,5 @@ class MomentSystem:
                 self.torques,
             )
         if near is not None:
-            near_contact.wait(near)
-            near_contact.launch_add_forces(near)
+            near_pairs.wait(near)
+            near_pairs.launch_add_forces(near)

@@ -28,8 +28,7 @@ CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductanc
                                + of_other(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
     const Number rest = w * radial - w * inverse * (by_alpha * a.alpha + by_gamma * a.gamma);
     const Number x = w * inverse * by_alpha, y = w * inverse * by_gamma;
-    return {rest * u.x + x * a.field.x + y * a.gradient.x, rest * u.y + x * a.field.y + y * a.gradient.y,
-            rest * u.z + x * a.field.z + y * a.gradient.z};
+    return sum(sum(scaled(rest, u), scaled(x, a.field)), scaled(y, a.gradient));
 }
 
 CUDA_CALLABLE inline void find_contact_forces(const Arrays& a, int i) {
@@ -57,15 +56,12 @@ CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& i
     const Vector t = own.t, m = own.m, t_j = its.t, m_j = its.m;
     const Number g1 = source * inverse, second = g2 * inverse;
     const Number a = dot(u, t), a_j = dot(u, t_j), lone = dot(u, m), lone_j = dot(u, m_j);
-    const Number among = (second * t.x) * t_j.x + (second * t.y) * t_j.y + (second * t.z) * t_j.z
-                         - (second * m.x) * m_j.x - (second * m.y) * m_j.y - (second * m.z) * m_j.z;
+    const Number among = dot(scaled(second, t), t_j) - dot(scaled(second, m), m_j);
     const Number radial = source * own.q * its.q + own.q * g2 * a_j - its.q * g2 * a - among - (third * a) * a_j
                           + (third * lone) * lone_j;
     const Number on = g1 * own.q - second * a, on_j = -(g1 * its.q + second * a_j);
-    return {radial,
-            {on * t_j.x + on_j * t.x + second * (lone * m_j.x + lone_j * m.x),
-             on * t_j.y + on_j * t.y + second * (lone * m_j.y + lone_j * m.y),
-             on * t_j.z + on_j * t.z + second * (lone * m_j.z + lone_j * m.z)}};
+    const Vector across = scaled(second, sum(scaled(lone, m_j), scaled(lone_j, m)));
+    return {radial, sum(sum(scaled(on, t_j), scaled(on_j, t)), across)};
 }
 
 // Of quadrupoles with sources, dipoles and each other: derivatives of their energy by the distance and the direction,
@@ -88,19 +84,18 @@ CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Source
                            + 2 * (part.xy * theta.xy + part.yz * theta.yz + part.zx * theta.zx);
     const Number energy_4 = fourth * on_dipoles;
     const Number energy_5 = (2 * product - 20 * dot(v, v_part) + 35 * (fifth * f_j) * f) * Real(1.0 / 3.0);
-    const Vector z = times(theta, t_j), z_j = times(theta_j, t), x = times(theta, v_part), x_j = times(part, v);
+    const Vector z = less(times(theta_j, t), times(theta, t_j)), x = sum(times(theta, v_part), times(part, v));
     auto turn_of = [=](Number t, Number t_j, Number v, Number v_j, Number z, Number x) -> Number {
         return 2 * k3 * (q * v_j + q_j * v) + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z)
                + Real(70.0 / 3.0) * ((fifth * f_j) * v + (fifth * v_j) * f) - Real(20.0 / 3.0) * x;
     };
-    const Vector turn = {turn_of(t.x, t_j.x, v.x, v_j.x, z_j.x - z.x, x.x + x_j.x),
-                         turn_of(t.y, t_j.y, v.y, v_j.y, z_j.y - z.y, x.y + x_j.y),
-                         turn_of(t.z, t_j.z, v.z, v_j.z, z_j.z - z.z, x.z + x_j.z)};
+    const Vector turn = {turn_of(t.x, t_j.x, v.x, v_j.x, z.x, x.x), turn_of(t.y, t_j.y, v.y, v_j.y, z.y, x.y),
+                         turn_of(t.z, t_j.z, v.z, v_j.z, z.z, x.z)};
     const Number second = g2 * inverse;
     const Number radial = slope * (k3 * on_sources + energy_4 + energy_5)
                           + w * Real(1.0 / 3.0) * (third + 2 * second) * on_sources
                           - w * inverse * (4 * energy_4 + 5 * energy_5 + dot(turn, u));
-    return {radial, {w * inverse * turn.x, w * inverse * turn.y, w * inverse * turn.z}};
+    return {radial, scaled(w * inverse, turn)};
 }
 
 CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& own) {

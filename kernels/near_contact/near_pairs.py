@@ -139,7 +139,7 @@ class NearContactBuffers:
     """
 
     dtype: Any
-    lists: neighbors.NeighborLists
+    lists: Any
     arrays: dict[str, wp.array]
     given: Any
     reach: float
@@ -172,7 +172,7 @@ def allocate(
         saturation: Saturation magnetization of each [A/m], shape [n].
         curve: Their magnetization curve, of ``curves.CURVE_IDS``.
         rows: Work list of the field loop (``pair_loops.Rows``).
-        partial: Its sums, and one part more, to be written by sweeps; no part, if the sums are fused.
+        partial: Its sums, and one part more, to be written by sweeps.
         movable: Whether the force on a moment is wanted, shape [n].
         twisted: Whether its torque is, shape [n].
         forces: What forces are added to [N], Warp array, shape [n].
@@ -180,37 +180,33 @@ def allocate(
     """
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
-    eligible = np.asarray(eligible, bool)
-    lists = neighbors.allocate(n, dtype, device, ratio=0.5 * contact_table.REACH + MARGIN, capacity=CANDIDATES)
     field_row = np.full(n, -1)
-    if len(partial):
-        field_row[rows.target.numpy()] = np.arange(rows.count)
+    field_row[rows.target.numpy()] = np.arange(rows.count)
 
     def padded(values, other):
         """Values of balls that take part, and another of the rest."""
         chosen = np.pad(np.where(eligible, values, other), (0, balls - n), constant_values=other)
         return wp.array(chosen, dtype=dtype if isinstance(other, float) else wp.int32, device=device)
 
+    group = padded(worlds, -1)
+    lists = neighbors.allocate(n, packed.packed, group, ratio=0.5 * contact_table.REACH + MARGIN, capacity=CANDIDATES)
     radii = packed.radii.numpy()
     kinds, material = _material_arrays(radii, eligible, susceptibility, saturation, padded)
-    arrays = (
-        _pair_arrays(balls, dtype, device)
-        | material
-        | {
-            "packed": packed.packed,
-            "group": padded(worlds, -1),
-            "candidate": lists.neighbor,
-            "candidate_count": lists.count,
-            "found_at": lists.found_at,
-            "moved": lists.moved,
-            "field_row": padded(field_row, -1),
-            "partial": partial[-1] if len(partial) else partial,
-            "movable": padded(movable, 0),
-            "twisted": padded(twisted, 0),
-            "forces": forces,
-            "torques": torques,
-        }
-    )
+    arrays = _pair_arrays(balls, dtype, device) | material
+    arrays |= {
+        "packed": packed.packed,
+        "group": group,
+        "candidate": lists.neighbor,
+        "candidate_count": lists.count,
+        "found_at": lists.found_at,
+        "moved": lists.moved,
+        "field_row": padded(field_row, -1),
+        "partial": partial[-1],
+        "movable": padded(movable, 0),
+        "twisted": padded(twisted, 0),
+        "forces": forces,
+        "torques": torques,
+    }
     stride = packed.packed.strides[0] // wp.types.type_size_in_bytes(dtype)
     return NearContactBuffers(
         dtype=dtype,
@@ -299,14 +295,14 @@ def kernel(dtype, passes: str):
     return passes_kernel(call, ContactArrays, options)
 
 
-def _launch(b: NearContactBuffers, function: str, first: int, last: int):
+def _launch(b: NearContactBuffers, passes: str, first: int, last: int):
     """Launch passes ``first`` to ``last``, one by one on a GPU, where a launch is what they wait for."""
     cpu = b.device.is_cpu
     for begin, end in [(first, last)] if cpu else pairwise(range(first, last + 1)):
-        key = function, begin, end
+        key = passes, begin, end
         if key not in b.commands:
             b.commands[key] = wp.launch(
-                kernel(b.dtype, function),
+                kernel(b.dtype, passes),
                 dim=1 if cpu else GROUP * b.given.balls,
                 inputs=[begin, end, b.threads, team() if cpu else None, b.given],
                 device=b.device,
@@ -328,17 +324,16 @@ def _beside(b: NearContactBuffers):
         b.stream.record_event(b.events[2])
 
 
-def launch_find_pairs(moments, b: NearContactBuffers):
-    """Find the near pairs of packed moments (``warpmag.packed.PackedMoments``) and tabulate what they add.
+def launch_find_pairs(b: NearContactBuffers):
+    """Find the near pairs of the packed moments and tabulate what they add.
 
     On a GPU that is done beside what is launched next, until :func:`wait` ends it.
     """
     if b.reach == 0.0:
         return
-    packed, group = moments.packed, b.arrays["group"]
     with _beside(b):
         _launch(b, "Places", 0, 1)
-        neighbors.launch_find_neighbors(packed, packed, group, group, b.reach, b.lists, b.lists)
+        neighbors.launch_find_neighbors(b.lists, b.lists, b.reach)
         _launch(b, "Pairs", 0, 2)
 
 
