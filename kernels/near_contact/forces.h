@@ -47,30 +47,30 @@ CUDA_CALLABLE inline void find_contact_forces(const Arrays& a, int i) {
 // Force on a ball by another one in direction u: along u, and what else there is.
 struct PairForce {
     Number radial;
-    Vector rest;
+    Vector across;
 };
 
 // Of sources and dipoles: of what is left of them, less the actual ones. ``third`` is g3 d³.
-CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& its, Vector u, Number source, Number g2,
-                                            Number inverse, Number third) {
-    const Vector t = own.t, m = own.m, t_j = its.t, m_j = its.m;
+CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& other, Vector u, Number source,
+                                            Number g2, Number inverse, Number third) {
+    const Vector t = own.t, m = own.m, t_j = other.t, m_j = other.m;
     const Number g1 = source * inverse, second = g2 * inverse;
-    const Number a = dot(u, t), a_j = dot(u, t_j), lone = dot(u, m), lone_j = dot(u, m_j);
+    const Number along = dot(u, t), along_j = dot(u, t_j), along_m = dot(u, m), along_m_j = dot(u, m_j);
     const Number among = dot(scaled(second, t), t_j) - dot(scaled(second, m), m_j);
-    const Number radial = source * own.q * its.q + own.q * g2 * a_j - its.q * g2 * a - among - (third * a) * a_j
-                          + (third * lone) * lone_j;
-    const Number on = g1 * own.q - second * a, on_j = -(g1 * its.q + second * a_j);
-    const Vector across = scaled(second, sum(scaled(lone, m_j), scaled(lone_j, m)));
+    const Number radial = source * own.q * other.q + own.q * g2 * along_j - other.q * g2 * along - among
+                          - (third * along) * along_j + (third * along_m) * along_m_j;
+    const Number on = g1 * own.q - second * along, on_j = -(g1 * other.q + second * along_j);
+    const Vector across = scaled(second, sum(scaled(along_m, m_j), scaled(along_m_j, m)));
     return {radial, sum(sum(scaled(on, t_j), scaled(on_j, t)), across)};
 }
 
 // Of quadrupoles with sources, dipoles and each other: derivatives of their energy by the distance and the direction,
 // with their window w and its ``slope``.
-CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& its, Vector u, Number g2,
+CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& other, Vector u, Number g2,
                                                 Number inverse, Number third, Number w, Number slope) {
-    const Vector t = own.t, t_j = its.t;
-    const Tensor theta = own.theta, theta_j = its.theta;
-    const Number q = own.q, q_j = its.q, a = dot(u, t), a_j = dot(u, t_j);
+    const Vector t = own.t, t_j = other.t;
+    const Tensor theta = own.theta, theta_j = other.theta;
+    const Number q = own.q, q_j = other.q, a = dot(u, t), a_j = dot(u, t_j);
     const Number square = inverse * inverse, fourth = square * square;
     const Vector v = times(theta, u), v_j = times(theta_j, u);
     const Number f = dot(v, u), f_j = dot(v_j, u);
@@ -106,18 +106,18 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& ow
     for (int s = share(); s - share() < near_slots; s += SHARES) {
         const Rows<PAIR_ROWS> row(a.pair(s, i));
         const Rows<PAIR_SLOPE_ROWS> slope(a.pair_slope(s, i));
-        const Sources its = sources_at(a, partners.of(s));
+        const Sources other = sources_at(a, partners.of(s));
         const Vector u = {row[0], row[1], row[2]};
-        const PairForce d = dipole_force(own, its, u, row[4], row[5], row[6], slope[0]);
-        const PairForce q = quadrupole_force(own, its, u, row[5], row[6], slope[0], row[7], slope[1]);
-        total = sum(total, d.rest);
-        total = sum(total, sum(scaled(d.radial + q.radial, u), q.rest));
+        const PairForce d = dipole_force(own, other, u, row[4], row[5], row[6], slope[0]);
+        const PairForce q = quadrupole_force(own, other, u, row[5], row[6], slope[0], row[7], slope[1]);
+        total = sum(total, d.across);
+        total = sum(total, sum(scaled(d.radial + q.radial, u), q.across));
     }
     for (int s = share(); s - share() < contact_slots; s += SHARES) {
         const int* place = list_at(a.counterpart, CONTACT_SLOTS, s, i);
         const Real* forces = a.pair_forces;
-        const Vector other = {gather(forces, place), gather(forces + CHUNK, place), gather(forces + 2 * CHUNK, place)};
-        total = sum(total, less(other, own_vector(a.pair_force(s, i))));
+        const Vector theirs = {gather(forces, place), gather(forces + CHUNK, place), gather(forces + 2 * CHUNK, place)};
+        total = sum(total, less(theirs, own_vector(a.pair_force(s, i))));
     }
     return {group_total(total.x), group_total(total.y), group_total(total.z)};
 }
@@ -140,7 +140,7 @@ CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
     }
 }
 
-// Two passes: what each ball has of its contacts' forces, then the sums with what the others have.
+// Two passes: what each ball has of other contacts' forces, then the sums with what the others have.
 struct Forces {
     const Arrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {

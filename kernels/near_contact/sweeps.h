@@ -25,7 +25,8 @@ CUDA_CALLABLE inline Softness softness_of(const Arrays& a, int i) {
     return {p, p * numbers(a.hardness + i)};
 }
 
-// Adds what the sources of another ball make to sums of φ, e_m and e_Θ; ``row`` is what does not change of the pair.
+// Adds what the sources of another ball make to sums of φ, e_m and e_Θ; ``row`` is what ``tabulate.h`` wrote of the
+// pair.
 CUDA_CALLABLE inline void add_drive(Number (&sum)[16], const Rows<PAIR_ROWS>& row, const Sources& o) {
     const Vector u = {row[0], row[1], row[2]}, t = o.t;
     const Number q = o.q, along = dot(u, t), source = row[4], g2 = row[5], inverse = row[6], w = row[7];
@@ -144,8 +145,8 @@ template <bool FIRST> CUDA_CALLABLE inline void find_drive(const Arrays& a, int 
         put(rows + 18 * CHUNK, soft.weight);
     }
     if (!finds_field) return;
-    const Vector lone = {number(kept, 16), number(kept, 22), number(kept, 23)};
-    const Vector h = less(lone, {number(difference, 5), number(difference, 6), number(difference, 7)});
+    const Vector dipoles = {number(kept, 16), number(kept, 22), number(kept, 23)};
+    const Vector h = less(dipoles, {number(difference, 5), number(difference, 6), number(difference, 7)});
     if (share() == 0) put_field(a, i, h);
 }
 

@@ -1,5 +1,5 @@
-// What does not change of near pairs while balls stand still: directions, radial factors, windows, conductances by the
-// table, and the place of what the other ball has of a contact's forces.
+// Tables of the near pairs of one arrangement: directions, radial factors, windows, conductances by the table of two
+// balls, and where to find the other ball's part of a contact's force.
 //
 // From Python: the windows of contact_table.py, and the nodes of its table.
 #pragma once
