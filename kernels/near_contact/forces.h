@@ -140,7 +140,7 @@ CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
     }
 }
 
-// Two passes: what each ball has of other contacts' forces, then the sums with what the others have.
+// Two passes: what each ball has of its contacts' forces, then the sums with what the others have.
 struct Forces {
     const Arrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
