@@ -1,5 +1,6 @@
 """The near-contact model against the exact solution of two, three and thirteen balls, and against its own energy."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import warp as wp
 from arrangements import as_float32, fcc_block, relative
 
 import warpmag
-from warpmag import near_contact, oracle
-from warpmag.near_contact import NearContacts
+from warpmag import contact_oracle, oracle
+from warpmag.contact_oracle import NearContacts
+from warpmag.kernels.near_contact import contact_table
 from warpmag.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
@@ -40,13 +42,13 @@ def linear(positions, radii, permeability, field, near=True):
 @pytest.mark.parametrize("own, other", [(np.inf, np.inf), (1000.0, 1000.0), (4.0, 4.0), (2.0, np.inf), (50.0, 3.0)])
 @pytest.mark.parametrize("gap", [0.0113, 0.07, 0.2, 0.38])
 def test_table_is_the_exact_solution(own, other, gap):
-    y = [np.atleast_1d(near_contact.hardness(mu - 1.0)) for mu in (own, other)]
-    value, slope = near_contact.conductances(np.array([gap]), *y)
+    y = [np.atleast_1d(contact_table.hardness(mu - 1.0)) for mu in (own, other)]
+    value, slope = contact_oracle.conductances(np.array([gap]), *y)
     exact = pair_conductance(2.0 + gap, [min(mu, 1e12) for mu in (own, other)])
     # cubic splines of 26 and 11 nodes
     np.testing.assert_allclose(value[0], exact, atol=2e-3 * np.abs(exact).max())
     step = 1e-5 * gap
-    high, low = (near_contact.conductances(np.array([gap + s * step]), *y)[0][0] for s in (1.0, -1.0))
+    high, low = (contact_oracle.conductances(np.array([gap + s * step]), *y)[0][0] for s in (1.0, -1.0))
     np.testing.assert_allclose((high - low) / (2.0 * step), slope[0], rtol=1e-6, atol=1e-8 * np.abs(slope).max())
 
 
@@ -60,7 +62,7 @@ def test_two_balls_are_exact_to_five_percent(permeability, field):
         exact = np.linalg.solve(two.resistance[direction], np.ones(2))
         force = -0.5 * MU0 * exact @ two.slope[direction] @ exact
         moments, forces = linear(np.array([0 * ALONG, (2.0 + gap) * ALONG]), 1.0, permeability, field)
-        assert abs(forces[1, 2] / force - 1.0) < (0.01 if gap <= near_contact.CONTACT_GAP[0] else 0.05)
+        assert abs(forces[1, 2] / force - 1.0) < (0.01 if gap <= contact_table.CONTACT_GAP[0] else 0.05)
         assert np.abs(moments @ field / exact - 1.0).max() < 2e-3
 
 
@@ -143,21 +145,33 @@ def test_force_is_continuous_and_bounded(field):
 
 
 def test_cut_off_is_smooth():
-    for end in (near_contact.REACH, near_contact.RANGE, 2.0 + near_contact.CONTACT_GAP[1]):
+    for end in (contact_table.REACH, contact_table.RANGE, 2.0 + contact_table.CONTACT_GAP[1]):
         near, far = (
             linear(np.array([0 * ALONG, (end + shift) * ALONG]), 1.0, np.inf, ALONG)[1] for shift in (-1e-6, 1e-6)
         )
         assert np.abs(near - far).max() < 1e-4 * MU0  # a force of 10 μ0 that changes over a radius
-    dipoles = linear(np.array([0 * ALONG, (near_contact.REACH + 1e-6) * ALONG]), 1.0, np.inf, ALONG, near=False)[1]
-    far = linear(np.array([0 * ALONG, (near_contact.REACH + 1e-6) * ALONG]), 1.0, np.inf, ALONG)[1]
+    dipoles = linear(np.array([0 * ALONG, (contact_table.REACH + 1e-6) * ALONG]), 1.0, np.inf, ALONG, near=False)[1]
+    far = linear(np.array([0 * ALONG, (contact_table.REACH + 1e-6) * ALONG]), 1.0, np.inf, ALONG)[1]
     np.testing.assert_array_equal(far, dipoles)
+
+
+def test_slope_of_langevins_curve():
+    """Literals of ``curves.h``: c' at a magnetization c over that of Cohen's approximation, 3 (1 − c²)²/(3 + c⁴)."""
+    header = (Path(warpmag.kernels.__file__).parent / "material" / "curves.h").read_text(encoding="utf-8")
+    literals = [float(x) for x in re.search(r"fitted\[\d+\] = {(.*?)}", header, re.DOTALL)[1].split(",")]
+    s = np.concatenate([np.linspace(0.0, 10.0, 2000), np.geomspace(10.0, 1e4, 1000)])
+    c, slope = oracle.reduced_curve(s, "langevin")
+    ratio = slope * (3.0 + c**4) / (3.0 * (1.0 - c**2) ** 2)
+    fit = np.polyfit(2.0 * c - 1.0, ratio, len(literals) - 1)
+    np.testing.assert_allclose(literals, fit, rtol=1e-6, atol=1e-6)  # of powers that cancel
+    np.testing.assert_allclose(np.polyval(literals, 2.0 * c - 1.0), ratio, rtol=2e-4)
 
 
 @pytest.mark.parametrize("strength, dipole", [(1e-4, False), (0.1, False), (3.0, True), (1e3, True)])
 def test_saturated_balls_are_dipoles(strength, dipole):
     x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.05], [1.9, 0.0, 1.0]])
     h0 = strength * np.array([0.3, 0.0, 1.0])
-    found, forces = near_contact.equilibrium(x, 1.0, h0, saturation=1.0)
+    found, forces = contact_oracle.equilibrium(x, 1.0, h0, saturation=1.0)
     assert found.residual < 1e-12
     alone = oracle.equilibrium(x, 1.0, h0, saturation=1.0)
     moments = 4.0 / 3.0 * np.pi * alone.magnetizations
@@ -202,7 +216,7 @@ def test_device_solution_is_the_reference(strength, dtype, error, device):
     """Balls of five materials and two sizes, at gaps of 5 to 60 %, unsaturated to saturated."""
     field = strength * IRON * np.array([0.4, -0.3, 0.9])
     settings = {"susceptibility": MIXED_SUSCEPTIBILITIES}
-    exact, exact_forces = near_contact.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
+    exact, exact_forces = contact_oracle.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
     found = solve(MIXED, MIXED_RADII, field, device, dtype, **settings)
     assert found.converged
     assert relative(found.magnetizations, exact.magnetizations) < error
@@ -219,7 +233,7 @@ def test_device_solution_is_the_reference(strength, dtype, error, device):
 def test_device_follows_the_curve(curve, strength, device):
     field = strength * IRON * np.array([0.4, -0.3, 0.9])
     settings = {"susceptibility": MIXED_SUSCEPTIBILITIES, "curve": curve}
-    exact, exact_forces = near_contact.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
+    exact, exact_forces = contact_oracle.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
     found = solve(MIXED, MIXED_RADII, field, device, **settings)
     # the slope of Langevin's curve is good to 2e-4 there
     assert relative(found.magnetizations, exact.magnetizations) < 1e-4
@@ -292,10 +306,7 @@ def test_device_runs_repeat_bit_by_bit(device):
 
 
 def test_device_precisions_agree_before_a_solve_has_ended(device):
-    """Sweep by sweep the same field, forces and torques, with a magnet and a ball that cannot move among the others.
-
-    On a GPU float32 takes another way than float64: all passes in the launch that sums the pairs.
-    """
+    """Sweep by sweep the same field, forces and torques, with a magnet and a ball that cannot move among the others."""
     x = np.concatenate([MIXED, [[0.02, 0.01, 0.0]]])
     magnet = np.zeros((6, 3))
     magnet[5] = [0.3, 0.0, 0.4]
@@ -352,7 +363,7 @@ def test_device_graph_gives_the_same_bits(device):
 
 @pytest.mark.parametrize("side", [7, 15, 20])
 def test_device_piles_of_any_size(side, device):
-    """Float32 against float64 in cubic grids at a gap of 1 %, few to many: on a GPU each takes another way."""
+    """Float32 against float64 in cubic grids at a gap of 1 %, few to many: the form of the pair sums depends on it."""
     grid = np.stack(np.meshgrid(*[np.arange(float(side))] * 3, indexing="ij"), -1).reshape(-1, 3)
     x = as_float32(0.005 * 2.01 * grid)[0]
     field = 0.2 * IRON * np.array([0.4, -0.3, 0.9])

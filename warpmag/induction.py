@@ -84,7 +84,7 @@ def solve_induction(
         dynamics: ``theta``: the exact flow of Eqs. 8 and 9, accelerated; ``theta-euler``: their explicit step;
             ``llg``, ``llg-damping``: Eq. 6 with and without precession.
         contact_model: ``dipole``; or ``multipole``, which adds what balls lack where they nearly touch, from the exact
-            solution of two balls (see ``warpmag.near_contact``).
+            solution of two balls (see ``warpmag.kernels.near_contact``).
         rtol: Relative residual at which to end.
         max_evaluations: Field evaluations after which to give up; ``converged`` tells.
         initial: Magnetizations to start from [A/m], shape [n, 3].

@@ -12,7 +12,7 @@ from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
-from warpmag.kernels.near_contact import near_contact
+from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
@@ -84,7 +84,7 @@ class MomentSystem:
         dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
             submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
         contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
-            nearly touch (see ``warpmag.near_contact``).
+            nearly touch (see ``warpmag.kernels.near_contact``).
         rtol: Relative residual at which induction ends.
         max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
@@ -228,7 +228,7 @@ class MomentSystem:
         susceptibility, saturation = (
             np.broadcast_to(np.asarray(values, float), n) for values in (susceptibility, saturation)
         )
-        return near_contact.allocate(
+        return near_pairs.allocate(
             self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, saturation,
             CURVE_IDS[curve], rows=self._mutual, partial=self._mutual.partial, movable=layout.movable,
             twisted=turned, forces=self.forces, torques=self.torques,
@@ -267,7 +267,7 @@ class MomentSystem:
         packed = self._packed
         packed.pack(self.positions, self.moments)
         if self._near is not None:
-            near_contact.launch_find_pairs(packed, self._near)
+            near_pairs.launch_find_pairs(self._near)
         packed.find_overlaps()
         if self._mutual.count == 0:
             return
@@ -275,7 +275,7 @@ class MomentSystem:
             self._applied.launch()
         self.dynamics.start()
         if self._near is not None:
-            near_contact.wait(self._near)
+            near_pairs.wait(self._near)
 
     def iterate(self):
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
@@ -295,13 +295,13 @@ class MomentSystem:
         if near is None:
             self._mutual.launch()
             return
-        near_contact.launch_sweeps(near)
-        self._mutual.launch(wait=lambda: near_contact.wait_for_field(near))
+        near_pairs.launch_sweeps(near)
+        self._mutual.launch(wait=lambda: near_pairs.wait_for_field(near))
 
     def _end_sweeps(self):
         """Have what is launched next wait for what near contacts do beside."""
         if self._near is not None:
-            near_contact.wait(self._near)
+            near_pairs.wait(self._near)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
@@ -315,10 +315,10 @@ class MomentSystem:
         check_force("force", force, "dipole" if near is None else "multipole")
         if force == "zeeman":
             launch_zeeman_moments(self._packed, self.h, self._material, self._effective)
-        if near is not None and self.device.is_cuda:
-            near_contact.launch_sweeps(near)
+        if near is not None:
+            near_pairs.launch_sweeps(near)
         for evaluation in self._wrench[force]:
             evaluation.launch()
         if near is not None:
-            near_contact.wait(near)
-            near_contact.launch_add_forces(near)
+            near_pairs.wait(near)
+            near_pairs.launch_add_forces(near)

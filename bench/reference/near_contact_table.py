@@ -15,7 +15,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import gammaln
 
 from bench.reference.spheres import sufficient_order
-from warpmag import near_contact
+from warpmag.contact_oracle import long_range, long_range_self
+from warpmag.kernels.near_contact.contact_table import FUNCTIONS, HARDNESSES, LOG_GAPS, TABLE_FILE
 
 
 def reduced_resistance(
@@ -43,10 +44,10 @@ def reduced_resistance(
 
 def pair_conductance(distance: float, permeabilities, tolerance: float = 1e-7) -> np.ndarray:
     """The functions of the first of two balls of unit radius and given μr, in the order of the table."""
-    u, g1, g2, _ = near_contact.long_range(np.array(distance), 1.0, 1.0)
+    u, g1, g2, _ = long_range(np.array(distance), 1.0, 1.0)
     # what U_sr leaves of 3/d³, with which a source and a quadrupole see each other
     left = 1.0 - g2 * distance**5 / 3.0
-    self_source, self_dipole = near_contact.long_range_self(1.0)
+    self_source, self_dipole = long_range_self(1.0)
     # potential of a dipole and field of a source on the axis have the radial derivative U' = g1 d
     axial = np.zeros((3, 3))
     axial[:2, :2] = [[u, -g1 * distance], [g1 * distance, -g1 - g2 * distance**2]]
@@ -82,9 +83,9 @@ def spline_coefficients(values: np.ndarray) -> np.ndarray:
 
 def make_table() -> np.ndarray:
     """The table, shape [gap nodes + 2, hardness nodes + 2, hardness nodes + 2, 8]."""
-    gaps = np.exp(np.linspace(*near_contact.LOG_GAPS))
-    permeabilities = [math.inf if y == 0.0 else y**-2.0 for y in np.linspace(*near_contact.HARDNESSES)]
-    values = np.zeros((len(gaps), len(permeabilities), len(permeabilities), near_contact.FUNCTIONS))
+    gaps = np.exp(np.linspace(*LOG_GAPS))
+    permeabilities = [math.inf if y == 0.0 else y**-2.0 for y in np.linspace(*HARDNESSES)]
+    values = np.zeros((len(gaps), len(permeabilities), len(permeabilities), FUNCTIONS))
     for i, gap in enumerate(gaps):
         for j, own in enumerate(permeabilities):
             for k, other in enumerate(permeabilities):
@@ -98,5 +99,5 @@ def make_table() -> np.ndarray:
 
 if __name__ == "__main__":
     table = make_table()
-    np.save(near_contact.TABLE_FILE, table)
-    print(f"{near_contact.TABLE_FILE}: {table.shape}, {near_contact.TABLE_FILE.stat().st_size / 1024:.0f} kB")
+    np.save(TABLE_FILE, table)
+    print(f"{TABLE_FILE}: {table.shape}, {TABLE_FILE.stat().st_size / 1024:.0f} kB")

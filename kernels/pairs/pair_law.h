@@ -103,4 +103,11 @@ CUDA_CALLABLE inline Vector force_of(const Overlap& p, Vector e) {
     const Number radial = p.g.g2 * dot(p.m, e) + p.g.g3 * of * along;
     return scaled(p.unit, sum(scaled(p.g.g2, across), scaled(radial, p.r)));
 }
+
+// Potential U of balls of radii a and b at distance d, 1/d from contact on; nearly concentric ones as at 0.05 (a + b).
+template <class N> CUDA_CALLABLE inline N averaged_potential(N d, N a, N b) {
+    const N p = a * b, s = a + b, c = 1 / (160 * p * p * p), x = larger(d, Real(0.05) * s), e = s - x, e2 = e * e;
+    const N u = (1 + e2 * e2 * (5 * (a * a + b * b) - 20 * p - 4 * s * x - x * x) * c) / x;
+    return d < s ? u : 1 / d;
+}
 }

@@ -1,89 +1,28 @@
-"""The near-contact model: what two balls add to their dipoles when they almost touch. Plain NumPy, no Warp.
+"""Dense reference of the near-contact model, in float64 with NumPy; ``warpmag.kernels.near_contact`` has the model.
 
-Close to contact the flux between two permeable balls crowds into the gap, and dipoles miss most of the force. As
-Bonnecaze and Brady did for suspensions, the far field stays many-body and what it lacks is added pair by pair, from the
-exact solution of two balls. Four things make it work for piles:
-
-* **Conductances add, resistances do not.** At a contact it is the surfaces' potentials that drive the flux, whatever
-  the other contacts of the ball do. So the pair's part is a conductance ΔC from potentials to sources, and a ball has a
-  potential: besides its moment a source q, its net flux through contacts, which the rest of its surface gives back.
-* **Two ranges.** With 1/d split into U_lr, the potential of balls inflated to ``RANGE``/2 radii, and the rest U_sr,
-  which vanishes beyond ``RANGE`` radii, sources q act by U_sr only: everything new is local. Both are positive.
-* **Quadrupoles do not add.** Those that its neighbours induce in a ball add up before they act, and cancel in the
-  middle of a pile. So each ball has its quadrupole Θ (symmetric, traceless; its potential is n·Θn/d³), which acts up to
-  ``QUADRUPOLE_REACH`` radii, on sources by U_sr as everything does that sources do; what a pair adds is the rest, and
-  vanishes beyond ``CONTACT_GAP``.
-* **An energy.** With a = (0, m, Θ) the actual sources of a ball, split into smooth and contact ones, a = ã + n,
-
-      E_near(m) = min over ã, Θ of ½ ã M ã + ½ n ΔC⁻¹ n + ½ Θ δ Θ − ½ a M_sr a,
-
-  M the matrix of U_sr and of the quadrupoles, δ what a quadrupole of finite permeability costs, M_sr the dipoles of M.
-  It vanishes with ΔC and Θ, and gives with e = M ã, n = ΔC e the field (M_sr a − e)_m at
-  the moments and the forces ½ e ∂ΔC e − ½ ã ∂M ã + ½ a ∂M_sr a: momentum is conserved, and two balls come out exactly.
-  That there is one minimum is measured (``test_any_arrangement_has_one_solution``), not proven: in wide gaps ΔC alone
-  has eigenvalues down to −0.03 R.
-
-ΔC of a pair has 14 functions of the gap and the two permeabilities, tabulated from the exact solution of two equal
-balls by ``bench.reference.near_contact_table``. With n_i the direction from i towards j, α = R n·e_m, γ the part of
-R² e_Θ that is symmetric about n, and ⊥ across it,
-
-    q_i    = R [A φ_i + B φ_j + C α_i + D α_j + I γ_i + J γ_j],
-    n·m_i  = R² [C φ_i + D' φ_j + E α_i + F α_j + K γ_i + L γ_j],    m_i⊥ = R³ [G e_i⊥ + H e_j⊥],
-    Θ_i    = R³ [I φ_i + J' φ_j + K α_i + L' α_j + O γ_i + P γ_j] (3nn − 1)/2,
-
-where D', J', L' are those that ball j sees.
-
-Reference: Bonnecaze and Brady 1990, "A method for determining the effective conductivity of dispersions of particles",
-Proc. R. Soc. Lond. A 430, 285-313.
+Tests compare the device with it, and with the exact solutions of ``bench.reference``. Names are those of the model.
 """
-
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
 from warpmag import oracle
-
-RANGE = 3.0
-"""Distance [mean radii] beyond which sources and dipoles have no short-range part."""
-QUADRUPOLE_REACH = (2.8, 3.3)
-"""Distance [mean radii] over which quadrupoles fade."""
-REACH = max(RANGE, QUADRUPOLE_REACH[1])
-"""Distance [mean radii] of the farthest near pair."""
-QUADRUPOLE_OVERLAP = (0.0, 0.15)
-"""Overlap [mean radii] over which they fade: nearer than contact they would induce each other without end."""
-CONTACT_GAP = (0.4, 0.8)
-"""Gap [radii] over which the pair's part fades."""
-SMALLEST_GAP = 0.01
-"""Gap [radii] at which forces are largest: contact solvers cannot follow them further."""
-SOFTNESS = 0.03
-"""Depth [radii] over which the pair's part levels off below the smallest gap."""
-DEEPEST = (0.1, 0.3)
-"""Overlap [radii] over which the pair's part fades: balls that deep in one another are no physical pair."""
-
-MOST_SHARED = (0.1, 0.3)
-"""Volume shared with neighbours, in volumes, over which a ball leaves the model: heaps that deep are no contacts."""
-LEAST_RATIO = (0.5, 0.8)
-"""Ratio of radii over which the pair's part sets in: the table is that of equal balls."""
-
-LOG_GAPS = (float(np.log(4.9e-4)), float(np.log(0.8)), 26)
-"""Natural logarithm of gap/R: first node, last node, number of nodes."""
-HARDNESSES = (0.0, 1.0, 11)
-"""μr^(-1/2): first node, last node, number of nodes."""
-FUNCTIONS = 14
-
-TABLE_FILE = Path(__file__).with_name("near_contact.npy")
-
-
-@cache
-def table() -> np.ndarray:
-    """Cubic B-spline coefficients of A to P by gap, own and other hardness, shape [gaps + 2, n + 2, n + 2, 14]."""
-    return np.load(TABLE_FILE)
-
-
-def hardness(susceptibility):
-    """Coordinate (1 + χ)^(-1/2) of the table; 0 for an ideally permeable ball."""
-    return 1.0 / np.sqrt(1.0 + np.asarray(susceptibility, float))
+from warpmag.kernels.near_contact.contact_table import (
+    CONTACT_GAP,
+    DEEPEST,
+    FUNCTIONS,
+    LEAST_RATIO,
+    LOG_GAPS,
+    MOST_SHARED,
+    QUADRUPOLE_OVERLAP,
+    QUADRUPOLE_REACH,
+    RANGE,
+    REACH,
+    SMALLEST_GAP,
+    SOFTNESS,
+    b_spline,
+    gap_table,
+    hardness,
+)
 
 
 def log_gap(gap):
@@ -114,40 +53,6 @@ def quadrupole_window(distance, radius_i, radius_j):
     return value, slope / unit
 
 
-def _fit_langevin(degree: int = 12) -> tuple[float, ...]:
-    """Slope of Langevin's curve at a magnetization c over that of Cohen's approximation, 3 (1 − c²)²/(3 + c⁴).
-
-    Coefficients of a polynomial in 2c − 1, highest first, good to 2e-4.
-    """
-    s = np.concatenate([np.linspace(0.0, 10.0, 2000), np.geomspace(10.0, 1e4, 1000)])
-    c, slope = oracle.reduced_curve(s, "langevin")
-    return tuple(map(float, np.polyfit(2.0 * c - 1.0, slope * (3.0 + c**4) / (3.0 * (1.0 - c**2) ** 2), degree)))
-
-
-LANGEVIN_STEEPNESS = _fit_langevin()
-
-
-def _b_spline(x, nodes):
-    """First of four coefficients, their weights and slopes of a uniform cubic B-spline at coordinates ``x``."""
-    first, last, count = nodes
-    scale = (count - 1) / (last - first)
-    x = np.clip((np.asarray(x, float) - first) * scale, 0.0, count - 1.0)
-    base = np.minimum(x.astype(int), count - 2)
-    t = x - base
-    weights = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], -1) / 6.0
-    slopes = scale * np.stack([-((1 - t) ** 2), 3 * t**2 - 4 * t, -3 * t**2 + 2 * t + 1, t**2], -1) / 2.0
-    return base, weights, slopes
-
-
-@cache
-def gap_table(own: float, other: float) -> np.ndarray:
-    """Coefficients of A to P by gap for a ball of hardness ``own`` near one of ``other``, shape [gaps + 2, 14]."""
-    row, row_weights, _ = _b_spline(own, HARDNESSES)
-    column, column_weights, _ = _b_spline(other, HARDNESSES)
-    patch = table()[:, row : row + 4, column : column + 4].astype(float)
-    return np.einsum("a,b,gabf->gf", row_weights, column_weights, patch)
-
-
 def conductances(gap, own, other):
     """The 14 functions A to P of pairs, and their derivatives by the gap.
 
@@ -161,7 +66,7 @@ def conductances(gap, own, other):
     """
     gap = np.asarray(gap, float)
     u, du = log_gap(gap)
-    row, weights, slopes = _b_spline(u, LOG_GAPS)
+    row, weights, slopes = b_spline(u, LOG_GAPS)
     value, slope = np.zeros((len(gap), FUNCTIONS)), np.zeros((len(gap), FUNCTIONS))
     for kind in {*zip(own, other, strict=True)}:
         rows = np.flatnonzero((own == kind[0]) & (other == kind[1]))
@@ -273,9 +178,9 @@ class NearContacts:
         alike = crowding[i] * crowding[j] * similarity(a, b)
         self.quadrupole = [alike * factor for factor in quadrupole_window(self.distance, a, b)]
         share = (w[i] * w[j] * alike)[:, None]
-        seen = [conductances(gap, y[one], y[other]) for one, other in ((i, j), (j, i))]
-        self.value = [share * self.scale[:, None] * value for value, _ in seen]  # as ball i and as ball j sees them
-        self.slope = [share * slope for _, slope in seen]
+        functions = [conductances(gap, y[one], y[other]) for one, other in ((i, j), (j, i))]
+        self.value = [share * self.scale[:, None] * value for value, _ in functions]  # of ball i and of ball j
+        self.slope = [share * slope for _, slope in functions]
         self.short_range = self._short_range()
         self.conductance = self._conductance()
 
@@ -385,7 +290,7 @@ class NearContacts:
         unit = self.direction
         radial, turn = 0.0, 0.0
         for side, one, other, sign in ((0, self.i, self.j, 1.0), (1, self.j, self.i, -1.0)):
-            own, its = self._seen(drive, one, sign), self._seen(drive, other, -sign)
+            own, its = self._at_contact(drive, one, sign), self._at_contact(drive, other, -sign)
             phi, alpha, gamma, field, pull, square = own
             phi_j, alpha_j, gamma_j, field_j, _, _ = its
             # what both share counts half for each
@@ -409,7 +314,7 @@ class NearContacts:
         turn -= np.einsum("pk,pk->p", unit, turn)[:, None] * unit
         return radial[:, None] * unit + turn / self.distance[:, None]
 
-    def _seen(self, drive, ball, sign):
+    def _at_contact(self, drive, ball, sign):
         """φ, α and γ of a ball of each pair, its field R e_m, the vector R² e_Θ n, and what of R e_m is across."""
         size = self.radii[ball]
         field = size[:, None] * drive[ball, 1:4]

@@ -1,0 +1,151 @@
+// Forces between near balls, in units of μ0/4π: of the short-range parts, of quadrupoles and of contacts; and torques.
+//
+// From Python: UNIT, μ0/4π [T·m/A].
+#pragma once
+#include "near_contact/sweeps.h"
+
+namespace warpmag {
+
+// What a ball has of its contacts' forces: derivatives of ½ e ΔC e by the other ball's place. ``g`` are the derivatives
+// of A to P by the distance.
+CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductances& f,
+                                          const Rows<CONDUCTANCE_SLOPE_ROWS>& g, Vector u, Number inverse,
+                                          const Drive& own, const Drive& other) {
+    const Number w = own.weight * other.weight;
+    const ContactDrive a = at_contact(own, u, 1), b = at_contact(other, u, -1);
+    const Number square = dot(a.field, a.field) - a.alpha * a.alpha;
+    const Number mixed = dot(a.field, b.field) + a.alpha * b.alpha;
+    // what both share counts half for each
+    const Number doubled = a.phi * (g[0] * a.phi + g[1] * b.phi) + a.alpha * (g[4] * a.alpha + g[5] * b.alpha)
+                           + g[6] * square + g[7] * mixed + a.gamma * (g[12] * a.gamma + g[13] * b.gamma);
+    const Number radial = Real(0.5) * doubled
+                          + a.phi * (g[2] * a.alpha + g[3] * b.alpha + g[8] * a.gamma + g[9] * b.gamma)
+                          + a.alpha * (g[10] * a.gamma + g[11] * b.gamma);
+    const Number by_alpha = f[2] * a.phi + of_other(arrays, f, 3) * b.phi + (f[4] - f[6]) * a.alpha
+                            + (f[5] + f[7]) * b.alpha + f[10] * a.gamma + f[11] * b.gamma;
+    const Number by_gamma = 2
+                            * (f[8] * a.phi + of_other(arrays, f, 9) * b.phi + f[10] * a.alpha
+                               + of_other(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
+    const Number rest = w * radial - w * inverse * (by_alpha * a.alpha + by_gamma * a.gamma);
+    const Number x = w * inverse * by_alpha, y = w * inverse * by_gamma;
+    return sum(sum(scaled(rest, u), scaled(x, a.field)), scaled(y, a.gradient));
+}
+
+CUDA_CALLABLE inline void find_contact_forces(const Arrays& a, int i) {
+    Partners<CONTACT_SLOTS> partners(a.near, i);
+    const int slots = most(a.contact_count + i);
+    const Drive own = drive_at(a, Own(i).at);
+    for (int s = share(); s - share() < slots; s += SHARES) {
+        const Conductances f(a.conductance(s, i));
+        const Rows<CONDUCTANCE_SLOPE_ROWS> g(a.conductance_slope(s, i));
+        const Real* pair = a.pair(s, i);
+        const Drive other = drive_at(a, partners.of(s));
+        put_vector(a.pair_force(s, i), contact_force(a, f, g, own_vector(pair), numbers(pair + 6 * CHUNK), own, other));
+    }
+}
+
+// Force on a ball by another one in direction u: along u, and what else there is.
+struct PairForce {
+    Number radial;
+    Vector across;
+};
+
+// Of sources and dipoles: of what is left of them, less the actual ones. ``third`` is g3 d³.
+CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& other, Vector u, Number source,
+                                            Number g2, Number inverse, Number third) {
+    const Vector t = own.t, m = own.m, t_j = other.t, m_j = other.m;
+    const Number g1 = source * inverse, second = g2 * inverse;
+    const Number along = dot(u, t), along_j = dot(u, t_j), along_m = dot(u, m), along_m_j = dot(u, m_j);
+    const Number among = dot(scaled(second, t), t_j) - dot(scaled(second, m), m_j);
+    const Number radial = source * own.q * other.q + own.q * g2 * along_j - other.q * g2 * along - among
+                          - (third * along) * along_j + (third * along_m) * along_m_j;
+    const Number on = g1 * own.q - second * along, on_j = -(g1 * other.q + second * along_j);
+    const Vector across = scaled(second, sum(scaled(along_m, m_j), scaled(along_m_j, m)));
+    return {radial, sum(sum(scaled(on, t_j), scaled(on_j, t)), across)};
+}
+
+// Of quadrupoles with sources, dipoles and each other: derivatives of their energy by the distance and the direction,
+// with their window w and its ``slope``.
+CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& other, Vector u, Number g2,
+                                                Number inverse, Number third, Number w, Number slope) {
+    const Vector t = own.t, t_j = other.t;
+    const Tensor theta = own.theta, theta_j = other.theta;
+    const Number q = own.q, q_j = other.q, a = dot(u, t), a_j = dot(u, t_j);
+    const Number square = inverse * inverse, fourth = square * square;
+    const Vector v = times(theta, u), v_j = times(theta_j, u);
+    const Number f = dot(v, u), f_j = dot(v_j, u);
+    const Number on_sources = q * f_j + q_j * f, k3 = Real(1.0 / 3.0) * g2;
+    const Number on_dipoles = 5 * (a * f_j - a_j * f) - 2 * (dot(t, v_j) - dot(t_j, v));
+    const Number fifth = fourth * inverse; // first, or else products of moments overflow
+    const Tensor part = {fifth * theta_j.xx, fifth * theta_j.yy, fifth * theta_j.xy, fifth * theta_j.yz,
+                         fifth * theta_j.zx};
+    const Vector v_part = scaled(fifth, v_j);
+    const Number product = part.xx * theta.xx + part.yy * theta.yy + (part.xx + part.yy) * (theta.xx + theta.yy)
+                           + 2 * (part.xy * theta.xy + part.yz * theta.yz + part.zx * theta.zx);
+    const Number energy_4 = fourth * on_dipoles;
+    const Number energy_5 = (2 * product - 20 * dot(v, v_part) + 35 * (fifth * f_j) * f) * Real(1.0 / 3.0);
+    const Vector z = less(times(theta_j, t), times(theta, t_j)), x = sum(times(theta, v_part), times(part, v));
+    auto turn_of = [=](Number t, Number t_j, Number v, Number v_j, Number z, Number x) -> Number {
+        return 2 * k3 * (q * v_j + q_j * v) + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z)
+               + Real(70.0 / 3.0) * ((fifth * f_j) * v + (fifth * v_j) * f) - Real(20.0 / 3.0) * x;
+    };
+    const Vector turn = {turn_of(t.x, t_j.x, v.x, v_j.x, z.x, x.x), turn_of(t.y, t_j.y, v.y, v_j.y, z.y, x.y),
+                         turn_of(t.z, t_j.z, v.z, v_j.z, z.z, x.z)};
+    const Number second = g2 * inverse;
+    const Number radial = slope * (k3 * on_sources + energy_4 + energy_5)
+                          + w * Real(1.0 / 3.0) * (third + 2 * second) * on_sources
+                          - w * inverse * (4 * energy_4 + 5 * energy_5 + dot(turn, u));
+    return {radial, scaled(w * inverse, turn)};
+}
+
+CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& own) {
+    const Number zero = numbers(a.radius + i) * Real(0);
+    Vector total = {zero, zero, zero};
+    Partners<NEAR_SLOTS> partners(a.near, i);
+    const int near_slots = most(a.near_count + i), contact_slots = most(a.contact_count + i);
+    for (int s = share(); s - share() < near_slots; s += SHARES) {
+        const Rows<PAIR_ROWS> row(a.pair(s, i));
+        const Rows<PAIR_SLOPE_ROWS> slope(a.pair_slope(s, i));
+        const Sources other = sources_at(a, partners.of(s));
+        const Vector u = {row[0], row[1], row[2]};
+        const PairForce d = dipole_force(own, other, u, row[4], row[5], row[6], slope[0]);
+        const PairForce q = quadrupole_force(own, other, u, row[5], row[6], slope[0], row[7], slope[1]);
+        total = sum(total, d.across);
+        total = sum(total, sum(scaled(d.radial + q.radial, u), q.across));
+    }
+    for (int s = share(); s - share() < contact_slots; s += SHARES) {
+        const int* place = list_at(a.counterpart, CONTACT_SLOTS, s, i);
+        const Real* forces = a.pair_forces;
+        const Vector theirs = {gather(forces, place), gather(forces + CHUNK, place), gather(forces + 2 * CHUNK, place)};
+        total = sum(total, less(theirs, own_vector(a.pair_force(s, i))));
+    }
+    return {group_total(total.x), group_total(total.y), group_total(total.z)};
+}
+
+// Adds forces, and torques m × 4π H_near, to those of the moments that move and turn.
+CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
+    const Sources own = sources_at(a, Own(i).at);
+    const Vector force = sum_forces(a, i, own);
+    if (share() > 0) return;
+    const Vector torque = cross(own.m, own_vector(rows_at(a.field, 3, i)));
+    auto add = [=](Real* out, Vector v, int l) {
+        out[0] += UNIT * lane_of(v.x, l);
+        out[1] += UNIT * lane_of(v.y, l);
+        out[2] += UNIT * lane_of(v.z, l);
+    };
+    for (int l = 0; l < WIDTH; ++l) {
+        if (a.movable[i + l] == 0) continue;
+        add(a.forces + 3 * (size_t)(i + l), force, l);
+        if (a.twisted[i + l] == 1) add(a.torques + 3 * (size_t)(i + l), torque, l);
+    }
+}
+
+// Two passes: what each ball has of its contacts' forces, then the sums with what the others have.
+struct Forces {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int pass, int i) const {
+        if (pass == 0) find_contact_forces(a, i);
+        else add_forces(a, i);
+    }
+};
+}

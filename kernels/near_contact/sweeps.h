@@ -1,0 +1,244 @@
+// Sweeps over near pairs: the drive e = M ã of all balls, then contact sources and quadrupoles a step towards ΔC e.
+//
+// The numbers of a ball's state, and of sums over its slots, are: 0 to 4 xx, yy, xy, yz, zx of a quadrupole, 5 to 7 a
+// dipole, 13 a source. From Python: PACE and MOMENTUM of a step, OWN_SOURCE and OWN_DIPOLE of M, SWEEPS.
+#pragma once
+#include "material/curves.h"
+#include "near_contact/state.h"
+
+namespace warpmag {
+
+constexpr unsigned DRIVES = 0x20ff, DRIVES_AND_FIELD = 0xe1ff; // numbers of a drive; and 8, 14, 15 of (M_sr a)_m
+
+struct Softness {
+    Number p, weight;
+};
+
+// Polarizability p = 2χ_d/(2χ_d + 5) of a ball's higher multipoles, 1/χ_d = 1/k_d − 1/3, and p over that of a small
+// field.
+CUDA_CALLABLE inline Softness softness_of(const Arrays& a, int i) {
+    const Number slope = numbers(a.curve_slope + i), zero = slope * Real(0);
+    const Vector reduced = scaled(numbers(a.unsaturated + i), a.own_moment(i));
+    const Number steepness = curve_steepness(dot(reduced, reduced), a.curve);
+    const Number softer = smaller(larger(slope * steepness, zero), zero + 3);
+    const Number p = softer / (Real(2.5) + softer * Real(1.0 / 6.0));
+    return {p, p * numbers(a.hardness + i)};
+}
+
+// Adds what the sources of another ball make to sums of φ, e_m and e_Θ; ``row`` is what ``tabulate.h`` wrote of the
+// pair.
+CUDA_CALLABLE inline void add_drive(Number (&sum)[16], const Rows<PAIR_ROWS>& row, const Sources& o) {
+    const Vector u = {row[0], row[1], row[2]}, t = o.t;
+    const Number q = o.q, along = dot(u, t), source = row[4], g2 = row[5], inverse = row[6], w = row[7];
+    const Number g1 = source * inverse, square = inverse * inverse;
+    const Number k3 = Real(1.0 / 3.0) * w * g2, k4 = w * square * square, k5 = k4 * inverse;
+    const Vector v = times(o.theta, u);
+    const Number f = dot(v, u);
+    sum[13] += row[3] * q + source * along + k3 * f;
+    const Number radial = 5 * k4 * f - source * q - g2 * along;
+    sum[5] += radial * u.x - g1 * t.x - 2 * k4 * v.x;
+    sum[6] += radial * u.y - g1 * t.y - 2 * k4 * v.y;
+    sum[7] += radial * u.z - g1 * t.z - 2 * k4 * v.z;
+    // 3/2 of what is symmetric and traceless of y u
+    const Number c = k3 * q - 5 * k4 * along + Real(35.0 / 3.0) * k5 * f;
+    const Number k = 2 * k4, b = Real(-20.0 / 3.0) * k5;
+    const Vector y = {k * t.x + b * v.x + c * u.x, k * t.y + b * v.y + c * u.y, k * t.z + b * v.z + c * u.z};
+    const Number third = Real(0.5) * dot(u, y);
+    sum[0] += Real(1.5) * u.x * y.x - third + k5 * o.theta.xx;
+    sum[1] += Real(1.5) * u.y * y.y - third + k5 * o.theta.yy;
+    sum[2] += Real(0.75) * (u.x * y.y + u.y * y.x) + k5 * o.theta.xy;
+    sum[3] += Real(0.75) * (u.y * y.z + u.z * y.y) + k5 * o.theta.yz;
+    sum[4] += Real(0.75) * (u.z * y.x + u.x * y.z) + k5 * o.theta.zx;
+}
+
+// Adds what the moment of another ball makes to (M_sr a)_m, numbers 8, 14 and 15.
+CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_ROWS>& row, Vector m) {
+    const Vector u = {row[0], row[1], row[2]};
+    const Number g1 = row[4] * row[6], radial = -row[5] * dot(u, m);
+    sum[8] += radial * u.x - g1 * m.x;
+    sum[14] += radial * u.y - g1 * m.y;
+    sum[15] += radial * u.z - g1 * m.z;
+}
+
+// Writes the near contacts' part of the field sums.
+CUDA_CALLABLE inline void put_field(const Arrays& a, int i, Vector h) {
+    put_vector(rows_at(a.field, 3, i), h);
+    for (int l = 0; l < WIDTH; ++l) {
+        if (a.field_row[i + l] < 0) continue;
+        Real* const sum = a.partial + 3 * (size_t)a.field_row[i + l];
+        sum[0] = lane_of(h.x, l);
+        sum[1] = lane_of(h.y, l);
+        sum[2] = lane_of(h.z, l);
+    }
+}
+
+// Sums e = M ã over near balls, those that nearly touch last. What the others make, and what moments make, is summed by
+// the first of an evaluation's passes and kept for those that follow.
+template <bool FIRST>
+CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<KEPT_ROWS>& kept) {
+    Partners<NEAR_SLOTS> partners(a.near, i);
+    const int contact_end = whole_rounds(most(a.contact_count + i));
+    const int end = FIRST ? whole_rounds(most(a.near_count + i)) : contact_end;
+    const Number zero = numbers(a.radius + i) * Real(0);
+    Number far[16];
+#pragma unroll
+    for (int c = 0; c < 16; ++c) {
+        // one thread of a group goes on from what was kept
+        sum[c] = !FIRST && DRIVES >> c & 1 && c % SHARES == share() ? kept[c / SHARES] : zero;
+        far[c] = zero;
+    }
+#pragma unroll 1
+    for (int s = end - SHARES + share(); s >= 0; s -= SHARES) {
+        const Rows<PAIR_ROWS> row(a.pair(s, i));
+        const Sources o = sources_at(a, partners.of(s));
+        add_drive(sum, row, o);
+        if (!FIRST) continue;
+        add_dipole_field(sum, row, o.m);
+        if (s - share() == contact_end)
+#pragma unroll
+            for (int c = 0; c < 16; ++c) far[c] = sum[c];
+    }
+    group_totals(sum, FIRST ? DRIVES_AND_FIELD : DRIVES);
+    if (!FIRST) return;
+    group_totals(far, DRIVES);
+    Real* const rows = rows_at(a.kept, KEPT_ROWS, i);
+#pragma unroll
+    for (int c = 0; c < 16; ++c) {
+        if (c % SHARES != share()) continue;
+        if (DRIVES >> c & 1) put(rows + c * CHUNK, far[c / SHARES * SHARES]);
+        if (c == 8 || c >= 14) put(rows + (8 + c) * CHUNK, sum[c / SHARES * SHARES]);
+    }
+}
+
+// The drive, what quadrupoles move towards, and if wanted 4π H_near = (M_sr a − e)_m.
+template <bool FIRST> CUDA_CALLABLE inline void find_drive(const Arrays& a, int i, bool finds_field) {
+    Real* const rows = rows_at(a.kept, KEPT_ROWS, i);
+    const Parts<KEPT_ROWS> kept(rows);
+    const Parts<STATE_ROWS> state(rows_at(a.state, STATE_ROWS, i));
+    const Number size = numbers(a.radius + i), zero = size * Real(0);
+    const Softness soft = FIRST ? softness_of(a, i) : Softness{number(kept, 17), number(kept, 18)};
+    Number sum[16], drive[parts(16)], difference[parts(16)], m[parts(8)];
+    for (int k = 0; k < parts(8); ++k) {
+        const int component = k * SHARES + share() - 5;
+        m[k] = component < 0 ? zero : numbers(a.moment(component < 0 ? 0 : component, i));
+    }
+    sum_drive<FIRST>(a, i, sum, kept);
+    const Number p = soft.p, square = size * size, inverse = 1 / size, cube = inverse * inverse * inverse;
+    const Number source = OWN_SOURCE * inverse, dipole = OWN_DIPOLE * cube, fifth = cube * inverse * inverse;
+#pragma unroll
+    for (int k = 0; k < parts(14); ++k) {
+        const int c = k * SHARES + share();
+        const Number other = sum[k * SHARES];
+        if (k * SHARES >= 8) {
+            drive[k] = other - source * state[k]; // of number 13 only
+            continue;
+        }
+        const bool quadrupole = c < 5;
+        const Number own = quadrupole ? state[k + parts(8)] : state[k];
+        difference[k] = other - (quadrupole ? fifth : dipole) * own;
+        drive[k] = quadrupole ? square * (1 - p) * difference[k] : size * (difference[k] + dipole * m[k]);
+        if (quadrupole) put(rows + (c + 8) * CHUNK, (p - 1) * own - p * square * square * size * other);
+    }
+    publish(a.drives, i, drive, {soft.weight, zero, zero});
+    if (FIRST && share() == 0) {
+        put(rows + 17 * CHUNK, soft.p);
+        put(rows + 18 * CHUNK, soft.weight);
+    }
+    if (!finds_field) return;
+    const Vector dipoles = {number(kept, 16), number(kept, 22), number(kept, 23)};
+    const Vector h = less(dipoles, {number(difference, 5), number(difference, 6), number(difference, 7)});
+    if (share() == 0) put_field(a, i, h);
+}
+
+// What a ball's drive is at a contact in direction u: φ, α, γ, R e_m, and R² e_Θ u.
+struct ContactDrive {
+    Number phi, alpha, gamma;
+    Vector field, gradient;
+};
+CUDA_CALLABLE inline ContactDrive at_contact(const Drive& o, Vector u, int sign) {
+    const Vector gradient = times(o.t, u);
+    return {o.phi, sign * dot(o.e, u), dot(gradient, u), o.e, gradient};
+}
+typedef Rows<CONDUCTANCE_ROWS> Conductances;
+// D', J' or L' of the other ball, which balls of one kind have in common with D, J and L, rows 3, 9 and 11.
+CUDA_CALLABLE inline Number of_other(const Arrays& a, const Conductances& f, int row) {
+    return a.kinds > 1 ? f[row == 3 ? 14 : row == 9 ? 15 : 16] : f[row];
+}
+
+// Adds the sources ΔC e of a contact that a ball of radius ``size`` has, driven as ``own``, with the other ball.
+CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum)[16], const Conductances& f, Vector u,
+                                              Number size, const Drive& own, const Drive& other) {
+    const Number w = own.weight * other.weight;
+    const ContactDrive a = at_contact(own, u, 1), b = at_contact(other, u, -1);
+    sum[13] += w * (f[0] * a.phi + f[1] * b.phi + f[2] * a.alpha + f[3] * b.alpha + f[8] * a.gamma + f[9] * b.gamma);
+    const Number g = f[6], h = f[7];
+    const Number along = w
+                         * (f[2] * a.phi + of_other(arrays, f, 3) * b.phi + (f[4] - g) * a.alpha + (f[5] + h) * b.alpha
+                            + f[10] * a.gamma + f[11] * b.gamma);
+    const Number on = w * g, on_b = w * h;
+    sum[5] += size * (along * u.x + on * a.field.x + on_b * b.field.x);
+    sum[6] += size * (along * u.y + on * a.field.y + on_b * b.field.y);
+    sum[7] += size * (along * u.z + on * a.field.z + on_b * b.field.z);
+    const Number axial = w
+                         * (f[8] * a.phi + of_other(arrays, f, 9) * b.phi + f[10] * a.alpha
+                            + of_other(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
+    const Number turned = Real(1.5) * size * size * axial, third = Real(0.5) * size * size * axial;
+    sum[0] += turned * u.x * u.x - third;
+    sum[1] += turned * u.y * u.y - third;
+    sum[2] += turned * u.x * u.y;
+    sum[3] += turned * u.y * u.z;
+    sum[4] += turned * u.z * u.x;
+}
+
+// Contact sources towards ΔC e, and quadrupoles towards their place, by a step of heavy-ball relaxation.
+CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
+    Partners<CONTACT_SLOTS> partners(a.near, i);
+    Real *const rows = rows_at(a.state, STATE_ROWS, i), *const last_rows = rows_at(a.last_state, STATE_ROWS, i);
+    const Parts<STATE_ROWS> state(rows), last(last_rows);
+    const Parts<KEPT_ROWS> kept(rows_at(a.kept, KEPT_ROWS, i));
+    const Number of_source = numbers(a.relaxation + i), of_dipole = numbers(a.relaxation + a.balls + i);
+    const int slots = most(a.contact_count + i);
+    const Drive own = drive_at(a, Own(i).at);
+    const Number size = numbers(a.radius + i), zero = size * Real(0), one = zero + 1;
+    Number sum[16], moved[parts(16)];
+#pragma unroll
+    for (int c = 0; c < 16; ++c) sum[c] = zero;
+    for (int s = share(); s - share() < slots; s += SHARES) {
+        const Conductances f(a.conductance(s, i));
+        const Drive other = drive_at(a, partners.of(s));
+        add_contact_sources(a, sum, f, own_vector(a.pair(s, i)), size, own, other);
+    }
+    group_totals(sum, DRIVES);
+#pragma unroll
+    for (int k = 0; k < parts(14); ++k) {
+        const int c = k * SHARES + share();
+        const bool contact_quadrupole = c >= 8 && c < 13; // of the sums number c − 8
+        const Number now = state[k];
+        const Number contact = contact_quadrupole ? sum[k % parts(8) * SHARES] : sum[k * SHARES];
+        const Number there = c < 5 ? kept[k + parts(8)] : contact;
+        const Number pace = PACE * (c == 13 ? of_source : c >= 5 && c < 8 ? of_dipole : one);
+        const Number next = now + pace * (there - now) + MOMENTUM * (now - last[k]);
+        moved[k] = next - next == zero ? next : zero;
+        put(last_rows + c * CHUNK, now);
+        put(rows + c * CHUNK, moved[k]);
+    }
+    publish(a.sources, i, moved, SHARES == 1 ? a.own_moment(i) : Vector{zero, zero, zero});
+}
+
+// Moments beside the published sources.
+CUDA_CALLABLE inline void publish_moment(const Arrays& a, int i) {
+    const Vector m = a.own_moment(i);
+    put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
+}
+
+// On a CPU pass 0 publishes moments; then a drive and a step for each sweep. The last drive gives the field.
+struct Sweeps {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int pass, int i) const {
+        if (SHARES == 1 && pass == 0) publish_moment(a, i);
+        else if (pass % 2 == 0) relax(a, i);
+        else if (pass == 1) find_drive<true>(a, i, false);
+        else find_drive<false>(a, i, pass == 2 * SWEEPS - 1);
+    }
+};
+}

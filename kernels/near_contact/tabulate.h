@@ -1,0 +1,200 @@
+// Tables of the near pairs of one arrangement: directions, radial factors, windows, conductances by the table of two
+// balls, and where to find the other ball's part of a contact's force.
+//
+// From Python: the windows of contact_table.py, and the nodes of its table.
+#pragma once
+#include "near_contact/select.h"
+
+namespace warpmag {
+
+// A near pair: radii, directed distance, and how far both balls take part.
+struct NearPair {
+    Number a, b, sum, unit, d, inverse, weight, alike;
+    Mask live;
+};
+
+// U and its radial factors of two homogeneous balls.
+struct Potential {
+    Number u, g1, g2, g3;
+};
+CUDA_CALLABLE inline Potential potential(Number d, Number a, Number b) {
+    const Number i1 = 1 / d, i2 = i1 * i1, i3 = i2 * i1;
+    const Mask overlap = d < a + b;
+    const Potential f = {i1, -i3, 3 * i3 * i2, -15 * i3 * i2 * i2};
+    if (!any(overlap)) return f;
+    const Factors<Number> g = averaged_factors(d, a, b);
+    return {averaged_potential(d, a, b), overlap ? g.g1 : f.g1, overlap ? g.g2 : f.g2, overlap ? g.g3 : f.g3};
+}
+
+// Writes the rows of slot s of ball i, a pair at separation r, zeros where none is.
+CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vector r, const NearPair& p) {
+    const Number a = p.a, b = p.b, unit = p.unit, zero = a * Real(0);
+    Real *const rows = arrays.pair(s, i), *const slopes = arrays.pair_slope(s, i);
+    auto keep = [=](int row, Number n) { put(rows + row * CHUNK, p.live ? n : zero); };
+    keep(0, r.x * p.inverse);
+    keep(1, r.y * p.inverse);
+    keep(2, r.z * p.inverse);
+    // in units of the distance in contact: powers of metres overflow float32
+    const Number y = unit * p.d, third = unit * unit * unit, x = HALF_RANGE * unit;
+    const Potential all = potential(y, unit * a, unit * b), far = potential(y, x * a, x * b);
+    const Number short_range = y < HALF_RANGE ? zero + 1 : zero;
+    keep(3, short_range * unit * (all.u - far.u));
+    keep(4, short_range * unit * unit * ((all.g1 - far.g1) * y));
+    keep(5, short_range * third * ((all.g2 - far.g2) * y * y));
+    keep(6, p.inverse);
+    put(slopes, p.live ? short_range * third * (unit * ((all.g3 - far.g3) * y * y * y)) : zero);
+    const Fade quadrupole =
+        window(2 * y - 2, QUADRUPOLE_GAP_LOW, QUADRUPOLE_GAP_HIGH, QUADRUPOLE_OVERLAP_LOW, QUADRUPOLE_OVERLAP_HIGH);
+    keep(7, p.weight * p.alike * quadrupole.value);
+    put(slopes + CHUNK, p.live ? p.weight * p.alike * 2 * unit * quadrupole.slope : zero);
+}
+
+// Where the spline of a gap [radii] is read: first of four nodes, their weights, and those of the derivative.
+struct Spline {
+    Index node;
+    Number weight[4], slope[4];
+
+    CUDA_CALLABLE explicit Spline(Number gap) {
+        const Number zero = gap * Real(0), one = zero + 1, outside = larger(gap, one * SMALLEST_GAP);
+        const Number z = smaller(gap - SMALLEST_GAP, zero) * (1 / SOFTNESS), steep = 1 / root(1 + z * z);
+        Number x = logarithm(outside) + (SOFTNESS / SMALLEST_GAP) * z * steep;
+        x = smaller(larger((x - FIRST_NODE) * NODES_PER_UNIT, zero), one * (NODES - 1));
+        node = whole(smaller(x, one * (NODES - 2)));
+        const Number v = x - number_of(node), u = 1 - v, sixth = one * Real(1.0 / 6.0);
+        const Number scale = Real(0.5) * NODES_PER_UNIT * steep * steep * steep / outside;
+        weight[0] = sixth * u * u * u;
+        weight[1] = sixth * (4 - 6 * v * v + 3 * v * v * v);
+        weight[2] = sixth * (4 - 6 * u * u + 3 * u * u * u);
+        weight[3] = sixth * v * v * v;
+        slope[0] = -scale * u * u;
+        slope[1] = scale * (3 * v * v - 4 * v);
+        slope[2] = scale * (4 * u - 3 * u * u);
+        slope[3] = scale * v * v;
+    }
+};
+
+// Adds to values and to derivatives of four of the table's functions, at nodes that begin at ``lines``.
+CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int* lines, const Spline& spline,
+                                      Four& value, Four& change) {
+    const Number zero = spline.weight[0] * Real(0);
+    value = change = {zero, zero, zero, zero};
+    for (int k = 0; k < 4; ++k) {
+        const Four node = four_at(tables + LINE * k, quarter, lines);
+        const Number w = spline.weight[k], slope = spline.slope[k];
+        value = {value.x + w * node.x, value.y + w * node.y, value.z + w * node.z, value.w + w * node.w};
+        change = {change.x + slope * node.x, change.y + slope * node.y, change.z + slope * node.z,
+                  change.w + slope * node.w};
+    }
+}
+
+// Writes the conductances of slot s of ball i and their derivatives, and adds those of its own sources and dipoles.
+CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both,
+                                           Index kind, Index its_kind, Number& sources, Number& dipoles) {
+    const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit, gap = (p.d - p.sum) / scale;
+    const auto touches = both > zero;
+    Real *const rows = arrays.conductance(s, i), *const slopes = arrays.conductance_slope(s, i);
+    const Spline spline(gap);
+    const Fade fade = window(gap, CONTACT_GAP_LOW, CONTACT_GAP_HIGH, DEEPEST_LOW, DEEPEST_HIGH);
+    const Number part_value = scale * both * fade.value, part_slope = both * fade.slope,
+                 part_change = both * fade.value;
+    auto keep = [=](int row, Number value) { put(rows + row * CHUNK, touches ? part_value * value : zero); };
+    auto store = [=](int row, Number value, Number change) {
+        keep(row, value);
+        put(slopes + row * CHUNK, touches ? part_change * change + part_slope * value : zero);
+    };
+    int lines[WIDTH];
+    put_indices(lines, (kind * arrays.kinds + its_kind) * (NODES + 2) + spline.node);
+    Four value, change;
+    for (int quarter = 0; quarter < 4; ++quarter) {
+        interpolate(arrays.tables, quarter, lines, spline, value, change);
+        store(4 * quarter, value.x, change.x);
+        store(4 * quarter + 1, value.y, change.y);
+        if (quarter == 0) sources += touches ? part_value * value.x : zero;
+        if (quarter == 1) dipoles += touches ? part_value * (value.x + 2 * value.z) : zero;
+        if (quarter == 3) break;
+        store(4 * quarter + 2, value.z, change.z);
+        store(4 * quarter + 3, value.w, change.w);
+    }
+    if (arrays.kinds == 1) return;
+    put_indices(lines, (its_kind * arrays.kinds + kind) * (NODES + 2) + spline.node);
+    interpolate(arrays.tables, 0, lines, spline, value, change);
+    keep(14, value.w);
+    interpolate(arrays.tables, 2, lines, spline, value, change);
+    keep(15, value.y);
+    keep(16, value.w);
+}
+
+// Finds where the other ball of a contact has its part of the force; the last place, of zeros, is for none.
+CUDA_CALLABLE inline void find_counterpart(const Arrays& a, int i, int s, int j) {
+    int place = -1;
+    auto takes_part = [&](int ball) { return a.places[LINE * (size_t)ball + 4] > 0; };
+    if (s < a.contact_count[i] && takes_part(i) && takes_part(j))
+        for (int slot = 0; slot < a.contact_count[j]; ++slot)
+            place = *list_at(a.near, NEAR_SLOTS, slot, j) == i ? slot : place;
+    *list_at(a.counterpart, CONTACT_SLOTS, s, i) =
+        place < 0 ? CONTACT_SLOTS * 3 * a.balls : (int)(a.pair_force(place, j) - a.pair_forces);
+}
+
+// A ball that has no near ball any more starts cold when it has one again.
+CUDA_CALLABLE inline void forget_where_alone(const Arrays& a, int i, Mask alone) {
+    if (!any(alone)) return;
+    const Number zero = numbers(a.radius + i) * Real(0);
+    for (int quarter = 0; quarter < 3; ++quarter) {
+        const Four f = own_four(a.sources, quarter, i);
+        put_four(a.sources, quarter, i,
+                 {alone ? zero : f.x, alone ? zero : f.y, alone ? zero : f.z, alone ? zero : f.w});
+    }
+    for (int c = 0; c < 2 * STATE_ROWS; ++c) {
+        Real* const row = rows_at(c < STATE_ROWS ? a.state : a.last_state, STATE_ROWS, i) + c % STATE_ROWS * CHUNK;
+        put(row, alone ? zero : numbers(row));
+    }
+}
+
+// Tabulates the slots of a ball. Those that are no longer used are emptied: they hold the ball itself, and zeros.
+CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
+    int *const used = a.used + i, *const used_contacts = used + a.balls;
+    const int contact_slots = most(a.contact_count + i), counted = most(a.near_count + i), emptied = most(used);
+    const int slots = counted > emptied ? counted : emptied, emptied_contacts = most(used_contacts);
+    const Number counts = number_of(indices(a.near_count + i)),
+                 contact_counts = number_of(indices(a.contact_count + i));
+    const Four own = own_four(a.places, 0, i), own_part = own_four(a.places, 1, i);
+    const Number size = own.w, zero = size * Real(0), one = zero + 1;
+    Number sources = zero, dipoles = zero;
+    for (int s = share(); s < slots; s += SHARES) {
+        int* const list = list_at(a.near, NEAR_SLOTS, s, i);
+        for (int l = 0; l < WIDTH; ++l) list[l] = s < a.near_count[i + l] ? list[l] : i + l;
+        const Four other = four_at(a.places, 0, list), part = four_at(a.places, 1, list);
+        const Number weight = counts > Real(s) ? own_part.x * part.x : zero;
+        const Mask live = weight > zero;
+        const Number b = live ? other.w : size + (size > zero ? zero : one), sum = size + b;
+        const Vector r = {other.x - own.x, other.y - own.y, other.z - own.z};
+        const Number distance = length(r), least = Real(1e-6) * size;
+        const Number d = live ? (distance > least ? distance : least) : sum;
+        const Number ratio = smaller(size, b) / larger(size, b);
+        const Number alike = smoothstep((ratio - LEAST_RATIO_LOW) * (1 / (LEAST_RATIO_HIGH - LEAST_RATIO_LOW))).value;
+        const NearPair pair = {size, b, sum, 1 / sum, d, 1 / d, weight, alike, live};
+        tabulate_pair(a, i, s, r, pair);
+        if (s >= contact_slots && s >= emptied_contacts) continue;
+        const Number both = contact_counts > Real(s) ? weight * alike : zero;
+        tabulate_contact(a, i, s, pair, both, whole(own_part.y), whole(part.y), sources, dipoles);
+        for (int l = 0; l < WIDTH; ++l) find_counterpart(a, i + l, s, list[l]);
+    }
+    sources = group_total(sources);
+    dipoles = group_total(dipoles) * Real(1.0 / 3.0);
+    if (share() > 0) return;
+    put(a.relaxation + i, size / (size + OWN_SOURCE * sources));
+    put(a.relaxation + a.balls + i, size / (size + OWN_DIPOLE * dipoles));
+    put_indices(used, indices(a.near_count + i));
+    put_indices(used_contacts, indices(a.contact_count + i));
+    forget_where_alone(a, i, counts == zero);
+}
+
+// Two passes: select near balls, then tabulate them.
+struct Pairs {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int pass, int i) const {
+        if (pass == 0) select(a, i);
+        else tabulate(a, i);
+    }
+};
+}
