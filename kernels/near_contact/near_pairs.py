@@ -26,7 +26,7 @@ kept as slots, those whose surfaces nearly touch first. ``select.h`` and ``tabul
 | near, near_count, contact_count | [chunks, slots, CHUNK], [balls] | near balls, how many, and how many nearly touch |
 | used | [2, balls] | slots of both kinds that hold something |
 | pairs | [chunks, slots, 8, CHUNK] | direction to the other ball; U_sr, g1 d, g2 d², 1/d, the quadrupoles' window |
-| pair_slopes | [chunks, slots, 2, CHUNK] | derivatives: g3 d³ and the window's |
+| pair_slopes | [chunks, slots, 2, CHUNK] | derivatives, apart since sweeps do not read them: g3 d³ and the window's |
 | conductances | [chunks, slots, 17, CHUNK] | of contacts: A to P, then D', J' and L' of the other ball |
 | conductance_slopes | [chunks, slots, 14, CHUNK] | derivatives of A to P by the distance |
 | relaxation | [2, balls] | s of a ball's q and N |
