@@ -27,72 +27,6 @@ _STATE, _WORDS = 0, 24
 _GONE, _ASLEEP = 0, 2
 """Place of a member's state among its words, how many these are, and two of its values; as in ``team.h``."""
 
-_LIBRARY = """
-#if defined(__APPLE__)
-    #define SYMBOL(name) "_" name
-#else
-    #define SYMBOL(name) name
-#endif
-    typedef unsigned long long Word;
-    typedef void* (*Start)(void*);
-    extern int start_thread(unsigned long*, const void*, Start, void*) __asm__(SYMBOL("pthread_create"));
-    extern int detach_thread(unsigned long) __asm__(SYMBOL("pthread_detach"));
-    extern int yield_thread() __asm__(SYMBOL("sched_yield"));
-    extern int make_lock(void*, const void*) __asm__(SYMBOL("pthread_mutex_init"));
-    extern int lock(void*) __asm__(SYMBOL("pthread_mutex_lock"));
-    extern int unlock(void*) __asm__(SYMBOL("pthread_mutex_unlock"));
-    extern int make_bell(void*, const void*) __asm__(SYMBOL("pthread_cond_init"));
-    extern int sleep(void*, void*) __asm__(SYMBOL("pthread_cond_wait"));
-    extern int ring(void*) __asm__(SYMBOL("pthread_cond_signal"));
-    #undef SYMBOL
-    static constexpr auto change = [](Word* member, Word from, Word to) -> bool {
-        return __atomic_compare_exchange_n(member + 0, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
-    };
-    static constexpr auto state_of = [](Word* member) -> Word {
-        return __atomic_load_n(member + 0, __ATOMIC_ACQUIRE);
-    };
-    static constexpr auto set = [](Word* member, Word state) {
-        __atomic_store_n(member + 0, state, __ATOMIC_RELEASE);
-    };
-"""
-
-TOGETHER = f"""
-    // together(team, threads, work) calls work(member) on as many threads, member 0 being the caller, and returns when
-    // all of those that began have returned; one that cannot be had, or is late, leaves its part to the others
-#if defined(_WIN32)
-    auto together = [](unsigned long long*, int, auto& work) {{ work(0); }};
-    auto yield_thread = [] {{}};
-#else
-    {_LIBRARY}
-    auto together = [](Word* team, int threads, auto& work) {{
-        typedef decltype(&work) Work;
-        auto call = [](Word job, int number) {{ (*(Work)job)(number); }};
-        Word* claimed[{MOST_THREADS}];
-        int count = 0;
-        for (int m = 0; m < {MOST_THREADS} && count < threads - 1; ++m) {{
-            Word* const member = team + {_WORDS} * m;
-            if (state_of(member) == 0) break;
-            const bool asleep = change(member, 2, 3);
-            if (!asleep && !change(member, 1, 3)) continue;
-            claimed[count++] = member;
-            member[1] = (Word)(void (*)(Word, int))call;
-            member[2] = (Word)&work;
-            member[3] = count;
-            if (asleep) lock(member + 8);
-            set(member, 4);
-            if (!asleep) continue;
-            unlock(member + 8);
-            ring(member + 16);
-        }}
-        work(0);
-        // to sleep until a thread has ended would take longer than to wait for it to say so
-        for (int t = 0; t < count; ++t)
-            while (!change(claimed[t], 4, 1) && state_of(claimed[t]) == 5) yield_thread();
-    }};
-#endif
-"""
-"""Text that defines ``together``, for native functions."""
-
 
 @wp.func_native("warpmag::start_members(count, team.data);")
 def _start(count: int, team: wp.array2d[wp.uint64]): ...
@@ -108,11 +42,6 @@ def _start_members(
     _start(count, team)
 
 
-def wide_registers() -> dict:
-    """Options of a module with native vectors: registers as wide as there are; clang stops at half of AVX-512."""
-    return {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512"}
-
-
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -125,7 +54,7 @@ def threads_for(count: int, each: int) -> int:
 
 @cache
 def team() -> wp.array:
-    """The members' memory, one for the process; it is what ``together`` takes."""
+    """The members' memory, one for the process; what ``run_together`` of ``team.h`` takes."""
     members = wp.zeros((MOST_THREADS, _WORDS), dtype=wp.uint64, device="cpu")
     wp.launch(_start_members, dim=1, inputs=[min(cores(), MOST_THREADS) - 1], outputs=[members], device="cpu")
     atexit.register(_wait_until_asleep, members.numpy())
