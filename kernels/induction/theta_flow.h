@@ -55,10 +55,6 @@ template <class Array> CUDA_CALLABLE inline void set(const Array& array, const P
 }
 CUDA_CALLABLE inline Vector vector_of(Four f) { return {f.x, f.y, f.z}; }
 
-CUDA_CALLABLE inline Vector group_sums(Vector part) {
-    return {group_sum(part.x), group_sum(part.y), group_sum(part.z)};
-}
-
 struct Material {
     Number saturation, slope;
     int curve;

@@ -29,6 +29,7 @@ from warpmag.kernels.pairs.work_list import arrays_type, block_tiles, cpu_tiles,
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 LOOP, FUSED, MIRRORED, REFERENCE = "loop", "fused", "mirrored", "reference"
@@ -38,8 +39,6 @@ _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE
 _LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
 _LEAST_MUTUAL = 0.75
 """Least part of the sources that are targets, for both ends of a pair to be worth what the mirrored form costs."""
-_GROUP = 8
-"""Threads of a GPU that finish a target row."""
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
 
 
@@ -140,12 +139,12 @@ class PairEvaluation:
     def _launch_finish(self):
         """Launch what follows the sums, recorded, which spares packing the struct each time."""
         if self._finish is None:
-            device, count = self.partial.device, self.count
+            device, group = self.partial.device, group_threads(self.partial.device)
+            threads, members = threads_for(self.count, MOMENTS_PER_THREAD), None if device.is_cuda else team()
             self._finish = wp.launch(
-                _finish_kernel(self.partial.dtype, self._finished),
-                # whole warps, since all threads of one take part in sums over groups
-                dim=32 * -(-_GROUP * count // 32) if device.is_cuda else 1,
-                inputs=[0, 1, threads_for(count, MOMENTS_PER_THREAD), None if device.is_cuda else team(), self._arrays],
+                _finish_kernel(self.partial.dtype, self._finished, group),
+                dim=group * self.count if device.is_cuda else 1,
+                inputs=[0, 1, threads, members, self._arrays],
                 device=device,
                 record_cmd=True,
             )
@@ -172,11 +171,11 @@ def _are_mutual(segments, count: int) -> bool:
 
 
 @cache
-def _finish_kernel(dtype, quantity: Quantity):
+def _finish_kernel(dtype, quantity: Quantity, group: int):
     return passes_kernel(
         f"warpmag::finish<warpmag::Quantity({quantity:d})>(thread, threads, team.data, arrays);",
         arrays_type(dtype),
-        native_options("pairs/finish.h", dtype=dtype, GROUP=_GROUP, **_CONSTANTS),
+        native_options("pairs/finish.h", dtype=dtype, GROUP=group, **_CONSTANTS),
     )
 
 

@@ -36,10 +36,8 @@ CUDA_CALLABLE inline Vector vectors_at(const Real* vectors, Index i) {
 }
 
 #if defined(__CUDA_ARCH__)
-template <class Arrays> CUDA_CALLABLE inline TargetRows target_rows(const Arrays& arrays, int first) {
-    const int row = min(first, arrays.target.shape[0] - 1); // all threads of a warp take part in sums over groups
-    return {
-        row, first == row && share() == 0, row, arrays.target.data[row], arrays.begin.data[row], arrays.end.data[row]};
+template <class Arrays> CUDA_CALLABLE inline TargetRows target_rows(const Arrays& arrays, int row) {
+    return {row, share() == 0, row, arrays.target.data[row], arrays.begin.data[row], arrays.end.data[row]};
 }
 CUDA_CALLABLE inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
     if (at.held > 0) put_vectors(vectors + 3 * (size_t)at.i, 1, v);
@@ -126,8 +124,6 @@ CUDA_CALLABLE inline void store(const Arrays& arrays, const TargetRows& at, Vect
     }
 }
 
-CUDA_CALLABLE inline Vector group_total(Vector v) { return {group_total(v.x), group_total(v.y), group_total(v.z)}; }
-
 template <Quantity Q, class Arrays> CUDA_CALLABLE inline void finish_rows(const Arrays& arrays, int first) {
     const TargetRows at = target_rows(arrays, first);
     const Vector base = vectors_at((const Real*)arrays.base.data, at.i);
@@ -140,7 +136,7 @@ template <Quantity Q, class Arrays> CUDA_CALLABLE inline void finish_rows(const 
         if (Q == Quantity::WRENCH) h = added_parts<6>(arrays, at, 3);
     }
     add_overlaps<Q>(h, f, e, arrays, at);
-    store<Q>(arrays, at, group_total(h), group_total(f), e, base);
+    store<Q>(arrays, at, group_sums(h), group_sums(f), e, base);
 }
 
 // Finishes all target rows, of which a group of threads of a GPU has one.

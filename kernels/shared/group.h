@@ -1,7 +1,7 @@
 // Groups of threads of a GPU that share a ball: ``GROUP`` of them (from Python, a power of two). On a CPU a thread has
 // a vector of balls for itself.
 #pragma once
-#include "shared/lanes.h"
+#include "shared/vectors.h"
 
 namespace warpmag {
 
@@ -42,4 +42,8 @@ inline int most(const int* counts) {
     return largest;
 }
 #endif
+
+CUDA_CALLABLE inline Vector group_sums(Vector part) {
+    return {group_sum(part.x), group_sum(part.y), group_sum(part.z)};
+}
 }
