@@ -61,7 +61,7 @@ from warpmag.kernels.shared.passes import CHUNK, LINE, passes_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
 MOST_KINDS = 16
-"""Susceptibilities that are told apart."""
+"""Susceptibilities that are distinguished."""
 CANDIDATES = 64
 """Balls that may be listed as near, or about to be."""
 MARGIN = 0.05

@@ -16,7 +16,7 @@ CUDA_CALLABLE inline Number group_total(Number part) {
     for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(~0u, part, other);
     return part;
 }
-// The same, of a group that goes its own way in the warp.
+// The same, of a group whose warp may have diverged.
 CUDA_CALLABLE inline Number group_sum(Number part) {
     for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(group_mask(), part, other);
     return part;
