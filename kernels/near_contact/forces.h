@@ -127,25 +127,21 @@ CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
     const Sources own = sources_at(a, Own(i).at);
     const Vector force = sum_forces(a, i, own);
     if (share() > 0) return;
-    const Vector torque = cross(own.m, own_vector(rows_at(a.field, 3, i)));
-    auto add = [=](Real* out, Vector v, int l) {
-        out[0] += UNIT * lane_of(v.x, l);
-        out[1] += UNIT * lane_of(v.y, l);
-        out[2] += UNIT * lane_of(v.z, l);
-    };
-    for (int l = 0; l < WIDTH; ++l) {
-        if (a.movable[i + l] == 0) continue;
-        add(a.forces + 3 * (size_t)(i + l), force, l);
-        if (a.twisted[i + l] == 1) add(a.torques + 3 * (size_t)(i + l), torque, l);
-    }
+    add_to(a.forces, i, UNIT, force, a.movable);
+    add_to(a.torques, i, UNIT, cross(own.m, own_vector(rows_at(a.field, 3, i))), a.turned);
 }
 
-// Two passes: what each ball has of its contacts' forces, then the sums with what the others have.
+// Sweeps, what each ball has of its contacts' forces beside the last step, then the sums with what the others have.
 struct Forces {
     const Arrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
-        if (pass == 0) find_contact_forces(a, i);
-        else add_forces(a, i);
+        if (pass > 2 * SWEEPS) {
+            add_forces(a, i);
+            return;
+        }
+        const Vector h = sweep_pass(a, pass, i);
+        if (pass == 2 * SWEEPS - 1 && share() == 0) put_vector(rows_at(a.field, 3, i), h);
+        if (pass == 2 * SWEEPS) find_contact_forces(a, i);
     }
 };
 }

@@ -35,15 +35,14 @@ kept as slots, those whose surfaces nearly touch first. ``select.h`` and ``tabul
 | kept | [chunks, 24, CHUNK] | what passes keep for those that follow, see below |
 | pair_forces | [chunks + 1, slots, 3, CHUNK] | what a ball has of its contacts' forces; zeros at the end |
 | counterpart | [chunks, slots, CHUNK] | place in ``pair_forces`` of what the other ball has |
-| field | [chunks, 3, CHUNK] | 4π H_near [A/m] |
-| field_row, partial | [balls], [rows, 3] | row of each ball in the field sums, −1 if it has none; the part to add |
+| field | [chunks, 3, CHUNK] | 4π H_near [A/m], for torques |
+| eligible, movable, turned | [balls] | whether a ball takes part, and its force and torque are wanted |
 
 Rows of ``kept`` are 0 to 7 and 13 what balls make of the drive that do not touch (e_Θ, e_m, φ), 8 to 12 what Θ̃ moves
 towards, 16, 22 and 23 (M_sr a)_m, 17 and 18 the polarizability of the quadrupole and the weight that falls as a ball
 saturates. Ball i is number i mod CHUNK of chunk i div CHUNK.
 """
 
-import math
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -55,6 +54,7 @@ import warp as wp
 
 from warpmag.kernels.near_contact import contact_table
 from warpmag.kernels.pairs import neighbors
+from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import CHUNK, LINE, passes_kernel
@@ -75,6 +75,8 @@ GROUP = 8
 SWEEPS = 2
 """Sweeps before each field evaluation, and before forces are taken: with one, a cold solve of a pile takes twice as
 many evaluations."""
+_LAST = 2 * SWEEPS
+"""The last pass of the sweeps: a drive and a step for each."""
 _ROWS = dict(
     PAIR_ROWS=8, PAIR_SLOPE_ROWS=2, CONDUCTANCE_ROWS=17, CONDUCTANCE_SLOPE_ROWS=14, STATE_ROWS=16, KEPT_ROWS=24
 )  # fmt: skip
@@ -94,7 +96,7 @@ def _constants() -> dict[str, int | float]:
         GROUP=GROUP, CANDIDATES=CANDIDATES, NEAR_SLOTS=NEAR_SLOTS, CONTACT_SLOTS=CONTACT_SLOTS, SWEEPS=SWEEPS,
         MARGIN=MARGIN, HALF_RANGE=0.5 * contact_table.RANGE, HALF_REACH=0.5 * contact_table.REACH,
         SMALLEST_GAP=contact_table.SMALLEST_GAP, SOFTNESS=contact_table.SOFTNESS, NODES=nodes, FIRST_NODE=first,
-        NODES_PER_UNIT=(nodes - 1) / (last - first), UNIT=MU0 / (4.0 * math.pi),
+        NODES_PER_UNIT=(nodes - 1) / (last - first), UNIT=MU0 * INVERSE_4PI, INVERSE_4PI=INVERSE_4PI,
         # M of a ball of unit radius on itself
         OWN_SOURCE=1.0 - 1.2 * 2.0 / contact_table.RANGE, OWN_DIPOLE=1.0 - (2.0 / contact_table.RANGE) ** 3,
         PACE=4.0 / (_MOST**0.5 + _LEAST**0.5) ** 2,
@@ -106,14 +108,14 @@ def _constants() -> dict[str, int | float]:
 
 # those that sweeps read stand together, at the end of the integers and at the beginning of the reals
 _INTEGERS = (
-    *("group", "kind", "candidate", "candidate_count", "moved", "used", "counterpart", "field_row"),
-    *("movable", "twisted", "near", "near_count", "contact_count"),
+    *("group", "eligible", "kind", "candidate", "candidate_count", "moved", "used", "counterpart"),
+    *("movable", "turned", "near", "near_count", "contact_count"),
 )
 _SIZES = ("balls", "moment_stride", "kinds", "curve")
 _REALS = (
     *("packed", "radius", "unsaturated", "curve_slope", "hardness", "relaxation", "pairs", "conductances", "state"),
     *("last_state", "sources", "drives", "field", "kept", "pair_slopes", "conductance_slopes", "pair_forces"),
-    *("partial", "found_at", "tables", "places", "forces", "torques"),
+    *("h", "found_at", "tables", "places", "forces", "torques"),
 )
 _MEMBERS = dict.fromkeys(_INTEGERS, wp.uint64) | dict.fromkeys(_SIZES, int) | dict.fromkeys(_REALS, wp.uint64)
 _DOC = "Where arrays begin, side by side, for a GPU to read together; and sizes. As in ``state.h``."
@@ -128,13 +130,13 @@ class NearContactBuffers:
         dtype: Warp scalar type.
         lists: Balls that are near, or about to be.
         arrays: What passes over the pairs work on: those of the table above, and packed, candidate, candidate_count,
-            found_at, moved, movable, twisted, forces and torques of others.
+            found_at, moved, h, forces and torques of others.
         given: Where these are, their sizes and what else passes are given: kinds, the number of kinds of material, and
             the magnetization curve.
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
         threads: Threads of a CPU.
         stream: Stream of a GPU for what is done beside the pair loops.
-        events: There, when it starts, when the field is summed, and when all is done.
+        events: There, when it starts and when it is done.
         commands: Launches as they were recorded, which spares packing the arrays each time.
     """
 
@@ -160,28 +162,25 @@ class NearContactBuffers:
 
 
 def allocate(
-    packed, worlds, eligible, susceptibility, saturation, curve, *, rows, partial, movable, twisted, forces, torques
+    packed, worlds, eligible, susceptibility, saturation, curve, *, movable, turned, h, forces, torques
 ) -> NearContactBuffers:
     """Allocate the buffers.
 
     Args:
-        packed: The moments (``warpmag.packed.PackedMoments``).
+        packed: The moments (``packing.PackedMoments``).
         worlds: World of each moment, shape [n].
         eligible: Whether a moment may take part, shape [n].
         susceptibility: Susceptibility of each, shape [n], may be infinite.
         saturation: Saturation magnetization of each [A/m], shape [n].
         curve: Their magnetization curve, of ``curves.CURVE_IDS``.
-        rows: Work list of the field loop (``pair_loops.Rows``).
-        partial: Its sums, and one part more, to be written by sweeps.
         movable: Whether the force on a moment is wanted, shape [n].
-        twisted: Whether its torque is, shape [n].
+        turned: Whether its torque is, shape [n].
+        h: What the field is added to [A/m], Warp array, shape [n].
         forces: What forces are added to [N], Warp array, shape [n].
         torques: What torques are added to [N·m], Warp array, shape [n].
     """
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
-    field_row = np.full(n, -1)
-    field_row[rows.target.numpy()] = np.arange(rows.count)
 
     def padded(values, other):
         """Values of balls that take part, and another of the rest."""
@@ -200,10 +199,10 @@ def allocate(
         "candidate_count": lists.count,
         "found_at": lists.found_at,
         "moved": lists.moved,
-        "field_row": padded(field_row, -1),
-        "partial": partial[-1],
+        "eligible": padded(1, 0),
         "movable": padded(movable, 0),
-        "twisted": padded(twisted, 0),
+        "turned": padded(movable & turned, 0),
+        "h": h,
         "forces": forces,
         "torques": torques,
     }
@@ -216,7 +215,7 @@ def allocate(
         reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
-        events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
+        events=tuple(wp.Event(device) for _ in range(2)) if device.is_cuda else (),
         commands={},
     )
 
@@ -321,7 +320,7 @@ def _beside(b: NearContactBuffers):
     b.stream.wait_event(wp.get_stream(b.stream.device).record_event(b.events[0]))
     with wp.ScopedStream(b.stream, sync_enter=False):
         yield
-        b.stream.record_event(b.events[2])
+        b.stream.record_event(b.events[1])
 
 
 def launch_find_pairs(b: NearContactBuffers):
@@ -337,39 +336,48 @@ def launch_find_pairs(b: NearContactBuffers):
         _launch(b, "Pairs", 0, 2)
 
 
-def launch_sweeps(b: NearContactBuffers):
-    """Move the contact sources towards those of the packed moments, and write their field into ``partial``.
+def launch_begin_field(b: NearContactBuffers):
+    """Begin to move the contact sources towards those of the packed moments.
 
-    On a GPU that is done beside what is launched next, until :func:`wait_for_field` and :func:`wait` end it.
+    On a GPU that is done beside what is launched next, until :func:`launch_add_field`, which does all of it on a CPU.
+    """
+    if b.reach > 0.0 and b.stream is not None:
+        with _beside(b):
+            _launch(b, "Sweeps", 1, _LAST - 1)
+
+
+def launch_add_field(b: NearContactBuffers):
+    """Add the field of the near contacts [A/m] to that of the moments.
+
+    On a GPU a last step of the sources is done beside what is launched next, until :func:`wait`.
     """
     if b.reach == 0.0:
         return
-    last = 2 * SWEEPS  # steps of all but the last pass find the field
+    if b.stream is None:
+        _launch(b, "Sweeps", 0, _LAST + 1)
+        return
+    wait(b)
+    _launch(b, "Sweeps", _LAST - 1, _LAST)
     with _beside(b):
-        if b.stream is None:
-            _launch(b, "Sweeps", 0, last + 1)
-        else:
-            _launch(b, "Sweeps", 1, last)
-            b.stream.record_event(b.events[1])
-            _launch(b, "Sweeps", last, last + 1)
+        _launch(b, "Sweeps", _LAST, _LAST + 1)
 
 
-def wait_for_field(b: NearContactBuffers):
-    """Have what is launched next wait for the field of :func:`launch_sweeps`."""
+def launch_begin_forces(b: NearContactBuffers):
+    """Begin to find the forces; on a GPU beside what is launched next, until :func:`launch_add_forces`."""
     if b.reach > 0.0 and b.stream is not None:
-        wp.get_stream(b.stream.device).wait_event(b.events[1])
+        with _beside(b):
+            _launch(b, "Forces", 1, _LAST + 1)
+
+
+def launch_add_forces(b: NearContactBuffers):
+    """Add the forces [N] of near pairs, and the torques [N·m] where they are wanted, to those of the moments."""
+    if b.reach == 0.0:
+        return
+    wait(b)
+    _launch(b, "Forces", 0 if b.stream is None else _LAST + 1, _LAST + 2)
 
 
 def wait(b: NearContactBuffers):
     """Have what is launched next wait for all that is done beside."""
     if b.reach > 0.0 and b.stream is not None:
-        wp.get_stream(b.stream.device).wait_event(b.events[2])
-
-
-def launch_add_forces(b: NearContactBuffers):
-    """Add the forces [N] of near pairs, and the torques [N·m] where they are wanted, to those of ``allocate``.
-
-    :func:`launch_sweeps` goes before.
-    """
-    if b.reach > 0.0:
-        _launch(b, "Forces", 0, 2)
+        wp.get_stream(b.stream.device).wait_event(b.events[1])

@@ -60,15 +60,14 @@ CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_RO
     sum[15] += radial * u.z - g1 * m.z;
 }
 
-// Writes the near contacts' part of the field sums.
-CUDA_CALLABLE inline void put_field(const Arrays& a, int i, Vector h) {
-    put_vector(rows_at(a.field, 3, i), h);
+// Adds ``unit`` times vectors to those of balls in an array.
+CUDA_CALLABLE inline void add_to(Real* array, int i, Real unit, Vector v, const int* wanted) {
     for (int l = 0; l < WIDTH; ++l) {
-        if (a.field_row[i + l] < 0) continue;
-        Real* const sum = a.partial + 3 * (size_t)a.field_row[i + l];
-        sum[0] = lane_of(h.x, l);
-        sum[1] = lane_of(h.y, l);
-        sum[2] = lane_of(h.z, l);
+        if (wanted[i + l] <= 0) continue;
+        Real* const own = array + 3 * (size_t)(i + l);
+        own[0] += unit * lane_of(v.x, l);
+        own[1] += unit * lane_of(v.y, l);
+        own[2] += unit * lane_of(v.z, l);
     }
 }
 
@@ -110,8 +109,8 @@ CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], c
     }
 }
 
-// The drive, what quadrupoles move towards, and if wanted 4π H_near = (M_sr a − e)_m.
-template <bool FIRST> CUDA_CALLABLE inline void find_drive(const Arrays& a, int i, bool finds_field) {
+// Finds the drive, and what quadrupoles move towards; returns 4π H_near = (M_sr a − e)_m, but not the first time.
+template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const Arrays& a, int i) {
     Real* const rows = rows_at(a.kept, KEPT_ROWS, i);
     const Parts<KEPT_ROWS> kept(rows);
     const Parts<STATE_ROWS> state(rows_at(a.state, STATE_ROWS, i));
@@ -144,10 +143,9 @@ template <bool FIRST> CUDA_CALLABLE inline void find_drive(const Arrays& a, int 
         put(rows + 17 * CHUNK, soft.p);
         put(rows + 18 * CHUNK, soft.weight);
     }
-    if (!finds_field) return;
+    if (FIRST) return {zero, zero, zero};
     const Vector dipoles = {number(kept, 16), number(kept, 22), number(kept, 23)};
-    const Vector h = less(dipoles, {number(difference, 5), number(difference, 6), number(difference, 7)});
-    if (share() == 0) put_field(a, i, h);
+    return less(dipoles, {number(difference, 5), number(difference, 6), number(difference, 7)});
 }
 
 // What a ball's drive is at a contact in direction u: φ, α, γ, R e_m, and R² e_Θ u.
@@ -231,14 +229,22 @@ CUDA_CALLABLE inline void publish_moment(const Arrays& a, int i) {
     put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
 }
 
-// On a CPU pass 0 publishes moments; then a drive and a step for each sweep. The last drive gives the field.
+// On a CPU pass 0 publishes moments; then a drive and a step for each sweep. Returns 4π H_near after the last drive.
+CUDA_CALLABLE inline Vector sweep_pass(const Arrays& a, int pass, int i) {
+    if (pass == 1) return find_drive<true>(a, i);
+    if (pass % 2 == 1) return find_drive<false>(a, i);
+    if (pass > 0) relax(a, i);
+    else if (SHARES == 1) publish_moment(a, i);
+    const Number zero = numbers(a.radius + i) * Real(0);
+    return {zero, zero, zero};
+}
+
+// Sweeps of a field evaluation. The pass of the last drive adds the near contacts' part to the field.
 struct Sweeps {
     const Arrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
-        if (SHARES == 1 && pass == 0) publish_moment(a, i);
-        else if (pass % 2 == 0) relax(a, i);
-        else if (pass == 1) find_drive<true>(a, i, false);
-        else find_drive<false>(a, i, pass == 2 * SWEEPS - 1);
+        const Vector h = sweep_pass(a, pass, i);
+        if (pass == 2 * SWEEPS - 1 && share() == 0) add_to(a.h, i, INVERSE_4PI, h, a.eligible);
     }
 };
 }
