@@ -149,7 +149,7 @@ class MomentSystem:
         self._make_material(layout.permanent, saturation, susceptibility, curve)
         near = contact_model == "multipole"
         turned = ~layout.lone | lone_torque
-        self._evaluate_field(layout)
+        self._evaluate_field(layout, near)
         self._evaluate_wrench(layout, turned)
         self._near = self._make_near_contacts(layout, turned, saturation, susceptibility, curve) if near else None
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
@@ -186,15 +186,16 @@ class MomentSystem:
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
 
-    def _evaluate_field(self, layout: _Layout):
+    def _evaluate_field(self, layout: _Layout, near: bool):
         """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
         ranges, packed, state = layout.ranges(), self._packed, self._induction
         applied = [(first, middle, middle, last) for first, middle, last in ranges]
         self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self.external_field, state.h0)
         if self._applied.pair_count == 0:
             state.h0 = self.external_field
-        mutual = [(first, middle, first, middle) for first, middle, _ in ranges]
-        self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h)
+        mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
+        # near contacts write one more partial sum
+        self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
 
     def _evaluate_wrench(self, layout: _Layout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
@@ -229,7 +230,7 @@ class MomentSystem:
         )
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, saturation,
-            CURVE_IDS[curve], movable=layout.movable, turned=turned, h=self.h, forces=self.forces,
+            CURVE_IDS[curve], field=self._mutual, movable=layout.movable, turned=turned, forces=self.forces,
             torques=self.torques,
         )  # fmt: skip
 
@@ -290,11 +291,12 @@ class MomentSystem:
 
     def _sum_field(self):
         """Launch the evaluation of the field at the inducible moments; :meth:`_end_sweeps` follows."""
-        if self._near is not None:
-            near_pairs.launch_begin_field(self._near)
-        self._mutual.launch()
-        if self._near is not None:
-            near_pairs.launch_add_field(self._near)
+        near = self._near
+        if near is None:
+            self._mutual.launch()
+            return
+        near_pairs.launch_sweeps(near)
+        self._mutual.launch(wait=lambda: near_pairs.wait_for_field(near))
 
     def _end_sweeps(self):
         """Have what is launched next wait for what near contacts do beside."""

@@ -122,13 +122,24 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& ow
     return {group_total(total.x), group_total(total.y), group_total(total.z)};
 }
 
+// Adds UNIT times vectors to those of the balls in an array that are ``wanted``.
+CUDA_CALLABLE inline void add_to(Real* array, int i, Vector v, const int* wanted) {
+    for (int l = 0; l < WIDTH; ++l) {
+        if (wanted[i + l] == 0) continue;
+        Real* const own = array + 3 * (size_t)(i + l);
+        own[0] += UNIT * lane_of(v.x, l);
+        own[1] += UNIT * lane_of(v.y, l);
+        own[2] += UNIT * lane_of(v.z, l);
+    }
+}
+
 // Adds forces, and torques m × 4π H_near, to those of the moments that move and turn.
 CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
     const Sources own = sources_at(a, Own(i).at);
     const Vector force = sum_forces(a, i, own);
     if (share() > 0) return;
-    add_to(a.forces, i, UNIT, force, a.movable);
-    add_to(a.torques, i, UNIT, cross(own.m, own_vector(rows_at(a.field, 3, i))), a.turned);
+    add_to(a.forces, i, force, a.movable);
+    add_to(a.torques, i, cross(own.m, own_vector(rows_at(a.field, 3, i))), a.turned);
 }
 
 // Sweeps, what each ball has of its contacts' forces beside the last step, then the sums with what the others have.

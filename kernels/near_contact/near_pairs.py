@@ -36,7 +36,8 @@ kept as slots, those whose surfaces nearly touch first. ``select.h`` and ``tabul
 | pair_forces | [chunks + 1, slots, 3, CHUNK] | what a ball has of its contacts' forces; zeros at the end |
 | counterpart | [chunks, slots, CHUNK] | place in ``pair_forces`` of what the other ball has |
 | field | [chunks, 3, CHUNK] | 4π H_near [A/m], for torques |
-| eligible, movable, turned | [balls] | whether a ball takes part, and its force and torque are wanted |
+| field_row, partial | [balls], [rows, 3] | row of each ball in the field sums, −1 if it has none; the part to add |
+| movable, turned | [balls] | whether the force and the torque on a ball are wanted |
 
 Rows of ``kept`` are 0 to 7 and 13 what balls make of the drive that do not touch (e_Θ, e_m, φ), 8 to 12 what Θ̃ moves
 towards, 16, 22 and 23 (M_sr a)_m, 17 and 18 the polarizability of the quadrupole and the weight that falls as a ball
@@ -96,7 +97,7 @@ def _constants() -> dict[str, int | float]:
         GROUP=GROUP, CANDIDATES=CANDIDATES, NEAR_SLOTS=NEAR_SLOTS, CONTACT_SLOTS=CONTACT_SLOTS, SWEEPS=SWEEPS,
         MARGIN=MARGIN, HALF_RANGE=0.5 * contact_table.RANGE, HALF_REACH=0.5 * contact_table.REACH,
         SMALLEST_GAP=contact_table.SMALLEST_GAP, SOFTNESS=contact_table.SOFTNESS, NODES=nodes, FIRST_NODE=first,
-        NODES_PER_UNIT=(nodes - 1) / (last - first), UNIT=MU0 * INVERSE_4PI, INVERSE_4PI=INVERSE_4PI,
+        NODES_PER_UNIT=(nodes - 1) / (last - first), UNIT=MU0 * INVERSE_4PI,
         # M of a ball of unit radius on itself
         OWN_SOURCE=1.0 - 1.2 * 2.0 / contact_table.RANGE, OWN_DIPOLE=1.0 - (2.0 / contact_table.RANGE) ** 3,
         PACE=4.0 / (_MOST**0.5 + _LEAST**0.5) ** 2,
@@ -108,14 +109,14 @@ def _constants() -> dict[str, int | float]:
 
 # those that sweeps read stand together, at the end of the integers and at the beginning of the reals
 _INTEGERS = (
-    *("group", "eligible", "kind", "candidate", "candidate_count", "moved", "used", "counterpart"),
+    *("group", "field_row", "kind", "candidate", "candidate_count", "moved", "used", "counterpart"),
     *("movable", "turned", "near", "near_count", "contact_count"),
 )
 _SIZES = ("balls", "moment_stride", "kinds", "curve")
 _REALS = (
     *("packed", "radius", "unsaturated", "curve_slope", "hardness", "relaxation", "pairs", "conductances", "state"),
     *("last_state", "sources", "drives", "field", "kept", "pair_slopes", "conductance_slopes", "pair_forces"),
-    *("h", "found_at", "tables", "places", "forces", "torques"),
+    *("partial", "found_at", "tables", "places", "forces", "torques"),
 )
 _MEMBERS = dict.fromkeys(_INTEGERS, wp.uint64) | dict.fromkeys(_SIZES, int) | dict.fromkeys(_REALS, wp.uint64)
 _DOC = "Where arrays begin, side by side, for a GPU to read together; and sizes. As in ``state.h``."
@@ -130,13 +131,13 @@ class NearContactBuffers:
         dtype: Warp scalar type.
         lists: Balls that are near, or about to be.
         arrays: What passes over the pairs work on: those of the table above, and packed, candidate, candidate_count,
-            found_at, moved, h, forces and torques of others.
+            found_at, moved, forces and torques of others.
         given: Where these are, their sizes and what else passes are given: kinds, the number of kinds of material, and
             the magnetization curve.
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
         threads: Threads of a CPU.
         stream: Stream of a GPU for what is done beside the pair loops.
-        events: There, when it starts and when it is done.
+        events: There, when it starts, when the field is summed, and when all is done.
         commands: Launches as they were recorded, which spares packing the arrays each time.
     """
 
@@ -162,7 +163,7 @@ class NearContactBuffers:
 
 
 def allocate(
-    packed, worlds, eligible, susceptibility, saturation, curve, *, movable, turned, h, forces, torques
+    packed, worlds, eligible, susceptibility, saturation, curve, *, field, movable, turned, forces, torques
 ) -> NearContactBuffers:
     """Allocate the buffers.
 
@@ -173,14 +174,17 @@ def allocate(
         susceptibility: Susceptibility of each, shape [n], may be infinite.
         saturation: Saturation magnetization of each [A/m], shape [n].
         curve: Their magnetization curve, of ``curves.CURVE_IDS``.
+        field: Evaluation of the field at them (``evaluate.PairEvaluation``), whose last part of the sums is written.
         movable: Whether the force on a moment is wanted, shape [n].
         turned: Whether its torque is, shape [n].
-        h: What the field is added to [A/m], Warp array, shape [n].
         forces: What forces are added to [N], Warp array, shape [n].
         torques: What torques are added to [N·m], Warp array, shape [n].
     """
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
+
+    field_row = np.full(n, -1)
+    field_row[field.target.numpy()] = np.arange(field.count)
 
     def padded(values, other):
         """Values of balls that take part, and another of the rest."""
@@ -199,10 +203,10 @@ def allocate(
         "candidate_count": lists.count,
         "found_at": lists.found_at,
         "moved": lists.moved,
-        "eligible": padded(1, 0),
+        "field_row": padded(field_row, -1),
+        "partial": field.partial[-1],
         "movable": padded(movable, 0),
         "turned": padded(movable & turned, 0),
-        "h": h,
         "forces": forces,
         "torques": torques,
     }
@@ -215,7 +219,7 @@ def allocate(
         reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
-        events=tuple(wp.Event(device) for _ in range(2)) if device.is_cuda else (),
+        events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
         commands={},
     )
 
@@ -320,7 +324,7 @@ def _beside(b: NearContactBuffers):
     b.stream.wait_event(wp.get_stream(b.stream.device).record_event(b.events[0]))
     with wp.ScopedStream(b.stream, sync_enter=False):
         yield
-        b.stream.record_event(b.events[1])
+        b.stream.record_event(b.events[2])
 
 
 def launch_find_pairs(b: NearContactBuffers):
@@ -336,30 +340,26 @@ def launch_find_pairs(b: NearContactBuffers):
         _launch(b, "Pairs", 0, 2)
 
 
-def launch_begin_field(b: NearContactBuffers):
-    """Begin to move the contact sources towards those of the packed moments.
+def launch_sweeps(b: NearContactBuffers):
+    """Move the contact sources towards those of the packed moments, and write their part of the field sums.
 
-    On a GPU that is done beside what is launched next, until :func:`launch_add_field`, which does all of it on a CPU.
-    """
-    if b.reach > 0.0 and b.stream is not None:
-        with _beside(b):
-            _launch(b, "Sweeps", 1, _LAST - 1)
-
-
-def launch_add_field(b: NearContactBuffers):
-    """Add the field of the near contacts [A/m] to that of the moments.
-
-    On a GPU a last step of the sources is done beside what is launched next, until :func:`wait`.
+    On a GPU that is done beside what is launched next, until :func:`wait_for_field` and :func:`wait` end it.
     """
     if b.reach == 0.0:
         return
     if b.stream is None:
         _launch(b, "Sweeps", 0, _LAST + 1)
         return
-    wait(b)
-    _launch(b, "Sweeps", _LAST - 1, _LAST)
     with _beside(b):
+        _launch(b, "Sweeps", 1, _LAST)
+        b.stream.record_event(b.events[1])
         _launch(b, "Sweeps", _LAST, _LAST + 1)
+
+
+def wait_for_field(b: NearContactBuffers):
+    """Have what is launched next wait for the field of :func:`launch_sweeps`."""
+    if b.reach > 0.0 and b.stream is not None:
+        wp.get_stream(b.stream.device).wait_event(b.events[1])
 
 
 def launch_begin_forces(b: NearContactBuffers):
@@ -380,4 +380,4 @@ def launch_add_forces(b: NearContactBuffers):
 def wait(b: NearContactBuffers):
     """Have what is launched next wait for all that is done beside."""
     if b.reach > 0.0 and b.stream is not None:
-        wp.get_stream(b.stream.device).wait_event(b.events[1])
+        wp.get_stream(b.stream.device).wait_event(b.events[2])

@@ -10,12 +10,12 @@ namespace warpmag {
 
 // As ``ContactArrays`` in near_pairs.py: pointers that sweeps read stand side by side, for a GPU to read together.
 struct Arrays {
-    int *group, *eligible, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *turned, *near,
+    int *group, *field_row, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *turned, *near,
         *near_count, *contact_count;
     int balls, moment_stride, kinds, curve;
     Real *packed, *radius, *unsaturated, *curve_slope, *hardness, *relaxation, *pairs, *conductances, *state,
-        *last_state, *sources, *drives, *field, *kept, *pair_slopes, *conductance_slopes, *pair_forces, *h, *found_at,
-        *tables, *places, *forces, *torques;
+        *last_state, *sources, *drives, *field, *kept, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
+        *found_at, *tables, *places, *forces, *torques;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "ContactArrays has the same members in the same order");

@@ -60,17 +60,6 @@ CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_RO
     sum[15] += radial * u.z - g1 * m.z;
 }
 
-// Adds ``unit`` times vectors to those of balls in an array.
-CUDA_CALLABLE inline void add_to(Real* array, int i, Real unit, Vector v, const int* wanted) {
-    for (int l = 0; l < WIDTH; ++l) {
-        if (wanted[i + l] <= 0) continue;
-        Real* const own = array + 3 * (size_t)(i + l);
-        own[0] += unit * lane_of(v.x, l);
-        own[1] += unit * lane_of(v.y, l);
-        own[2] += unit * lane_of(v.z, l);
-    }
-}
-
 // Sums e = M ã over near balls, those that nearly touch last. What the others make, and what moments make, is summed by
 // the first of an evaluation's passes and kept for those that follow.
 template <bool FIRST>
@@ -239,12 +228,19 @@ CUDA_CALLABLE inline Vector sweep_pass(const Arrays& a, int pass, int i) {
     return {zero, zero, zero};
 }
 
-// Sweeps of a field evaluation. The pass of the last drive adds the near contacts' part to the field.
+// Sweeps of a field evaluation. The pass of the last drive writes the near contacts' part of the field sums.
 struct Sweeps {
     const Arrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
         const Vector h = sweep_pass(a, pass, i);
-        if (pass == 2 * SWEEPS - 1 && share() == 0) add_to(a.h, i, INVERSE_4PI, h, a.eligible);
+        if (pass != 2 * SWEEPS - 1 || share() > 0) return;
+        for (int l = 0; l < WIDTH; ++l) {
+            if (a.field_row[i + l] < 0) continue;
+            Real* const part = a.partial + 3 * (size_t)a.field_row[i + l];
+            part[0] = lane_of(h.x, l);
+            part[1] = lane_of(h.y, l);
+            part[2] = lane_of(h.z, l);
+        }
     }
 };
 }

@@ -60,32 +60,34 @@ class PairEvaluation:
         effective: Effective moments e [A·m²], shape [3, t]; None means the moments.
         turned: Whether the torque on a moment is wanted, shape [t].
         torques: Out, torques [N·m], shape [t].
+        extra_parts: Partial sums that the caller writes.
         smoothing: Length ℓ [m] of the paper's smoothing, with the form ``REFERENCE``.
         form: Form of the sums; None means the fastest.
 
     Attributes:
         form: ``LOOP``, ``FUSED``, ``MIRRORED`` or ``REFERENCE``.
         count: Number of target rows.
+        target: Packed column of each, shape [count].
         pair_count: Pairs of a target and a source.
-        partial: Partial sums, shape [parts, rows, sums].
+        partial: Partial sums, shape [parts, rows, sums], the caller's ``extra_parts`` last.
     """
 
     def __init__(
         self, quantity, segments, targets, sources, base, out, *, effective=None, turned=None, torques=None,
-        smoothing=0.0, form=None,
+        extra_parts=0, smoothing=0.0, form=None,
     ):  # fmt: skip
         """Allocate what the form needs."""
         segments = np.asarray(segments, np.int64).reshape(-1, 4)
         device, dtype = targets.device, targets.dtype
-        self.form = form or _choose_form(quantity, segments, device, targets is sources)
+        self.form = form or _choose_form(quantity, segments, device, targets is sources, extra_parts)
         if self.form == MIRRORED:
             segments = segments[:1, [2, 3, 2, 3]]
         self._arrays = a = arrays_type(dtype)()
         a.target, a.begin, a.end = target_rows(segments, device)
-        self.count, self.pair_count = a.target.shape[0], pair_count(segments)
+        self.target, self.count, self.pair_count = a.target, a.target.shape[0], pair_count(segments)
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         parts, tiles = self._plan_sums(quantity, segments, device, smoothing)
-        shape = parts, max(self.count, 1), WIDTHS[quantity]
+        shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
         self.partial = a.partial = wp.zeros(shape, dtype=dtype, device=device)
         a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
@@ -124,11 +126,13 @@ class PairEvaluation:
         )
         return len(ends) - 1, tiles
 
-    def launch(self):
-        """Evaluate at all target rows."""
+    def launch(self, wait=None):
+        """Evaluate at all target rows; ``wait``, if given, is called before the partial sums are added up."""
         if self.count == 0:
             return
         self._launch_sums(self._arrays)
+        if wait is not None:
+            wait()
         if self.form != FUSED:
             self._launch_finish()
 
@@ -147,14 +151,14 @@ class PairEvaluation:
         self._finish.launch()
 
 
-def _choose_form(quantity, segments, device, among) -> str:
+def _choose_form(quantity, segments, device, among, extra_parts) -> str:
     """The fastest form; ``among`` says whether targets and sources are the same moments."""
     if not device.is_cuda:
         return LOOP
     count = int(np.sum(segments[:, 1] - segments[:, 0]))
     if among and count >= _LEAST_MIRRORED.get(quantity, np.inf) and _are_mutual(segments, count):
         return MIRRORED
-    return FUSED if count <= _MOST_FUSED[quantity] else LOOP
+    return FUSED if count <= _MOST_FUSED[quantity] and not extra_parts else LOOP
 
 
 def _are_mutual(segments, count: int) -> bool:
