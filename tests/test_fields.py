@@ -8,12 +8,11 @@ from arrangements import as_float32, overlapping, pile, relative
 
 import warpmag
 from warpmag import oracle
-from warpmag.kernels.pairs import fused_cuda as pair_sums_cuda
-from warpmag.kernels.pairs import mirror_cuda as pair_mirror_cuda
+from warpmag.kernels.pairs import fused_cuda, mirror_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.shared import team as cpu_team
+from warpmag.kernels.shared import team
 
 # Sums of n terms in float32 carry about √n·2⁻²⁴ ≈ 2.7e-6·√(n/2000) in the worst case and 3e-7 in lanes; issue: 1e-6.
 TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
@@ -98,7 +97,7 @@ def test_as_many_targets_as_moments(dtype, device):
 @pytest.mark.parametrize("threads", [1, 3])
 def test_segments(dtype, threads, device, monkeypatch):
     """Two worlds of one radius each, more than a tile of moments, and some moments that see all of them."""
-    monkeypatch.setattr(cpu_team, "cores", lambda: threads)
+    monkeypatch.setattr(team, "cores", lambda: threads)
     x, _, m = pile(count=1500)
     radii = as_float32(np.where(np.arange(1500) < 900, 0.0049, 0.0045))[0]
     segments = [(0, 901, 0, 901), (901, 1490, 901, 1490), (1490, 1500, 3, 1489)]
@@ -150,7 +149,7 @@ def test_any_count_of_touching_balls(count, dtype, device):
     "module, quantity, shape",
     [
         (module, quantity, shape)
-        for module in (pair_sums_cuda, pair_mirror_cuda)
+        for module in (fused_cuda, mirror_cuda)
         for quantity, table in module._SHAPES.items()
         for _, shape in table
     ],
@@ -158,7 +157,7 @@ def test_any_count_of_touching_balls(count, dtype, device):
 def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
     """Those for many moments too, with some moments that fill no tile; of one radius but for a few."""
     monkeypatch.setitem(module._SHAPES, quantity, ((None, shape),))
-    form = MIRRORED if module is pair_mirror_cuda else FUSED
+    form = MIRRORED if module is mirror_cuda else FUSED
     x, radii, m = pile(count=1103)
     radii[40:] = 0.005
     (found, *_) = sums(x, radii, m, [(0, 1103, 0, 1103)], quantity, "float32", device, form=form)
@@ -174,7 +173,7 @@ def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
 @pytest.mark.parametrize("slabs", [1, 3, 100])
 def test_mirrored_passes(slabs, quantity, dtype, device, monkeypatch):
     """Tiles of moments in as many passes as little memory asks for; bodies of three."""
-    monkeypatch.setattr(pair_mirror_cuda, "_SLAB_BYTES", slabs * 12 * 2001)
+    monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", slabs * 12 * 2001)
     x, _, m = pile(count=2001)
     radii, bodies = as_float32(np.where(np.arange(2001) < 1500, 0.0049, 0.004))[0], np.arange(2001) // 3
     form = MIRRORED if device != "cpu" else LOOP

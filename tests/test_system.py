@@ -11,7 +11,7 @@ from warpmag.errors import InputError
 from warpmag.kernels.pairs import evaluate
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.shared import team as cpu_team
+from warpmag.kernels.shared import team
 from warpmag.system import MomentSystem
 
 MS = 1.7e6
@@ -322,7 +322,7 @@ def test_threads_do_not_show(device, monkeypatch):
     velocities = np.random.default_rng(5).normal(size=x.shape) * 2e-4
     results = []
     for cores in (3, 3, 1):
-        monkeypatch.setattr(cpu_team, "cores", lambda cores=cores: cores)
+        monkeypatch.setattr(team, "cores", lambda cores=cores: cores)
         system = MomentSystem(
             radii=np.full(len(x), 0.005), saturation=MS, external_field=[0.0, 0.0, 1e5], rtol=1e-5, device=device
         )

@@ -104,8 +104,8 @@ class MomentSystem:
         dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
         h: Field at inducible moments [A/m], external and all other moments', shape [n].
         forces: Forces [N] on those that may move, shape [n], by :meth:`apply_forces`.
-        torques: Torques e × H about each moment's position [N·m], e being m with Kelvin's law (see ``kernels.wrench``),
-            shape [n]; zero for an inducible ball of one moment.
+        torques: Torques e × H about each moment's position [N·m], e being m with Kelvin's law (see
+            ``kernels.pairs.wrench``), shape [n]; zero for an inducible ball of one moment.
         error: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world, the computable form of Eq. 12, shape [worlds].
         evaluations: Field evaluations of the last solve, shape [worlds].
         converged: 1 where the last solve reached ``rtol``, shape [worlds].

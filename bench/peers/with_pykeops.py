@@ -1,5 +1,7 @@
 """KeOps: the matrix of pairs as a formula, reduced without being stored."""
 
+from typing import Any
+
 import numpy as np
 from pykeops.numpy import LazyTensor
 
@@ -9,7 +11,7 @@ from bench.peers import Evaluation
 def prepare(positions, moments, device):
     """See ``bench.peers``."""
     backend = "GPU" if device.startswith("cuda") else "CPU"
-    r = LazyTensor(positions[:, None, :]) - LazyTensor(positions[None, :, :])
+    r: Any = LazyTensor(positions[:, None, :]) - LazyTensor(positions[None, :, :])
     m = LazyTensor(moments[None, :, :])
     d2 = (r * r).sum(-1)
     # the moment itself counts as infinitely far: step(x) is 1 from 0 on
