@@ -128,9 +128,26 @@ def _check(options) -> int:
     field = ", ".join(f"{value:g}" for value in settings.external_field)
     laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"
     print(f"magnetics   {laws}, rtol {settings.rtol:g}, external field ({field}) A/m")
-    for finding in report.findings:
-        print(f"{finding.severity:11} {finding}")
-    return BAD_INPUT if report.errors else 0
+    errors, warnings = list(map(str, report.refusals)), list(map(str, report.warnings))
+    if not errors:
+        try:
+            warnings = _load(Path(report.path)).warnings()
+        except InputError as error:
+            errors.append(str(error))
+    for severity, lines in (("error", errors), ("warning", warnings)):
+        for line in lines:
+            print(f"{severity:11} {line}")
+    return BAD_INPUT if errors else 0
+
+
+def _load(path: Path, **options):
+    """Return the simulation of a stage, ready to step."""
+    _quiet_warp()
+    from warpmag.engine.simulation import Simulation  # noqa: PLC0415
+
+    if sys.stderr.isatty():
+        print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
+    return Simulation(path, **options)
 
 
 def _render(options) -> int:
@@ -150,13 +167,8 @@ def _run(options) -> int:
         check_rtol("rtol", options.rtol)
     path, is_bundled = _find_scene(options.scene)
     output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
-    _quiet_warp()
-    from warpmag.engine.simulation import Simulation  # noqa: PLC0415
-
-    if sys.stderr.isatty():
-        print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
     method = METHODS[options.method] if options.method else None
-    simulation = Simulation(
+    simulation = _load(
         path,
         solver=options.solver,
         force=options.force or (method and method.force),
@@ -168,7 +180,7 @@ def _run(options) -> int:
         deterministic=options.deterministic,
         visuals=options.viewer != "none",
     )
-    known = simulation.statistics.warnings()
+    known = simulation.warnings()
     _warn(known)
     viewer = _open_viewer(options.viewer, simulation)
     progress = _Progress(simulation.frames_of(options.frames))
@@ -190,7 +202,7 @@ def _run(options) -> int:
     for line in statistics.summary():
         print(line)
     print(f"written        {output}")
-    _warn([line for line in statistics.warnings() if line not in known])
+    _warn([line for line in simulation.warnings() if line not in known])
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
     return 0

@@ -98,7 +98,8 @@ class Magnetics:
             return np.repeat(np.asarray(values, dtype=dtype), counts)
 
         magnets = [one.magnet for one in self.magnets]
-        kinematic = (self._model.body_flags.numpy() & _KINEMATIC) != 0
+        flags = self._model.body_flags  # None in a model without bodies
+        kinematic = [] if flags is None else (flags.numpy() & _KINEMATIC) != 0
         fixed = np.cumsum([one.body < 0 for one in self.magnets]) + self._model.body_count
         bodies = [one.body if one.body >= 0 else own for one, own in zip(self.magnets, fixed, strict=True)]
         return MomentSystem(

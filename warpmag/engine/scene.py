@@ -3,6 +3,7 @@
 import os
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import newton
 import numpy as np
@@ -11,7 +12,7 @@ import warp as wp
 from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, StageMagnets
-from warpmag.usd import StageClock, open_stage, read_magnets, stage_clock
+from warpmag.usd import GroundedJoint, StageClock, enabled_joints, inspect, open_stage, prepare_joints
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class ImportedScene:
         magnets: What the stage says about magnets.
         bodies: Body of each rigid-body prim.
         magnet_shapes: Shapes of each magnet prim.
+        warnings: What the user should know about the stage, a line each.
     """
 
     stage: object
@@ -33,6 +35,7 @@ class ImportedScene:
     magnets: StageMagnets
     bodies: dict[str, int]
     magnet_shapes: dict[str, list[int]]
+    warnings: tuple[str, ...]
 
 
 def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: float | None = None) -> ImportedScene:
@@ -44,23 +47,79 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
         time_code: The moment at which bodies stand; by default the start of the stage.
 
     Raises:
-        InputError: The stage cannot be read, or a magnet of it became no shape.
+        InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
     """
     stage = open_stage(path, time_code)
-    magnets = read_magnets(stage)
-    clock = stage_clock(stage)
+    report = inspect(stage, path)
+    if report.refusals:
+        raise InputError(str(report.refusals[0]))
+    clock, contents = report.clock, report.contents
+    assert clock is not None, "a clock that is wrong is a reason to refuse"
+    grounded = prepare_joints(stage)
     builder = newton.ModelBuilder()
     register_attributes(builder)
+    found = _add_stage(builder, stage, path, visuals)
+    _let_frictionless_roll(builder)
+    bodies, shapes, joints = found["path_body_map"], found["path_shape_map"], found["path_joint_map"]
+    for prim in contents.bodies:
+        if prim not in bodies:
+            raise InputError(f"{prim}: Newton imports no body from it, as from one that only excluded joints hold")
+    for joint in enabled_joints(stage):
+        if str(joint.GetPath()) not in joints:
+            raise InputError(f"{joint.GetPath()}: Newton imports no joint from it")
+    for joint in grounded:
+        _place_on_ground(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
+    covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
+    magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
+    return ImportedScene(stage, builder, clock, magnets, bodies, covered, tuple(map(str, report.warnings)))
+
+
+def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:
+    """Let Newton import ``stage``; return which prim became what."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            found = builder.add_usd(stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals)
-        except (ValueError, RuntimeError, NotImplementedError) as error:
-            raise InputError(f"{path}: Newton cannot import it ({' '.join(str(error).split())})") from None
-    _let_frictionless_roll(builder)
-    bodies, shapes = found["path_body_map"], found["path_shape_map"]
+            return builder.add_usd(
+                stage,
+                apply_up_axis_from_stage=True,
+                load_visual_shapes=visuals,
+                only_load_enabled_rigid_bodies=True,
+            )
+        except Exception as error:  # whatever its importer stumbles over
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{path}: Newton cannot import it ({reason})") from None
+
+
+def _place_on_ground(
+    builder: newton.ModelBuilder, joint: GroundedJoint, number: int, body: int, shapes: dict[str, int]
+) -> None:
+    """Put right what Newton makes of a joint to something that does not move.
+
+    It takes the fixed end for one that lies where the body's end is, which a distance joint need not do, the frame of
+    a fixed prim for that of the world, and ``body0`` for the end that is fixed.
+    """
+    kind = builder.joint_type[number]
+    if joint.fixed or kind == newton.JointType.DISTANCE:
+        builder.joint_X_p[number] = wp.transform(joint.position, joint.rotation)
+    if joint.reversed and kind in (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC):
+        axis = builder.joint_qd_start[number]
+        lower, upper = builder.joint_limit_lower[axis], builder.joint_limit_upper[axis]
+        builder.joint_limit_lower[axis], builder.joint_limit_upper[axis] = -upper, -lower
+        builder.joint_target_qd[axis] *= -1.0
+        builder.joint_target_q[builder.joint_q_start[number]] *= -1.0
+    if joint.fixed and not joint.collides:
+        for prim, shape in shapes.items():
+            if prim == joint.fixed or prim.startswith(f"{joint.fixed}/"):
+                for other in builder.body_shapes[body]:
+                    builder.add_shape_collision_filter_pair(shape, other)
+
+
+def _mark_magnets(
+    builder: newton.ModelBuilder, stage, magnets: dict[str, Magnet], bodies: dict[str, int], shapes: dict[str, int]
+) -> dict[str, list[int]]:
+    """Let the shapes of the magnet prims carry the magnets; return the shapes of each prim."""
     covered = {}
-    for prim, magnet in magnets.magnets.items():
+    for prim, magnet in magnets.items():
         if prim in bodies:
             covered[prim] = magnet_shapes(builder, bodies[prim])
         elif prim in shapes:
@@ -70,7 +129,7 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
         for shape in covered[prim]:
             turn = builder.shape_transform[shape].q if prim in bodies else _axis_turn(stage, prim)
             mark_shape(builder, shape, _in_shape_frame(magnet, turn))
-    return ImportedScene(stage, builder, clock, magnets, bodies, covered)
+    return covered
 
 
 def _in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import resolve_device
-from warpmag.engine.contacts import RigidSolver, body_sizes
+from warpmag.engine.contacts import MAXIMAL, RigidSolver, body_sizes
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -87,18 +87,11 @@ class Simulation:
         if isinstance(scene, newton.ModelBuilder):
             builder, settings = scene, MagneticSettings()
         else:
-            from warpmag.engine.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
-
-            self._scene = import_scene(scene, visuals=visuals)
-            builder, settings, clock = self._scene.builder, self._scene.magnets.settings, self._scene.clock
-            self.frame_rate, step = clock.frames_per_second, step if step is not None else clock.step
-            seconds = (clock.end - clock.start) / clock.time_codes_per_second
-            self.frame_count = round(seconds * self.frame_rate) or None
+            builder, settings, own_step = self._open(scene, visuals)
+            step = own_step if step is None else step
         self.step_size = DEFAULT_STEP if step is None else step
         check_positive("step", self.step_size)
-        with wp.ScopedDevice(self.device):
-            self.model = builder.finalize(device=self.device)
-        self._check_poses()
+        self.model = self._finalize(builder, solver)
         self._magnetics = Magnetics(
             self.model,
             force=settings.force if force is None else force,
@@ -108,7 +101,42 @@ class Simulation:
             external_field=settings.external_field if external_field is None else external_field,
             curve=curve,
         )
-        sizes = body_sizes(self.model)
+        self._prepare(solver, graphs, deterministic)
+
+    def _open(self, path: str | os.PathLike, visuals: bool) -> tuple:
+        """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
+        from warpmag.engine.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
+
+        self._scene = import_scene(path, visuals=visuals)
+        clock = self._scene.clock
+        self.frame_rate = clock.frames_per_second
+        seconds = (clock.end - clock.start) / clock.time_codes_per_second
+        self.frame_count = round(seconds * self.frame_rate) or None
+        return self._scene.builder, self._scene.magnets.settings, clock.step
+
+    def _finalize(self, builder: newton.ModelBuilder, solver: str) -> newton.Model:
+        """Make the model."""
+        _check_articulations(builder, solver)
+        if not builder.body_count:  # Newton allocates nothing for bodies then; one without shapes changes nothing
+            whole = newton.ModelBuilder()
+            whole.add_builder(builder)
+            whole.add_link(is_kinematic=True)
+            builder = whole
+        with wp.ScopedDevice(self.device):
+            try:
+                model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
+            except ValueError as error:
+                raise InputError(f"scene: Newton cannot take it ({' '.join(str(error).split())})") from None
+        for name in ("body_q", "body_qd"):
+            bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
+            if bad.any():
+                what = "position or orientation" if name == "body_q" else "velocity"
+                raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {what} is not finite")
+        return model
+
+    def _prepare(self, solver: str, graphs: bool, deterministic: bool) -> None:
+        """Set up what moves the bodies, and look at how they start."""
+        self._sizes = sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver, deterministic=deterministic)
         self._stepper = Stepper(
             self.model,
@@ -119,7 +147,6 @@ class Simulation:
             longest_substep=LONGEST_SUBSTEP,
             graphs=graphs,
         )
-        self._sizes = sizes
         self._moving = np.array(
             sorted({one.body for one in self._magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int
         )
@@ -140,13 +167,6 @@ class Simulation:
             return 0.0
         farthest = np.abs(self.state.body_q.numpy()[moving, :3]).max()
         return float(np.spacing(farthest) / self._sizes.thickness[moving].min())
-
-    def _check_poses(self) -> None:
-        for name in ("body_q", "body_qd"):
-            bad = ~np.isfinite(getattr(self.model, name).numpy()).all(axis=1)
-            if bad.any():
-                what = "position or orientation" if name == "body_q" else "velocity"
-                raise InputError(f"{self.model.body_label[int(np.argmax(bad))]}: {what} is not finite")
 
     def _start_from_stage(self) -> None:
         """Let induction start from the moments that the stage holds, of an earlier run say."""
@@ -180,6 +200,10 @@ class Simulation:
         """Figures of the run so far, those of the end filled in by :meth:`finish`; waits as :attr:`state` does."""
         self._look()
         return self._statistics
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
+        return [*(self._scene.warnings if self._scene else ()), *self.statistics.warnings()]
 
     @property
     def capture_failure(self) -> str:
@@ -316,6 +340,22 @@ class Simulation:
         pairs = node[np.stack(sides, axis=1)]
         touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
         return find_held(pairs[touching], holds, fixed)[: model.body_count]
+
+
+def _check_articulations(builder: newton.ModelBuilder, solver: str) -> None:
+    """Refuse joints outside articulations to solvers that know bodies by their articulations alone."""
+    if solver in MAXIMAL:
+        return
+    joints = list(
+        zip(builder.joint_label, builder.joint_articulation, builder.joint_parent, builder.joint_child, strict=True)
+    )
+    inside = {body for _, articulation, *bodies in joints if articulation >= 0 for body in bodies}
+    for label, articulation, parent, child in joints:
+        if articulation < 0 and parent >= 0 and child not in inside:
+            raise InputError(
+                f"{label}: a joint outside all articulations, which the solver {solver} cannot take, but "
+                f"{' and '.join(MAXIMAL)} can; or apply PhysicsArticulationRootAPI above it"
+            )
 
 
 @contextlib.contextmanager

@@ -6,7 +6,8 @@ attributes right even then).
 """
 
 from warpmag.usd.schemas import author_magnet, author_settings  # isort: skip  (registers the schemas first)
-from warpmag.usd.check import StageReport, check
+from warpmag.usd.check import StageReport, check, inspect
+from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints
 from warpmag.usd.reader import (
     Finding,
     StageClock,
@@ -24,6 +25,7 @@ from warpmag.usd.writer import CacheWriter
 __all__ = [
     "CacheWriter",
     "Finding",
+    "GroundedJoint",
     "StageClock",
     "StageContents",
     "StageReport",
@@ -31,9 +33,12 @@ __all__ = [
     "author_settings",
     "check",
     "describe",
+    "enabled_joints",
     "first_camera",
     "hold",
+    "inspect",
     "open_stage",
+    "prepare_joints",
     "read_magnets",
     "stage_clock",
     "survey",

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pxr import Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
 
 from warpmag.errors import InputError
+from warpmag.usd.joints import joint_findings
 from warpmag.usd.reader import Finding, StageClock, StageContents, open_stage, stage_clock, stage_name, survey
 
 _SEVERITIES = {"Error": "error", "Warn": "warning"}
@@ -23,6 +24,7 @@ class StageReport:
         clock: How time runs, None where that is wrong.
         contents: Bodies, colliders, magnets and settings.
         findings: All that is wrong, the findings of ``UsdValidation`` included; errors before warnings.
+        refusals: The findings for which a run refuses the stage.
     """
 
     path: str
@@ -32,11 +34,17 @@ class StageReport:
     clock: StageClock | None
     contents: StageContents
     findings: tuple[Finding, ...]
+    refusals: tuple[Finding, ...]
 
     @property
     def errors(self) -> tuple[Finding, ...]:
         """The findings for which a run would refuse the stage, or that break a rule of USD."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """The findings with which a stage still runs, broken rules of USD among them."""
+        return tuple(finding for finding in self.findings if finding not in self.refusals)
 
     def magnets(self, kind: str) -> list[str]:
         """Paths of the magnets of one kind, ``inducible`` or ``permanent``."""
@@ -49,15 +57,25 @@ def check(path: str | os.PathLike) -> StageReport:
     Raises:
         InputError: The file cannot be opened as a stage at all.
     """
-    stage = open_stage(path)
+    return inspect(open_stage(path), path)
+
+
+def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
+    """Do what :func:`check` does with an open stage.
+
+    Args:
+        stage: As :func:`open_stage` opened it.
+        path: File of the stage.
+    """
     contents = survey(stage)
-    findings = list(contents.findings)
+    findings = [*contents.findings, *joint_findings(stage)]
     try:
         clock = stage_clock(stage)
     except InputError as error:
         clock = None
         where, _, message = str(error).rpartition(": ")
         findings.append(Finding(where, message))
+    refusals = tuple(dict.fromkeys(finding for finding in findings if finding.severity == "error"))
     findings += validate(stage)
     return StageReport(
         path=str(path),
@@ -67,6 +85,7 @@ def check(path: str | os.PathLike) -> StageReport:
         clock=clock,
         contents=contents,
         findings=tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")),
+        refusals=refusals,
     )
 
 

@@ -1,0 +1,358 @@
+"""Scenes that are unusual and valid run with sane physics; what cannot run is told alike by ``check`` and ``run``."""
+
+import math
+
+import newton
+import numpy as np
+import pytest
+from pxr import Usd
+
+import warpmag
+from warpmag import cli
+from warpmag.engine.simulation import Simulation
+from warpmag.usd import check
+
+G = 9.81  # m/s²
+R = 0.005  # m
+IRON = 7870.0  # kg/m³
+HEAD = """#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 1
+    kilogramsPerUnit = 1
+    upAxis = "Z"
+    timeCodesPerSecond = 60
+    startTimeCode = 0
+    endTimeCode = 60
+)
+"""
+PERMANENT = 'uniform token warpmag:kind = "permanent"\n vector3f warpmag:magnetization = (0, 0, 1e6)\n'
+FIELD = (0.0, 0.0, 1000.0)  # A/m: far from saturation
+
+
+def physics(gravity=G, field=(0.0, 0.0, 0.0), name="Scene"):
+    return f"""def PhysicsScene "{name}" (prepend apiSchemas = ["WarpmagSceneAPI"]) {{
+    vector3f physics:gravityDirection = (0, 0, -1)
+    float physics:gravityMagnitude = {gravity}
+    vector3f warpmag:externalField = {field}
+}}
+"""
+
+
+def ball(name, place, lines="", radius=R, magnet=True, body=True, kinematic=False):
+    schemas = ["PhysicsCollisionAPI", "PhysicsMassAPI"]
+    schemas += ["PhysicsRigidBodyAPI"] * body + ["WarpmagMagnetAPI"] * magnet
+    return f"""def Sphere "{name}" (prepend apiSchemas = {str(schemas).replace("'", '"')}) {{
+    double radius = {radius}
+    float physics:density = {IRON}
+    double3 xformOp:translate = {place}
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    {"bool physics:kinematicEnabled = 1" if kinematic else ""}
+    {lines}
+}}
+"""
+
+
+def joint(kind, one, other, place_of_one, place_of_other, lines="", name="Joint"):
+    """A joint about the y axis between prims of the world, or None for the world itself."""
+    bodies = [f"rel physics:body{k} = </World/{prim}>" for k, prim in enumerate((one, other)) if prim]
+    axis = 'uniform token physics:axis = "Y"' if kind in ("Revolute", "Prismatic") else ""
+    return f"""def Physics{kind}Joint "{name}" {{
+    {chr(10).join([*bodies, axis])}
+    point3f physics:localPos0 = {place_of_one}
+    point3f physics:localPos1 = {place_of_other}
+    quatf physics:localRot0 = (1, 0, 0, 0)
+    quatf physics:localRot1 = (1, 0, 0, 0)
+    {lines}
+}}
+"""
+
+
+def write(folder, *parts):
+    path = folder / "scene.usda"
+    path.write_text(HEAD + 'def Xform "World" {\n' + "".join(parts) + "}\n")
+    return path
+
+
+def advance(simulation, seconds):
+    for _ in range(round(seconds / simulation.step_size)):
+        simulation.step()
+    return simulation.state.body_q.numpy(), simulation.state.body_qd.numpy()
+
+
+def told(path, folder, device, capsys, frames=2):
+    """Errors and warnings of ``check`` and ``run``; both commands end alike."""
+    capsys.readouterr()
+    code = cli.main(["check", str(path)])
+    lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    checked = {kind: [rest for name, rest in lines if name == kind] for kind in ("error", "warning")}
+    command = ["run", str(path), "-o", str(folder / "out.usda"), "--frames", str(frames), "--device", device]
+    assert cli.main(command) == code
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warpmag: ")]
+    ran = [line.removeprefix("warpmag: warning: ") for line in lines if line.startswith("warpmag: warning: ")]
+    refused = [line.removeprefix("warpmag: ") for line in lines if not line.startswith("warpmag: warning: ")]
+    assert code == (cli.BAD_INPUT if checked["error"] else 0)
+    assert refused == checked["error"][:1]
+    if not refused:
+        assert ran == checked["warning"]
+    return checked["error"], checked["warning"]
+
+
+A, B, C = (ball(name, (0.05 * k, 0.0, 1.0)) for k, name in enumerate("ABC"))
+RIGHT, LEFT = (0.025, 0.0, 0.0), (-0.025, 0.0, 0.0)
+CHAIN = [joint("Spherical", one, other, RIGHT, LEFT, name=one + other) for one, other in ("AB", "BC")]
+COMPOUND = f"""def Xform "Body" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {{
+    double3 xformOp:translate = (0, 0, 1)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    {ball("Magnet", (0, 0, 0), body=False)}
+    {ball("Other", (2 * R, 0, 0), body=False, magnet=False)}
+}}
+"""
+FALLING = {
+    "no physics scene, no ground": [A],
+    "one body of a magnet and something else": [physics(), COMPOUND],
+    "only permanent magnets": [physics(), ball("A", (0, 0, 1), PERMANENT), ball("B", (2.0, 0, 1), PERMANENT)],
+    "a chain": [physics(), A, B, C, *CHAIN],
+    "a chain named from its end": [
+        *(physics(), A, B, C),
+        *(joint("Revolute", one, other, LEFT, RIGHT, name=one + other) for one, other in ("CB", "BA")),
+    ],
+    "two joints into one body": [
+        *(physics(), A, B, C, CHAIN[0]),
+        joint("Spherical", "C", "B", LEFT, RIGHT, name="CB"),
+    ],
+    "a loop": [physics(), A, B, C, *CHAIN, joint("Spherical", "C", "A", (-0.05, 0, 0), (0.05, 0, 0), name="CA")],
+    **{
+        f"a pair with a {kind} joint": [physics(), A, B, joint(kind, "A", "B", RIGHT, LEFT)]
+        for kind in ("Fixed", "Prismatic", "Distance")
+    },
+}
+
+
+@pytest.mark.parametrize("case", FALLING)
+def test_what_nothing_holds_falls_freely(case, device, tmp_path, capsys):
+    path = write(tmp_path, *FALLING[case])
+    told(path, tmp_path, device, capsys, frames=6)
+    stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
+    places = [prim.GetAttribute("xformOp:translate:warpmag") for prim in stage.Traverse()]
+    ways = np.array([np.subtract(place.Get(0.0), place.Get(6.0)) for place in places if place])
+    # Symplectic Euler with substeps h falls g t (t + h) / 2; substeps are 0.5 ms. The centre of equal balls falls.
+    fallen = 0.5 * G * 0.1 * (0.1 + 5e-4)
+    np.testing.assert_allclose(ways.mean(axis=0), (0.0, 0.0, fallen), atol=1e-3 * fallen)
+
+
+LENGTH, BOB = 0.1, 0.05  # m
+SWUNG = ball("Bob", (LENGTH, 0, 1), radius=BOB)
+HOLDER = {"radius": 0.06, "magnet": False}  # into the ball: bodies of a joint do not collide
+FIRST, SECOND = (0.0, 0.0, 0.0), (-LENGTH, 0.0, 0.0)
+PENDULUMS = {
+    "the world": [joint("Revolute", None, "Bob", (0, 0, 1), SECOND)],
+    "a static prim": [
+        ball("Stand", (0, 0, 1), body=False, **HOLDER),
+        joint("Revolute", "Bob", "Stand", SECOND, FIRST),
+    ],
+    "a disabled body": [
+        ball("Stand", (0, 0, 1), "bool physics:rigidBodyEnabled = 0", **HOLDER),
+        joint("Revolute", "Stand", "Bob", FIRST, SECOND),
+    ],
+    "two static prims": [
+        *(ball(name, (0, y, 1), body=False, **HOLDER) for name, y in (("Left", 0.02), ("Right", -0.02))),
+        joint("Revolute", "Left", "Bob", (0, -0.02, 0), SECOND, name="One"),
+        joint("Revolute", "Right", "Bob", (0, 0.02, 0), SECOND, name="Other"),
+    ],
+    "a kinematic body": [
+        ball("Stand", (0, 0, 1), kinematic=True, **HOLDER),
+        joint("Spherical", "Stand", "Bob", FIRST, SECOND),
+    ],
+    "a kinematic body, the other way round": [
+        ball("Stand", (0, 0, 1), kinematic=True, **HOLDER),
+        joint("Revolute", "Bob", "Stand", SECOND, FIRST),
+    ],
+}
+
+
+@pytest.mark.parametrize("held_by", PENDULUMS)
+def test_the_first_swing_of_a_pendulum(held_by, device, tmp_path):
+    simulation = Simulation(write(tmp_path, physics(), SWUNG, *PENDULUMS[held_by]), device=device)
+    assert simulation.statistics.overlapping == 0
+    # From the horizontal to the bottom: I/(m g L) under a root, times the elliptic integral K(sin 45°).
+    quarter = math.sqrt((LENGTH**2 + 0.4 * BOB**2) / (G * LENGTH)) * 1.85407467730137
+    poses, speeds = advance(simulation, quarter)
+    swung = math.degrees(math.atan2(1.0 - poses[0, 2], poses[0, 0]))
+    assert swung == pytest.approx(90.0, abs=1.0)  # a step is 0.8 degrees there; XPBD loses 0.8 % of the speed
+    fastest = math.sqrt(2.0 * G * LENGTH / (LENGTH**2 + 0.4 * BOB**2))
+    assert speeds[0, 4] == pytest.approx(fastest, rel=0.015)
+
+
+def test_a_distance_joint_is_a_rope(device, tmp_path):
+    rope = joint("Distance", None, "Bob", (0, 0, 1), (0, 0, 0), f"float physics:maxDistance = {LENGTH}")
+    simulation = Simulation(write(tmp_path, physics(), ball("Bob", (LENGTH, 0, 1)), rope), device=device)
+    poses, speeds = advance(simulation, math.sqrt(LENGTH / G) * 1.85407467730137)
+    np.testing.assert_allclose(poses[0, :3], (0.0, 0.0, 1.0 - LENGTH), atol=0.02 * LENGTH)
+    assert np.linalg.norm(speeds[0, :3]) == pytest.approx(math.sqrt(2.0 * G * LENGTH), rel=0.015)
+
+
+@pytest.mark.parametrize(("one", "other", "fallen"), [(None, "Bob", 20.0), ("Bob", None, 10.0)])
+def test_limits_count_from_body0_to_body1(one, other, fallen, device, tmp_path):
+    ends = [(0, 0, 1), SECOND] if one is None else [SECOND, (0, 0, 1)]
+    limits = "float physics:lowerLimit = -10\n float physics:upperLimit = 20"
+    simulation = Simulation(
+        write(tmp_path, physics(), SWUNG, joint("Revolute", one, other, *ends, limits)), device=device
+    )
+    [pose], _ = advance(simulation, 0.4)
+    assert math.degrees(math.atan2(1.0 - pose[2], pose[0])) == pytest.approx(fallen, abs=0.1)
+
+
+def test_a_generic_joint_is_free_where_it_has_no_limit(device, tmp_path):
+    moving = ball("A", (0, 0, 1), "vector3f physics:velocity = (0, 0, 0.1)", magnet=False)
+    path = write(tmp_path, physics(0.0), moving, B, joint("", "A", "B", RIGHT, LEFT))
+    _, speeds = advance(Simulation(path, device=device), 0.05)
+    np.testing.assert_allclose(speeds[:, 2], (0.1, 0.0), atol=1e-6)
+
+
+STILL = {
+    "one static magnet": [physics(), ball("A", (0, 0, 0), PERMANENT, body=False)],
+    "kinematic bodies alone": [
+        physics(),
+        *(ball("A", (0, 0, 0), PERMANENT, kinematic=True), ball("B", (0.02, 0, 0), kinematic=True)),
+    ],
+    "no rigid bodies": [
+        physics(),
+        *(ball("A", (0, 0, 0), PERMANENT, body=False), ball("B", (0.02, 0, 0), body=False)),
+    ],
+    "zero gravity": [physics(0.0), A],
+}
+
+
+@pytest.mark.parametrize("case", STILL)
+def test_what_nothing_moves_stays(case, device, tmp_path, capsys):
+    path = write(tmp_path, *STILL[case])
+    assert told(path, tmp_path, device, capsys) == ([], [])
+    before, after = Usd.Stage.Open(str(path)), Usd.Stage.Open(str(tmp_path / "out.usda"))
+    for name in ("A", "B"):
+        if prim := before.GetPrimAtPath(f"/World/{name}"):
+            place = after.GetPrimAtPath(prim.GetPath()).GetAttribute("xformOp:translate:warpmag")
+            assert not place or np.allclose(place.Get(2.0), prim.GetAttribute("xformOp:translate").Get(), atol=1e-7)
+    permanent = after.GetPrimAtPath("/World/A").GetAttribute("warpmag:moment").Get(2.0)
+    volume = 4.0 / 3.0 * math.pi * R**3
+    if case != "zero gravity":
+        np.testing.assert_allclose(permanent, (0.0, 0.0, 1e6 * volume), rtol=1e-6)
+    if induced := after.GetAttributeAtPath("/World/B.warpmag:moment"):
+        field = -1e6 * volume / (4.0 * math.pi * 0.02**3)  # beside a dipole
+        expected = 1.7e6 * math.tanh(3.0 * field / 1.7e6) * volume
+        np.testing.assert_allclose(induced.Get(2.0), (0.0, 0.0, expected), rtol=2e-3, atol=-1e-6 * expected)
+
+
+@pytest.mark.parametrize("body", [True, False])
+def test_an_iron_ball_alone_in_a_field(body, device, tmp_path):
+    simulation = Simulation(write(tmp_path, physics(0.0, FIELD), ball("A", (0, 0, 1), body=body)), device=device)
+    poses, _ = advance(simulation, 0.02)
+    volume = 4.0 / 3.0 * math.pi * R**3
+    # tanh(3 H/Ms) is linear there to 1e-6
+    np.testing.assert_allclose(simulation.magnetics.shape_moments(), [volume * 3.0 * np.array(FIELD)], rtol=2e-3)
+    if body:
+        np.testing.assert_allclose(poses[0, :3], (0, 0, 1), atol=1e-7)
+
+
+def test_permanent_magnets_attract_as_dipoles(device, tmp_path):
+    apart = 0.04  # m, one above the other
+    magnets = [ball(name, (0, 0, z), PERMANENT) for name, z in (("A", 0.0), ("B", apart))]
+    simulation = Simulation(write(tmp_path, physics(0.0), *magnets), device=device)
+    _, speeds = advance(simulation, 0.002)
+    volume = 4.0 / 3.0 * math.pi * R**3
+    force = 6.0 * 4e-7 * math.pi * (1e6 * volume) ** 2 / (4.0 * math.pi * apart**4)
+    expected = force / (IRON * volume) * 0.002
+    np.testing.assert_allclose(speeds[:, 2], (expected, -expected), rtol=0.01)  # they come 0.2 % closer
+
+
+REFUSED = {
+    "no magnets": ([physics(), ball("A", (0, 0, 1), magnet=False)], "no magnets: no prim has WarpmagMagnetAPI"),
+    "nothing at all": ([], "no magnets: no prim has WarpmagMagnetAPI"),
+    "two scenes": ([physics(), physics(name="Other"), A], "/World/Other: one PhysicsScene of several"),
+    "a joint to nowhere": (
+        [A, joint("Revolute", "A", "Nowhere", RIGHT, LEFT)],
+        "/World/Joint: physics:body1 names /World/Nowhere, which is not there",
+    ),
+    "a joint of one body": ([A, joint("Revolute", "A", "A", RIGHT, LEFT)], "/World/Joint: both of its ends are on the"),
+    "a joint to two": (
+        [A, B, joint("Revolute", "A", "B", RIGHT, LEFT).replace("</World/B>", "[</World/A>, </World/B>]")],
+        "/World/Joint: physics:body1 names 2 prims",
+    ),
+    "curves": (
+        [A, B.replace("double radius", 'uniform token warpmag:curve = "langevin"\n double radius')],
+        "its magnets have the curves langevin, tanh",
+    ),
+    "an excluded joint": (
+        [
+            'def Xform "R" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {\n',
+            *(A, B, C, CHAIN[0].replace("World/", "World/R/")),
+            CHAIN[1].replace("World/", "World/R/").replace("point3f", "bool physics:excludeFromArticulation = 1\n#", 1),
+            "}\n",
+        ],
+        "/World/R/C: Newton imports no body from it",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_run_is_told_by_both(case, device, tmp_path, capsys):
+    parts, message = REFUSED[case]
+    [error], _ = told(write(tmp_path, *parts), tmp_path, device, capsys)
+    assert message in error
+
+
+WARNED = {
+    "a joint of nothing": ([A, joint("Revolute", None, None, RIGHT, LEFT)], "/World/Joint: joins things that do not"),
+    "a joint of kinematic bodies": (
+        [A, ball("K", (1, 0, 0), kinematic=True, magnet=False), joint("Fixed", "K", None, RIGHT, LEFT)],
+        "/World/Joint: joins things that do not move",
+    ),
+    "an overlap": ([A, ball("B", (1.9 * R, 0, 1))], "1 pair of bodies overlaps at the start"),
+}
+
+
+@pytest.mark.parametrize("case", WARNED)
+def test_warnings_of_both_are_the_same(case, device, tmp_path, capsys):
+    parts, message = WARNED[case]
+    errors, warnings = told(write(tmp_path, *parts), tmp_path, device, capsys)
+    assert errors == []
+    assert any(message in warning for warning in warnings)
+
+
+def test_a_broken_rule_of_usd_is_a_warning(device, tmp_path, capsys):
+    path = write(tmp_path, A)
+    path.write_text(path.read_text().replace('defaultPrim = "World"', ""))
+    assert [finding.severity for finding in check(path).errors] == ["error"]
+    errors, [warning] = told(path, tmp_path, device, capsys)
+    assert errors == []
+    assert "missing defaultPrim" in warning
+
+
+def test_a_builder_of_one_static_magnet(device):
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    magnet = builder.add_shape_sphere(-1, radius=R)
+    warpmag.add_permanent(builder, shape=magnet, magnetization=(0.0, 0.0, 1e6))
+    simulation = Simulation(builder, device=device)
+    simulation.step()
+    moment = 1e6 * 4.0 / 3.0 * math.pi * R**3
+    np.testing.assert_allclose(simulation.magnetics.shape_moments(), [(0.0, 0.0, moment)], rtol=1e-6)
+    assert builder.body_count == 0  # it is the user's
+
+
+def test_magnetics_of_a_model_without_bodies(device):
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    magnet = builder.add_shape_sphere(-1, radius=R)
+    warpmag.add_inducible(builder, shape=magnet)
+    model = builder.finalize(device=device)
+    magnetics = warpmag.Magnetics(model, external_field=FIELD)
+    magnetics.apply(model.state())
+    moment = 4.0 / 3.0 * math.pi * R**3 * 3.0 * np.array(FIELD)
+    np.testing.assert_allclose(magnetics.shape_moments(), [moment], rtol=2e-3)
+
+
+def test_a_solver_that_needs_articulations_names_the_joint(device, tmp_path):
+    path = write(tmp_path, physics(), A, B, CHAIN[0])
+    with pytest.raises(warpmag.InputError, match="/World/AB: a joint outside all articulations, which the solver stee"):
+        Simulation(path, device=device, solver="steel")

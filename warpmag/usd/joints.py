@@ -1,0 +1,166 @@
+"""Reads which bodies joints connect, and where the ends of joints stand that no body moves.
+
+Newton's importer drops joints that it cannot make, without a word, and takes the frame of a fixed prim at a joint for
+that of the world. Both are found here.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+
+from warpmag.usd.reader import Finding
+
+_AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
+
+
+@dataclass(frozen=True)
+class GroundedJoint:
+    """A joint between a body that moves and something that does not.
+
+    Attributes:
+        path: Prim of the joint.
+        position: Where the joint's frame stands on what is fixed [m], world frame.
+        rotation: How it is turned there, quaternion x y z w.
+        fixed: Prim that is fixed, a collider or a kinematic body for instance; empty for the world itself.
+        moving: Prim of the body that moves.
+        reversed: Whether the body that moves is ``body0``: coordinates of the joint then count the other way round.
+        collides: Whether the two may touch.
+    """
+
+    path: str
+    position: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+    fixed: str
+    moving: str
+    reversed: bool
+    collides: bool
+
+
+@dataclass(frozen=True)
+class _End:
+    """One end of a joint: what it is attached to, and the rigid body that carries that, if one does."""
+
+    prim: Usd.Prim | None
+    body: Usd.Prim | None
+    moves: bool
+
+
+def joint_findings(stage: Usd.Stage) -> Iterator[Finding]:
+    """Yield what is wrong with the joints of a stage."""
+    for joint in enabled_joints(stage):
+        path = str(joint.GetPath())
+        if problem := _problem(stage, joint):
+            yield Finding(path, problem)
+        elif not any(end.moves for end in _ends(stage, joint)):
+            yield Finding(path, "joins things that do not move, and is left out", "warning")
+
+
+def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:
+    """Return the joints of a stage that are enabled, those in instances included."""
+    prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
+    return [joint for joint in joints if joint.GetJointEnabledAttr().Get()]
+
+
+def prepare_joints(stage: Usd.Stage) -> list[GroundedJoint]:
+    """Rewrite joints that Newton reads otherwise than USD means them, in the stage's session layer.
+
+    Joints with a kinematic body as ``body1`` hang on the world then, those between two things that do not move are
+    disabled, and axes that a generic joint does not limit are free in so many words.
+
+    Returns:
+        The joints between a body that moves and something that does not, but for kinematic bodies as ``body0``.
+    """
+    grounded = []
+    for path in [joint.GetPath() for joint in enabled_joints(stage)]:
+        joint = UsdPhysics.Joint.Get(stage, path)
+        ends, axes = _ends(stage, joint), _free_axes(joint.GetPrim())
+        still = [number for number, end in enumerate(ends) if not end.moves]
+        if (still == [0] and not ends[0].body) or still == [1]:
+            grounded.append(_grounded(joint, ends, still[0]))
+        swapped = still == [1] and ends[1].body is not None
+        if not (axes or swapped or len(still) == 2):
+            continue
+        with Usd.EditContext(stage, stage.GetSessionLayer()):
+            joint = UsdPhysics.Joint(_editable(stage, path))
+            for axis in axes:
+                limit = UsdPhysics.LimitAPI.Apply(joint.GetPrim(), axis)
+                limit.CreateLowAttr(-math.inf)
+                limit.CreateHighAttr(math.inf)
+            if swapped:  # Newton drops it; where a prim is no body it takes the world, and joints with one prim each
+                joint.GetBody1Rel().SetTargets([path])
+            if len(still) == 2:
+                joint.GetJointEnabledAttr().Set(False)
+    return grounded
+
+
+def _editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:
+    """Return the prim at ``path``, no longer in an instance: those cannot be edited."""
+    while (prim := stage.GetPrimAtPath(path)).IsInstanceProxy():
+        while prim.IsInstanceProxy():
+            prim = prim.GetParent()
+        prim.SetInstanceable(False)
+    return prim
+
+
+def _free_axes(joint: Usd.Prim) -> list[str]:
+    """Return the axes that a generic joint leaves free by having no limit for them, which Newton would lock."""
+    if joint.GetTypeName() != "PhysicsJoint":
+        return []
+    return [axis for axis in _AXES if not joint.HasAPI(UsdPhysics.LimitAPI, axis)]
+
+
+def _problem(stage: Usd.Stage, joint: UsdPhysics.Joint) -> str:
+    """Return why a joint cannot be made; empty if it can."""
+    for relationship in _relationships(joint):
+        targets = relationship.GetTargets()
+        if len(targets) > 1:
+            return f"{relationship.GetName()} names {len(targets)} prims, a joint has one at each end"
+        if targets and not stage.GetPrimAtPath(targets[0]):
+            return f"{relationship.GetName()} names {targets[0]}, which is not there"
+    one, other = _ends(stage, joint)
+    if one.body and one.body == other.body:
+        return f"both of its ends are on the body {one.body.GetPath()}"
+    return ""
+
+
+def _relationships(joint) -> tuple[Usd.Relationship, Usd.Relationship]:
+    return joint.GetBody0Rel(), joint.GetBody1Rel()
+
+
+def _ends(stage, joint) -> list[_End]:
+    ends = []
+    for relationship in _relationships(joint):
+        targets = relationship.GetTargets()
+        prim = stage.GetPrimAtPath(targets[0]) if targets else None
+        body = prim
+        while body and not _is_body(body):
+            body = body.GetParent()
+        kinematic = body and UsdPhysics.RigidBodyAPI(body).GetKinematicEnabledAttr().Get()
+        ends.append(_End(prim or None, body or None, bool(body) and not kinematic))
+    return ends
+
+
+def _is_body(prim) -> bool:
+    return prim.HasAPI(UsdPhysics.RigidBodyAPI) and bool(UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get())
+
+
+def _grounded(joint, ends, still: int) -> GroundedJoint:
+    """Return where the end number ``still`` of a joint stands in the world."""
+    place = (joint.GetLocalPos0Attr, joint.GetLocalPos1Attr)[still]().Get()
+    turn = Gf.Quatd((joint.GetLocalRot0Attr, joint.GetLocalRot1Attr)[still]().Get()).GetNormalized()
+    fixed = ends[still].prim
+    world = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(fixed) if fixed else Gf.Matrix4d(1.0)
+    position = world.Transform(Gf.Vec3d(place))
+    turn = Gf.Transform(world).GetRotation().GetQuat() * turn
+    return GroundedJoint(
+        str(joint.GetPath()),
+        tuple(position),
+        (*turn.GetImaginary(), turn.GetReal()),
+        str(fixed.GetPath()) if fixed else "",
+        str(ends[1 - still].body.GetPath()),
+        still == 1,
+        bool(joint.GetCollisionEnabledAttr().Get()),
+    )
