@@ -1,7 +1,6 @@
 """From a USD stage to a Newton builder whose shapes carry the stage's magnets."""
 
 import os
-import warnings
 from dataclasses import dataclass
 
 import newton
@@ -11,7 +10,7 @@ import warp as wp
 from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, StageMagnets
-from warpmag.usd import StageClock, open_stage, read_magnets, stage_clock
+from warpmag.usd import StageClock, open_stage, read_magnets, refusals, stage_clock
 
 
 @dataclass(frozen=True)
@@ -51,12 +50,8 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
     clock = stage_clock(stage)
     builder = newton.ModelBuilder()
     register_attributes(builder)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            found = builder.add_usd(stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals)
-        except (ValueError, RuntimeError, NotImplementedError) as error:
-            raise InputError(f"{path}: Newton cannot import it ({' '.join(str(error).split())})") from None
+    with refusals(str(path), "import"):
+        found = builder.add_usd(stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals)
     _let_frictionless_roll(builder)
     bodies, shapes = found["path_body_map"], found["path_shape_map"]
     covered = {}

@@ -96,7 +96,7 @@ class Simulation:
             self.frame_count = round(seconds * self.frame_rate) or None
         self.step_size = DEFAULT_STEP if step is None else step
         check_positive("step", self.step_size)
-        with wp.ScopedDevice(self.device):
+        with wp.ScopedDevice(self.device), self._refusals(scene):
             self.model = builder.finalize(device=self.device)
         self._check_poses()
         self._magnetics = Magnetics(
@@ -129,6 +129,14 @@ class Simulation:
         self._center = self._positions().mean(axis=0) if len(self._moving) else np.zeros(3)
         self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
         self._statistics.coarseness = self._coarseness()
+
+    def _refusals(self, scene):
+        """Return what makes one line of Newton's errors about a stage; those about a builder stay as they are."""
+        if self._scene is None:
+            return contextlib.nullcontext()
+        from warpmag.usd import refusals  # noqa: PLC0415 - a builder can do without USD
+
+        return refusals(str(scene), "use")
 
     def _moves(self, body: int) -> bool:
         return math.isfinite(self._sizes.thickness[body])

@@ -7,18 +7,18 @@ attributes right even then).
 
 from warpmag.usd.schemas import author_magnet, author_settings  # isort: skip  (registers the schemas first)
 from warpmag.usd.check import StageReport, check
+from warpmag.usd.clock import StageClock, stage_clock
+from warpmag.usd.guard import refusals
 from warpmag.usd.reader import (
-    Finding,
-    StageClock,
     StageContents,
     describe,
     first_camera,
     hold,
     open_stage,
     read_magnets,
-    stage_clock,
     survey,
 )
+from warpmag.usd.values import Finding
 from warpmag.usd.writer import CacheWriter
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "hold",
     "open_stage",
     "read_magnets",
+    "refusals",
     "stage_clock",
     "survey",
 ]
