@@ -3,54 +3,73 @@
 from collections.abc import Iterator
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 
 from warpmag import lattice
 from warpmag.errors import InputError
-from warpmag.usd.values import FARTHEST, LARGEST_SIZE, SMALLEST_SIZE, Finding, value_of
+from warpmag.usd.values import FARTHEST, LARGEST_SIZE, SMALLEST_SIZE, Finding, finding_of, value_of
 
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height")
+_SOLIDS = (
+    *(UsdGeom.Sphere, UsdGeom.Cube, UsdGeom.Mesh, UsdGeom.Cone),
+    *(UsdGeom.Capsule, UsdGeom.Capsule_1, UsdGeom.Cylinder, UsdGeom.Cylinder_1),
+)
+_LARGEST_MAGNET = 2e4
+"""Limit of a magnet's sizes [m], so that its moment and its square stay in single precision."""
 _AS_DRAWN = ("none", "meshSimplification", "sdf", None)
 """Approximations of a mesh that keep its surface; all others close it."""
 
 
+def is_solid(prim: Usd.Prim) -> bool:
+    """Whether a prim is of a type that has a volume."""
+    return any(prim.IsA(kind) for kind in _SOLIDS)
+
+
 def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:
     """Yield what is wrong with the size of a collider in the world, and with its mesh."""
-    path = str(prim.GetPath())
     if prim.IsA(UsdGeom.Mesh):
         yield from _mesh_findings(prim)
+    else:
+        yield from _size_findings(prim, LARGEST_SIZE)
+
+
+def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
+    """Yield why a collider that is sound as such cannot be magnetized."""
+    if not prim.IsA(UsdGeom.Mesh):
+        yield from _size_findings(prim, _LARGEST_MAGNET)
+    elif prim.GetAttribute("physics:approximation").Get() in _AS_DRAWN:
+        points, counts, indices = (np.asarray(value) for value in _topology(prim))
+        try:
+            lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
+        except InputError as error:
+            yield Finding(str(prim.GetPath()), str(error))
+
+
+def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
+    """Yield why a viewer could not read the faces of a mesh that is only seen; it may have none."""
+    try:
+        points, counts, indices = _topology(prim)
+        holes = value_of(prim, "holeIndices")
+    except InputError as error:
+        yield finding_of(str(prim.GetPath()), error)
         return
+    if points and indices and (message := _topology_fault(len(points), counts, indices, holes)):
+        yield Finding(str(prim.GetPath()), message)
+
+
+def _size_findings(prim, largest) -> Iterator[Finding]:
     try:
         sizes = [value_of(prim, name) for name in _SIZES] if prim.IsA(UsdGeom.Gprim) else []
     except InputError:  # among the findings of the attributes already
         return
     lengths = np.linalg.norm(_axes(prim), axis=1)
     for name, size in zip(_SIZES, sizes, strict=False):
-        if size is not None and not (SMALLEST_SIZE <= size * lengths.min() and size * lengths.max() <= LARGEST_SIZE):
+        if size is not None and not (SMALLEST_SIZE <= size * lengths.min() and size * lengths.max() <= largest):
             yield Finding(
-                path,
+                str(prim.GetPath()),
                 f"{name} {size:g} scaled by {lengths.min():g} to {lengths.max():g} must be from {SMALLEST_SIZE:g} "
-                f"to {LARGEST_SIZE:g} m",
+                f"to {largest:g} m",
             )
-
-
-def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield the faults for which the faces of a mesh that is only seen cannot be read; it may have none."""
-    if not (prim.GetAttribute("points").Get() and prim.GetAttribute("faceVertexIndices").Get()):
-        return
-    yield from _mesh_findings(prim)
-
-
-def closure_finding(prim: Usd.Prim) -> Finding | None:
-    """Return why a sound mesh bounds no volume that could be magnetized."""
-    if prim.GetAttribute("physics:approximation").Get() not in _AS_DRAWN:
-        return None
-    points, counts, indices = (np.asarray(value) for value in _topology(prim))
-    try:
-        lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
-    except InputError as error:
-        return Finding(str(prim.GetPath()), str(error))
-    return None
 
 
 def _mesh_findings(prim) -> Iterator[Finding]:
@@ -106,5 +125,4 @@ def _triangles(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
 def _axes(prim) -> np.ndarray:
     """Return the rows that a transform turns the axes of a prim into."""
-    matrix = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim)
-    return np.array(matrix)[:3, :3] if isinstance(matrix, Gf.Matrix4d) else np.eye(3)
+    return np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim))[:3, :3]

@@ -15,7 +15,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
-from warpmag.usd.geometry import closure_finding, mesh_findings, shape_findings
+from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
 from warpmag.usd.values import Finding, attribute_findings, check_type, declared, finding_of, quiet
@@ -152,7 +152,7 @@ def survey(stage: Usd.Stage) -> StageContents:
     _read_scene(stage, prims, contents)
     for prim in prims:
         if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
-            _read_magnet(prim, contents)
+            _read_magnet(prim, transforms, contents)
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))
     return contents
@@ -172,7 +172,7 @@ def _read_prim(prim, transforms, contents) -> None:
         contents.colliders.append(path)
     faults = list(transforms.findings(prim)) if body or collider else []
     faults += attribute_findings(prim, shape=body or collider)
-    if collider and not faults:
+    if collider and not faults and transforms.is_sound(prim):
         faults += shape_findings(prim)
     elif prim.IsA(UsdGeom.Mesh) and not collider:
         faults += mesh_findings(prim)
@@ -219,7 +219,7 @@ def _read_scene(stage, prims, contents) -> None:
             contents.findings.append(finding_of(str(found[0].GetPath()), error))
 
 
-def _read_magnet(prim, contents) -> None:
+def _read_magnet(prim, transforms, contents) -> None:
     """Read one magnet into ``contents``, or what is wrong with it."""
     path = str(prim.GetPath())
     body, collider = is_body(prim), is_collider(prim)
@@ -227,8 +227,8 @@ def _read_magnet(prim, contents) -> None:
         contents.findings.append(
             Finding(path, f"{MAGNET_API} on a prim that is neither an enabled rigid body nor an enabled collider")
         )
-    elif not collider and not any(map(is_collider, _prims_of_body(prim))):
-        contents.findings.append(Finding(path, "a magnet without colliders: there is no shape to magnetize"))
+    elif not any(is_collider(one) and is_solid(one) for one in _prims_of_magnet(prim)):
+        contents.findings.append(Finding(path, "a magnet without colliders that are solid: no shape to magnetize"))
     elif not body and (owner := _body_above(prim)) and has_api(owner, MAGNET_API):
         contents.findings.append(Finding(path, f"its rigid body {owner.GetPath()} is a magnet already"))
     try:
@@ -237,16 +237,14 @@ def _read_magnet(prim, contents) -> None:
             contents.initial_moments[path] = moment
     except InputError as error:
         contents.findings.append(finding_of(path, error))
-    contents.findings += _closure_findings(prim, contents)
-
-
-def _closure_findings(prim, contents) -> Iterator[Finding]:
-    """Yield the meshes of a magnet that bound no volume; those with other faults have been named."""
     faulty = {finding.where for finding in contents.findings if finding.severity == "error"}
-    for one in _prims_of_body(prim) if is_body(prim) else (prim,):
-        if is_collider(one) and one.IsA(UsdGeom.Mesh) and str(one.GetPath()) not in faulty:
-            if finding := closure_finding(one):
-                yield finding
+    for one in _prims_of_magnet(prim):
+        if is_collider(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one):
+            contents.findings += magnet_findings(one)
+
+
+def _prims_of_magnet(prim) -> Iterator[Usd.Prim]:
+    return _prims_of_body(prim) if is_body(prim) else iter((prim,))
 
 
 def _prims_of_body(body) -> Iterator[Usd.Prim]:

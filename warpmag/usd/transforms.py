@@ -24,11 +24,11 @@ def is_collider(prim: Usd.Prim) -> bool:
 
 def is_animated(prim: Usd.Prim) -> bool:
     """Whether a layer gives time samples for the prim's own transform, held or not."""
-    return prim.IsA(UsdGeom.Xformable) and any(
-        spec.HasInfo("timeSamples")
-        for operation in UsdGeom.Xformable(prim).GetOrderedXformOps()
-        for spec in operation.GetAttr().GetPropertyStack()
-    )
+    if not prim.IsA(UsdGeom.Xformable):
+        return False
+    order = UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() or ()
+    operations = (prim.GetAttribute(name.removeprefix(_INVERSE)) for name in order if "xformOp:" in name)
+    return any(spec.HasInfo("timeSamples") for one in operations if one for spec in one.GetPropertyStack())
 
 
 class TransformCheck:
@@ -42,7 +42,7 @@ class TransformCheck:
     def findings(self, prim: Usd.Prim) -> Iterator[Finding]:
         """Yield what is wrong with the transform of a body or collider, its ancestors' included."""
         yield from self._lineage_findings(prim)
-        if not self._sound[prim.GetPath()]:
+        if not self.is_sound(prim):
             return
         path = str(prim.GetPath())
         world = np.array(self._cache.GetLocalToWorldTransform(prim))
@@ -63,6 +63,10 @@ class TransformCheck:
             yield Finding(path, "transform is mirrored, which Newton imports wrong: mirror the mesh instead")
         elif prim.IsA(UsdGeom.Sphere) and np.abs(np.diag(gram) - size).max() > 1e-5 * size:
             yield Finding(path, "a sphere scaled unevenly would be imported as a ball: make it a mesh")
+
+    def is_sound(self, prim: Usd.Prim) -> bool:
+        """Whether USD can compose the transform of a prim whose findings have been asked for."""
+        return self._sound[prim.GetPath()]
 
     def _lineage_findings(self, prim) -> Iterator[Finding]:
         lineage = []
@@ -115,6 +119,6 @@ def _operation_fault(prim, name) -> str:
         matrix = UsdGeom.XformOp(attribute).GetOpTransform(Usd.TimeCode.Default())
     except (Tf.ErrorException, RuntimeError):
         return f"{name} has a type or value that USD cannot compose"
-    if value is None and attribute.HasAuthoredValue():
+    if value is None and attribute.HasAuthoredValue() and not attribute.GetNumTimeSamples():
         return f"{name} has a value that USD cannot read"
     return "" if np.isfinite(np.array(matrix)).all() else f"transform is not finite ({name})"

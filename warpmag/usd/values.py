@@ -46,6 +46,10 @@ _RANGES = {  # lowest, highest, and whether 0 stands for "not given"
     "newton:contactFrictionGain": (0.0, LARGEST, False),
     "newton:timeStepsPerSecond": (1, 1_000_000, False),
 }
+_TOKENS = {
+    **dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")),
+    "orientation": ("rightHanded", "leftHanded"),
+}
 _READ = ("physics:", "newton:", "mjc:", "drive:", "limit:")
 _SHAPES = {
     "Sphere": ("radius",),
@@ -115,6 +119,8 @@ def value_of(prim: Usd.Prim, name: str):
         return value
     example, fallback = _expected(prim, attribute)
     check_type(prim, name, value, example)
+    if name in _TOKENS and value not in _TOKENS[name]:
+        raise InputError(f"{prim.GetPath()}: {name} must be one of {', '.join(_TOKENS[name])}, got {_shown(value)}")
     _check_numbers(prim, name, value, fallback)
     return value
 
