@@ -61,6 +61,23 @@ REFUSED = {
     "infinite centre": (ball("point3f physics:centerOfMass = (inf, 0, 0)"), "/Ball: physics:centerOfMass must be fin"),
     "NaN inertia": (ball("float3 physics:diagonalInertia = (nan, 0, 0)"), "/Ball: physics:diagonalInertia must"),
     "NaN axes of inertia": (ball("quatf physics:principalAxes = (nan, 0, 0, 0)"), "/Ball: physics:principalAxes must"),
+    "inertia of no body": (ball("float3 physics:diagonalInertia = (3, 1, 1)"), "/Ball: physics:diagonalInertia must"),
+    "axes of inertia too long": (
+        ball("quatf physics:principalAxes = (2, 0, 0, 0)"),
+        "must be a quaternion of length 1",
+    ),
+    "frame of a joint": (
+        ball()
+        + 'def PhysicsFixedJoint "Joint"\n{\nrel physics:body0 = </Ball>\nquatf physics:localRot0 = (0, 0, 0, 0)\n}',
+        "/Joint: physics:localRot0 must be a quaternion of length 1",
+    ),
+    "axis of no name": (ball('uniform token axis = "W"', kind="Cone"), "/Ball: axis must be one of X, Y, Z, got 'W'"),
+    "NaN that a kind has no use for": (
+        ball("vector3f warpmag:magnetization = (nan, 0, 0)"),
+        "/Ball: warpmag:magnetization: must be finite",
+    ),
+    "collider that is no shape": (ball(kind="Xform"), "/Ball: a magnet without colliders that are solid"),
+    "magnet as large as a country": (ball(radius="double radius = 1e5"), "/Ball: radius 100000 scaled by 1 to 1 must"),
     "too fast": (ball("vector3f physics:velocity = (1e30, 0, 0)"), "/Ball: physics:velocity must be from"),
     "negative margin": (ball("float newton:contactMargin = -1"), "/Ball: newton:contactMargin must be from 0"),
     "NaN gap": (ball("float newton:contactGap = nan"), "/Ball: newton:contactGap must be finite"),

@@ -162,15 +162,15 @@ def _read_prim(prim, transforms, contents) -> None:
     """Note what a prim is for rigid bodies, and what is wrong with it."""
     path = str(prim.GetPath())
     body, collider = is_body(prim), is_collider(prim)
+    faults = list(transforms.findings(prim)) if body or collider else []
     if body:
         contents.bodies.append(path)
         if UsdPhysics.RigidBodyAPI(prim).GetKinematicEnabledAttr().Get():
             contents.kinematic.append(path)
-            if is_animated(prim):
+            if transforms.is_sound(prim) and is_animated(prim):
                 contents.findings.append(Finding(path, "animated and kinematic: a run holds it still", "warning"))
     if collider:
         contents.colliders.append(path)
-    faults = list(transforms.findings(prim)) if body or collider else []
     faults += attribute_findings(prim, shape=body or collider)
     if collider and not faults and transforms.is_sound(prim):
         faults += shape_findings(prim)

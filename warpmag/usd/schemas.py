@@ -12,7 +12,7 @@ from pxr import Gf, Plug, Sdf, Usd
 
 from warpmag import materials
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings, check_finite
+from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_finite, check_positive, check_token
 from warpmag.usd.values import number, text, vector
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
@@ -61,7 +61,12 @@ def magnet_of(prim: Usd.Prim) -> Magnet:
     material = prim.GetAttribute(MATERIAL).Get()
     if material is not None and text(f"{prim.GetPath()}: {MATERIAL}", material):
         magnet = dataclasses.replace(magnet, **_of_material(prim, material, magnet))
-    magnet.check(str(prim.GetPath()))
+    path = str(prim.GetPath())
+    magnet.check(path)
+    check_token(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve, CURVES)  # what its kind has no use for, too
+    check_finite(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
+    for field, infinite in (("saturation", False), ("susceptibility", True)):
+        check_positive(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
     return magnet
 
 

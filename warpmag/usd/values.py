@@ -50,6 +50,9 @@ _TOKENS = {
     **dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")),
     "orientation": ("rightHanded", "leftHanded"),
 }
+_TURNS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
+_INERTIA = 1e-2
+"""Inertias are often rounded: by this part of their sum the largest may exceed the others."""
 _READ = ("physics:", "newton:", "mjc:", "drive:", "limit:")
 _SHAPES = {
     "Sphere": ("radius",),
@@ -122,6 +125,8 @@ def value_of(prim: Usd.Prim, name: str):
     if name in _TOKENS and value not in _TOKENS[name]:
         raise InputError(f"{prim.GetPath()}: {name} must be one of {', '.join(_TOKENS[name])}, got {_shown(value)}")
     _check_numbers(prim, name, value, fallback)
+    if message := _shape_of_value(name, value):
+        raise InputError(f"{prim.GetPath()}: {name} {message}, got {_shown(value)}")
     return value
 
 
@@ -240,6 +245,17 @@ def _check_numbers(prim, name, value, fallback) -> None:
     if (wrong & (given != 0.0) if zero else wrong).any():
         unless = "0 or " if zero and lowest > 0.0 else ""
         raise InputError(f"{where} must be {unless}from {lowest:g} to {highest:g}, got {_shown(value)}")
+
+
+def _shape_of_value(name, value) -> str:
+    """Return what the numbers of a value must be together, empty where they are."""
+    if name in _TURNS:
+        norm = float(np.linalg.norm(_numbers(value)))
+        if abs(norm - 1.0) > 1e-2 and not (norm == 0.0 and name == "physics:principalAxes"):
+            return "must be a quaternion of length 1"
+    if name == "physics:diagonalInertia" and 2.0 * max(value) > (1.0 + _INERTIA) * sum(value):
+        return "must be the inertia of a body: none of three more than the sum of the others"
+    return ""
 
 
 def _numbers(value) -> np.ndarray | None:
