@@ -167,7 +167,7 @@ REFUSED = {
     ),
     "NaN gravity": (
         BALL + 'def PhysicsScene "Scene" { float physics:gravityMagnitude = nan\n}',
-        "/Scene: gravity must be finite",
+        "/Scene: physics:gravityMagnitude must be finite",
     ),
     "two scenes": (
         BALL + 'def PhysicsScene "One" { }\ndef PhysicsScene "Two" { }',
@@ -219,7 +219,9 @@ def test_all_problems_are_found(tmp_path):
     report = check(write(tmp_path, body, 'metersPerUnit = 0.01\nupAxis = "Z"\ntimeCodesPerSecond = -1'))
     assert {finding.where.rpartition("/")[2] for finding in report.errors} >= {"stage.usda", "Ball", "Small"}
     messages = [finding.message for finding in report.errors if finding.where == "/Ball"]
-    assert "transform is not finite" in messages and any("saturation" in message for message in messages)
+    assert "transform is not finite (xformOp:translate)" in messages and any(
+        "saturation" in message for message in messages
+    )
     assert report.clock is None
 
 

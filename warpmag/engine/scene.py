@@ -1,7 +1,6 @@
 """From a USD stage to a Newton builder whose shapes carry the stage's magnets."""
 
 import os
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ import warp as wp
 from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, StageMagnets
-from warpmag.usd import GroundedJoint, StageClock, enabled_joints, inspect, open_stage, prepare_joints
+from warpmag.usd import GroundedJoint, StageClock, enabled_joints, inspect, open_stage, prepare_joints, refusals
 
 
 @dataclass(frozen=True)
@@ -76,18 +75,10 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
 
 def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:
     """Let Newton import ``stage``; return which prim became what."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return builder.add_usd(
-                stage,
-                apply_up_axis_from_stage=True,
-                load_visual_shapes=visuals,
-                only_load_enabled_rigid_bodies=True,
-            )
-        except Exception as error:  # whatever its importer stumbles over
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{path}: Newton cannot import it ({reason})") from None
+    with refusals(str(path), "import"):
+        return builder.add_usd(
+            stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals, only_load_enabled_rigid_bodies=True
+        )
 
 
 def _place_on_ground(

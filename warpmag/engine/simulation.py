@@ -91,7 +91,7 @@ class Simulation:
             step = own_step if step is None else step
         self.step_size = DEFAULT_STEP if step is None else step
         check_positive("step", self.step_size)
-        self.model = self._finalize(builder, solver)
+        self.model = self._finalize(builder, solver, scene)
         self._magnetics = Magnetics(
             self.model,
             force=settings.force if force is None else force,
@@ -114,7 +114,7 @@ class Simulation:
         self.frame_count = round(seconds * self.frame_rate) or None
         return self._scene.builder, self._scene.magnets.settings, clock.step
 
-    def _finalize(self, builder: newton.ModelBuilder, solver: str) -> newton.Model:
+    def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
         """Make the model."""
         _check_articulations(builder, solver)
         if not builder.body_count:  # Newton allocates nothing for bodies then; one without shapes changes nothing
@@ -122,11 +122,8 @@ class Simulation:
             whole.add_builder(builder)
             whole.add_link(is_kinematic=True)
             builder = whole
-        with wp.ScopedDevice(self.device):
-            try:
-                model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
-            except ValueError as error:
-                raise InputError(f"scene: Newton cannot take it ({' '.join(str(error).split())})") from None
+        with wp.ScopedDevice(self.device), self._refusals(scene):
+            model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
         for name in ("body_q", "body_qd"):
             bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
             if bad.any():
@@ -156,6 +153,14 @@ class Simulation:
         self._center = self._positions().mean(axis=0) if len(self._moving) else np.zeros(3)
         self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
         self._statistics.coarseness = self._coarseness()
+
+    def _refusals(self, scene):
+        """Return what makes one line of Newton's errors about a stage; those about a builder stay as they are."""
+        if self._scene is None:
+            return contextlib.nullcontext()
+        from warpmag.usd import refusals  # noqa: PLC0415 - a builder can do without USD
+
+        return refusals(str(scene), "use")
 
     def _moves(self, body: int) -> bool:
         return math.isfinite(self._sizes.thickness[body])

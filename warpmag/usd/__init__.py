@@ -7,19 +7,19 @@ attributes right even then).
 
 from warpmag.usd.schemas import author_magnet, author_settings  # isort: skip  (registers the schemas first)
 from warpmag.usd.check import StageReport, check, inspect
+from warpmag.usd.clock import StageClock, stage_clock
+from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints
 from warpmag.usd.reader import (
-    Finding,
-    StageClock,
     StageContents,
     describe,
     first_camera,
     hold,
     open_stage,
     read_magnets,
-    stage_clock,
     survey,
 )
+from warpmag.usd.values import Finding
 from warpmag.usd.writer import CacheWriter
 
 __all__ = [
@@ -40,6 +40,7 @@ __all__ = [
     "open_stage",
     "prepare_joints",
     "read_magnets",
+    "refusals",
     "stage_clock",
     "survey",
 ]

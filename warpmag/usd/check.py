@@ -3,11 +3,13 @@
 import os
 from dataclasses import dataclass
 
-from pxr import Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
+from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdValidation
 
 from warpmag.errors import InputError
+from warpmag.usd.clock import StageClock, stage_clock, stage_name
 from warpmag.usd.joints import joint_findings
-from warpmag.usd.reader import Finding, StageClock, StageContents, open_stage, stage_clock, stage_name, survey
+from warpmag.usd.reader import StageContents, open_stage, survey
+from warpmag.usd.values import Finding, quiet
 
 _SEVERITIES = {"Error": "error", "Warn": "warning"}
 
@@ -89,14 +91,17 @@ def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
     )
 
 
+@quiet()
 def validate(stage: Usd.Stage) -> list[Finding]:
     """Return the errors and warnings of USD's own validators, those for usdz packages left out."""
     registry = UsdValidation.ValidationRegistry()
     packages = {one.name for one in registry.GetValidatorMetadataForKeyword("UsdzValidators")}
     names = [one.name for one in registry.GetAllValidatorMetadata() if not one.isSuite and one.name not in packages]
-    silencer = UsdUtils.CoalescingDiagnosticDelegate()
-    errors = UsdValidation.ValidationContext(registry.GetOrLoadValidatorsByName(names)).Validate(stage)
-    del silencer
+    try:
+        errors = UsdValidation.ValidationContext(registry.GetOrLoadValidatorsByName(names)).Validate(stage)
+    except Tf.ErrorException as error:  # transforms that cannot be composed stop them all
+        reason = error.args[0].commentary if error.args else type(error).__name__
+        return [Finding(stage_name(stage), f"USD's validators cannot read it ({' '.join(str(reason).split())})")]
     findings = []
     for error in errors:
         severity = _SEVERITIES.get(error.GetType().name)

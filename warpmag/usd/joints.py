@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
-from warpmag.usd.reader import Finding
+from warpmag.usd.values import Finding
 
 _AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 

@@ -8,12 +8,12 @@ import dataclasses
 from pathlib import Path
 
 import newton_usd_schemas  # noqa: F401  (registers Newton's own schemas, which must happen before a stage is opened)
-import numpy as np
 from pxr import Gf, Plug, Sdf, Usd
 
 from warpmag import materials
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_finite, check_positive, check_token
+from warpmag.usd.values import number, text, vector
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
 
@@ -23,6 +23,8 @@ MOMENT = "warpmag:moment"
 MATERIAL = "warpmag:material"
 
 _TYPES = {str: Sdf.ValueTypeNames.Token, float: Sdf.ValueTypeNames.Float, tuple: Sdf.ValueTypeNames.Vector3f}
+
+_READERS = {str: text, float: number, tuple: vector}
 
 _MAGNET_ATTRIBUTES = {
     "kind": "warpmag:kind",
@@ -57,10 +59,26 @@ def magnet_of(prim: Usd.Prim) -> Magnet:
     """Read and check the magnet that ``prim`` carries; raises :class:`InputError` naming the prim."""
     magnet = _read(prim, _MAGNET_ATTRIBUTES, Magnet())
     material = prim.GetAttribute(MATERIAL).Get()
-    if material:
+    if material is not None and text(f"{prim.GetPath()}: {MATERIAL}", material):
         magnet = dataclasses.replace(magnet, **_of_material(prim, material, magnet))
-    magnet.check(str(prim.GetPath()))
+    path = str(prim.GetPath())
+    magnet.check(path)
+    check_token(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve, CURVES)  # what its kind has no use for, too
+    check_finite(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
+    for field, infinite in (("saturation", False), ("susceptibility", True)):
+        check_positive(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
     return magnet
+
+
+def moment_of(prim: Usd.Prim) -> tuple[float, float, float] | None:
+    """Read the authored moment of a magnet [A·m²], world frame, None where it has none."""
+    attribute = prim.GetAttribute(MOMENT)
+    value = attribute.Get() if attribute and attribute.HasAuthoredValue() else None
+    if value is None:
+        return None
+    moment = vector(f"{prim.GetPath()}: {MOMENT}", value)
+    check_finite(f"{prim.GetPath()}: {MOMENT}", moment)
+    return moment
 
 
 def _of_material(prim: Usd.Prim, material: str, magnet: Magnet) -> dict:
@@ -103,25 +121,5 @@ def _read(prim, attributes, defaults):
     for field, name in attributes.items():
         value = prim.GetAttribute(name).Get()
         if value is not None:
-            values[field] = _converted(f"{prim.GetPath()}: {name}", value, type(getattr(defaults, field)))
+            values[field] = _READERS[type(getattr(defaults, field))](f"{prim.GetPath()}: {name}", value)
     return dataclasses.replace(defaults, **values)
-
-
-def _converted(name, value, kind):
-    """Return ``value`` as ``kind`` (str, float or tuple of three floats), whatever type a hand-written file gave it."""
-    try:
-        if kind is tuple:
-            x, y, z = map(_decimal, value)
-            return x, y, z
-        if kind is float:
-            return _decimal(value)
-        if isinstance(value, str):
-            return value
-    except (TypeError, ValueError):
-        pass
-    raise InputError(f"{name}: {value!r} is not a {'vector' if kind is tuple else kind.__name__}")
-
-
-def _decimal(value) -> float:
-    """Return the shortest decimal that a single-precision ``value`` stands for: 0.001, not 0.0010000000475."""
-    return float(str(np.float32(value)))

@@ -13,8 +13,9 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from warpmag.errors import InputError
-from warpmag.usd.reader import is_animated, stage_clock
+from warpmag.usd.clock import stage_clock
 from warpmag.usd.schemas import MOMENT
+from warpmag.usd.transforms import is_animated
 
 _SUFFIXES = (".usd", ".usda", ".usdc")
 _COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")  # metadata that sublayers do hand up

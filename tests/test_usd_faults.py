@@ -1,0 +1,250 @@
+"""Faults of values, transforms, times and meshes: refused before Newton sees them, in one line that names the prim."""
+
+import warnings
+
+import pytest
+from pxr import Usd
+
+from warpmag.errors import InputError
+from warpmag.usd import check, open_stage, read_magnets, refusals, stage_clock, survey
+
+METRES = 'metersPerUnit = 1\nkilogramsPerUnit = 1\nupAxis = "Z"'
+APIS = "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"
+TETRAHEDRON = "point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]"
+CORNERS = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
+
+
+def write(folder, body, metadata=METRES):
+    path = folder / "stage.usda"
+    path.write_text(f"#usda 1.0\n(\n{metadata}\n)\n{body}\n")
+    return path
+
+
+def ball(*lines, kind="Sphere", radius="double radius = 0.005"):
+    applied = ", ".join(f'"{api}"' for api in APIS)
+    inner = "\n".join((*([radius] if kind == "Sphere" else []), *lines))
+    return f'def {kind} "Ball" (prepend apiSchemas = [{applied}])\n{{\n{inner}\n}}\n'
+
+
+def mesh(corners=tuple(CORNERS), counts=(3, 3, 3, 3), points=TETRAHEDRON, *, more=""):
+    faces = f"int[] faceVertexIndices = {list(corners)}\nint[] faceVertexCounts = {list(counts)}"
+    return ball(points, faces, more, kind="Mesh")
+
+
+def posed(order, *operations):
+    names = ", ".join(f'"{name}"' for name in order)
+    return ball(*operations, f"uniform token[] xformOpOrder = [{names}]")
+
+
+def changed(place, corner):
+    return [corner if k == place else one for k, one in enumerate(CORNERS)]
+
+
+REFUSED = {
+    "array for a radius": (ball(radius="double[] radius = [0.005, 1]"), "/Ball: radius must be a float, got an array"),
+    "string for a mass": (ball('string physics:mass = "x"'), "/Ball: physics:mass must be a float, got 'x'"),
+    "token for a switch": (ball('token physics:rigidBodyEnabled = "y"'), "/Ball: physics:rigidBodyEnabled must be"),
+    "vector for a density": (ball("float3 physics:density = (1, 2, 3)"), "/Ball: physics:density must be a float"),
+    "doubles for a velocity": (ball("double3 physics:velocity = (1, 2, 3)"), "/Ball: physics:velocity must be a Vec3f"),
+    "text for a saturation": (ball('string warpmag:saturationMagnetization = "1e6"'), "'1e6' is not a float"),
+    "switch for a saturation": (ball("bool warpmag:saturationMagnetization = 1"), "True is not a float"),
+    "text for a moment": (ball('string warpmag:moment = "123"'), "/Ball: warpmag:moment: '123' is not a vector"),
+    "number for a material": (ball("float warpmag:material = 2"), "/Ball: warpmag:material: 2 is not a str"),
+    "radius beyond single precision": (ball(radius="double radius = 1e300"), "/Ball: radius must be from"),
+    "radius without a mass": (ball(radius="double radius = 1e-30"), "/Ball: radius must be from 1e-07 to 1e+06"),
+    "scaled to nothing": (
+        posed(["xformOp:scale"], "float3 xformOp:scale = (1e-6, 1e-6, 1e-6)"),
+        "/Ball: radius 0.005 scaled by 1e-06 to 1e-06 must be",
+    ),
+    "negative mass": (ball("float physics:mass = -1"), "/Ball: physics:mass must not be negative"),
+    "infinite density": (ball("float physics:density = inf"), "/Ball: physics:density must not be negative"),
+    "infinite centre": (ball("point3f physics:centerOfMass = (inf, 0, 0)"), "/Ball: physics:centerOfMass must be fin"),
+    "NaN inertia": (ball("float3 physics:diagonalInertia = (nan, 0, 0)"), "/Ball: physics:diagonalInertia must"),
+    "NaN axes of inertia": (ball("quatf physics:principalAxes = (nan, 0, 0, 0)"), "/Ball: physics:principalAxes must"),
+    "inertia of no body": (ball("float3 physics:diagonalInertia = (3, 1, 1)"), "/Ball: physics:diagonalInertia must"),
+    "axes of inertia too long": (
+        ball("quatf physics:principalAxes = (2, 0, 0, 0)"),
+        "must be a quaternion of length 1",
+    ),
+    "frame of a joint": (
+        ball()
+        + 'def PhysicsFixedJoint "Joint"\n{\nrel physics:body0 = </Ball>\nquatf physics:localRot0 = (0, 0, 0, 0)\n}',
+        "/Joint: physics:localRot0 must be a quaternion of length 1",
+    ),
+    "axis of no name": (ball('uniform token axis = "W"', kind="Cone"), "/Ball: axis must be one of X, Y, Z, got 'W'"),
+    "NaN that a kind has no use for": (
+        ball("vector3f warpmag:magnetization = (nan, 0, 0)"),
+        "/Ball: warpmag:magnetization: must be finite",
+    ),
+    "collider that is no shape": (ball(kind="Xform"), "/Ball: a magnet without colliders that are solid"),
+    "magnet as large as a country": (ball(radius="double radius = 1e5"), "/Ball: radius 100000 scaled by 1 to 1 must"),
+    "too fast": (ball("vector3f physics:velocity = (1e30, 0, 0)"), "/Ball: physics:velocity must be from"),
+    "negative margin": (ball("float newton:contactMargin = -1"), "/Ball: newton:contactMargin must be from 0"),
+    "NaN gap": (ball("float newton:contactGap = nan"), "/Ball: newton:contactGap must be finite"),
+    "friction of a material": (
+        ball() + 'def Material "Rubber" (prepend apiSchemas = ["PhysicsMaterialAPI"])\n'
+        "{\nfloat physics:dynamicFriction = -0.5\n}",
+        "/Rubber: physics:dynamicFriction must be from 0",
+    ),
+    "restitution above one": (
+        ball() + 'def Material "Rubber" (prepend apiSchemas = ["PhysicsMaterialAPI"])\n'
+        "{\nfloat physics:restitution = 1.5\n}",
+        "/Rubber: physics:restitution must be from 0 to 1",
+    ),
+    "operation that is missing": (posed(["xformOp:scale:a"]), "/Ball: xformOpOrder names 'xformOp:scale:a', which"),
+    "operation without a name": (posed([""]), "/Ball: xformOpOrder names '', which"),
+    "operation of a wrong type": (
+        posed(["xformOp:translate"], "float xformOp:translate = 2"),
+        "/Ball: xformOp:translate has a type or value that USD cannot compose",
+    ),
+    "order that is text": (
+        ball('string xformOpOrder = "xformOp:translate"'),
+        "/Ball: xformOpOrder must be a TokenArray",
+    ),
+    "far away": (
+        posed(["xformOp:translate"], "double3 xformOp:translate = (1e25, 0, 0)"),
+        "/Ball: transform reaches 1e+25",
+    ),
+    "projection": (
+        posed(
+            ["xformOp:transform"],
+            "matrix4d xformOp:transform = ((1, 0, 0, 0.5), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))",
+        ),
+        "/Ball: transform is a projection",
+    ),
+    "index beyond the points": (mesh(changed(5, 20)), "/Ball: faceVertexIndices name point 20, but there are points 0"),
+    "negative index": (mesh(changed(0, -1)), "/Ball: faceVertexIndices name point -1"),
+    "face of two": (mesh(CORNERS, (3, 3, 2, 4)), "/Ball: faceVertexCounts must be 3 or more, got 2"),
+    "negative count": (mesh(CORNERS, (3, 3, -3, 9)), "/Ball: faceVertexCounts must be 3 or more, got -3"),
+    "counts that do not sum": (mesh(CORNERS, (3, 3, 3)), "/Ball: faceVertexCounts sum to 9, but there are 12"),
+    "no faces": (mesh([], []), "/Ball: mesh has no faces"),
+    "point at 1e28": (
+        mesh(points=TETRAHEDRON.replace("(1, 0, 0)", "(1e28, 0, 0)")),
+        "/Ball: points must be from -1e+08 to 1e+08",
+    ),
+    "long mesh": (mesh(points=TETRAHEDRON.replace("(1, 0, 0)", "(2e6, 0, 0)")), "/Ball: mesh is 2e+06 m long"),
+    "open magnet": (mesh(CORNERS[:9], (3, 3, 3)), "/Ball: mesh: not closed"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_with_one_line(tmp_path, capfd, case):
+    body, message = REFUSED[case]
+    path = write(tmp_path, body)
+    with warnings.catch_warnings(), pytest.raises(InputError) as caught:
+        warnings.simplefilter("error")
+        read_magnets(open_stage(path))
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert any(message in str(finding) for finding in check(path).errors)
+    assert capfd.readouterr().err == ""
+
+
+SOUND = {
+    "infinities that are the schema's own": ball(
+        "point3f physics:centerOfMass = (-inf, -inf, -inf)", "float newton:contactGap = -inf"
+    )
+    + 'def PhysicsScene "Scene"\n{\nfloat physics:gravityMagnitude = -inf\n}',
+    "zeros that mean nothing given": ball("float physics:mass = 0", "float3 physics:diagonalInertia = (0, 0, 0)"),
+    "other numbers for a magnet": ball(
+        "double warpmag:saturationMagnetization = 2e6", "int warpmag:susceptibility = 5"
+    ),
+    "polygons": mesh([0, 3, 2, 1, 0, 1, 4, 1, 2, 4, 2, 3, 4, 3, 0, 4], (4, 3, 3, 3, 3)).replace(
+        TETRAHEDRON, "point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0.5, 0.5, 1)]"
+    ),
+    "open mesh that its hull closes": mesh(
+        CORNERS[:9], (3, 3, 3), more='uniform token physics:approximation = "convexHull"'
+    ),
+    "inverted operation": posed(
+        ["xformOp:translate", "!invert!xformOp:translate"], "double3 xformOp:translate = (1, 2, 3)"
+    ),
+    "notes of somebody": ball('custom float note = nan\ncustom string other = "x"'),
+    "empty mesh to look at": ball() + 'def Mesh "Decoration"\n{\npoint3f[] points = []\n}',
+}
+
+
+@pytest.mark.parametrize("case", SOUND)
+def test_sound(tmp_path, case):
+    assert [str(one) for one in survey(open_stage(write(tmp_path, SOUND[case]))).findings] == []
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ("startTimeCode = nan", "startTimeCode must be finite"),
+        ("endTimeCode = inf", "endTimeCode must be finite"),
+        ("startTimeCode = 9\nendTimeCode = 5", "endTimeCode 5 is before startTimeCode 9"),
+        ("timeCodesPerSecond = 5e-324", "timeCodesPerSecond must be from 0.001"),
+        ("timeCodesPerSecond = 0", "timeCodesPerSecond must be positive"),
+        ("timeCodesPerSecond = 24\nframesPerSecond = 1e9", "framesPerSecond must be from 0.001"),
+        ("endTimeCode = 1e11", "frames from startTimeCode to endTimeCode"),
+    ],
+)
+def test_times(tmp_path, times, message):
+    path = write(tmp_path, ball(), f"{METRES}\n{times}")
+    with pytest.raises(InputError) as caught:
+        stage_clock(open_stage(path))
+    assert str(caught.value).startswith(f"{path}: ") and message in str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["metersPerUnit", "kilogramsPerUnit"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "5e-324"])
+def test_units(tmp_path, unit, value):
+    metadata = METRES.replace(f"{unit} = 1", f"{unit} = {value}")
+    with pytest.raises(InputError, match=f"stage.usda: {unit} must be positive and finite"):
+        read_magnets(open_stage(write(tmp_path, ball(), metadata)))
+
+
+def test_time_samples_of_another_type(tmp_path):
+    path = write(tmp_path, ball('string physics:velocity.timeSamples = { 0: "a", 10: "b" }'))
+    with pytest.raises(InputError, match="^/Ball: physics:velocity must be a Vec3f, got 'a'"):
+        open_stage(path)
+
+
+INSTANCES = """
+class Xform "Prototype"
+{
+    BODY
+}
+def Xform "A" (instanceable = true
+    references = </Prototype>)
+{
+}
+"""
+
+
+@pytest.mark.parametrize(
+    "animated",
+    [
+        "double radius.timeSamples = { 0: 0.02, 10: 0.03 }",
+        "double radius = 0.02\ndouble3 xformOp:translate.timeSamples = { 0: (0, 0, 1) }\n"
+        'uniform token[] xformOpOrder = ["xformOp:translate"]',
+    ],
+)
+def test_time_samples_inside_instances(tmp_path, animated):
+    path = write(tmp_path, INSTANCES.replace("BODY", ball(radius=animated)))
+    errors = [str(one) for one in survey(open_stage(path)).findings if one.severity == "error"]
+    assert len(errors) == 1 and errors[0].startswith("/A/Ball: ") and "set instanceable = false on /A" in errors[0]
+    path.write_text(path.read_text().replace("instanceable = true", "instanceable = false"))
+    stage = open_stage(path)
+    assert survey(stage).findings == []
+    held = stage.GetPrimAtPath("/A/Ball")
+    assert held.GetAttribute("radius").Get(Usd.TimeCode.Default()) == 0.02
+
+
+def test_constant_samples_inside_instances_are_sound(tmp_path):
+    both = "double radius = 0.02\ndouble radius.timeSamples = { 0: 0.02 }"
+    assert survey(open_stage(write(tmp_path, INSTANCES.replace("BODY", ball(radius=both))))).findings == []
+
+
+def test_what_newton_raises_or_leaves_out_is_one_line():
+    for error in (KeyError("joint"), ZeroDivisionError("x\ny"), MemoryError()):
+        with (
+            pytest.raises(InputError, match=r"^s\.usda: Newton cannot import it") as caught,
+            refusals("s.usda", "import"),
+        ):
+            raise error
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="cannot import all of it .Skipping collider /A"), refusals("s.usda", "import"):
+        warnings.warn("Skipping collider /A: no volume", stacklevel=1)
+    with refusals("s.usda", "import"):
+        warnings.warn("a remark", stacklevel=1)

@@ -1,0 +1,37 @@
+"""Turns what Newton raises over a stage, or warns about and then leaves out, into one line about the stage."""
+
+import contextlib
+import re
+import warnings
+from collections.abc import Iterator
+
+from warpmag.errors import InputError
+from warpmag.usd.values import quiet
+
+_LOSSES = re.compile(r"[Ss]kipp|Invalid|Ignoring (?!body-level density)|unspecified|zero mass|not imported|result\.")
+"""What a warning says by which something of the stage is lost; the others are remarks."""
+
+
+@contextlib.contextmanager
+def refusals(where: str, what: str) -> Iterator[None]:
+    """Raise :class:`InputError` for every error in the block, and for every warning by which something gets lost.
+
+    Args:
+        where: The stage, as messages call it.
+        what: What the block does with it.
+    """
+    try:
+        with quiet(), warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield
+    except InputError:
+        raise
+    except Exception as error:  # of any kind: nothing of Newton's or Warp's is to reach the user as a traceback
+        raise InputError(f"{where}: Newton cannot {what} it ({_line(error) or type(error).__name__})") from None
+    for one in caught:
+        if _LOSSES.search(_line(one.message)):
+            raise InputError(f"{where}: Newton cannot {what} all of it ({_line(one.message)})")
+
+
+def _line(text) -> str:
+    return " ".join(str(text).split())

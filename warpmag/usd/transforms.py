@@ -1,0 +1,124 @@
+"""Transforms: those that USD cannot compose, and those that no rigid body can have."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from pxr import Tf, Usd, UsdGeom, UsdPhysics
+
+from warpmag.errors import InputError
+from warpmag.usd.values import FARTHEST, Finding, finding_of, instance_finding, value_of
+
+_RESET = "!resetXformStack!"
+_INVERSE = "!invert!"
+
+
+def is_body(prim: Usd.Prim) -> bool:
+    """Whether a prim is an enabled rigid body."""
+    return prim.HasAPI(UsdPhysics.RigidBodyAPI) and bool(UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get())
+
+
+def is_collider(prim: Usd.Prim) -> bool:
+    """Whether a prim is an enabled collider."""
+    return prim.HasAPI(UsdPhysics.CollisionAPI) and bool(UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get())
+
+
+def is_animated(prim: Usd.Prim) -> bool:
+    """Whether a layer gives time samples for the prim's own transform, held or not."""
+    if not prim.IsA(UsdGeom.Xformable):
+        return False
+    order = UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() or ()
+    operations = (prim.GetAttribute(name.removeprefix(_INVERSE)) for name in order if "xformOp:" in name)
+    return any(spec.HasInfo("timeSamples") for one in operations if one for spec in one.GetPropertyStack())
+
+
+class TransformCheck:
+    """Finds transforms that no rigid body can have, those that cannot be composed once, at the prim that causes it."""
+
+    def __init__(self):
+        """Know nothing yet."""
+        self._cache = UsdGeom.XformCache(Usd.TimeCode.Default())
+        self._sound = {}
+
+    def findings(self, prim: Usd.Prim) -> Iterator[Finding]:
+        """Yield what is wrong with the transform of a body or collider, its ancestors' included."""
+        yield from self._lineage_findings(prim)
+        if not self.is_sound(prim):
+            return
+        path = str(prim.GetPath())
+        world = np.array(self._cache.GetLocalToWorldTransform(prim))
+        if not np.abs(world).max() <= FARTHEST:
+            yield Finding(path, f"transform reaches {np.abs(world).max():g}, beyond {FARTHEST:g}")
+            return
+        matrix = world[:3, :3]
+        gram = matrix @ matrix.T
+        # Rotation and scale leave the axes at right angles. Poses are often single precision: 1e-5.
+        size = np.trace(gram) / 3.0
+        if np.linalg.norm(matrix, axis=1).min() < 1.0 / FARTHEST:
+            yield Finding(path, f"transform has a scale of less than {1.0 / FARTHEST:g}")
+        elif np.abs(gram - np.diag(np.diag(gram))).max() > 1e-5 * size:
+            yield Finding(path, "transform is sheared, which Newton imports wrong")
+        elif np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+            yield Finding(path, "transform is a projection, which no rigid body has")
+        elif is_body(prim) and np.linalg.det(matrix) < 0.0:
+            yield Finding(path, "transform is mirrored, which Newton imports wrong: mirror the mesh instead")
+        elif prim.IsA(UsdGeom.Sphere) and np.abs(np.diag(gram) - size).max() > 1e-5 * size:
+            yield Finding(path, "a sphere scaled unevenly would be imported as a ball: make it a mesh")
+
+    def is_sound(self, prim: Usd.Prim) -> bool:
+        """Whether USD can compose the transform of a prim whose findings have been asked for."""
+        return self._sound[prim.GetPath()]
+
+    def _lineage_findings(self, prim) -> Iterator[Finding]:
+        lineage = []
+        while not prim.IsPseudoRoot() and prim.GetPath() not in self._sound:
+            lineage.append(prim)
+            prim = prim.GetParent()
+        for prim in reversed(lineage):
+            found = list(_own_findings(prim))
+            self._sound[prim.GetPath()] = not found and self._sound.get(prim.GetParent().GetPath(), True)
+            yield from found
+
+
+def _own_findings(prim) -> Iterator[Finding]:
+    """Yield what is wrong with the operations of one prim."""
+    if not prim.IsA(UsdGeom.Xformable):
+        return
+    path = str(prim.GetPath())
+    try:
+        order = value_of(prim, "xformOpOrder")
+    except InputError as error:
+        yield finding_of(path, error)
+        return
+    for entry in order or ():
+        name = entry.removeprefix(_INVERSE)
+        if entry == _RESET:
+            continue
+        if message := _operation_fault(prim, name):
+            yield Finding(path, message)
+            return
+        if finding := instance_finding(prim.GetAttribute(name)):
+            yield finding
+    try:
+        matrix = UsdGeom.Xformable(prim).GetLocalTransformation(Usd.TimeCode.Default())
+    except Tf.ErrorException:
+        yield Finding(path, "transform cannot be composed by USD")
+        return
+    if not np.isfinite(np.array(matrix)).all():
+        yield Finding(path, "transform is not finite")
+    elif matrix.GetDeterminant3() == 0.0:
+        yield Finding(path, "transform has a scale of zero")
+
+
+def _operation_fault(prim, name) -> str:
+    """Return what is wrong with one operation of a transform, empty where nothing is."""
+    attribute = prim.GetAttribute(name) if name.startswith("xformOp:") else None
+    if not attribute:
+        return f"xformOpOrder names {name!r:.80}, which the prim does not have"
+    try:
+        value = attribute.Get()
+        matrix = UsdGeom.XformOp(attribute).GetOpTransform(Usd.TimeCode.Default())
+    except (Tf.ErrorException, RuntimeError):
+        return f"{name} has a type or value that USD cannot compose"
+    if value is None and attribute.HasAuthoredValue() and not attribute.GetNumTimeSamples():
+        return f"{name} has a value that USD cannot read"
+    return "" if np.isfinite(np.array(matrix)).all() else f"transform is not finite ({name})"

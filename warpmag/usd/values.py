@@ -1,0 +1,289 @@
+"""The one way to an attribute's value: of the type that its schema says, finite and in range, or one line about it."""
+
+import contextlib
+import math
+import numbers
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from pxr import Gf, Tf, Usd, UsdUtils, Vt
+
+from warpmag.errors import InputError
+
+LARGEST = float(np.finfo(np.float32).max)
+"""What lies beyond single precision cannot reach Newton."""
+SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
+"""Sizes of shapes [m] whose volumes, inertias and moments single precision holds."""
+FARTHEST = 1e8
+"""Limit of every coordinate [m], so that squares and fourth powers of distances stay in single precision."""
+_LIGHTEST, _HEAVIEST = 1e-20, 1e20
+_FASTEST = 1e6
+_SIZE, _COORDINATE = (SMALLEST_SIZE, LARGEST_SIZE, False), (-FARTHEST, FARTHEST, False)
+_COEFFICIENT = (0.0, 1e6, False)
+_RANGES = {  # lowest, highest, and whether 0 stands for "not given"
+    **dict.fromkeys(("radius", "radiusTop", "radiusBottom", "size", "height"), _SIZE),
+    **dict.fromkeys(("points", "physics:centerOfMass"), _COORDINATE),
+    **dict.fromkeys(("physics:localPos0", "physics:localPos1"), _COORDINATE),
+    "physics:mass": (_LIGHTEST, _HEAVIEST, True),
+    "physics:density": (1e-6, 1e12, True),
+    "physics:diagonalInertia": (1e-36, 1e36, True),
+    "physics:velocity": (-_FASTEST, _FASTEST, False),
+    "physics:angularVelocity": (-1e8, 1e8, False),
+    "physics:gravityMagnitude": (0.0, 1e6, False),
+    "physics:gravityDirection": (-1e9, 1e9, False),
+    "physics:staticFriction": _COEFFICIENT,
+    "physics:dynamicFriction": _COEFFICIENT,
+    "physics:restitution": (0.0, 1.0, False),
+    "newton:torsionalFriction": _COEFFICIENT,
+    "newton:rollingFriction": _COEFFICIENT,
+    "newton:contactMargin": (0.0, LARGEST_SIZE, False),
+    "newton:contactGap": (0.0, LARGEST_SIZE, False),
+    "newton:contactStiffness": (0.0, LARGEST, False),
+    "newton:contactDamping": (0.0, LARGEST, False),
+    "newton:contactAdhesion": (0.0, LARGEST, False),
+    "newton:contactFrictionGain": (0.0, LARGEST, False),
+    "newton:timeStepsPerSecond": (1, 1_000_000, False),
+}
+_TOKENS = {
+    **dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")),
+    "orientation": ("rightHanded", "leftHanded"),
+}
+_TURNS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
+_INERTIA = 1e-2
+"""Inertias are often rounded: by this part of their sum the largest may exceed the others."""
+_READ = ("physics:", "newton:", "mjc:", "drive:", "limit:")
+_SHAPES = {
+    "Sphere": ("radius",),
+    "Cube": ("size",),
+    **dict.fromkeys(("Capsule", "Cylinder", "Cone"), ("radius", "height", "axis")),
+    **dict.fromkeys(("Capsule_1", "Cylinder_1"), ("radiusTop", "radiusBottom", "height", "axis")),
+    "Plane": ("width", "length", "axis"),
+    "Mesh": ("points", "faceVertexCounts", "faceVertexIndices", "orientation", "subdivisionScheme", "holeIndices"),
+}
+_VECTORS = (Gf.Vec3f, Gf.Vec3d, Gf.Vec3h, Gf.Vec3i)
+_SCHEMAS = (
+    *("PhysicsMassAPI", "PhysicsMaterialAPI", "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"),
+    *("NewtonSceneAPI", "NewtonMaterialAPI", "NewtonMeshCollisionAPI", "NewtonCollisionAPI"),
+    "NewtonArticulationRootAPI",
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something wrong with a stage.
+
+    Attributes:
+        where: Path of the prim, or the name of the stage.
+        message: What is wrong with it.
+        severity: ``error`` (a run refuses the stage) or ``warning``.
+    """
+
+    where: str
+    message: str
+    severity: str = "error"
+
+    def __str__(self) -> str:
+        """One line that names the prim."""
+        return f"{self.where}: {self.message}"
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what USD has to say off stderr; its errors are raised all the same."""
+    silencer = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        del silencer
+
+
+def finding_of(where: str, error: InputError) -> Finding:
+    """Return what an :class:`InputError` about ``where`` says as a finding."""
+    return Finding(where, str(error).removeprefix(f"{where}: "))
+
+
+def value_of(prim: Usd.Prim, name: str):
+    """Return the default value of an attribute, None where it has none.
+
+    Raises:
+        InputError: The value is not what the schema says it is, not finite or out of range. Infinities that are the
+            schema's own defaults, of a limit say, are right.
+    """
+    attribute = prim.GetAttribute(name)
+    if not attribute:
+        return None
+    try:
+        value = attribute.Get()
+    except Tf.ErrorException:
+        raise InputError(f"{prim.GetPath()}: {name} has a value that USD cannot read") from None
+    if value is None or not attribute.HasAuthoredValue():
+        return value
+    example, fallback = _expected(prim, attribute)
+    check_type(prim, name, value, example)
+    if name in _TOKENS and value not in _TOKENS[name]:
+        raise InputError(f"{prim.GetPath()}: {name} must be one of {', '.join(_TOKENS[name])}, got {_shown(value)}")
+    _check_numbers(prim, name, value, fallback)
+    if message := _shape_of_value(name, value):
+        raise InputError(f"{prim.GetPath()}: {name} {message}, got {_shown(value)}")
+    return value
+
+
+def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
+    """Yield what is wrong with those attributes of a prim that Newton's importer reads, transforms left out.
+
+    Args:
+        prim: Any prim.
+        shape: Whether its shape counts, too.
+    """
+    names = [name for name in prim.GetAuthoredPropertyNames() if name.startswith(_READ)]
+    for name in (*names, *(_SHAPES.get(prim.GetTypeName(), ()) if shape else ())):
+        attribute = prim.GetAttribute(name)
+        if not attribute:
+            continue
+        try:
+            value_of(prim, name)
+        except InputError as error:
+            yield finding_of(str(prim.GetPath()), error)
+        if finding := instance_finding(attribute):
+            yield finding
+
+
+def instance_finding(attribute: Usd.Attribute) -> Finding | None:
+    """Return what is wrong with time samples where no value can be held: inside an instance, from which all read."""
+    prim = attribute.GetPrim()
+    if not (prim.IsInstanceProxy() and attribute.GetNumTimeSamples()):
+        return None
+    default = attribute.Get()
+    if all(attribute.Get(time) == default for time in attribute.GetTimeSamples()):
+        return None
+    while not prim.IsInstance():
+        prim = prim.GetParent()
+    return Finding(
+        str(attribute.GetPrim().GetPath()),
+        f"{attribute.GetName()} has time samples inside an instance, where no moment of them can be held: "
+        f"set instanceable = false on {prim.GetPath()}",
+    )
+
+
+def number(name: str, value) -> float:
+    """Return a number, the shortest decimal that its single precision stands for: 0.001, not 0.0010000000475.
+
+    Args:
+        name: Prim and attribute, for the message.
+        value: What the attribute holds, whatever type a hand-written file gave it.
+    """
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        raise InputError(f"{name}: {_shown(value)} is not a float")
+    with np.errstate(over="ignore"):
+        return float(str(np.float32(value)))
+
+
+def vector(name: str, value) -> tuple[float, float, float]:
+    """Return a vector of three numbers as :func:`number` gives them."""
+    if not isinstance(value, _VECTORS):
+        raise InputError(f"{name}: {_shown(value)} is not a vector")
+    x, y, z = (number(name, one) for one in value)
+    return x, y, z
+
+
+def text(name: str, value) -> str:
+    """Return a token or a string."""
+    if not isinstance(value, str):
+        raise InputError(f"{name}: {_shown(value)} is not a str")
+    return value
+
+
+def check_type(prim: Usd.Prim, name: str, value, example) -> None:
+    """Raise :class:`InputError` unless ``value`` is of the type of ``example``, which None leaves open."""
+    if example is not None and type(value) is not type(example):
+        raise InputError(f"{prim.GetPath()}: {name} must be {_kind(example)}, got {_shown(value)}")
+
+
+def declared(attribute: Usd.Attribute):
+    """Return a value of the type that an attribute is declared with, None where that type is unknown."""
+    return attribute.GetTypeName().defaultValue if attribute.GetTypeName() else None
+
+
+@cache
+def _known() -> dict[str, object]:
+    """Defaults of what Newton reads by name alone, applied schema or not."""
+    registry = Usd.SchemaRegistry()
+    found = {}
+    for schema in _SCHEMAS:
+        definition = registry.FindAppliedAPIPrimDefinition(schema)
+        for name in definition.GetPropertyNames() if definition else ():
+            found[name] = definition.GetAttributeFallbackValue(name)
+    return found
+
+
+def _expected(prim, attribute):
+    """Return a value of the right type, and the schema's default or None."""
+    name = attribute.GetName()
+    fallback = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
+    if fallback is None:
+        fallback = _known().get(name)
+    return (declared(attribute) if fallback is None else fallback), fallback
+
+
+def _check_numbers(prim, name, value, fallback) -> None:
+    given = _numbers(value)
+    if given is None or not given.size:
+        return
+    usual = None if fallback is None else _numbers(fallback)
+    if usual is not None and np.isinf(usual).all() and np.array_equal(given, usual):
+        return
+    where = f"{prim.GetPath()}: {name}"
+    lowest, highest, zero = _RANGES.get(name, (-LARGEST, LARGEST, True))
+    if lowest > 0.0 and not (np.isfinite(given) & ((given > 0.0) | (zero & (given == 0.0)))).all():
+        wanted = "not be negative and must be finite" if zero else "be positive and finite"
+        raise InputError(f"{where} must {wanted}, got {_shown(value)}")
+    if not np.isfinite(given).all():
+        raise InputError(f"{where} must be finite, got {_shown(value)}")
+    wrong = (given < lowest) | (given > highest)
+    if (wrong & (given != 0.0) if zero else wrong).any():
+        unless = "0 or " if zero and lowest > 0.0 else ""
+        raise InputError(f"{where} must be {unless}from {lowest:g} to {highest:g}, got {_shown(value)}")
+
+
+def _shape_of_value(name, value) -> str:
+    """Return what the numbers of a value must be together, empty where they are."""
+    if name in _TURNS:
+        norm = float(np.linalg.norm(_numbers(value)))
+        if abs(norm - 1.0) > 1e-2 and not (norm == 0.0 and name == "physics:principalAxes"):
+            return "must be a quaternion of length 1"
+    if name == "physics:diagonalInertia" and 2.0 * max(value) > (1.0 + _INERTIA) * sum(value):
+        return "must be the inertia of a body: none of three more than the sum of the others"
+    return ""
+
+
+def _numbers(value) -> np.ndarray | None:
+    """Return the numbers of a value, None for tokens and the like."""
+    if isinstance(value, (bool, str)):
+        return None
+    if isinstance(value, (Gf.Quatf, Gf.Quatd, Gf.Quath)):
+        value = (value.GetReal(), *value.GetImaginary())
+    try:
+        return np.array(value, dtype=float).ravel()
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _kind(example) -> str:
+    if isinstance(example, str):
+        return "a token"
+    name = type(example).__name__
+    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
+
+
+def _shown(value) -> str:
+    """Return a value in a few words, however long it is."""
+    if isinstance(value, float):
+        return f"{value:g}" if math.isfinite(value) else str(value)
+    if isinstance(value, _VECTORS):
+        return str(tuple(value))
+    if type(value).__module__ == Vt.__name__ and hasattr(value, "__len__"):
+        return f"an array of {len(value)}"
+    shown = " ".join(repr(value).split())
+    return shown if len(shown) <= 80 else f"{shown[:77]}..."
