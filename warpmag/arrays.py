@@ -18,6 +18,8 @@ FARTHEST = {wp.float32: 1e7, wp.float64: 1e30}
 REFERENCE_RADIUS_RANGE = {wp.float32: (1e-6, 2e4), wp.float64: (1e-30, 1e30)}
 REFERENCE_FARTHEST = {wp.float32: 5e4, wp.float64: 1e30}
 """The same of the plain loop, which has r⁶ of overlapping balls and r⁻⁷."""
+MATERIAL_RANGE = {wp.float32: (1e-12, 1e15), wp.float64: (1e-100, 1e100)}
+"""Least and largest saturation [A/m] and finite susceptibility, by Warp scalar type."""
 CELLS = 1e9
 """Distance from the origin, in contact distances of the largest balls, to which the search for neighbours has cells."""
 
@@ -37,7 +39,7 @@ def hint(dtype) -> str:
 
 def range_message(name: str, unit: str, value: float, limits: tuple[float, float], dtype) -> str:
     """Text for a value that is out of the range of the Warp scalar type ``dtype``."""
-    text = f"{name}: must be {limits[0]:g} to {limits[1]:g} {unit} in {name_of(dtype)}, got {value:g}"
+    text = f"{name}: must be {limits[0]:g} to {limits[1]:g}{unit} in {name_of(dtype)}, got {value:g}"
     return text + ("; use float64" if dtype is wp.float32 else "")
 
 
@@ -110,7 +112,7 @@ def host_radii(name: str, value, dtype, *, reference: bool = False) -> np.ndarra
     least, most = (REFERENCE_RADIUS_RANGE if reference else RADIUS_RANGE)[dtype]
     outside = (radii > 0.0) & ((radii < least) | (radii > most))
     if outside.any():
-        raise InputError(range_message(name, "m", radii[outside].flat[0], (least, most), dtype))
+        raise InputError(range_message(name, " m", radii[outside].flat[0], (least, most), dtype))
     return radii
 
 
@@ -127,11 +129,18 @@ def host_positive(name: str, value, count: int, dtype, *, infinite: bool = False
     array = host_scalars(name, value, count, infinite=infinite)
     if not (array > 0.0).all():
         raise InputError(f"{name}: must be positive, got {array.min():g}")
-    limits = np.finfo(name_of(dtype))
-    outside = (array < float(limits.tiny)) | (np.isfinite(array) & (array > float(limits.max)))
+    least, most = MATERIAL_RANGE[dtype]
+    outside = (array < least) | (np.isfinite(array) & (array > most))
     if outside.any():
-        raise InputError(f"{name}: {array[outside][0]:g} is out of range {hint(dtype)}")
+        raise InputError(range_message(name, "", array[outside][0], (least, most), dtype))
     return array
+
+
+def largest(array) -> float:
+    """Largest absolute component of a Warp array of vectors; on a GPU their norm, of one reduction."""
+    if array.shape[0] and array.device.is_cuda:
+        return math.sqrt(wp.utils.array_inner(array, array))
+    return float(np.abs(array.numpy()).max(initial=0.0))
 
 
 def first_not_finite(array) -> int | None:

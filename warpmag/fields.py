@@ -177,7 +177,7 @@ def _is_reference(kind: Kind, method, smoothing, radii, rtol, dtype) -> bool:
         raise InputError("smoothing: only for point dipoles; leave radii out")
     least, most = REFERENCE_RADIUS_RANGE[kind.dtype]
     if smoothing > 0.0 and not least <= smoothing <= most:
-        raise InputError(range_message("smoothing", "m", smoothing, (least, most), kind.dtype))
+        raise InputError(range_message("smoothing", " m", smoothing, (least, most), kind.dtype))
     return method == "reference" or smoothing > 0.0
 
 

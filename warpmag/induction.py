@@ -15,6 +15,8 @@ from warpmag.arrays import (
     host_positive,
     host_radii,
     host_scalars,
+    largest,
+    name_of,
     real_array,
     resolve_kind,
 )
@@ -22,6 +24,8 @@ from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.magnets import shown
 from warpmag.system import MomentSystem
 
+_FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
+"""Least and largest field in units of saturation of which neither square nor root is lost, by Warp scalar type."""
 _USUAL = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
 """Numbers that are not the cause where a result is not finite, by Warp scalar type."""
 
@@ -127,6 +131,9 @@ def solve_induction(
     source_x, source_m = _sources(kind, sources, farthest)
     k = source_x.shape[0]
 
+    saturation = host_positive("saturation", saturation, n, kind.dtype)
+    susceptibility = host_positive("susceptibility", susceptibility, n, kind.dtype, infinite=True)
+
     def with_sources(values, others):
         return np.concatenate([values, np.full(k, others)])
 
@@ -134,8 +141,8 @@ def solve_induction(
         radii=with_sources(size, 0.0),
         permanent=np.arange(n + k) >= n,
         movable=np.arange(n + k) < n,
-        saturation=with_sources(host_positive("saturation", saturation, n, kind.dtype), 1.0),
-        susceptibility=with_sources(host_positive("susceptibility", susceptibility, n, kind.dtype, infinite=True), 1.0),
+        saturation=with_sources(saturation, 1.0),
+        susceptibility=with_sources(susceptibility, 1.0),
         curve=curve,
         dynamics=dynamics,
         contact_model=contact_model,
@@ -164,6 +171,7 @@ def solve_induction(
         "initial": initial,
     }
     _check_finite(kind, system, n, given, magnetization=m, field=system.h)
+    _check_strength(kind, largest(system.h), saturation)
     result = InductionResult(
         magnetizations=kind.finish(m, n),
         h_field=kind.finish(system.h, n),
@@ -189,6 +197,19 @@ def _sources(kind: Kind, sources, farthest):
         raise InputError(f"sources: must be (positions, moments), got {shown(sources)}")
     x = kind.vectors("sources: positions", sources[0], farthest=farthest)
     return x, kind.vectors("sources: moments", sources[1], x.shape[0])
+
+
+def _check_strength(kind: Kind, strongest: float, saturation):
+    """Raise ``InputError`` where the ``strongest`` field [A/m] is so weak or strong that a solve cannot resolve it."""
+    least, most = _FIELD_RANGE[kind.dtype]
+    tiny = float(np.finfo(name_of(kind.dtype)).tiny)  # what is smaller counts as zero
+    weak = tiny <= strongest < least * max(1.0, saturation.max(initial=0.0))
+    if weak or strongest > most * saturation.min(initial=np.inf):
+        how, of = ("weak", saturation.max()) if weak else ("strong", saturation.min())
+        raise InputError(
+            f"external_field, sources, saturation: a field of {strongest:.3g} A/m is too {how} for a saturation of "
+            f"{of:.3g} A/m {hint(kind.dtype)}"
+        )
 
 
 def _check_finite(kind: Kind, system: MomentSystem, count: int, given: dict, **results):
