@@ -3,6 +3,7 @@
 import math
 import numbers
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -136,16 +137,22 @@ def host_positive(name: str, value, count: int, dtype, *, infinite: bool = False
     return array
 
 
+def norm_squared(array) -> float:
+    """Sum of the squares of a Warp array of vectors, infinite or NaN if one of them is: on a GPU one reduction."""
+    total: Any = wp.utils.array_inner(array, array)
+    return float(total)
+
+
 def largest(array) -> float:
     """Largest absolute component of a Warp array of vectors; on a GPU their norm, of one reduction."""
     if array.shape[0] and array.device.is_cuda:
-        return math.sqrt(wp.utils.array_inner(array, array))
+        return math.sqrt(norm_squared(array))
     return float(np.abs(array.numpy()).max(initial=0.0))
 
 
 def first_not_finite(array) -> int | None:
     """Row of a Warp array that is the first not to be finite, None if all are: on a GPU one reduction."""
-    if not array.shape[0] or (array.device.is_cuda and np.isfinite(wp.utils.array_sum(array)).all()):
+    if not array.shape[0] or (array.device.is_cuda and math.isfinite(norm_squared(array))):
         return None
     host = array.numpy()
     return None if np.isfinite(host).all() else int(np.argwhere(~np.isfinite(host))[0, 0])
@@ -242,7 +249,7 @@ def _within(array, least: float, most: float) -> bool:
     """Whether a reduction on a GPU tells that the largest absolute value of an array of vectors is in range."""
     if not (array.shape[0] and array.device.is_cuda):
         return False
-    square = wp.utils.array_inner(array, array)  # of the largest, at least, and at most so many times that
+    square = norm_squared(array)  # of the largest, at least, and at most so many times that
     return 3.0 * array.shape[0] * least**2 < square < math.inf and math.sqrt(square) <= most
 
 
