@@ -150,11 +150,11 @@ def largest(array) -> float:
     return float(np.abs(array.numpy()).max(initial=0.0))
 
 
-def first_not_finite(array) -> int | None:
-    """Row of a Warp array that is the first not to be finite, None if all are: on a GPU one reduction."""
-    if not array.shape[0] or (array.device.is_cuda and math.isfinite(norm_squared(array))):
+def first_not_finite(array, count: int) -> int | None:
+    """Row among the first ``count`` of a Warp array that is not finite, None if all are: on a GPU one reduction."""
+    if not count or (array.device.is_cuda and math.isfinite(norm_squared(array[:count]))):
         return None
-    host = array.numpy()
+    host = array.numpy()[:count]
     return None if np.isfinite(host).all() else int(np.argwhere(~np.isfinite(host))[0, 0])
 
 
@@ -168,10 +168,12 @@ class Kind:
 
     def finish(self, array, count=None):
         """Return a Warp array, or a copy of its first ``count`` entries, as the caller's kind."""
-        if count is not None:
-            # Warp refuses an empty slice
-            array = wp.clone(array[:count]) if count else wp.empty(0, dtype=array.dtype, device=array.device)
-        return array if self.warp_out else array.numpy()
+        if not self.warp_out:
+            return array.numpy() if count is None else array.numpy()[:count].copy()
+        if count is None:
+            return array
+        # Warp refuses an empty slice
+        return wp.clone(array[:count]) if count else wp.empty(0, dtype=array.dtype, device=array.device)
 
     def vectors(self, name, value, count=None, *, farthest=None, least=None):
         """Warp array of three-vectors, shape [n], from [n, 3] or, with ``count``, from one vector for all.

@@ -42,7 +42,8 @@ def h_field(
     """Field H of magnetic moments (Kim and Han 2022, Eq. 1).
 
     Moments with a radius are uniformly magnetized balls; where a ball overlaps the target's ball the field is the one
-    averaged over the target. Point dipoles at zero distance are left out, as is a moment's own field.
+    averaged over the target. Point dipoles at zero distance are left out, as is a moment's own field; in float32 that is
+    what is nearer than 1e-19 m, about.
 
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
@@ -60,7 +61,8 @@ def h_field(
         H [A/m], shape [t, 3], NumPy or a Warp array of vectors as ``positions`` is.
 
     Raises:
-        InputError: An argument has a wrong shape, is not finite or is out of range.
+        InputError: An argument has a wrong shape, holds no real numbers, is out of range of ``dtype`` (see
+            ``warpmag.arrays``), or the result is not finite.
     """
     kind = resolve_kind(positions, dtype, device)
     reference = _is_reference(kind, method, smoothing, radii, rtol, dtype)
@@ -118,7 +120,8 @@ def wrench(
         Forces [N] and torques about each moment's position [N·m], each of shape [n, 3], in the kind of ``positions``.
 
     Raises:
-        InputError: An argument has a wrong shape, is not finite or is out of range.
+        InputError: An argument has a wrong shape, holds no real numbers, is out of range of ``dtype`` (see
+            ``warpmag.arrays``), or the result is not finite.
     """
     kind = resolve_kind(positions, dtype, device)
     reference = _is_reference(kind, method, smoothing, radii, rtol, dtype)
@@ -183,7 +186,7 @@ def _is_reference(kind: Kind, method, smoothing, radii, rtol, dtype) -> bool:
 
 def _check_finite(what, kind: Kind, results, positions, moments, at, more=""):
     """Raise ``InputError`` where results [n] at places ``at`` are not finite, with what is likely to be the cause."""
-    row = first_not_finite(results)
+    row = first_not_finite(results, results.shape[0])
     if row is None:
         return
     x, place, m = (a.numpy().astype(float) for a in (positions, at, moments))

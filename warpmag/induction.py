@@ -114,7 +114,8 @@ def solve_induction(
         The equilibrium, an :class:`InductionResult`.
 
     Raises:
-        InputError: An argument has a wrong shape, is not finite or is out of range.
+        InputError: An argument has a wrong shape, holds no real numbers, is out of range of ``dtype`` (see
+            ``warpmag.arrays``), or the result is not finite.
 
     Warns:
         ConvergenceWarning: ``max_evaluations`` did not suffice; the result is the best that was found.
@@ -171,11 +172,14 @@ def solve_induction(
         "initial": initial,
     }
     _check_finite(kind, system, n, given, magnetization=m, field=system.h)
+    error = float(system.error.numpy().max(initial=0.0))
+    if not math.isfinite(error):
+        raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
     _check_strength(kind, largest(system.h), saturation)
     result = InductionResult(
         magnetizations=kind.finish(m, n),
         h_field=kind.finish(system.h, n),
-        error=float(system.error.numpy().max(initial=0.0)),
+        error=error,
         evaluations=int(system.evaluations.numpy().max(initial=0)),
         converged=bool(system.converged.numpy().all()),
         _system=system,
@@ -213,14 +217,12 @@ def _check_strength(kind: Kind, strongest: float, saturation):
 
 
 def _check_finite(kind: Kind, system: MomentSystem, count: int, given: dict, **results):
-    """Raise ``InputError`` where the error, or a row of results of the first ``count``, is not finite.
+    """Raise ``InputError`` where a row of results of the first ``count`` is not finite.
 
     The message names those of the ``given`` arguments that are likely to be the cause.
     """
-    rows = {what: first_not_finite(array[:count] if count else array) for what, array in results.items()}
+    rows = {what: first_not_finite(array, count) for what, array in results.items()}
     where = [f"the {what} of ball {row}" for what, row in rows.items() if row is not None]
-    if not np.isfinite(system.error.numpy()).all():
-        where.append("the error")
     if not where:
         return
     least, most = _USUAL[kind.dtype]
