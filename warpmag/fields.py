@@ -42,8 +42,8 @@ def h_field(
     """Field H of magnetic moments (Kim and Han 2022, Eq. 1).
 
     Moments with a radius are uniformly magnetized balls; where a ball overlaps the target's ball the field is the one
-    averaged over the target. Point dipoles at zero distance are left out, as is a moment's own field; in float32 that is
-    what is nearer than 1e-19 m, about.
+    averaged over the target. Point dipoles at zero distance are left out, as is a moment's own field; zero is what is
+    nearer than about 1e-19 m in float32.
 
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
