@@ -3,14 +3,27 @@
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import Kind, check_radii, resolve_kind, vec3_type
+from warpmag.arrays import (
+    REFERENCE_RADIUS_RANGE,
+    Kind,
+    farthest_place,
+    first_not_finite,
+    hint,
+    host_radii,
+    range_message,
+    resolve_kind,
+    vec3_type,
+)
 from warpmag.errors import InputError
 from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.magnets import check_rtol, check_token
+from warpmag.magnets import check_not_negative, check_rtol, check_token
 
 _METHODS = ("auto", "vectorized", "reference")
+_LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
+_LEAST_OF_FORCE = {wp.float32: 1e-18, wp.float64: 1e-150}
+"""Least of the largest component of moments [A·m²]: products of smaller ones have no digits left."""
 
 
 def h_field(
@@ -29,7 +42,8 @@ def h_field(
     """Field H of magnetic moments (Kim and Han 2022, Eq. 1).
 
     Moments with a radius are uniformly magnetized balls; where a ball overlaps the target's ball the field is the one
-    averaged over the target. Point dipoles at zero distance are left out, as is a moment's own field.
+    averaged over the target. Point dipoles at zero distance are left out, as is a moment's own field; zero is what is
+    nearer than about 1e-19 m in float32.
 
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
@@ -47,26 +61,29 @@ def h_field(
         H [A/m], shape [t, 3], NumPy or a Warp array of vectors as ``positions`` is.
 
     Raises:
-        InputError: An argument has a wrong shape, is not finite or is out of range.
+        InputError: An argument has a wrong shape, holds no real numbers, is out of range of ``dtype`` (see
+            ``warpmag.arrays``), or the result is not finite.
     """
     kind = resolve_kind(positions, dtype, device)
-    _check_method(method, rtol, dtype)
-    x = kind.vectors("positions", positions)
-    m = kind.vectors("moments", moments, x.shape[0])
+    reference = _is_reference(kind, method, smoothing, radii, rtol, dtype)
     same_set = targets is None
     if same_set and target_radii is not None:
         raise InputError("target_radii: only with targets; the moments' own radii are in radii")
-    _check_smoothing(smoothing, radii)
-    sources = _packed(kind, "radii", radii, x, m)
-    at = sources
+    size, target_size = (_largest_radius(name, r, kind.dtype, reference) for name, r in _named(radii, target_radii))
+    farthest = farthest_place(kind.dtype, size + (size if same_set else target_size), reference=reference)
+    x = kind.vectors("positions", positions, farthest=farthest)
+    m = kind.vectors("moments", moments, x.shape[0], least=_LEAST_OF_FIELD)
+    sources = at = _packed(kind, "radii", radii, size, x, m)
+    points = x
     if not same_set:
-        points = kind.vectors("targets", targets)
-        at = _packed(kind, "target_radii", target_radii, points, wp.zeros_like(points))
+        points = kind.vectors("targets", targets, farthest=farthest)
+        at = _packed(kind, "target_radii", target_radii, target_size, points, wp.zeros_like(points))
     base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
     h = wp.zeros_like(base)
-    form = _prepare(at, sources, method, smoothing)
+    form = _prepare(at, sources, reference)
     segments = [(0, at.count, 0, sources.count)]
     PairEvaluation(Quantity.FIELD, segments, at, sources, base, h, form=form, smoothing=smoothing).launch()
+    _check_finite("field", kind, h, x, m, points)
     return kind.finish(h)
 
 
@@ -103,62 +120,79 @@ def wrench(
         Forces [N] and torques about each moment's position [N·m], each of shape [n, 3], in the kind of ``positions``.
 
     Raises:
-        InputError: An argument has a wrong shape, is not finite or is out of range.
+        InputError: An argument has a wrong shape, holds no real numbers, is out of range of ``dtype`` (see
+            ``warpmag.arrays``), or the result is not finite.
     """
     kind = resolve_kind(positions, dtype, device)
-    _check_method(method, rtol, dtype)
-    _check_smoothing(smoothing, radii)
-    x = kind.vectors("positions", positions)
-    m = kind.vectors("moments", moments, x.shape[0])
+    reference = _is_reference(kind, method, smoothing, radii, rtol, dtype)
+    size = _largest_radius("radii", radii, kind.dtype, reference)
+    farthest = farthest_place(kind.dtype, 2.0 * size, reference=reference)
+    x = kind.vectors("positions", positions, farthest=farthest)
     n = x.shape[0]
-    external = kind.vectors("external_field", np.zeros(3) if external_field is None else external_field, n)
-    packed = _packed(kind, "radii", radii, x, m)
+    m = kind.vectors("moments", moments, n, least=_LEAST_OF_FORCE)
+    external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
+    packed = _packed(kind, "radii", radii, size, x, m)
     forces, torques = wp.zeros_like(x), wp.zeros_like(x)
     turned = wp.ones(n, dtype=int, device=kind.device)
-    form = _prepare(packed, packed, method, smoothing)
+    form = _prepare(packed, packed, reference)
     PairEvaluation(
         Quantity.WRENCH, [(0, n, 0, n)], packed, packed, external, forces, turned=turned, torques=torques, form=form,
         smoothing=smoothing,
     ).launch()  # fmt: skip
+    _check_finite("force", kind, forces, x, m, x)
+    _check_finite("torque", kind, torques, x, m, x, more=", external_field")
     return kind.finish(forces), kind.finish(torques)
 
 
-def _packed(kind: Kind, name, radii, positions, moments) -> PackedMoments:
-    """Pack one-shot arrays, radii checked under ``name``."""
-    n = positions.shape[0]
-    array = kind.scalars(name, 0.0 if radii is None else radii, n)
-    packed = PackedMoments(array, largest_radius=_largest_radius(name, radii, kind.dtype))
+def _named(radii, target_radii):
+    return ("radii", radii), ("target_radii", target_radii)
+
+
+def _packed(kind: Kind, name, radii, largest, positions, moments) -> PackedMoments:
+    """Pack one-shot arrays, radii under ``name`` and the largest of them checked before."""
+    packed = PackedMoments(
+        kind.scalars(name, 0.0 if radii is None else radii, positions.shape[0]), largest_radius=largest
+    )
     packed.pack(positions, moments)
     return packed
 
 
-def _prepare(at, sources, method, smoothing):
+def _prepare(at, sources, reference):
     """Form of the sums, None for the fastest, which wants overlapping pairs to be found."""
-    if method == "reference" or smoothing > 0.0:
+    if reference:
         return REFERENCE
     at.find_overlaps(None if at is sources else sources)
     return None
 
 
-def _largest_radius(name, radii, dtype) -> float:
-    """Largest radius [m]; ``InputError`` for one that is negative or too small."""
-    if radii is None:
-        return 0.0
-    host = radii.numpy() if isinstance(radii, wp.array) else np.asarray(radii, float)
-    if host.size == 0:
-        return 0.0
-    check_radii(name, host, dtype)
-    return float(host.max())
+def _largest_radius(name, radii, dtype, reference) -> float:
+    """Largest radius [m], zero for none; ``InputError`` for one that is out of range."""
+    return 0.0 if radii is None else float(host_radii(name, radii, dtype, reference=reference).max(initial=0.0))
 
 
-def _check_method(method, rtol, dtype):
+def _is_reference(kind: Kind, method, smoothing, radii, rtol, dtype) -> bool:
+    """Whether the plain loop is to be used; ``InputError`` where options are out of range."""
     check_token("method", method, _METHODS)
     if rtol is not None:
         check_rtol("rtol", rtol, dtype)
-
-
-def _check_smoothing(smoothing, radii):
-    if not (smoothing >= 0.0 and np.isfinite(smoothing)):
-        raise InputError(f"smoothing: must be zero or positive and finite, got {smoothing}")
+    check_not_negative("smoothing", smoothing)
     if smoothing > 0.0 and radii is not None:
         raise InputError("smoothing: only for point dipoles; leave radii out")
+    least, most = REFERENCE_RADIUS_RANGE[kind.dtype]
+    if smoothing > 0.0 and not least <= smoothing <= most:
+        raise InputError(range_message("smoothing", " m", smoothing, (least, most), kind.dtype))
+    return method == "reference" or smoothing > 0.0
+
+
+def _check_finite(what, kind: Kind, results, positions, moments, at, more=""):
+    """Raise ``InputError`` where results [n] at places ``at`` are not finite, with what is likely to be the cause."""
+    row = first_not_finite(results, results.shape[0])
+    if row is None:
+        return
+    x, place, m = (a.numpy().astype(float) for a in (positions, at, moments))
+    apart = np.linalg.norm(x - place[row], axis=1)
+    nearest = apart[apart > 0.0].min(initial=np.inf)
+    raise InputError(
+        f"positions, moments{more}: the {what} at row {row} is not finite, with the nearest moment at {nearest:.3g} m "
+        f"and moments up to {np.abs(m).max():.3g} A·m², {hint(kind.dtype)}"
+    )

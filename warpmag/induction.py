@@ -7,10 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import Kind, resolve_kind
+from warpmag.arrays import (
+    Kind,
+    farthest_place,
+    first_not_finite,
+    hint,
+    host_positive,
+    host_radii,
+    host_scalars,
+    largest,
+    name_of,
+    real_array,
+    resolve_kind,
+)
 from warpmag.errors import ConvergenceWarning, InputError
-from warpmag.magnets import check_positive
+from warpmag.magnets import shown
 from warpmag.system import MomentSystem
+
+_FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
+"""Least and largest field in units of saturation of which neither square nor root is lost, by Warp scalar type."""
+_USUAL = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
+"""Numbers that are not the cause where a result is not finite, by Warp scalar type."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +49,7 @@ class InductionResult:
     converged: bool
     _system: MomentSystem
     _kind: Kind
+    _given: dict
     _count: int
 
     def wrench(self, force="kelvin"):
@@ -45,10 +63,11 @@ class InductionResult:
             vanish as far as the solve converged.
 
         Raises:
-            InputError: Unknown force law.
+            InputError: Unknown force law, or a force that is not finite.
         """
         system = self._system
         system.apply_forces(force)
+        _check_finite(self._kind, system, self._count, self._given, force=system.forces, torque=system.torques)
         return self._kind.finish(system.forces, self._count), self._kind.finish(system.torques, self._count)
 
 
@@ -95,34 +114,36 @@ def solve_induction(
         The equilibrium, an :class:`InductionResult`.
 
     Raises:
-        InputError: An argument has a wrong shape, is not finite or is out of range.
+        InputError: An argument has a wrong shape, holds no real numbers, is out of range of ``dtype`` (see
+            ``warpmag.arrays``), or the result is not finite.
 
     Warns:
         ConvergenceWarning: ``max_evaluations`` did not suffice; the result is the best that was found.
     """
     kind = resolve_kind(positions, dtype, device)
-    x = kind.vectors("positions", positions)
+    size = host_radii("radii", radii, kind.dtype)
+    farthest = farthest_place(kind.dtype, 2.0 * float(size.max(initial=0.0)))
+    x = kind.vectors("positions", positions, farthest=farthest)
     n = x.shape[0]
-    size = _host("radii", radii, n)
-    for name, value, infinite in (("saturation", saturation, False), ("susceptibility", susceptibility, True)):
-        check_positive(name, float(np.min(value, initial=math.inf)) if np.size(value) else 1.0, infinite=infinite)
-    if size.size and not size.min() > 0.0:
-        raise InputError(f"radii: must be positive, got {size.min()}")
-    external = kind.vectors("external_field", np.zeros(3) if external_field is None else external_field, n)
-    source_x, source_m = (np.zeros((0, 3)),) * 2 if sources is None else sources
-    source_x = kind.vectors("sources: positions", source_x)
+    size = host_scalars("radii", size, n)
+    if not (size > 0.0).all():
+        raise InputError(f"radii: must be positive, got {size.min():g}")
+    external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
+    source_x, source_m = _sources(kind, sources, farthest)
     k = source_x.shape[0]
-    source_m = kind.vectors("sources: moments", source_m, k)
 
-    def with_sources(values):
-        return np.concatenate([np.broadcast_to(np.asarray(values, float), n), np.ones(k)])
+    saturation = host_positive("saturation", saturation, n, kind.dtype)
+    susceptibility = host_positive("susceptibility", susceptibility, n, kind.dtype, infinite=True)
+
+    def with_sources(values, others):
+        return np.concatenate([values, np.full(k, others)])
 
     system = MomentSystem(
-        radii=np.concatenate([size, np.zeros(k)]),
+        radii=with_sources(size, 0.0),
         permanent=np.arange(n + k) >= n,
         movable=np.arange(n + k) < n,
-        saturation=with_sources(saturation),
-        susceptibility=with_sources(susceptibility),
+        saturation=with_sources(saturation, 1.0),
+        susceptibility=with_sources(susceptibility, 1.0),
         curve=curve,
         dynamics=dynamics,
         contact_model=contact_model,
@@ -140,14 +161,30 @@ def solve_induction(
     if initial is not None:
         system.start_from(kind.vectors("initial", initial, n))
     system.solve()
+    m = system.magnetizations()
+    source_positions, source_moments = (None, None) if sources is None else sources
+    given = {
+        "positions": positions,
+        "saturation": saturation,
+        "external_field": external_field,
+        "sources: positions": source_positions,
+        "sources: moments": source_moments,
+        "initial": initial,
+    }
+    _check_finite(kind, system, n, given, magnetization=m, field=system.h)
+    error = float(system.error.numpy().max(initial=0.0))
+    if not math.isfinite(error):
+        raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
+    _check_strength(kind, largest(system.h), saturation)
     result = InductionResult(
-        magnetizations=kind.finish(system.magnetizations(), n),
+        magnetizations=kind.finish(m, n),
         h_field=kind.finish(system.h, n),
-        error=float(system.error.numpy().max(initial=0.0)),
+        error=error,
         evaluations=int(system.evaluations.numpy().max(initial=0)),
         converged=bool(system.converged.numpy().all()),
         _system=system,
         _kind=kind,
+        _given=given,
         _count=n,
     )
     if not result.converged:
@@ -156,11 +193,44 @@ def solve_induction(
     return result
 
 
-def _host(name, value, count):
-    """NumPy float64 array of shape [count] from a scalar or an array of either kind."""
-    array = np.asarray(value.numpy() if isinstance(value, wp.array) else value, float)
-    if array.shape not in ((), (count,)):
-        raise InputError(f"{name}: shape must be [] or [{count}], got {list(array.shape)}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name}: must be finite")
-    return np.broadcast_to(array, (count,))
+def _sources(kind: Kind, sources, farthest):
+    """Positions and moments of permanent magnets, none if ``sources`` is None, as Warp arrays."""
+    if sources is None:
+        sources = np.zeros((0, 3)), np.zeros((0, 3))
+    if not isinstance(sources, (tuple, list)) or len(sources) != 2:
+        raise InputError(f"sources: must be (positions, moments), got {shown(sources)}")
+    x = kind.vectors("sources: positions", sources[0], farthest=farthest)
+    return x, kind.vectors("sources: moments", sources[1], x.shape[0])
+
+
+def _check_strength(kind: Kind, strongest: float, saturation):
+    """Raise ``InputError`` where the ``strongest`` field [A/m] is so weak or strong that a solve cannot resolve it."""
+    least, most = _FIELD_RANGE[kind.dtype]
+    tiny = float(np.finfo(name_of(kind.dtype)).tiny)  # what is smaller counts as zero
+    weak = tiny <= strongest < least * max(1.0, saturation.max(initial=0.0))
+    if weak or strongest > most * saturation.min(initial=np.inf):
+        how, of = ("weak", saturation.max()) if weak else ("strong", saturation.min())
+        raise InputError(
+            f"external_field, sources, saturation: a field of {strongest:.3g} A/m is too {how} for a saturation of "
+            f"{of:.3g} A/m {hint(kind.dtype)}"
+        )
+
+
+def _check_finite(kind: Kind, system: MomentSystem, count: int, given: dict, **results):
+    """Raise ``InputError`` where a row of results of the first ``count`` is not finite.
+
+    The message names those of the ``given`` arguments that are likely to be the cause.
+    """
+    rows = {what: first_not_finite(array, count) for what, array in results.items()}
+    where = [f"the {what} of ball {row}" for what, row in rows.items() if row is not None]
+    if not where:
+        return
+    least, most = _USUAL[kind.dtype]
+    sizes = {name: np.abs(real_array(name, value)) for name, value in given.items() if value is not None}
+    unusual = [name for name, size in sizes.items() if ((size > 0.0) & ~((size > least) & (size < most))).any()]
+    if system.contact_model == "multipole" and not unusual:
+        raise InputError(
+            f"contact_model: 'multipole' fails with balls that are nearly concentric: {where[0]} is not finite "
+            f"{hint(kind.dtype)} or 'dipole'"
+        )
+    raise InputError(f"{', '.join(unusual or sizes)}: {where[0]} is not finite {hint(kind.dtype)}")

@@ -5,6 +5,8 @@ words whether it comes from a stage, from the command line or from a script.
 """
 
 import math
+import numbers
+import reprlib
 from dataclasses import dataclass, field
 
 from warpmag.errors import InputError
@@ -22,23 +24,60 @@ ACCURACY = {"float32": 2e-6, "float64": 1e-13}
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
 
+_REPR = reprlib.Repr()
+_REPR.maxother = 60
+
+
+def shown(value) -> str:
+    """Any value for a message: short, and on one line."""
+    return " ".join(_REPR.repr_instance(value, 0).split())
+
+
+def real(name: str, value) -> float:
+    """Return one real number as a float; :class:`InputError` for anything else, bools among it."""
+    plain = value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
+    if isinstance(plain, bool) or not isinstance(plain, numbers.Real):
+        raise InputError(f"{name}: must be one real number, got {shown(value)}")
+    try:
+        return float(plain)
+    except OverflowError as error:  # an int or a fraction
+        raise InputError(f"{name}: beyond the largest float, got {shown(value)}") from error
+
 
 def check_token(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise :class:`InputError` unless ``value`` is one of ``allowed``."""
-    if value not in allowed:
-        raise InputError(f"{name}: {value!r} is not one of {', '.join(allowed)}")
+    if not isinstance(value, str) or value not in allowed:
+        raise InputError(f"{name}: {shown(value)} is not one of {', '.join(allowed)}")
 
 
 def check_positive(name: str, value: float, *, infinite: bool = False) -> None:
     """Raise :class:`InputError` unless ``value`` is positive and finite (or infinite where that is allowed)."""
-    if not value > 0.0 or (math.isinf(value) and not infinite):
-        raise InputError(f"{name}: must be positive{'' if infinite else ' and finite'}, got {value}")
+    number = real(name, value)
+    if not number > 0.0 or (math.isinf(number) and not infinite):
+        raise InputError(f"{name}: must be positive{'' if infinite else ' and finite'}, got {number:g}")
+
+
+def check_not_negative(name: str, value: float) -> None:
+    """Raise :class:`InputError` unless ``value`` is zero or positive and finite."""
+    number = real(name, value)
+    if not (number >= 0.0 and math.isfinite(number)):
+        raise InputError(f"{name}: must be zero or positive and finite, got {number:g}")
 
 
 def check_finite(name: str, values: tuple[float, ...]) -> None:
-    """Raise :class:`InputError` unless every one of ``values`` is finite."""
-    if not all(math.isfinite(v) for v in values):
-        raise InputError(f"{name}: must be finite, got {tuple(values)}")
+    """Raise :class:`InputError` unless ``values`` are three finite numbers."""
+    if not hasattr(values, "__len__") or len(values) != 3:
+        raise InputError(f"{name}: must be three numbers, got {shown(values)}")
+    if not all(math.isfinite(real(name, v)) for v in values):
+        raise InputError(f"{name}: must be finite, got {tuple(float(v) for v in values)}")
+
+
+def check_count(name: str, value: int) -> None:
+    """Raise :class:`InputError` unless ``value`` is a whole number from 1 to the largest of 32 bits."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise InputError(f"{name}: must be a whole number, got {shown(value)}")
+    if not 1 <= value < 2**31:
+        raise InputError(f"{name}: must be at least 1 and below 2³¹, got {shown(value)}")
 
 
 def check_force(name: str, value: str, contact_model: str = "dipole") -> None:
@@ -50,8 +89,9 @@ def check_force(name: str, value: str, contact_model: str = "dipole") -> None:
 
 def check_rtol(name: str, value: float, dtype: str = "float32") -> None:
     """Raise :class:`InputError` unless ``value`` is a relative error that sums in ``dtype`` can reach."""
-    if not ACCURACY[dtype] <= value < math.inf:
-        raise InputError(f"{name}: must be at least {ACCURACY[dtype]:g} in {dtype} and finite, got {value}")
+    number = real(name, value)
+    if not ACCURACY[dtype] <= number < math.inf:
+        raise InputError(f"{name}: must be at least {ACCURACY[dtype]:g} in {dtype} and finite, got {number:g}")
 
 
 @dataclass(frozen=True)
@@ -83,8 +123,7 @@ class Magnet:
             check_token(f"{name}: curve", self.curve, CURVES)
         else:
             check_finite(f"{name}: magnetization", self.magnetization)
-        if not (self.moment_spacing >= 0.0 and math.isfinite(self.moment_spacing)):
-            raise InputError(f"{name}: moment spacing: must be zero or positive and finite, got {self.moment_spacing}")
+        check_not_negative(f"{name}: moment spacing", self.moment_spacing)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,16 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import check_radii, resolve_device, resolve_dtype, vec3_type
+from warpmag.arrays import (
+    host_array,
+    host_positive,
+    host_radii,
+    host_scalars,
+    resolve_device,
+    resolve_dtype,
+    shape_message,
+    vec3_type,
+)
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.induction import solve_state
@@ -17,7 +26,10 @@ from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import launch_zeeman_moments
-from warpmag.magnets import CONTACT_MODELS, check_force, check_rtol, check_token
+from warpmag.magnets import CONTACT_MODELS, check_count, check_force, check_rtol, check_token
+
+_POINT = {wp.float32: 1e-16, wp.float64: 1e-120}
+"""Radius [m] of a point dipole beside near contacts, which divide by it; its volume is still zero."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +61,30 @@ class _Layout:
         ]
 
 
-def _layout(radii, worlds, permanent, bodies, movable) -> _Layout:
+def _layout(radii, worlds, permanent, bodies, movable, dtype) -> _Layout:
     """Layout of moments, of which all but the radii may be None; see :class:`MomentSystem`."""
+    radii = host_radii("radii", radii, dtype)
+    if radii.ndim != 1:
+        raise InputError(shape_message("radii", "[n]", radii))
     n = len(radii)
-    worlds = np.zeros(n, int) if worlds is None else np.asarray(worlds, int)
-    permanent = np.zeros(n, bool) if permanent is None else np.asarray(permanent, bool)
-    bodies = np.arange(n) if bodies is None else np.asarray(bodies)
-    movable = np.ones(n, bool) if movable is None else np.asarray(movable, bool)
-    if (np.diff(2 * worlds + permanent) < 0).any():
-        raise InputError("worlds, permanent: moments must be ordered by world, the inducible ones of each first")
+
+    def labels(name, values, default, kinds):
+        array = np.asarray(default if values is None else values)
+        if array.shape != (n,):
+            raise InputError(shape_message(name, f"[{n}]", array))
+        if array.size and array.dtype.kind not in kinds:
+            raise InputError(f"{name}: must be {'flags' if 'b' in kinds else 'whole numbers'}, got {array.dtype}")
+        return array.astype(default.dtype)
+
+    worlds, bodies = labels("worlds", worlds, np.zeros(n, int), "iu"), labels("bodies", bodies, np.arange(n), "iu")
+    permanent = labels("permanent", permanent, np.zeros(n, bool), "biu")
+    movable = labels("movable", movable, np.ones(n, bool), "biu")
+    if (worlds < 0).any() or (np.diff(2 * worlds + permanent) < 0).any():
+        raise InputError(
+            "worlds, permanent: moments must be ordered by world, from 0 on, the inducible ones of each first"
+        )
     _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
-    return _Layout(np.asarray(radii, float), worlds, permanent, bodies, movable, ~permanent & (size[body] == 1))
+    return _Layout(radii, worlds, permanent, bodies, movable, ~permanent & (size[body] == 1))
 
 
 class MomentSystem:
@@ -140,14 +165,13 @@ class MomentSystem:
         check_token("curve", curve, tuple(CURVE_IDS))
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         check_rtol("rtol", rtol, dtype)
-        if max_evaluations < 1:
-            raise InputError(f"max_evaluations: must be at least 1, got {max_evaluations}")
-        layout = _layout(radii, worlds, permanent, bodies, movable)
-        check_radii("radii", layout.radii, self.dtype)
-        self.rtol, self.max_evaluations, self._force = float(rtol), int(max_evaluations), force
-        self._allocate(layout, external_field)
-        self._make_material(layout.permanent, saturation, susceptibility, curve)
+        check_count("max_evaluations", max_evaluations)
+        layout = _layout(radii, worlds, permanent, bodies, movable, self.dtype)
+        self.rtol, self.max_evaluations, self.contact_model = float(rtol), int(max_evaluations), contact_model
+        self._force = force
         near = contact_model == "multipole"
+        self._allocate(layout, external_field, _POINT[self.dtype] if near else 0.0)
+        saturation, susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
         self._evaluate_wrench(layout, turned)
@@ -155,14 +179,17 @@ class MomentSystem:
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
         self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
 
-    def _allocate(self, layout: _Layout, external_field):
+    def _allocate(self, layout: _Layout, external_field, least_radius: float):
         n, vec3 = len(layout.radii), vec3_type(self.dtype)
         self.positions, self.moments, self.forces, self.torques = (
             wp.zeros(n, dtype=vec3, device=self.device) for _ in range(4)
         )
-        self.external_field = wp.array(np.broadcast_to(external_field, (n, 3)), dtype=vec3, device=self.device)
+        applied = host_array("external_field", external_field)
+        if applied.shape not in ((3,), (n, 3)):
+            raise InputError(shape_message("external_field", f"[3] or [{n}, 3]", applied))
+        self.external_field = wp.array(np.broadcast_to(applied, (n, 3)), dtype=vec3, device=self.device)
         self._packed = PackedMoments(
-            wp.array(layout.radii, dtype=self.dtype, device=self.device),
+            wp.array(np.maximum(layout.radii, least_radius), dtype=self.dtype, device=self.device),
             largest_radius=float(layout.radii.max(initial=0.0)),
             labels=layout.bodies,
             groups=layout.worlds,
@@ -173,18 +200,23 @@ class MomentSystem:
         self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
 
     def _make_material(self, permanent, saturation, susceptibility, curve):
+        """Make the material of all moments; return saturation and susceptibility, 1 where they are permanent."""
         n = len(permanent)
-        susceptibility = np.broadcast_to(np.asarray(susceptibility, float), n)
+        saturation = np.where(permanent, 1.0, host_scalars("saturation", saturation, n))
+        susceptibility = np.where(permanent, 1.0, host_scalars("susceptibility", susceptibility, n, infinite=True))
+        host_positive("saturation", saturation, n, self.dtype)
+        host_positive("susceptibility", susceptibility, n, self.dtype, infinite=True)
 
         def put(values, dtype):
             return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=dtype, device=self.device)
 
         self._material = CurveParameters(
             inducible=put((~permanent).astype(np.int32), wp.int32),
-            saturation=put(np.asarray(saturation, float), self.dtype),
+            saturation=put(saturation, self.dtype),
             slope=put(3.0 / (1.0 + 3.0 / susceptibility), self.dtype),
             curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
         )
+        return saturation, susceptibility
 
     def _evaluate_field(self, layout: _Layout, near: bool):
         """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
@@ -224,10 +256,6 @@ class MomentSystem:
         }
 
     def _make_near_contacts(self, layout: _Layout, turned, saturation, susceptibility, curve):
-        n = len(layout.radii)
-        susceptibility, saturation = (
-            np.broadcast_to(np.asarray(values, float), n) for values in (susceptibility, saturation)
-        )
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, saturation,
             CURVE_IDS[curve], field=self._mutual, movable=layout.movable, turned=turned, forces=self.forces,

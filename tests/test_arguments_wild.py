@@ -1,0 +1,144 @@
+"""Wild arguments of the array functions: right against the oracle, or an ``InputError``; never anything else.
+
+Hypothesis draws sizes and strengths over eighty decades, in any guise, and values that are none.
+"""
+
+import math
+import warnings
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from test_arguments import GUISES, MS, Unreadable, X, call
+
+import warpmag
+from warpmag import oracle
+
+WILD = settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+STRANGE = st.sampled_from(
+    [
+        *(None, True, "x", b"x", 1j, math.nan, math.inf, -1, 0, 10**400, 1e300, 1e-300, [], {}, np.ma.masked),
+        *(X[:, :1], X[:0], Unreadable(), np.datetime64("2020"), [[1, 2], [3]], "float64", "cpu", "multipole"),
+        np.int64(3),
+    ]
+)
+SCALES = st.one_of(st.just(0.0), st.floats(-40.0, 40.0))
+GUISE = st.sampled_from([lambda a: a, *GUISES.values()])
+NEAREST = 1e-5
+"""Distance [contact distances] of balls that nearly coincide, below which the kernels bound the pair law."""
+
+
+@st.composite
+def arrangements(draw):
+    """Positions [m], their scale [m] and radii [m] or None: of any size, some of them far, near or coincident."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    n, scale = draw(st.integers(0, 12)), 10.0 ** draw(st.one_of(st.just(-2.0), st.floats(-12.0, 12.0)))
+    x = scale * rng.normal(size=(n, 3))
+    if n > 1:
+        x[0] *= 10.0 ** draw(st.one_of(st.just(0.0), st.floats(-8.0, 8.0)))
+        x[1] = draw(st.sampled_from([x[1], x[0], x[0] * (1.0 + 1e-3)]))
+    radii = scale * 10.0 ** rng.uniform(-3.0, 0.5, n)
+    return x, scale, draw(st.sampled_from([None, radii, scale * 0.3]))
+
+
+def single(values, dtype):
+    """Values as a call of some precision sees them."""
+    with np.errstate(over="ignore"):  # of an external field, where there is no ball to feel it
+        return np.asarray(values, float).astype(dtype).astype(float)
+
+
+def outcome(name, device, /, **arguments):
+    """What a call returned, None where it was refused; anything else fails."""
+    try:
+        found = call(name, device, **arguments)
+    except warpmag.InputError as error:
+        assert ": " in str(error) and "\n" not in str(error)
+        return None
+    assert all(np.isfinite(one).all() for one in found)
+    return found
+
+
+def scales(x, m, radii):
+    """Sizes that sums over pairs are rounded at: of m/d³ and μ0 m m'/d⁴; None where balls all but coincide."""
+    d, size, reach = np.linalg.norm(x[:, None] - x, axis=2), np.linalg.norm(m, axis=1), np.add.outer(radii, radii)
+    if ((d > 0.0) & (d < NEAREST * reach)).any():
+        return None
+    d = np.maximum(d, reach)
+    np.fill_diagonal(d, 0.0)
+    near = np.where(d > 0.0, 1.0 / np.where(d > 0.0, d, 1.0), 0.0)
+    return (near**3 @ size).max(initial=0.0), 1e-6 * (size * (near**4 @ size)).max(initial=0.0), size.max(initial=0.0)
+
+
+@WILD
+@given(arrangements(), SCALES, st.integers(0, 99), GUISE, st.sampled_from(["float32", "float64"]), st.booleans())
+def test_any_field_and_force(device, arrangement, power, seed, guise, dtype, reference):
+    x, _, radii = arrangement
+    m = 10.0**power * np.random.default_rng(seed).normal(size=x.shape)
+    arguments = {"positions": guise(x), "moments": guise(m), "dtype": dtype, "radii": radii}
+    arguments["method"] = "reference" if reference else "auto"
+    h, wrench = outcome("h_field", device, **arguments), outcome("wrench", device, **arguments)
+    if h is None and wrench is None:
+        return
+    x, m = single(x, dtype), single(m, dtype)
+    radii = np.broadcast_to(0.0 if radii is None else single(radii, dtype), len(x))
+    size = scales(x, m, radii)
+    if size is None:
+        return
+    rtol, tiny = (5e-5, 1e-30) if dtype == "float32" else (1e-9, 1e-280)
+    if h is not None:
+        assert np.abs(h[0] - oracle.h_field(x, m, radii=radii)).max(initial=0.0) <= rtol * size[0] + tiny
+    if wrench is not None and len(x):
+        force = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii))
+        torque = oracle.torque(m, oracle.h_field(x, m, radii=radii))
+        assert np.abs(wrench[0] - force).max() <= rtol * size[1] + tiny
+        assert np.abs(wrench[1] - torque).max() <= rtol * 1e-6 * size[2] * size[0] + tiny
+
+
+@WILD
+@given(arrangements(), SCALES, SCALES, GUISE, st.sampled_from(["float32", "float64"]), st.sampled_from(["", "sources"]))
+def test_any_induction(device, arrangement, field, strength, guise, dtype, beside):
+    x, scale, radii = arrangement
+    radii = scale * 0.5 if radii is None else radii
+    applied, saturation = 10.0 ** (5.0 + field) * np.array([0.6, 0.0, 0.8]), MS * 10.0**strength
+    arguments = {"positions": guise(x), "radii": radii, "saturation": saturation, "external_field": applied}
+    h0 = np.broadcast_to(single(applied, dtype), x.shape).copy()
+    if beside:
+        places, moments = scale * np.array([[3.0, 1.0, 2.0]]), np.array([[1e5 * scale**3, 0.0, 0.0]])
+        arguments["sources"] = places, moments
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", warpmag.errors.ConvergenceWarning)
+            found = warpmag.solve_induction(**arguments, dtype=dtype, device=device, max_evaluations=200)
+            forces = found.wrench()
+    except warpmag.InputError as error:
+        assert ": " in str(error) and "\n" not in str(error)
+        return
+    m = np.asarray(found.magnetizations, float)
+    assert all(np.isfinite(one).all() for one in (m, found.h_field, *forces, found.error))
+    if not found.converged:
+        return
+    x, radii = single(x, dtype), np.broadcast_to(single(radii, dtype), len(x))
+    h0 += oracle.h_field(x, m * (4.0 / 3.0 * np.pi * radii**3)[:, None], radii=radii)
+    if beside:
+        h0 += oracle.h_field(single(places, dtype), single(moments, dtype), x, target_radii=radii)
+    wanted, _ = oracle.magnetization(h0, single(saturation, dtype))
+    tolerance = 1e-3 + (2e-3 if dtype == "float32" else 1e-8)
+    assert np.linalg.norm(m - wanted) <= tolerance * np.linalg.norm(wanted) + (1e-30 if dtype == "float32" else 0.0)
+
+
+ARGUMENTS = {
+    "h_field": "positions moments targets radii target_radii smoothing method rtol dtype device",
+    "wrench": "positions moments radii external_field smoothing method rtol dtype device",
+    "solve_induction": "positions radii saturation susceptibility curve external_field sources dynamics contact_model "
+    "rtol max_evaluations initial dtype device",
+}
+
+
+@WILD
+@given(st.data())
+def test_any_value_of_any_argument(device, data):
+    name = data.draw(st.sampled_from(list(ARGUMENTS)))
+    chosen = data.draw(st.lists(st.sampled_from(ARGUMENTS[name].split()), min_size=1, max_size=3))
+    outcome(name, device, **{argument: data.draw(STRANGE) for argument in chosen})
