@@ -28,9 +28,6 @@ from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import launch_zeeman_moments
 from warpmag.magnets import CONTACT_MODELS, check_count, check_force, check_rtol, check_token
 
-_POINT = {wp.float32: 1e-16, wp.float64: 1e-120}
-"""Radius [m] of a point dipole beside near contacts, which divide by it; its volume is still zero."""
-
 
 @dataclass(frozen=True)
 class _Layout:
@@ -170,7 +167,7 @@ class MomentSystem:
         self.rtol, self.max_evaluations, self.contact_model = float(rtol), int(max_evaluations), contact_model
         self._force = force
         near = contact_model == "multipole"
-        self._allocate(layout, external_field, _POINT[self.dtype] if near else 0.0)
+        self._allocate(layout, external_field)
         saturation, susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
@@ -179,7 +176,7 @@ class MomentSystem:
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
         self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
 
-    def _allocate(self, layout: _Layout, external_field, least_radius: float):
+    def _allocate(self, layout: _Layout, external_field):
         n, vec3 = len(layout.radii), vec3_type(self.dtype)
         self.positions, self.moments, self.forces, self.torques = (
             wp.zeros(n, dtype=vec3, device=self.device) for _ in range(4)
@@ -189,7 +186,7 @@ class MomentSystem:
             raise InputError(shape_message("external_field", f"[3] or [{n}, 3]", applied))
         self.external_field = wp.array(np.broadcast_to(applied, (n, 3)), dtype=vec3, device=self.device)
         self._packed = PackedMoments(
-            wp.array(np.maximum(layout.radii, least_radius), dtype=self.dtype, device=self.device),
+            wp.array(layout.radii, dtype=self.dtype, device=self.device),
             largest_radius=float(layout.radii.max(initial=0.0)),
             labels=layout.bodies,
             groups=layout.worlds,

@@ -90,8 +90,9 @@ CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int
 // Writes the conductances of slot s of ball i and their derivatives, and adds those of its own sources and dipoles.
 CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both,
                                            Index kind, Index its_kind, Number& sources, Number& dipoles) {
-    const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit, gap = (p.d - p.sum) / scale;
+    const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit;
     const auto touches = both > zero;
+    const Number gap = touches ? (p.d - p.sum) / scale : zero + 1; // a point dipole's would be no number
     Real *const rows = arrays.conductance(s, i), *const slopes = arrays.conductance_slope(s, i);
     const Spline spline(gap);
     const Fade fade = window(gap, CONTACT_GAP_LOW, CONTACT_GAP_HIGH, DEEPEST_LOW, DEEPEST_HIGH);

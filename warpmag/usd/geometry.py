@@ -7,7 +7,7 @@ from pxr import Usd, UsdGeom
 
 from warpmag import lattice
 from warpmag.errors import InputError
-from warpmag.usd.values import FARTHEST, LARGEST_SIZE, SMALLEST_SIZE, Finding, finding_of, value_of
+from warpmag.usd.values import LARGEST_COORDINATE, LARGEST_SIZE, SMALLEST_SIZE, Finding, finding_of, value_of
 
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height")
 _SOLIDS = (
@@ -89,8 +89,8 @@ def _mesh_findings(prim) -> Iterator[Finding]:
     extent = np.ptp(corners, axis=0).max()
     if not SMALLEST_SIZE <= extent <= LARGEST_SIZE:
         yield Finding(path, f"mesh is {extent:g} m long, must be from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} m")
-    elif not np.abs(corners).max() <= FARTHEST:
-        yield Finding(path, f"points reach {np.abs(corners).max():g} m, beyond {FARTHEST:g}")
+    elif not np.abs(corners).max() <= LARGEST_COORDINATE:
+        yield Finding(path, f"points reach {np.abs(corners).max():g} m, beyond {LARGEST_COORDINATE:g}")
 
 
 def _topology(prim) -> tuple:

@@ -6,7 +6,7 @@ import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
-from warpmag.usd.values import FARTHEST, Finding, finding_of, instance_finding, value_of
+from warpmag.usd.values import LARGEST_COORDINATE, Finding, finding_of, instance_finding, value_of
 
 _RESET = "!resetXformStack!"
 _INVERSE = "!invert!"
@@ -46,15 +46,15 @@ class TransformCheck:
             return
         path = str(prim.GetPath())
         world = np.array(self._cache.GetLocalToWorldTransform(prim))
-        if not np.abs(world).max() <= FARTHEST:
-            yield Finding(path, f"transform reaches {np.abs(world).max():g}, beyond {FARTHEST:g}")
+        if not np.abs(world).max() <= LARGEST_COORDINATE:
+            yield Finding(path, f"transform reaches {np.abs(world).max():g}, beyond {LARGEST_COORDINATE:g}")
             return
         matrix = world[:3, :3]
         gram = matrix @ matrix.T
         # Rotation and scale leave the axes at right angles. Poses are often single precision: 1e-5.
         size = np.trace(gram) / 3.0
-        if np.linalg.norm(matrix, axis=1).min() < 1.0 / FARTHEST:
-            yield Finding(path, f"transform has a scale of less than {1.0 / FARTHEST:g}")
+        if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
+            yield Finding(path, f"transform has a scale of less than {1.0 / LARGEST_COORDINATE:g}")
         elif np.abs(gram - np.diag(np.diag(gram))).max() > 1e-5 * size:
             yield Finding(path, "transform is sheared, which Newton imports wrong")
         elif np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:

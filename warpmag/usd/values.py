@@ -16,11 +16,11 @@ LARGEST = float(np.finfo(np.float32).max)
 """What lies beyond single precision cannot reach Newton."""
 SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
 """Sizes of shapes [m] whose volumes, inertias and moments single precision holds."""
-FARTHEST = 1e8
+LARGEST_COORDINATE = 1e8
 """Limit of every coordinate [m], so that squares and fourth powers of distances stay in single precision."""
 _LIGHTEST, _HEAVIEST = 1e-20, 1e20
 _FASTEST = 1e6
-_SIZE, _COORDINATE = (SMALLEST_SIZE, LARGEST_SIZE, False), (-FARTHEST, FARTHEST, False)
+_SIZE, _COORDINATE = (SMALLEST_SIZE, LARGEST_SIZE, False), (-LARGEST_COORDINATE, LARGEST_COORDINATE, False)
 _COEFFICIENT = (0.0, 1e6, False)
 _RANGES = {  # lowest, highest, and whether 0 stands for "not given"
     **dict.fromkeys(("radius", "radiusTop", "radiusBottom", "size", "height"), _SIZE),
