@@ -144,9 +144,9 @@ def norm_squared(array) -> float:
 
 
 def largest(array) -> float:
-    """Largest absolute component of a Warp array of vectors; on a GPU their norm, of one reduction."""
-    if array.shape[0] and array.device.is_cuda:
-        return math.sqrt(norm_squared(array))
+    """Largest absolute component of a Warp array of vectors; on a GPU their norm, where its square is a float32."""
+    if array.shape[0] and array.device.is_cuda and 1e-30 < (squared := norm_squared(array)) < 1e30:
+        return math.sqrt(squared)
     return float(np.abs(array.numpy()).max(initial=0.0))
 
 
