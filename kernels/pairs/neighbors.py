@@ -32,7 +32,8 @@ _PADDING = 16
 
 
 @cache
-def _lists_type(dtype):
+def lists_type(dtype):
+    """Struct of moments, or other balls, and their neighbours; see :func:`allocate`."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
@@ -86,7 +87,7 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
     """
     device, dtype = packed.device, packed.dtype
     linked, padded = (0, count + _PADDING) if device.is_cpu else (count, 0)
-    lists = _lists_type(dtype)()
+    lists = lists_type(dtype)()
     lists.packed, lists.group, lists.ratio = packed, group, ratio
     lists.neighbor, lists.overlap = (wp.zeros((count, capacity), dtype=int, device=device) for _ in range(2))
     lists.count, lists.overlap_count = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
@@ -104,7 +105,7 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
 
 @cache
 def _kernel(call: str, header: str, dtype, capacity: int, group: int):
-    lists = _lists_type(dtype)
+    lists = lists_type(dtype)
 
     @wp.func_native(f"warpmag::{call};")
     def run(

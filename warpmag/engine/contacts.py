@@ -13,6 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.broad_phase import NeighborBroadPhase
 from warpmag.engine.xpbd import OrderedXPBD, PileXPBD
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, watch_capacity, watch_contacts, watch_flags
@@ -224,6 +225,7 @@ class RigidSolver:
                 deterministic=self._ordered,
                 verify_buffers=False,  # would only print; the counters are read instead
             )
+            self._pipeline.broad_phase = NeighborBroadPhase(self._model, self._speculation)
             self.contacts = self._pipeline.contacts()
             self._contact_view = view_contacts(self._model, self.contacts)
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)

@@ -1,0 +1,216 @@
+// Pairs of shapes whose boxes meet within a substep, those of Newton's broad phase.
+//
+// Targets are balls, then the other shapes, numbered as in broad_phase.py. A ball finds other balls in its list of
+// neighbours; the boxes of other shapes stand in rows of a table, side by side for a vector of them, those of all
+// worlds first.
+#pragma once
+#include "pairs/overlaps.h"
+#include "shared/team.h"
+
+namespace warpmag {
+
+struct Box {
+    Real lower[3], upper[3];
+};
+
+CUDA_CALLABLE inline const Real* row_of(const wp::array_t<wp::vec3>& vectors, int i) {
+    return (const Real*)vectors.data + 3 * (size_t)i;
+}
+
+// Displacement [m] of a shape within the substep; shapes of still scenes have none.
+template <class Arrays> CUDA_CALLABLE inline Real displacement(const Arrays& arrays, int shape, int c) {
+    return arrays.displacement.shape[0] ? row_of(arrays.displacement, shape)[c] : Real(0);
+}
+
+// Box of all places of a shape's box within the substep.
+template <class Arrays> CUDA_CALLABLE inline Box swept_box(const Arrays& arrays, int shape) {
+    Box box;
+    for (int c = 0; c < 3; ++c) {
+        const Real d = displacement(arrays, shape, c);
+        box.lower[c] = row_of(arrays.lower, shape)[c] + (d < 0 ? d : 0);
+        box.upper[c] = row_of(arrays.upper, shape)[c] + (d > 0 ? d : 0);
+    }
+    return box;
+}
+
+// Stores where a ball is in the middle of the substep, with a radius that holds all of its places as far ahead as
+// contacts are sought, and whether the lists are too old for it; or the swept box of another shape.
+template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arrays, int target) {
+    const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
+    if (target >= balls) {
+        const Box box = swept_box(arrays, shape);
+        for (int c = 0; c < 3; ++c) {
+            Real* const column = (Real*)arrays.boxes.data + target - balls;
+            column[c * arrays.boxes.shape[1]] = box.lower[c];
+            column[(c + 3) * arrays.boxes.shape[1]] = box.upper[c];
+        }
+        return;
+    }
+    const size_t pitch = arrays.lists.packed.strides[0] / sizeof(Real);
+    Real* const packed = (Real*)arrays.lists.packed.data + target;
+    const Real* const found_at = row_of(arrays.lists.found_at, target);
+    Real swept = 0, moved = 0;
+    for (int c = 0; c < 3; ++c) {
+        Real d = displacement(arrays, shape, c);
+        d = d < -arrays.farthest ? -arrays.farthest : d > arrays.farthest ? arrays.farthest : d;
+        const Real x = Real(0.5) * (row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c] + d);
+        packed[c * pitch] = x;
+        swept += d * d;
+        moved += (x - found_at[c]) * (x - found_at[c]);
+    }
+    packed[3 * pitch] = arrays.radius.data[target] + Real(0.5) * sqrt(swept);
+    const Real found_radius = packed[4 * pitch], grown = packed[3 * pitch] - found_radius;
+    if (!(sqrt(moved) + (grown > 0 ? grown : 0) <= SKIN * found_radius)) arrays.lists.moved.data[0] = 1;
+}
+
+// Whether collision groups a and b collide: a positive one with itself and negative ones, a negative one with all but
+// itself, zero with none.
+CUDA_CALLABLE inline bool groups_collide(int a, int b) { return a && b && (a > 0 ? a == b || b < 0 : a != b); }
+
+// Whether a pair is listed among the excluded, which are sorted.
+template <class Arrays> CUDA_CALLABLE inline bool is_excluded(const Arrays& arrays, int a, int b) {
+    int low = 0, high = arrays.excluded_count;
+    while (low < high) {
+        const int middle = (low + high) / 2;
+        const wp::vec2i listed = arrays.excluded.data[middle];
+        if (listed[0] < a || (listed[0] == a && listed[1] < b)) low = middle + 1;
+        else high = middle;
+    }
+    return low < arrays.excluded_count && arrays.excluded.data[low][0] == a && arrays.excluded.data[low][1] == b;
+}
+
+template <class Arrays> CUDA_CALLABLE inline bool is_fixed(const Arrays& arrays, int body) {
+    return body < 0 || (arrays.body_flags.shape[0] && arrays.body_flags.data[body] & KINEMATIC);
+}
+
+// Whether shapes a < b may collide at all.
+template <class Arrays> CUDA_CALLABLE inline bool may_collide(const Arrays& arrays, int a, int b) {
+    const int body_a = arrays.body.data[a], body_b = arrays.body.data[b];
+    const int world_a = arrays.world.data[a], world_b = arrays.world.data[b];
+    if (body_a == body_b || (world_a >= 0 && world_b >= 0 && world_a != world_b)) return false;
+    if (!arrays.fixed_pairs && is_fixed(arrays, body_a) && is_fixed(arrays, body_b)) return false;
+    return groups_collide(arrays.group.data[a], arrays.group.data[b]) && !is_excluded(arrays, a, b);
+}
+
+// Whether the boxes of two shapes, which move evenly, meet at some time of the substep.
+template <class Arrays> CUDA_CALLABLE inline bool boxes_meet(const Arrays& arrays, int a, int b) {
+    Real enter = 0, leave = 1;
+    for (int c = 0; c < 3; ++c) {
+        const Real before = row_of(arrays.lower, b)[c] - row_of(arrays.upper, a)[c];
+        const Real behind = row_of(arrays.upper, b)[c] - row_of(arrays.lower, a)[c];
+        const Real d = displacement(arrays, a, c) - displacement(arrays, b, c);
+        if (d == 0) {
+            if (!(before <= 0 && behind >= 0)) return false;
+        } else {
+            const Real first = (d > 0 ? before : behind) / d, last = (d > 0 ? behind : before) / d;
+            enter = first > enter ? first : enter;
+            leave = last < leave ? last : leave;
+        }
+    }
+    return enter <= leave;
+}
+
+// Calls emit(a, b) if a target's shape collides with another.
+template <class Arrays, class Emit>
+CUDA_CALLABLE inline void try_pair(const Arrays& arrays, int shape, int other, Emit emit) {
+    const int a = shape < other ? shape : other, b = shape < other ? other : shape;
+    if (may_collide(arrays, a, b) && boxes_meet(arrays, a, b)) emit(a, b);
+}
+
+// Tries a target's shape with the other shapes ``begin`` to ``end`` whose swept boxes meet its own.
+template <class Arrays, class Emit>
+CUDA_CALLABLE inline void try_boxes(const Arrays& arrays, int shape, const Box& own, int begin, int end, Emit emit) {
+    const Real* const boxes = arrays.boxes.data;
+    const size_t pitch = arrays.boxes.shape[1];
+    const int* const others = arrays.shape.data + arrays.lists.group.shape[0];
+    for (int first = begin + share(); first < end; first += SHARES * WIDTH) {
+        Mask meet = mask_of(lanes() < end - first);
+        for (int c = 0; c < 3; ++c)
+            meet &= (numbers(boxes + c * pitch + first) <= own.upper[c])
+                    & (numbers(boxes + (c + 3) * pitch + first) >= own.lower[c]);
+        if (!any(meet)) continue;
+#if defined(__CUDA_ARCH__)
+        try_pair(arrays, shape, others[first], emit);
+#else
+        for (unsigned bits = bits_of(meet); bits; bits &= bits - 1)
+            try_pair(arrays, shape, others[first + __builtin_ctz(bits)], emit);
+#endif
+    }
+}
+
+// Calls emit(a, b) for all pairs a < b of which this target is the later one.
+template <class Arrays, class Emit>
+CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Emit emit) {
+    const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
+    int last = arrays.boxes.shape[1];
+    if (target < balls) {
+        const int count = arrays.lists.count.data[target];
+        const bool listed = count <= CAPACITY;
+        const int* const list = arrays.lists.neighbor.data + (size_t)CAPACITY * target;
+        for (int n = share(); n < (listed ? count : target); n += SHARES) {
+            const int j = listed ? list[n] : n;
+            if (j < target) try_pair(arrays, shape, arrays.shape.data[j], emit);
+        }
+    } else {
+        last = target - balls;
+    }
+    const Box own = swept_box(arrays, shape);
+    const wp::vec2i range = arrays.range.data[target];
+    try_boxes(arrays, shape, own, 0, arrays.shared < last ? arrays.shared : last, emit);
+    try_boxes(arrays, shape, own, range[0], range[1] < last ? range[1] : last, emit);
+}
+
+// Remembers the radius that a ball was listed with.
+template <class Arrays> CUDA_CALLABLE inline void keep_radius(const Arrays& arrays, int target) {
+    const size_t pitch = arrays.lists.packed.strides[0] / sizeof(Real);
+    Real* const packed = (Real*)arrays.lists.packed.data + target;
+    if (target < arrays.lists.group.shape[0] && arrays.lists.searching.data[0]) packed[4 * pitch] = packed[3 * pitch];
+}
+
+template <class Word, class Arrays>
+CUDA_CALLABLE inline void place_targets(int thread, int threads, Word* team, const Arrays& arrays) {
+#if defined(__CUDA_ARCH__)
+    if (thread < arrays.shape.shape[0]) place_target(arrays, thread);
+#else
+    share_out(team, threads, arrays.shape.shape[0], TARGETS_AT_ONCE, [&](int t) { place_target(arrays, t); });
+#endif
+}
+
+// Writes all pairs, in the order of targets on a CPU. More may be found than there is room for.
+template <class Word, class Arrays>
+CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const Arrays& arrays) {
+    const int room = arrays.pairs.shape[0];
+#if defined(__CUDA_ARCH__)
+    const int target = thread / GROUP;
+    if (share() == 0) keep_radius(arrays, target);
+    find_pairs_of(arrays, target, [&](int a, int b) {
+        const int n = atomicAdd(arrays.pair_count.data, 1);
+        if (n < room) arrays.pairs.data[n] = wp::vec2i(a, b);
+    });
+#else
+    const int targets = arrays.shape.shape[0];
+    int* const starts = arrays.starts.data;
+    share_out(team, threads, targets, TARGETS_AT_ONCE, [&](int t) {
+        int count = 0;
+        keep_radius(arrays, t);
+        find_pairs_of(arrays, t, [&](int, int) { ++count; });
+        starts[t] = count;
+    });
+    int total = 0;
+    for (int t = 0; t < targets; ++t) {
+        const int count = starts[t];
+        starts[t] = total;
+        total += count;
+    }
+    arrays.pair_count.data[0] = total;
+    share_out(team, threads, targets, TARGETS_AT_ONCE, [&](int t) {
+        int n = starts[t];
+        if (n == (t + 1 < targets ? starts[t + 1] : total)) return;
+        find_pairs_of(arrays, t, [&](int a, int b) {
+            if (n < room) arrays.pairs.data[n] = wp::vec2i(a, b);
+            ++n;
+        });
+    });
+#endif
+}
+}

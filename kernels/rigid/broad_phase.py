@@ -1,0 +1,176 @@
+"""Pairs of shapes whose bounding boxes meet within a substep: a broad phase for piles of balls among other shapes.
+
+Newton's broad phase sorts all boxes along an axis and compares those whose projections overlap, N^(5/3) in a heap of N
+balls. Here balls find each other through the lists of neighbours that moments have, too (``pairs.neighbors``): these
+hold what is near, and are made anew only once a ball has moved by a part of its radius. All other shapes are compared
+with everything, a vector of boxes at a time. Which pairs are kept is decided as Newton does: by worlds, collision
+groups, bodies and excluded pairs, and by whether the boxes meet as they move.
+
+A ball is taken as the ball about the middle of its way that holds it all along. Of two balls whose boxes meet but whose
+surfaces do not come as near as contacts are sought, the pair is left out.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpmag.kernels.pairs import neighbors
+from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.team import team, threads_for
+
+_SKIN = 0.3
+"""Part of its radius that a ball may move before the lists are made anew."""
+_LARGEST = 2.0
+"""Balls of more than so many times the median radius are compared with everything, like other shapes: the largest
+radius sets how wide the search's cells are."""
+_PADDING = 16
+"""Boxes that vectors may read beyond the last."""
+_TARGETS_PER_THREAD = 300
+"""Shapes that make another thread of a CPU worth waking."""
+_TARGETS_AT_ONCE = 64
+"""Targets that a thread of a CPU takes at a time."""
+_MOST_COMPARISONS = 2e7
+"""With other shapes; more take longer than to sort all boxes."""
+_PACKED_ROWS = 5
+_KINEMATIC = 2
+"""Newton's flag of bodies that forces do not move."""
+_lists_type = neighbors.lists_type(wp.float32)
+
+
+@wp.struct
+class BroadPhaseArrays:
+    """Shapes, s of them, and the t targets among them that collide: b balls, then o others.
+
+    Attributes:
+        lower, upper: Boxes of the shapes [m], enlarged by how far contacts are sought, shape [s].
+        displacement: Motion of the shapes within the substep [m], shape [s], or none.
+        group, world, body: Collision group, world and body of the shapes, shape [s].
+        body_flags: Newton's flags of the bodies.
+        excluded: Sorted pairs of shapes that do not collide; the first ``excluded_count`` count.
+        fixed_pairs: Whether shapes that forces do not move collide with each other.
+        farthest: How far ahead of a shape contacts are sought, along an axis [m].
+        shape: Shape of each target, shape [t]; the others of all worlds first, then by world.
+        range: Others in the world of each target, begin and end, shape [t].
+        shared: Others of all worlds.
+        radius: Radii of the balls with how far contacts are sought [m], shape [b].
+        lists: Neighbour lists of the balls; packed row 4 holds the radius that a ball was listed with.
+        boxes: Swept boxes of the others [m], lower then upper, shape [6, o padded].
+        starts: First pair of each target, on a CPU, shape [t].
+        pairs, pair_count: Out, the pairs and how many there are, also beyond their room.
+    """
+
+    lower: wp.array[wp.vec3]
+    upper: wp.array[wp.vec3]
+    displacement: wp.array[wp.vec3]
+    group: wp.array[int]
+    world: wp.array[int]
+    body: wp.array[int]
+    body_flags: wp.array[int]
+    excluded: wp.array[wp.vec2i]
+    excluded_count: int
+    fixed_pairs: int
+    farthest: float
+    shape: wp.array[int]
+    range: wp.array[wp.vec2i]
+    shared: int
+    radius: wp.array[float]
+    lists: _lists_type
+    boxes: wp.array2d[float]
+    starts: wp.array[int]
+    pairs: wp.array[wp.vec2i]
+    pair_count: wp.array[int]
+
+
+@dataclass(frozen=True)
+class PairSearch:
+    """Buffers of the search on one device.
+
+    Attributes:
+        arrays: What the passes work on.
+        targets: Number of targets.
+        reach: Distance of the farthest pair of balls [m].
+    """
+
+    arrays: Any
+    targets: int
+    reach: float
+
+
+def allocate(shape_world, colliding, ball_radius, *, farthest, device) -> PairSearch | None:
+    """Plan the search.
+
+    Args:
+        shape_world: World of each shape, -1 for all worlds, shape [s].
+        colliding: Whether a shape collides at all, shape [s].
+        ball_radius: Radius [m] of a ball with how far contacts are sought, NaN for other shapes, shape [s].
+        farthest: How far ahead of a shape contacts are sought [m].
+        device: Warp device.
+
+    Returns:
+        The buffers; None where comparing all other shapes would take too long.
+    """
+    worlds = np.where(colliding, shape_world, -1)
+    worlds = worlds if (worlds >= 0).any() else np.zeros_like(worlds)
+    is_ball = colliding & np.isfinite(ball_radius) & (worlds >= 0)
+    is_ball &= ball_radius <= _LARGEST * np.median(ball_radius[is_ball]) if is_ball.any() else False
+    balls, others = np.flatnonzero(is_ball), np.flatnonzero(colliding & ~is_ball)
+    others = others[np.argsort(worlds[others], kind="stable")]
+    shape = np.concatenate([balls, others])
+    limits = [np.searchsorted(worlds[others], worlds[shape], side) for side in ("left", "right")]
+    ranges = np.where(worlds[shape] >= 0, limits, 0).T.astype(np.int32)
+    shared = int(np.count_nonzero(worlds[others] < 0))
+    if len(shape) * shared + np.sum(ranges[:, 1] - ranges[:, 0]) > _MOST_COMPARISONS:
+        return None
+
+    def integers(values, dtype=wp.int32):
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=dtype, device=device)
+
+    arrays = BroadPhaseArrays()
+    arrays.shape, arrays.range, arrays.shared = integers(shape), integers(ranges, wp.vec2i), shared
+    arrays.radius = wp.array(ball_radius[balls], dtype=float, device=device)
+    packed = wp.zeros((_PACKED_ROWS, max(len(balls), 1)), dtype=float, device=device)
+    group = integers(worlds[balls])
+    arrays.lists = neighbors.allocate(len(balls), packed, group, ratio=1.0 + _SKIN)
+    arrays.boxes = wp.zeros((6, len(others) + _PADDING), dtype=float, device=device)
+    arrays.starts = wp.zeros(len(shape), dtype=int, device=device)
+    arrays.farthest = farthest
+    # half of a ball's way is at most half of the diagonal of a cube as wide as it may be swept
+    reach = 2.0 * float(ball_radius[balls].max(initial=0.0)) + np.sqrt(3.0) * farthest
+    return PairSearch(arrays, len(shape), reach)
+
+
+@cache
+def _kernel(call: str, group: int):
+    options = native_options(
+        "rigid/broad_phase.h", dtype=wp.float32, CAPACITY=neighbors.CAPACITY, GROUP=group, SKIN=_SKIN,
+        KINEMATIC=_KINEMATIC, TARGETS_AT_ONCE=_TARGETS_AT_ONCE,
+    )  # fmt: skip
+    return passes_kernel(f"warpmag::{call}(thread, threads, team.data, arrays);", BroadPhaseArrays, options)
+
+
+def launch_find_shape_pairs(search: PairSearch) -> None:
+    """Find the pairs of shapes whose boxes meet; ``search.arrays`` has the boxes, and gets the pairs."""
+    if search.targets == 0:
+        return
+    arrays = search.arrays
+    device = arrays.shape.device
+    _launch("place_targets", search, 1)
+    if arrays.radius.shape[0]:
+        neighbors.launch_find_neighbors(arrays.lists, arrays.lists, search.reach)
+    _launch("find_pairs", search, group_threads(device))
+
+
+def _launch(call: str, search: PairSearch, group: int) -> None:
+    device = search.arrays.shape.device
+    threads, members = (0, None) if device.is_cuda else (threads_for(search.targets, _TARGETS_PER_THREAD), team())
+    wp.launch(
+        _kernel(call, group),
+        dim=group * search.targets if device.is_cuda else 1,
+        inputs=[0, 1, threads, members, search.arrays],
+        device=device,
+    )

@@ -1,0 +1,114 @@
+"""The search for shapes that may touch finds what Newton's comparison of all pairs finds."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+from warpmag.engine.broad_phase import NeighborBroadPhase
+
+FARTHEST = 0.02
+"""How far ahead contacts are sought [m]: twice the radius of the balls."""
+SUBSTEP = 5e-4
+
+
+def random_scene(seed: int, worlds: int, device, largest: float = 0.03) -> newton.Model:
+    """Balls of many sizes, boxes and capsules above a plane, some fixed, kinematic, or not to collide with others."""
+    rng = np.random.default_rng(seed)
+    scene = newton.ModelBuilder()
+    for _ in range(max(worlds, 1)):
+        builder = newton.ModelBuilder()
+        for number in range(150):
+            place = wp.transform(rng.uniform(0.0, 0.09, 3), wp.quat_identity())
+            config = newton.ModelBuilder.ShapeConfig(gap=1e-3, collision_group=int(rng.choice([1, 1, 1, 1, 2, -1, -2])))
+            body = -1 if number % 10 == 0 else builder.add_body(xform=place, is_kinematic=number % 17 == 0)
+            where = place if body < 0 else wp.transform_identity()
+            if number % 7 == 1:
+                builder.add_shape_box(body, xform=where, hx=0.01, hy=0.004, hz=rng.uniform(0.003, largest), cfg=config)
+            elif number % 7 == 2:
+                builder.add_shape_capsule(body, xform=where, radius=0.004, half_height=0.01, cfg=config)
+            else:
+                radius = rng.choice([0.008, 0.01, largest], p=[0.5, 0.45, 0.05])
+                builder.add_shape_sphere(body, xform=where, radius=radius, cfg=config)
+        for a, b in rng.choice(builder.shape_count, (40, 2)):
+            if a != b:
+                builder.add_shape_collision_filter_pair(int(a), int(b))
+        if worlds:
+            scene.add_world(builder)
+        else:
+            scene.add_builder(builder)
+    scene.add_ground_plane()
+    return scene.finalize(device=device)
+
+
+def find(model, state, broad_phase) -> tuple[set, list]:
+    """Pairs of shapes, and contacts: both shapes and the first one's point [m]."""
+    pipeline = newton.CollisionPipeline(
+        model, broad_phase="nxn", speculative_contact_gap_max=FARTHEST, rigid_contact_max=100_000, verify_buffers=False
+    )
+    if broad_phase is not None:
+        pipeline.broad_phase = broad_phase
+    contacts = pipeline.contacts()
+    pipeline.collide(state, contacts, dt=SUBSTEP)
+    count = int(pipeline.broad_phase_pair_count.numpy()[0])
+    pairs = list(map(tuple, pipeline.broad_phase_shape_pairs.numpy()[:count].tolist()))
+    assert len(set(pairs)) == len(pairs)
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    shapes = [getattr(contacts, f"rigid_contact_shape{side}").numpy()[:count] for side in (0, 1)]
+    points = contacts.rigid_contact_point0.numpy()[:count]
+    return set(pairs), sorted(zip(*map(list, shapes), points.tolist(), strict=True))
+
+
+def set_motion(model, state, rng, shift: float, speed: float):
+    """Shift all bodies by up to ``shift`` [m] and give them velocities of up to ``speed`` [m/s]."""
+    poses = state.body_q.numpy()
+    poses[:, :3] += rng.uniform(-shift, shift, (len(poses), 3))
+    state.body_q.assign(poses)
+    velocities = rng.uniform(-speed, speed, (len(poses), 6)) * (1.0, 1.0, 1.0, 30.0, 30.0, 30.0)
+    state.body_qd.assign(velocities.astype(np.float32))
+
+
+@pytest.mark.parametrize(("worlds", "seed"), [(0, 0), (1, 1), (5, 2)])
+def test_contacts_are_those_of_all_pairs(worlds, seed, device):
+    model = random_scene(seed, worlds, device)
+    state, rng = model.state(), np.random.default_rng(seed)
+    own = NeighborBroadPhase(model, FARTHEST)
+    balls = model.shape_type.numpy() == newton.GeoType.SPHERE
+    # still, and moved by less and by more than lists allow; slow, and faster than contacts are sought ahead
+    for shift, speed in ((0.0, 0.0), (1e-3, 0.1), (1e-3, 10.0), (1e-3, 100.0), (0.01, 1.0), (1e-4, 0.0)):
+        set_motion(model, state, rng, shift, speed)
+        pairs, contacts = find(model, state, None)
+        found, own_contacts = find(model, state, own)
+        assert own_contacts == contacts
+        assert found <= pairs
+        assert {pair for pair in pairs - found if not balls[list(pair)].all()} == set()
+        assert len(contacts) > 100
+
+
+def test_crowded_balls_are_found(device):
+    """More neighbours than a list holds."""
+    builder = newton.ModelBuilder()
+    for place in np.random.default_rng(0).normal(0.0, 0.004, (150, 3)):
+        builder.add_shape_sphere(builder.add_body(xform=wp.transform(place, wp.quat_identity())), radius=0.005)
+    model = builder.finalize(device=device)
+    own = NeighborBroadPhase(model, FARTHEST)
+    contacts = find(model, model.state(), None)[1]
+    found, own_contacts = find(model, model.state(), own)
+    assert own_contacts == contacts
+    assert len(found) > 64 * 150 / 2
+
+
+def test_many_other_shapes_are_swept(device, monkeypatch):
+    monkeypatch.setattr("warpmag.kernels.rigid.broad_phase._MOST_COMPARISONS", 100)
+    model = random_scene(3, 2, device)
+    own = NeighborBroadPhase(model, FARTHEST)
+    pairs, contacts = find(model, model.state(), None)
+    found, own_contacts = find(model, model.state(), own)
+    assert (found, own_contacts) == (pairs, contacts)
+
+
+def test_nothing_collides(device):
+    builder = newton.ModelBuilder()
+    builder.add_body()
+    model = builder.finalize(device=device)
+    assert find(model, model.state(), NeighborBroadPhase(model, FARTHEST)) == (set(), [])
