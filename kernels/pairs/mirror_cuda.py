@@ -37,7 +37,7 @@ class MirrorShape:
 _SHAPES = {
     Quantity.FIELD: (
         (7000, MirrorShape(2, 4, 6, 2)),
-        (30000, MirrorShape(3, 4, 4, 2)),
+        (30000, MirrorShape(3, 8, 2, 2)),
         (None, MirrorShape(6, 4, 3, 2)),
     ),
     Quantity.MUTUAL_FORCE: ((7000, MirrorShape(2, 4, 6, 2)), (None, MirrorShape(4, 4, 4, 1))),
