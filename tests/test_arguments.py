@@ -264,19 +264,6 @@ def test_results_are_the_callers(device):
     assert np.array_equal(kelvin, before)
 
 
-def test_concentric_balls_near_contact(device):
-    """Small balls inside large ones: the force is finite, or refused by name."""
-    for ratio in (0.9, 0.5, 0.1, 0.01):
-        for dtype in ("float32", "float64"):
-            arguments = {"positions": np.zeros((2, 3)), "radii": np.array([0.005, 0.005 * ratio]), "dtype": dtype}
-            try:
-                found = call("solve_induction", device, contact_model="multipole", **arguments)
-            except warpmag.InputError as error:
-                assert str(error).startswith("contact_model: 'multipole' fails with balls that are nearly concentric")
-            else:
-                assert all(np.isfinite(one).all() for one in found)
-
-
 @pytest.mark.parametrize("gap", [-0.02, 0.05, 0.3])
 def test_sources_beside_near_contacts(gap, device):
     """A far and weak source, in one vector with balls that touch, changes nothing; it read outside the table."""

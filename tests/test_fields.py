@@ -52,6 +52,83 @@ def test_overlapping_balls(dtype, device):
     assert relative(forces, oracle.kelvin_force(m, gradient)) < tolerance
 
 
+RATIOS = (1.0, 1.0 + 1e-6, 1.01, 1.5, 2.9, 10.0, 1000.0)
+# distances over those at contact
+DEPTHS = (0.0, 1e-30, 1e-22, 1e-12, 1e-9, 1e-6, 1e-3, 0.1, 0.3, 0.49, 0.51, 0.7, 0.9, 0.99, 0.999)
+
+
+def balls_in_one_another(scale, dtype):
+    """Pairs of balls of all ``RATIOS`` of radii at all ``DEPTHS``, the larger of radius ``scale`` [m]."""
+    rng = np.random.default_rng(8)
+    for ratio in RATIOS:
+        for depth in DEPTHS:
+            radii = scale * np.array([1.0, 1.0 / ratio])
+            direction = rng.normal(size=3)
+            x = np.array([np.zeros(3), depth * radii.sum() * direction / np.linalg.norm(direction)])
+            m = rng.normal(size=(2, 3)) * 1e6 * radii[:, None] ** 3
+            yield [np.asarray(a, dtype).astype(float) for a in (x, radii, m)]
+
+
+@pytest.mark.parametrize("dtype, scale", [("float32", 1e-4), ("float32", 5e3), ("float64", 1e-8), ("float64", 1e3)])
+def test_balls_in_one_another(dtype, scale, device):
+    """Fields, forces and torques to a few roundings, of the result and of the distance, down to coincident centres."""
+    cases = [*balls_in_one_another(scale, dtype)]
+    x, radii, m = (np.concatenate(one) for one in zip(*cases, strict=True))
+    worlds = np.arange(len(x)) // 2
+    segments = [(i, i + 2, i, i + 2) for i in range(0, len(x), 2)]
+    eps = float(np.finfo(dtype).eps)
+    for form in forms(device):
+        (h,) = sums(x, radii, m, segments, Quantity.FIELD, dtype, device, groups=worlds, form=form)
+        forces, torques = sums(x, radii, m, segments, Quantity.WRENCH, dtype, device, groups=worlds, form=form)
+        found = [np.reshape(one, (-1, 2, 3)) for one in (h, forces, torques)]
+        for (at, size, moments), *results in zip(cases, *found, strict=True):
+            exact, moved = (pair_at(place, size, moments) for place in (at, (1.0 + 8.0 * eps) * at))
+            # the clamped dipole, from which the law of overlapping balls is taken
+            field = np.linalg.norm(moments[::-1], axis=1) / (2.0 * np.pi * size.sum() ** 3)
+            turn = oracle.MU0 * np.linalg.norm(moments, axis=1) * field
+            for one, value, other, unit in zip(
+                results, exact, moved, (field, 3.0 * turn / size.sum(), turn), strict=True
+            ):
+                error, spread = np.linalg.norm(one - value, axis=1), np.linalg.norm(other - value, axis=1)
+                assert (error <= 20.0 * eps * (unit + np.linalg.norm(value, axis=1)) + 5.0 * spread).all()
+
+
+def pair_at(x, radii, m):
+    """The oracle's field, forces and torques of two balls."""
+    h = oracle.h_field(x, m, radii=radii)
+    return h, oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii)), oracle.torque(m, h)
+
+
+@pytest.mark.parametrize("dtype, scale", [("float32", 2.5e-5), ("float32", 2e6), ("float64", 1e-20), ("float64", 1e20)])
+def test_any_scale(dtype, scale, device):
+    """Balls of 0.1 µm and of 10 km, and in float64 of any size."""
+    x, radii, m = pile(count=300)
+    x, radii, m = (np.asarray(a, dtype).astype(float) for a in (scale * x, 0.9999 * scale * radii, scale**3 * m))
+    h, force, torque = pair_at(x, radii, m)
+    # positions are rounded, and so is where balls touch
+    assert relative(warpmag.h_field(x, m, radii=radii, dtype=dtype, device=device), h) < TOLERANCE[dtype]
+    found = warpmag.wrench(x, m, radii=radii, dtype=dtype, device=device)
+    assert relative(found[0], force) < 2.0 * TOLERANCE[dtype]
+    assert relative(found[1], torque) < TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize("distance", [1e-9, 2e-8, 2e-7, 1e3, 5e6])
+@pytest.mark.parametrize("strength", [1e-17, 1e-6, 1e6, 1e18])
+def test_points_at_any_distance(distance, strength, device):
+    """In float32 the field and the force of point dipoles are right, or refused by name."""
+    x, m = as_float32([[0.0, 0.0, 0.0], [0.6 * distance, 0.0, 0.8 * distance]], [[0.0, 0.0, 1.0], [1.0, 0.5, 0.0]])
+    m = as_float32(strength * m)[0]
+    exact, force, _ = pair_at(x, None, m)
+    try:
+        assert relative(warpmag.h_field(x, m, device=device), exact) < TOLERANCE["float32"]
+        found = warpmag.wrench(x, m, device=device)[0]
+        # what underflows is zero
+        assert np.abs(found - force).max() < TOLERANCE["float32"] * np.abs(force).max() + 1e-36
+    except warpmag.InputError as error:
+        assert str(error).startswith(("positions, moments", "moments"))
+        assert distance < 1e-7 or not 1e-36 < np.abs(force).max() < 1e30  # of which 4π/μ0 is a float32
+
+
 @pytest.mark.parametrize("extent", [1e-3, 0.0])
 def test_neighbor_lists_that_overflow(extent, device):
     """More overlapping neighbours than a list holds: everybody walks all sources, nothing is dropped."""
@@ -190,11 +267,12 @@ def forms(device, *mirrored):
     return (LOOP,) if device == "cpu" else (LOOP, FUSED, *mirrored)
 
 
-def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, form):
+def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, groups=None, form):
     """Field [A/m], or forces [N] and torques [N·m], of segments of one moment set, in one form of the native sums."""
     kind = {"float32": wp.float32, "float64": wp.float64}[dtype]
     vectors = [wp.array(a, dtype=wp.types.vector(3, kind), device=device) for a in (x, m)]
-    packed = PackedMoments(wp.array(radii, dtype=kind, device=device), largest_radius=radii.max(), labels=bodies)
+    sizes = wp.array(radii, dtype=kind, device=device)
+    packed = PackedMoments(sizes, largest_radius=radii.max(), labels=bodies, groups=groups)
     packed.pack(*vectors)
     packed.find_overlaps()
     none, out, torques = (wp.zeros_like(vectors[0]) for _ in range(3))

@@ -18,9 +18,11 @@ FARTHEST = {wp.float32: 1e7, wp.float64: 1e30}
 """Largest coordinate [m] by Warp scalar type: r⁻⁵ of two of them is still a normal number."""
 REFERENCE_RADIUS_RANGE = {wp.float32: (1e-6, 2e4), wp.float64: (1e-30, 1e30)}
 REFERENCE_FARTHEST = {wp.float32: 5e4, wp.float64: 1e30}
-"""The same of the plain loop, which has r⁶ of overlapping balls and r⁻⁷."""
+"""The same of the plain loop, which has r⁶ of overlapping balls."""
 MATERIAL_RANGE = {wp.float32: (1e-12, 1e15), wp.float64: (1e-100, 1e100)}
 """Least and largest saturation [A/m] and finite susceptibility, by Warp scalar type."""
+LEAST_OF_FORCE = {wp.float32: 1e-18, wp.float64: 1e-150}
+"""Least of the largest component of moments [A·m²], by Warp scalar type: products of smaller ones have no digits."""
 CELLS = 1e9
 """Distance from the origin, in contact distances of the largest balls, to which the search for neighbours has cells."""
 

@@ -114,13 +114,16 @@ def long_range_self(radius):
 
 
 def averaged_potential(d, a, b):
-    """Mean potential U [1/m] of a homogeneous ball of radius b over one of radius a, |a − b| < d ≤ a + b; else 1/d."""
+    """Mean potential U [1/m] of a homogeneous ball of radius b over one of radius a."""
     s, p, delta2 = a + b, a * b, (a - b) ** 2
     k = 5.0 * delta2**2 * (delta2 + 6.0 * p)
     u1, u2, u3 = 45.0 * s**2 * delta2, -40.0 * s * (delta2 + p), 15.0 * (delta2 + 2.0 * p)
     join = 160.0 * p**3 / s - (k / s + u1 * s + u2 * s**2 + u3 * s**3 - s**5)
-    polynomial = join + k / d + u1 * d + u2 * d**2 + u3 * d**3 - d**5
-    return np.where(d < s, polynomial / (160.0 * p**3), 1.0 / d)
+    apart = np.where(d > np.abs(a - b), d, s)
+    polynomial = join + k / apart + u1 * d + u2 * d**2 + u3 * d**3 - d**5
+    large, small = np.maximum(a, b), np.minimum(a, b)
+    inside = (3.0 * large**2 - d**2 - 0.6 * small**2) / (2.0 * large**3)
+    return np.select([d <= np.abs(a - b), d < s], [inside, polynomial / (160.0 * p**3)], 1.0 / apart)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -168,9 +171,10 @@ class NearContacts:
         self.i, self.j = np.nonzero(np.triu(np.linalg.norm(r, axis=2) < reach, 1))
         i, j = self.i, self.j
         self.separation = self.positions[j] - self.positions[i]
-        self.distance = np.linalg.norm(self.separation, axis=1)
-        self.direction = self.separation / np.maximum(self.distance, np.finfo(float).tiny)[:, None]
         a, b = self.radii[i], self.radii[j]
+        length = np.linalg.norm(self.separation, axis=1)
+        self.direction = self.separation / np.maximum(length, np.finfo(float).tiny)[:, None]
+        self.distance = np.maximum(length, 1e-12 * (a + b))  # powers of 1/d that nothing comes of stay finite
         self.scale = 2.0 * a * b / (a + b)  # the curvature of the gap
         both = shared_volume(self.distance, a, b)
         crowding = crowding_weight(np.bincount(i, both, n) + np.bincount(j, both, n))

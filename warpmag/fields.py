@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import (
+    LEAST_OF_FORCE,
     REFERENCE_RADIUS_RANGE,
     Kind,
     farthest_place,
@@ -22,8 +23,7 @@ from warpmag.magnets import check_not_negative, check_rtol, check_token
 
 _METHODS = ("auto", "vectorized", "reference")
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
-_LEAST_OF_FORCE = {wp.float32: 1e-18, wp.float64: 1e-150}
-"""Least of the largest component of moments [A·m²]: products of smaller ones have no digits left."""
+"""Least of the largest component of moments [A·m²]: fields of smaller ones have no digits left."""
 
 
 def h_field(
@@ -129,7 +129,7 @@ def wrench(
     farthest = farthest_place(kind.dtype, 2.0 * size, reference=reference)
     x = kind.vectors("positions", positions, farthest=farthest)
     n = x.shape[0]
-    m = kind.vectors("moments", moments, n, least=_LEAST_OF_FORCE)
+    m = kind.vectors("moments", moments, n, least=LEAST_OF_FORCE)
     external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
     packed = _packed(kind, "radii", radii, size, x, m)
     forces, torques = wp.zeros_like(x), wp.zeros_like(x)

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import (
+    LEAST_OF_FORCE,
     Kind,
     farthest_place,
     first_not_finite,
@@ -63,11 +64,17 @@ class InductionResult:
             vanish as far as the solve converged.
 
         Raises:
-            InputError: Unknown force law, or a force that is not finite.
+            InputError: Unknown force law, a force that is not finite, or moments so small that it would have no digits.
         """
         system = self._system
         system.apply_forces(force)
-        _check_finite(self._kind, system, self._count, self._given, force=system.forces, torque=system.torques)
+        strongest = largest(system.moments)
+        if 0.0 < strongest < LEAST_OF_FORCE[self._kind.dtype]:
+            raise InputError(
+                f"radii, saturation, external_field: moments of at most {strongest:.3g} A·m² are too small for forces "
+                f"{hint(self._kind.dtype)}"
+            )
+        _check_finite(self._kind, self._count, self._given, force=system.forces, torque=system.torques)
         return self._kind.finish(system.forces, self._count), self._kind.finish(system.torques, self._count)
 
 
@@ -165,13 +172,14 @@ def solve_induction(
     source_positions, source_moments = (None, None) if sources is None else sources
     given = {
         "positions": positions,
+        "radii": size,
         "saturation": saturation,
         "external_field": external_field,
         "sources: positions": source_positions,
         "sources: moments": source_moments,
         "initial": initial,
     }
-    _check_finite(kind, system, n, given, magnetization=m, field=system.h)
+    _check_finite(kind, n, given, magnetization=m, field=system.h)
     error = float(system.error.numpy().max(initial=0.0))
     if not math.isfinite(error):
         raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
@@ -216,7 +224,7 @@ def _check_strength(kind: Kind, strongest: float, saturation):
         )
 
 
-def _check_finite(kind: Kind, system: MomentSystem, count: int, given: dict, **results):
+def _check_finite(kind: Kind, count: int, given: dict, **results):
     """Raise ``InputError`` where a row of results of the first ``count`` is not finite.
 
     The message names those of the ``given`` arguments that are likely to be the cause.
@@ -228,9 +236,4 @@ def _check_finite(kind: Kind, system: MomentSystem, count: int, given: dict, **r
     least, most = _USUAL[kind.dtype]
     sizes = {name: np.abs(real_array(name, value)) for name, value in given.items() if value is not None}
     unusual = [name for name, size in sizes.items() if ((size > 0.0) & ~((size > least) & (size < most))).any()]
-    if system.contact_model == "multipole" and not unusual:
-        raise InputError(
-            f"contact_model: 'multipole' fails with balls that are nearly concentric: {where[0]} is not finite "
-            f"{hint(kind.dtype)} or 'dipole'"
-        )
     raise InputError(f"{', '.join(unusual or sizes)}: {where[0]} is not finite {hint(kind.dtype)}")

@@ -80,9 +80,10 @@ def _overlap_factors(d, a, b):
     g1 = c * (-k / d**3 + u1 / d + 2.0 * u2 + 3.0 * u3 * d - 5.0 * d**3)
     g2 = c * (3.0 * k / d**5 - u1 / d**3 + 3.0 * u3 / d - 15.0 * d)
     g3 = c * (-15.0 * k / d**7 + 3.0 * u1 / d**5 - 3.0 * u3 / d**3 - 15.0 / d)
-    # the printed form, for d near a + b and for very different radii, where the polynomial cancels
+    # the printed form, for d near a + b and for very different radii, where the polynomial cancels; its q is
+    # q0/d − 4s − d, which cancels
     e, q0 = s - d, 5.0 * a**2 - 20.0 * p + 5.0 * b**2
-    q, q1, q2, q3 = q0 / d - 4.0 * s - d, -q0 / d**2 - 1.0, 2.0 * q0 / d**3, -6.0 * q0 / d**4
+    q, q1, q2, q3 = (6.0 * s * e - 30.0 * p - e**2) / d, -q0 / d**2 - 1.0, 2.0 * q0 / d**3, -6.0 * q0 / d**4
     w1 = -4.0 * e**3 * q + e**4 * q1
     w2 = 12.0 * e**2 * q - 8.0 * e**3 * q1 + e**4 * q2
     w3 = -24.0 * e * q + 36.0 * e**2 * q1 - 12.0 * e**3 * q2 + e**4 * q3

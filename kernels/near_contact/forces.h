@@ -1,4 +1,5 @@
 // Forces between near balls, in units of μ0/4π: of the short-range parts, of quadrupoles and of contacts; and torques.
+// Products of sources leave float32's range where balls are small or large, so that lengths are in radii of the ball.
 //
 // From Python: UNIT, μ0/4π [T·m/A].
 #pragma once
@@ -65,7 +66,7 @@ CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& o
 }
 
 // Of quadrupoles with sources, dipoles and each other: derivatives of their energy by the distance and the direction,
-// with their window w and its ``slope``.
+// with their window w and its ``slope``; none where they are so close that powers of 1/d overflow.
 CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& other, Vector u, Number g2,
                                                 Number inverse, Number third, Number w, Number slope) {
     const Vector t = own.t, t_j = other.t;
@@ -76,18 +77,16 @@ CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Source
     const Number f = dot(v, u), f_j = dot(v_j, u);
     const Number on_sources = q * f_j + q_j * f, k3 = Real(1.0 / 3.0) * g2;
     const Number on_dipoles = 5 * (a * f_j - a_j * f) - 2 * (dot(t, v_j) - dot(t_j, v));
-    const Number fifth = fourth * inverse; // first, or else products of moments overflow
-    const Tensor part = {fifth * theta_j.xx, fifth * theta_j.yy, fifth * theta_j.xy, fifth * theta_j.yz,
-                         fifth * theta_j.zx};
-    const Vector v_part = scaled(fifth, v_j);
-    const Number product = part.xx * theta.xx + part.yy * theta.yy + (part.xx + part.yy) * (theta.xx + theta.yy)
-                           + 2 * (part.xy * theta.xy + part.yz * theta.yz + part.zx * theta.zx);
+    const Number fifth = fourth * inverse;
+    const Number product = theta_j.xx * theta.xx + theta_j.yy * theta.yy
+                           + (theta_j.xx + theta_j.yy) * (theta.xx + theta.yy)
+                           + 2 * (theta_j.xy * theta.xy + theta_j.yz * theta.yz + theta_j.zx * theta.zx);
     const Number energy_4 = fourth * on_dipoles;
-    const Number energy_5 = (2 * product - 20 * dot(v, v_part) + 35 * (fifth * f_j) * f) * Real(1.0 / 3.0);
-    const Vector z = less(times(theta_j, t), times(theta, t_j)), x = sum(times(theta, v_part), times(part, v));
+    const Number energy_5 = fifth * (2 * product - 20 * dot(v, v_j) + 35 * f_j * f) * Real(1.0 / 3.0);
+    const Vector z = less(times(theta_j, t), times(theta, t_j)), x = sum(times(theta, v_j), times(theta_j, v));
     auto turn_of = [=](Number t, Number t_j, Number v, Number v_j, Number z, Number x) -> Number {
         return 2 * k3 * (q * v_j + q_j * v) + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z)
-               + Real(70.0 / 3.0) * ((fifth * f_j) * v + (fifth * v_j) * f) - Real(20.0 / 3.0) * x;
+               + fifth * (Real(70.0 / 3.0) * (f_j * v + v_j * f) - Real(20.0 / 3.0) * x);
     };
     const Vector turn = {turn_of(t.x, t_j.x, v.x, v_j.x, z.x, x.x), turn_of(t.y, t_j.y, v.y, v_j.y, z.y, x.y),
                          turn_of(t.z, t_j.z, v.z, v_j.z, z.z, x.z)};
@@ -98,18 +97,31 @@ CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Source
     return {radial, scaled(w * inverse, turn)};
 }
 
-CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& own) {
-    const Number zero = numbers(a.radius + i) * Real(0);
+// Sources, with lengths in another unit, of which a metre has so many.
+CUDA_CALLABLE inline Sources in_units(const Sources& o, Number metre) {
+    const Number square = metre * metre, cube = square * metre;
+    const Tensor t = o.theta;
+    return {scaled(square, o.t),
+            scaled(square, o.m),
+            metre * o.q,
+            {cube * t.xx, cube * t.yy, cube * t.xy, cube * t.yz, cube * t.zx}};
+}
+
+CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& sources) {
+    const Number size = numbers(a.radius + i), zero = size * Real(0), square = size * size, metre = 1 / size;
+    const Sources own = in_units(sources, metre);
     Vector total = {zero, zero, zero};
     Partners<NEAR_SLOTS> partners(a.near, i);
     const int near_slots = most(a.near_count + i), contact_slots = most(a.contact_count + i);
     for (int s = share(); s - share() < near_slots; s += SHARES) {
         const Rows<PAIR_ROWS> row(a.pair(s, i));
         const Rows<PAIR_SLOPE_ROWS> slope(a.pair_slope(s, i));
-        const Sources other = sources_at(a, partners.of(s));
+        const Sources other = in_units(sources_at(a, partners.of(s)), metre);
         const Vector u = {row[0], row[1], row[2]};
-        const PairForce d = dipole_force(own, other, u, row[4], row[5], row[6], slope[0]);
-        const PairForce q = quadrupole_force(own, other, u, row[5], row[6], slope[0], row[7], slope[1]);
+        const Number g1 = square * row[4], g2 = square * size * row[5], g3 = square * (square * slope[0]), w = row[7];
+        const Number inverse = size * row[6], apart = w > zero ? inverse : zero;
+        const PairForce d = dipole_force(own, other, u, g1, g2, inverse, g3);
+        const PairForce q = quadrupole_force(own, other, u, g2, apart, g3, w, size * slope[1]);
         total = sum(total, d.across);
         total = sum(total, sum(scaled(d.radial + q.radial, u), q.across));
     }

@@ -13,36 +13,38 @@ struct NearPair {
     Mask live;
 };
 
-// U and its radial factors of two homogeneous balls.
+// U, g1 d, g2 d² and g3 d³ of two homogeneous balls of radii a and b, ``apart`` = |a − b|.
 struct Potential {
     Number u, g1, g2, g3;
 };
-CUDA_CALLABLE inline Potential potential(Number d, Number a, Number b) {
-    const Number i1 = 1 / d, i2 = i1 * i1, i3 = i2 * i1;
+CUDA_CALLABLE inline Potential potential(Number d, Number a, Number b, Number apart) {
+    const Number i1 = 1 / d, i2 = i1 * i1;
     const Mask overlap = d < a + b;
-    const Potential f = {i1, -i3, 3 * i3 * i2, -15 * i3 * i2 * i2};
+    const Potential f = {i1, -i2, 3 * i2 * i1, -15 * i2 * i2};
     if (!any(overlap)) return f;
-    const Factors<Number> g = averaged_factors(d, a, b);
-    return {averaged_potential(d, a, b), overlap ? g.g1 : f.g1, overlap ? g.g2 : f.g2, overlap ? g.g3 : f.g3};
+    const Factors<Number> g = averaged_factors(d, a, b, apart);
+    return {overlap ? averaged_potential(d, a, b, apart) : f.u, overlap ? g.g1 * d : f.g1, overlap ? g.g2 * d : f.g2,
+            overlap ? g.g3 : f.g3};
 }
 
-// Writes the rows of slot s of ball i, a pair at separation r, zeros where none is.
-CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vector r, const NearPair& p) {
+// Writes the rows of slot s of ball i, a pair in direction u, zeros where none is.
+CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vector u, const NearPair& p) {
     const Number a = p.a, b = p.b, unit = p.unit, zero = a * Real(0);
     Real *const rows = arrays.pair(s, i), *const slopes = arrays.pair_slope(s, i);
     auto keep = [=](int row, Number n) { put(rows + row * CHUNK, p.live ? n : zero); };
-    keep(0, r.x * p.inverse);
-    keep(1, r.y * p.inverse);
-    keep(2, r.z * p.inverse);
+    keep(0, u.x);
+    keep(1, u.y);
+    keep(2, u.z);
     // in units of the distance in contact: powers of metres overflow float32
     const Number y = unit * p.d, third = unit * unit * unit, x = HALF_RANGE * unit;
-    const Potential all = potential(y, unit * a, unit * b), far = potential(y, x * a, x * b);
+    const Number apart = larger(a - b, b - a);
+    const Potential all = potential(y, unit * a, unit * b, unit * apart), far = potential(y, x * a, x * b, x * apart);
     const Number short_range = y < HALF_RANGE ? zero + 1 : zero;
     keep(3, short_range * unit * (all.u - far.u));
-    keep(4, short_range * unit * unit * ((all.g1 - far.g1) * y));
-    keep(5, short_range * third * ((all.g2 - far.g2) * y * y));
+    keep(4, short_range * unit * unit * (all.g1 - far.g1));
+    keep(5, short_range * third * (all.g2 - far.g2));
     keep(6, p.inverse);
-    put(slopes, p.live ? short_range * third * (unit * ((all.g3 - far.g3) * y * y * y)) : zero);
+    put(slopes, p.live ? short_range * third * (unit * (all.g3 - far.g3)) : zero);
     const Fade quadrupole =
         window(2 * y - 2, QUADRUPOLE_GAP_LOW, QUADRUPOLE_GAP_HIGH, QUADRUPOLE_OVERLAP_LOW, QUADRUPOLE_OVERLAP_HIGH);
     keep(7, p.weight * p.alike * quadrupole.value);
@@ -169,12 +171,13 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
         const Mask live = weight > zero;
         const Number b = live ? other.w : size + (size > zero ? zero : one), sum = size + b;
         const Vector r = {other.x - own.x, other.y - own.y, other.z - own.z};
-        const Number distance = length(r), least = Real(1e-6) * size;
-        const Number d = live ? (distance > least ? distance : least) : sum;
+        const Polar apart = polar(scaled(1 / sum, r));
+        // bounded: powers of 1/d that nothing comes of, since the balls overlap, may not overflow
+        const Number d = live ? sum * larger(apart.d, zero + Real(1e-12)) : sum;
         const Number ratio = smaller(size, b) / larger(size, b);
         const Number alike = smoothstep((ratio - LEAST_RATIO_LOW) * (1 / (LEAST_RATIO_HIGH - LEAST_RATIO_LOW))).value;
         const NearPair pair = {size, b, sum, 1 / sum, d, 1 / d, weight, alike, live};
-        tabulate_pair(a, i, s, r, pair);
+        tabulate_pair(a, i, s, apart.u, pair);
         if (s >= contact_slots && s >= emptied_contacts) continue;
         const Number both = contact_counts > Real(s) ? weight * alike : zero;
         tabulate_contact(a, i, s, pair, both, whole(own_part.y), whole(part.y), sources, dipoles);

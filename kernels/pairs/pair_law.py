@@ -5,7 +5,8 @@ A moment m at x_j makes at x_i, with r = x_i − x_j and d = ‖r‖, the field 
     H        = (g1 m + g2 r (r·m)) / 4π
     ∂H_k/∂x_l = (g2 [r_k m_l + m_k r_l + δ_kl r·m] + g3 (r·m) r_k r_l) / 4π
 
-with radial factors g1 = U'/d, g2 = g1'/d, g3 = g2'/d of a potential U(d). Three sets of factors are used:
+with radial factors g1 = U'/d, g2 = g1'/d, g3 = g2'/d of a potential U(d). Functions return g1, g2 d and g3 d³, which go
+with the direction r/d and stay finite down to d = 0. Three sets of factors are used:
 
 * ``dipole_factors``: the point dipole, U = 1/d (Kim and Han 2022, Eqs. 1 and 14).
 * ``averaged_factors``: the field of one uniformly magnetized ball averaged over another that overlaps it. It joins the
@@ -29,58 +30,54 @@ INVERSE_4PI = 0.07957747154594767
 
 
 @wp.func
-def dipole_factors(d2: Any):
-    """Factors [g1, g2, g3] of two point dipoles at squared distance ``d2`` [m²]; zero at zero distance."""
-    zero = d2 * type(d2)(0.0)
-    # masked before the power: a self pair's r⁻⁵ overflows float32
-    inverse = wp.where(d2 > zero, type(d2)(1.0) / wp.sqrt(wp.where(d2 > zero, d2, type(d2)(1.0))), zero)
-    inverse2 = inverse * inverse
-    g1 = -inverse2 * inverse
-    g2 = type(d2)(-3.0) * g1 * inverse2
-    g3 = type(d2)(-5.0) * g2 * inverse2
-    return wp.vector(g1, g2, g3, length=3)
+def dipole_factors(d: Any):
+    """Factors of two point dipoles at distance ``d`` [m]; zero at zero distance."""
+    zero = d * type(d)(0.0)
+    # masked before the power: a self pair's r⁻⁴ overflows float32
+    inverse = wp.where(d > zero, type(d)(1.0) / wp.where(d > zero, d, type(d)(1.0)), zero)
+    g1 = -inverse * inverse * inverse
+    g2 = type(d)(-3.0) * g1 * inverse
+    return wp.vector(g1, g2, type(d)(-5.0) * g2, length=3)
 
 
 @wp.func
-def smoothed_factors(d2: Any, epsilon2: Any):
-    """Factors [g1, g2, g3] with ε² [m⁵] added to d⁵ in every denominator; zero at zero distance."""
-    zero = d2 * type(d2)(0.0)
-    safe = wp.where(d2 > zero, d2, type(d2)(1.0))
-    w = wp.where(d2 > zero, type(d2)(1.0) / (safe * safe * wp.sqrt(safe) + epsilon2), zero)
-    return wp.vector(-safe * w, type(d2)(3.0) * w, type(d2)(-15.0) * w / safe, length=3)
+def smoothed_factors(d: Any, epsilon2: Any):
+    """Factors with ε² [m⁵] added to d⁵ in every denominator; zero at zero distance."""
+    w = d / (d * d * d * d * d + epsilon2)
+    return wp.vector(-d * w, type(d)(3.0) * w, type(d)(-15.0) * w, length=3)
 
 
 @cache
 def pair_factors(dtype):
-    """Warp function (d2, a, b, epsilon2): factors [g1, g2, g3] of balls of radii a, b [m] at squared distance d2 [m²].
+    """Warp function (d, a, b, epsilon2): factors of balls of radii a, b [m] at distance d [m].
 
     They are averaged where the balls overlap; with an ε² [m⁵] they are smoothed instead.
     """
     vec3 = wp.types.vector(3, dtype)
 
-    @wp.func_native("const auto g = warpmag::averaged_factors(d, a, b); return {g.g1, g.g2, g.g3};")
-    def averaged_factors(d: dtype, a: dtype, b: dtype) -> vec3: ...
+    @wp.func_native("const auto g = warpmag::averaged_factors(d, a, b, apart); return {g.g1, g.g2, g.g3};")
+    def averaged_factors(d: dtype, a: dtype, b: dtype, apart: dtype) -> vec3: ...
 
     @wp.func
-    def factors(d2: dtype, a: dtype, b: dtype, epsilon2: dtype):
+    def factors(d: dtype, a: dtype, b: dtype, epsilon2: dtype):
         if epsilon2 > dtype(0.0):
-            return smoothed_factors(d2, epsilon2)
-        if d2 < (a + b) * (a + b):
-            return averaged_factors(wp.sqrt(d2), a, b)
-        return dipole_factors(d2)
+            return smoothed_factors(d, epsilon2)
+        if d < a + b:
+            return averaged_factors(d, a, b, wp.abs(a - b))
+        return dipole_factors(d)
 
     return factors
 
 
 @wp.func
-def field_of(g: Any, r: Any, m: Any):
-    """4π times the field [A/m] of moment ``m`` [A·m²] at separation ``r`` [m] for radial factors ``g``."""
-    return g[0] * m + (g[1] * wp.dot(r, m)) * r
+def field_of(g: Any, d: Any, u: Any, m: Any):
+    """4π times the field [A/m] of moment ``m`` [A·m²] at distance ``d`` [m] in direction ``u`` for factors ``g``."""
+    return g[0] * m + (g[1] * d * wp.dot(u, m)) * u
 
 
 @wp.func
-def force_of(g: Any, r: Any, m: Any, e: Any):
-    """4π times (e·∇)H [A²] of moment ``m`` at separation ``r`` for an effective moment ``e`` [A·m²]."""
-    rm = wp.dot(r, m)
-    re = wp.dot(r, e)
-    return g[1] * (re * m + rm * e) + (g[1] * wp.dot(m, e) + g[2] * rm * re) * r
+def force_of(g: Any, u: Any, m: Any, e: Any):
+    """4π times (e·∇)H [A²] of moment ``m`` in direction ``u`` for an effective moment ``e`` [A·m²]."""
+    um = wp.dot(u, m)
+    ue = wp.dot(u, e)
+    return g[1] * (ue * m + um * e) + (g[1] * wp.dot(m, e) + g[2] * um * ue) * u

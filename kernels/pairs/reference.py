@@ -36,11 +36,13 @@ def _kernel(dtype, quantity: Quantity):
             if not left_out:
                 r = x - vec3(arrays.sources[0, j], arrays.sources[1, j], arrays.sources[2, j])
                 m = vec3(arrays.sources[4, j], arrays.sources[5, j], arrays.sources[6, j])
-                g = factors(wp.dot(r, r), arrays.targets[3, i], arrays.sources[3, j], epsilon2)
+                d = wp.length(r)
+                u = wp.normalize(r)
+                g = factors(d, arrays.targets[3, i], arrays.sources[3, j], epsilon2)
                 if wp.static(field):
-                    h += field_of(g, r, m)
+                    h += field_of(g, d, u, m)
                 if wp.static(force):
-                    f += force_of(g, r, m, e)
+                    f += force_of(g, u, m, e)
         for c in range(3):
             if wp.static(force):
                 arrays.partial[0, row, c] = f[c]
