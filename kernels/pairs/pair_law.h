@@ -76,11 +76,10 @@ struct Polar {
 };
 CUDA_CALLABLE inline Polar polar(Vector r) {
     const Number zero = Number(Real(0)), one = Number(Real(1));
-    // the squares of small numbers are lost
-    const Number lift = dot(r, r) < Real(1e-20) ? Number(Real(1e18)) : one;
-    const Vector lifted = scaled(lift, r);
+    const Mask tiny = dot(r, r) < Real(1e-20); // times 2⁶⁰, for its square to keep its digits
+    const Vector lifted = scaled(tiny ? Number(Real(1.152921504606847e18)) : one, r);
     const Number d = length(lifted);
-    return {d / lift, scaled(d > zero ? one / d : zero, lifted)};
+    return {d * (tiny ? Number(Real(8.673617379884035e-19)) : one), scaled(d > zero ? one / d : zero, lifted)};
 }
 
 // An overlapping pair in units of its contact distance, in which no power of it overflows: direction u, distance d,
@@ -126,8 +125,9 @@ CUDA_CALLABLE inline Vector force_of(const Overlap& p, Vector e) {
 // Potential U of overlapping balls of radii a and b at distance d < a + b, in the forms of averaged_factors.
 template <class N> CUDA_CALLABLE inline N averaged_potential(N d, N a, N b, N apart) {
     const N p = a * b, s = a + b, c = 1 / (160 * p * p * p), e = s - d, e2 = e * e, d2 = d * d, i1 = 1 / d;
-    const N large = larger(a, b), small = s - large, apart2 = apart * apart;
     const N far = (1 + e2 * e2 * (6 * s * e - 30 * p - e2) * c) * i1;
+    if (!any(mask_of(d <= larger(Real(0.5) * s, apart)))) return far;
+    const N large = larger(a, b), small = s - large, apart2 = apart * apart;
     const N near = 24 * s * s * s * (5 * p - s * s) + 5 * apart2 * apart * (apart * i1) * (apart2 + 6 * p)
                    + d * (45 * s * s * apart2 + d * (-40 * s * (apart2 + p) + d * (15 * (apart2 + 2 * p) - d2)));
     const N inside = (3 * large * large - d2 - Real(0.6) * small * small) / (2 * large * large * large);
