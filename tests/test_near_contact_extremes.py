@@ -35,9 +35,16 @@ def two_in_one(_, depth):
     return x, np.array([1.0, 0.2, 0.2, 1.0])
 
 
+def beside(ratio, depth):
+    """Two balls that nearly touch, beside two in one another, which leave the model gradually as they overlap."""
+    x, radii = in_one_another(ratio, depth)
+    return np.array([*x[:2], [2.2, 0.0, 0.3], [2.1, 2.03, 0.4]]), np.append(radii, 1.0)
+
+
 @pytest.mark.parametrize("dtype, scale", [("float64", 0.005), ("float32", 0.005), ("float32", 100.0)])
 @pytest.mark.parametrize(
-    "arrange, ratio", [(in_one_another, ratio) for ratio in (1.0, 1.000001, 1.2, 3.0, 1000.0)] + [(two_in_one, 5.0)]
+    "arrange, ratio",
+    [(in_one_another, ratio) for ratio in (1.0, 1.000001, 1.2, 3.0, 1000.0)] + [(two_in_one, 5.0), (beside, 1.2)],
 )
 def test_balls_in_one_another(arrange, ratio, dtype, scale, device):
     """Magnetizations and forces down to coincident centres are the reference's, which is in units of the radius."""

@@ -179,7 +179,8 @@ class NearContacts:
         both = shared_volume(self.distance, a, b)
         crowding = crowding_weight(np.bincount(i, both, n) + np.bincount(j, both, n))
         gap = (self.distance - a - b) / self.scale
-        alike = crowding[i] * crowding[j] * similarity(a, b)
+        self.present = crowding[i] * crowding[j]
+        alike = self.present * similarity(a, b)
         self.quadrupole = [alike * factor for factor in quadrupole_window(self.distance, a, b)]
         share = (w[i] * w[j] * alike)[:, None]
         functions = [conductances(gap, y[one], y[other]) for one, other in ((i, j), (j, i))]
@@ -189,10 +190,10 @@ class NearContacts:
         self.conductance = self._conductance()
 
     def _factors(self):
-        """U_sr and its radial factors g1, g2, g3 of the pairs."""
+        """U_sr and its radial factors g1, g2, g3 of the pairs, as far as both balls take part."""
         a, b, d = self.radii[self.i], self.radii[self.j], self.distance
         near = averaged_potential(d, a, b), *oracle.radial_factors(d, a, b)
-        return [x - y for x, y in zip(near, long_range(d, a, b), strict=True)]
+        return [self.present * (x - y) for x, y in zip(near, long_range(d, a, b), strict=True)]
 
     def _short_range(self):
         """M, shape [9n, 9n]: 4π potentials, minus fields and minus their gradients, of the sources."""

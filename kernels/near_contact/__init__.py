@@ -26,6 +26,8 @@ exact solution of two balls. Four things make it work for piles:
   That there is one minimum is measured (``test_any_arrangement_has_one_solution``), not proven: in wide gaps ΔC alone
   has eigenvalues down to −0.03 R.
 
+Balls that share much of their volume with others leave the model: what they have in ΔC and M_sr fades together.
+
 ΔC of a pair has 14 functions of the gap and the two permeabilities, tabulated from the exact solution of two equal
 balls by ``bench.reference.near_contact_table``. With n_i the direction from i towards j, α = R n·e_m, γ the part of
 R² e_Θ that is symmetric about n, and ⊥ across it,

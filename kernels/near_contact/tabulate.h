@@ -39,7 +39,7 @@ CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vect
     const Number y = unit * p.d, third = unit * unit * unit, x = HALF_RANGE * unit;
     const Number apart = larger(a - b, b - a);
     const Potential all = potential(y, unit * a, unit * b, unit * apart), far = potential(y, x * a, x * b, x * apart);
-    const Number short_range = y < HALF_RANGE ? zero + 1 : zero;
+    const Number short_range = y < HALF_RANGE ? p.weight : zero; // balls leave the model gradually
     keep(3, short_range * unit * (all.u - far.u));
     keep(4, short_range * unit * unit * (all.g1 - far.g1));
     keep(5, short_range * third * (all.g2 - far.g2));
