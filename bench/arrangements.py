@@ -30,7 +30,7 @@ class Arrangement:
 
     positions: np.ndarray
     applied: np.ndarray
-    radii: object = RADIUS
+    radii: float | np.ndarray = RADIUS
     material: dict = field(default_factory=lambda: {"saturation": SATURATION})
 
 
@@ -87,7 +87,8 @@ def _uniform(positions, strength, radii=RADIUS, **material):
 def _dipole(positions, moment, **material):
     """Arrangement under a dipole [A·m²], two centimetres above its top and beside its middle."""
     x = np.asarray(positions, np.float32).astype(float)
-    place = np.append(x[:, :2].mean(axis=0), x[:, 2].max()) + [0.003, 0.001, 0.02]
+    middle = x.mean(axis=0)
+    place = np.array([middle[0] + 0.003, middle[1] + 0.001, x[:, 2].max() + 0.02])
     applied = oracle.h_field(place[None], np.array([[0.2 * moment, 0.0, moment]]), x)
     return Arrangement(x, applied, RADIUS, {"saturation": SATURATION, **material})
 

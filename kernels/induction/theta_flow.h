@@ -307,16 +307,16 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
     const Vector g = sum(mixed, r), next = sum(mixed, scaled((Real)world.omega, r));
     const Material material = material_of(state, at);
     set(state.s, at, next);
+    // what ends takes a whole step, where moments and field are the material's; s is the next solve's start
+    const bool ended = !world.active;
+    const Vector shown = ended ? sum(mixed, scaled(whole_step<Real>((Real)world.omega), r)) : next;
     const Number radius = some(entries(state.packed, at, 3), at.held, 0);
-    if (!world.active) {
-        // moments and field are the material's at the end of a last step; s is the next solve's start
-        const Vector last = sum(mixed, scaled(whole_step<Real>((Real)world.omega), r));
-        store_moments(state, at, moments_of(material, radius, last));
-        set(state.h, at, scaled(material.saturation / material.slope, last));
+    const Vector m = moments_of(material, radius, shown);
+    store_moments(state, at, m);
+    if (ended) {
+        set(state.h, at, scaled(material.saturation / material.slope, shown));
         return keep_solution(state, at, material, mixed, g);
     }
-    const Vector m = moments_of(material, radius, next);
-    store_moments(state, at, m);
     if (world.next != STEP_AND_SWEEP) return;
     const Vector before = moments_of(material, radius, mixed), change = less(m, before);
     set(state.mixed_g, at, g);

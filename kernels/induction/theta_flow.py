@@ -39,9 +39,9 @@ neighbours go before its first evaluation: the field of the neighbours is comput
 all others, F = H − H0 − G' M, is extrapolated as F₁ + β (F₁ − F₂), F of the last solve and of the one before for the
 present neighbours. Both are those of s̄ and ḡ, which are nearer to the solution than the last iterate. β is what would
 have predicted the last change from the one before it, β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth
-motion is followed, noise is not. The changes Δs_j, Δr_j outlive a solve, since the coupling hardly changes: a slow mode,
-as of long columns of balls, costs one evaluation instead of three. All that leaves 1.1 evaluations a solve where 243
-balls jump (Balls Up). Whatever a start is worth, the solve converges to the one solution.
+motion is followed, noise is not. The changes Δs_j, Δr_j outlive a solve, since the coupling hardly changes: a slow
+mode, as of long columns of balls, costs one evaluation instead of three. All that leaves 1.2 evaluations a solve
+where 243 balls jump (Balls Up). Whatever a start is worth, the solve converges to the one solution.
 """
 
 from functools import cache
