@@ -12,6 +12,7 @@ model costs:
 | time step | energy of two balls that fall towards each other | conservation |
 | boxes | forces of two box magnets, sampled as they come | ``bench.reference.cuboids`` |
 | price | time of the near-contact model in a touching pile | dipoles alone |
+| arrangements | magnetizations of many arrangements, and what the solve says of them | a float64 Newton solution |
 
 Prints a table of each, or of those named, and writes ``accuracy.jsonl`` and, of all, ``accuracy.png``.
 """
@@ -26,6 +27,7 @@ import numpy as np
 import warp as wp
 
 import warpmag
+from bench.arrangements import ARRANGEMENTS, arranged, trace
 from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
 from bench.reference import clusters, cuboids, spheres
@@ -84,6 +86,23 @@ def iteration(device) -> Iterator[dict]:
             error = _relative(system.magnetizations().numpy(), exact)
             evaluations = int(system.evaluations.numpy()[0])
             yield {"dtype": dtype, "rtol": rtol, "evaluations": evaluations, "ms": milliseconds, "error": error}
+
+
+def arrangements(device) -> Iterator[dict]:
+    """Cold solves of ``bench.arrangements``: their error and what they say of it, both over rtol.
+
+    Besides the evaluations, those after which the residual alone would have ended the solve.
+    """
+    for name, make in ARRANGEMENTS.items():
+        one = make()
+        exact = oracle.equilibrium(one.positions, one.radii, one.applied, **one.material).magnetizations
+        for rtol in TOLERANCES[1:]:
+            system = arranged(one, rtol=rtol, device=device)
+            residuals = trace(system)
+            enough = 1 + int(np.argmax(residuals <= rtol))
+            row = {"arrangement": name, "balls": len(exact), "rtol": rtol, "evaluations": len(residuals)}
+            found, said = _relative(system.magnetizations().numpy(), exact), float(system.error.numpy()[0])
+            yield {**row, "to residual": enough, "error": found / rtol, "said": said / rtol}
 
 
 def model(device) -> Iterator[dict]:
@@ -199,7 +218,7 @@ def price(device) -> Iterator[dict]:
 
 ERRORS = {
     "rounding": rounding, "iteration": iteration, "model": model, "clusters": cluster, "time step": time_step,
-    "boxes": boxes, "price": price,
+    "boxes": boxes, "price": price, "arrangements": arrangements,
 }  # fmt: skip
 
 

@@ -153,10 +153,12 @@ def largest(array) -> float:
 
 
 def first_not_finite(array, count: int) -> int | None:
-    """Row among the first ``count`` of a Warp array that is not finite, None if all are: on a GPU one reduction."""
-    if not count or (array.device.is_cuda and math.isfinite(norm_squared(array[:count]))):
-        return None
-    host = array.numpy()[:count]
+    """Row among the first ``count`` of an array that is not finite, None if all are: on a GPU one reduction."""
+    if isinstance(array, wp.array):
+        if not count or (array.device.is_cuda and math.isfinite(norm_squared(array[:count]))):
+            return None
+        array = array.numpy()
+    host = array[:count]
     return None if np.isfinite(host).all() else int(np.argwhere(~np.isfinite(host))[0, 0])
 
 

@@ -38,9 +38,12 @@ class InductionResult:
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
         h_field: Field H at the balls [A/m], external, from the sources and from the other balls, shape [n, 3].
-        error: Relative residual ‖M − f(H)‖/‖f(H)‖ over all balls, the computable form of Eq. 12.
+        error: Estimate of the relative error of the magnetizations, ‖M − M*‖/‖M*‖ over all balls, M* being the exact
+            solution, rounding apart: the residual of the last iterate times what the solve learnt of its amplification
+            (see ``warpmag.kernels.induction.theta_flow``). Of other dynamics than ``theta`` that residual,
+            ‖M − f(H)‖/‖f(H)‖, the computable form of Eq. 12.
         evaluations: All-pairs field evaluations among the balls.
-        converged: Whether ``error`` reached ``rtol``.
+        converged: Whether ``error`` is at most ``rtol``.
     """
 
     magnetizations: object
@@ -74,8 +77,9 @@ class InductionResult:
                 f"radii, saturation, external_field: moments of at most {strongest:.3g} A·m² are too small for forces "
                 f"{hint(self._kind.dtype)}"
             )
-        _check_finite(self._kind, self._count, self._given, force=system.forces, torque=system.torques)
-        return self._kind.finish(system.forces, self._count), self._kind.finish(system.torques, self._count)
+        forces, torques = (self._kind.finish(array, self._count) for array in (system.forces, system.torques))
+        _check_finite(self._kind, self._count, self._given, force=forces, torque=torques)
+        return forces, torques
 
 
 def solve_induction(
@@ -111,7 +115,7 @@ def solve_induction(
             ``llg``, ``llg-damping``: Eq. 6 with and without precession.
         contact_model: ``dipole``; or ``multipole``, which adds what balls lack where they nearly touch, from the exact
             solution of two balls (see ``warpmag.kernels.near_contact``).
-        rtol: Relative residual at which to end.
+        rtol: Relative error of the magnetizations to reach.
         max_evaluations: Field evaluations after which to give up; ``converged`` tells.
         initial: Magnetizations to start from [A/m], shape [n, 3].
         dtype: ``float32`` or ``float64``.
@@ -168,7 +172,7 @@ def solve_induction(
     if initial is not None:
         system.start_from(kind.vectors("initial", initial, n))
     system.solve()
-    m = system.magnetizations()
+    m, h = (kind.finish(array, n) for array in (system.magnetizations(), system.h))
     source_positions, source_moments = (None, None) if sources is None else sources
     given = {
         "positions": positions,
@@ -179,14 +183,14 @@ def solve_induction(
         "sources: moments": source_moments,
         "initial": initial,
     }
-    _check_finite(kind, n, given, magnetization=m, field=system.h)
+    _check_finite(kind, n, given, magnetization=m, field=h)
     error = float(system.error.numpy().max(initial=0.0))
     if not math.isfinite(error):
         raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
     _check_strength(kind, largest(system.h), saturation)
     result = InductionResult(
-        magnetizations=kind.finish(m, n),
-        h_field=kind.finish(system.h, n),
+        magnetizations=m,
+        h_field=h,
         error=error,
         evaluations=int(system.evaluations.numpy().max(initial=0)),
         converged=bool(system.converged.numpy().all()),

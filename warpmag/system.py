@@ -107,7 +107,7 @@ class MomentSystem:
             submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
         contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
             nearly touch (see ``warpmag.kernels.near_contact``).
-        rtol: Relative residual at which induction ends.
+        rtol: Relative error of the inducible moments' magnetization at which induction ends.
         max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
         damping: Damping α [dimensionless] of ``llg``; None means its default.
@@ -124,11 +124,15 @@ class MomentSystem:
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
         dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
-        h: Field at inducible moments [A/m], external and all other moments', shape [n].
+        h: Field at inducible moments [A/m], external and all other moments', of which the dynamics ``theta`` makes M =
+            f(H) when it ends, shape [n].
         forces: Forces [N] on those that may move, shape [n], by :meth:`apply_forces`.
         torques: Torques e × H about each moment's position [N·m], e being m with Kelvin's law (see
             ``kernels.pairs.wrench``), shape [n]; zero for an inducible ball of one moment.
-        error: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world, the computable form of Eq. 12, shape [worlds].
+        error: Relative error of each world's magnetization, as ``theta`` estimates it (see ``kernels.induction``); of
+            other dynamics the residual; shape [worlds].
+        residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last field evaluation, the computable form
+            of Eq. 12, shape [worlds]; ``theta`` goes a step on from there.
         evaluations: Field evaluations of the last solve, shape [worlds].
         converged: 1 where the last solve reached ``rtol``, shape [worlds].
     """
@@ -193,7 +197,7 @@ class MomentSystem:
         )
         self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
         self._induction = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
-        self.h, self.error = self._induction.h, self._induction.error
+        self.h, self.residual, self.error = self._induction.h, self._induction.residual, self._induction.error
         self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
 
     def _make_material(self, permanent, saturation, susceptibility, curve):

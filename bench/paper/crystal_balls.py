@@ -119,8 +119,8 @@ def trace(system: MomentSystem, iterations: int) -> np.ndarray:
     system.begin()
     for _ in range(min(iterations, system.max_evaluations)):
         system.iterate()
-        errors.append(float(system.error.numpy()[0]))
-        if system.converged.numpy()[0] or not np.isfinite(errors[-1]):
+        errors.append(float(system.residual.numpy()[0]))
+        if errors[-1] <= system.rtol or not np.isfinite(errors[-1]):
             break
     wp.synchronize_device(system.device)
     return np.array(errors)

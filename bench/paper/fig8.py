@@ -84,8 +84,8 @@ def _second_choices(output: Output) -> str:
         cells = []
         for choice in choices:
             system = _make_system(dynamics, curve, device=output.device, iterations=PATIENCE, **choice)
-            system.solve()
-            iterations, error = int(system.evaluations.numpy()[0]), float(system.error.numpy()[0])
+            errors = crystal_balls.trace(system, PATIENCE)
+            iterations, error = len(errors), float(errors[-1])
             output.record(dynamics=dynamics, curve=curve, **choice, iterations=iterations, error=error)
             cells.append(_outcome(iterations, error))
         return cells

@@ -71,7 +71,7 @@ def _agreement(strength: str, curve: str, output: Output) -> list[list]:
         converged = bool(system.converged.numpy()[0])
         values = {
             "iterations": int(system.evaluations.numpy()[0]),
-            "residual": float(system.error.numpy()[0]),
+            "residual": float(system.residual.numpy()[0]),
             "from_newton": _distance(m, newton),
             "from_theta": _distance(m, own),
         }

@@ -23,23 +23,31 @@ template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w
     world.linked = 0;
     world.plain_steps = 0;
     world.best = -1.0;
-    if (state.warm.data[w] == 0) world.kept = 0;
+    if (state.warm.data[w] == 0) {
+        world.kept = 0;
+        world.slowness = 0.0;
+    }
     state.condition.data[0] = 1;
 }
 
-// Whether a world ends after another evaluation, from its sums ‖M − f(H)‖² and ‖f(H)‖². Its residual is relative, save
-// where there is no field. A state that is not finite is no start for the next solve.
+// Residual of sums ‖M − f(H)‖² and ‖f(H)‖² (Eq. 12): relative, save where there is no field.
+CUDA_CALLABLE inline double relative_residual(double deviation2, double goal2) {
+    const double deviation = wp::sqrt(deviation2), goal = wp::sqrt(goal2);
+    return goal > 0.0 ? deviation / goal : deviation;
+}
+
+// Whether a world ends after another evaluation, with a residual and an error. A state that is not finite is no start
+// for the next solve.
 template <class State>
-CUDA_CALLABLE inline bool check_convergence(State& state, int w, double deviation2, double goal2, bool finite,
+CUDA_CALLABLE inline bool check_convergence(State& state, int w, double residual, double error, bool finite,
                                             bool hopeless) {
     auto& world = state.worlds.data[w];
-    const double deviation = wp::sqrt(deviation2), goal = wp::sqrt(goal2),
-                 residual = goal > 0.0 ? deviation / goal : deviation;
-    const bool converged = residual <= state.rtol;
+    const bool converged = error <= state.rtol;
     world.evaluations += 1;
     world.stiffness = 0.0;
     world.in_field = 0;
-    state.error.data[w] = residual;
+    state.residual.data[w] = residual;
+    state.error.data[w] = error;
     state.evaluations.data[w] = world.evaluations;
     state.converged.data[w] = converged;
     const bool done = converged || world.evaluations >= state.max_evaluations || hopeless;

@@ -9,7 +9,7 @@ The state of n moments, m of them inducible, in w worlds and c chunks:
     packed, moments: Moments, packed and plain [A·m²], shapes [8, n] and [n]; the inducible ones are written.
     neighbor, neighbor_count, overlap, overlap_count, searching: Their lists (``PackedMoments``).
     saturation, slope, curve: What they are made of (``curves.CurveParameters``).
-    rtol: Relative residual ‖M − f(H)‖/‖f(H)‖ at which a world ends.
+    rtol: Error at which a world ends.
     max_evaluations: Field evaluations after which a world gives up.
     row: Number, world, and the world's inducible moments from and to, of each inducible moment, shape [m].
     chunk: Rows from and to, and world, of each chunk, shape [c].
@@ -32,7 +32,8 @@ The state of n moments, m of them inducible, in w worlds and c chunks:
     arrived: Chunks of each world whose sums are done, shape [w].
     worlds: State of each world, shape [w].
     warm: Solves of each world since it began cold, as far as it matters, shape [w].
-    error: Relative residual of each world, shape [w].
+    residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w].
+    error: Its relative error: an estimate of ``theta_flow``, the residual of its rivals, shape [w].
     evaluations, converged: What a solve took, and whether it reached its goal, shape [w].
     condition: Whether any world still iterates, shape [1].
 """
@@ -48,7 +49,7 @@ from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5
 """Changes between iterates that are kept and mixed, see ``anderson.h``."""
-COLUMNS = 5 + DEPTH + DEPTH * (DEPTH + 1) // 2
+COLUMNS = 6 + DEPTH + DEPTH * (DEPTH + 1) // 2
 """Sums over the moments of a chunk or world; as in ``theta_step.h``."""
 BLOCK_CHUNK = 128
 """Moments in a chunk on a GPU, each of them for a thread of a block; on a CPU a chunk has ``passes.CHUNK``."""
@@ -56,7 +57,7 @@ BLOCK_CHUNK = 128
 
 @wp.struct
 class World:
-    """State of a world between evaluations, in one cache line, where a GPU would wait for one array after another.
+    """State of a world between evaluations; in one cache line, up to the last, what every moment needs of it.
 
     Attributes:
         active: Whether it still iterates.
@@ -74,6 +75,8 @@ class World:
         ahead: Part of the last change from solve to solve that the next start adds.
         best: Smallest merit of this solve, negative before the first.
         alpha: Anderson coefficients.
+        slowness: Sum of the steps to come over the last one, if they go on as they do.
+        gain: Size of each kept change of the iterate over that of its residual, by slot.
     """
 
     active: int
@@ -91,6 +94,8 @@ class World:
     ahead: wp.float64
     best: wp.float64
     alpha: wp.types.vector(DEPTH, wp.float64)
+    slowness: wp.float64
+    gain: wp.types.vector(DEPTH, wp.float64)
 
 
 @cache
@@ -137,6 +142,7 @@ def state_type(dtype):
         arrived: wp.array[int]
         worlds: wp.array[World]
         warm: wp.array[int]
+        residual: wp.array[wp.float64]
         error: wp.array[wp.float64]
         evaluations: wp.array[int]
         converged: wp.array[int]
@@ -186,7 +192,7 @@ def allocate(worlds, inducible, dtype, device):
         **zeros("past now swept", (count * size if on_cpu else len(rows), LINE), dtype),
         **zeros("sums", (count * vectors, COLUMNS), wp.float64),
         **zeros("worlds", world_count, World),
-        **zeros("error", world_count, wp.float64),
+        **zeros("residual error", world_count, wp.float64),
         **zeros("arrived warm evaluations", world_count),
         **zeros("condition", 1),
     }
@@ -204,7 +210,7 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
         packed: All moments, packed (``PackedMoments``).
         material: What they are made of (``curves.CurveParameters``).
         moments: Moments [A·m²], shape [n].
-        rtol: Relative residual at which a world ends.
+        rtol: Error at which a world ends.
         max_evaluations: Field evaluations after which a world gives up.
     """
     state.packed, state.moments, state.searching = packed.packed, moments, packed.searching

@@ -189,8 +189,11 @@ def _convergence_kernel(dtype):
     state_struct = state_type(dtype)
     sum_world = world_summation(dtype, 2)
 
-    @wp.func_native("warpmag::check_convergence(state, w, deviation2, goal2, finite, !finite);")
-    def end_world(state: state_struct, w: int, deviation2: wp.float64, goal2: wp.float64, finite: bool): ...
+    @wp.func_native("return warpmag::relative_residual(deviation2, goal2);")
+    def relative_residual(deviation2: wp.float64, goal2: wp.float64) -> wp.float64: ...
+
+    @wp.func_native("warpmag::check_convergence(state, w, residual, residual, finite, !finite);")
+    def end_world(state: state_struct, w: int, residual: wp.float64, finite: bool): ...
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype))
     def check_convergence(state: state_struct, pairs: pairs_type(dtype)):
@@ -209,7 +212,8 @@ def _convergence_kernel(dtype):
             mine += wp.vec2d(deviation * deviation, wp.float64(wp.length(goal)) * wp.float64(wp.length(goal)))
         last, total = sum_world(mine, c, lane, chunk[2], state)
         if last:
-            end_world(state, chunk[2], total[0], total[1], wp.isfinite(total[0]) and wp.isfinite(total[1]))
+            finite = wp.isfinite(total[0]) and wp.isfinite(total[1])
+            end_world(state, chunk[2], relative_residual(total[0], total[1]), finite)
 
     return check_convergence
 

@@ -174,9 +174,9 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     const Vector h0 = get(state.h0, at);
     if (any(mask_of(length(h0) > Real(0)))) world.in_field = 1;
     Vector s = get(state.s, at);
-    // the θ flow with κ = k from no magnetization: exact for a lone ball; shorter where balls overlap deeply
+    // the θ flow with κ = k from no magnetization: exact for a lone ball
     if (warm == 0) {
-        const Number one = 1, step = smaller(one, step_length<Real>(stiffness) / Real(0.6));
+        const Number step = whole_step<Real>(step_length<Real>(stiffness));
         s = scaled(step * material.slope / material.saturation, h0);
     }
     if (warm == STEADY) s = sum(s, scaled(ahead, less(get(state.past_g, at), get(state.past_g, at, 1))));
@@ -234,8 +234,10 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Material material = material_of(state, at);
     const Vector s = get(state.s, at), g = scaled(material.slope / material.saturation, get(state.h, at));
     const Vector r = less(g, s);
+    Vector step = {0, 0, 0};
     if (world.linked) {
-        set(state.history_s, at, less(s, get(state.iterate_s, at)), history.newest);
+        step = less(s, get(state.iterate_s, at));
+        set(state.history_s, at, step, history.newest);
         set(state.history_r, at, less(r, get(state.iterate_r, at)), history.newest);
     }
     set(state.iterate_s, at, s);
@@ -250,6 +252,7 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     put(DEVIATION, deviation * deviation);
     put(GOAL, goal * goal);
     put(MERIT, merit * merit);
+    put(CHANGE, square * wide_dot(step, step));
     const Vector past = get(state.past_g, at), earlier = less(past, get(state.past_g, at, 1));
     put(FOLLOWED, square * wide_dot(less(g, past), earlier));
     put(EARLIER, square * wide_dot(earlier, earlier));
@@ -304,11 +307,16 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
     const Vector g = sum(mixed, r), next = sum(mixed, scaled((Real)world.omega, r));
     const Material material = material_of(state, at);
     set(state.s, at, next);
-    // what has ended keeps the moments that its error was measured at, and s is the next solve's start
-    if (!world.active) return keep_solution(state, at, material, mixed, g);
+    // what ends takes a whole step, where moments and field are the material's; s is the next solve's start
+    const bool ended = !world.active;
+    const Vector shown = ended ? sum(mixed, scaled(whole_step<Real>((Real)world.omega), r)) : next;
     const Number radius = some(entries(state.packed, at, 3), at.held, 0);
-    const Vector m = moments_of(material, radius, next);
+    const Vector m = moments_of(material, radius, shown);
     store_moments(state, at, m);
+    if (ended) {
+        set(state.h, at, scaled(material.saturation / material.slope, shown));
+        return keep_solution(state, at, material, mixed, g);
+    }
     if (world.next != STEP_AND_SWEEP) return;
     const Vector before = moments_of(material, radius, mixed), change = less(m, before);
     set(state.mixed_g, at, g);

@@ -20,15 +20,28 @@ follow, ḡ = s̄ + r̄, ω' a little above ω. From cold they spare a pile of t
 An accelerated step or a swept one that leaves the merit ‖φ r‖ more than twice the best is taken back, and a few plain
 steps follow from the best iterate.
 
-The residual that ends a solve is good for one more step: that polished s, further by β Δg, is where the next solve
-starts, Δg the last change of g from solve to solve. Sweeps over neighbours go before its first evaluation: the field of
-the neighbours is computed where they are now, and the field of all others, F = H − H0 − G' M, is extrapolated as
-F₁ + β (F₁ − F₂), F of the last solve and of the one before for the present neighbours. Both are those of s̄ and ḡ, which
-are nearer to the solution than the last iterate. β is what would have predicted the last change from the one before it,
-β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth motion is followed, noise is not. The changes Δs_j, Δr_j
-outlive a solve, since the coupling hardly changes: a slow mode, as of long columns of balls, costs one evaluation
-instead of three. All that leaves 1.5 evaluations a solve where 2,500 balls jump (Balls Up). Whatever a start is worth,
-the solve converges to the one solution.
+**What a solve returns, and its error.** The residual that ends a solve is good for one more step. Returned are M and H
+of s̄ + ω₁ r̄, M = f(H), with the whole step ω₁ = 1 that solves a lone ball, or less where balls overlap. What the mixture
+removes of r has a known worth in s: at most γ times itself, γ = max ‖φ Δs_j‖/‖φ Δr_j‖. What it leaves, r̄, the step
+corrects, and as much error again is allowed for. Hence the estimate is an amplification of the residual (Eq. 12) of the
+last iterate,
+
+    error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [(2 − ω₁) ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖).
+
+With slow convergence many steps like the last one are to come: σ is their geometric series ρ/(1 − ρ), ρ being ‖φ r‖
+over the smallest before, and at least 1; half of a σ outlives an evaluation. An error below a hundredth of the last
+‖φ Δs‖ is not believed: sweeps over near contacts lag behind the moments. Rounding comes on top of all that, and a
+residual that is no more than rounding is not amplified. ``python -m bench.accuracy arrangements`` compares the estimate
+with the truth.
+
+s̄ + ω r̄, further by β Δg, is where the next solve starts, Δg the last change of g from solve to solve. Sweeps over
+neighbours go before its first evaluation: the field of the neighbours is computed where they are now, and the field of
+all others, F = H − H0 − G' M, is extrapolated as F₁ + β (F₁ − F₂), F of the last solve and of the one before for the
+present neighbours. Both are those of s̄ and ḡ, which are nearer to the solution than the last iterate. β is what would
+have predicted the last change from the one before it, β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth
+motion is followed, noise is not. The changes Δs_j, Δr_j outlive a solve, since the coupling hardly changes: a slow
+mode, as of long columns of balls, costs one evaluation instead of three. All that leaves 1.2 evaluations a solve
+where 243 balls jump (Balls Up). Whatever a start is worth, the solve converges to the one solution.
 """
 
 from functools import cache

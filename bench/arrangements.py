@@ -1,0 +1,145 @@
+"""Arrangements of iron balls in fields from weak to saturating, on which the error of a solve is compared with truth.
+
+They are of the kinds that magnetic balls come in: chains, rings, shells, packings, heaps and loose balls; touching,
+apart and overlapping; in uniform fields and under a dipole, where one end saturates and the other hardly notices.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.cases import RADIUS, SATURATION
+from warpmag import oracle
+from warpmag.system import MomentSystem
+
+TILTED = np.array([0.48, 0.6, 0.64])
+"""Direction of uniform fields, along no axis of an arrangement."""
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Balls in a field.
+
+    Attributes:
+        positions: Centres [m], shape [n, 3], which float32 holds.
+        applied: Applied field [A/m], shape [n, 3].
+        radii: Radii [m], scalar or [n].
+        material: Arguments of a solve that say what the balls are made of.
+    """
+
+    positions: np.ndarray
+    applied: np.ndarray
+    radii: float | np.ndarray = RADIUS
+    material: dict = field(default_factory=lambda: {"saturation": SATURATION})
+
+
+def _chain(count):
+    return 2.0 * RADIUS * np.arange(count)[:, None] * [1.0, 0.0, 0.0]
+
+
+def _ring(count):
+    angle = 2.0 * np.pi * np.arange(count) / count
+    return RADIUS / np.sin(np.pi / count) * np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+
+
+def _shell(count):
+    """Balls on a spiral over a sphere, the nearest two touching."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angle, across = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count), np.sqrt(1.0 - z * z)
+    unit = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+    apart = np.linalg.norm(unit[:, None] - unit, axis=-1) + 9.0 * np.eye(count)
+    return 2.0 * RADIUS / apart.min() * unit
+
+
+def _grid(*counts):
+    axes = np.meshgrid(*[np.arange(float(count)) for count in counts], indexing="ij")
+    return 2.0 * RADIUS * np.stack(axes, axis=-1).reshape(-1, 3)
+
+
+def _packing(cells):
+    """Face-centred cubic packing of touching balls."""
+    basis = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]])
+    corners = _grid(*cells).reshape(-1, 1, 3) / (2.0 * RADIUS)
+    return (2.0 * np.sqrt(2.0) * RADIUS * (corners + basis)).reshape(-1, 3)
+
+
+def _heap(count):
+    """A cone of touching balls."""
+    x = _packing((8, 8, 4))
+    middle = x.mean(axis=0)
+    height = np.hypot(x[:, 0] - middle[0], x[:, 1] - middle[1]) + x[:, 2]
+    return x[np.argsort(height, kind="stable")[:count]]
+
+
+def _loose(count, extent, seed=0):
+    """Balls thrown into a cube, with no regard for one another."""
+    return extent * np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
+
+
+def _uniform(positions, strength, radii=RADIUS, **material):
+    """Arrangement in a tilted field of a ``strength`` over the saturation."""
+    x = np.asarray(positions, np.float32).astype(float)
+    applied = np.broadcast_to(strength * SATURATION * TILTED, x.shape)
+    return Arrangement(x, applied, radii, {"saturation": SATURATION, **material})
+
+
+def _dipole(positions, moment, **material):
+    """Arrangement under a dipole [A·m²], two centimetres above its top and beside its middle."""
+    x = np.asarray(positions, np.float32).astype(float)
+    middle = x.mean(axis=0)
+    place = np.array([middle[0] + 0.003, middle[1] + 0.001, x[:, 2].max() + 0.02])
+    applied = oracle.h_field(place[None], np.array([[0.2 * moment, 0.0, moment]]), x)
+    return Arrangement(x, applied, RADIUS, {"saturation": SATURATION, **material})
+
+
+def _mixed():
+    """Balls of three sizes and of all materials."""
+    rng = np.random.default_rng(5)
+    x = 1.2 * _grid(5, 5, 5)
+    saturation, susceptibility = rng.uniform(0.3, 2.0, len(x)) * 1e6, 10.0 ** rng.uniform(-1.0, 3.0, len(x))
+    radii = rng.choice([0.004, 0.005, 0.006], len(x))
+    return _uniform(x, 0.15, radii, saturation=saturation, susceptibility=susceptibility)
+
+
+ARRANGEMENTS: dict[str, Callable[[], Arrangement]] = {
+    "chain, weak field": lambda: _uniform(_chain(60), 1e-4),
+    "chain under a dipole": lambda: _dipole(_chain(60), 60.0),
+    "ring": lambda: _uniform(_ring(40), 0.1),
+    "shell": lambda: _uniform(_shell(100), 0.1),
+    "shell under a dipole": lambda: _dipole(_shell(100), 60.0),
+    "packing, weak field": lambda: _uniform(_packing((3, 3, 3)), 1e-4),
+    "packing, half saturated": lambda: _uniform(_packing((3, 3, 3)), 0.5),
+    "packing, clamped": lambda: _uniform(_packing((3, 3, 3)), 0.2, curve="clamped"),
+    "packing, frohlich": lambda: _uniform(_packing((3, 3, 3)), 0.2, curve="frohlich"),
+    "packing under a dipole": lambda: _dipole(_packing((3, 3, 3)), 900.0),
+    "heap, weak field": lambda: _uniform(_heap(120), 1e-4),
+    "heap under a dipole": lambda: _dipole(_heap(120), 60.0),
+    "heap under a weak dipole": lambda: _dipole(_heap(120), 5.0),
+    "heap under a dipole, langevin": lambda: _dipole(_heap(120), 60.0, curve="langevin"),
+    "pile under a dipole": lambda: _dipole(_grid(5, 5, 5), 60.0),
+    "pile under a strong dipole": lambda: _dipole(_grid(5, 5, 5), 900.0),
+    "pile of a weak material": lambda: _dipole(_grid(5, 5, 5), 60.0, susceptibility=3.0),
+    "bar": lambda: _uniform(_grid(14, 3, 3), 0.1),
+    "materials side by side": _mixed,
+    "loose balls": lambda: _uniform(_loose(120, 0.12), 0.1),
+    "overlapping balls": lambda: _uniform(_loose(120, 0.05), 0.1),
+}
+
+
+def arranged(one: Arrangement, **settings) -> MomentSystem:
+    """Balls that are arranged, with more arguments of the system."""
+    radii = np.broadcast_to(one.radii, len(one.positions))
+    system = MomentSystem(radii=radii, external_field=one.applied, **one.material, **settings)
+    system.positions.assign(one.positions)
+    return system
+
+
+def trace(system: MomentSystem) -> np.ndarray:
+    """Solve, and return the residual after each field evaluation."""
+    residuals = []
+    system.begin()
+    while not residuals or (not system.converged.numpy()[0] and len(residuals) < system.max_evaluations):
+        system.iterate()
+        residuals.append(float(system.residual.numpy()[0]))
+    return np.array(residuals)
