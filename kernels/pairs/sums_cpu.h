@@ -35,10 +35,10 @@ static_assert(W == 2); // inverse distances are twice_inverse_root(d²)
 template <Quantity Q> constexpr bool MUTUAL = Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE;
 template <Quantity Q> constexpr Quantity ROWS = Q == Quantity::MUTUAL_FORCE ? Quantity::FORCE : Q;
 
-// In each square of numbers in COUNT vectors, rows and columns exchanged, by blocks of STEP and more.
-template <int STEP, int COUNT, int... L> inline void transpose(Simd (&rows)[COUNT], Sequence<int, L...> lanes) {
-    if constexpr (STEP < COUNT) {
-        for (int i = 0; i < COUNT; ++i) {
+// Exchanges rows and columns of a square of numbers, by blocks of STEP and more.
+template <int STEP, int... L> inline void transpose(Simd (&rows)[LANES], Sequence<int, L...> lanes) {
+    if constexpr (STEP < LANES) {
+        for (int i = 0; i < LANES; ++i) {
             if (i & STEP) continue;
             const Simd a = rows[i], b = rows[i + STEP];
             rows[i] = __builtin_shufflevector(a, b, (L & STEP ? LANES + L - STEP : L)...);
@@ -48,36 +48,13 @@ template <int STEP, int COUNT, int... L> inline void transpose(Simd (&rows)[COUN
     }
 }
 
-// Totals over the lanes of COUNT vectors, from the first lane to the last.
-template <int COUNT> inline auto totals(Simd (&rows)[COUNT]) {
-    typedef Real Total __attribute__((ext_vector_type(COUNT)));
+// Totals over the lanes of as many vectors, in the lanes of one. Added up one vector after the other, it would take
+// three times as many operations.
+inline Simd totals(Simd (&rows)[LANES]) {
     transpose<1>(rows, __make_integer_seq<Sequence, int, LANES>());
-    Total sum = 0;
-    for (int l = 0; l < LANES; ++l) {
-        Total lane;
-        __builtin_memcpy(&lane, (const Real*)&rows[l % COUNT] + l / COUNT * COUNT, sizeof(lane));
-        sum += lane;
-    }
+    Simd sum = 0;
+    for (int l = 0; l < LANES; ++l) sum += rows[l];
     return sum;
-}
-
-template <Quantity Q> inline Sums<Real> totals(const Sums<Simd>& sums) {
-    constexpr int COUNT = LANES < 4 ? LANES : 4;
-    Real found[3][4] = {};
-    const auto find = [&](int k, const Vec3<Simd>& v, Simd other) {
-        const Simd numbers[4] = {v.x, v.y, v.z, other};
-        for (int first = 0; first < 4; first += COUNT) {
-            Simd rows[COUNT];
-            for (int i = 0; i < COUNT; ++i) rows[i] = numbers[first + i];
-            const auto total = totals(rows);
-            for (int i = 0; i < COUNT; ++i) found[k][first + i] = total[i];
-        }
-    };
-    if constexpr (Q != Quantity::FIELD) find(0, sums.f, sums.a);
-    if constexpr (Q != Quantity::FORCE) find(1, sums.h, 0);
-    if constexpr (Q == Quantity::WRENCH) find(2, sums.g, 0);
-    const auto vector = [&](int k) -> Vec3<Real> { return {found[k][0], found[k][1], found[k][2]}; };
-    return {vector(0), vector(1), vector(2), found[0][3]};
 }
 
 inline Vec3<Simd> splat(const Vec3<Real>& v) { return {Simd(v.x), Simd(v.y), Simd(v.z)}; }
@@ -167,40 +144,57 @@ inline void compare(Tile& tile) {
         tile.ascending &= number(tile.rows[LABEL], i - 1) < number(tile.rows[LABEL], i);
 }
 
-template <Quantity Q> inline void add_results(Real* out, const Sums<Real>& sums, const Vec3<Real>& e) {
-    Real numbers[width(Q)];
-    results<Q>(sums, e, numbers);
-    for (int c = 0; c < width(Q); ++c) out[c] += numbers[c];
+// Sums of a target, packed in a column, over the sources of a tile.
+template <Quantity Q> inline Sums<Simd> sum_row(const Share& share, int column, Tile& tile) {
+    const Table& targets = share.targets;
+    const int own = column - tile.begin;
+    // a moment's own field is left out: its moment is zero, and its label, while its row is summed
+    const bool masked = Q == Quantity::FIELD && targets.data == share.sources.data && own >= 0 && own < tile.count;
+    Real kept[TILE_ROWS];
+    for (int r = MOMENT; r < TILE_ROWS && masked; ++r) {
+        kept[r] = number(tile.rows[r], own);
+        number(tile.rows[r], own) = 0;
+    }
+    const Vec3<Simd> x = splat(targets.vector(POSITION, column));
+    const Vec3<Simd> e = Q == Quantity::FIELD ? Vec3<Simd>{} : splat(share.effective.vector(0, column));
+    const Real radius = targets.row(RADIUS)[column], label = targets.row(LABEL)[column];
+    Sums<Simd> sums;
+    for (int v = 0; v < tile.vectors; ++v) {
+        const Source<Simd> source = tile.source(v);
+        const Vec3<Simd> r = x - source.x;
+        const Simd s = radius + tile.rows[RADIUS][v], s2 = s * s, d2 = dot(r, r), c = d2 > s2 ? d2 : s2;
+        auto wanted = c > 0;
+        if constexpr (Q != Quantity::FIELD) wanted &= label != tile.rows[LABEL][v];
+        add_pair<Q>(sums, r, wanted ? twice_inverse_root(c) : 0, source, e);
+    }
+    for (int r = MOMENT; r < TILE_ROWS && masked; ++r) number(tile.rows[r], own) = kept[r];
+    return sums;
 }
 
 // Adds the sources of a tile to the sums of targets that are packed from a column on.
 template <Quantity Q>
 __attribute__((noinline)) void add_rows(const Share& share, Real* out, int column_begin, int column_end, Tile& tile) {
-    const Table& targets = share.targets;
-    const bool among_sources = Q == Quantity::FIELD && targets.data == share.sources.data;
-    for (int column = column_begin; column < column_end; ++column, out += width(Q)) {
-        const int own = column - tile.begin;
-        // a moment's own field is left out: its moment is zero, and its label, while its row is summed
-        const bool masked = among_sources && own >= 0 && own < tile.count;
-        Real kept[TILE_ROWS];
-        for (int r = MOMENT; r < TILE_ROWS && masked; ++r) {
-            kept[r] = number(tile.rows[r], own);
-            number(tile.rows[r], own) = 0;
+    constexpr int SUMS = sizeof(Sums<Simd>) / sizeof(Simd);
+    constexpr auto used = [](int k) {
+        return Q == Quantity::WRENCH || (Q == Quantity::FIELD ? k >= 3 && k < 6 : k < 3 || k == 9);
+    };
+    for (int column = column_begin; column < column_end; column += LANES) {
+        const int held = column_end - column < LANES ? column_end - column : LANES;
+        Simd rows[SUMS][LANES], found[SUMS];
+        for (int l = 0; l < LANES; ++l) {
+            const Sums<Simd> sums = l < held ? sum_row<Q>(share, column + l, tile) : Sums<Simd>{};
+            for (int k = 0; k < SUMS; ++k)
+                if (used(k)) rows[k][l] = ((const Simd*)&sums)[k];
         }
-        const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column);
-        const Vec3<Simd> x = splat(targets.vector(POSITION, column)), all_e = splat(e);
-        const Real radius = targets.row(RADIUS)[column], label = targets.row(LABEL)[column];
-        Sums<Simd> sums;
-        for (int v = 0; v < tile.vectors; ++v) {
-            const Source<Simd> source = tile.source(v);
-            const Vec3<Simd> r = x - source.x;
-            const Simd s = radius + tile.rows[RADIUS][v], s2 = s * s, d2 = dot(r, r), c = d2 > s2 ? d2 : s2;
-            auto wanted = c > 0;
-            if constexpr (Q != Quantity::FIELD) wanted &= label != tile.rows[LABEL][v];
-            add_pair<Q>(sums, r, wanted ? twice_inverse_root(c) : 0, source, all_e);
+        for (int k = 0; k < SUMS; ++k) found[k] = used(k) ? totals(rows[k]) : 0;
+        for (int l = 0; l < held; ++l, out += width(Q)) {
+            const auto sum = [&](int k) { return number(found + k, l); };
+            const auto vector = [&](int k) -> Vec3<Real> { return {sum(k), sum(k + 1), sum(k + 2)}; };
+            const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column + l);
+            Real numbers[width(Q)];
+            results<Q>({vector(0), vector(3), vector(6), sum(9)}, e, numbers);
+            for (int c = 0; c < width(Q); ++c) out[c] += numbers[c];
         }
-        add_results<Q>(out, totals<Q>(sums), e);
-        for (int r = MOMENT; r < TILE_ROWS && masked; ++r) number(tile.rows[r], own) = kept[r];
     }
 }
 

@@ -17,7 +17,7 @@ from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
 _PAIRS_PER_START = 200_000
 """Pairs that a CPU sums while another of its threads wakes: 50 to 100 µs."""
-TILE_SIZE = 512
+TILE_SIZE = 640
 """Most sources of a tile of a CPU, and most targets if it stands for its mirror image, too."""
 _LEAST_TARGETS = 32
 """Targets that are worth loading a tile of sources for."""
