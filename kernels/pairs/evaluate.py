@@ -86,7 +86,7 @@ class PairEvaluation:
         a.target, a.begin, a.end = target_rows(segments, device)
         self.target, self.count, self.pair_count = a.target, a.target.shape[0], pair_count(segments)
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
-        parts, tiles = self._plan_sums(quantity, segments, targets, smoothing)
+        parts, tiles = self._plan_sums(quantity, segments, targets, targets is sources, smoothing)
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
         self.partial = a.partial = wp.zeros(shape, dtype=dtype, device=device)
         a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
@@ -98,7 +98,7 @@ class PairEvaluation:
             a.turned, a.torques = turned, torques
         self._recorded = {}
 
-    def _plan_sums(self, quantity, segments, targets, smoothing):
+    def _plan_sums(self, quantity, segments, targets, among, smoothing):
         """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
         device, finished, count = targets.device, self._finished, self.count
         if self.form == REFERENCE:
@@ -119,7 +119,9 @@ class PairEvaluation:
                 finished, shape, a.targets, a.sources, a.effective, a.tiles, a.partial
             )
             return parts, tiles
-        tiles, shares, parts, threads = cpu_tiles(segments)
+        tiles, shares, parts, threads = cpu_tiles(
+            segments, among and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
+        )
         self._arrays.shares = wp.array(shares, dtype=wp.int32, device=device)
         pair_loop = pair_loop_kernel(targets.dtype, quantity)
         self._launch_sums = lambda _: self._launch_pass(pair_loop, threads)

@@ -1,8 +1,7 @@
 // All-pairs sums, field (Eq. 1) and force (Eqs. 4, 13 and 14), of a work list of tiles on a CPU: in vectors as wide as
 // the machine has them, by several threads.
 //
-// A tile holds up to TILE_SIZE sources (from Python) in the first-level cache, and as many targets. There are two loops
-// over its pairs:
+// Up to TILE_SIZE sources (from Python) at a time are kept in the first-level cache. There are two loops over pairs:
 //
 // * add_rows sums a target at a time, whatever the radii.
 // * add_both_ends is for the field and Kelvin's force among moments of one radius. It computes a separation and its
@@ -48,7 +47,7 @@ template <int STEP, int... L> inline void transpose(Simd (&rows)[LANES], Sequenc
     }
 }
 
-// Totals over the lanes of as many vectors, in the lanes of one. Added up one vector after the other, it would take
+// Totals over the lanes of as many vectors, in the lanes of one. Lane by lane of each, it would take
 // three times as many operations.
 inline Simd totals(Simd (&rows)[LANES]) {
     transpose<1>(rows, __make_integer_seq<Sequence, int, LANES>());
@@ -207,15 +206,17 @@ template <Quantity Q> __attribute__((noinline)) void add_both_ends(Tile& targets
         Simd c;
     };
     const Simd contact = targets.radius + sources.radius, clamp = contact * contact;
-    const bool diagonal = &targets == &sources;
+    const bool diagonal = &targets == &sources, afresh = diagonal || sources.vectors < 2;
+    const auto separation = [&](const Vec3<Simd>& x, int v) -> Separation {
+        const Vec3<Simd> r = x - vectors(sources.rows + POSITION, v);
+        const Simd d2 = dot(r, r);
+        return {r, d2 > clamp ? d2 : clamp};
+    };
+    Separation now, next;
+    Simd inv;
     const auto sum_row = [&](int i) -> Vec3<Simd> {
         const Vec3<Simd> x = splat(numbers(targets.rows + POSITION, i)), m = splat(numbers(targets.rows + MOMENT, i));
         const Vec3<Simd> n = splat(numbers(targets.rows + SCALED_MOMENT, i));
-        const auto separation = [&](int v) -> Separation {
-            const Vec3<Simd> r = x - vectors(sources.rows + POSITION, v);
-            const Simd d2 = dot(r, r);
-            return {r, d2 > clamp ? d2 : clamp};
-        };
         Vec3<Simd> h{};
         int v = 0;
         if (diagonal) {
@@ -224,20 +225,25 @@ template <Quantity Q> __attribute__((noinline)) void add_both_ends(Tile& targets
             auto others = clamp > 0;
             others[i % LANES] = 0;
             Vec3<Simd> unused{};
-            const Separation s = separation(v);
+            const Separation s = separation(x, v);
             add_mirrored_pair<Q>(h, unused, s.r, others ? twice_inverse_root(s.c) : 0, sources.source(v), m, n);
             ++v;
         }
-        Separation now = separation(v), next = separation(v + 1);
-        Simd inv = twice_inverse_root(now.c);
-        for (; v < sources.vectors; ++v) {
-            const Separation later = separation(v + 2);
+        if (afresh || i == 0) {
+            now = separation(x, v), next = separation(x, v + 1);
+            inv = twice_inverse_root(now.c);
+        }
+        const auto sum_vector = [&](const Separation& later) {
             const Simd next_inv = twice_inverse_root(next.c);
             Vec3<Simd> g = vectors(sources.sums, v);
             add_mirrored_pair<Q>(h, g, now.r, inv, sources.source(v), m, n);
             sources.sums[0][v] = g.x, sources.sums[1][v] = g.y, sources.sums[2][v] = g.z;
             now = next, next = later, inv = next_inv;
-        }
+        };
+        for (; v < sources.vectors - 2 * !afresh; ++v) sum_vector(separation(x, v + 2));
+        // the next target's first separations
+        const Vec3<Simd> y = splat(numbers(targets.rows + POSITION, i + 1));
+        for (; v < sources.vectors; ++v) sum_vector(separation(y, v + 2 - sources.vectors));
         return h;
     };
     for (int v = 0; v < targets.vectors; ++v) {
@@ -251,7 +257,7 @@ template <Quantity Q> __attribute__((noinline)) void add_both_ends(Tile& targets
 }
 
 // Adds sums of pairs that were summed for both ends to the partial sums of a tile's moments.
-template <Quantity Q> __attribute__((noinline)) void add_tile_sums(const Tile& tile, Real* out) {
+__attribute__((noinline)) inline void add_tile_sums(const Tile& tile, Real* out) {
     for (int i = 0; i < tile.count; i += WIDTH, out += 3 * WIDTH) {
         const auto h = [&](int c) { return warpmag::numbers((const Real*)tile.sums[c] + i); };
         const int held = tile.count - i;
@@ -272,26 +278,37 @@ inline void sum_mirrored(const Share& share, const TileEntry& entry, TargetTile&
     Real* const out = share.sums_at<Q>(entry.split, entry.row_begin);
     Real* const mirror_out = share.sums_at<Q>(entry.mirror_split, entry.row_begin + entry.source_begin - begin);
     if (targets.out != out) {
-        if constexpr (MUTUAL<Q>) add_tile_sums<Q>(targets.tile, targets.out);
+        add_tile_sums(targets.tile, targets.out);
         targets.out = out;
         fill<Q>(targets.tile, share.sources, begin, end);
-        if constexpr (MUTUAL<Q>) compare(targets.tile);
+        compare(targets.tile);
     }
     const bool diagonal = entry.source_begin == begin;
     Tile &a = targets.tile, &b = diagonal ? a : tile;
-    if (!diagonal) fill<Q>(b, share.sources, entry.source_begin, entry.source_end);
-    if constexpr (MUTUAL<Q>) {
-        if (!diagonal) compare(b);
-        const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
-        const bool distinct = Q == Quantity::FIELD || (diagonal ? a.ascending : apart);
-        if (share.targets.data == share.sources.data && a.radius > 0 && b.radius > 0 && distinct) {
-            add_both_ends<Q>(a, b);
-            if (!diagonal) add_tile_sums<Q>(b, mirror_out);
-            return;
-        }
+    if (!diagonal) {
+        fill<Q>(b, share.sources, entry.source_begin, entry.source_end);
+        compare(b);
     }
-    add_rows<ROWS<Q>>(share, out, begin, end, b);
-    if (!diagonal) add_rows<ROWS<Q>>(share, mirror_out, entry.source_begin, entry.source_end, a);
+    const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
+    const bool distinct = Q == Quantity::FIELD || (diagonal ? a.ascending : apart);
+    if (a.radius > 0 && b.radius > 0 && distinct) {
+        add_both_ends<Q>(a, b);
+        if (!diagonal) add_tile_sums(b, mirror_out);
+    } else {
+        add_rows<ROWS<Q>>(share, out, begin, end, b);
+        if (!diagonal) add_rows<ROWS<Q>>(share, mirror_out, entry.source_begin, entry.source_end, a);
+    }
+}
+
+// Sums a tile for its targets, about equal parts of its sources at a time.
+template <Quantity Q> inline void sum_sources(const Share& share, const TileEntry& entry, Tile& tile) {
+    const int begin = entry.column_begin, end = begin + entry.row_end - entry.row_begin;
+    const int count = entry.source_end - entry.source_begin, parts = (count + TILE_SIZE - 1) / TILE_SIZE;
+    for (int first = entry.source_begin; first < entry.source_end; first += tile.count) {
+        const int chunks = (count + CHUNK * parts - 1) / (CHUNK * parts), left = entry.source_end - first;
+        fill<Q>(tile, share.sources, first, first + (CHUNK * chunks < left ? CHUNK * chunks : left));
+        add_rows<ROWS<Q>>(share, share.sums_at<Q>(entry.split, entry.row_begin), begin, end, tile);
+    }
 }
 
 template <Quantity Q> inline void sum_share(const Share& share) {
@@ -308,14 +325,12 @@ template <Quantity Q> inline void sum_share(const Share& share) {
     TargetTile targets;
     for (const TileEntry* entry = share.begin; entry < share.end; ++entry) {
         if (entry->mirrored) {
-            sum_mirrored<Q>(share, *entry, targets, tile);
-        } else if (entry->source_begin < entry->source_end) {
-            const int begin = entry->column_begin, end = begin + entry->row_end - entry->row_begin;
-            fill<Q>(tile, share.sources, entry->source_begin, entry->source_end);
-            add_rows<ROWS<Q>>(share, share.sums_at<Q>(entry->split, entry->row_begin), begin, end, tile);
+            if constexpr (MUTUAL<Q>) sum_mirrored<Q>(share, *entry, targets, tile);
+        } else {
+            sum_sources<Q>(share, *entry, tile);
         }
     }
-    if constexpr (MUTUAL<Q>) add_tile_sums<Q>(targets.tile, targets.out);
+    add_tile_sums(targets.tile, targets.out);
 }
 
 // Sums all tiles of ``Arrays``, the struct of work_list.py.

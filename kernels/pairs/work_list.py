@@ -11,14 +11,13 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
 _PAIRS_PER_START = 200_000
 """Pairs that a CPU sums while another of its threads wakes: 50 to 100 µs."""
 TILE_SIZE = 640
-"""Most sources of a tile of a CPU, and most targets if it stands for its mirror image, too."""
+"""Sources, and targets that are sources, too, that a CPU keeps in its first-level cache."""
 _LEAST_TARGETS = 32
 """Targets that are worth loading a tile of sources for."""
 _LANES = 16
@@ -63,83 +62,105 @@ def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
     return block_tiles(segments, width, splits), splits
 
 
-def cpu_tiles(segments):
+def cpu_tiles(segments, mutual: bool):
     """Tiles of a CPU; where each share of them begins; the number of partial sums; and threads to take shares.
 
     Pairs are cut into blocks, stripes of targets by stripes of sources, two for each thread that they could keep busy.
-    Targets among their own sources need the blocks above the diagonal only, each standing for its mirror image. Blocks
-    that have targets in common write partial sums of their own there. How pairs are cut depends on the segments alone,
-    and so does the order in which the sums of a target are added up. Threads take shares, which are runs of whole
-    blocks, the largest first.
+    Blocks that have targets in common write partial sums of their own there. How pairs are cut depends on the segments
+    alone, and so does the order in which the sums of a target are added up. Threads take shares, which are runs of
+    whole blocks, the largest first.
+
+    Args:
+        segments: Integers [k, 4]: target column begin and end, source begin and end.
+        mutual: Whether a pair may be summed for both its ends. Then targets among their own sources need the blocks
+            above the diagonal only, each standing for its mirror image.
     """
     pairs = pair_count(segments)
     busy = min(pairs // (2 * _PAIRS_PER_START), MOST_THREADS)
-    grain = pairs / (2 * busy) if busy > 1 else np.inf
+    grain = pairs / (2 * busy) if busy > 1 else math.inf
     starts = row_starts(segments).tolist()
-    cut = [_cut_segment(segment, row, grain) for segment, row in zip(segments.tolist(), starts[:-1], strict=True)]
-    blocks = [block for found in cut for block in found] + _idle_rows(cut, np.diff(starts))
-    blocks.sort(key=_work, reverse=True)
-    work = np.array([_work(block) for block in blocks])
-    # blocks of a quarter of the usual size or less go together
-    _, first = np.unique((np.cumsum(work) - 0.5 * work) // (0.25 * grain), return_index=True)
-    begin = np.cumsum([0, *map(len, blocks)])
-    tiles = np.array([tile for block in blocks for tile in block], np.int64).reshape(-1, TILE_COLUMNS)
-    threads = min(threads_for(pairs, 2 * _PAIRS_PER_START), max(len(first), 1))
-    return tiles, begin[[*first, -1]], 1 + int(tiles[:, [5, 7]].max(initial=0)), threads
+    blocks, written = [], []
+    for segment, row in zip(segments.tolist(), starts[:-1], strict=True):
+        found, parts = _cut_segment(segment, row, grain, mutual)
+        blocks += found
+        written.append(parts)
+    parts = max([1, *written])
+    blocks.sort(key=lambda block: block[0], reverse=True)
+    blocks += [(0, [tile]) for tile in _idle_rows(starts, written, parts)]
+    begin, tiles, begun = [], [], 0.0
+    for work, block in blocks:
+        # blocks of a quarter of the usual size or less go together
+        if not begin or begun >= 0.25 * grain:
+            begin.append(len(tiles))
+            begun = 0.0
+        begun += work
+        tiles += block
+    threads = min(threads_for(pairs, 2 * _PAIRS_PER_START), max(len(begin), 1))
+    return tiles, [*begin, len(tiles)], parts, threads
 
 
-def _cut_segment(segment, row, grain):
-    """Blocks of about ``grain`` pairs, each a list of tiles, of a segment that has its first target in ``row``."""
+def _cut_segment(segment, row, grain, mutual):
+    """Blocks of about ``grain`` pairs, their work and their tiles, of a segment whose first target has a given row.
+
+    Returns the number of partial sums, too.
+    """
     t0, t1, s0, s1 = segment
-    count, shift, part, blocks = t1 - t0, row - t0, 0, []
-    whole = count * (s1 - s0) <= grain  # in one block, and in one partial sum
+    count, shift, parts, blocks = t1 - t0, row - t0, 0, []
+    whole = count * (s1 - s0) <= grain
     rest = [(s0, s1)]
-    if s0 <= t0 and t1 <= s1:
-        # half as wide as two for each thread would be, of which all but the diagonal count twice: these fill gaps
+    if mutual and s0 <= t0 and t1 <= s1:
+        # all but those on the diagonal count twice, which fill gaps
         stripes = _stripes(t0, t1, 1 if whole else 2 * math.ceil(count / math.sqrt(2.0 * grain)))
         blocks = [
             _block(shift, stripes[a], stripes[b], b, a) for a in range(len(stripes)) for b in range(a, len(stripes))
         ]
-        part, rest = len(stripes), [(s0, t0), (t1, s1)]
+        parts, rest = len(stripes), [(s0, t0), (t1, s1)]
     for j0, j1 in rest:
         wanted = 1 if whole else math.ceil(count * (j1 - j0) / grain)
         rows = max(min(wanted, count // _LEAST_TARGETS), 1)
         edges = [t0 + count * k // rows for k in range(rows + 1)]
         sources = _stripes(j0, j1, -(-wanted // rows))
         blocks += [
-            _block(shift, targets, ends, 0 if whole else part + k)
+            _block(shift, targets, ends, 0 if whole else parts + k)
             for k, ends in enumerate(sources)
             for targets in pairwise(edges)
         ]
-        part += len(sources)
-    return [[tile for block in blocks for tile in block]] if whole else blocks
+        parts += len(sources)
+    if whole and blocks:  # in one block, and in one partial sum
+        return [(sum(work for work, _ in blocks), [tile for _, block in blocks for tile in block])], 1
+    return blocks, parts
 
 
-def _idle_rows(cut, counts):
-    """Blocks without sources, for partial sums that no block of a row's segment writes."""
-    written = [1 + max((max(tile[5], tile[7]) for block in found for tile in block), default=-1) for found in cut]
-    written = np.repeat(written, counts)
-    return [
-        [(begin, end, 0, 0, 0, part, 0, 0)]
-        for part in range(max([1, *written]))
-        for begin, end in np.flatnonzero(np.diff(written <= part, prepend=False, append=False)).reshape(-1, 2).tolist()
+def _idle_rows(starts, written, parts):
+    """Tiles without sources, for the partial sums that no block of a row's segment writes."""
+    idle = [
+        (begin, end, 0, 0, 0, part, 0, 0)
+        for part in range(min(written, default=parts), parts)
+        for (begin, end), own in zip(pairwise(starts), written, strict=True)
+        if own <= part
     ]
+    joined = idle[:1]
+    for tile in idle[1:]:
+        last = joined[-1]
+        if last[5] == tile[5] and last[1] == tile[0]:
+            joined[-1] = (last[0], *tile[1:])
+        else:
+            joined.append(tile)
+    return joined
 
 
 def _block(shift, targets, sources, part, mirror_part=None):
-    """Tiles of some targets and some sources, and what they are added to; ``shift`` leads from columns to rows."""
-    mirrored = mirror_part is not None
-    return [
-        (i0 + shift, i1 + shift, i0, j0, j1, part, int(mirrored), mirror_part or 0)
-        for i0, i1 in (_short_stripes(*targets) if mirrored else [targets])
+    """Work and tiles of some targets and some sources, added to given parts; ``shift`` leads from columns to rows."""
+    work = (targets[1] - targets[0]) * (sources[1] - sources[0])
+    if mirror_part is None:
+        return work, [(targets[0] + shift, targets[1] + shift, targets[0], *sources, part, 0, 0)]
+    tiles = [
+        (i0 + shift, i1 + shift, i0, j0, j1, part, 1, mirror_part)
+        for i0, i1 in _short_stripes(*targets)
         for j0, j1 in _short_stripes(*sources)
-        if not mirrored or i0 <= j0
+        if i0 <= j0
     ]
-
-
-def _work(block) -> int:
-    """Pairs of a block, with those of mirror images."""
-    return sum((t[1] - t[0]) * (t[4] - t[3]) * (2 if t[6] and t[2] < t[3] else 1) for t in block)
+    return work if mirror_part == part else 2 * work, tiles
 
 
 def pair_count(segments) -> int:
