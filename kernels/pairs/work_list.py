@@ -14,8 +14,10 @@ import warp as wp
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
-_PAIRS_PER_START = 200_000
-"""Pairs that a CPU sums while another of its threads wakes: 50 to 100 µs."""
+_PAIRS_PER_THREAD = 400_000
+"""Pairs that make another thread worth waking, which takes 50 to 100 µs: in these a thread sums half of them."""
+_LEAST_SHARE = 50_000
+"""Pairs of a share, of several blocks if they are few."""
 TILE_SIZE = 640
 """Sources, and targets that are sources, too, that a CPU keeps in its first-level cache."""
 _LEAST_TARGETS = 32
@@ -65,52 +67,47 @@ def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
 def cpu_tiles(segments, mutual: bool):
     """Tiles of a CPU; where each share of them begins; the number of partial sums; and threads to take shares.
 
-    Pairs are cut into blocks, stripes of targets by stripes of sources, two for each thread that they could keep busy.
-    Blocks that have targets in common write partial sums of their own there. How pairs are cut depends on the segments
-    alone, and so does the order in which the sums of a target are added up. Threads take shares, which are runs of
-    whole blocks, the largest first.
+    A segment of many pairs is cut into blocks, stripes of targets by stripes of sources. Blocks that have targets in
+    common write partial sums of their own there. How a segment is cut depends on nothing else, and so does the order in
+    which the sums of a target are added up. Threads take shares, which are runs of whole blocks, the largest first.
 
     Args:
         segments: Integers [k, 4]: target column begin and end, source begin and end.
         mutual: Whether a pair may be summed for both its ends. Then targets among their own sources need the blocks
             above the diagonal only, each standing for its mirror image.
     """
-    pairs = pair_count(segments)
-    busy = min(pairs // (2 * _PAIRS_PER_START), MOST_THREADS)
-    grain = pairs / (2 * busy) if busy > 1 else math.inf
-    starts = row_starts(segments).tolist()
+    pairs, starts = pair_count(segments), row_starts(segments).tolist()
     blocks, written = [], []
     for segment, row in zip(segments.tolist(), starts[:-1], strict=True):
-        found, parts = _cut_segment(segment, row, grain, mutual)
+        found, parts = _cut_segment(segment, row, mutual)
         blocks += found
         written.append(parts)
     parts = max([1, *written])
     blocks.sort(key=lambda block: block[0], reverse=True)
     blocks += [(0, [tile]) for tile in _idle_rows(starts, written, parts)]
-    begin, tiles, begun = [], [], 0.0
+    begin, tiles, begun = [], [], 0
     for work, block in blocks:
-        # blocks of a quarter of the usual size or less go together
-        if not begin or begun >= 0.25 * grain:
+        if not begin or begun >= _LEAST_SHARE:
             begin.append(len(tiles))
-            begun = 0.0
+            begun = 0
         begun += work
         tiles += block
-    threads = min(threads_for(pairs, 2 * _PAIRS_PER_START), max(len(begin), 1))
+    threads = min(threads_for(pairs, _PAIRS_PER_THREAD), max(len(begin), 1))
     return tiles, [*begin, len(tiles)], parts, threads
 
 
-def _cut_segment(segment, row, grain, mutual):
-    """Blocks of about ``grain`` pairs, their work and their tiles, of a segment whose first target has a given row.
-
-    Returns the number of partial sums, too.
-    """
+def _cut_segment(segment, row, mutual):
+    """Work and tiles of the blocks of a segment whose first target has a given row, and the number of partial sums."""
     t0, t1, s0, s1 = segment
     count, shift, parts, blocks = t1 - t0, row - t0, 0, []
-    whole = count * (s1 - s0) <= grain
+    pairs = count * (s1 - s0)
+    busy = min(pairs // _PAIRS_PER_THREAD, MOST_THREADS)
+    whole, grain = busy < 2, pairs / (2 * max(busy, 1))
     rest = [(s0, s1)]
     if mutual and s0 <= t0 and t1 <= s1:
-        # all but those on the diagonal count twice, which fill gaps
-        stripes = _stripes(t0, t1, 1 if whole else 2 * math.ceil(count / math.sqrt(2.0 * grain)))
+        # as wide as makes two blocks for each thread, one on the diagonal being half of another
+        wanted = 1 if whole or count**2 <= grain else 2 * math.ceil(count / math.sqrt(2.0 * grain))
+        stripes = _stripes(t0, t1, wanted)
         blocks = [
             _block(shift, stripes[a], stripes[b], b, a) for a in range(len(stripes)) for b in range(a, len(stripes))
         ]
