@@ -214,7 +214,7 @@ template <Quantity Q> __attribute__((noinline)) void add_both_ends(Tile& targets
     };
     Separation now, next;
     Simd inv;
-    const auto sum_row = [&](int i) -> Vec3<Simd> {
+    const auto sum_row = [&](int i) __attribute__((always_inline)) -> Vec3<Simd> {
         const Vec3<Simd> x = splat(numbers(targets.rows + POSITION, i)), m = splat(numbers(targets.rows + MOMENT, i));
         const Vec3<Simd> n = splat(numbers(targets.rows + SCALED_MOMENT, i));
         Vec3<Simd> h{};
