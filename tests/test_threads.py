@@ -114,11 +114,11 @@ def test_a_world_keeps_its_bits_in_company(device):
 def test_a_simulation(device, assert_same_bits, tmp_path):
     """Balls Up with balls enough for several threads."""
     stage = tmp_path / "pile.usda"
-    balls_up.author(stage, columns=16, rows=16, layers=4, height=0.0611)
+    balls_up.author(stage, columns=15, rows=15, layers=4, height=0.0611)
 
     def work():
         simulation = Simulation(stage, device=device)
-        for _ in range(4):
+        for _ in range(2):
             simulation.step()
         system = simulation.magnetics.system
         return [a.numpy() for a in (simulation.state.body_q, simulation.state.body_qd, system.moments)]

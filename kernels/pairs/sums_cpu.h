@@ -47,8 +47,8 @@ template <int STEP, int... L> inline void transpose(Simd (&rows)[LANES], Sequenc
     }
 }
 
-// Totals over the lanes of as many vectors, in the lanes of one. Lane by lane of each, it would take
-// three times as many operations.
+// Totals over the lanes of as many vectors, in the lanes of one. To add up the lanes of each would take three times as
+// many operations.
 inline Simd totals(Simd (&rows)[LANES]) {
     transpose<1>(rows, __make_integer_seq<Sequence, int, LANES>());
     Simd sum = 0;
