@@ -119,9 +119,8 @@ class PairEvaluation:
                 finished, shape, a.targets, a.sources, a.effective, a.tiles, a.partial
             )
             return parts, tiles
-        tiles, shares, parts, threads = cpu_tiles(
-            segments, among and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
-        )
+        mutual = among and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
+        tiles, shares, parts, threads = cpu_tiles(segments, mutual, targets.dtype)
         self._arrays.shares = wp.array(shares, dtype=wp.int32, device=device)
         pair_loop = pair_loop_kernel(targets.dtype, quantity)
         self._launch_sums = lambda _: self._launch_pass(pair_loop, threads)

@@ -3,7 +3,7 @@
 from functools import cache
 
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.pairs.work_list import TILE_SIZE, arrays_type
+from warpmag.kernels.pairs.work_list import arrays_type, tile_size
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
 
@@ -14,5 +14,5 @@ def pair_loop_kernel(dtype, quantity: Quantity):
     return passes_kernel(
         f"warpmag::cpu::sum_tiles<warpmag::Quantity({quantity:d})>(arrays, threads, team.data);",
         arrays_type(dtype),
-        native_options("pairs/sums_cpu.h", dtype=dtype, TILE_SIZE=TILE_SIZE),
+        native_options("pairs/sums_cpu.h", dtype=dtype, TILE_SIZE=tile_size(dtype)),
     )

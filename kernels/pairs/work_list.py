@@ -18,8 +18,8 @@ _PAIRS_PER_THREAD = 400_000
 """Pairs that make another thread worth waking, which takes 50 to 100 µs: in these a thread sums half of them."""
 _LEAST_SHARE = 50_000
 """Pairs of a share, of several blocks if they are few."""
-TILE_SIZE = 640
-"""Sources, and targets that are sources, too, that a CPU keeps in its first-level cache."""
+_TILE_BYTES = 2560
+"""Of a component of the sources, and of targets that are sources, too, that a CPU keeps in its first-level cache."""
 _LEAST_TARGETS = 32
 """Targets that are worth loading a tile of sources for."""
 _LANES = 16
@@ -64,7 +64,12 @@ def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
     return block_tiles(segments, width, splits), splits
 
 
-def cpu_tiles(segments, mutual: bool):
+def tile_size(dtype) -> int:
+    """Most sources that a CPU loads at a time, and most targets of a tile that stands for its mirror image, too."""
+    return _TILE_BYTES // wp.types.type_size_in_bytes(dtype)
+
+
+def cpu_tiles(segments, mutual: bool, dtype):
     """Tiles of a CPU; where each share of them begins; the number of partial sums; and threads to take shares.
 
     A segment of many pairs is cut into blocks, stripes of targets by stripes of sources. Blocks that have targets in
@@ -75,11 +80,12 @@ def cpu_tiles(segments, mutual: bool):
         segments: Integers [k, 4]: target column begin and end, source begin and end.
         mutual: Whether a pair may be summed for both its ends. Then targets among their own sources need the blocks
             above the diagonal only, each standing for its mirror image.
+        dtype: Warp scalar type of the sums.
     """
     pairs, starts = pair_count(segments), row_starts(segments).tolist()
     blocks, written = [], []
     for segment, row in zip(segments.tolist(), starts[:-1], strict=True):
-        found, parts = _cut_segment(segment, row, mutual)
+        found, parts = _cut_segment(segment, row, mutual, tile_size(dtype))
         blocks += found
         written.append(parts)
     parts = max([1, *written])
@@ -96,7 +102,7 @@ def cpu_tiles(segments, mutual: bool):
     return tiles, [*begin, len(tiles)], parts, threads
 
 
-def _cut_segment(segment, row, mutual):
+def _cut_segment(segment, row, mutual, most):
     """Work and tiles of the blocks of a segment whose first target has a given row, and the number of partial sums."""
     t0, t1, s0, s1 = segment
     count, shift, parts, blocks = t1 - t0, row - t0, 0, []
@@ -109,7 +115,9 @@ def _cut_segment(segment, row, mutual):
         wanted = 1 if whole or count**2 <= grain else 2 * math.ceil(count / math.sqrt(2.0 * grain))
         stripes = _stripes(t0, t1, wanted)
         blocks = [
-            _block(shift, stripes[a], stripes[b], b, a) for a in range(len(stripes)) for b in range(a, len(stripes))
+            _square(shift, stripes[a], stripes[b], b, a, most)
+            for a in range(len(stripes))
+            for b in range(a, len(stripes))
         ]
         parts, rest = len(stripes), [(s0, t0), (t1, s1)]
     for j0, j1 in rest:
@@ -117,10 +125,11 @@ def _cut_segment(segment, row, mutual):
         rows = max(min(wanted, count // _LEAST_TARGETS), 1)
         edges = [t0 + count * k // rows for k in range(rows + 1)]
         sources = _stripes(j0, j1, -(-wanted // rows))
+        part = 0 if whole else parts
         blocks += [
-            _block(shift, targets, ends, 0 if whole else parts + k)
-            for k, ends in enumerate(sources)
-            for targets in pairwise(edges)
+            ((i1 - i0) * (end - begin), [(i0 + shift, i1 + shift, i0, begin, end, part + k, 0, 0)])
+            for k, (begin, end) in enumerate(sources)
+            for i0, i1 in pairwise(edges)
         ]
         parts += len(sources)
     if whole and blocks:  # in one block, and in one partial sum
@@ -146,28 +155,22 @@ def _idle_rows(starts, written, parts):
     return joined
 
 
-def _block(shift, targets, sources, part, mirror_part=None):
-    """Work and tiles of some targets and some sources, added to given parts; ``shift`` leads from columns to rows."""
-    work = (targets[1] - targets[0]) * (sources[1] - sources[0])
-    if mirror_part is None:
-        return work, [(targets[0] + shift, targets[1] + shift, targets[0], *sources, part, 0, 0)]
+def _square(shift, targets, sources, part, mirror_part, most):
+    """Work and tiles of targets and sources on or above the diagonal; ``shift`` leads from columns to rows."""
+    stripes = [_stripes(*ends, -(-(ends[1] - ends[0]) // most)) for ends in (targets, sources)]
     tiles = [
         (i0 + shift, i1 + shift, i0, j0, j1, part, 1, mirror_part)
-        for i0, i1 in _short_stripes(*targets)
-        for j0, j1 in _short_stripes(*sources)
+        for i0, i1 in stripes[0]
+        for j0, j1 in stripes[1]
         if i0 <= j0
     ]
-    return work if mirror_part == part else 2 * work, tiles
+    pairs = (targets[1] - targets[0]) * (sources[1] - sources[0])
+    return pairs if targets == sources else 2 * pairs, tiles
 
 
 def pair_count(segments) -> int:
     """Pairs of a target and a source."""
     return int(np.sum((segments[:, 1] - segments[:, 0]) * (segments[:, 3] - segments[:, 2])))
-
-
-def _short_stripes(begin, end):
-    """Ranges of at most ``TILE_SIZE``, about equal."""
-    return _stripes(begin, end, -(-(end - begin) // TILE_SIZE))
 
 
 def _stripes(begin, end, wanted):
