@@ -24,7 +24,7 @@ from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
-from warpmag.kernels.pairs.sums_cpu import launch_pair_loop_cpu
+from warpmag.kernels.pairs.sums_cpu import pair_loop_kernel
 from warpmag.kernels.pairs.work_list import arrays_type, block_tiles, cpu_tiles, loop_tiles, pair_count, target_rows
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import native_options
@@ -86,7 +86,7 @@ class PairEvaluation:
         a.target, a.begin, a.end = target_rows(segments, device)
         self.target, self.count, self.pair_count = a.target, a.target.shape[0], pair_count(segments)
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
-        parts, tiles = self._plan_sums(quantity, segments, device, smoothing)
+        parts, tiles = self._plan_sums(quantity, segments, targets, targets is sources, smoothing)
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
         self.partial = a.partial = wp.zeros(shape, dtype=dtype, device=device)
         a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
@@ -96,11 +96,11 @@ class PairEvaluation:
         a.base, a.out = base, out
         if quantity != Quantity.FIELD:
             a.turned, a.torques = turned, torques
-        self._finish = None
+        self._recorded = {}
 
-    def _plan_sums(self, quantity, segments, device, smoothing):
+    def _plan_sums(self, quantity, segments, targets, among, smoothing):
         """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
-        finished, count = self._finished, self.count
+        device, finished, count = targets.device, self._finished, self.count
         if self.form == REFERENCE:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
             return 1, ()
@@ -119,12 +119,12 @@ class PairEvaluation:
                 finished, shape, a.targets, a.sources, a.effective, a.tiles, a.partial
             )
             return parts, tiles
-        tiles, ends, threads = cpu_tiles(segments)
-        shares = wp.array(ends, dtype=wp.int32, device=device)
-        self._launch_sums = lambda a: launch_pair_loop_cpu(
-            quantity, a.targets, a.sources, a.effective, a.tiles, shares, threads, a.partial
-        )
-        return len(ends) - 1, tiles
+        mutual = among and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
+        tiles, shares, parts, threads = cpu_tiles(segments, mutual, targets.dtype)
+        self._arrays.shares = wp.array(shares, dtype=wp.int32, device=device)
+        pair_loop = pair_loop_kernel(targets.dtype, quantity)
+        self._launch_sums = lambda _: self._launch_pass(pair_loop, threads)
+        return parts, tiles
 
     def launch(self, wait=None):
         """Evaluate at all target rows; ``wait``, if given, is called before the partial sums are added up."""
@@ -134,21 +134,21 @@ class PairEvaluation:
         if wait is not None:
             wait()
         if self.form != FUSED:
-            self._launch_finish()
+            finish = _finish_kernel(self.partial.dtype, self._finished, group_threads(self.partial.device))
+            self._launch_pass(finish, threads_for(self.count, MOMENTS_PER_THREAD))
 
-    def _launch_finish(self):
-        """Launch what follows the sums, recorded, which spares packing the struct each time."""
-        if self._finish is None:
-            device, group = self.partial.device, group_threads(self.partial.device)
-            threads, members = threads_for(self.count, MOMENTS_PER_THREAD), None if device.is_cuda else team()
-            self._finish = wp.launch(
-                _finish_kernel(self.partial.dtype, self._finished, group),
-                dim=group * self.count if device.is_cuda else 1,
-                inputs=[0, 1, threads, members, self._arrays],
+    def _launch_pass(self, kernel, threads):
+        """Launch a pass over the target rows, recorded, which spares packing the struct each time."""
+        if kernel not in self._recorded:
+            device = self.partial.device
+            self._recorded[kernel] = wp.launch(
+                kernel,
+                dim=group_threads(device) * self.count if device.is_cuda else 1,
+                inputs=[0, 1, threads, None if device.is_cuda else team(), self._arrays],
                 device=device,
                 record_cmd=True,
             )
-        self._finish.launch()
+        self._recorded[kernel].launch()
 
 
 def _choose_form(quantity, segments, device, among, extra_parts) -> str:

@@ -37,9 +37,10 @@ constexpr Real W = 2;
 constexpr Real scaled_moment(Quantity q) { return Real(double(W) * W / (q == Quantity::FIELD ? 3.0 : 5.0)); }
 
 // An entry of the work list of tiles: the target rows, the packed column of the first of them, the sources, the partial
-// sums that it is added to, and whether it stands also for the tile with sources and targets exchanged.
+// sums that it is added to, and whether it stands also for the tile with sources and targets exchanged, and what that
+// is added to.
 struct TileEntry {
-    int row_begin, row_end, column_begin, source_begin, source_end, split, mirrored, unused;
+    int row_begin, row_end, column_begin, source_begin, source_end, split, mirrored, mirror_split;
 };
 
 template <class N> struct Vec3 {

@@ -21,4 +21,4 @@ WIDTHS = {Quantity.FIELD: 3, Quantity.FORCE: 3, Quantity.WRENCH: 6, Quantity.MUT
 TILE_COLUMNS = 8
 """Columns of a work list of tiles, ``TileEntry`` of ``pair_terms.h``: target rows begin and end, packed column of the
 first of them, sources begin and end, partial sums that the tile is added to, whether it stands also for the tile with
-sources and targets exchanged, and nothing, so that a GPU reads a row as two vectors."""
+sources and targets exchanged, and partial sums that this is added to. A GPU reads a row as two vectors."""

@@ -1,8 +1,7 @@
 // All-pairs sums, field (Eq. 1) and force (Eqs. 4, 13 and 14), of a work list of tiles on a CPU: in vectors as wide as
 // the machine has them, by several threads.
 //
-// A tile holds up to TILE_SIZE sources (from Python) in the first-level cache, and as many targets. There are two loops
-// over its pairs:
+// Up to TILE_SIZE sources (from Python) at a time are kept in the first-level cache. There are two loops over pairs:
 //
 // * add_rows sums a target at a time, whatever the radii.
 // * add_both_ends is for the field and Kelvin's force among moments of one radius. It computes a separation and its
@@ -10,12 +9,13 @@
 //   for two forces, where it takes 37. Tiles that may hold moments of the same body do not have their forces that way.
 //
 // Threads take shares of the tiles, the largest first; one that starts late or is interrupted leaves more to the
-// others. Each share has partial sums of its own, which the finishing kernel adds up in order, so that results do not
-// depend on which thread took which share.
+// others. No two shares add to the same partial sums of a row, and the finishing kernel adds those up in order, so that
+// results do not depend on which thread took which share.
 #pragma once
 #include "pairs/pair_terms.h"
 #include "shared/inverse_root.h"
 #include "shared/team.h"
+#include "shared/vectors.h"
 
 namespace warpmag::cpu {
 
@@ -34,13 +34,27 @@ static_assert(W == 2); // inverse distances are twice_inverse_root(d²)
 template <Quantity Q> constexpr bool MUTUAL = Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE;
 template <Quantity Q> constexpr Quantity ROWS = Q == Quantity::MUTUAL_FORCE ? Quantity::FORCE : Q;
 
-inline Real total(Simd lanes) {
-    Real sum = 0;
-    for (int l = 0; l < LANES; ++l) sum += lanes[l];
-    return sum;
+// Exchanges rows and columns of a square of numbers, by blocks of STEP and more.
+template <int STEP, int... L> inline void transpose(Simd (&rows)[LANES], Sequence<int, L...> lanes) {
+    if constexpr (STEP < LANES) {
+        for (int i = 0; i < LANES; ++i) {
+            if (i & STEP) continue;
+            const Simd a = rows[i], b = rows[i + STEP];
+            rows[i] = __builtin_shufflevector(a, b, (L & STEP ? LANES + L - STEP : L)...);
+            rows[i + STEP] = __builtin_shufflevector(a, b, (L & STEP ? LANES + L : L + STEP)...);
+        }
+        transpose<2 * STEP>(rows, lanes);
+    }
 }
 
-inline Vec3<Real> total(const Vec3<Simd>& v) { return {total(v.x), total(v.y), total(v.z)}; }
+// Totals over the lanes of as many vectors, in the lanes of one. To add up the lanes of each would take three times as
+// many operations.
+inline Simd totals(Simd (&rows)[LANES]) {
+    transpose<1>(rows, __make_integer_seq<Sequence, int, LANES>());
+    Simd sum = 0;
+    for (int l = 0; l < LANES; ++l) sum += rows[l];
+    return sum;
+}
 
 inline Vec3<Simd> splat(const Vec3<Real>& v) { return {Simd(v.x), Simd(v.y), Simd(v.z)}; }
 
@@ -67,18 +81,22 @@ struct Table {
     Vec3<Real> vector(int r, int column) const { return {row(r)[column], row(r + 1)[column], row(r + 2)[column]}; }
 };
 
-// Tiles that one thread sums, and its partial sums, shape [row_count, width(Q)].
+// Tiles that one thread sums, and partial sums, shape [parts, row_count, width(Q)].
 struct Share {
     Table targets, sources, effective;
     const TileEntry *begin, *end;
-    Real* out;
+    Real* partial;
     size_t row_count;
+
+    template <Quantity Q> Real* sums_at(int part, int row) const {
+        return partial + (part * row_count + row) * width(Q);
+    }
 };
 
 struct Tile {
     Simd rows[TILE_ROWS][VECTORS + 2]; // two vectors more than are summed, for a loop that reads ahead
-    Simd sums[3][VECTORS];             // mirrored sums h at the sources themselves
-    int begin = -1, count = 0, vectors = 0;
+    Simd sums[3][VECTORS];             // sums h at its own moments of pairs that are summed for both ends
+    int begin, count = 0, vectors = 0;
     Real radius; // the one radius of all moments, or 0
     Real lowest_label, highest_label;
     bool ascending; // whether labels ascend, so that no two moments are of one body
@@ -106,83 +124,99 @@ template <Quantity Q> __attribute__((noinline)) void fill(Tile& tile, const Tabl
             tile.rows[SCALED_MOMENT + c][v] = SCALE * tile.rows[MOMENT + c][v];
             tile.sums[c][v] = 0;
         }
-    const Real *radii = (const Real*)tile.rows[RADIUS], *labels = (const Real*)tile.rows[LABEL];
-    bool equal = true;
-    tile.lowest_label = tile.highest_label = labels[0];
+}
+
+// Finds what moments of a tile have in common.
+inline void compare(Tile& tile) {
+    const Simd *radii = tile.rows[RADIUS], *labels = tile.rows[LABEL];
+    Simd spread = 0, lowest = labels[0], highest = labels[0];
+    for (int v = 0; v < tile.vectors; ++v) {
+        spread = __builtin_elementwise_max(spread, __builtin_elementwise_abs(radii[v] - number(tile.rows[RADIUS], 0)));
+        lowest = __builtin_elementwise_min(lowest, labels[v]);
+        highest = __builtin_elementwise_max(highest, labels[v]);
+    }
+    tile.radius = __builtin_reduce_max(spread) == 0 ? number(tile.rows[RADIUS], 0) : 0;
+    tile.lowest_label = __builtin_reduce_min(lowest);
+    tile.highest_label = __builtin_reduce_max(highest);
     tile.ascending = true;
-    for (int i = 1; i < tile.count; ++i) {
-        equal &= radii[i] == radii[0];
-        tile.ascending &= labels[i - 1] < labels[i];
-        tile.lowest_label = tile.lowest_label < labels[i] ? tile.lowest_label : labels[i];
-        tile.highest_label = tile.highest_label > labels[i] ? tile.highest_label : labels[i];
-    }
-    tile.radius = equal ? radii[0] : 0;
+    for (int i = 1; i < tile.count; ++i)
+        tile.ascending &= number(tile.rows[LABEL], i - 1) < number(tile.rows[LABEL], i);
 }
 
-template <Quantity Q>
-inline void add_results(const Share& share, int row, const Sums<Real>& sums, const Vec3<Real>& e = {}) {
-    Real numbers[width(Q)];
-    results<Q>(sums, e, numbers);
-    for (int c = 0; c < width(Q); ++c) share.out[(size_t)row * width(Q) + c] += numbers[c];
-}
-
-// Adds the sources of a tile to target rows, of which the first is packed in column_begin.
-template <Quantity Q>
-__attribute__((noinline)) void add_rows(const Share& share, int row_begin, int row_end, int column_begin, Tile& tile) {
+// Sums of a target, packed in a column, over the sources of a tile.
+template <Quantity Q> inline Sums<Simd> sum_row(const Share& share, int column, Tile& tile) {
     const Table& targets = share.targets;
-    const bool among_sources = Q == Quantity::FIELD && targets.data == share.sources.data;
-    for (int row = row_begin; row < row_end; ++row) {
-        const int column = column_begin + row - row_begin, own = column - tile.begin;
-        // a moment's own field is left out: its moment is zero, and its label, while its row is summed
-        const bool masked = among_sources && own >= 0 && own < tile.count;
-        Real kept[TILE_ROWS];
-        for (int r = MOMENT; r < TILE_ROWS && masked; ++r) {
-            kept[r] = number(tile.rows[r], own);
-            number(tile.rows[r], own) = 0;
-        }
-        const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column);
-        const Vec3<Simd> x = splat(targets.vector(POSITION, column)), all_e = splat(e);
-        const Real radius = targets.row(RADIUS)[column], label = targets.row(LABEL)[column];
-        Sums<Simd> sums;
-        for (int v = 0; v < tile.vectors; ++v) {
-            const Source<Simd> source = tile.source(v);
-            const Vec3<Simd> r = x - source.x;
-            const Simd s = radius + tile.rows[RADIUS][v], s2 = s * s, d2 = dot(r, r), c = d2 > s2 ? d2 : s2;
-            auto wanted = c > 0;
-            if constexpr (Q != Quantity::FIELD) wanted &= label != tile.rows[LABEL][v];
-            add_pair<Q>(sums, r, wanted ? twice_inverse_root(c) : 0, source, all_e);
-        }
-        add_results<Q>(share, row, {total(sums.f), total(sums.h), total(sums.g), total(sums.a)}, e);
-        for (int r = MOMENT; r < TILE_ROWS && masked; ++r) number(tile.rows[r], own) = kept[r];
+    const int own = column - tile.begin;
+    // a moment's own field is left out: its moment is zero, and its label, while its row is summed
+    const bool masked = Q == Quantity::FIELD && targets.data == share.sources.data && own >= 0 && own < tile.count;
+    Real kept[TILE_ROWS];
+    for (int r = MOMENT; r < TILE_ROWS && masked; ++r) {
+        kept[r] = number(tile.rows[r], own);
+        number(tile.rows[r], own) = 0;
     }
+    const Vec3<Simd> x = splat(targets.vector(POSITION, column));
+    const Vec3<Simd> e = Q == Quantity::FIELD ? Vec3<Simd>{} : splat(share.effective.vector(0, column));
+    const Real radius = targets.row(RADIUS)[column], label = targets.row(LABEL)[column];
+    Sums<Simd> sums;
+    for (int v = 0; v < tile.vectors; ++v) {
+        const Source<Simd> source = tile.source(v);
+        const Vec3<Simd> r = x - source.x;
+        const Simd s = radius + tile.rows[RADIUS][v], s2 = s * s, d2 = dot(r, r), c = d2 > s2 ? d2 : s2;
+        auto wanted = c > 0;
+        if constexpr (Q != Quantity::FIELD) wanted &= label != tile.rows[LABEL][v];
+        add_pair<Q>(sums, r, wanted ? twice_inverse_root(c) : 0, source, e);
+    }
+    for (int r = MOMENT; r < TILE_ROWS && masked; ++r) number(tile.rows[r], own) = kept[r];
+    return sums;
 }
 
-// Targets of mirrored tiles that follow each other in the work list, and their partial sums in lanes.
-struct TargetTile {
-    Tile tile;
-    Simd sums[3][TILE_SIZE];
-    int row;
-};
+// Adds the sources of a tile to the sums of targets that are packed from a column on.
+template <Quantity Q>
+__attribute__((noinline)) void add_rows(const Share& share, Real* out, int column_begin, int column_end, Tile& tile) {
+    constexpr int SUMS = sizeof(Sums<Simd>) / sizeof(Simd);
+    constexpr auto used = [](int k) {
+        return Q == Quantity::WRENCH || (Q == Quantity::FIELD ? k >= 3 && k < 6 : k < 3 || k == 9);
+    };
+    for (int column = column_begin; column < column_end; column += LANES) {
+        const int held = column_end - column < LANES ? column_end - column : LANES;
+        Simd rows[SUMS][LANES], found[SUMS];
+        for (int l = 0; l < LANES; ++l) {
+            const Sums<Simd> sums = l < held ? sum_row<Q>(share, column + l, tile) : Sums<Simd>{};
+            for (int k = 0; k < SUMS; ++k)
+                if (used(k)) rows[k][l] = ((const Simd*)&sums)[k];
+        }
+        for (int k = 0; k < SUMS; ++k) found[k] = used(k) ? totals(rows[k]) : 0;
+        for (int l = 0; l < held; ++l, out += width(Q)) {
+            const auto sum = [&](int k) { return number(found + k, l); };
+            const auto vector = [&](int k) -> Vec3<Real> { return {sum(k), sum(k + 1), sum(k + 2)}; };
+            const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column + l);
+            Real numbers[width(Q)];
+            results<Q>({vector(0), vector(3), vector(6), sum(9)}, e, numbers);
+            for (int c = 0; c < width(Q); ++c) out[c] += numbers[c];
+        }
+    }
+}
 
 // Adds each pair of two tiles, or of a tile with itself, to the sums of both its ends. The loop is software pipelined,
 // so that nothing waits for its inverse root: one vector of sources has its separations computed, the one before its
 // roots, and the one before that is summed.
-template <Quantity Q> __attribute__((noinline)) void add_both_ends(TargetTile& targets, Tile& sources) {
+template <Quantity Q> __attribute__((noinline)) void add_both_ends(Tile& targets, Tile& sources) {
     struct Separation {
         Vec3<Simd> r;
         Simd c;
     };
-    Tile& tile = targets.tile;
-    const Simd contact = tile.radius + sources.radius, clamp = contact * contact;
-    const bool diagonal = &tile == &sources;
-    for (int i = 0; i < tile.count; ++i) {
-        const Vec3<Simd> x = splat(numbers(tile.rows + POSITION, i)), m = splat(numbers(tile.rows + MOMENT, i));
-        const Vec3<Simd> n = splat(numbers(tile.rows + SCALED_MOMENT, i));
-        const auto separation = [&](int v) -> Separation {
-            const Vec3<Simd> r = x - vectors(sources.rows + POSITION, v);
-            const Simd d2 = dot(r, r);
-            return {r, d2 > clamp ? d2 : clamp};
-        };
+    const Simd contact = targets.radius + sources.radius, clamp = contact * contact;
+    const bool diagonal = &targets == &sources, afresh = diagonal || sources.vectors < 2;
+    const auto separation = [&](const Vec3<Simd>& x, int v) -> Separation {
+        const Vec3<Simd> r = x - vectors(sources.rows + POSITION, v);
+        const Simd d2 = dot(r, r);
+        return {r, d2 > clamp ? d2 : clamp};
+    };
+    Separation now, next;
+    Simd inv;
+    const auto sum_row = [&](int i) __attribute__((always_inline)) -> Vec3<Simd> {
+        const Vec3<Simd> x = splat(numbers(targets.rows + POSITION, i)), m = splat(numbers(targets.rows + MOMENT, i));
+        const Vec3<Simd> n = splat(numbers(targets.rows + SCALED_MOMENT, i));
         Vec3<Simd> h{};
         int v = 0;
         if (diagonal) {
@@ -191,87 +225,121 @@ template <Quantity Q> __attribute__((noinline)) void add_both_ends(TargetTile& t
             auto others = clamp > 0;
             others[i % LANES] = 0;
             Vec3<Simd> unused{};
-            const Separation s = separation(v);
+            const Separation s = separation(x, v);
             add_mirrored_pair<Q>(h, unused, s.r, others ? twice_inverse_root(s.c) : 0, sources.source(v), m, n);
             ++v;
         }
-        Separation now = separation(v), next = separation(v + 1);
-        Simd inv = twice_inverse_root(now.c);
-        for (; v < sources.vectors; ++v) {
-            const Separation later = separation(v + 2);
+        if (afresh || i == 0) {
+            now = separation(x, v), next = separation(x, v + 1);
+            inv = twice_inverse_root(now.c);
+        }
+        const auto sum_vector = [&](const Separation& later) {
             const Simd next_inv = twice_inverse_root(next.c);
             Vec3<Simd> g = vectors(sources.sums, v);
             add_mirrored_pair<Q>(h, g, now.r, inv, sources.source(v), m, n);
             sources.sums[0][v] = g.x, sources.sums[1][v] = g.y, sources.sums[2][v] = g.z;
             now = next, next = later, inv = next_inv;
+        };
+        for (; v < sources.vectors - 2 * !afresh; ++v) sum_vector(separation(x, v + 2));
+        // the next target's first separations
+        const Vec3<Simd> y = splat(numbers(targets.rows + POSITION, i + 1));
+        for (; v < sources.vectors; ++v) sum_vector(separation(y, v + 2 - sources.vectors));
+        return h;
+    };
+    for (int v = 0; v < targets.vectors; ++v) {
+        Simd h[3][LANES] = {};
+        for (int l = 0, i = v * LANES; l < LANES && i < targets.count; ++l, ++i) {
+            const Vec3<Simd> sum = sum_row(i);
+            h[0][l] = sum.x, h[1][l] = sum.y, h[2][l] = sum.z;
         }
-        targets.sums[0][i] += h.x, targets.sums[1][i] += h.y, targets.sums[2][i] += h.z;
+        for (int c = 0; c < 3; ++c) targets.sums[c][v] += totals(h[c]);
     }
 }
 
-template <Quantity Q> __attribute__((noinline)) void add_target_sums(const Share& share, TargetTile& targets) {
-    for (int i = 0; i < targets.tile.count; ++i) {
-        const auto& sums = targets.sums;
-        const Vec3<Real> h = {total(sums[0][i]), total(sums[1][i]), total(sums[2][i])};
-        add_results<Q>(share, targets.row + i, {.h = h + numbers(targets.tile.sums, i)});
+// Adds sums of pairs that were summed for both ends to the partial sums of a tile's moments.
+__attribute__((noinline)) inline void add_tile_sums(const Tile& tile, Real* out) {
+    for (int i = 0; i < tile.count; i += WIDTH, out += 3 * WIDTH) {
+        const auto h = [&](int c) { return warpmag::numbers((const Real*)tile.sums[c] + i); };
+        const int held = tile.count - i;
+        put_vectors(out, held, sum(warpmag::vectors(out, held), scaled(H_FACTOR, {h(0), h(1), h(2)})));
     }
 }
+
+// The targets of mirrored tiles that follow each other in the work list, and their partial sums.
+struct TargetTile {
+    Tile tile;
+    Real* out = nullptr;
+};
 
 // Sums a tile for its targets, and the tile with sources and targets exchanged.
 template <Quantity Q>
 inline void sum_mirrored(const Share& share, const TileEntry& entry, TargetTile& targets, Tile& tile) {
     const int begin = entry.column_begin, end = begin + entry.row_end - entry.row_begin;
-    const int mirror_begin = entry.row_begin + entry.source_begin - begin;
-    if (targets.tile.begin != begin || targets.row != entry.row_begin) {
-        if constexpr (MUTUAL<Q>) {
-            add_target_sums<Q>(share, targets);
-            __builtin_memset(targets.sums, 0, sizeof(targets.sums));
-        }
-        targets.row = entry.row_begin;
+    Real* const out = share.sums_at<Q>(entry.split, entry.row_begin);
+    Real* const mirror_out = share.sums_at<Q>(entry.mirror_split, entry.row_begin + entry.source_begin - begin);
+    if (targets.out != out) {
+        add_tile_sums(targets.tile, targets.out);
+        targets.out = out;
         fill<Q>(targets.tile, share.sources, begin, end);
+        compare(targets.tile);
     }
     const bool diagonal = entry.source_begin == begin;
     Tile &a = targets.tile, &b = diagonal ? a : tile;
-    if (!diagonal) fill<Q>(b, share.sources, entry.source_begin, entry.source_end);
-    if constexpr (MUTUAL<Q>) {
-        const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
-        const bool distinct = Q == Quantity::FIELD || (diagonal ? a.ascending : apart);
-        if (share.targets.data == share.sources.data && a.radius > 0 && b.radius > 0 && distinct) {
-            add_both_ends<Q>(targets, b);
-            for (int j = 0; j < b.count && !diagonal; ++j)
-                add_results<Q>(share, mirror_begin + j, {.h = numbers(b.sums, j)});
-            return;
-        }
+    if (!diagonal) {
+        fill<Q>(b, share.sources, entry.source_begin, entry.source_end);
+        compare(b);
     }
-    add_rows<ROWS<Q>>(share, entry.row_begin, entry.row_end, begin, b);
-    if (!diagonal) add_rows<ROWS<Q>>(share, mirror_begin, mirror_begin + b.count, entry.source_begin, a);
+    const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
+    const bool distinct = Q == Quantity::FIELD || (diagonal ? a.ascending : apart);
+    if (a.radius > 0 && b.radius > 0 && distinct) {
+        add_both_ends<Q>(a, b);
+        if (!diagonal) add_tile_sums(b, mirror_out);
+    } else {
+        add_rows<ROWS<Q>>(share, out, begin, end, b);
+        if (!diagonal) add_rows<ROWS<Q>>(share, mirror_out, entry.source_begin, entry.source_end, a);
+    }
+}
+
+// Sums a tile for its targets, about equal parts of its sources at a time.
+template <Quantity Q> inline void sum_sources(const Share& share, const TileEntry& entry, Tile& tile) {
+    const int begin = entry.column_begin, end = begin + entry.row_end - entry.row_begin;
+    const int count = entry.source_end - entry.source_begin, parts = (count + TILE_SIZE - 1) / TILE_SIZE;
+    for (int first = entry.source_begin; first < entry.source_end; first += tile.count) {
+        const int chunks = (count + CHUNK * parts - 1) / (CHUNK * parts), left = entry.source_end - first;
+        fill<Q>(tile, share.sources, first, first + (CHUNK * chunks < left ? CHUNK * chunks : left));
+        add_rows<ROWS<Q>>(share, share.sums_at<Q>(entry.split, entry.row_begin), begin, end, tile);
+    }
 }
 
 template <Quantity Q> inline void sum_share(const Share& share) {
-    __builtin_memset(share.out, 0, share.row_count * width(Q) * sizeof(Real));
+    for (const TileEntry* entry = share.begin; entry < share.end; ++entry) {
+        const auto clear = [&](int part, int row, int rows) {
+            __builtin_memset(share.sums_at<Q>(part, row), 0, rows * width(Q) * sizeof(Real));
+        };
+        clear(entry->split, entry->row_begin, entry->row_end - entry->row_begin);
+        if (!entry->mirrored) continue;
+        const int mirror_begin = entry->row_begin + entry->source_begin - entry->column_begin;
+        clear(entry->mirror_split, mirror_begin, entry->source_end - entry->source_begin);
+    }
     Tile tile;
     TargetTile targets;
     for (const TileEntry* entry = share.begin; entry < share.end; ++entry) {
         if (entry->mirrored) {
-            sum_mirrored<Q>(share, *entry, targets, tile);
+            if constexpr (MUTUAL<Q>) sum_mirrored<Q>(share, *entry, targets, tile);
         } else {
-            fill<Q>(tile, share.sources, entry->source_begin, entry->source_end);
-            add_rows<ROWS<Q>>(share, entry->row_begin, entry->row_end, entry->column_begin, tile);
+            sum_sources<Q>(share, *entry, tile);
         }
     }
-    if constexpr (MUTUAL<Q>) add_target_sums<Q>(share, targets);
+    add_tile_sums(targets.tile, targets.out);
 }
 
-// Sums all tiles. Shape of partial_out: [shares, target rows, width(Q)]; shares has the tile that each begins with.
-template <Quantity Q>
-inline void sum_tiles(const wp::array_t<Real>& targets, const wp::array_t<Real>& sources,
-                      const wp::array_t<Real>& effective, const wp::array_t<int>& tiles, const wp::array_t<int>& shares,
-                      int threads, Word* team, const wp::array_t<Real>& partial_out) {
-    const TileEntry* entries = (const TileEntry*)tiles.data;
-    const size_t rows = partial_out.shape[1];
-    share_out(team, threads, (int)shares.shape[0] - 1, 1, [&](int s) {
-        sum_share<Q>({targets, sources, effective, entries + shares.data[s], entries + shares.data[s + 1],
-                      partial_out.data + s * rows * width(Q), rows});
+// Sums all tiles of ``Arrays``, the struct of work_list.py.
+template <Quantity Q, class Arrays> inline void sum_tiles(const Arrays& arrays, int threads, Word* team) {
+    const TileEntry* const tiles = (const TileEntry*)arrays.tiles.data;
+    const int* const shares = arrays.shares.data; // the tile that each begins with
+    share_out(team, threads, (int)arrays.shares.shape[0] - 1, 1, [&](int s) {
+        sum_share<Q>({arrays.targets, arrays.sources, arrays.effective, tiles + shares[s], tiles + shares[s + 1],
+                      arrays.partial.data, (size_t)arrays.partial.shape[1]});
     });
 }
 

@@ -4,23 +4,24 @@ Segments say which range of packed targets has which range of packed sources; th
 other, are the target rows. A tile is a row of ``TILE_COLUMNS`` integers, see ``pair_terms``.
 """
 
+import math
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.sums_cpu import TILE_SIZE
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
-from warpmag.kernels.shared.team import threads_for
+from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
-_PAIRS_PER_START = 200_000
-"""Pairs that a CPU sums while another of its threads wakes: 50 to 100 µs."""
-_TILES_PER_THREAD = 16
-"""Tiles that a thread should have, so that they can be shared out evenly."""
-_ROUNDS, _MOST_SHARES = 3, 12
-"""Shares of a thread, each round of them half as large as the one before; unless there are so many threads that adding
-up their sums would take longer than waiting for each other."""
+_PAIRS_PER_THREAD = 400_000
+"""Pairs that make another thread worth waking, which takes 50 to 100 µs: in these a thread sums half of them."""
+_LEAST_SHARE = 50_000
+"""Pairs of a share, of several blocks if they are few."""
+_TILE_BYTES = 2560
+"""Of a component of the sources, and of targets that are sources, too, that a CPU keeps in its first-level cache."""
+_LEAST_TARGETS = 32
+"""Targets that are worth loading a tile of sources for."""
 _LANES = 16
 """Width of the widest vectors: a stripe of a multiple of it wastes none."""
 
@@ -63,30 +64,108 @@ def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
     return block_tiles(segments, width, splits), splits
 
 
-def cpu_tiles(segments):
-    """Tiles of stripes of targets and stripes of sources; where each share of them begins; and threads to take them.
+def tile_size(dtype) -> int:
+    """Most sources that a CPU loads at a time, and most targets of a tile that stands for its mirror image, too."""
+    return _TILE_BYTES // wp.types.type_size_in_bytes(dtype)
 
-    Targets among their own sources need the tiles above the diagonal only, each standing for its mirror image.
+
+def cpu_tiles(segments, mutual: bool, dtype):
+    """Tiles of a CPU; where each share of them begins; the number of partial sums; and threads to take shares.
+
+    A segment of many pairs is cut into blocks, stripes of targets by stripes of sources. Blocks that have targets in
+    common write partial sums of their own there. How a segment is cut depends on nothing else, and so does the order in
+    which the sums of a target are added up. Threads take shares, which are runs of whole blocks, the largest first.
+
+    Args:
+        segments: Integers [k, 4]: target column begin and end, source begin and end.
+        mutual: Whether a pair may be summed for both its ends. Then targets among their own sources need the blocks
+            above the diagonal only, each standing for its mirror image.
+        dtype: Warp scalar type of the sums.
     """
-    threads = threads_for(pair_count(segments), 2 * _PAIRS_PER_START)
-    tiles, work = [], []
-    for (t0, t1, s0, s1), row in zip(segments, row_starts(segments), strict=False):
-        among = s0 <= t0 and t1 <= s1
-        for j0, j1 in ((t0, t1), (s0, t0), (t1, s1)) if among else ((s0, s1),):
-            mirrored = (t0, t1) == (j0, j1)
-            wanted = int(np.ceil(np.sqrt((2 if mirrored else 1) * _TILES_PER_THREAD * threads)))
-            targets, sources = (_stripes(*ends, wanted if threads > 1 else 1) for ends in ((t0, t1), (j0, j1)))
-            for a, (i0, i1) in enumerate(targets):
-                for b, (j0, j1) in enumerate(sources):
-                    if not mirrored or a <= b:
-                        tiles.append((row + i0 - t0, row + i1 - t0, i0, j0, j1, 0, mirrored, 0))
-                        work.append((i1 - i0) * (j1 - j0) * (2.0 if mirrored and a < b else 1.0))
-    rounds = int(np.clip(_MOST_SHARES // threads, 1, _ROUNDS)) if threads > 1 else 1
-    sizes = np.repeat(0.5 ** np.arange(rounds), threads)
-    # a tile goes to the share in which its middle lies
-    done = np.concatenate([[0.0], np.cumsum(work)])
-    ends = np.searchsorted((done[:-1] + done[1:]) / 2.0, done[-1] * np.cumsum(sizes)[:-1] / sizes.sum())
-    return np.array(tiles, np.int64), np.concatenate([[0], ends, [len(tiles)]]), threads
+    pairs, starts = pair_count(segments), row_starts(segments).tolist()
+    blocks, written = [], []
+    for segment, row in zip(segments.tolist(), starts[:-1], strict=True):
+        found, parts = _cut_segment(segment, row, mutual, tile_size(dtype))
+        blocks += found
+        written.append(parts)
+    parts = max([1, *written])
+    blocks.sort(key=lambda block: block[0], reverse=True)
+    blocks += [(0, [tile]) for tile in _idle_rows(starts, written, parts)]
+    begin, tiles, begun = [], [], 0
+    for work, block in blocks:
+        if not begin or begun >= _LEAST_SHARE:
+            begin.append(len(tiles))
+            begun = 0
+        begun += work
+        tiles += block
+    threads = min(threads_for(pairs, _PAIRS_PER_THREAD), max(len(begin), 1))
+    return tiles, [*begin, len(tiles)], parts, threads
+
+
+def _cut_segment(segment, row, mutual, most):
+    """Work and tiles of the blocks of a segment whose first target has a given row, and the number of partial sums."""
+    t0, t1, s0, s1 = segment
+    count, shift, parts, blocks = t1 - t0, row - t0, 0, []
+    pairs = count * (s1 - s0)
+    busy = min(pairs // _PAIRS_PER_THREAD, MOST_THREADS)
+    whole, grain = busy < 2, pairs / (2 * max(busy, 1))
+    rest = [(s0, s1)]
+    if mutual and s0 <= t0 and t1 <= s1:
+        # as wide as makes two blocks for each thread, one on the diagonal being half of another
+        wanted = 1 if whole or count**2 <= grain else 2 * math.ceil(count / math.sqrt(2.0 * grain))
+        stripes = _stripes(t0, t1, wanted)
+        blocks = [
+            _square(shift, stripes[a], stripes[b], b, a, most)
+            for a in range(len(stripes))
+            for b in range(a, len(stripes))
+        ]
+        parts, rest = len(stripes), [(s0, t0), (t1, s1)]
+    for j0, j1 in rest:
+        wanted = 1 if whole else math.ceil(count * (j1 - j0) / grain)
+        rows = max(min(wanted, count // _LEAST_TARGETS), 1)
+        edges = [t0 + count * k // rows for k in range(rows + 1)]
+        sources = _stripes(j0, j1, -(-wanted // rows))
+        part = 0 if whole else parts
+        blocks += [
+            ((i1 - i0) * (end - begin), [(i0 + shift, i1 + shift, i0, begin, end, part + k, 0, 0)])
+            for k, (begin, end) in enumerate(sources)
+            for i0, i1 in pairwise(edges)
+        ]
+        parts += len(sources)
+    if whole and blocks:  # in one block, and in one partial sum
+        return [(sum(work for work, _ in blocks), [tile for _, block in blocks for tile in block])], 1
+    return blocks, parts
+
+
+def _idle_rows(starts, written, parts):
+    """Tiles without sources, for the partial sums that no block of a row's segment writes."""
+    idle = [
+        (begin, end, 0, 0, 0, part, 0, 0)
+        for part in range(min(written, default=parts), parts)
+        for (begin, end), own in zip(pairwise(starts), written, strict=True)
+        if own <= part
+    ]
+    joined = idle[:1]
+    for tile in idle[1:]:
+        last = joined[-1]
+        if last[5] == tile[5] and last[1] == tile[0]:
+            joined[-1] = (last[0], *tile[1:])
+        else:
+            joined.append(tile)
+    return joined
+
+
+def _square(shift, targets, sources, part, mirror_part, most):
+    """Work and tiles of targets and sources on or above the diagonal; ``shift`` leads from columns to rows."""
+    stripes = [_stripes(*ends, -(-(ends[1] - ends[0]) // most)) for ends in (targets, sources)]
+    tiles = [
+        (i0 + shift, i1 + shift, i0, j0, j1, part, 1, mirror_part)
+        for i0, i1 in stripes[0]
+        for j0, j1 in stripes[1]
+        if i0 <= j0
+    ]
+    pairs = (targets[1] - targets[0]) * (sources[1] - sources[0])
+    return pairs if targets == sources else 2 * pairs, tiles
 
 
 def pair_count(segments) -> int:
@@ -95,9 +174,8 @@ def pair_count(segments) -> int:
 
 
 def _stripes(begin, end, wanted):
-    """Ranges of at most ``TILE_SIZE`` that cut one into about as many equal parts as wanted, or more."""
-    parts = max(wanted, -(-(end - begin) // TILE_SIZE), 1)
-    width = max(-(-(end - begin) // (parts * _LANES)) * _LANES, _LANES)
+    """At most so many ranges that cut one into equal parts, of a multiple of ``_LANES``."""
+    width = max(-(-(end - begin) // (max(wanted, 1) * _LANES)), 1) * _LANES
     return [(a, min(a + width, end)) for a in range(begin, end, width)]
 
 
@@ -123,5 +201,6 @@ def arrays_type(dtype):
         turned: wp.array[int]
         out: wp.array[vec3]
         torques: wp.array[vec3]
+        shares: wp.array[int]
 
     return EvaluationArrays
