@@ -1,0 +1,152 @@
+// XPBD for rigid bodies in contact: the impulses of a contact in one iteration, and how they move a body.
+//
+// Newton's equations (newton/_src/solvers/xpbd/kernels.py: solve_body_contact_positions, apply_body_deltas), with
+// points about centres of mass. A contact is seen from one of its two bodies, the own one, and looks the same from the
+// other: its impulses there are opposite, whichever of the two computes them.
+//
+// Lever arms are corrected, or contacts do not keep angular momentum. XPBD moves bodies with their new velocities, then
+// takes contacts, and the lever arms of their impulses, at the new poses. A position that moves with its own velocity
+// keeps its momentum, but lever arms r have turned by ω dt. With contact points a and b that coincided before the
+// substep, opposite impulses p change the angular momentum of two bodies by dt (ω_a × r_a − ω_b × r_b) × p. That is
+// negligible in a light touch, but turns a heap that strong forces press together ever faster: at the rate a dt/r for
+// accelerations a. Balls are not affected: the lever arms of their contacts point along the normal. With the lever arms
+// from before the substep the sum is right. So once contacts are solved, the angular impulses − dt (ω × r) × p are
+// added to each body. Iterations apply impulses in portions, and ω changes with them: the mean of ω before and after is
+// taken. Friction, too, is taken to act at the shape's contact point, short of its margin.
+#pragma once
+#include "shared/vectors.h"
+
+namespace warpmag {
+
+struct Quaternion {
+    Number x, y, z, w;
+};
+struct Symmetric {
+    Number xx, yy, zz, xy, yz, zx;
+};
+
+CUDA_CALLABLE inline Vector imaginary(Quaternion q) { return {q.x, q.y, q.z}; }
+CUDA_CALLABLE inline Vector turned(Quaternion q, Vector a) {
+    const Vector t = scaled(2, cross(imaginary(q), a));
+    return sum(sum(a, scaled(q.w, t)), cross(imaginary(q), t));
+}
+CUDA_CALLABLE inline Vector turned_back(Quaternion q, Vector a) {
+    const Vector t = scaled(2, cross(imaginary(q), a));
+    return sum(less(a, scaled(q.w, t)), cross(imaginary(q), t));
+}
+CUDA_CALLABLE inline Vector times(const Symmetric& s, Vector a) {
+    return {s.xx * a.x + s.xy * a.y + s.zx * a.z, s.xy * a.x + s.yy * a.y + s.yz * a.z,
+            s.zx * a.x + s.yz * a.y + s.zz * a.z};
+}
+
+// A body at the beginning of an iteration: centre of mass, orientation, velocities, inverse mass, and whether it is
+// kinematic: 1 or 0.
+struct Body {
+    Vector x, v, spin;
+    Quaternion q;
+    Number inv_mass, kinematic;
+};
+// Its inverse inertia in its frame, and the number of shares that its contacts split it into (mass_splitting.py).
+struct Inertia {
+    Symmetric inverse;
+    Number shares;
+};
+// A contact from its own body's side: points about the centres of mass in the bodies' frames, where surfaces rub, the
+// unit normal from the other body to the own one, the sum of the margins, and coefficients of friction.
+struct Contact {
+    Vector point, other_point, rub, other_rub, normal;
+    Number margin, mu, torsional, rolling;
+};
+// On the own body, and angular on the other, where the opposite linear one acts.
+struct Impulse {
+    Vector linear, own, other;
+};
+
+CUDA_CALLABLE inline Vector arm(const Body& body, Vector point) { return turned(body.q, point); }
+// Distance of the surfaces along the normal, negative where they overlap.
+CUDA_CALLABLE inline Number gap(const Contact& c, const Body& own, const Body& other, Vector r, Vector other_r) {
+    return dot(c.normal, sum(less(own.x, other.x), less(r, other_r))) - c.margin;
+}
+
+// How easily a unit angular impulse turns a share of a body about it, and a unit impulse at an arm moves its point.
+CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector about) {
+    const Vector local = turned_back(body.q, about);
+    return inertia.shares * dot(local, times(inertia.inverse, local));
+}
+CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector r, Vector along) {
+    return inertia.shares * body.inv_mass + ease(body, inertia, cross(r, along));
+}
+CUDA_CALLABLE inline Number quotient(Number a, Number b) { return b > 0 ? a / b : a * Real(0); }
+
+// The velocity that a kinematic body lends its surface, of which positions do not tell.
+CUDA_CALLABLE inline Vector drift(const Body& body, Vector r) {
+    return scaled(body.kinematic, sum(body.v, cross(body.spin, r)));
+}
+
+// Impulses of a contact whose surfaces overlap by −``distance``, at arms r. ``rate`` is the relaxation over dt.
+CUDA_CALLABLE inline Impulse contact_impulse(const Contact& c, const Body& own, const Body& other,
+                                             const Inertia& inertia, const Inertia& other_inertia, Number distance,
+                                             Vector r, Vector other_r, Real rate, Real dt) {
+    const Vector n = c.normal;
+    const Number push_ease = ease(own, inertia, r, n) + ease(other, other_inertia, other_r, n);
+    const Number push = distance < 0 ? quotient(-rate * distance, push_ease) : distance * Real(0);
+    Impulse p;
+    p.linear = scaled(push, n);
+    p.own = cross(r, p.linear);
+    p.other = cross(p.linear, other_r);
+
+    r = arm(own, c.rub), other_r = arm(other, c.other_rub);
+    Vector slip = sum(less(own.x, other.x), less(r, other_r));
+    slip = sum(slip, scaled(dt, less(drift(own, r), drift(other, other_r))));
+    slip = less(slip, scaled(dot(n, slip), n));
+    const Number way = length(slip);
+    const Vector along = scaled(quotient(way * Real(0) + 1, way), slip);
+    const Number rub_ease = ease(own, inertia, r, along) + ease(other, other_inertia, other_r, along);
+    const Vector rub = scaled(-smaller(quotient(rate * way, rub_ease), c.mu * push), along);
+    p.linear = sum(p.linear, rub);
+    p.own = sum(p.own, cross(r, rub));
+    p.other = sum(p.other, cross(rub, other_r));
+
+    const Vector turn = less(own.spin, other.spin);
+    const Number twist = dt * dot(turn, n), twist_most = c.torsional * push;
+    const Number twist_ease = ease(own, inertia, n) + ease(other, other_inertia, n);
+    const Number torsion = larger(smaller(quotient(-rate * twist, twist_ease), twist_most), -twist_most);
+    const Vector roll = less(turn, scaled(dot(turn, n), n));
+    const Number speed = length(roll);
+    const Vector about = scaled(quotient(speed * Real(0) + 1, speed), roll);
+    const Number roll_ease = ease(own, inertia, about) + ease(other, other_inertia, about);
+    const Number rolling = smaller(quotient(rate * dt * speed, roll_ease), c.rolling * push);
+    const Vector friction = less(scaled(torsion, n), scaled(rolling, about));
+    p.own = sum(p.own, friction);
+    p.other = less(p.other, friction);
+    return p;
+}
+
+// What is missing in the angular impulse of a contact on a body, whose mean spin is given, for a linear impulse there.
+CUDA_CALLABLE inline Vector lever_correction(const Body& body, Vector mean_spin, Vector point, Vector linear, Real dt) {
+    return scaled(-dt, cross(cross(mean_spin, arm(body, point)), linear));
+}
+
+// Moves a body by the sum of impulses and angular impulses; its velocities change with its pose.
+CUDA_CALLABLE inline void apply(Body& body, const Symmetric& inverse, const Symmetric& inertia, Vector linear,
+                                Vector angular, Real dt) {
+    const Vector change = scaled(body.inv_mass, linear), spin = turned_back(body.q, body.spin);
+    const Vector spun = times(inverse, turned_back(body.q, angular));
+    const Vector gyration = sum(cross(spun, times(inertia, sum(spin, spun))), cross(spin, times(inertia, spun)));
+    const Vector gain = turned(body.q, less(spun, scaled(dt, times(inverse, gyration))));
+    body.x = sum(body.x, scaled(dt, change));
+    const Quaternion q = body.q;
+    const Vector half = scaled(Real(0.5) * dt, gain), axis = imaginary(q);
+    const Vector turn = sum(axis, sum(scaled(q.w, half), cross(half, axis)));
+    const Number w = q.w - dot(half, axis);
+    const Number unit = 1 / root(dot(turn, turn) + w * w);
+    body.q = {unit * turn.x, unit * turn.y, unit * turn.z, unit * w};
+    // Newton's solver lets what is this slow rest
+    constexpr Real REST = Real(1e-4);
+    const Vector v = sum(body.v, change), turns = sum(body.spin, gain);
+    const Number none = w * Real(0), moves = length(v) < REST ? none : none + 1;
+    const Number spins = length(turns) < REST ? none : none + 1;
+    body.v = scaled(moves, v);
+    body.spin = scaled(spins, turns);
+}
+}
