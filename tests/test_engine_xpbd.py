@@ -87,9 +87,8 @@ class PlainXPBD(PileXPBD):
     def __init__(self, model, contact_max, **settings):
         super().__init__(model, contact_max, **settings)
         flag = int(newton.BodyFlags.KINEMATIC)
-        self._solve = contact_solve.allocate(
-            contact_max, model.body_count, levers=False, kinematic_flag=flag, device=model.device
-        )
+        bodies = self._view_bodies(model.state())
+        self._solve = contact_solve.allocate(contact_max, bodies, levers=False, kinematic_flag=flag)
 
 
 @pytest.mark.parametrize("kind", KINDS)

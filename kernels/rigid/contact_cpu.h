@@ -49,7 +49,7 @@ inline void write_contacts(const Arrays& a, const Lists& lists) {
         int* const other = list_at(a.other, 4, 0, k);
         for (int end = 0; end < 2; ++end) {
             other[end * CHUNK] = a.lines - 1;
-            other[(2 + end) * CHUNK] = -1;
+            other[(2 + end) * CHUNK] = 2 * a.contact_max + k / WIDTH; // of nothing that moves
         }
         for (int r = 0; r < 3 * a.with_levers; ++r) rows_at(a.pressed, 3, k)[r * CHUNK] = 0;
         a.wide[k / WIDTH] = 0;
@@ -67,20 +67,25 @@ inline void write_contacts(const Arrays& a, const Lists& lists) {
     }
 }
 
+// Puts four numbers of each contact into one half of the records that ``places`` are.
+template <int FIRST> inline void put_halves(Real* half, const int* places, Number row) {
+    const Quarter q = __builtin_shufflevector(row, row, FIRST, FIRST + 1, FIRST + 2, FIRST + 3);
+    memcpy(half + RECORD * (size_t)places[FIRST], &q, sizeof(q));
+    if constexpr (FIRST + 4 < WIDTH) put_halves<FIRST + 4>(half, places, row);
+}
+inline void put_vector(const Arrays& a, const int* places, int half, Vector v) {
+    const Number none = 0;
+    const Four rows = transposed(v.x, v.y, v.z, none);
+    const Number row[4] = {rows.x, rows.y, rows.z, rows.w};
+    for (int r = 0; r < 4; ++r) put_halves<0>(a.record + 4 * half, places + r, row[r]);
+}
 // Writes the impulses of a vector of contacts on their second and first bodies into the records of these.
 inline void put_records(const Arrays& a, int k, Vector linear, Vector own, Vector other) {
-    Real rows[WIDTH * LINE];
-    const Number none = 0;
-    put_four(rows, 0, 0, {-linear.x, -linear.y, -linear.z, none});
-    put_four(rows, 1, 0, {other.x, other.y, other.z, none});
-    put_four(rows, 2, 0, {linear.x, linear.y, linear.z, none});
-    put_four(rows, 3, 0, {own.x, own.y, own.z, none});
     const int* const places = list_at(a.other, 4, 2, k);
-    for (int l = 0; l < WIDTH; ++l)
-        for (int end = 0; end < 2; ++end)
-            if (places[end * CHUNK + l] >= 0)
-                memcpy(a.record + RECORD * (size_t)places[end * CHUNK + l], rows + LINE * l + RECORD * end,
-                       RECORD * sizeof(Real));
+    put_vector(a, places, 0, scaled(-1, linear));
+    put_vector(a, places, 1, other);
+    put_vector(a, places + CHUNK, 0, linear);
+    put_vector(a, places + CHUNK, 1, own);
 }
 
 struct Pair {
@@ -110,7 +115,12 @@ inline void press_contacts(const Arrays& a, int k, Real rate, Real dt) {
     if (!closed && quiet) return;
     quiet = !closed;
     const Inertia own = read_inertia(matter_at(a, p.own_line)), other = read_inertia(matter_at(a, p.other_line));
-    const Impulse found = contact_impulse(p.contact, p.own, p.other, own, other, distance, r, other_r, rate, dt);
+    auto drifts = [&](int end) {
+        const int* const line = end == 1 ? p.own_line : p.other_line;
+        return read_drift([&](int quarter) { return four_at(a.motion, quarter, line); });
+    };
+    const Impulse found =
+        contact_impulse(p.contact, p.own, p.other, own, other, distance, r, other_r, drifts, rate, dt);
     put_records(a, k, found.linear, found.own, found.other);
     if (!a.with_levers) return;
     Real* const pressed = rows_at(a.pressed, 3, k);
@@ -121,7 +131,8 @@ inline void correct_levers(const Arrays& a, int k, Real dt) {
     const Pair p = pair_at(a, k);
     const Vector linear = own_vector(rows_at(a.pressed, 3, k)), none = scaled(0, linear);
     auto correction = [&](const Body& body, const int* line, Vector point, Vector impulse) {
-        const Vector spin = scaled(Real(0.5), sum(body.spin, read_first_spin(matter_at(a, line))));
+        const Body first = read_body([&](int quarter) { return four_at(a.first_motion, quarter, line); });
+        const Vector spin = scaled(Real(0.5), sum(body.spin, first.spin));
         return lever_correction(body, spin, point, impulse, dt);
     };
     put_records(a, k, none, correction(p.own, p.own_line, p.contact.point, linear),
@@ -142,10 +153,12 @@ inline void move_bodies(const Arrays& a, int i, Real dt) {
         memcpy(totals + LINE * l, &total, sizeof(total));
     }
     const Four linear = own_four(totals, 0, 0), angular = own_four(totals, 1, 0);
-    Body body = read_body([&](int quarter) { return own_four(a.motion, quarter, i); });
-    auto matter = [&](int quarter) { return own_four(a.matter, quarter, i); };
-    apply(body, matter, {linear.x, linear.y, linear.z}, {angular.x, angular.y, angular.z}, dt);
-    put_body(a.motion, i, body);
+    auto motion = [&](int quarter) { return own_four(a.motion, quarter, i); };
+    Body body = read_body(motion);
+    Drift drift = read_drift(motion);
+    Whole whole = read_whole(drift, [&](int quarter) { return own_four(a.matter, quarter, i); });
+    apply(body, whole, {linear.x, linear.y, linear.z}, {angular.x, angular.y, angular.z}, dt);
+    put_body(a.motion, i, body, {whole.v, drift.kinematic});
 }
 
 inline void solve_contacts(const Arrays& a, int iterations, Real rate, Real dt, int threads, Word* team) {
@@ -165,8 +178,8 @@ inline void solve_contacts(const Arrays& a, int iterations, Real rate, Real dt, 
         });
     }
     for (int i = 0; i < lists.bodies; i += WIDTH) {
-        const Body body = read_body([&](int quarter) { return own_four(a.motion, quarter, i); });
-        end_lines(a, body, i, lists.bodies - i);
+        auto motion = [&](int quarter) { return own_four(a.motion, quarter, i); };
+        end_lines(a, read_body(motion), read_drift(motion), i, lists.bodies - i);
     }
 }
 }

@@ -112,7 +112,11 @@ __device__ inline Pressure press(const Arrays& a, const Real* motion, int slot, 
         const Number distance = gap(contact, own, other, r, other_r);
         if (!(distance < 0)) continue;
         const Inertia other_inertia = read_inertia([&](int quarter) { return four_at(a.matter, quarter, &j); });
-        const Impulse p = contact_impulse(contact, own, other, inertia, other_inertia, distance, r, other_r, rate, dt);
+        auto drifts = [&](int end) {
+            return read_drift([&](int quarter) { return own_four(motion, quarter, end == 1 ? slot : j); });
+        };
+        const Impulse p =
+            contact_impulse(contact, own, other, inertia, other_inertia, distance, r, other_r, drifts, rate, dt);
         total.linear = sum(total.linear, p.linear);
         total.angular = sum(total.angular, p.own);
         if (a.with_levers) {
@@ -145,11 +149,14 @@ __device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, 
     Real* const to = odd ? a.motion : a.next_motion;
     const int block = thread / BLOCK;
     auto move = [&](int slot, int first, int threads, auto totals) {
-        Body own = read_body([&](int quarter) { return own_four(from, quarter, slot); });
+        auto motion = [&](int quarter) { return own_four(from, quarter, slot); };
         auto matter = [&](int quarter) { return own_four(a.matter, quarter, slot); };
+        Body own = read_body(motion);
+        const Drift drift = read_drift(motion);
         const Pressure p = totals(press(a, from, slot, own, read_inertia(matter), first, threads, rate, dt));
-        apply(own, matter, p.linear, p.angular, dt);
-        if (first == 0) put_body(to, slot, own);
+        Whole whole = read_whole(drift, matter);
+        apply(own, whole, p.linear, p.angular, dt);
+        if (first == 0) put_body(to, slot, own, {whole.v, drift.kinematic});
     };
     if (block < WIDE_BLOCKS) {
         for (int w = block; w < a.totals[WIDE_BODIES]; w += WIDE_BLOCKS)
@@ -165,20 +172,24 @@ __device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, 
 __device__ inline void finish(int thread, const Arrays& a, int odd, Real dt) {
     const int slot = thread / GROUP;
     if (slot >= a.totals[BODIES]) return;
-    const Real* const motion = odd ? a.next_motion : a.motion;
-    Body body = read_body([&](int quarter) { return own_four(motion, quarter, slot); });
+    const Real* const lines = odd ? a.next_motion : a.motion;
+    auto motion = [&](int quarter) { return own_four(lines, quarter, slot); };
+    Body body = read_body(motion);
+    Drift drift = read_drift(motion);
     if (a.with_levers) {
-        auto matter = [&](int quarter) { return own_four(a.matter, quarter, slot); };
-        const Vector mean = scaled(Real(0.5), sum(body.spin, read_first_spin(matter)));
+        const Body first = read_body([&](int quarter) { return own_four(a.first_motion, quarter, slot); });
+        const Vector mean = scaled(Real(0.5), sum(body.spin, first.spin));
         Vector angular = {0, 0, 0};
         for (int k = a.range[2 * slot] + share(); k < a.range[2 * slot + 1]; k += GROUP) {
             const Four point = ((const Four*)a.side)[SIDE / 4 * (size_t)k], pressed = ((const Four*)a.pressed)[k];
             const Vector linear = {pressed.x, pressed.y, pressed.z};
             angular = sum(angular, lever_correction(body, mean, {point.x, point.y, point.z}, linear, dt));
         }
-        apply(body, matter, {0, 0, 0}, group_sums(angular), dt);
+        Whole whole = read_whole(drift, [&](int quarter) { return own_four(a.matter, quarter, slot); });
+        apply(body, whole, {0, 0, 0}, group_sums(angular), dt);
+        drift.v = whole.v;
     }
-    if (share() == 0) end_lines(a, body, slot, 1);
+    if (share() == 0) end_lines(a, body, drift, slot, 1);
 }
 }
 #endif

@@ -39,23 +39,24 @@ CUDA_CALLABLE inline Vector times(const Symmetric& s, Vector a) {
             s.zx * a.x + s.yz * a.y + s.zz * a.z};
 }
 
-// A body at the beginning of an iteration: centre of mass, orientation, velocities, inverse mass, and whether it is
-// kinematic: 1 or 0.
+// A body at the beginning of an iteration: centre of mass, orientation and angular velocity. Its contacts split it into
+// shares (mass_splitting.py): the inverse mass of a share, and if it is ROUND (from Python: all bodies are) its inverse
+// inertia about any axis.
 struct Body {
-    Vector x, v, spin;
+    Vector x, spin;
     Quaternion q;
-    Number inv_mass, kinematic;
+    Number ease, spin_ease;
 };
-// Its inverse inertia in its frame, and the number of shares that its contacts split it into (mass_splitting.py).
+// If it is not, the inverse inertia of a share in its frame.
 struct Inertia {
     Symmetric inverse;
-    Number shares;
 };
 // A contact from its own body's side: points about the centres of mass in the bodies' frames, where surfaces rub, the
-// unit normal from the other body to the own one, the sum of the margins, and coefficients of friction.
+// unit normal from the other body to the own one, the sum of the margins, coefficients of friction, and whether one of
+// the bodies is kinematic: 1 or 0.
 struct Contact {
     Vector point, other_point, rub, other_rub, normal;
-    Number margin, mu, torsional, rolling;
+    Number margin, drifting, mu, torsional, rolling;
 };
 // On the own body, and angular on the other, where the opposite linear one acts.
 struct Impulse {
@@ -70,23 +71,30 @@ CUDA_CALLABLE inline Number gap(const Contact& c, const Body& own, const Body& o
 
 // How easily a unit angular impulse turns a share of a body about it, and a unit impulse at an arm moves its point.
 CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector about) {
+    if constexpr (ROUND) return body.spin_ease * dot(about, about);
     const Vector local = turned_back(body.q, about);
-    return inertia.shares * dot(local, times(inertia.inverse, local));
+    return dot(local, times(inertia.inverse, local));
 }
 CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector r, Vector along) {
-    return inertia.shares * body.inv_mass + ease(body, inertia, cross(r, along));
+    return body.ease + ease(body, inertia, cross(r, along));
 }
 CUDA_CALLABLE inline Number quotient(Number a, Number b) { return b > 0 ? a / b : a * Real(0); }
 
 // The velocity that a kinematic body lends its surface, of which positions do not tell.
-CUDA_CALLABLE inline Vector drift(const Body& body, Vector r) {
-    return scaled(body.kinematic, sum(body.v, cross(body.spin, r)));
+struct Drift {
+    Vector v;
+    Number kinematic; // 1 or 0
+};
+CUDA_CALLABLE inline Vector drift_at(const Drift& drift, const Body& body, Vector r) {
+    return scaled(drift.kinematic, sum(drift.v, cross(body.spin, r)));
 }
 
-// Impulses of a contact whose surfaces overlap by −``distance``, at arms r. ``rate`` is the relaxation over dt.
+// Impulses of a contact whose surfaces overlap by −``distance``, at arms r. ``rate`` is the relaxation over dt,
+// ``drifts`` gives the drifts of the own (1) and the other body (0), and is asked where one is kinematic.
+template <class Drifts>
 CUDA_CALLABLE inline Impulse contact_impulse(const Contact& c, const Body& own, const Body& other,
                                              const Inertia& inertia, const Inertia& other_inertia, Number distance,
-                                             Vector r, Vector other_r, Real rate, Real dt) {
+                                             Vector r, Vector other_r, Drifts drifts, Real rate, Real dt) {
     const Vector n = c.normal;
     const Number push_ease = ease(own, inertia, r, n) + ease(other, other_inertia, other_r, n);
     const Number push = distance < 0 ? quotient(-rate * distance, push_ease) : distance * Real(0);
@@ -97,7 +105,10 @@ CUDA_CALLABLE inline Impulse contact_impulse(const Contact& c, const Body& own, 
 
     r = arm(own, c.rub), other_r = arm(other, c.other_rub);
     Vector slip = sum(less(own.x, other.x), less(r, other_r));
-    slip = sum(slip, scaled(dt, less(drift(own, r), drift(other, other_r))));
+    if (any(c.drifting > 0)) {
+        const Vector drift = less(drift_at(drifts(1), own, r), drift_at(drifts(0), other, other_r));
+        slip = sum(slip, scaled(dt, drift));
+    }
     slip = less(slip, scaled(dot(n, slip), n));
     const Number way = length(slip);
     const Vector along = scaled(quotient(way * Real(0) + 1, way), slip);
@@ -127,26 +138,35 @@ CUDA_CALLABLE inline Vector lever_correction(const Body& body, Vector mean_spin,
     return scaled(-dt, cross(cross(mean_spin, arm(body, point)), linear));
 }
 
+// What moves a body as a whole: velocity, inverse mass and inertia in its frame.
+struct Whole {
+    Vector v;
+    Number inv_mass;
+    Symmetric inverse, inertia;
+};
+
 // Moves a body by the sum of impulses and angular impulses; its velocities change with its pose.
-CUDA_CALLABLE inline void apply(Body& body, const Symmetric& inverse, const Symmetric& inertia, Vector linear,
-                                Vector angular, Real dt) {
-    const Vector change = scaled(body.inv_mass, linear), spin = turned_back(body.q, body.spin);
-    const Vector spun = times(inverse, turned_back(body.q, angular));
-    const Vector gyration = sum(cross(spun, times(inertia, sum(spin, spun))), cross(spin, times(inertia, spun)));
-    const Vector gain = turned(body.q, less(spun, scaled(dt, times(inverse, gyration))));
+CUDA_CALLABLE inline void apply(Body& body, Whole& whole, Vector linear, Vector angular, Real dt) {
+    const Vector change = scaled(whole.inv_mass, linear);
+    Vector gain = scaled(whole.inverse.xx, angular);
+    if constexpr (!ROUND) {
+        const Vector spin = turned_back(body.q, body.spin), spun = times(whole.inverse, turned_back(body.q, angular));
+        const Vector both =
+            sum(cross(spun, times(whole.inertia, sum(spin, spun))), cross(spin, times(whole.inertia, spun)));
+        gain = turned(body.q, less(spun, scaled(dt, times(whole.inverse, both))));
+    }
     body.x = sum(body.x, scaled(dt, change));
-    const Quaternion q = body.q;
-    const Vector half = scaled(Real(0.5) * dt, gain), axis = imaginary(q);
-    const Vector turn = sum(axis, sum(scaled(q.w, half), cross(half, axis)));
-    const Number w = q.w - dot(half, axis);
+    const Vector half = scaled(Real(0.5) * dt, gain), axis = imaginary(body.q);
+    const Vector turn = sum(axis, sum(scaled(body.q.w, half), cross(half, axis)));
+    const Number w = body.q.w - dot(half, axis);
     const Number unit = 1 / root(dot(turn, turn) + w * w);
     body.q = {unit * turn.x, unit * turn.y, unit * turn.z, unit * w};
     // Newton's solver lets what is this slow rest
     constexpr Real REST = Real(1e-4);
-    const Vector v = sum(body.v, change), turns = sum(body.spin, gain);
+    const Vector v = sum(whole.v, change), spin = sum(body.spin, gain);
     const Number none = w * Real(0), moves = length(v) < REST ? none : none + 1;
-    const Number spins = length(turns) < REST ? none : none + 1;
-    body.v = scaled(moves, v);
-    body.spin = scaled(spins, turns);
+    const Number spins = length(spin) < REST ? none : none + 1;
+    whole.v = scaled(moves, v);
+    body.spin = scaled(spins, spin);
 }
 }

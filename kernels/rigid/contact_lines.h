@@ -21,7 +21,7 @@ struct Arrays {
     const Real* shares;
     int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide;
     unsigned long long* key;
-    Real *motion, *next_motion, *matter, *side, *pressed, *record;
+    Real *motion, *next_motion, *first_motion, *matter, *side, *pressed, *record;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "SolveArrays has the same members in the same order");
@@ -30,39 +30,42 @@ struct Arrays {
     CUDA_CALLABLE int found() const { return *count < contact_max ? *count : contact_max; }
     CUDA_CALLABLE int body_of(int shape) const { return shape_body[shape]; }
     CUDA_CALLABLE bool movable(int b) const { return b >= 0 && inv_mass[b] > 0; }
+    CUDA_CALLABLE bool kinematic(int b) const { return b >= 0 && (flags[b] & kinematic_flag) != 0; }
     CUDA_CALLABLE int line_of(int b) const { return b < 0 ? lines - 1 : slot[b]; }
 };
 
 constexpr int SIDE = 20, RECORD = 8; // numbers of a side, and of an impulse record, both in fours
 
 // Reads by four numbers, which ``fours`` gives for a quarter of a line.
-template <class Fours> CUDA_CALLABLE inline Body read_body(Fours fours) {
-    const Four a = fours(0), b = fours(1), c = fours(2), d = fours(3);
-    return {{a.x, a.y, a.z}, {d.x, d.y, d.z}, {c.x, c.y, c.z}, {b.x, b.y, b.z, b.w}, a.w, c.w};
+template <class Fours> CUDA_CALLABLE inline Body read_body(Fours motion) {
+    const Four a = motion(0), b = motion(1), c = motion(2);
+    return {{a.x, a.y, a.z}, {c.x, c.y, c.z}, {b.x, b.y, b.z, b.w}, a.w, c.w};
 }
-template <class Fours> CUDA_CALLABLE inline Inertia read_inertia(Fours fours) {
-    const Four a = fours(0), b = fours(1);
-    return {{a.x, a.y, a.z, b.x, b.y, b.z}, a.w};
+template <class Fours> CUDA_CALLABLE inline Drift read_drift(Fours motion) {
+    const Four d = motion(3);
+    return {{d.x, d.y, d.z}, d.w};
 }
-template <class Fours> CUDA_CALLABLE inline Contact read_contact(Fours fours) {
-    const Four a = fours(0), b = fours(1), c = fours(2), d = fours(3), e = fours(4);
-    return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, {c.x, c.y, c.z}, {d.x, d.y, d.z}, {e.x, e.y, e.z}, a.w, c.w, d.w, e.w};
+// Of a share, which is smaller than the whole by a number that stands beside the inverse inertia.
+template <class Fours> CUDA_CALLABLE inline Inertia read_inertia(Fours matter) {
+    if constexpr (ROUND) return {};
+    const Four a = matter(0), b = matter(1);
+    return {{a.w * a.x, a.w * a.y, a.w * a.z, a.w * b.x, a.w * b.y, a.w * b.z}};
 }
-// The spin that a body had before its contacts.
-template <class Fours> CUDA_CALLABLE inline Vector read_first_spin(Fours fours) {
-    return {fours(1).w, fours(2).w, fours(3).w};
+// Of the whole body, of which motion is given, too.
+template <class Fours> CUDA_CALLABLE inline Whole read_whole(const Drift& motion, Fours matter) {
+    const Four a = matter(0), b = matter(1), c = matter(2), d = matter(3);
+    return {motion.v, b.w, {a.x, a.y, a.z, b.x, b.y, b.z}, {c.x, c.y, c.z, d.x, d.y, d.z}};
 }
-template <class Fours>
-CUDA_CALLABLE inline void apply(Body& body, Fours matter, Vector linear, Vector angular, Real dt) {
-    const Four c = matter(2), d = matter(3);
-    const Symmetric inertia = {c.x, c.y, c.z, d.x, d.y, d.z};
-    apply(body, read_inertia(matter).inverse, inertia, linear, angular, dt);
+template <class Fours> CUDA_CALLABLE inline Contact read_contact(Fours side) {
+    const Four a = side(0), b = side(1), c = side(2), d = side(3), e = side(4);
+    return {
+        {a.x, a.y, a.z}, {b.x, b.y, b.z}, {c.x, c.y, c.z}, {d.x, d.y, d.z}, {e.x, e.y, e.z}, a.w, b.w, c.w, d.w, e.w};
 }
-CUDA_CALLABLE inline void put_body(Real* motion, int i, const Body& body) {
-    put_four(motion, 0, i, {body.x.x, body.x.y, body.x.z, body.inv_mass});
+CUDA_CALLABLE inline void put_body(Real* motion, int i, const Body& body, const Drift& drift) {
+    put_four(motion, 0, i, {body.x.x, body.x.y, body.x.z, body.ease});
     put_four(motion, 1, i, {body.q.x, body.q.y, body.q.z, body.q.w});
-    put_four(motion, 2, i, {body.spin.x, body.spin.y, body.spin.z, body.kinematic});
-    put_four(motion, 3, i, {body.v.x, body.v.y, body.v.z, body.kinematic});
+    put_four(motion, 2, i, {body.spin.x, body.spin.y, body.spin.z, body.spin_ease});
+    put_four(motion, 3, i, {drift.v.x, drift.v.y, drift.v.z, drift.kinematic});
 }
 
 CUDA_CALLABLE inline void put_symmetric(Real* quarters, const Real* matrix) {
@@ -89,30 +92,34 @@ CUDA_CALLABLE inline void begin_lines(const Arrays& a, int i) {
         for (int c = 0; c < 3; ++c) {
             motion[c] = a.q[7 * (size_t)b + c];
             motion[12 + c] = a.qd[6 * (size_t)b + c];
-            motion[8 + c] = matter[7 + 4 * c] = a.qd[6 * (size_t)b + 3 + c];
+            motion[8 + c] = a.qd[6 * (size_t)b + 3 + c];
         }
         for (int c = 0; c < 4; ++c) motion[4 + c] = a.q[7 * (size_t)b + 3 + c];
-        motion[3] = a.inv_mass[b];
-        motion[11] = (a.flags[b] & a.kinematic_flag) != 0;
         if (a.shares) matter[3] = a.shares[b];
         put_symmetric(matter, a.inv_inertia + 9 * (size_t)b);
         put_symmetric(matter + 8, a.inertia + 9 * (size_t)b);
+        motion[3] = matter[3] * a.inv_mass[b];
+        matter[7] = a.inv_mass[b];
+        motion[11] = matter[3] * matter[0];
+        motion[15] = a.kinematic(b);
     }
-    Body body = read_body([&](int quarter) { return own_four(a.motion, quarter, i); });
+    auto motion = [&](int quarter) { return own_four(a.motion, quarter, i); };
+    Body body = read_body(motion);
     body.x = sum(body.x, turned(body.q, centers(a, i)));
-    put_body(a.motion, i, body);
-    put_body(a.next_motion, i, body);
+    put_body(a.motion, i, body, read_drift(motion));
+    if (a.next_motion) put_body(a.next_motion, i, body, read_drift(motion));
+    if (a.with_levers) put_body(a.first_motion, i, body, read_drift(motion));
 }
 
 // Writes the poses and velocities of lines i, of which ``held`` are bodies.
-CUDA_CALLABLE inline void end_lines(const Arrays& a, const Body& body, int i, int held) {
+CUDA_CALLABLE inline void end_lines(const Arrays& a, const Body& body, const Drift& drift, int i, int held) {
     const Vector origin = less(body.x, turned(body.q, centers(a, i)));
     for (int l = 0; l < WIDTH && l < held; ++l) {
         Real *const q = a.q + 7 * (size_t)a.body[i + l], *const qd = a.qd + 6 * (size_t)a.body[i + l];
         q[0] = lane_of(origin.x, l), q[1] = lane_of(origin.y, l), q[2] = lane_of(origin.z, l);
         q[3] = lane_of(body.q.x, l), q[4] = lane_of(body.q.y, l), q[5] = lane_of(body.q.z, l);
         q[6] = lane_of(body.q.w, l);
-        qd[0] = lane_of(body.v.x, l), qd[1] = lane_of(body.v.y, l), qd[2] = lane_of(body.v.z, l);
+        qd[0] = lane_of(drift.v.x, l), qd[1] = lane_of(drift.v.y, l), qd[2] = lane_of(drift.v.z, l);
         qd[3] = lane_of(body.spin.x, l), qd[4] = lane_of(body.spin.y, l), qd[5] = lane_of(body.spin.z, l);
     }
 }
@@ -139,7 +146,7 @@ CUDA_CALLABLE inline void put_side(const Arrays& a, int c, int end, Real* place,
     for (int k = 0; k < 3; ++k) place[(16 + k) * stride] = (end == 1 ? 1 : -1) * a.normal[3 * (size_t)c + k];
     auto mean = [&](const Real* of_shape) { return Real(0.5) * (of_shape[shapes[0]] + of_shape[shapes[1]]); };
     place[3 * stride] = a.margin0[c] + a.margin1[c];
-    place[7 * stride] = 0;
+    place[7 * stride] = a.kinematic(a.body_of(shapes[0])) || a.kinematic(a.body_of(shapes[1]));
     place[11 * stride] = mean(a.mu);
     place[15 * stride] = mean(a.mu_torsional);
     place[19 * stride] = mean(a.mu_rolling);

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpmag.kernels.rigid.newton_views import BodyView, ContactView
@@ -22,6 +23,8 @@ _WIDE, _WIDE_BLOCKS = 48, 64
 """Contacts beyond which a body is shared by a whole block, and blocks for such bodies."""
 _BODIES_PER_THREAD = 100
 """Bodies that make another thread of a CPU worth its start."""
+_ROUND = 1e-6
+"""Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
 _SIDE, _RECORD = 20, 8
 """Numbers of a side and of a record; as in ``contact_lines.h``."""
 
@@ -33,7 +36,7 @@ _OF_CONTACTS = (
 _OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "inertia", "q", "qd")
 _OWN = (
     *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "key"),
-    *("motion", "next_motion", "matter", "side", "pressed", "record"),
+    *("motion", "next_motion", "first_motion", "matter", "side", "pressed", "record"),
 )
 _ADDRESSES = (*_OF_CONTACTS, *_OF_BODIES, "shares", *_OWN)
 _DOC = "Sizes, and where arrays begin; as ``Arrays`` in ``contact_lines.h``."
@@ -64,35 +67,39 @@ class SolveBuffers:
                 entry: Contacts that take part, shape [c].
                 other: Lines of the first and second body and their records, shape [c padded / CHUNK, 4, CHUNK].
                 side: The contacts, shape [c padded / CHUNK, 20, CHUNK].
-                record: Impulses on each side, by bodies, shape [2c, 8].
+                record: Impulses on each side, by bodies, and one for each vector of what nothing moves, shape
+                    [2c + c padded / CHUNK, 8].
                 wide: Whether records of a vector of contacts are zero, shape [c padded / CHUNK].
             and on both
                 slot: Line of each body, shape [b].
                 body: Body of each line, -1 for the world, shape [lines].
                 range: First of the sides of a line's body, and the one after the last, shape [lines, 2].
-                motion, next_motion: Lines of what moves, before and after an iteration, shape [lines, LINE].
+                motion, next_motion: Lines of what moves, before and on a GPU after an iteration, shape [lines, LINE].
+                first_motion: The same before contacts, for lever arms, shape [lines, LINE].
                 matter: Lines of what does not, shape [lines, LINE].
                 pressed: Impulses of all iterations, for lever arms, shape [2c, 4] or [c padded / CHUNK, 3, CHUNK].
         given: Their sizes and addresses, and what else the kernels are given.
+        round: Whether every body has the same inertia about all axes.
         threads: Threads of a CPU.
     """
 
     arrays: dict[str, wp.array]
     given: Any
+    round: bool
     threads: int
 
 
-def allocate(contact_max: int, bodies: int, *, levers: bool, kinematic_flag: int, device) -> SolveBuffers:
+def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag: int) -> SolveBuffers:
     """Allocate the buffers.
 
     Args:
         contact_max: Most contacts.
-        bodies: Number of bodies.
+        bodies: The bodies.
         levers: Whether lever arms are corrected, which balls do not need.
         kinematic_flag: Newton's flag of kinematic bodies.
-        device: Device.
     """
-    device = wp.get_device(device)
+    device, inertia, bodies = bodies.inv_mass.device, bodies.inv_inertia.numpy(), len(bodies.inv_mass)
+    isotropic = inertia[:, 0, 0, None, None] * np.eye(3)
     lines = -(-bodies // CHUNK) * CHUNK + 3 * CHUNK  # the movable and the others are padded, and the world has a vector
     padded = -(-max(contact_max, 1) // CHUNK) * CHUNK
 
@@ -106,23 +113,30 @@ def allocate(contact_max: int, bodies: int, *, levers: bool, kinematic_flag: int
     arrays["body"] = wp.full(lines, -1, dtype=wp.int32, device=device)
     arrays["wide"] = zeros(max(bodies, padded // CHUNK))
     arrays["key"] = zeros(0 if device.is_cpu else 2 * padded, dtype=wp.uint64)
-    arrays |= {name: zeros(lines, LINE, dtype=wp.float32) for name in ("motion", "next_motion", "matter")}
+    arrays |= {name: zeros(lines, LINE, dtype=wp.float32) for name in ("motion", "matter")}
+    arrays["next_motion"] = zeros(0 if device.is_cpu else lines, LINE, dtype=wp.float32)
+    arrays["first_motion"] = zeros(lines if levers else 0, LINE, dtype=wp.float32)
     arrays["side"] = zeros((1 if device.is_cpu else 2) * padded, _SIDE, dtype=wp.float32)
-    arrays["record"] = zeros(2 * padded if device.is_cpu else 0, _RECORD, dtype=wp.float32)
+    arrays["record"] = zeros((2 * padded + padded // CHUNK) if device.is_cpu else 0, _RECORD, dtype=wp.float32)
     arrays["pressed"] = zeros(2 * padded if levers else 0, 4, dtype=wp.float32)
     given = SolveArrays()
     for name in _OWN:
         setattr(given, name, arrays[name].ptr or 0)
     for name, size in zip(_SIZES, (contact_max, bodies, lines, int(levers), kinematic_flag), strict=True):
         setattr(given, name, size)
-    return SolveBuffers(arrays, given, threads_for(bodies, _BODIES_PER_THREAD))
+    return SolveBuffers(
+        arrays,
+        given,
+        round=bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all()),
+        threads=threads_for(bodies, _BODIES_PER_THREAD),
+    )
 
 
 @cache
-def solve_kernel(call: str, cpu: bool):
+def solve_kernel(call: str, is_round: bool, cpu: bool):
     """Kernel that calls a function of the device's header."""
     header = "rigid/contact_cpu.h" if cpu else "rigid/contact_cuda.h"
-    constants = dict(GROUP=_GROUP, BLOCK=_BLOCK, WIDE=_WIDE, WIDE_BLOCKS=_WIDE_BLOCKS)
+    constants = dict(ROUND=int(is_round), GROUP=_GROUP, BLOCK=_BLOCK, WIDE=_WIDE, WIDE_BLOCKS=_WIDE_BLOCKS)
 
     @wp.func_native(f"warpmag::{call};")
     def run(
@@ -173,7 +187,7 @@ def launch_solve_contacts(
 
     def launch(call, dim, number=0):
         inputs = [given, number, relaxation / dt, dt, b.threads, team() if device.is_cpu else None]
-        wp.launch(solve_kernel(call, device.is_cpu), dim, inputs=inputs, device=device, block_dim=_BLOCK)
+        wp.launch(solve_kernel(call, b.round, device.is_cpu), dim, inputs=inputs, device=device, block_dim=_BLOCK)
 
     if device.is_cpu:
         launch(ON_CPU, 1, iterations)

@@ -18,7 +18,7 @@ import warp as wp
 
 from warpmag.kernels.rigid import contact_solve
 from warpmag.kernels.rigid.mass_splitting import launch_count_shares, launch_split_masses
-from warpmag.kernels.rigid.newton_views import view_bodies, view_contacts
+from warpmag.kernels.rigid.newton_views import BodyView, view_bodies, view_contacts
 
 
 class PileXPBD(newton.solvers.SolverXPBD):
@@ -43,13 +43,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
         others = model.joint_count, model.particle_count, model.tendon_segment_count, self.enable_restitution
         self._solve = None
         if not any(others) and not self.rigid_contact_con_weighting:
-            self._solve = contact_solve.allocate(
-                contact_max,
-                model.body_count,
-                levers=bool(splits.any()),
-                kinematic_flag=int(newton.BodyFlags.KINEMATIC),
-                device=model.device,
-            )
+            flag = int(newton.BodyFlags.KINEMATIC)
+            bodies = self._view_bodies(model.state())
+            self._solve = contact_solve.allocate(contact_max, bodies, levers=bool(splits.any()), kinematic_flag=flag)
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; as Newton's."""
@@ -64,17 +60,21 @@ class PileXPBD(newton.solvers.SolverXPBD):
     def _step_bodies(self, state_in, state_out, contacts, dt) -> None:
         assert self._solve is not None
         self.integrate_bodies(self.model, state_in, state_out, dt, self.angular_damping)
-        bodies = view_bodies(self.model, state_out)
-        bodies.inv_mass, bodies.inv_inertia = self.body_inv_mass_effective, self.body_inv_inertia_effective
         contact_solve.launch_solve_contacts(
             self._solve,
             view_contacts(self.model, contacts),
-            bodies,
+            self._view_bodies(state_out),
             self._shares if self._splits is not None else None,
             iterations=self.iterations,
             relaxation=self.rigid_contact_relaxation,
             dt=dt,
         )
+
+    def _view_bodies(self, state) -> BodyView:
+        """Return the bodies, of which forces and contacts do not move the kinematic ones."""
+        bodies = view_bodies(self.model, state)
+        bodies.inv_mass, bodies.inv_inertia = self.body_inv_mass_effective, self.body_inv_inertia_effective
+        return bodies
 
     @contextlib.contextmanager
     def _splitting(self) -> Iterator[None]:
