@@ -95,7 +95,7 @@ class PlainXPBD(PileXPBD):
 def test_a_substep_is_that_of_newtons_kernels(kind, device):
     """Gaps are differences of positions, known to 6e-8 of the largest in float32, and impulses to that over dt.
 
-    As many iterations add up as many errors, of any sign.
+    As many iterations add up as many errors of any sign, and the largest of some hundred sums is three times the usual.
     """
     model, state, contacts = heap(kind, device)
     free = model.state()
@@ -105,7 +105,7 @@ def test_a_substep_is_that_of_newtons_kernels(kind, device):
         pushed = np.abs(theirs[1] - free.body_qd.numpy())[:, :3].max(1)
         assert (pushed > 1e-3).sum() > 20
         rounding = 6e-8 * np.abs(theirs[0][:, :3]).max()  # m
-        error = rounding / DT * iterations**0.5  # m/s
+        error = 3.0 * rounding / DT * iterations**0.5  # m/s
         np.testing.assert_allclose(ours[1][:, :3], theirs[1][:, :3], rtol=0, atol=error)
         np.testing.assert_allclose(ours[1][:, 3:], theirs[1][:, 3:], rtol=0, atol=error / R)
         np.testing.assert_allclose(ours[0][:, :3], theirs[0][:, :3], rtol=0, atol=error * DT + rounding)
