@@ -98,12 +98,11 @@ struct Pressure {
     Vector linear, angular;
 };
 
-// What each ``threads``-th contact of a body does, from number ``thread`` on.
-__device__ inline Pressure press(const Arrays& a, const Real* motion, int slot, const Body& own, const Inertia& inertia,
-                                 int thread, int threads, Real rate, Real dt) {
+// What each ``threads``-th contact of a body does, from k to last.
+__device__ inline Pressure press(const Arrays& a, const Real* motion, int k, int last, int threads, int slot,
+                                 const Body& own, const Inertia& inertia, Real rate, Real dt) {
     Pressure total = {{0, 0, 0}, {0, 0, 0}};
-    const int last = a.range[2 * slot + 1];
-    for (int k = a.range[2 * slot] + thread; k < last; k += threads) {
+    for (; k < last; k += threads) {
         const int j = a.other[k];
         const Contact contact =
             read_contact([&](int quarter) { return ((const Four*)a.side)[SIDE / 4 * (size_t)k + quarter]; });
@@ -147,25 +146,28 @@ __device__ inline Pressure block_sums(Pressure mine) {
 __device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, Real dt) {
     const Real* const from = odd ? a.next_motion : a.motion;
     Real* const to = odd ? a.motion : a.next_motion;
-    const int block = thread / BLOCK;
-    auto move = [&](int slot, int first, int threads, auto totals) {
+    auto move = [&](int slot, bool taken, int first, int threads, auto totals) {
+        const int2 sides = ((const int2*)a.range)[slot];
         auto motion = [&](int quarter) { return own_four(from, quarter, slot); };
         auto matter = [&](int quarter) { return own_four(a.matter, quarter, slot); };
         Body own = read_body(motion);
         const Drift drift = read_drift(motion);
-        const Pressure p = totals(press(a, from, slot, own, read_inertia(matter), first, threads, rate, dt));
+        const Inertia inertia = read_inertia(matter);
         Whole whole = read_whole(drift, matter);
+        // all of that is read at once, whether it is needed or not
+        if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
+        const Pressure p = totals(press(a, from, sides.x + first, sides.y, threads, slot, own, inertia, rate, dt));
         apply(own, whole, p.linear, p.angular, dt);
         if (first == 0) put_body(to, slot, own, {whole.v, drift.kinematic});
     };
+    const int block = thread / BLOCK;
     if (block < WIDE_BLOCKS) {
         for (int w = block; w < a.totals[WIDE_BODIES]; w += WIDE_BLOCKS)
-            move(a.wide[w], threadIdx.x, BLOCK, [](Pressure p) { return block_sums(p); });
+            move(a.wide[w], true, threadIdx.x, BLOCK, [](Pressure p) { return block_sums(p); });
         return;
     }
     const int slot = (thread - WIDE_BLOCKS * BLOCK) / GROUP;
-    if (slot >= a.totals[BODIES] || a.range[2 * slot + 1] - a.range[2 * slot] > WIDE) return;
-    move(slot, share(), GROUP, [](Pressure p) { return p; });
+    move(slot, slot < a.totals[BODIES], share(), GROUP, [](Pressure p) { return p; });
 }
 
 // Ends the solve for the body that a group of threads shares: corrects lever arms, and writes its pose and velocities.

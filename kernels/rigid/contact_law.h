@@ -14,6 +14,7 @@
 // added to each body. Iterations apply impulses in portions, and ω changes with them: the mean of ω before and after is
 // taken. Friction, too, is taken to act at the shape's contact point, short of its margin.
 #pragma once
+#include "shared/inverse_root.h"
 #include "shared/vectors.h"
 
 namespace warpmag {
@@ -69,16 +70,31 @@ CUDA_CALLABLE inline Number gap(const Contact& c, const Body& own, const Body& o
     return dot(c.normal, sum(less(own.x, other.x), less(r, other_r))) - c.margin;
 }
 
-// How easily a unit angular impulse turns a share of a body about it, and a unit impulse at an arm moves its point.
-CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector about) {
-    if constexpr (ROUND) return body.spin_ease * dot(about, about);
-    const Vector local = turned_back(body.q, about);
+// Quotients and inverse lengths of nothing are nothing.
+CUDA_CALLABLE inline Number quotient(Number a, Number b) {
+#if defined(__CUDA_ARCH__)
+    return b > 0 ? __fdividef(a, b) : 0;
+#else
+    return b > 0 ? a / b : a * Real(0);
+#endif
+}
+CUDA_CALLABLE inline Number inverse_length(Vector a) {
+    const Number square = dot(a, a);
+    return square > Real(1e-30) ? Real(0.5) * twice_inverse_root(square) : square * Real(0);
+}
+
+// How easily an angular impulse turns a share of a body about it: the energy of a unit impulse along an axis, and of a
+// unit impulse at an arm, where it also moves the body.
+CUDA_CALLABLE inline Number spin_ease(const Body& body, const Inertia& inertia, Vector axis) {
+    if constexpr (ROUND) return body.spin_ease;
+    const Vector local = turned_back(body.q, axis);
     return dot(local, times(inertia.inverse, local));
 }
 CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector r, Vector along) {
-    return body.ease + ease(body, inertia, cross(r, along));
+    const Vector about = cross(r, along);
+    const Number length = ROUND ? dot(about, about) : about.x * Real(0) + 1;
+    return body.ease + length * spin_ease(body, inertia, about);
 }
-CUDA_CALLABLE inline Number quotient(Number a, Number b) { return b > 0 ? a / b : a * Real(0); }
 
 // The velocity that a kinematic body lends its surface, of which positions do not tell.
 struct Drift {
@@ -110,26 +126,25 @@ CUDA_CALLABLE inline Impulse contact_impulse(const Contact& c, const Body& own, 
         slip = sum(slip, scaled(dt, drift));
     }
     slip = less(slip, scaled(dot(n, slip), n));
-    const Number way = length(slip);
-    const Vector along = scaled(quotient(way * Real(0) + 1, way), slip);
+    const Vector along = scaled(inverse_length(slip), slip);
     const Number rub_ease = ease(own, inertia, r, along) + ease(other, other_inertia, other_r, along);
-    const Vector rub = scaled(-smaller(quotient(rate * way, rub_ease), c.mu * push), along);
+    const Vector rub = scaled(-smaller(quotient(rate * dot(along, slip), rub_ease), c.mu * push), along);
     p.linear = sum(p.linear, rub);
     p.own = sum(p.own, cross(r, rub));
     p.other = sum(p.other, cross(rub, other_r));
 
     const Vector turn = less(own.spin, other.spin);
-    const Number twist = dt * dot(turn, n), twist_most = c.torsional * push;
-    const Number twist_ease = ease(own, inertia, n) + ease(other, other_inertia, n);
-    const Number torsion = larger(smaller(quotient(-rate * twist, twist_ease), twist_most), -twist_most);
-    const Vector roll = less(turn, scaled(dot(turn, n), n));
-    const Number speed = length(roll);
-    const Vector about = scaled(quotient(speed * Real(0) + 1, speed), roll);
-    const Number roll_ease = ease(own, inertia, about) + ease(other, other_inertia, about);
-    const Number rolling = smaller(quotient(rate * dt * speed, roll_ease), c.rolling * push);
-    const Vector friction = less(scaled(torsion, n), scaled(rolling, about));
-    p.own = sum(p.own, friction);
-    p.other = less(p.other, friction);
+    const Number twist = dot(turn, n), twist_most = c.torsional * push;
+    const Vector roll = less(turn, scaled(twist, n)), about = scaled(inverse_length(roll), roll);
+    auto stop = [&](Vector axis) { // the angular impulse that stops a unit of speed about an axis
+        return quotient(push * Real(0) + rate * dt,
+                        spin_ease(own, inertia, axis) + spin_ease(other, other_inertia, axis));
+    };
+    const Number torsion = larger(smaller(twist * stop(n), twist_most), -twist_most);
+    const Number rolling = smaller(dot(about, roll) * stop(about), c.rolling * push);
+    const Vector friction = sum(scaled(torsion, n), scaled(rolling, about));
+    p.own = less(p.own, friction);
+    p.other = sum(p.other, friction);
     return p;
 }
 
@@ -159,13 +174,13 @@ CUDA_CALLABLE inline void apply(Body& body, Whole& whole, Vector linear, Vector 
     const Vector half = scaled(Real(0.5) * dt, gain), axis = imaginary(body.q);
     const Vector turn = sum(axis, sum(scaled(body.q.w, half), cross(half, axis)));
     const Number w = body.q.w - dot(half, axis);
-    const Number unit = 1 / root(dot(turn, turn) + w * w);
+    const Number unit = Real(0.5) * twice_inverse_root(dot(turn, turn) + w * w);
     body.q = {unit * turn.x, unit * turn.y, unit * turn.z, unit * w};
     // Newton's solver lets what is this slow rest
     constexpr Real REST = Real(1e-4);
     const Vector v = sum(whole.v, change), spin = sum(body.spin, gain);
-    const Number none = w * Real(0), moves = length(v) < REST ? none : none + 1;
-    const Number spins = length(spin) < REST ? none : none + 1;
+    const Number none = w * Real(0), moves = dot(v, v) < REST * REST ? none : none + 1;
+    const Number spins = dot(spin, spin) < REST * REST ? none : none + 1;
     whole.v = scaled(moves, v);
     body.spin = scaled(spins, spin);
 }

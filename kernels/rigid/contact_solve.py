@@ -17,10 +17,10 @@ from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import CHUNK, LINE
 from warpmag.kernels.shared.team import team, threads_for
 
-_GROUP, _BLOCK = 8, 128
-"""Threads of a GPU that share a body, and those of a block."""
-_WIDE, _WIDE_BLOCKS = 48, 64
-"""Contacts beyond which a body is shared by a whole block, and blocks for such bodies."""
+_GROUPS = ((6_000, 8), (20_000, 4), (60_000, 2), (2**31, 1))
+"""Bodies up to which so many threads of a GPU share each: a launch is short while they all run at once."""
+_BLOCK, _WIDE_BLOCKS = 128, 64
+"""Threads of a block, and blocks for bodies with many contacts, which are shared by a whole one."""
 _BODIES_PER_THREAD = 100
 """Bodies that make another thread of a CPU worth its start."""
 _ROUND = 1e-6
@@ -80,12 +80,14 @@ class SolveBuffers:
                 pressed: Impulses of all iterations, for lever arms, shape [2c, 4] or [c padded / CHUNK, 3, CHUNK].
         given: Their sizes and addresses, and what else the kernels are given.
         round: Whether every body has the same inertia about all axes.
+        group: Threads of a GPU that share a body, 0 on a CPU.
         threads: Threads of a CPU.
     """
 
     arrays: dict[str, wp.array]
     given: Any
     round: bool
+    group: int
     threads: int
 
 
@@ -128,15 +130,16 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
         arrays,
         given,
         round=bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all()),
+        group=0 if device.is_cpu else next(group for most, group in _GROUPS if bodies <= most),
         threads=threads_for(bodies, _BODIES_PER_THREAD),
     )
 
 
 @cache
-def solve_kernel(call: str, is_round: bool, cpu: bool):
+def solve_kernel(call: str, is_round: bool, group: int):
     """Kernel that calls a function of the device's header."""
-    header = "rigid/contact_cpu.h" if cpu else "rigid/contact_cuda.h"
-    constants = dict(ROUND=int(is_round), GROUP=_GROUP, BLOCK=_BLOCK, WIDE=_WIDE, WIDE_BLOCKS=_WIDE_BLOCKS)
+    header = "rigid/contact_cuda.h" if group else "rigid/contact_cpu.h"
+    constants = dict(ROUND=int(is_round), GROUP=group, BLOCK=_BLOCK, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
 
     @wp.func_native(f"warpmag::{call};")
     def run(
@@ -187,17 +190,21 @@ def launch_solve_contacts(
 
     def launch(call, dim, number=0):
         inputs = [given, number, relaxation / dt, dt, b.threads, team() if device.is_cpu else None]
-        wp.launch(solve_kernel(call, b.round, device.is_cpu), dim, inputs=inputs, device=device, block_dim=_BLOCK)
+        wp.launch(solve_kernel(call, b.round, b.group), dim, inputs=inputs, device=device, block_dim=_BLOCK)
 
     if device.is_cpu:
         launch(ON_CPU, 1, iterations)
         return
-    groups = _GROUP * given.bodies
+    groups = b.group * given.bodies
     b.arrays["counters"].zero_()
     launch(COUNT, given.contact_max)
     launch(PLACE, -(-(given.bodies + 1) // 32) * 32)
     launch(LIST, given.contact_max)
     launch(WRITE, 2 * given.contact_max)
-    for iteration in range(iterations):
-        launch(ITERATE, _WIDE_BLOCKS * _BLOCK + groups, iteration % 2)
-    launch(FINISH, groups, iterations % 2)
+
+    def iterate():
+        for iteration in range(iterations):
+            launch(ITERATE, _WIDE_BLOCKS * _BLOCK + groups, iteration % 2)
+        launch(FINISH, groups, iterations % 2)
+
+    wp.capture_if(b.arrays["totals"][:1], iterate)
