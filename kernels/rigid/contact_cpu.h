@@ -167,6 +167,8 @@ inline void solve_contacts(const Arrays& a, int iterations, Real rate, Real dt, 
     write_contacts(a, lists);
     for (int i = 0; i < lists.lines; i += WIDTH) begin_lines(a, i);
     begin_lines(a, a.lines - WIDTH);
+    const int helpful = lists.contacts / CONTACTS_PER_THREAD;
+    threads = helpful < 1 ? 1 : helpful < threads ? helpful : threads;
     const int passes = 2 * (iterations + a.with_levers);
     for (int first = 0; first < passes; first += MOST_PASSES) {
         const int last = passes - first < MOST_PASSES ? passes - first : MOST_PASSES;

@@ -17,12 +17,12 @@ from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import CHUNK, LINE
 from warpmag.kernels.shared.team import team, threads_for
 
-_GROUPS = ((6_000, 8), (20_000, 4), (60_000, 2), (2**31, 1))
-"""Bodies up to which so many threads of a GPU share each: a launch is short while they all run at once."""
+_GROUPS = ((6_000, 8), (20_000, 4), (2**31, 2))
+"""Bodies up to which so many threads of a GPU share each, measured with three contacts a body on an H200."""
 _BLOCK, _WIDE_BLOCKS = 128, 64
 """Threads of a block, and blocks for bodies with many contacts, which are shared by a whole one."""
-_BODIES_PER_THREAD = 100
-"""Bodies that make another thread of a CPU worth its start."""
+_CONTACTS_PER_THREAD = 100
+"""Contacts that make another thread of a CPU worth its start: an iteration over them takes 1 to 2 µs."""
 _ROUND = 1e-6
 """Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
 _SIDE, _RECORD = 20, 8
@@ -81,7 +81,7 @@ class SolveBuffers:
         given: Their sizes and addresses, and what else the kernels are given.
         round: Whether every body has the same inertia about all axes.
         group: Threads of a GPU that share a body, 0 on a CPU.
-        threads: Threads of a CPU.
+        threads: Most threads of a CPU.
     """
 
     arrays: dict[str, wp.array]
@@ -131,7 +131,7 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
         given,
         round=bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all()),
         group=0 if device.is_cpu else next(group for most, group in _GROUPS if bodies <= most),
-        threads=threads_for(bodies, _BODIES_PER_THREAD),
+        threads=threads_for(contact_max, 1),
     )
 
 
@@ -140,6 +140,7 @@ def solve_kernel(call: str, is_round: bool, group: int):
     """Kernel that calls a function of the device's header."""
     header = "rigid/contact_cuda.h" if group else "rigid/contact_cpu.h"
     constants = dict(ROUND=int(is_round), GROUP=group, BLOCK=_BLOCK, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
+    constants["CONTACTS_PER_THREAD"] = _CONTACTS_PER_THREAD
 
     @wp.func_native(f"warpmag::{call};")
     def run(
