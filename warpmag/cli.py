@@ -62,9 +62,6 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--contact-model", choices=CONTACT_MODELS, help="balls that nearly touch (default: the stage's)")
     run.add_argument("--rtol", type=float, metavar="X", help="magnetization error to reach (default: the stage's)")
     run.add_argument(
-        "--deterministic", action="store_true", help="same bits in every run on a GPU too (xpbd only, slower)"
-    )
-    run.add_argument(
         "--viewer", choices=("none", *_VIEWERS), default="none", help="watch the run (default: %(default)s)"
     )
     run.set_defaults(command=_run)
@@ -177,7 +174,6 @@ def _run(options) -> int:
         curve=method and method.curve,
         rtol=options.rtol,
         device=options.device,
-        deterministic=options.deterministic,
         visuals=options.viewer != "none",
     )
     known = simulation.warnings()

@@ -25,7 +25,7 @@ def _count_contacts(
     contacts: ContactView,
     body_q_in: wp.array[wp.transform],
     splits_in: wp.array[wp.int32],
-    counts_out: wp.array[wp.int32],
+    counts_out: wp.array[float],
 ):
     i = wp.tid()
     if i >= contact_count(contacts):
@@ -35,15 +35,37 @@ def _count_contacts(
         return
     body0, body1 = contact_bodies(contacts, i)
     if body0 >= 0 and splits_in[body0] == 1:
-        wp.atomic_add(counts_out, body0, 1)
+        wp.atomic_add(counts_out, body0, 1.0)
     if body1 >= 0 and splits_in[body1] == 1:
-        wp.atomic_add(counts_out, body1, 1)
+        wp.atomic_add(counts_out, body1, 1.0)
+
+
+@wp.kernel
+def _find_shares(shares_io: wp.array[float]):
+    body = wp.tid()
+    shares_io[body] = wp.max(1.0, shares_io[body] / float(_UNSPLIT))
+
+
+def launch_count_shares(contacts: ContactView, body_q, splits, shares):
+    """Write into how many shares each body is split.
+
+    Args:
+        contacts: The contacts.
+        body_q: Poses that they were found at, shape [body_count].
+        splits: 1 for bodies whose mass may be split, shape [body_count].
+        shares: Out, number of shares, a quarter of the contacts that touch or nearly do, 1 at least, shape
+            [body_count].
+    """
+    shares.zero_()
+    inputs = [contacts, body_q, splits]  # whole numbers: in any order they add up to the same
+    wp.launch(_count_contacts, dim=contacts.shape0.shape[0], inputs=inputs, outputs=[shares], device=shares.device)
+    wp.launch(_find_shares, dim=len(shares), outputs=[shares], device=shares.device)
 
 
 @wp.kernel
 def _split_masses(
     # inputs:
-    counts_in: wp.array[wp.int32],
+    shares_in: wp.array[float],
     inv_mass_in: wp.array[float],
     inv_inertia_in: wp.array[wp.mat33],
     # outputs:
@@ -51,23 +73,16 @@ def _split_masses(
     inv_inertia_out: wp.array[wp.mat33],
 ):
     body = wp.tid()
-    shares = wp.max(1.0, float(counts_in[body]) / float(_UNSPLIT))
-    inv_mass_out[body] = shares * inv_mass_in[body]
-    inv_inertia_out[body] = shares * inv_inertia_in[body]
+    inv_mass_out[body] = shares_in[body] * inv_mass_in[body]
+    inv_inertia_out[body] = shares_in[body] * inv_inertia_in[body]
 
 
-def launch_split_masses(contacts: ContactView, body_q, splits, whole, counts, shares):
+def launch_split_masses(shares, whole, split):
     """Write the inverse masses [1/kg] and inertias [1/(kg·m²)] of the share of each body that one contact acts on.
 
     Args:
-        contacts: The contacts.
-        body_q: Poses that they were found at, shape [body_count].
-        splits: 1 for bodies whose mass may be split, shape [body_count].
+        shares: Number of shares of each body, shape [body_count].
         whole: Inverse masses and inertias of the bodies, each of shape [body_count].
-        counts: Out, contacts of each body to split that touch or nearly do, shape [body_count].
-        shares: Out, inverse masses and inertias of a share, each of shape [body_count].
+        split: Out, those of a share, each of shape [body_count].
     """
-    counts.zero_()
-    inputs = [contacts, body_q, splits]
-    wp.launch(_count_contacts, dim=contacts.shape0.shape[0], inputs=inputs, outputs=[counts], device=counts.device)
-    wp.launch(_split_masses, dim=len(counts), inputs=[counts, *whole], outputs=[*shares], device=counts.device)
+    wp.launch(_split_masses, dim=len(shares), inputs=[shares, *whole], outputs=[*split], device=shares.device)

@@ -10,29 +10,29 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyView:
-    """Bodies in one state, or copies of bodies, arrays of shape [bodies].
+    """Bodies in one state, arrays of shape [bodies].
 
     Attributes:
         q: Pose.
         qd: Velocity of the centre of mass and angular velocity [m/s, rad/s].
         f: Force and torque about the centre of mass [N, N·m].
         com: Centre of mass in the body's frame [m].
+        inertia: Inertia in the body's frame [kg·m²].
         inv_mass: Inverse mass, zero for bodies that forces do not move [1/kg].
         inv_inertia: Inverse inertia in the body's frame [1/(kg·m²)].
         flags: Newton's ``BodyFlags``.
         world: World of the body.
-        deltas: Sum of the impulses and angular impulses of contacts [N·s, N·m·s].
     """
 
     q: wp.array[wp.transform]
     qd: wp.array[wp.spatial_vector]
     f: wp.array[wp.spatial_vector]
     com: wp.array[wp.vec3]
+    inertia: wp.array[wp.mat33]
     inv_mass: wp.array[float]
     inv_inertia: wp.array[wp.mat33]
     flags: wp.array[wp.int32]
     world: wp.array[wp.int32]
-    deltas: wp.array[wp.spatial_vector]
 
 
 @wp.struct
@@ -43,6 +43,7 @@ class ContactView:
         count: Contacts found, more than ``contact_max`` if some were dropped, shape [1].
         shape0, shape1: Shapes of each contact, shape [contact_max].
         point0, point1: Contact points in the frames of the two bodies [m], shape [contact_max].
+        offset0, offset1: From the points to where the surfaces rub, in those frames [m], shape [contact_max].
         margin0, margin1: Distance of the surface from each point [m], shape [contact_max].
         normal: Unit vector from the first shape to the second, shape [contact_max].
         shape_body: Body of each shape, -1 for the world, shape [shapes].
@@ -55,6 +56,8 @@ class ContactView:
     shape1: wp.array[wp.int32]
     point0: wp.array[wp.vec3]
     point1: wp.array[wp.vec3]
+    offset0: wp.array[wp.vec3]
+    offset1: wp.array[wp.vec3]
     margin0: wp.array[float]
     margin1: wp.array[float]
     normal: wp.array[wp.vec3]
@@ -66,10 +69,11 @@ class ContactView:
 
 
 def view_bodies(model, state) -> BodyView:
-    """Return the bodies of ``model`` in ``state``, without ``deltas``."""
+    """Return the bodies of ``model`` in ``state``."""
     view = BodyView()
     view.q, view.qd, view.f = state.body_q, state.body_qd, state.body_f
-    view.com, view.inv_mass, view.inv_inertia = model.body_com, model.body_inv_mass, model.body_inv_inertia
+    view.com, view.inertia = model.body_com, model.body_inertia
+    view.inv_mass, view.inv_inertia = model.body_inv_mass, model.body_inv_inertia
     view.flags, view.world = model.body_flags, model.body_world
     return view
 
@@ -78,7 +82,7 @@ def view_contacts(model, contacts) -> ContactView:
     """Return Newton's ``contacts`` between the shapes of ``model``."""
     view = ContactView()
     view.count = contacts.rigid_contact_count
-    for name in ("shape0", "shape1", "point0", "point1", "margin0", "margin1", "normal"):
+    for name in ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "margin0", "margin1", "normal"):
         setattr(view, name, getattr(contacts, f"rigid_contact_{name}"))
     view.shape_body, view.shape_gap = model.shape_body, model.shape_gap
     for name in ("mu", "mu_torsional", "mu_rolling"):

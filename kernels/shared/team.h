@@ -127,20 +127,23 @@ template <class Visit> void share_out(Word* team, int threads, int count, int sh
     run_together(team, threads, work);
 }
 
-// Calls make_pass(pass, i) for passes ``first`` to ``last`` and the vectors of ``width`` balls that begin at ball i, by
-// threads that take chunks of balls and go on to the next pass when one is done.
-template <class MakePass>
-void run_passes(Word* team, int threads, int first, int last, int balls, int width, MakePass make_pass) {
-    constexpr int MOST_PASSES = 16;
-    const int taken_at_once = 4 * width, chunks = (balls + taken_at_once - 1) / taken_at_once;
+// Calls make_pass(pass, i) for passes ``first`` to ``last`` and the vectors of ``width`` items that begin at item i, of
+// items(pass), by threads that take chunks of items and go on to the next pass when one is done.
+constexpr int MOST_PASSES = 16;
+template <class Items, class MakePass>
+void run_passes(Word* team, int threads, int first, int last, Items items, int width, MakePass make_pass) {
+    const int taken_at_once = 4 * width;
+    auto chunks_of = [&](int pass) { return (items(pass) + taken_at_once - 1) / taken_at_once; };
     auto make_chunk = [&](int pass, int chunk) {
-        const int begin = chunk * taken_at_once, end = begin + taken_at_once < balls ? begin + taken_at_once : balls;
+        const int count = items(pass), begin = chunk * taken_at_once;
+        const int end = begin + taken_at_once < count ? begin + taken_at_once : count;
         for (int i = begin; i < end; i += width) make_pass(pass, i);
     };
     // the caller takes chunks from the first on, others from the last: each finds its own in its cache next time
     int taken[MOST_PASSES] = {}, ahead[MOST_PASSES] = {}, behind[MOST_PASSES] = {}, done[MOST_PASSES] = {};
     auto work = [&](int member) {
         for (int pass = first; pass < last; ++pass) {
+            const int chunks = chunks_of(pass);
             while (__atomic_fetch_add(&taken[pass], 1, __ATOMIC_RELAXED) < chunks) {
                 const int n = __atomic_fetch_add(member == 0 ? &ahead[pass] : &behind[pass], 1, __ATOMIC_RELAXED);
                 make_chunk(pass, member == 0 ? n : chunks - 1 - n);
@@ -150,6 +153,12 @@ void run_passes(Word* team, int threads, int first, int last, int balls, int wid
         }
     };
     run_together(team, threads, work);
+}
+
+// The same for passes over ``count`` items each.
+template <class MakePass>
+void run_passes(Word* team, int threads, int first, int last, int count, int width, MakePass make_pass) {
+    run_passes(team, threads, first, last, [=](int) { return count; }, width, make_pass);
 }
 }
 #endif

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.engine.broad_phase import NeighborBroadPhase
-from warpmag.engine.xpbd import OrderedXPBD, PileXPBD
+from warpmag.engine.xpbd import PileXPBD
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, watch_capacity, watch_contacts, watch_flags
 from warpmag.kernels.rigid.newton_views import view_contacts
@@ -26,6 +26,8 @@ _GAP = 0.1
 _CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 12, 40
 """First sizes of the buffers: a ball in the densest packing has 12 neighbours, each pair is counted once."""
 _GROWTH = 1.5
+_NUMBERED = 2**20
+"""Triangle pairs that Newton can put into an order."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def _without_free_joints(model: newton.Model) -> newton.Model:
     return model
 
 
-def _xpbd(model: newton.Model, contact_max: int, ordered: bool = False):
+def _xpbd(model: newton.Model, contact_max: int):
     # Contacts are relaxed all at once: beyond a third of each correction the many contacts of a ball in a pile
     # together overshoot, which keeps the pile hot for good (RMS speed on Balls Up after 1.5 s of 0.15 cm/s at 0.35,
     # 1.6 at 0.5, 10 at Newton's 0.8). Averaging over a body's contacts instead would need far more iterations.
@@ -134,12 +136,7 @@ def _xpbd(model: newton.Model, contact_max: int, ordered: bool = False):
     # Joints are relaxed alike along and about their axes, or hinged bodies swing as if they were heavier (a quarter
     # swing ends at 84.9 instead of 90 degrees with Newton's 0.7 and 0.4). Two at one place are stable up to 0.5 each.
     settings |= {"joint_linear_relaxation": 0.4, "joint_angular_relaxation": 0.4}
-    model = _without_free_joints(model)
-    if not ordered:
-        return PileXPBD(model, contact_max, **settings)
-    if model.joint_count or model.particle_count:
-        raise ValueError("with joints or particles its runs on a GPU are not deterministic")
-    return OrderedXPBD(model, contact_max, **settings)
+    return PileXPBD(_without_free_joints(model), contact_max, **settings)
 
 
 def _steel(model: newton.Model, contact_max: int):
@@ -181,7 +178,6 @@ class RigidSolver:
         *,
         solver: str = "xpbd",
         capacity: float = 1.0,
-        deterministic: bool = False,
     ):
         """Set up collision and solver.
 
@@ -190,7 +186,6 @@ class RigidSolver:
             sizes: Sizes of its bodies.
             solver: One of ``SOLVERS``.
             capacity: First size of the contact and pair buffers over the usual one.
-            deterministic: Whether every run must give the same bits. On a CPU it does anyway.
 
         Raises:
             InputError: There is no such solver, or it cannot be had or cannot run this model.
@@ -198,9 +193,6 @@ class RigidSolver:
         if solver not in SOLVERS:
             raise InputError(f"solver: {solver!r} is not one of {', '.join(SOLVERS)}")
         self._model, self._name = model, solver
-        self._ordered = deterministic and wp.get_device(model.device).is_cuda
-        if self._ordered and solver != "xpbd":
-            raise InputError(f"solver {solver}: its runs on a GPU are not deterministic, those of xpbd can be")
         scale_gaps(model, sizes)
         finite = sizes.thickness[np.isfinite(sizes.thickness)]
         self._speculation = float(2.0 * finite.max()) if len(finite) else 0.0
@@ -222,7 +214,7 @@ class RigidSolver:
                 rigid_contact_max=self._limits["contact"],
                 shape_pairs_max=self._limits["pair"],
                 max_triangle_pairs=self._limits["triangle"],
-                deterministic=self._ordered,
+                deterministic=self._reduces_in_order(),
                 verify_buffers=False,  # would only print; the counters are read instead
             )
             self._pipeline.broad_phase = NeighborBroadPhase(self._model, self._speculation)
@@ -230,8 +222,7 @@ class RigidSolver:
             self._contact_view = view_contacts(self._model, self.contacts)
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:
-                options = {"ordered": True} if self._ordered else {}
-                self._solver = SOLVERS[self._name](self._model, self._limits["contact"], **options)
+                self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
             except (ImportError, NotImplementedError, TypeError, ValueError, RuntimeError) as error:
                 raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None
         narrow = self._pipeline.narrow_phase
@@ -247,6 +238,15 @@ class RigidSolver:
         lost = getattr(self._solver, "constraint_overflow", None)
         if lost is not None:
             self.buffers.append(Buffer("contact", lost, 0))
+
+    def _reduces_in_order(self) -> bool:
+        """Whether contacts of meshes are to be the same in every run, as long as Newton can number that many.
+
+        Those of other shapes are, in some order, which the solver makes up for.
+        """
+        meshes = np.isin(self._model.shape_type.numpy(), (newton.GeoType.MESH, newton.GeoType.HFIELD)).any()
+        on_gpu = wp.get_device(self._model.device).is_cuda
+        return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _NUMBERED)
 
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""

@@ -57,7 +57,6 @@ class Simulation:
         curve: str | None = None,
         device: str | None = None,
         graphs: bool = True,
-        deterministic: bool = False,
         visuals: bool = False,
     ):
         """Import the scene and get ready to step.
@@ -74,8 +73,6 @@ class Simulation:
             curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
             device: Warp device; by default Warp's.
             graphs: Replay captured graphs instead of launching kernels one by one.
-            deterministic: Give the same bits in every run on a GPU too, where rigid bodies then take up to 1.7 times as
-                long (H200); on a CPU every run does.
             visuals: Also import what is only seen, for a viewer.
 
         Raises:
@@ -101,7 +98,7 @@ class Simulation:
             external_field=settings.external_field if external_field is None else external_field,
             curve=curve,
         )
-        self._prepare(solver, graphs, deterministic)
+        self._prepare(solver, graphs)
 
     def _open(self, path: str | os.PathLike, visuals: bool) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
@@ -131,10 +128,10 @@ class Simulation:
                 raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {what} is not finite")
         return model
 
-    def _prepare(self, solver: str, graphs: bool, deterministic: bool) -> None:
+    def _prepare(self, solver: str, graphs: bool) -> None:
         """Set up what moves the bodies, and look at how they start."""
         self._sizes = sizes = body_sizes(self.model)
-        self._solver = RigidSolver(self.model, sizes, solver=solver, deterministic=deterministic)
+        self._solver = RigidSolver(self.model, sizes, solver=solver)
         self._stepper = Stepper(
             self.model,
             self._magnetics,

@@ -1,0 +1,197 @@
+// The contact solve on a GPU: groups of threads share a body and go through its own contacts, one launch an iteration.
+//
+// Both bodies of a contact compute its impulses, from what they were after the last iteration: no atomics are needed,
+// and nothing waits for another block. Where bodies and their lists lie depends on the order in which threads came, but
+// no result does: a body's contacts are sorted by what they are.
+#pragma once
+#include "rigid/contact_lines.h"
+#include "shared/group.h"
+
+#if defined(__CUDA_ARCH__)
+namespace warpmag {
+
+enum Total { BODIES, SIDES, IMMOVABLE, WIDE_BODIES }; // entries of ``totals``
+
+// For contact c: counts it for the bodies that it moves.
+__device__ inline void count_sides(int c, const Arrays& a) {
+    int ends[2];
+    if (c >= a.found() || !ends_of(a, c, ends)) return;
+    for (int end = 0; end < 2; ++end)
+        if (a.movable(ends[end])) atomicAdd(a.side_count + ends[end], 1);
+}
+
+// A place of its own for each thread of a warp that wants ``count`` entries, from a counter.
+__device__ inline int reserve(int* counter, int count) {
+    const int lane = threadIdx.x % 32;
+    int before = count;
+    for (int step = 1; step < 32; step *= 2) {
+        const int its = __shfl_up_sync(~0u, before, step);
+        before += lane >= step ? its : 0;
+    }
+    int first = 0;
+    if (lane == 31 && before > 0) first = atomicAdd(counter, before);
+    return __shfl_sync(~0u, first, 31) + before - count;
+}
+
+// For body b: a line, and room for its sides; all threads of a warp take part. The body after the last is the world.
+__device__ inline void place_body(int b, const Arrays& a) {
+    const int sides = b < a.bodies ? a.side_count[b] : 0;
+    const int slot = reserve(a.totals + BODIES, sides > 0), start = reserve(a.totals + SIDES, sides);
+    if (b > a.bodies) return;
+    int line = slot;
+    if (sides > 0) {
+        a.range[2 * slot] = start;
+        a.range[2 * slot + 1] = start + sides;
+        if (sides > WIDE) a.wide[atomicAdd(a.totals + WIDE_BODIES, 1)] = slot;
+    } else if (b == a.bodies) line = a.lines - 1;
+    else if (a.inv_mass[b] == 0) line = a.lines - 2 - atomicAdd(a.totals + IMMOVABLE, 1);
+    else return;
+    if (b < a.bodies) a.slot[b] = line;
+    a.body[line] = b < a.bodies ? b : -1;
+    begin_lines(a, line);
+}
+
+// For contact c: puts its sides into the lists of their bodies, as they come.
+__device__ inline void list_sides(int c, const Arrays& a) {
+    int ends[2];
+    if (c >= a.found() || !ends_of(a, c, ends)) return;
+    for (int end = 0; end < 2; ++end) {
+        if (!a.movable(ends[end])) continue;
+        const int place = a.range[2 * a.slot[ends[end]]] + atomicAdd(a.filled + ends[end], 1);
+        a.entry[place] = 2 * c + end;
+        a.key[place] = (unsigned long long)a.shape0[c] << 32 | (unsigned)a.shape1[c];
+    }
+}
+
+// Whether contact c comes before d, which is between the same shapes, by where and how they touch.
+__device__ inline bool touches_before(const Arrays& a, int c, int d) {
+    for (const Real* row : {a.point0, a.point1, a.normal})
+        for (int k = 0; k < 3; ++k)
+            if (row[3 * (size_t)c + k] != row[3 * (size_t)d + k])
+                return row[3 * (size_t)c + k] < row[3 * (size_t)d + k];
+    return a.margin0[c] + a.margin1[c] < a.margin0[d] + a.margin1[d];
+}
+
+// For entry k of the lists: writes the side to where it comes among those of its body.
+__device__ inline void write_side(int k, const Arrays& a) {
+    if (k >= a.totals[SIDES]) return;
+    const int c = a.entry[k] / 2, end = a.entry[k] % 2;
+    int ends[2];
+    ends_of(a, c, ends);
+    const int slot = a.slot[ends[end]], first = a.range[2 * slot], last = a.range[2 * slot + 1];
+    const unsigned long long key = a.key[k];
+    int place = first;
+    for (int m = first; m < last; ++m) {
+        if (a.key[m] != key) place += a.key[m] < key;
+        else if (m != k) {
+            const int d = a.entry[m] / 2;
+            place += touches_before(a, d, c) || (m < k && !touches_before(a, c, d));
+        }
+    }
+    put_side(a, c, end, a.side + SIDE * (size_t)place, 1);
+    a.other[place] = a.line_of(ends[1 - end]);
+    if (a.with_levers) ((Four*)a.pressed)[place] = {0, 0, 0, 0};
+}
+
+// Sums of impulses on a body, over the threads that share it.
+struct Pressure {
+    Vector linear, angular;
+};
+
+// What each ``threads``-th contact of a body does, from k to last.
+__device__ inline Pressure press(const Arrays& a, const Real* motion, int k, int last, int threads, int slot,
+                                 const Body& own, const Inertia& inertia, Real rate, Real dt) {
+    Pressure total = {{0, 0, 0}, {0, 0, 0}};
+    for (; k < last; k += threads) {
+        const int j = a.other[k];
+        const Contact contact =
+            read_contact([&](int quarter) { return ((const Four*)a.side)[SIDE / 4 * (size_t)k + quarter]; });
+        const Body other = read_body([&](int quarter) { return four_at(motion, quarter, &j); });
+        const Vector r = arm(own, contact.point), other_r = arm(other, contact.other_point);
+        const Number distance = gap(contact, own, other, r, other_r);
+        if (!(distance < 0)) continue;
+        const Inertia other_inertia = read_inertia([&](int quarter) { return four_at(a.matter, quarter, &j); });
+        auto drifts = [&](int end) {
+            return read_drift([&](int quarter) { return own_four(motion, quarter, end == 1 ? slot : j); });
+        };
+        const Impulse p =
+            contact_impulse(contact, own, other, inertia, other_inertia, distance, r, other_r, drifts, rate, dt);
+        total.linear = sum(total.linear, p.linear);
+        total.angular = sum(total.angular, p.own);
+        if (a.with_levers) {
+            Four& pressed = ((Four*)a.pressed)[k];
+            pressed = {pressed.x + p.linear.x, pressed.y + p.linear.y, pressed.z + p.linear.z, 0};
+        }
+    }
+    return {group_sums(total.linear), group_sums(total.angular)};
+}
+
+// Sums over a block of the sums of its groups.
+__device__ inline Pressure block_sums(Pressure mine) {
+    constexpr int GROUPS = BLOCK / GROUP;
+    __shared__ Pressure parts[GROUPS];
+    __syncthreads();
+    if (share() == 0) parts[threadIdx.x / GROUP] = mine;
+    __syncthreads();
+    Pressure total = parts[0];
+    for (int g = 1; g < GROUPS; ++g) {
+        total.linear = sum(total.linear, parts[g].linear);
+        total.angular = sum(total.angular, parts[g].angular);
+    }
+    return total;
+}
+
+// One iteration: moves the body that a group of threads shares, from one array of motions to the other. The first
+// blocks take the bodies with many contacts, a whole block each.
+__device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, Real dt) {
+    const Real* const from = odd ? a.next_motion : a.motion;
+    Real* const to = odd ? a.motion : a.next_motion;
+    auto move = [&](int slot, bool taken, int first, int threads, auto totals) {
+        const int2 sides = ((const int2*)a.range)[slot];
+        auto motion = [&](int quarter) { return own_four(from, quarter, slot); };
+        auto matter = [&](int quarter) { return own_four(a.matter, quarter, slot); };
+        Body own = read_body(motion);
+        const Drift drift = read_drift(motion);
+        const Inertia inertia = read_inertia(matter);
+        Whole whole = read_whole(drift, matter);
+        // all of that is read at once, whether it is needed or not
+        if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
+        const Pressure p = totals(press(a, from, sides.x + first, sides.y, threads, slot, own, inertia, rate, dt));
+        apply(own, whole, p.linear, p.angular, dt);
+        if (first == 0) put_body(to, slot, own, {whole.v, drift.kinematic});
+    };
+    const int block = thread / BLOCK;
+    if (block < WIDE_BLOCKS) {
+        for (int w = block; w < a.totals[WIDE_BODIES]; w += WIDE_BLOCKS)
+            move(a.wide[w], true, threadIdx.x, BLOCK, [](Pressure p) { return block_sums(p); });
+        return;
+    }
+    const int slot = (thread - WIDE_BLOCKS * BLOCK) / GROUP;
+    move(slot, slot < a.totals[BODIES], share(), GROUP, [](Pressure p) { return p; });
+}
+
+// Ends the solve for the body that a group of threads shares: corrects lever arms, and writes its pose and velocities.
+__device__ inline void finish(int thread, const Arrays& a, int odd, Real dt) {
+    const int slot = thread / GROUP;
+    if (slot >= a.totals[BODIES]) return;
+    const Real* const lines = odd ? a.next_motion : a.motion;
+    auto motion = [&](int quarter) { return own_four(lines, quarter, slot); };
+    Body body = read_body(motion);
+    Drift drift = read_drift(motion);
+    if (a.with_levers) {
+        const Body first = read_body([&](int quarter) { return own_four(a.first_motion, quarter, slot); });
+        const Vector mean = scaled(Real(0.5), sum(body.spin, first.spin));
+        Vector angular = {0, 0, 0};
+        for (int k = a.range[2 * slot] + share(); k < a.range[2 * slot + 1]; k += GROUP) {
+            const Four point = ((const Four*)a.side)[SIDE / 4 * (size_t)k], pressed = ((const Four*)a.pressed)[k];
+            const Vector linear = {pressed.x, pressed.y, pressed.z};
+            angular = sum(angular, lever_correction(body, mean, {point.x, point.y, point.z}, linear, dt));
+        }
+        Whole whole = read_whole(drift, [&](int quarter) { return own_four(a.matter, quarter, slot); });
+        apply(body, whole, {0, 0, 0}, group_sums(angular), dt);
+        drift.v = whole.v;
+    }
+    if (share() == 0) end_lines(a, body, drift, slot, 1);
+}
+}
+#endif

@@ -1,0 +1,211 @@
+"""Newton's XPBD for rigid bodies in contact, where work follows contacts and no sum depends on the order of threads.
+
+Once a substep the contacts that move anything are listed for each body that they move. An iteration then relaxes them
+all at once (``contact_law.h``): each body gathers from its own contacts. On a CPU one launch does all iterations, and
+the impulses of a contact are computed once. On a GPU an iteration is a launch, and both bodies compute them.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpmag.kernels.rigid.newton_views import BodyView, ContactView
+from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.passes import CHUNK, LINE
+from warpmag.kernels.shared.team import team, threads_for
+
+_GROUPS = ((6_000, 8), (20_000, 4), (2**31, 2))
+"""Bodies up to which so many threads of a GPU share each, measured with three contacts a body on an H200."""
+_BLOCK, _WIDE_BLOCKS = 128, 64
+"""Threads of a block, and blocks for bodies with many contacts, which are shared by a whole one."""
+_CONTACTS_PER_THREAD = 100
+"""Contacts that make another thread of a CPU worth its start: an iteration over them takes 1 to 2 µs."""
+_ROUND = 1e-6
+"""Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
+_SIDE, _RECORD = 20, 8
+"""Numbers of a side and of a record; as in ``contact_lines.h``."""
+
+_SIZES = ("contact_max", "bodies", "lines", "with_levers", "kinematic_flag")
+_OF_CONTACTS = (
+    *("count", "shape0", "shape1", "shape_body", "point0", "point1", "offset0", "offset1", "normal"),
+    *("margin0", "margin1", "mu", "mu_torsional", "mu_rolling"),
+)
+_OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "inertia", "q", "qd")
+_OWN = (
+    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "key"),
+    *("motion", "next_motion", "first_motion", "matter", "side", "pressed", "record"),
+)
+_ADDRESSES = (*_OF_CONTACTS, *_OF_BODIES, "shares", *_OWN)
+_DOC = "Sizes, and where arrays begin; as ``Arrays`` in ``contact_lines.h``."
+SolveArrays = wp.struct(
+    type(
+        "SolveArrays",
+        (),
+        {"__doc__": _DOC, "__annotations__": dict.fromkeys(_SIZES, int) | dict.fromkeys(_ADDRESSES, wp.uint64)},
+    )
+)
+
+
+@dataclass(frozen=True)
+class SolveBuffers:
+    """Buffers for c contacts, which have two sides each, and b bodies.
+
+    Attributes:
+        arrays: The arrays: on a GPU
+                totals: Numbers of bodies and sides that take part, of bodies that nothing moves, and of those with many
+                    contacts, shape [4].
+                side_count, filled: Sides of each body, and how many of them are listed, shape [b].
+                entry, key: Side, twice its contact plus its end, and shapes of it, by bodies, shape [2c].
+                other: Line of the body at the other end, shape [2c].
+                side: Contacts as each end sees them, see ``contact_law.h``, shape [2c, 20].
+                wide: Lines of bodies with many contacts, shape [b].
+            and on a CPU, where vectors of contacts are seen from their second bodies,
+                side_count: Sides of each body, shape [b].
+                entry: Contacts that take part, shape [c].
+                other: Lines of the first and second body and their records, shape [c padded / CHUNK, 4, CHUNK].
+                side: The contacts, shape [c padded / CHUNK, 20, CHUNK].
+                record: Impulses on each side, by bodies, and one for each vector of what nothing moves, shape
+                    [2c + c padded / CHUNK, 8].
+                wide: Whether records of a vector of contacts are zero, shape [c padded / CHUNK].
+            and on both
+                slot: Line of each body, shape [b].
+                body: Body of each line, -1 for the world, shape [lines].
+                range: First of the sides of a line's body, and the one after the last, shape [lines, 2].
+                motion, next_motion: Lines of what moves, before and on a GPU after an iteration, shape [lines, LINE].
+                first_motion: The same before contacts, for lever arms, shape [lines, LINE].
+                matter: Lines of what does not, shape [lines, LINE].
+                pressed: Impulses of all iterations, for lever arms, shape [2c, 4] or [c padded / CHUNK, 3, CHUNK].
+        given: Their sizes and addresses, and what else the kernels are given.
+        round: Whether every body has the same inertia about all axes.
+        group: Threads of a GPU that share a body, 0 on a CPU.
+        threads: Most threads of a CPU.
+    """
+
+    arrays: dict[str, wp.array]
+    given: Any
+    round: bool
+    group: int
+    threads: int
+
+
+def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag: int) -> SolveBuffers:
+    """Allocate the buffers.
+
+    Args:
+        contact_max: Most contacts.
+        bodies: The bodies.
+        levers: Whether lever arms are corrected, which balls do not need.
+        kinematic_flag: Newton's flag of kinematic bodies.
+    """
+    device, inertia, bodies = bodies.inv_mass.device, bodies.inv_inertia.numpy(), len(bodies.inv_mass)
+    isotropic = inertia[:, 0, 0, None, None] * np.eye(3)
+    lines = -(-bodies // CHUNK) * CHUNK + 3 * CHUNK  # the movable and the others are padded, and the world has a vector
+    padded = -(-max(contact_max, 1) // CHUNK) * CHUNK
+
+    def zeros(*shape, dtype=wp.int32):
+        return wp.zeros(shape, dtype=dtype, device=device)
+
+    counters = zeros(4 + 2 * bodies)
+    arrays = {"counters": counters, "totals": counters[:4], "side_count": counters[4 : 4 + bodies]}
+    arrays["filled"] = counters[4 + bodies :]
+    arrays |= {"slot": zeros(bodies), "range": zeros(lines, 2), "entry": zeros(2 * padded), "other": zeros(4 * padded)}
+    arrays["body"] = wp.full(lines, -1, dtype=wp.int32, device=device)
+    arrays["wide"] = zeros(max(bodies, padded // CHUNK))
+    arrays["key"] = zeros(0 if device.is_cpu else 2 * padded, dtype=wp.uint64)
+    arrays |= {name: zeros(lines, LINE, dtype=wp.float32) for name in ("motion", "matter")}
+    arrays["next_motion"] = zeros(0 if device.is_cpu else lines, LINE, dtype=wp.float32)
+    arrays["first_motion"] = zeros(lines if levers else 0, LINE, dtype=wp.float32)
+    arrays["side"] = zeros((1 if device.is_cpu else 2) * padded, _SIDE, dtype=wp.float32)
+    arrays["record"] = zeros((2 * padded + padded // CHUNK) if device.is_cpu else 0, _RECORD, dtype=wp.float32)
+    arrays["pressed"] = zeros(2 * padded if levers else 0, 4, dtype=wp.float32)
+    given = SolveArrays()
+    for name in _OWN:
+        setattr(given, name, arrays[name].ptr or 0)
+    for name, size in zip(_SIZES, (contact_max, bodies, lines, int(levers), kinematic_flag), strict=True):
+        setattr(given, name, size)
+    return SolveBuffers(
+        arrays,
+        given,
+        round=bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all()),
+        group=0 if device.is_cpu else next(group for most, group in _GROUPS if bodies <= most),
+        threads=threads_for(contact_max, 1),
+    )
+
+
+@cache
+def solve_kernel(call: str, is_round: bool, group: int):
+    """Kernel that calls a function of the device's header."""
+    header = "rigid/contact_cuda.h" if group else "rigid/contact_cpu.h"
+    constants = dict(ROUND=int(is_round), GROUP=group, BLOCK=_BLOCK, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
+    constants["CONTACTS_PER_THREAD"] = _CONTACTS_PER_THREAD
+
+    @wp.func_native(f"warpmag::{call};")
+    def run(
+        thread: int, given: SolveArrays, number: int, rate: float, dt: float, threads: int, team: wp.array2d[wp.uint64]
+    ): ...
+
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        module_options=native_options(header, dtype=wp.float32, **constants),
+    )
+    def solve_contacts(
+        given: SolveArrays, number: int, rate: float, dt: float, threads: int, team: wp.array2d[wp.uint64]
+    ):
+        run(wp.tid(), given, number, rate, dt, threads, team)
+
+    return solve_contacts
+
+
+ON_CPU = "solve_contacts(warpmag::Arrays(given), number, rate, dt, threads, team.data)"
+COUNT = "count_sides(thread, warpmag::Arrays(given))"
+PLACE = "place_body(thread, warpmag::Arrays(given))"
+LIST = "list_sides(thread, warpmag::Arrays(given))"
+WRITE = "write_side(thread, warpmag::Arrays(given))"
+ITERATE = "iterate(thread, warpmag::Arrays(given), number, rate, dt)"
+FINISH = "finish(thread, warpmag::Arrays(given), number, dt)"
+
+
+def launch_solve_contacts(
+    b: SolveBuffers, contacts: ContactView, bodies: BodyView, shares, *, iterations: int, relaxation: float, dt: float
+):
+    """Move bodies out of their contacts.
+
+    Args:
+        b: Buffers.
+        contacts: The contacts.
+        bodies: The bodies after ``dt`` without contacts; ``q`` and ``qd`` of those with contacts are changed.
+        shares: Number of shares that contacts split each body into, shape [bodies], or None for whole bodies.
+        iterations: Number of iterations.
+        relaxation: Part of its correction that each contact is given in an iteration.
+        dt: Substep [s].
+    """
+    given, device = b.given, b.arrays["motion"].device
+    for names, view in ((_OF_CONTACTS, contacts), (_OF_BODIES, bodies)):
+        for name in names:
+            setattr(given, name, getattr(view, name).ptr or 0)
+    given.shares = 0 if shares is None else shares.ptr
+
+    def launch(call, dim, number=0):
+        inputs = [given, number, relaxation / dt, dt, b.threads, team() if device.is_cpu else None]
+        wp.launch(solve_kernel(call, b.round, b.group), dim, inputs=inputs, device=device, block_dim=_BLOCK)
+
+    if device.is_cpu:
+        launch(ON_CPU, 1, iterations)
+        return
+    groups = b.group * given.bodies
+    b.arrays["counters"].zero_()
+    launch(COUNT, given.contact_max)
+    launch(PLACE, -(-(given.bodies + 1) // 32) * 32)
+    launch(LIST, given.contact_max)
+    launch(WRITE, 2 * given.contact_max)
+
+    def iterate():
+        for iteration in range(iterations):
+            launch(ITERATE, _WIDE_BLOCKS * _BLOCK + groups, iteration % 2)
+        launch(FINISH, groups, iterations % 2)
+
+    wp.capture_if(b.arrays["totals"][:1], iterate)
