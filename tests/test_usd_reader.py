@@ -344,3 +344,25 @@ def test_description(tmp_path):
     path = write(tmp_path, BALL, 'doc = """One line.\n\nMore."""')
     assert describe(path) == "One line."
     assert describe(write(tmp_path, BALL, name="plain.usda")) == ""
+
+
+def test_samples_that_block_a_value_are_held_as_none(tmp_path):
+    samples = "double radius = 5\ndouble radius.timeSamples = { 0: None, 10: 7 }"
+    stage = open_stage(write(tmp_path, ball(samples, kind="Sphere").replace("double radius = 0.005\n", "")))
+    radius = stage.GetPrimAtPath("/Ball").GetAttribute("radius")
+    assert (radius.Get(), radius.HasAuthoredValue()) == (None, False)
+    hold(stage, 10.0)
+    assert radius.Get() == 7.0
+    hold(stage, 0.0)
+    with pytest.raises(InputError, match="^/Ball: radius is blocked and has no value"):
+        read_magnets(stage)
+
+
+def test_messages_are_one_line_however_long_a_name_is(tmp_path):
+    name = "n" * 100_000
+    errors = survey(open_stage(write(tmp_path, ball("float physics:mass = -1", name=name)))).findings
+    assert len(errors) == 1 and str(errors[0]).startswith("/nnn") and len(str(errors[0])) < 1000
+    with pytest.raises(InputError) as caught:
+        read_magnets(open_stage(tmp_path / "stage.usda"))
+    assert len(str(caught.value)) < 1000 and "must not be negative" in str(caught.value)
+    assert str(InputError("a\nb\x1b[31m")) == "a b [31m"

@@ -1,5 +1,14 @@
 """Errors and warnings of the library."""
 
+_BEGIN, _END = 400, 200
+"""Characters of a message that are kept, where names in it have hundreds of thousands."""
+
+
+def one_line(text: str) -> str:
+    """Return a text as one line that a terminal shows as it is, its middle left out where it is very long."""
+    line = "".join(one if one.isprintable() else " " for one in text)
+    return line if len(line) <= _BEGIN + _END else f"{line[:_BEGIN]} ... {line[-_END:]}"
+
 
 class InputError(ValueError):
     """Bad input from the user: one line that names the prim or the argument.
@@ -7,9 +16,17 @@ class InputError(ValueError):
     The command prints it and exits with code 2; at the array and Newton level it is an ordinary ``ValueError``.
     """
 
+    def __init__(self, message: str):
+        """Make one line of ``message``."""
+        super().__init__(one_line(str(message)))
+
 
 class SimulationError(RuntimeError):
     """A simulation that cannot go on: one line that names the step and the body."""
+
+    def __init__(self, message: str):
+        """Make one line of ``message``."""
+        super().__init__(one_line(str(message)))
 
 
 class ConvergenceWarning(UserWarning):

@@ -18,7 +18,7 @@ from warpmag.engine.contacts import MAXIMAL, RigidSolver, body_sizes
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
-from warpmag.errors import InputError
+from warpmag.errors import InputError, SimulationError
 from warpmag.magnets import MagneticSettings, check_positive
 
 DEFAULT_STEP = 1e-3
@@ -228,8 +228,14 @@ class Simulation:
             self._look()
 
     def _look(self) -> None:
-        for report in self._stepper.look():
-            self._statistics.add_step(report)
+        try:
+            for report in self._stepper.look():
+                self._statistics.add_step(report)
+        except SimulationError as error:
+            if not self._statistics.overlapping:
+                raise
+            reason = "bodies overlap at the start, and what pushes them apart may turn them without bounds"
+            raise SimulationError(f"{error}: {self._statistics.overlapping} pairs of {reason}") from None
 
     def _positions(self) -> np.ndarray:
         return self.state.body_q.numpy()[self._moving, :3].astype(float)

@@ -7,6 +7,7 @@ from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdValidation
 
 from warpmag.errors import InputError
 from warpmag.usd.clock import StageClock, stage_clock, stage_name
+from warpmag.usd.guard import readable
 from warpmag.usd.joints import joint_findings
 from warpmag.usd.reader import StageContents, open_stage, survey
 from warpmag.usd.values import Finding, quiet
@@ -69,6 +70,11 @@ def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
         stage: As :func:`open_stage` opened it.
         path: File of the stage.
     """
+    with readable(str(path)):
+        return _report(stage, path)
+
+
+def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
     contents = survey(stage)
     findings = [*contents.findings, *joint_findings(stage)]
     try:

@@ -75,6 +75,8 @@ def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
     for what, unit in (("metersPerUnit", metres), ("kilogramsPerUnit", kilograms)):
         if not 1e-50 < unit < 1e50:
             yield Finding(name, f"{what} must be positive and finite, got {unit:g}")
+    if (up := UsdGeom.GetStageUpAxis(stage)) not in ("Y", "Z"):
+        yield Finding(name, f"upAxis must be Y or Z, got {up!r}")
     if not math.isclose(metres, 1.0) and 1e-50 < metres < 1e50:
         given = f"metersPerUnit is {metres:g}"
         if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):

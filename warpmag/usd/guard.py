@@ -1,4 +1,4 @@
-"""Turns what Newton raises over a stage, or warns about and then leaves out, into one line about the stage."""
+"""Turns what USD or Newton raises over a stage, or warns about and then leaves out, into one line about the stage."""
 
 import contextlib
 import re
@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator
 
 from warpmag.errors import InputError
+from warpmag.usd.first_reading import FAILURES, failure
 from warpmag.usd.values import quiet
 
 _LOSSES = re.compile(r"[Ss]kipp|Invalid|Ignoring (?!body-level density)|unspecified|zero mass|not imported|result\.")
@@ -31,6 +32,22 @@ def refusals(where: str, what: str) -> Iterator[None]:
     for one in caught:
         if _LOSSES.search(_line(one.message)):
             raise InputError(f"{where}: Newton cannot {what} all of it ({_line(one.message)})")
+
+
+@contextlib.contextmanager
+def readable(where: str) -> Iterator[None]:
+    """Raise :class:`InputError` for what USD raises in the block, and keep what it has to say off stderr.
+
+    Args:
+        where: The stage, as messages call it.
+    """
+    try:
+        with quiet():
+            yield
+    except InputError:
+        raise
+    except FAILURES as error:
+        raise InputError(f"{where}: USD cannot read it ({failure(error)})") from None
 
 
 def _line(text) -> str:

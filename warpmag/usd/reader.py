@@ -15,7 +15,9 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
+from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings
+from warpmag.usd.guard import readable
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
 from warpmag.usd.values import Finding, attribute_findings, check_type, declared, finding_of, quiet
@@ -59,17 +61,18 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file")
+    if reason := first_reading(path):
+        raise InputError(f"{path}: {reason}")
     try:
         with quiet():  # what USD has to say goes into the error
             stage = Usd.Stage.Open(str(path))
             broken = [str(error) for error in stage.GetCompositionErrors()]
-    except Tf.ErrorException as error:
-        # USD ends its list with "failed to open", the reasons stand before it.
-        reasons = [one.commentary.strip().splitlines()[0] for one in error.args[:-1]]
-        raise InputError(f"{path}: not a USD file{''.join(f' ({reason})' for reason in reasons[:1])}") from None
+    except FAILURES as error:
+        raise InputError(f"{path}: not a USD file ({failure(error)})") from None
     if broken:
         raise InputError(f"{path}: {' '.join(broken[0].split())}")
-    hold(stage, start_of(stage) if time_code is None else time_code)
+    with readable(str(path)):
+        hold(stage, start_of(stage) if time_code is None else time_code)
     return stage
 
 
@@ -98,6 +101,8 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
         for attribute, value in values:
             if value is not None:
                 attribute.Set(value)
+            elif attribute.GetNumTimeSamples():  # blocked at that time: as if it had never been authored
+                attribute.Block()
 
 
 def _at(attribute, time_code):

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from pxr import Gf, Tf, Usd, UsdUtils, Vt
 
-from warpmag.errors import InputError
+from warpmag.errors import InputError, one_line
 
 LARGEST = float(np.finfo(np.float32).max)
 """What lies beyond single precision cannot reach Newton."""
@@ -86,7 +86,7 @@ class Finding:
 
     def __str__(self) -> str:
         """One line that names the prim."""
-        return f"{self.where}: {self.message}"
+        return one_line(f"{self.where}: {self.message}")
 
 
 @contextlib.contextmanager
@@ -118,9 +118,11 @@ def value_of(prim: Usd.Prim, name: str):
         value = attribute.Get()
     except Tf.ErrorException:
         raise InputError(f"{prim.GetPath()}: {name} has a value that USD cannot read") from None
+    example, fallback = _expected(prim, attribute)
+    if value is None and fallback is not None:
+        raise InputError(f"{prim.GetPath()}: {name} is blocked and has no value")
     if value is None or not attribute.HasAuthoredValue():
         return value
-    example, fallback = _expected(prim, attribute)
     check_type(prim, name, value, example)
     if name in _TOKENS and value not in _TOKENS[name]:
         raise InputError(f"{prim.GetPath()}: {name} must be one of {', '.join(_TOKENS[name])}, got {_shown(value)}")

@@ -1,0 +1,1 @@
+"""Stages spoiled at random, and what becomes of them: ``python -m tests.fuzz --help``."""

@@ -1,0 +1,62 @@
+"""``python -m tests.fuzz``: spoils small scenes at random and sends them through ``warpmag check`` and ``run``.
+
+    python -m tests.fuzz --count 3000 --seed 7              each stage in a process of its own
+    python -m tests.fuzz --count 300 --seed 7 --batch 100   a hundred of them in one process
+    python -m tests.fuzz --count 100 --seed 7 --fresh       each command in a fresh interpreter
+    python -m tests.fuzz --seed 7 --only 1234               one stage, which is kept in the folder
+
+Stages with problems are kept in the folder, beside ``verdicts.jsonl`` with a line about each stage. Ends with 1 where
+there are problems.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # USD's threads do not survive a fork
+
+
+def main() -> int:
+    """Run a campaign and return its exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=300, help="stages (default: %(default)s)")
+    parser.add_argument("--first", type=int, default=0, help="number of the first of them (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="which stages (default: %(default)s)")
+    parser.add_argument("--only", type=int, metavar="N", help="number of the only stage, which is kept")
+    parser.add_argument("--batch", type=int, default=1, help="stages of one process (default: %(default)s)")
+    parser.add_argument("--fresh", action="store_true", help="a fresh interpreter for each command")
+    parser.add_argument("-o", "--output", type=Path, default=Path("fuzz_out"), help="folder (default: %(default)s)")
+    options = parser.parse_args()
+
+    from .campaign import Campaign, warm_up  # noqa: PLC0415 - imports USD, which reads the environment
+    from .sources import author  # noqa: PLC0415
+
+    folder = options.output.absolute()
+    sources = author(folder / "sources")
+    campaign = Campaign(
+        options.seed, folder, sources, batch=options.batch, fresh=options.fresh, keep=options.only is not None
+    )
+    if not options.fresh:
+        warm_up(sources)
+    numbers = [options.only] if options.only is not None else range(options.first, options.first + options.count)
+    ends, slowest = Counter(), 0.0
+    with open(folder / "verdicts.jsonl", "a", encoding="utf-8") as file:
+        for verdict in campaign.verdicts(list(numbers)):
+            print(json.dumps(asdict(verdict), ensure_ascii=False), file=file, flush=True)
+            ends[{0: "accepted", 2: "refused"}.get(verdict.run, "neither")] += 1
+            ends["with problems"] += bool(verdict.problems)
+            slowest = max(slowest, verdict.seconds)
+            if verdict.problems or options.only is not None:
+                print(
+                    f"{verdict.number} {verdict.done}\n    {verdict.line}", *verdict.problems, sep="\n    ", flush=True
+                )
+    print(", ".join(f"{count} {end}" for end, count in ends.items()), f"slowest {slowest:.0f} s of CPU time", sep="; ")
+    return 1 if ends["with problems"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,279 @@
+"""Sends spoiled stages through ``warpmag check`` and ``warpmag run --frames 1``, in processes that may die of it.
+
+Workers fork from a process that has Newton imported and kernels loaded, so that a stage takes little longer than it
+takes to read. A stage has to end in a run, or in one line that says what is wrong. All else is a problem.
+"""
+
+import contextlib
+import json
+import os
+import random
+import re
+import resource
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from . import damage
+from .mutate import mutate
+from .truth import differences
+
+FORMS = ("usda",) * 13 + ("text",) * 3 + ("crate",) * 3 + ("package",)
+"""How mutants lie on disk, as often as here: sound text, damaged text, damaged crate files, damaged packages."""
+CPU_SECONDS, WALL_SECONDS = 60, 300
+"""Time that a stage may take [s]; wall time allows for a loaded machine."""
+MEMORY = 8 << 30
+"""Address space of a worker [bytes]."""
+OK, FAILED, BAD_INPUT = 0, 1, 2
+_LONGEST_LINE = 1000
+_ROOT = Path(__file__).resolve().parents[2]
+_FRESH = {name: value for name, value in os.environ.items() if name != "PXR_WORK_THREAD_LIMIT"}
+_EXPECTED = re.compile(r"^warpmag: |^$|^\S+: loading|frame/s|s/frame|frame \[")
+
+
+@dataclass
+class Verdict:
+    """What became of one mutant.
+
+    Attributes:
+        number: Which one.
+        form: One of ``FORMS``.
+        done: What was done to the stage.
+        check: Exit code of ``warpmag check``.
+        run: Exit code of ``warpmag run``.
+        line: The one line by which the run was refused.
+        problems: What must not happen.
+        seconds: CPU time [s].
+    """
+
+    number: int
+    form: str = ""
+    done: str = ""
+    check: int | None = None
+    run: int | None = None
+    line: str = ""
+    problems: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Path, str, str]:
+    """Write one mutant; return its file, its form and what was done to it."""
+    chance = random.Random(f"{seed}-{number}")
+    form, source = chance.choice(FORMS), sources[number % len(sources)]
+    path = folder / f"{number:05}.usda"
+    done = mutate(source, path, chance.randrange(1 << 40), fewest=1 if form == "usda" else 0)
+    if form == "text":
+        done += "; " + damage.spoil_text(path, chance)
+    elif form != "usda":
+        path = damage.to_crate(path) if form == "crate" else damage.to_package(path, chance)
+        done += "; " + damage.spoil_bytes(path, chance)
+    return path, form, f"{source.stem}: {done}"
+
+
+def warm_up(sources: list[Path]) -> None:
+    """Import Newton and load the kernels that small scenes need."""
+    with tempfile.TemporaryDirectory() as folder:
+        for source in sources:
+            code, _, said = in_process(
+                "run", str(source), "--frames", "1", "--device", "cpu", "-o", f"{folder}/out.usda"
+            )
+            if code != OK:
+                raise RuntimeError(f"{source}: {said}")
+
+
+def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Callable, device: str = "cpu") -> Verdict:
+    """Make a mutant, send it through ``check`` and ``run``, and look at what came of it."""
+    began = time.process_time()
+    verdict = Verdict(number)
+    place = folder / f"{number:05}"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    path, verdict.form, verdict.done = make(number, seed, place, sources)
+    (place / "done.txt").write_text(json.dumps([verdict.form, verdict.done]), encoding="utf-8")
+    output = place / "out" / "out.usda"
+    with _recorded() as simulations:
+        verdict.check, told, stderr_of_check = command("check", str(path))
+        verdict.run, _, stderr_of_run = command(
+            "run", str(path), "--frames", "1", "--device", device, "-o", str(output)
+        )
+    errors = [line[12:] for line in told if line.startswith("error ")] + _messages(stderr_of_check)
+    refusals = _messages(stderr_of_run)
+    verdict.line = refusals[-1] if refusals else ""
+    verdict.problems += [*_talk("check", stderr_of_check), *_talk("run", stderr_of_run)]
+    verdict.problems += _disagreements(verdict.check, errors, verdict.run, refusals)
+    if verdict.run == BAD_INPUT and output.exists():
+        verdict.problems.append("a refused run wrote")
+    if verdict.run == FAILED and "overlap at the start" not in verdict.line:
+        verdict.problems.append(f"failed: {verdict.line}")
+    if verdict.run == OK:
+        verdict.problems += differences(path, output, simulations[-1] if simulations else None)
+    verdict.seconds = time.process_time() - began
+    return verdict
+
+
+@contextlib.contextmanager
+def _recorded() -> Iterator[list]:
+    """Keep the simulations that are run meanwhile."""
+    from warpmag.engine.simulation import Simulation  # noqa: PLC0415 - a worker has it imported
+
+    simulations, before = [], Simulation.run
+
+    def run(self, *arguments, **options):
+        simulations.append(self)
+        return before(self, *arguments, **options)
+
+    Simulation.run = run
+    try:
+        yield simulations
+    finally:
+        Simulation.run = before
+
+
+def in_process(*arguments: str) -> tuple[int, list[str], list[str]]:
+    """Run the command in this process; return its exit code and its lines on stdout and stderr."""
+    from warpmag import cli  # noqa: PLC0415
+
+    with _caught(1) as out, _caught(2) as err:
+        try:
+            code = cli.main(list(arguments))
+        except BaseException:
+            traceback.print_exc()
+            code = -1
+        sys.stdout.flush(), sys.stderr.flush()
+    return code, out[0].splitlines(), err[0].splitlines()
+
+
+def in_fresh_process(*arguments: str) -> tuple[int, list[str], list[str]]:
+    """Do the same in a fresh interpreter."""
+    done = subprocess.run(
+        [sys.executable, "-m", "warpmag.cli", *arguments], capture_output=True, check=False, env=_FRESH, cwd=_ROOT
+    )
+    out, err = (one.decode(errors="replace").splitlines() for one in (done.stdout, done.stderr))
+    return done.returncode, out, err if done.returncode >= 0 else [*err, f"died of signal {-done.returncode}"]
+
+
+@contextlib.contextmanager
+def _caught(descriptor: int) -> Iterator[list[str]]:
+    """Catch what is written to a file descriptor, by native code as well."""
+    sys.stdout.flush(), sys.stderr.flush()
+    before, text = os.dup(descriptor), []
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), descriptor)
+        try:
+            yield text
+        finally:
+            sys.stdout.flush(), sys.stderr.flush()
+            os.dup2(before, descriptor)
+            os.close(before)
+            file.seek(0)
+            text.append(file.read().decode(errors="replace"))
+
+
+def _messages(lines: list[str]) -> list[str]:
+    """Return the errors among lines on stderr."""
+    return [
+        line.removeprefix("warpmag: ")
+        for line in lines
+        if line.startswith("warpmag: ") and not line.startswith("warpmag: warning: ")
+    ]
+
+
+def _talk(command: str, lines: list[str]) -> list[str]:
+    """Return what a command must not have written to stderr."""
+    if any(line.startswith("Traceback") for line in lines):
+        return [f"{command}: traceback: {lines[-1][:200]}"]
+    strange = [line for line in lines if not _EXPECTED.search(line)]
+    found = [f"{command}: said {strange[0][:200]!r} and {len(strange) - 1} lines more"] if strange else []
+    if len(_messages(lines)) > 1:
+        found.append(f"{command}: {len(_messages(lines))} lines of errors")
+    return found + [f"{command}: a line of {len(line)}" for line in lines if len(line) > _LONGEST_LINE]
+
+
+def _disagreements(check: int, errors: list[str], run: int, refusals: list[str]) -> list[str]:
+    """Return what ``check`` and ``run`` do not say alike."""
+    if (check == BAD_INPUT) != (run == BAD_INPUT):
+        return [f"check ends with {check}, run with {run}: {(errors or refusals or ['nothing said'])[0][:200]}"]
+    if run == BAD_INPUT and refusals and refusals[0] not in errors:
+        return [f"run says {refusals[0][:150]!r}, check {errors[0][:150] if errors else 'nothing'!r}"]
+    return []
+
+
+@dataclass
+class Campaign:
+    """Many mutants, so and so many to a worker process.
+
+    Attributes:
+        seed: Which ones.
+        folder: Where they are written; those without problems are removed again.
+        sources: Stages that are spoiled.
+        batch: Mutants that one worker does before the next one starts.
+        fresh: Whether each command gets an interpreter of its own.
+        keep: Whether mutants without problems are kept, too.
+    """
+
+    seed: int
+    folder: Path
+    sources: list[Path]
+    batch: int = 1
+    fresh: bool = False
+    keep: bool = False
+
+    def verdicts(self, numbers: list[int]) -> Iterator[Verdict]:
+        """Yield what became of each of the mutants."""
+        left = list(numbers)
+        while left:
+            for verdict in self._worker(left[: self.batch]):
+                left.remove(verdict.number)
+                if not (verdict.problems or self.keep):
+                    shutil.rmtree(self.folder / f"{verdict.number:05}")
+                yield verdict
+
+    def _worker(self, numbers: list[int]) -> Iterator[Verdict]:
+        """Yield the verdicts of one worker; the last one is about its death if it dies."""
+        inward, outward = os.pipe()
+        process = os.fork()
+        if not process:
+            os.close(inward)
+            self._work(numbers, outward)
+        os.close(outward)
+        count, ended = 0, ""
+        with os.fdopen(inward, "rb") as results:
+            while count < len(numbers):
+                if not select.select([results], [], [], WALL_SECONDS)[0]:
+                    os.kill(process, signal.SIGKILL)
+                    ended = f"hung for {WALL_SECONDS} s"
+                    break
+                line = results.readline()
+                if not line:
+                    break
+                count += 1
+                yield Verdict(**json.loads(line))
+        _, status = os.waitpid(process, 0)
+        if count < len(numbers):
+            ended = ended or f"died of {signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else status}"
+            note = self.folder / f"{numbers[count]:05}" / "done.txt"
+            form, done = json.loads(note.read_text(encoding="utf-8")) if note.exists() else ("", "the mutator itself")
+            yield Verdict(numbers[count], form, done, problems=[ended])
+
+    def _work(self, numbers: list[int], outward: int) -> None:
+        """Be a worker, and never return."""
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        command = in_fresh_process if self.fresh else in_process
+        for number in numbers:
+            limit = int(time.process_time()) + CPU_SECONDS
+            resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
+            try:
+                verdict = judge(number, self.seed, self.folder, self.sources, command)
+            except BaseException:
+                verdict = Verdict(number, problems=[traceback.format_exc()])
+            os.write(outward, json.dumps(asdict(verdict)).encode() + b"\n")
+        os._exit(0)

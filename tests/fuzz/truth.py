@@ -1,0 +1,230 @@
+"""What an accepted stage says, read with plain USD, against what Newton's model and the written cache hold.
+
+Nothing of warpmag's own reader is used: bodies, poses, sizes, masses, frictions, gravity and moments are read again.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+
+WRITTEN = ("physics:velocity", "physics:angularVelocity", "warpmag:moment")
+DENSITY = 1000.0  # kg/m³: UsdPhysics where nobody gives one
+
+
+def differences(path: Path, output: Path, simulation) -> list[str]:
+    """Return where a run says other things than its stage; without the simulation, where its cache does."""
+    stage, result = Usd.Stage.Open(str(path)), Usd.Stage.Open(str(output))
+    reading = Reading(stage)
+    reading = Reading(stage)
+    found = [*not_finite(result), *_poses(reading, result), *_moments(reading, result)]
+    if simulation is not None:
+        found += [*_masses(reading, simulation), *_shapes(reading, simulation), *_gravity(reading, simulation)]
+    return found
+
+
+class Reading:
+    """A stage at its start, as plain USD reads it."""
+
+    def __init__(self, stage):
+        self.stage, self.time = stage, Usd.TimeCode(stage.GetStartTimeCode())
+        self.transforms = UsdGeom.XformCache(self.time)
+        self.prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+        self.bodies = self.enabled("physics:rigidBodyEnabled", "PhysicsRigidBodyAPI")
+        self.colliders = self.enabled("physics:collisionEnabled", "PhysicsCollisionAPI")
+
+    def get(self, prim, name, default=None):
+        """The value of an attribute at the start."""
+        attribute = prim.GetAttribute(name)
+        value = attribute.Get(self.time) if attribute else None
+        if value is None and attribute:  # blocked
+            value = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
+        return default if value is None else value
+
+    def enabled(self, switch, api) -> list:
+        return [one for one in self.prims if api in one.GetAppliedSchemas() and self.get(one, switch, True)]
+
+    def world(self, prim) -> np.ndarray:
+        return np.array(self.transforms.GetLocalToWorldTransform(prim))
+
+    def above(self, prim):
+        """The body that a prim moves with."""
+        while prim and prim not in self.bodies:
+            prim = prim.GetParent()
+        return prim or None
+
+    def volume(self, prim) -> float | None:
+        """Volume of a collider [m³], None where its approximation decides."""
+        matrix = self.world(prim)[:3, :3]
+        kind, scales = prim.GetTypeName(), np.linalg.norm(matrix, axis=1)
+        if kind in ("Capsule", "Cone", "Cylinder", "Sphere") and np.ptp(scales) > 1e-4 * scales.max():
+            return None
+        size, radius, height = (self.get(prim, name, 0.0) for name in ("size", "radius", "height"))
+        local = {
+            "Sphere": 4.0 / 3.0 * math.pi * radius**3,
+            "Cube": size**3,
+            "Cylinder": math.pi * radius**2 * height,
+            "Cone": math.pi * radius**2 * height / 3.0,
+            "Capsule": math.pi * radius**2 * (height + 4.0 / 3.0 * radius),
+        }.get(kind)
+        if kind == "Mesh" and self.get(prim, "physics:approximation", "none") in ("none", "convexHull"):
+            local = self.mesh_volume(prim)
+        return None if local is None else abs(local * np.linalg.det(matrix))
+
+    def mesh_volume(self, prim) -> float:
+        points = np.array(self.get(prim, "points"), dtype=float)
+        if self.get(prim, "physics:approximation", "none") == "convexHull":
+            from scipy.spatial import ConvexHull  # noqa: PLC0415
+
+            return ConvexHull(points).volume
+        total, place = 0.0, 0
+        indices = np.array(self.get(prim, "faceVertexIndices"))
+        for count in self.get(prim, "faceVertexCounts"):
+            face = points[indices[place : place + count]]
+            place += count
+            for k in range(1, count - 1):
+                total += face[0] @ np.cross(face[k], face[k + 1]) / 6.0
+        return total
+
+    def material(self, prim):
+        return UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+
+    def density(self, prim) -> float:
+        """Density of a collider [kg/m³]: its own, that of what it is part of, its material's, water's."""
+        one = prim
+        while one and not one.IsPseudoRoot():
+            if "PhysicsMassAPI" in one.GetAppliedSchemas() and (own := self.get(one, "physics:density", 0.0)) > 0.0:
+                return own
+            if one in self.bodies:
+                break
+            one = one.GetParent()
+        material = self.material(prim)
+        return (material and self.get(material, "physics:density", 0.0)) or DENSITY
+
+    def mass(self, body) -> float | None:
+        """Mass of a body [kg], None where shapes decide that are not known here."""
+        if (own := self.get(body, "physics:mass", 0.0)) > 0.0:
+            return own
+        total = 0.0
+        for one in self.colliders:
+            if self.above(one) == body:
+                own = self.get(one, "physics:mass", 0.0) if one != body else 0.0
+                volume = self.volume(one)
+                if volume is None and not own:
+                    return None
+                total += own or volume * self.density(one)
+        return total
+
+
+def not_finite(stage) -> list[str]:
+    """Return the attributes written by a run that hold numbers that are none."""
+    found = []
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        names = [name for name in prim.GetAuthoredPropertyNames() if name.endswith(":warpmag")]
+        for name in (*names, *(WRITTEN if names or prim.HasAttribute("warpmag:moment") else ())):
+            attribute = prim.GetAttribute(name)
+            for time in attribute.GetTimeSamples() if attribute else ():
+                value = attribute.Get(time)
+                numbers = (value.GetReal(), *value.GetImaginary()) if hasattr(value, "GetReal") else value
+                if not np.isfinite(np.array(numbers, dtype=float)).all():
+                    found.append(f"not finite: {attribute.GetPath()} at {time}")
+                    break
+    return found[:3]
+
+
+def _poses(reading, result):
+    """Compare the poses that the cache starts with."""
+    cache = UsdGeom.XformCache(Usd.TimeCode(result.GetStartTimeCode()))
+    for prim in reading.bodies:
+        given = reading.world(prim)
+        written = np.array(cache.GetLocalToWorldTransform(result.GetPrimAtPath(prim.GetPath())))
+        size = np.abs(given[3, :3]).max() + np.linalg.norm(given[:3, :3], axis=1).max()
+        if not np.abs(given - written).max() <= 1e-4 * size:
+            yield f"pose of {prim.GetPath()}: {np.abs(given - written).max():g} off"
+
+
+def _masses(reading, simulation):
+    model, numbers = simulation.model, simulation._scene.bodies
+    masses, inverses = model.body_mass.numpy(), model.body_inv_mass.numpy()
+    if set(numbers) != {str(prim.GetPath()) for prim in reading.bodies}:
+        yield f"bodies: {len(numbers)} in the model, {len(reading.bodies)} on the stage"
+        return
+    for prim in reading.bodies:
+        wanted, found = reading.mass(prim), masses[numbers[str(prim.GetPath())]]
+        if wanted is not None and not math.isclose(wanted, found, rel_tol=1e-3):
+            yield f"mass of {prim.GetPath()}: {found:g} for {wanted:g}"
+        if not (math.isfinite(found) and np.isfinite(inverses).all()):
+            yield f"mass of {prim.GetPath()} is {found}"
+
+
+def _shapes(reading, simulation):
+    """Compare sizes, friction and restitution of colliders."""
+    model = simulation.model
+    scales, mu = model.shape_scale.numpy(), model.shape_material_mu.numpy()
+    restitution = model.shape_material_restitution.numpy()
+    numbers = {label: index for index, label in enumerate(model.shape_label)}
+    for prim in reading.colliders:
+        index = numbers.get(str(prim.GetPath()))
+        if index is None:
+            if prim.IsA(UsdGeom.Gprim):
+                yield f"collider {prim.GetPath()} is not in the model"
+            continue
+        if prim.IsA(UsdGeom.Sphere):
+            wanted = reading.get(prim, "radius") * np.linalg.norm(reading.world(prim)[0, :3])
+            if not math.isclose(wanted, scales[index][0], rel_tol=1e-4):
+                yield f"radius of {prim.GetPath()}: {scales[index][0]:g} for {wanted:g}"
+        material = reading.material(prim)
+        if material and "PhysicsMaterialAPI" in material.GetAppliedSchemas():
+            for name, value in (("physics:dynamicFriction", mu[index]), ("physics:restitution", restitution[index])):
+                wanted = reading.get(material, name)
+                given = material.GetAttribute(name).HasAuthoredValue()
+                if given and not math.isclose(wanted, value, rel_tol=1e-5, abs_tol=1e-9):
+                    yield f"{name} of {prim.GetPath()}: {value:g} for {wanted:g}"
+
+
+def _gravity(reading, simulation):
+    scenes = [prim for prim in reading.prims if prim.IsA(UsdPhysics.Scene)]
+    if not scenes:
+        return
+    up = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0)}.get(UsdGeom.GetStageUpAxis(reading.stage), (0.0, 0.0, 1.0))
+    strength = reading.get(scenes[0], "physics:gravityMagnitude", -math.inf)
+    direction = np.array(reading.get(scenes[0], "physics:gravityDirection", (0.0, 0.0, 0.0)), dtype=float)
+    direction = direction / np.linalg.norm(direction) if direction.any() else -np.array(up)
+    wanted = direction * (9.81 if strength < 0.0 else strength)
+    found = simulation.model.gravity.numpy()[0]
+    if not np.allclose(wanted, found, rtol=1e-3, atol=1e-6):
+        yield f"gravity {found} for {wanted}"
+
+
+def _moments(reading, result):
+    """Compare the moments of permanent magnets at the end with how they stand then, and who is a magnet at all."""
+    end = Usd.TimeCode(result.GetEndTimeCode())
+    caches = [UsdGeom.XformCache(time) for time in (Usd.TimeCode(result.GetStartTimeCode()), end)]
+    for prim in reading.prims:
+        if "WarpmagMagnetAPI" not in prim.GetAppliedSchemas():
+            continue
+        written = result.GetPrimAtPath(prim.GetPath()).GetAttribute("warpmag:moment").Get(end)
+        if written is None:
+            yield f"no moment of {prim.GetPath()}"
+            continue
+        if reading.get(prim, "warpmag:kind", "inducible") != "permanent" or reading.get(prim, "warpmag:material"):
+            continue
+        whole = prim in reading.bodies
+        members = [one for one in reading.colliders if one == prim or (whole and reading.above(one) == prim)]
+        volumes = [reading.volume(one) for one in members]
+        if len(volumes) != 1 or None in volumes:  # several may overlap
+            continue
+        before, after = (_turn(one, result.GetPrimAtPath(prim.GetPath())) for one in caches)
+        given = np.array(reading.get(prim, "warpmag:magnetization", (0.0, 0.0, 0.0)), dtype=float) * volumes[0]
+        size = np.linalg.norm(given)
+        at_rest = np.abs(after - before).max() < 0.1  # a moment is that of the last substep, and a body may spin
+        apart = at_rest and np.linalg.norm(given @ after - written) > 0.2 * size
+        if apart or not math.isclose(size, np.linalg.norm(written), rel_tol=1e-3):
+            yield f"moment of {prim.GetPath()}: {np.array(written)} for {given @ after}"
+
+
+def _turn(cache, prim) -> np.ndarray:
+    """The axes of a prim in the world, as rows."""
+    matrix = np.array(cache.GetLocalToWorldTransform(prim))[:3, :3]
+    return matrix / np.linalg.norm(matrix, axis=1)[:, None]

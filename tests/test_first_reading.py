@@ -1,0 +1,97 @@
+"""Stages that USD's own reader dies of are read in a process of its own first."""
+
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+from pxr import Sdf
+
+from warpmag.errors import InputError
+from warpmag.usd import first_reading, open_stage
+
+HEAD = "#usda 1.0\n"
+NESTED = {
+    "prims": 'def "x" {\n' * 100_000 + "}\n" * 100_000,
+    "dictionaries": "(customLayerData = " + "{ dictionary a = " * 100_000 + "{}" + "}" * 100_000 + ")\n",
+    "numbers": 'def "x" { float3 a = ' + "(" * 100_000 + ")" * 100_000 + "}\n",
+}
+
+
+def crate(path):
+    """A small binary stage, and a longer one that it takes some of its content from."""
+    layer = Sdf.Layer.CreateNew(str(path))
+    Sdf.CreatePrimInLayer(layer, "/World").specifier = Sdf.SpecifierDef
+    layer.Save()
+    return path
+
+
+@pytest.mark.parametrize("case", NESTED)
+def test_what_overflows_the_stack_of_usd_is_refused(tmp_path, case):
+    path = tmp_path / "deep.usda"
+    path.write_text(HEAD + NESTED[case])
+    with pytest.raises(InputError, match="deep.usda: brackets are nested more than 5000 deep"):
+        open_stage(path)
+
+
+def test_usd_dies_of_it_otherwise(tmp_path):
+    path = tmp_path / "deep.usda"
+    path.write_text(HEAD + NESTED["dictionaries"])
+    program = f"from pxr import Sdf\nSdf.Layer.OpenAsAnonymous({str(path)!r})"
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode < 0
+
+
+def test_what_dies_in_a_layer_below_is_one_line(tmp_path):
+    (tmp_path / "below.usda").write_text(HEAD + NESTED["dictionaries"])
+    path = tmp_path / "stage.usda"
+    path.write_text(HEAD + "(subLayers = [@./below.usda@])\n")
+    with pytest.raises(InputError, match="stage.usda: USD's reader dies of it .SIGSEGV.") as caught:
+        open_stage(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_nested_text_is_read(tmp_path):
+    path = tmp_path / "stage.usda"
+    path.write_text(HEAD + 'def "x" {\n' * 1000 + "}\n" * 1000)
+    stage = open_stage(path)
+    assert sum(1 for _ in stage.TraverseAll()) == 1000
+
+
+def test_a_binary_stage_is_read(tmp_path):
+    assert open_stage(crate(tmp_path / "stage.usdc")).GetPrimAtPath("/World")
+
+
+@pytest.mark.parametrize("name", ["stage.usdc", "stage.usd", "stage.usdz"])
+def test_a_damaged_binary_stage_is_one_line(tmp_path, capfd, name):
+    content = crate(tmp_path / "whole.usdc").read_bytes()
+    path = tmp_path / name
+    path.write_bytes(content[: len(content) * 2 // 3])
+    with pytest.raises(InputError, match=f"{name}: not a USD file") as caught:
+        open_stage(path)
+    assert "\n" not in str(caught.value) and capfd.readouterr().err == ""
+
+
+def test_a_reader_that_does_not_end(tmp_path, monkeypatch):
+    """A pipe that nobody writes to, as a file that takes for ever."""
+    endless = tmp_path / "below.usdc"
+    os.mkfifo(endless)
+    path = tmp_path / "stage.usda"
+    path.write_text(HEAD + "(subLayers = [@./below.usdc@])\n")
+    monkeypatch.setattr(first_reading, "_SECONDS", 1.0)
+    began = time.monotonic()
+    with pytest.raises(InputError, match="stage.usda: USD did not read it within 1 s"):
+        open_stage(path)
+    assert time.monotonic() - began < 30.0
+
+
+def test_without_an_interpreter_it_is_read_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
+    assert open_stage(crate(tmp_path / "stage.usdc")).GetPrimAtPath("/World")
+
+
+def test_text_that_is_no_text(tmp_path):
+    path = tmp_path / "stage.usda"
+    path.write_bytes(HEAD.encode() + b'def "\xff\xfe" {}\n')
+    with pytest.raises(InputError, match="stage.usda: not a USD file"):
+        open_stage(path)

@@ -1,0 +1,97 @@
+"""Reads a stage once in a process of its own, because USD's reader may take its process with it.
+
+Of damaged binary files it crashes now and then, or asks for all of the memory there is; text nested a hundred thousand
+deep overflows its stack. A single text file that is nested no deeper than others is read without: it costs a quarter of
+a second.
+
+This file is also what that process runs, without importing anything of warpmag.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from itertools import accumulate
+from pathlib import Path
+
+DEEPEST = 5_000
+"""Brackets within brackets of a text: a main thread's stack holds some 40,000."""
+FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError)
+"""What USD raises over a stage; its own errors are of the first kind."""
+_SECONDS, _BYTES_PER_SECOND = 30.0, 1e7
+_OPENING, _CLOSING = b"{[(", b"}])"
+_OTHERS = bytes(set(range(256)) - {*_OPENING, *_CLOSING})
+
+
+def first_reading(path: str | os.PathLike) -> str:
+    """Return why USD cannot read a stage, if it dies of that or says so; empty where it can be read here.
+
+    Args:
+        path: A file that exists.
+    """
+    content = Path(path).read_bytes()
+    if content.startswith(b"#usda"):
+        if _depth(content) > DEEPEST:
+            return f"brackets are nested more than {DEEPEST} deep"
+        if b"@" not in content:  # no other file
+            return ""
+    command = [sys.executable, "-S", "-E", __file__, json.dumps(sys.path), str(path)]
+    limit = _SECONDS + len(content) / _BYTES_PER_SECOND
+    del content
+    try:
+        done = subprocess.run(command, capture_output=True, check=False, timeout=limit)
+    except subprocess.TimeoutExpired:
+        return f"USD did not read it within {limit:.0f} s"
+    except OSError:  # no interpreter to start: an application with Python inside
+        return ""
+    if done.returncode < 0:
+        return f"USD's reader dies of it ({signal.Signals(-done.returncode).name})"
+    with contextlib.suppress(ValueError):
+        return str(json.loads(done.stdout))
+    return ""
+
+
+def _depth(text: bytes) -> int:
+    """Return how deep brackets lie in brackets, those in strings among them."""
+    steps = (1 if one in _OPENING else -1 for one in text.translate(None, _OTHERS))
+    return max(accumulate(steps), default=0)
+
+
+def failure(error: Exception) -> str:
+    """Return the first thing that an error raised by USD says, on one line."""
+    if not isinstance(error, UnicodeDecodeError):
+        with contextlib.suppress(UnicodeDecodeError):  # it may quote the file
+            said = getattr(error.args[0], "commentary", error.args[0]) if error.args else ""
+            return (str(said).strip().splitlines() or [type(error).__name__])[0]
+    return "text that is not UTF-8"
+
+
+def _read(path: str) -> str:
+    """Read a stage with all of its layers to the last value; return why that fails, empty where it does not."""
+    from pxr import Sdf, Usd  # noqa: PLC0415 - only the child needs it
+
+    try:
+        stage = Usd.Stage.Open(path)
+        for layer in stage.GetUsedLayers():
+            Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
+    except FAILURES as error:
+        return f"not a USD file ({failure(error)})"
+    return ""
+
+
+def _limit_memory() -> None:
+    """Let the process have half of the machine's memory at most."""
+    import resource  # noqa: PLC0415 - not everywhere
+
+    half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    resource.setrlimit(resource.RLIMIT_AS, (half, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+if __name__ == "__main__":
+    sys.path[:] = json.loads(sys.argv[1])
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        _limit_memory()
+    print(json.dumps(_read(sys.argv[2])))
