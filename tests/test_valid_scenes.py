@@ -10,6 +10,7 @@ from pxr import Usd
 import warpmag
 from warpmag import cli
 from warpmag.engine.simulation import Simulation
+from warpmag.errors import SimulationError
 from warpmag.usd import check
 
 G = 9.81  # m/s²
@@ -356,3 +357,34 @@ def test_a_solver_that_needs_articulations_names_the_joint(device, tmp_path):
     path = write(tmp_path, physics(), A, B, CHAIN[0])
     with pytest.raises(warpmag.InputError, match="/World/AB: a joint outside all articulations, which the solver stee"):
         Simulation(path, device=device, solver="steel")
+
+
+BOXES = (
+    ((0, 0, 0.01), (0.02, 0.005, 0.003)),
+    ((-0.008, 0, 0), (0.003, 0.005, 0.02)),
+    ((0, 0, -0.01), (0.01, 0.005, 0.003)),
+)
+
+
+def letter(name):
+    boxes = "".join(
+        f"""def Cube "Box{k}" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {{
+    double size = 1
+    double3 xformOp:translate = {place}
+    float3 xformOp:scale = {size}
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+}}
+"""
+        for k, (place, size) in enumerate(BOXES)
+    )
+    return f"""def Xform "{name}" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "WarpmagMagnetAPI"]) {{
+    {boxes}
+}}
+"""
+
+
+def test_two_letters_at_one_place_end_in_a_line_that_says_why(device, tmp_path):
+    simulation = Simulation(write(tmp_path, physics(0.0), letter("A"), letter("B")), device=device)
+    assert any("overlap at the start" in line for line in simulation.warnings())
+    with pytest.raises(SimulationError, match="has left all finite numbers; bodies overlapped at the start"):
+        advance(simulation, 0.2)

@@ -111,7 +111,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
     verdict.problems += _disagreements(verdict.check, errors, verdict.run, refusals)
     if verdict.run == BAD_INPUT and output.exists():
         verdict.problems.append("a refused run wrote")
-    if verdict.run == FAILED and "overlap at the start" not in verdict.line:
+    if verdict.run == FAILED and "overlapped at the start" not in verdict.line:
         verdict.problems.append(f"failed: {verdict.line}")
     if verdict.run == OK:
         verdict.problems += differences(path, output, simulations[-1] if simulations else None)

@@ -234,8 +234,8 @@ class Simulation:
         except SimulationError as error:
             if not self._statistics.overlapping:
                 raise
-            reason = "bodies overlap at the start, and what pushes them apart may turn them without bounds"
-            raise SimulationError(f"{error}: {self._statistics.overlapping} pairs of {reason}") from None
+            cause = "bodies overlapped at the start, and pushing them apart may turn them faster and faster"
+            raise SimulationError(f"{error}; {cause}") from None
 
     def _positions(self) -> np.ndarray:
         return self.state.body_q.numpy()[self._moving, :3].astype(float)

@@ -14,13 +14,13 @@ import signal
 import subprocess
 import sys
 from itertools import accumulate
-from pathlib import Path
 
 DEEPEST = 5_000
 """Brackets within brackets of a text: a main thread's stack holds some 40,000."""
 FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError)
 """What USD raises over a stage; its own errors are of the first kind."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 1e7
+_TEXT = b"#usda"
 _OPENING, _CLOSING = b"{[(", b"}])"
 _OTHERS = bytes(set(range(256)) - {*_OPENING, *_CLOSING})
 
@@ -31,15 +31,21 @@ def first_reading(path: str | os.PathLike) -> str:
     Args:
         path: A file that exists.
     """
-    content = Path(path).read_bytes()
-    if content.startswith(b"#usda"):
+    try:
+        with open(path, "rb") as file:
+            content = file.read(len(_TEXT))
+            size = os.fstat(file.fileno()).st_size
+            if content == _TEXT:
+                content += file.read()
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    if content.startswith(_TEXT):
         if _depth(content) > DEEPEST:
             return f"brackets are nested more than {DEEPEST} deep"
         if b"@" not in content:  # no other file
             return ""
-    command = [sys.executable, "-S", "-E", __file__, json.dumps(sys.path), str(path)]
-    limit = _SECONDS + len(content) / _BYTES_PER_SECOND
-    del content
+    command = [sys.executable or "", "-S", "-E", __file__, json.dumps(sys.path), str(path)]
+    limit = _SECONDS + size / _BYTES_PER_SECOND
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=limit)
     except subprocess.TimeoutExpired:
