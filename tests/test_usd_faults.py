@@ -246,5 +246,8 @@ def test_what_newton_raises_or_leaves_out_is_one_line():
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="cannot import all of it .Skipping collider /A"), refusals("s.usda", "import"):
         warnings.warn("Skipping collider /A: no volume", stacklevel=1)
+    with pytest.raises(InputError, match="expected 6. Ignoring"), refusals("s.usda", "import"):
+        warnings.warn("newton:inertia has 1 elements, expected 6. Ignoring.", stacklevel=1)
     with refusals("s.usda", "import"):
         warnings.warn("a remark", stacklevel=1)
+        warnings.warn("mass is authored, too. Ignoring body-level density.", stacklevel=1)

@@ -231,7 +231,7 @@ def empty(layer, prims, chance) -> str:
             del layer.rootPrims[one.name]
     elif kind == 1:
         for key in layer.pseudoRoot.ListInfoKeys():
-            if key not in ("primChildren", "subLayers"):
+            if key not in ("primChildren", "subLayers", "subLayerOffsets"):
                 layer.pseudoRoot.ClearInfo(key)
     else:
         for one in {path for path in prims if layer.GetPrimAtPath(path).typeName == "PhysicsScene"}:

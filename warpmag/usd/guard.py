@@ -9,7 +9,7 @@ from warpmag.errors import InputError
 from warpmag.usd.first_reading import FAILURES, failure
 from warpmag.usd.values import quiet
 
-_LOSSES = re.compile(r"[Ss]kipp|Invalid|Ignoring (?!body-level density)|unspecified|zero mass|not imported|result\.")
+_LOSSES = re.compile(r"[Ss]kipp|Invalid|Ignoring(?! body-level density)|unspecified|zero mass|not imported|result\.")
 """What a warning says by which something of the stage is lost; the others are remarks."""
 
 
