@@ -251,3 +251,15 @@ def test_what_newton_raises_or_leaves_out_is_one_line():
     with refusals("s.usda", "import"):
         warnings.warn("a remark", stacklevel=1)
         warnings.warn("mass is authored, too. Ignoring body-level density.", stacklevel=1)
+
+
+def test_what_no_schema_asks_for_is_a_warning(tmp_path):
+    body = ball("float physics:mass = 2").replace('"PhysicsMassAPI", ', "")
+    body += 'def Material "Rubber"\n{\nfloat physics:density = 900\nfloat physics:restitution = 0.5\n}\n'
+    findings = survey(open_stage(write(tmp_path, body))).findings
+    assert {one.severity for one in findings} == {"warning"}
+    assert [str(one) for one in findings] == [
+        "/Ball: physics:mass has no effect: the prim has no PhysicsMassAPI",
+        "/Rubber: physics:density has no effect: the prim has no PhysicsMassAPI or PhysicsMaterialAPI",
+        "/Rubber: physics:restitution has no effect: the prim has no PhysicsMaterialAPI",
+    ]

@@ -100,16 +100,21 @@ class Reading:
                 break
             one = one.GetParent()
         material = self.material(prim)
-        return (material and self.get(material, "physics:density", 0.0)) or DENSITY
+        given = material and "PhysicsMaterialAPI" in material.GetAppliedSchemas()
+        return (given and self.get(material, "physics:density", 0.0)) or DENSITY
+
+    def own_mass(self, prim) -> float:
+        """Mass that a prim gives itself [kg], 0 where it does not."""
+        return self.get(prim, "physics:mass", 0.0) if "PhysicsMassAPI" in prim.GetAppliedSchemas() else 0.0
 
     def mass(self, body) -> float | None:
         """Mass of a body [kg], None where shapes decide that are not known here."""
-        if (own := self.get(body, "physics:mass", 0.0)) > 0.0:
+        if own := self.own_mass(body):
             return own
         total = 0.0
         for one in self.colliders:
             if self.above(one) == body:
-                own = self.get(one, "physics:mass", 0.0) if one != body else 0.0
+                own = self.own_mass(one)
                 volume = self.volume(one)
                 if volume is None and not own:
                     return None

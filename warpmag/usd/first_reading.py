@@ -15,7 +15,7 @@ import subprocess
 import sys
 from itertools import accumulate
 
-DEEPEST = 5_000
+DEEPEST_NESTING = 5_000
 """Brackets within brackets of a text: a main thread's stack holds some 40,000."""
 FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError)
 """What USD raises over a stage; its own errors are of the first kind."""
@@ -40,8 +40,8 @@ def first_reading(path: str | os.PathLike) -> str:
     except OSError as error:
         return f"cannot be read ({error.strerror})"
     if content.startswith(_TEXT):
-        if _depth(content) > DEEPEST:
-            return f"brackets are nested more than {DEEPEST} deep"
+        if _depth(content) > DEEPEST_NESTING:
+            return f"brackets are nested more than {DEEPEST_NESTING} deep"
         if b"@" not in content:  # no other file
             return ""
     command = [sys.executable or "", "-S", "-E", __file__, json.dumps(sys.path), str(path)]

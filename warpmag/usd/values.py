@@ -63,6 +63,12 @@ _SHAPES = {
     "Mesh": ("points", "faceVertexCounts", "faceVertexIndices", "orientation", "subdivisionScheme", "holeIndices"),
 }
 _VECTORS = (Gf.Vec3f, Gf.Vec3d, Gf.Vec3h, Gf.Vec3i)
+_OF_SCHEMAS = (
+    *("physics:mass", "physics:density", "physics:centerOfMass", "physics:diagonalInertia", "physics:principalAxes"),
+    *("physics:staticFriction", "physics:dynamicFriction", "physics:restitution"),
+    *("physics:velocity", "physics:angularVelocity", "physics:kinematicEnabled"),
+)
+"""What counts only where its schema is applied, one of the first few below."""
 _SCHEMAS = (
     *("PhysicsMassAPI", "PhysicsMaterialAPI", "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"),
     *("NewtonSceneAPI", "NewtonMaterialAPI", "NewtonMeshCollisionAPI", "NewtonCollisionAPI"),
@@ -150,6 +156,9 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
             yield finding_of(str(prim.GetPath()), error)
         if finding := instance_finding(attribute):
             yield finding
+        if name in _OF_SCHEMAS and name not in prim.GetPrimDefinition().GetPropertyNames():
+            schemas = " or ".join(one for one in _SCHEMAS[:4] if name in _defaults(one))
+            yield Finding(str(prim.GetPath()), f"{name} has no effect: the prim has no {schemas}", "warning")
 
 
 def instance_finding(attribute: Usd.Attribute) -> Finding | None:
@@ -211,13 +220,15 @@ def declared(attribute: Usd.Attribute):
 @cache
 def _known() -> dict[str, object]:
     """Defaults of what Newton reads by name alone, applied schema or not."""
-    registry = Usd.SchemaRegistry()
-    found = {}
-    for schema in _SCHEMAS:
-        definition = registry.FindAppliedAPIPrimDefinition(schema)
-        for name in definition.GetPropertyNames() if definition else ():
-            found[name] = definition.GetAttributeFallbackValue(name)
-    return found
+    return {name: value for schema in _SCHEMAS for name, value in _defaults(schema).items()}
+
+
+@cache
+def _defaults(schema: str) -> dict[str, object]:
+    """Attributes of an applied schema and their defaults."""
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema)
+    names = definition.GetPropertyNames() if definition else ()
+    return {name: definition.GetAttributeFallbackValue(name) for name in names}
 
 
 def _expected(prim, attribute):
