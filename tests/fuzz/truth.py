@@ -60,14 +60,15 @@ class Reading:
         kind, scales = prim.GetTypeName(), np.linalg.norm(matrix, axis=1)
         if kind in ("Capsule", "Cone", "Cylinder", "Sphere") and np.ptp(scales) > 1e-4 * scales.max():
             return None
-        size, radius, height = (self.get(prim, name, 0.0) for name in ("size", "radius", "height"))
-        local = {
-            "Sphere": 4.0 / 3.0 * math.pi * radius**3,
-            "Cube": size**3,
-            "Cylinder": math.pi * radius**2 * height,
-            "Cone": math.pi * radius**2 * height / 3.0,
-            "Capsule": math.pi * radius**2 * (height + 4.0 / 3.0 * radius),
-        }.get(kind)
+        size, radius, height = (np.float64(self.get(prim, name, 0.0)) for name in ("size", "radius", "height"))
+        with np.errstate(over="ignore", invalid="ignore"):  # sizes that are not this kind's
+            local = {
+                "Sphere": 4.0 / 3.0 * math.pi * radius**3,
+                "Cube": size**3,
+                "Cylinder": math.pi * radius**2 * height,
+                "Cone": math.pi * radius**2 * height / 3.0,
+                "Capsule": math.pi * radius**2 * (height + 4.0 / 3.0 * radius),
+            }.get(kind)
         if kind == "Mesh" and self.get(prim, "physics:approximation", "none") in ("none", "convexHull"):
             local = self.mesh_volume(prim)
         return None if local is None else abs(local * np.linalg.det(matrix))
@@ -88,7 +89,10 @@ class Reading:
         return total
 
     def material(self, prim):
-        return UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+        """The material that is bound to a collider where the schema of bindings is applied, too."""
+        bound, relationship = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
+        valid = relationship and "MaterialBindingAPI" in relationship.GetPrim().GetAppliedSchemas()
+        return bound.GetPrim() if valid else None
 
     def density(self, prim) -> float:
         """Density of a collider [kg/m³]: its own, that of what it is part of, its material's, water's."""
