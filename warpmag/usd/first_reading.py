@@ -1,8 +1,8 @@
 """Reads a stage once in a process of its own, because USD's reader may take its process with it.
 
-Text nested 100,000 deep overflows its stack; a damaged binary file, one of 1,800 in which random bytes were changed, made
-it take all the memory there is for minutes. A single text file that is not nested that deep is read at once: a process
-of its own costs a quarter of a second.
+Text nested 100,000 deep overflows its stack; a binary file, one of 1,800 in which bytes were changed at random, made it
+take all the memory there is for minutes. A single text file that is not nested that deep is read at once: a process of
+its own costs a quarter of a second.
 
 This file is also what that process runs, without importing anything of warpmag.
 """
