@@ -236,6 +236,11 @@ def test_all_problems_are_found(tmp_path):
         ("syntax.usda", b'#usda 1.0\ndef Xform "A" { oops }', "not a USD file"),
         ("broken.usda", b'#usda 1.0\ndef Xform "A" (references = @./nothing.usda@) { }', "nothing.usda"),
         ("hollow.usda", b"#usda 1.0\n(subLayers = [@./nothing.usda@])", "nothing.usda"),
+        (
+            "circle.usda",
+            b'#usda 1.0\ndef "A" {\ndef "B" (references = </A>) {}\n}',
+            "circle.usda@</A/B> CANNOT reference",
+        ),
     ],
 )
 def test_files_that_do_not_open(tmp_path, capfd, name, content, message):

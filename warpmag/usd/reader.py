@@ -6,6 +6,7 @@ it: values by ``values.py``, transforms by ``transforms.py``, sizes and meshes b
 """
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,9 @@ from warpmag.usd.guard import readable
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
 from warpmag.usd.values import Finding, attribute_findings, check_type, declared, finding_of, quiet
+
+_SESSION = re.compile(r",@anon:[^@]*@")
+"""How USD names a stage's session layer, by an address that is another one each time."""
 
 
 @dataclass
@@ -70,7 +74,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     except FAILURES as error:
         raise InputError(f"{path}: not a USD file ({failure(error)})") from None
     if broken:
-        raise InputError(f"{path}: {' '.join(broken[0].split())}")
+        raise InputError(f"{path}: {' '.join(_SESSION.sub('', broken[0]).split())}")
     with readable(str(path)):
         hold(stage, start_of(stage) if time_code is None else time_code)
     return stage
