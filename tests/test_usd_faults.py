@@ -244,6 +244,9 @@ def test_what_newton_raises_or_leaves_out_is_one_line():
         ):
             raise error
         assert "\n" not in str(caught.value)
+    with pytest.raises(InputError) as caught, refusals("s.usda", "import"):
+        Usd.Stage.CreateInMemory().DefinePrim("no path")
+    assert str(caught.value).startswith("s.usda: Newton cannot import it (") and "pxrInternal" not in str(caught.value)
     with pytest.raises(InputError, match="cannot import all of it .Skipping collider /A"), refusals("s.usda", "import"):
         warnings.warn("Skipping collider /A: no volume", stacklevel=1)
     with pytest.raises(InputError, match="expected 6. Ignoring"), refusals("s.usda", "import"):

@@ -5,6 +5,8 @@ import re
 import warnings
 from collections.abc import Iterator
 
+from pxr import Tf
+
 from warpmag.errors import InputError
 from warpmag.usd.first_reading import FAILURES, failure
 from warpmag.usd.values import quiet
@@ -28,7 +30,8 @@ def refusals(where: str, what: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # of any kind: nothing of Newton's or Warp's is to reach the user as a traceback
-        raise InputError(f"{where}: Newton cannot {what} it ({_line(error) or type(error).__name__})") from None
+        said = failure(error) if isinstance(error, Tf.ErrorException) else _line(error)
+        raise InputError(f"{where}: Newton cannot {what} it ({said or type(error).__name__})") from None
     for one in caught:
         if _LOSSES.search(_line(one.message)):
             raise InputError(f"{where}: Newton cannot {what} all of it ({_line(one.message)})")
