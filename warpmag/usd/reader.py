@@ -8,7 +8,6 @@ it: values by ``values.py``, transforms by ``transforms.py``, sizes and meshes b
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
@@ -16,6 +15,7 @@ from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings
+from warpmag.usd.paths import full_path, usable_path
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
 from warpmag.usd.values import Finding, attribute_findings, check_type, declared, finding_of, quiet
@@ -57,11 +57,12 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     Raises:
         InputError: The file is missing, is not USD or does not compose.
     """
-    if not Path(path).is_file():
+    file = usable_path(path)
+    if not os.path.isfile(file):
         raise InputError(f"{path}: no such file")
     try:
         with quiet():  # what USD has to say goes into the error
-            stage = Usd.Stage.Open(str(path))
+            stage = Usd.Stage.Open(str(full_path(file)))
             broken = [str(error) for error in stage.GetCompositionErrors()]
     except Tf.ErrorException as error:
         # USD ends its list with "failed to open", the reasons stand before it.
