@@ -29,7 +29,7 @@ OWNERS = {
     "warp": (
         "warpmag/engine",
         "warpmag/cli.py",
-        *(f"warpmag/{name}.py" for name in ("arrays", "dynamics", "fields", "induction", "system")),
+        *(f"warpmag/{name}.py" for name in ("arrays", "dynamics", "fields", "induction", "snapshot", "system")),
     ),
 }
 """What of ``warpmag/`` may import a library."""

@@ -3,16 +3,18 @@
 import argparse
 import contextlib
 import os
+import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 from warpmag.errors import InputError, SimulationError
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, check_rtol
 
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
-"""Exit codes; 0 where all went well."""
+BAD_INPUT, FAILED, STOPPED = 2, 1, 128
+"""Exit codes; 0 where all went well, ``STOPPED`` and the signal's number where a signal ended it."""
 
 _SOLVERS = ("xpbd", "steel", "mujoco", "semi-implicit", "featherstone")
 _VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
@@ -26,20 +28,82 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
+class _Stopped(KeyboardInterrupt):
+    """A signal that ends the command."""
+
+    def __init__(self, number: int):
+        self.number = number
+        super().__init__("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
+    _open_standard_files()
     try:
-        options = _parser().parse_args(arguments)
-        return options.command(options)
+        with _signals_raised():
+            options = _parser().parse_args(arguments)
+            code = options.command(options)
+            sys.stdout.flush()
+            return code
     except InputError as error:
-        print(f"warpmag: {error}", file=sys.stderr)
+        _tell(error)
         return BAD_INPUT
     except SimulationError as error:
-        print(f"warpmag: {error}", file=sys.stderr)
+        _tell(error)
         return FAILED
-    except KeyboardInterrupt:
-        print("warpmag: interrupted", file=sys.stderr)
-        return INTERRUPTED
+    except _Stopped as stopped:
+        _tell(stopped)
+        return STOPPED + stopped.number
+    except BrokenPipeError:
+        _tell("nobody reads the standard output any more")
+        _silence(1)
+        return STOPPED + signal.SIGPIPE
+
+
+def _open_standard_files() -> None:
+    """Put something in the place of standard files that are closed, or files of a run would take their numbers."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w" if number else "r", encoding="utf-8"))
+
+
+@contextlib.contextmanager
+def _signals_raised() -> Iterator[None]:
+    """Raise :class:`_Stopped` for signals that would end the process; those that are ignored stay so."""
+
+    def stop(number, _):
+        raise _Stopped(number)
+
+    ends = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: handler for number, handler in ends.items() if signal.getsignal(number) == handler}
+    for number in before:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _tell(what) -> None:
+    """Print a line on stderr, if somebody reads it."""
+    try:
+        print(f"warpmag: {what}", file=sys.stderr, flush=True)
+    except OSError:
+        _silence(2)
+
+
+def _silence(descriptor: int) -> None:
+    """Drop what goes to a standard file, also what Python writes there when it ends."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, descriptor)
+    os.close(nothing)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -50,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
     run.add_argument("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
     run.add_argument("--frames", type=int, metavar="N", help="output frames to simulate (default: those of the stage)")
+    run.add_argument("--resume", action="store_true", help="go on with the run at the output, if there is one")
     run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     run.add_argument("--solver", choices=_SOLVERS, default=_SOLVERS[0], help="rigid-body solver (default: %(default)s)")
     run.add_argument(
@@ -96,13 +161,15 @@ def _scenes(options) -> int:
 def _find_scene(name: str) -> tuple[Path, bool]:
     """Return the file of a scene and whether it is a bundled one."""
     from warpmag.scenes_usd import bundled  # noqa: PLC0415
+    from warpmag.usd import usable_path  # noqa: PLC0415
 
     scenes = bundled()
-    if name in scenes and not Path(name).is_file():
+    path = usable_path(name)
+    if name in scenes and not os.path.isfile(path):
         return scenes[name], True
-    if not Path(name).exists() and not Path(name).suffix:
+    if not os.path.exists(path) and not path.suffix:
         raise InputError(f"{name}: no such file and no bundled scene (there are {', '.join(scenes)})")
-    return Path(name), False
+    return path, False
 
 
 def _check(options) -> int:
@@ -186,15 +253,18 @@ def _run(options) -> int:
         return _show(viewer, simulation)
 
     try:
-        statistics = simulation.run(progress.frames, output=output, copy_scene=is_bundled, on_frame=show)
-    except KeyboardInterrupt:
-        progress.close()
-        if progress.done is None:
-            raise
-        print(f"warpmag: interrupted, {output} has the frames up to {progress.done}", file=sys.stderr)
-        return INTERRUPTED
+        statistics = simulation.run(
+            progress.frames, output=output, copy_scene=is_bundled, resume=options.resume, on_frame=show
+        )
+    except (KeyboardInterrupt, InputError, SimulationError) as end:
+        if progress.done is not None:
+            end.args = (f"{end}, {output} has the frames up to {progress.done}",)
+        raise
     finally:
         progress.close()
+    if progress.done is None:
+        print(f"complete       {output} has all {progress.frames} frames already")
+        return 0
     for line in statistics.summary():
         print(line)
     print(f"written        {output}")
@@ -206,7 +276,7 @@ def _run(options) -> int:
 
 def _warn(lines: list[str]) -> None:
     for line in lines:
-        print(f"warpmag: warning: {line}", file=sys.stderr)
+        _tell(f"warning: {line}")
 
 
 class _Progress:
@@ -218,18 +288,34 @@ class _Progress:
 
     def show(self, frame: int) -> None:
         """Show that ``frame`` is done."""
+        self.done = frame
+        try:
+            self._draw(frame)
+        except OSError:  # nobody reads it any more, which is no reason to end the run
+            _silence(2)
+
+    def _draw(self, frame: int) -> None:
         if self._bar is None:
             from tqdm import tqdm  # noqa: PLC0415
 
             interval = 0.2 if sys.stderr.isatty() else 10.0
-            self._bar = tqdm(total=self.frames, unit="frame", mininterval=interval, file=sys.stderr, dynamic_ncols=True)
+            self._bar = tqdm(
+                total=self.frames,
+                initial=frame,
+                unit="frame",
+                mininterval=interval,
+                file=sys.stderr,
+                dynamic_ncols=True,
+            )
         self._bar.update(frame - self._bar.n)
-        self.done = frame
 
     def close(self) -> None:
         """Leave the bar as it is."""
-        if self._bar is not None:
-            self._bar.close()
+        try:
+            if self._bar is not None:
+                self._bar.close()
+        except OSError:
+            _silence(2)
 
 
 def _open_viewer(name: str, simulation):

@@ -1,9 +1,10 @@
 """Magnetization dynamics: how inducible moments move from a field evaluation towards equilibrium.
 
-This is the one place where a dynamics is chosen. Each is an object with the same four methods, all of which only launch
-kernels: ``start`` begins a solve in the applied field, ``refine`` improves the moments by the field of their neighbours
-before the whole field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the magnetizations of the
-next start. They work on the state of a solve (``kernels.induction.solve_state``), bound to its moments.
+This is the one place where a dynamics is chosen. Each is an object with the same methods, which only launch kernels:
+``start`` begins a solve in the applied field, ``refine`` improves the moments by the field of their neighbours before
+the whole field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the magnetizations of the next
+start; ``carried`` says what they remember from one solve to the next. They work on the state of a solve
+(``kernels.induction.solve_state``), bound to its moments.
 """
 
 from functools import cached_property
@@ -27,6 +28,10 @@ class ThetaFlow:
     def __init__(self, state):
         """Move the moments of ``state``."""
         self._state = state
+
+    def carried(self) -> dict:
+        """Return the arrays of its own that one solve hands on to the next one, by name."""
+        return {}
 
     @cached_property
     def _launches(self) -> theta_flow.Launches:
@@ -65,6 +70,10 @@ class SubmagnetizationPairs:
         self._state = state
         self._pairs = submagnetization.make_pairs(state, law, step, 1.0 / damping if law == "llg" else 0.0)
         self.first, self.second = self._pairs.first, self._pairs.second
+
+    def carried(self) -> dict:
+        """Return the arrays of its own that one solve hands on to the next one, by name."""
+        return {"first": self.first, "second": self.second}
 
     def set_pairs(self, first, second):
         """Start the next solve from given directions of M1 and M2, NumPy arrays of unit vectors, shape [n, 3]."""

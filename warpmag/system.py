@@ -283,6 +283,15 @@ class MomentSystem:
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
         self.dynamics.start_from(magnetizations)
 
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays that one solve hands on to the next one, by name: with them in place it goes on alike."""
+        parts = {"induction": solve_state.carried_arrays(self._induction), "pairs": self._packed.carried()}
+        parts["dynamics"] = self.dynamics.carried()
+        if self._near is not None:
+            parts["near"] = self._near.carried()
+        inner = {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
+        return {"moments": self.moments, **inner}
+
     def solve(self):
         """Launch the induction solve: inducible ``moments`` in equilibrium with the field at ``positions``."""
         self.begin()

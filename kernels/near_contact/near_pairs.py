@@ -81,6 +81,8 @@ _LAST = 2 * SWEEPS
 _ROWS = dict(
     PAIR_ROWS=8, PAIR_SLOPE_ROWS=2, CONDUCTANCE_ROWS=17, CONDUCTANCE_SLOPE_ROWS=14, STATE_ROWS=16, KEPT_ROWS=24
 )  # fmt: skip
+_WARM = ("state", "last_state", "sources")
+"""Arrays that sweeps go on from."""
 _BALLS_PER_THREAD = 500
 """Balls that make another thread of a CPU worth its start."""
 _LEAST, _MOST = 0.4, 4.0
@@ -158,8 +160,12 @@ class NearContactBuffers:
 
     def forget(self):
         """Start cold, from no contact sources."""
-        for name in ("state", "last_state", "sources"):
+        for name in _WARM:
             self.arrays[name].zero_()
+
+    def carried(self) -> dict:
+        """Return the arrays that one solve hands on to the next one, by name."""
+        return neighbors.carried_lists(self.lists) | {name: self.arrays[name] for name in _WARM}
 
 
 def allocate(

@@ -103,6 +103,11 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
     return lists
 
 
+def carried_lists(lists) -> dict:
+    """Return the arrays of lists that one search hands on to the next one, by name."""
+    return {name: getattr(lists, name) for name in ("neighbor", "count", "found_at", "moved", "searching")}
+
+
 @cache
 def _kernel(call: str, header: str, dtype, capacity: int, group: int):
     lists = lists_type(dtype)

@@ -112,6 +112,10 @@ class PackedMoments:
         self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
         self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
 
+    def carried(self) -> dict:
+        """Return the arrays that outlive an arrangement, by name."""
+        return neighbors.carried_lists(self._lists)
+
     def pack(self, positions, moments):
         """Launch the packing of positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
         if self.count:

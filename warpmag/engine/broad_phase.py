@@ -4,6 +4,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.pairs.neighbors import carried_lists
 from warpmag.kernels.rigid.broad_phase import allocate, launch_find_shape_pairs
 
 
@@ -32,6 +33,13 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         )
         if self._search is None:
             super().__init__(model.shape_world, shape_flags=model.shape_flags, sort_type="auto", device=model.device)
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays that one search hands on to the next one, by name."""
+        if self._search is None:
+            return {}
+        lists = self._search.arrays.lists
+        return carried_lists(lists) | {"packed": lists.packed}
 
     def launch(self, shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count,
                candidate_pair, candidate_pair_count, **options) -> None:  # fmt: skip

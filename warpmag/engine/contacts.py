@@ -28,6 +28,8 @@ _CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 12, 40
 _GROWTH = 1.5
 _NUMBERED = 2**20
 """Triangle pairs that Newton can put into an order."""
+_KINDS = ("contact", "pair", "triangle")
+"""Kinds of buffers."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,8 @@ SOLVERS: dict[str, Callable] = {
     "featherstone": lambda model, contact_max: newton.solvers.SolverFeatherstone(model),
 }
 """Rigid-body solvers by name; the first is the default and the one that piles are tested with."""
+UNRESUMABLE = ("mujoco",)
+"""Solvers that start each step from what they keep to themselves of the last one, which no checkpoint has."""
 MAXIMAL = ("xpbd", "semi-implicit")
 """Solvers that know each body by its own pose, so that joints need no articulation."""
 
@@ -247,6 +251,22 @@ class RigidSolver:
         meshes = np.isin(self._model.shape_type.numpy(), (newton.GeoType.MESH, newton.GeoType.HFIELD)).any()
         on_gpu = wp.get_device(self._model.device).is_cuda
         return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _NUMBERED)
+
+    def limits(self) -> np.ndarray:
+        """Return the sizes of the buffers, for :meth:`set_limits`; 0 for Newton's estimate."""
+        return np.array([self._limits[kind] or 0 for kind in _KINDS])
+
+    def set_limits(self, limits: np.ndarray) -> None:
+        """Make the buffers as large as they were at :meth:`limits`; contacts and graphs are void afterwards."""
+        wanted = {kind: int(limit) or None for kind, limit in zip(_KINDS, limits, strict=True)}
+        if wanted != self._limits:
+            self._limits = wanted
+            self._allocate()
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays that one substep hands on to the next one, by name."""
+        broad_phase = self._pipeline.broad_phase
+        return broad_phase.carried() if isinstance(broad_phase, NeighborBroadPhase) else {}
 
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""

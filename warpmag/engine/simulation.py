@@ -3,10 +3,8 @@
 import contextlib
 import math
 import os
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import newton
@@ -14,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import resolve_device
-from warpmag.engine.contacts import MAXIMAL, RigidSolver, body_sizes
+from warpmag.engine.contacts import MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -89,16 +87,20 @@ class Simulation:
         self.step_size = DEFAULT_STEP if step is None else step
         check_positive("step", self.step_size)
         self.model = self._finalize(builder, solver, scene)
-        self._magnetics = Magnetics(
-            self.model,
-            force=settings.force if force is None else force,
-            dynamics=settings.dynamics if dynamics is None else dynamics,
-            contact_model=settings.contact_model if contact_model is None else contact_model,
-            rtol=settings.rtol if rtol is None else rtol,
-            external_field=settings.external_field if external_field is None else external_field,
-            curve=curve,
-        )
+        laws = {
+            "force": settings.force if force is None else force,
+            "dynamics": settings.dynamics if dynamics is None else dynamics,
+            "contact_model": settings.contact_model if contact_model is None else contact_model,
+            "rtol": settings.rtol if rtol is None else rtol,
+            "external_field": settings.external_field if external_field is None else external_field,
+            "curve": curve,
+        }
+        self._magnetics = Magnetics(self.model, **laws)
         self._prepare(solver, graphs)
+        kind = "cuda" if self._magnetics.system.device.is_cuda else "cpu"
+        choices = laws | {"step": self.step_size, "solver": solver, "device": kind}
+        choices["external_field"] = tuple(np.asarray(laws["external_field"], dtype=float).tolist())
+        self._options = {name.replace("_", " "): str(value) for name, value in choices.items()}
 
     def _open(self, path: str | os.PathLike, visuals: bool) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
@@ -246,48 +248,67 @@ class Simulation:
         *,
         output: str | os.PathLike | None = None,
         copy_scene: bool = False,
+        resume: bool = False,
         on_frame: Callable[[int], bool | None] | None = None,
     ) -> Statistics:
         """Simulate, and record the frames on a USD stage.
 
-        A frame is taken at the step nearest to its time and stands at the time of that step. Interrupted, the stage
-        has the frames so far.
+        A frame is taken at the step nearest to its time and stands at the time of that step. Frames are written as they
+        come, so that the stage has them whatever ends the process.
 
         Args:
             frames: Output frames after the first; by default those of the stage, else one second.
             output: USD file to write; only for a scene that came from a stage.
             copy_scene: Copy the scene beside the output instead of pointing to it.
+            resume: Go on with the run at the output, of the same scene with the same options, if there is one; on a CPU
+                it ends with the bits of a run that was never interrupted.
             on_frame: Called after each frame with its number, from 0; returning False ends the run.
 
         Returns:
             The statistics, :meth:`finish` done.
 
         Raises:
-            InputError: The output cannot be written.
+            InputError: The output cannot be written, or what is there cannot be resumed.
             SimulationError: The state is not finite any more.
         """
         frames = self.frames_of(frames)
-        recorder = self._open_recorder(output, copy_scene)
+        recorder = None if output is None else self._open_recorder(output, copy_scene, frames)
+        if resume and recorder is None:
+            raise InputError("resume: only a run with an output can be resumed")
+        if resume and self._options["solver"] in UNRESUMABLE:
+            raise InputError(f"resume: runs of the solver {self._options['solver']} cannot be resumed")
+        resumed = complete = False
+        try:
+            if resume:
+                resumed, complete = self._resume(recorder, output, frames)
+            if not complete:
+                complete = self._run_frames(frames, recorder, on_frame, resumed)
+        finally:
+            if recorder:
+                recorder.close(complete)
+        return self.finish()
+
+    def _run_frames(self, frames: int, recorder, on_frame: Callable[[int], bool | None] | None, resumed: bool) -> bool:
+        """Simulate and record, the first frame unless ``resumed``; return whether all frames are done."""
+        figures, before = self._statistics, self._statistics.wall_seconds
         began = time.perf_counter()
         try:
             for frame in range(frames + 1):
-                target = round(frame / (self.frame_rate * self.step_size))
-                if frame and target <= self._stepper.steps:
-                    continue  # steps are longer than frames: several would stand at one time
+                target = self._steps_at(frame)
+                if target <= self._stepper.steps and (frame or resumed):
+                    continue  # done before, or steps are longer than frames: several would stand at one time
                 while self._stepper.steps < target:
                     self.step()
-                if recorder:
-                    with _interrupts_held():
-                        recorder.add_frame(*self._frame())
                 self._follow()
+                figures.wall_seconds = before + time.perf_counter() - began
+                if recorder:
+                    resumable = self._options["solver"] not in UNRESUMABLE
+                    recorder.add_frame(self.time, self.state, self._save if resumable else None)
                 if on_frame and on_frame(frame) is False:
-                    break
+                    return frame == frames
+            return True
         finally:
-            self._statistics.wall_seconds += time.perf_counter() - began
-            if recorder:
-                with _interrupts_held():
-                    recorder.close()
-        return self.finish()
+            figures.wall_seconds = before + time.perf_counter() - began
 
     def frames_of(self, frames: int | None) -> int:
         """Return how many frames a run of ``frames`` has, which may be None for the scene's own number."""
@@ -297,22 +318,44 @@ class Simulation:
             raise InputError(f"frames: must be a positive whole number, got {frames}")
         return frames
 
-    def _open_recorder(self, output, copy_scene):
-        if output is None:
-            return None
+    def _open_recorder(self, output: str | os.PathLike, copy_scene: bool, frames: int):
         if self._scene is None:
             raise InputError(f"{Path(output)}: only a scene that came from a stage can be written to one")
-        from warpmag.usd import CacheWriter  # noqa: PLC0415 - a builder can do without USD
+        from warpmag.engine.recording import Recorder  # noqa: PLC0415 - a builder can do without USD
 
-        return CacheWriter(
-            self._scene.stage, output, list(self._scene.bodies), list(self._scene.magnet_shapes), copy_scene=copy_scene
+        return Recorder(
+            self._scene,
+            self._magnetics,
+            output,
+            copy_scene=copy_scene,
+            frames=frames + 1,
+            options=self._options,
         )
 
-    def _frame(self) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        rows = list(self._scene.bodies.values())
-        totals = dict(zip(self.magnetics.shapes.tolist(), self.magnetics.shape_moments(), strict=True))
-        moments = [sum(totals[shape] for shape in shapes) for shapes in self._scene.magnet_shapes.values()]
-        return self.time, self.state.body_q.numpy()[rows], self.state.body_qd.numpy()[rows], np.array(moments)
+    def _resume(self, recorder, output: str | os.PathLike, frames: int) -> tuple[bool, bool]:
+        """Go on with the run at the output; return whether there was one, and whether it is complete."""
+        if self._stepper.steps:
+            raise ValueError("only a simulation that has not begun can resume another")
+        found = recorder.resume()
+        if found is None or (found.state is None and found.time <= 0.0):
+            return False, False  # nothing there, or no more than the first frame
+        done, wanted = round(found.time / self.step_size), self._steps_at(frames)
+        if done > wanted:
+            raise InputError(f"frames: {Path(output)} has {found.time:g} s already, more than {frames} frames")
+        if found.state is not None:
+            self._stepper.load(found.state)
+            self._statistics.load({name[5:]: one for name, one in found.state.items() if name.startswith("stat.")})
+        elif done < wanted:
+            raise InputError(f"frames: the run of {Path(output)} ended at {found.time:g} s, there is nothing to resume")
+        return True, found.state is None
+
+    def _save(self) -> dict[str, np.ndarray]:
+        """Return all that a run has to know to go on from the present state."""
+        return self._stepper.save() | {f"stat.{name}": one for name, one in self.statistics.save().items()}
+
+    def _steps_at(self, frame: int) -> int:
+        """Return how many steps are done at a frame."""
+        return round(frame / (self.frame_rate * self.step_size))
 
     def _follow(self) -> None:
         if len(self._moving):
@@ -364,19 +407,3 @@ def _check_articulations(builder: newton.ModelBuilder, solver: str) -> None:
                 f"{label}: a joint outside all articulations, which the solver {solver} cannot take, but "
                 f"{' and '.join(MAXIMAL)} can; or apply PhysicsArticulationRootAPI above it"
             )
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Let Ctrl-C wait until what is being recorded is complete."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    caught = []
-    before = signal.signal(signal.SIGINT, lambda *arguments: caught.append(arguments))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if caught:
-        raise KeyboardInterrupt

@@ -1,6 +1,8 @@
 """What a run reports about itself."""
 
-from dataclasses import dataclass, field
+import math
+from array import array
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -8,6 +10,8 @@ from warpmag.engine.stepper import StepReport
 
 _COARSE = 1e-3
 """Coarseness of positions from which on contacts tremble: they are settled to about a thousandth of the thickness."""
+_UNTIMED = (math.nan,) * 3
+"""Times of a step in which kernels were compiled."""
 _DEEP = 0.05
 """Penetration over the thickness that no user takes for contact."""
 
@@ -23,7 +27,6 @@ class Statistics:
         repeated: Attempts at steps that were thrown away.
         capped: Steps in which a body moved farther in a substep than allowed.
         regrown: Steps in which contact or pair buffers had to grow.
-        evaluations: Field evaluations of each step.
         unconverged: Substeps whose induction did not converge.
         error: Largest magnetization error of any substep.
         peak_speed: Highest speed of a body [m/s].
@@ -46,7 +49,6 @@ class Statistics:
     repeated: int = 0
     capped: int = 0
     regrown: int = 0
-    evaluations: list[int] = field(default_factory=list)
     unconverged: int = 0
     error: float = 0.0
     peak_speed: float = 0.0
@@ -61,7 +63,8 @@ class Statistics:
     overlapping: int = 0
     coarseness: float = 0.0
     wall_seconds: float = 0.0
-    _seconds: list[tuple[float, float, float] | None] = field(default_factory=list)
+    _evaluations: array = field(default_factory=lambda: array("i"))
+    _seconds: array = field(default_factory=lambda: array("f"))
 
     def add_step(self, report: StepReport) -> None:
         """Take in one step."""
@@ -70,13 +73,18 @@ class Statistics:
         self.repeated += report.attempts - 1
         self.capped += report.capped
         self.regrown += report.regrown
-        self.evaluations.append(report.evaluations)
+        self._evaluations.append(report.evaluations)
         self.unconverged += report.unconverged
         self.error = max(self.error, report.error)
         self.peak_speed = max(self.peak_speed, report.speed)
         self.overlap = max(self.overlap, report.overlap)
         self.depth = max(self.depth, report.depth)
-        self._seconds.append(report.seconds)
+        self._seconds.extend(report.seconds or _UNTIMED)
+
+    @property
+    def evaluations(self) -> list[int]:
+        """Field evaluations of each step."""
+        return self._evaluations.tolist()
 
     @property
     def milliseconds(self) -> tuple[float, float, float]:
@@ -85,8 +93,19 @@ class Statistics:
 
     def milliseconds_since(self, step: int) -> tuple[float, float, float]:
         """Mean times of the steps after the first ``step``; see :attr:`milliseconds`."""
-        timed = [seconds for seconds in self._seconds[step:] if seconds]
-        return tuple((1e3 * np.mean(timed, axis=0)).tolist()) if timed else (0.0, 0.0, 0.0)
+        seconds = np.array(self._seconds, dtype=float).reshape(-1, len(_UNTIMED))[step:]
+        timed = seconds[np.isfinite(seconds).all(axis=1)]
+        return tuple((1e3 * timed.mean(axis=0)).tolist()) if len(timed) else (0.0, 0.0, 0.0)
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Return all figures by name."""
+        return {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
+
+    def load(self, saved: dict[str, np.ndarray]) -> None:
+        """Take over the figures that :meth:`save` returned."""
+        for one in fields(self):
+            own, value = getattr(self, one.name), saved[one.name].tolist()
+            setattr(self, one.name, array(own.typecode, value) if isinstance(own, array) else value)
 
     def warnings(self) -> list[str]:
         """Return what the user should know before he trusts the run, a line each."""

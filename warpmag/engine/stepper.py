@@ -19,6 +19,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag import snapshot
 from warpmag.engine.capture import Workspace, without_allocations
 from warpmag.engine.contacts import BodySizes, RigidSolver
 from warpmag.engine.magnetics import Magnetics
@@ -259,6 +260,29 @@ class Stepper:
             self._capture, self.capture_failure = False, " ".join(str(error).split()) or type(error).__name__
             _clear_error(self._device)
         self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Return all that the next step depends on; :meth:`look` first."""
+        numbers = {"steps": np.array(self.steps), "buffers": self._solver.limits()}
+        return numbers | snapshot.save(self._carried())
+
+    def load(self, saved: dict[str, np.ndarray]) -> None:
+        """Go on from where :meth:`save` was called, in another run of the same model.
+
+        Raises:
+            InputError: It was called for something else.
+        """
+        self._solver.set_limits(saved["buffers"])
+        self._prepare()
+        snapshot.load(self._carried(), saved)
+        self.steps = self._reported = int(saved["steps"])
+
+    def _carried(self) -> dict[str, wp.array]:
+        """Return the arrays that a step hands on to the next one, by name."""
+        machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
+        parts = {"state": dict(enumerate(_arrays(self.state))), "machine": machine}
+        parts |= {"magnetics": self._magnetics.system.carried(), "solver": self._solver.carried()}
+        return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
         """Find the contacts of the present state; :meth:`look` first.

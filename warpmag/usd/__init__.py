@@ -10,6 +10,7 @@ from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints
+from warpmag.usd.paths import usable_path
 from warpmag.usd.reader import (
     StageContents,
     describe,
@@ -20,10 +21,11 @@ from warpmag.usd.reader import (
     survey,
 )
 from warpmag.usd.values import Finding
-from warpmag.usd.writer import CacheWriter
+from warpmag.usd.writer import CacheWriter, Earlier
 
 __all__ = [
     "CacheWriter",
+    "Earlier",
     "Finding",
     "GroundedJoint",
     "StageClock",
@@ -43,4 +45,5 @@ __all__ = [
     "refusals",
     "stage_clock",
     "survey",
+    "usable_path",
 ]

@@ -9,7 +9,6 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
@@ -19,6 +18,7 @@ from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings
 from warpmag.usd.guard import readable
+from warpmag.usd.paths import full_path, usable_path
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
 from warpmag.usd.values import Finding, attribute_findings, check_type, declared, finding_of, quiet
@@ -63,13 +63,14 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     Raises:
         InputError: The file is missing, is not USD or does not compose.
     """
-    if not Path(path).is_file():
+    file = usable_path(path)
+    if not os.path.isfile(file):
         raise InputError(f"{path}: no such file")
-    if reason := first_reading(path):
+    if reason := first_reading(full_path(file)):
         raise InputError(f"{path}: {reason}")
     try:
         with quiet():  # what USD has to say goes into the error
-            stage = Usd.Stage.Open(str(path))
+            stage = Usd.Stage.Open(str(full_path(file)))
             broken = [str(error) for error in stage.GetCompositionErrors()]
     except FAILURES as error:
         raise InputError(f"{path}: not a USD file ({failure(error)})") from None

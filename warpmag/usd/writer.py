@@ -1,12 +1,18 @@
-"""Writes a run as a cache layer over an untouched scene.
+"""Writes a run as a cache layer over an untouched scene, frame by frame.
 
 ``out.usda`` is a thin root whose sublayers are ``./out.cache.usdc``, which holds the motion, and the scene. The root
 repeats the metadata of the scene, since that does not compose, and has no prims: an opinion there would hide the
-samples of the cache.
+samples of the cache. ``samples.py`` lets the cache grow, ``output.py`` has the files.
 """
 
+import contextlib
+import hashlib
+import itertools
 import os
-from collections.abc import Sequence
+import time as clock_time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,20 +20,60 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from warpmag.errors import InputError
 from warpmag.usd.clock import stage_clock
+from warpmag.usd.output import Output
+from warpmag.usd.paths import path_between
+from warpmag.usd.placements import Placements
+from warpmag.usd.samples import END_MARK, SampleFile, time_mark
+from warpmag.usd.scene_copy import copy_scene
 from warpmag.usd.schemas import MOMENT
-from warpmag.usd.transforms import is_animated
 
-_SUFFIXES = (".usd", ".usda", ".usdc")
 _COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")  # metadata that sublayers do hand up
 _TRANSLATE, _ORIENT, _SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
 _TYPES = Sdf.ValueTypeNames
+_CHECKPOINT_SECONDS = 1.0
+_CHECKPOINT_SHARE = 0.01
+"""Checkpoints come so often, and take at most this part of the time."""
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """An attribute that is written for every body or every magnet."""
+
+    name: str
+    usd_type: object
+    array: Callable
+    dtype: type
+    size: int
+
+
+_BODY = (
+    _Kind(_TRANSLATE, _TYPES.Double3, Vt.Vec3dArray, np.float64, 3),
+    _Kind(_ORIENT, _TYPES.Quatf, Vt.QuatfArray, np.float32, 4),
+    _Kind("physics:velocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
+    _Kind("physics:angularVelocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
+)
+_KINDS = (*_BODY, _Kind(MOMENT, _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3))
+"""In the order of a frame, see :class:`warpmag.usd.placements.Placed`."""
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """A run that was found at the output.
+
+    Attributes:
+        time: Time of its last frame since the start of the stage [s].
+        state: What the run handed to :meth:`CacheWriter.add_frame` then; None if it was complete.
+    """
+
+    time: float
+    state: dict[str, np.ndarray] | None
 
 
 class CacheWriter:
-    """Collects the frames of a run and writes them when closed.
+    """Writes the frames of a run as they come.
 
-    Used as a context manager it closes in any case, so that an interrupted run leaves a valid stage with the frames
-    done so far. Without a single frame nothing is written.
+    The stage can be opened from the first frame on, and has all frames whatever ends the process. Used as a context
+    manager it closes in any case. Without a single frame nothing is written.
     """
 
     def __init__(
@@ -38,6 +84,8 @@ class CacheWriter:
         magnet_paths: Sequence[str],
         *,
         copy_scene: bool = False,
+        frames: int | None = None,
+        options: dict[str, str] | None = None,
     ):
         """Prepare for a run.
 
@@ -48,80 +96,236 @@ class CacheWriter:
             magnet_paths: Prims of the magnets, in the order of the frames' moments.
             copy_scene: Copy the scene beside the root, as is right for a bundled one, instead of pointing to it. A
                 scene that is no file is always copied.
+            frames: Frames that are expected; without it the file may become longer than it has to be.
+            options: What a run that goes on from this one must have in common with it, besides the scene.
 
         Raises:
             InputError: The path has another suffix, cannot be written or would overwrite a layer of the scene.
         """
-        self._path = Path(path)
         self._stage = stage
         self._clock = stage_clock(stage)
         self._copy_scene = copy_scene or stage.GetRootLayer().anonymous
-        self._cache_path = self._path.with_name(f"{self._path.stem}.cache.usdc")
-        self._scene_path = self._path.with_name(f"{self._path.stem}.scene.usdc")
-        self._check_output()
+        scene = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
+        self._output = Output(path, scene, copy_scene=self._copy_scene)
         self._magnet_paths = list(magnet_paths)
-        self._frames = _Placements(stage, body_paths)
-        self._times: list[float] = []
-        self._body_q: list[np.ndarray] = []
-        self._body_qd: list[np.ndarray] = []
-        self._moments: list[np.ndarray] = []
-        self._closed = False
+        self._bodies = Placements(stage, body_paths)
+        self._counts = [len(self._bodies.paths)] * len(_BODY) + [len(self._magnet_paths)]
+        self._frames, self._options = frames, options or {}
+        self._samples: SampleFile | None = None
+        self._first: list[np.ndarray] = []
+        self._last_turns: np.ndarray | None = None
+        self._last_time = -np.inf
+        self._below = ""
+        self._checkpoint_due = 0.0
 
     def __enter__(self) -> "CacheWriter":
         """Return the writer itself."""
         return self
 
-    def __exit__(self, *exception) -> None:
-        """Write the frames so far, whatever ended the run."""
-        self.close()
+    def __exit__(self, kind, *exception) -> None:
+        """Close, whatever ended the run."""
+        self.close(complete=kind is None)
 
-    def add_frame(self, time: float, body_q: np.ndarray, body_qd: np.ndarray, moments: np.ndarray) -> None:
-        """Keep one frame.
+    def resume(self) -> Earlier | None:
+        """Go on with the run that is at the output; call it before the first frame.
+
+        Returns:
+            What was found, None if there is nothing. A complete run is left as it is.
+
+        Raises:
+            InputError: Another run is writing there, or what is there is another run's, or none's.
+        """
+        if not (self._output.root.exists() or self._output.checkpoint.exists()):
+            return None
+        self._output.lock()
+        try:
+            checkpoint = self._output.load_checkpoint()
+            return self._completed() if checkpoint is None else self._go_on(*checkpoint)
+        except BaseException:
+            self._output.close()
+            raise
+
+    def _go_on(self, about: dict[str, str], arrays: dict[str, np.ndarray]) -> Earlier:
+        """Go on from a checkpoint."""
+        self._compare(about)
+        output = self._output
+        places = {name[5:]: array for name, array in arrays.items() if name.startswith("file/")}
+        state = {name[6:]: array for name, array in arrays.items() if name.startswith("state/")}
+        with output.errors(output.cache):
+            self._samples = SampleFile.resume(output.cache, self._value_sizes(), places)
+        self._first = self._unpack(self._samples.frame(0))
+        self._last_turns = self._unpack(self._samples.frame(self._samples.count - 1))[1]
+        self._last_time = float(about["time"])
+        for target in self._write_scene_and_root():
+            output.place(target)
+        output.place(output.root)
+        return Earlier(self._last_time, state)
+
+    def _completed(self) -> Earlier:
+        """Return what there is to say about a run that has left no checkpoint."""
+        cache = Sdf.Layer.OpenAsAnonymous(str(self._output.cache)) if self._output.cache.exists() else None
+        about = cache.customLayerData.get("warpmag") if cache else None
+        if about is None:
+            raise InputError(f"{self._output.root}: nothing to resume, no run of this version has written it")
+        self._compare(about)
+        return Earlier((cache.endTimeCode - self._clock.start) / self._clock.time_codes_per_second, None)
+
+    def _compare(self, about: dict[str, str]) -> None:
+        """Refuse to go on with another run."""
+        for name, value in self._about.items():
+            if about.get(name) != value:
+                change = "" if name == "scene" else f": {about.get(name, 'unknown')}, now {value}"
+                raise InputError(f"{self._output.root}: cannot resume, it was run with another {name}{change}")
+
+    @cached_property
+    def _about(self) -> dict[str, str]:
+        """What makes out the run."""
+        return {"scene": _digest(self._stage), **self._options}
+
+    def add_frame(
+        self,
+        time: float,
+        body_q: np.ndarray,
+        body_qd: np.ndarray,
+        moments: np.ndarray,
+        state: Callable[[], dict[str, np.ndarray]] | None = None,
+    ) -> None:
+        """Write one frame.
 
         Args:
             time: Time since the start of the stage [s]; rises from frame to frame.
             body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
             body_qd: Linear velocity of the centre of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
             moments: Moments of the magnets [A·m²], world frame, shape [m, 3].
+            state: Returns all that the run needs to go on from this frame; called about once a second.
+
+        Raises:
+            InputError: It cannot be written; the stage has the frames before.
         """
-        if self._times and not time > self._times[-1]:
-            raise ValueError(f"time must rise from frame to frame: {time} after {self._times[-1]}")
-        self._times.append(float(time))
-        count = len(self._frames.paths)
-        self._body_q.append(np.array(body_q, dtype=np.float32).reshape(count, 7))
-        self._body_qd.append(np.array(body_qd, dtype=np.float32).reshape(count, 6))
-        self._moments.append(np.array(moments, dtype=np.float32).reshape(len(self._magnet_paths), 3))
+        if not time > self._last_time:
+            raise ValueError(f"time must rise from frame to frame: {time} after {self._last_time}")
+        count = len(self._bodies.paths)
+        body_q = np.asarray(body_q, dtype=np.float32).reshape(count, 7)
+        body_qd = np.asarray(body_qd, dtype=np.float32).reshape(count, 6)
+        moments = np.asarray(moments, dtype=np.float32).reshape(len(self._magnet_paths), 3)
+        placed = self._bodies.place(body_q, body_qd, self._last_turns)
+        values = [placed.positions, placed.turns, placed.linear, placed.angular, moments]
+        self._last_time, self._last_turns = float(time), placed.turns
+        if self._samples is None:
+            self._samples = self._begin(time, values)
+        else:
+            self._append(self._samples, time, values)
+        now = clock_time.monotonic()
+        if now >= self._checkpoint_due:
+            self._save(self._samples, state() if state else None)
+            spent = clock_time.monotonic() - now
+            self._checkpoint_due = now + max(_CHECKPOINT_SECONDS, spent / _CHECKPOINT_SHARE)
 
-    def close(self) -> None:
-        """Write the stage, all of its files or none; a second call does nothing."""
-        if self._closed or not self._times:
+    def close(self, complete: bool = True) -> None:
+        """Close the files; a second call does nothing.
+
+        Args:
+            complete: Whether all frames are there, so that nobody will want to resume.
+        """
+        samples, self._samples = self._samples, None
+        output = self._output
+        try:
+            if samples is None:
+                return
+            with contextlib.nullcontext() if complete else contextlib.suppress(InputError):  # there is a reason already
+                with output.errors(output.cache):
+                    samples.close()
+                self._place_root()
+            if complete:
+                output.checkpoint.unlink(missing_ok=True)
+        finally:
+            output.close()
+        for path in (output.beside(".scene.usdc"), output.cache, output.root):
+            if known := Sdf.Layer.Find(str(path)):  # an earlier run's result that this process has open
+                known.Reload(force=True)
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def _begin(self, time: float, values: list[np.ndarray]) -> SampleFile:
+        """Write the files with the first frame; an earlier result stays until all of them are whole."""
+        output = self._output
+        output.lock()
+        with output.errors(output.cache):
+            output.write(self._cache_layer(values), output.cache)
+            samples = SampleFile.begin(output.temporary(output.cache), self._value_sizes(), self._frames)
+        try:
+            self._first = values
+            self._append(samples, time, values)
+            copied = self._write_scene_and_root()
+            with output.errors(output.root):
+                output.checkpoint.unlink(missing_ok=True)
+                for target in (*copied, output.cache, output.root):
+                    output.place(target)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                samples.close()
+            raise
+        return samples
+
+    def _append(self, samples: SampleFile, time: float, values: list[np.ndarray]) -> None:
+        changed, begin = [], 0
+        for own, first in zip(values, self._first, strict=True):
+            rows = np.flatnonzero(~samples.sampled[begin : begin + len(own)])
+            changed += (begin + rows[(own[rows] != first[rows]).any(axis=1)]).tolist()
+            begin += len(own)
+        data = np.concatenate([np.ascontiguousarray(one).view(np.uint8).ravel() for one in values])
+        with self._output.errors(self._output.cache):
+            samples.append(self._code(time), data, changed)
+
+    def _save(self, samples: SampleFile, state: dict[str, np.ndarray] | None) -> None:
+        """Write what changes with every frame besides the cache."""
+        self._place_root()
+        if state is None:
             return
-        self._closed = True
-        layers = {self._cache_path: self._cache_layer(), self._path: self._root_layer()}
+        about = {**self._about, "time": repr(self._last_time)}
+        arrays = {f"file/{name}": array for name, array in samples.places().items()}
+        arrays |= {f"state/{name}": array for name, array in state.items()}
+        with self._output.errors(self._output.checkpoint):
+            self._output.save_checkpoint(about, arrays)
+
+    def _write_scene_and_root(self) -> list[Path]:
+        """Write copies of the scene and the root, without placing them; return what to place before the root."""
+        output, copied = self._output, []
         if self._copy_scene:
-            layers = {self._scene_path: self._stage.GetRootLayer(), **layers}
-        _write_all(layers)
+            with output.errors(output.beside(".scene")):
+                target, scene = copy_scene(self._stage, output)
+            copied.append(target)
+            self._below = f"./{scene.relative_to(output.root.parent)}"
+        else:
+            self._below = path_between(output.root, Path(self._stage.GetRootLayer().realPath))
+        with output.errors(output.root):
+            output.write(self._root_layer(), output.root)
+        return copied
 
-    def _check_output(self) -> None:
-        if self._path.suffix not in _SUFFIXES:
-            raise InputError(f"{self._path}: the output must end in {', '.join(_SUFFIXES)}")
-        targets = {self._path, self._cache_path, *([self._scene_path] if self._copy_scene else [])}
-        used = {Path(layer.realPath).resolve() for layer in self._stage.GetUsedLayers() if layer.realPath}
-        for target in sorted(targets):
-            if target.resolve() in used:
-                raise InputError(f"{self._path}: would overwrite {target}, which belongs to the scene")
-            if target.is_dir():
-                raise InputError(f"{self._path}: {target} is a directory")
-        folder = self._path.absolute().parent
-        while not folder.exists():
-            folder = folder.parent
-        if not (folder.is_dir() and os.access(folder, os.W_OK)):
-            raise InputError(f"{self._path}: cannot write to {folder}")
+    def _place_root(self) -> None:
+        with self._output.errors(self._output.root):
+            self._output.write(self._root_layer(), self._output.root)
+            self._output.place(self._output.root)
 
-    def _time_codes(self) -> list[float]:
-        return [self._clock.start + time * self._clock.time_codes_per_second for time in self._times]
+    # ---------------------------------------------------------------------------------------------------------------
 
-    def _set_metadata(self, layer) -> None:
+    def _code(self, time: float) -> float:
+        return self._clock.start + time * self._clock.time_codes_per_second
+
+    def _value_sizes(self) -> np.ndarray:
+        """Return the size of each value of a frame [bytes]."""
+        return np.repeat([kind.size * np.dtype(kind.dtype).itemsize for kind in _KINDS], self._counts)
+
+    def _unpack(self, data: bytes) -> list[np.ndarray]:
+        """Return the values of a frame, as they were written."""
+        found, place = [], 0
+        for kind, count in zip(_KINDS, self._counts, strict=True):
+            values = np.frombuffer(data, dtype=kind.dtype, count=count * kind.size, offset=place)
+            found.append(values.reshape(count, kind.size))
+            place += values.nbytes
+        return found
+
+    def _set_metadata(self, layer, end: float) -> None:
         """Repeat on ``layer`` what says how the numbers of the scene are meant."""
         layer.pseudoRoot.SetInfo("metersPerUnit", UsdGeom.GetStageMetersPerUnit(self._stage))
         layer.pseudoRoot.SetInfo("kilogramsPerUnit", UsdPhysics.GetStageKilogramsPerUnit(self._stage))
@@ -129,7 +333,7 @@ class CacheWriter:
         layer.timeCodesPerSecond = self._clock.time_codes_per_second  # equal in all layers: USD rescales otherwise
         layer.framesPerSecond = self._clock.frames_per_second
         layer.startTimeCode = self._clock.start
-        layer.endTimeCode = self._time_codes()[-1]
+        layer.endTimeCode = end
 
     def _root_layer(self) -> Sdf.Layer:
         scene = self._stage.GetRootLayer()
@@ -137,112 +341,32 @@ class CacheWriter:
         for key in scene.pseudoRoot.ListInfoKeys():
             if key not in _COMPOSED:
                 root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
-        self._set_metadata(root)
-        below = f"./{self._scene_path.name}"
-        if not self._copy_scene:
-            below = os.path.relpath(Path(scene.realPath).resolve(), self._path.parent.resolve())
-            below = below if below.startswith("..") else f"./{below}"
-        root.subLayerPaths[:] = [f"./{self._cache_path.name}", below]
+        self._set_metadata(root, self._code(self._last_time))
+        root.subLayerPaths[:] = [f"./{self._output.cache.name}", self._below]
         return root
 
-    def _cache_layer(self) -> Sdf.Layer:
+    def _cache_layer(self, values: list[np.ndarray]) -> Sdf.Layer:
+        """Return the layer with the first frame, with room for samples."""
         cache = Sdf.Layer.CreateAnonymous()
-        self._set_metadata(cache)
-        codes = self._time_codes()
-        body_q, body_qd = np.stack(self._body_q, axis=1), np.stack(self._body_qd, axis=1)  # [n, frames, ...]
-        moments = np.stack(self._moments, axis=1)
+        self._set_metadata(cache, END_MARK)
+        cache.customLayerData = {"warpmag": self._about}
+        bodies, paths = self._bodies, [*[self._bodies.paths] * len(_BODY), self._magnet_paths]
         with Sdf.ChangeBlock():
-            for index in range(len(self._frames.paths)):
-                self._frames.author(cache, index, codes, body_q[index], body_qd[index])
-            for path, values in zip(self._magnet_paths, moments, strict=True):
+            for path in (*bodies.paths, *self._magnet_paths):
                 _over(cache, self._stage, path)
-                _author(cache, path, MOMENT, _TYPES.Vector3f, codes, values, Vt.Vec3fArray)
+            number = itertools.count()
+            for kind, prims, first in zip(_KINDS, paths, values, strict=True):
+                for path, value in zip(prims, kind.array.FromNumpy(np.ascontiguousarray(first)), strict=True):
+                    place = _author_default(cache, path, kind.name, kind.usd_type, value)
+                    cache.SetTimeSample(place, time_mark(next(number)), value)
+            for path, scale, free in zip(bodies.paths, bodies.scales, bodies.free, strict=True):
+                order = ["!resetXformStack!"] * bool(free) + [_TRANSLATE, _ORIENT]
+                if not np.allclose(scale, 1.0, rtol=0.0, atol=1e-6):
+                    _author_default(cache, path, _SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
+                    order.append(_SCALE)
+                kind, value = _TYPES.TokenArray, Vt.TokenArray(order)
+                _author_default(cache, path, "xformOpOrder", kind, value, Sdf.VariabilityUniform)
         return cache
-
-
-class _Placements:
-    """Turns body frames in the world into transforms local to the parents of the prims."""
-
-    def __init__(self, stage, paths):
-        self.paths = list(paths)
-        self._stage = stage
-        self._transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
-        moving = set(self.paths)
-        self._parents, self._scales = [], []
-        for path in self.paths:
-            prim = stage.GetPrimAtPath(path)
-            world = np.array(self._transforms.GetLocalToWorldTransform(prim))
-            scale = np.diag(world[:3, :3] @ _rigid(world)[:3, :3].T)
-            parent = self._parent(prim, moving)
-            self._parents.append(parent)
-            self._scales.append(scale if parent is None else scale / _scale(parent))
-
-    def _parent(self, prim, moving) -> np.ndarray | None:
-        """Return the parent's world transform, None where the prim must leave it behind.
-
-        That is so where the parent moves, and where it would shear a turning body.
-        """
-        parent = prim.GetParent()
-        above = parent
-        while above and not above.IsPseudoRoot():
-            if str(above.GetPath()) in moving or is_animated(above):
-                return None
-            above = above.GetParent()
-        matrix = np.array(self._transforms.GetLocalToWorldTransform(parent))
-        scale = _scale(matrix)
-        # Scales are often authored in single precision.
-        similar = np.allclose(matrix[:3, :3], scale * _rigid(matrix)[:3, :3], rtol=0.0, atol=1e-6 * abs(scale))
-        return matrix if similar else None
-
-    def author(self, layer, index, codes, body_q, body_qd) -> None:
-        """Author the motion of one body, ``body_q`` [frames, 7] and ``body_qd`` [frames, 6]."""
-        path, parent, scale = self.paths[index], self._parents[index], self._scales[index]
-        positions = body_q[:, :3].astype(np.float64)
-        turns = body_q[:, 3:].astype(np.float64)
-        turns /= np.linalg.norm(turns, axis=1, keepdims=True)
-        in_body = turns * (-1.0, -1.0, -1.0, 1.0)
-        linear = _rotate(in_body, body_qd[:, :3])
-        angular = _rotate(in_body, np.degrees(body_qd[:, 3:].astype(np.float64)))
-        if parent is not None and not np.array_equal(parent, np.eye(4)):
-            positions = (np.c_[positions, np.ones(len(positions))] @ np.linalg.inv(parent))[:, :3]
-            turns = _product(_conjugate_rotation(parent), turns)
-        turns *= np.where(np.cumsum(np.r_[0, np.sum(turns[1:] * turns[:-1], axis=1) < 0.0]) % 2, -1.0, 1.0)[:, None]
-
-        _over(layer, self._stage, path)
-        _author(layer, path, _TRANSLATE, _TYPES.Double3, codes, positions, Vt.Vec3dArray)
-        _author(layer, path, _ORIENT, _TYPES.Quatf, codes, turns.astype(np.float32), Vt.QuatfArray)
-        order = [_TRANSLATE, _ORIENT]
-        if not np.allclose(scale, 1.0, rtol=0.0, atol=1e-6):
-            _author_default(layer, path, _SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
-            order.append(_SCALE)
-        if parent is None:
-            order.insert(0, "!resetXformStack!")
-        _author_default(layer, path, "xformOpOrder", _TYPES.TokenArray, Vt.TokenArray(order), Sdf.VariabilityUniform)
-        _author(layer, path, "physics:velocity", _TYPES.Vector3f, codes, linear.astype(np.float32), Vt.Vec3fArray)
-        _author(
-            layer, path, "physics:angularVelocity", _TYPES.Vector3f, codes, angular.astype(np.float32), Vt.Vec3fArray
-        )
-
-
-def _write_all(layers: dict[Path, Sdf.Layer]) -> None:
-    """Write the layers beside their places first, then move them there, the last one last."""
-    temporary = {path: path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}") for path in layers}
-    try:
-        for path, layer in layers.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            arguments = {"format": "usda"} if path.suffix == ".usd" else {}  # a thin root is for people to read
-            if not layer.Export(str(temporary[path]), args=arguments):
-                raise InputError(f"{path}: cannot be written")
-        for path in layers:
-            os.replace(temporary[path], path)
-    except OSError as error:
-        raise InputError(f"{error.filename}: cannot be written ({error.strerror})") from None
-    finally:
-        for path in temporary.values():
-            path.unlink(missing_ok=True)
-    for path in layers:
-        if known := Sdf.Layer.Find(str(path)):  # an earlier run's result that this process has open
-            known.Reload(force=True)
 
 
 def _over(layer, stage, path) -> None:
@@ -255,52 +379,20 @@ def _over(layer, stage, path) -> None:
             Sdf.CreatePrimInLayer(layer, prim.GetPath()).instanceable = False
 
 
-def _author(layer, path, name, kind, codes, values, array) -> None:
-    """Author ``values`` [frames, ...] as time samples, or as one default value if they are all the same.
-
-    The samples come with a default, the first of them, for readers that do not ask for a time.
-    """
-    samples = array.FromNumpy(np.ascontiguousarray(values))
-    place = _author_default(layer, path, name, kind, samples[0])
-    if (values != values[0]).any():
-        for code, sample in zip(codes, samples, strict=True):
-            layer.SetTimeSample(place, code, sample)
-
-
 def _author_default(layer, path, name, kind, value, variability=Sdf.VariabilityVarying) -> Sdf.Path:
-    place = Sdf.Path(f"{path}.{name}")  # made once: parsing it for every sample would take half of the time
+    place = Sdf.Path(f"{path}.{name}")
     Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, variability, False)
     layer.GetAttributeAtPath(place).default = value
     return place
 
 
-def _scale(matrix) -> float:
-    """Return the mean scale of a transform, the cube root of its determinant."""
-    return float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-
-
-def _rigid(matrix) -> np.ndarray:
-    """Return position and rotation of a transform, as USD's physics and Newton take them: the body's frame."""
-    transform = Gf.Transform(Gf.Matrix4d(matrix.tolist()))
-    rigid = Gf.Matrix4d().SetRotate(transform.GetRotation())
-    rigid.SetTranslateOnly(transform.GetTranslation())
-    return np.array(rigid)
-
-
-def _conjugate_rotation(matrix) -> np.ndarray:
-    turn = Gf.Transform(Gf.Matrix4d(matrix.tolist())).GetRotation().GetQuat()
-    return np.array([*(-turn.GetImaginary()), turn.GetReal()])
-
-
-def _product(a, b) -> np.ndarray:
-    """Return the product of quaternions x y z w: first ``b``, then ``a``."""
-    va, vb, wa, wb = a[..., :3], b[..., :3], a[..., 3:], b[..., 3:]
-    vector = wa * vb + wb * va + np.cross(va, vb)
-    return np.concatenate([vector, wa * wb - np.sum(va * vb, axis=-1, keepdims=True)], axis=-1)
-
-
-def _rotate(turns, vectors) -> np.ndarray:
-    """Rotate ``vectors`` [n, 3] by quaternions ``turns`` [n, 4]."""
-    axis, w = turns[:, :3], turns[:, 3:]
-    across = 2.0 * np.cross(axis, vectors)
-    return vectors + w * across + np.cross(axis, across)
+def _digest(stage: Usd.Stage) -> str:
+    """Return a digest of the files that a stage is made of, wherever they lie."""
+    digests = []
+    for layer in stage.GetUsedLayers():
+        if layer.realPath:
+            with open(layer.realPath, "rb") as file:
+                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
+        elif layer == stage.GetRootLayer():
+            digests.append(hashlib.sha256(layer.ExportToString().encode()).hexdigest())
+    return hashlib.sha256("".join(sorted(digests)).encode()).hexdigest()

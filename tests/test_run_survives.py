@@ -1,0 +1,244 @@
+"""A run survives its end: whatever ends it, the stage has its frames, and it can be resumed to the same bits.
+
+Runs are children that are really killed. What they leave is compared, bit by bit, with a run that nobody disturbed.
+"""
+
+import contextlib
+import errno
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from pxr import Sdf, Usd
+from run_server import RunServer
+
+from warpmag import Simulation, cli
+from warpmag.scenes_usd import balls_up
+
+FRAMES = 60
+BALLS = 18
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("survives") / "small.usda"
+    balls_up.author(path, columns=3, rows=3, layers=2, height=0.05)
+    return path
+
+
+def samples(output):
+    """All time samples and defaults of a run's cache, the values as bytes."""
+    layer = Sdf.Layer.OpenAsAnonymous(str(output.with_name(f"{output.stem}.cache.usdc")))
+    found = {}
+
+    def visit(path):
+        if path.IsPropertyPath():
+            times = layer.ListTimeSamplesForPath(path)
+            values = [layer.QueryTimeSample(path, time) for time in times]
+            found[path] = layer.GetAttributeAtPath(path).default, dict(zip(times, values, strict=True))
+
+    layer.Traverse("/", visit)
+    return found
+
+
+def frames_of(output):
+    """Numbers of the frames that stand on the stage of a run, which must open and be whole."""
+    stage = Usd.Stage.Open(str(output))
+    assert not stage.GetCompositionErrors()
+    times = stage.GetAttributeAtPath("/World/Balls/Ball_0000.warpmag:moment").GetTimeSamples()
+    assert stage.GetEndTimeCode() <= (times[-1] if times else 0.0)
+    return times
+
+
+def assert_begins_like(output, reference):
+    """Every sample on the stage is one of the undisturbed run, and none of those up to the last is missing."""
+    found = samples(output)
+    assert found.keys() == reference.keys()
+    last = max((max(times) for _, times in found.values() if times), default=0.0)
+    for path, (default, times) in found.items():
+        before, expected = reference[path]
+        assert default == before
+        until = {time: value for time, value in expected.items() if time <= last}
+        # an attribute gets samples once it changes
+        assert times == until or (not times and all(value == default for value in until.values())), path
+
+
+def alive(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+class Survival:
+    """Ends runs at random moments and looks at what is left."""
+
+    def __init__(self, scene, folder, seed):
+        self.server, self.random = RunServer(), random.Random(seed)
+        self.folder, self.command = folder, ["run", scene, "--frames", FRAMES, "--device", "cpu"]
+        self.output, self.messages, self.log = folder / "out.usda", folder / "messages", folder / "frames"
+        assert self.run(folder / "reference" / "out.usda") == 0
+        times = self.frames().values()
+        self.seconds = max(times) - min(times)
+        self.reference = samples(folder / "reference" / "out.usda")
+
+    def start(self, output):
+        return self.server.start([*self.command, "-o", output, "--resume"], self.messages, self.log)
+
+    def run(self, output):
+        self.start(output)
+        return self.server.wait()
+
+    def frames(self):
+        """Time of each frame that the run says it has done."""
+        lines = self.log.read_text().splitlines() if self.log.exists() else []
+        return {int(frame): float(when) for when, frame in (line.split() for line in lines)}
+
+    def end(self, number):
+        """Start or resume the run and end it at a random moment; return whether it had ended by itself."""
+        self.log.unlink(missing_ok=True)
+        process = self.start(self.output)
+        if self.random.random() < 0.8:  # in the run proper, not while it is loaded
+            while not self.frames() and alive(process):
+                time.sleep(0.01)
+        time.sleep(self.random.uniform(0.0, 0.6 * self.seconds))
+        killed = time.monotonic()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, number)
+        code = self.server.wait()
+        assert code in (0, -number if number == signal.SIGKILL else 128 + number), code
+        done = [frame for frame, when in self.frames().items() if when < killed - 1.0]
+        if done:  # a first frame alone makes no samples
+            assert len(frames_of(self.output)) > max(done) or max(done) == 0
+        if self.output.exists():
+            assert_begins_like(self.output, self.reference)
+        if code and number != signal.SIGKILL:
+            (line,) = self.messages.read_text().splitlines()
+            assert line.startswith("warpmag: interrupted" if number == signal.SIGINT else "warpmag: ended by SIG")
+            assert not self.frames() or line.endswith(f", {self.output} has the frames up to {max(self.frames())}")
+        return code == 0
+
+    def finish(self):
+        """Resume the run to its end and compare it."""
+        assert self.run(self.output) == 0
+        assert samples(self.output) == self.reference
+        assert sorted(os.listdir(self.output.parent)) == ["out.cache.usdc", "out.usda"]
+
+
+@pytest.fixture
+def always(monkeypatch):
+    """A checkpoint after every frame."""
+    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SHARE", math.inf)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"contact_model": "multipole"}, {"dynamics": "theta-euler"}],
+    ids=str,
+)
+def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, device, always, options):
+    """Also where it is interrupted again and again: every part of the state is in the checkpoint."""
+
+    def run(name, last, resume):
+        simulation = Simulation(scene, device=device, **options)
+        output = tmp_path / name / "out.usda"
+        figures = simulation.run(9, output=output, resume=resume, on_frame=lambda frame: frame < last)
+        return figures.evaluations, figures.substeps, samples(output)
+
+    expected = run("whole", 9, False)
+    for last in (2, 5, 9):
+        found = run("parts", last, True)
+    assert found == expected
+    assert sorted(os.listdir(tmp_path / "parts")) == ["out.cache.usdc", "out.usda"]
+
+
+def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, always, capsys):
+    output = tmp_path / "out.usda"
+    Simulation(scene, device=device).run(6, output=output, on_frame=lambda frame: frame < 3)
+    other = tmp_path / "other.usda"
+    balls_up.author(other, columns=3, rows=3, layers=1, height=0.05)
+    command = ["run", "-o", str(output), "--device", device, "--resume"]
+    for arguments, message in [
+        ([str(scene), "--frames", "6", "--force", "zeeman"], "cannot resume, it was run with another force: kelvin"),
+        ([str(scene), "--frames", "6", "--rtol", "1e-4"], "another rtol: 0.001"),
+        ([str(other), "--frames", "6"], "cannot resume, it was run with another scene"),
+        ([str(scene), "--frames", "2"], "has 0.05 s already, more than 2 frames"),
+    ]:
+        assert cli.main([*command, *arguments]) == 2
+        printed = capsys.readouterr()
+        (line,) = printed.err.splitlines()
+        assert line.startswith("warpmag: ") and "out.usda" in line and message in line and not printed.out
+    assert cli.main([*command, str(scene), "--frames", "6"]) == 0
+    assert "written" in capsys.readouterr().out
+    assert cli.main([*command, str(scene), "--frames", "6"]) == 0
+    assert "has all 6 frames already" in capsys.readouterr().out
+    assert cli.main([*command, str(scene), "--frames", "7"]) == 2
+    assert "there is nothing to resume" in capsys.readouterr().err
+
+
+def test_a_full_disk_ends_a_run_in_one_line(scene, tmp_path, device, always, monkeypatch, capsys):
+    """And where there is room again, it goes on."""
+    command = ["run", str(scene), "--frames", "9", "--device", device, "--resume", "-o"]
+    assert cli.main([*command, str(tmp_path / "whole" / "out.usda")]) == 0
+    output, write, room = tmp_path / "parts" / "out.usda", os.pwrite, 20000
+
+    def limited(file, data, place):
+        nonlocal room
+        room -= len(data)
+        if room < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(file, data, place)
+
+    monkeypatch.setattr(os, "pwrite", limited)
+    capsys.readouterr()
+    assert cli.main([*command, str(output)]) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    last = len(frames_of(output)) - 1
+    assert 0 < last < 9
+    reason = "cannot be written (No space left on device)"
+    assert line == f"warpmag: {tmp_path}/parts/out.cache.usdc: {reason}, {output} has the frames up to {last}"
+    monkeypatch.setattr(os, "pwrite", write)
+    assert cli.main([*command, str(output)]) == 0
+    assert samples(output) == samples(tmp_path / "whole" / "out.usda")
+
+
+def test_nobody_reads_what_a_run_prints(scene, tmp_path):
+    """The run goes on to its end, for its frames are what it is for."""
+    output = tmp_path / "out.usda"
+    command = [sys.executable, "-m", "warpmag.cli", "run", str(scene), "-o", str(output), "--frames", "5"]
+    with subprocess.Popen([*command, "--device", "cpu"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        process.stderr.close()
+    assert process.returncode == 128 + signal.SIGPIPE
+    assert len(frames_of(output)) == 6
+    assert sorted(os.listdir(tmp_path)) == ["out.cache.usdc", "out.usda"]
+
+
+def test_ended_in_each_way(scene, tmp_path):
+    survival = Survival(scene, tmp_path, seed=1)
+    survival.output = tmp_path / "run" / "out.usda"
+    for way in (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        if survival.end(way):
+            break
+    survival.finish()
+    survival.server.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("way", ["SIGKILL", "SIGTERM", "SIGHUP", "SIGINT"])
+def test_fifty_random_moments(scene, tmp_path, way):
+    survival = Survival(scene, tmp_path, seed=way)
+    survival.output = tmp_path / "run" / "out.usda"
+    for moment in range(50):
+        if survival.end(getattr(signal, way)) or moment % 5 == 4:
+            survival.finish()
+            for left in survival.output.parent.iterdir():
+                left.unlink()
+    survival.server.close()

@@ -1,0 +1,368 @@
+"""The files of a run: whole at every moment, locked, with everything they need, and under any name."""
+
+import contextlib
+import errno
+import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom
+
+from warpmag.errors import InputError
+from warpmag.usd import CacheWriter, open_stage
+
+PATHS = [f"/World/Ball_{k}" for k in range(3)]
+NAMES = ("xformOp:translate:warpmag", "xformOp:orient:warpmag", "physics:velocity", "physics:angularVelocity")
+BALL = 'def Sphere "Ball_{}" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "WarpmagMagnetAPI"])\n{{\n}}\n'
+SCENE = f"""#usda 1.0
+(
+    metersPerUnit = 1
+    kilogramsPerUnit = 1
+    upAxis = "Z"
+    timeCodesPerSecond = 128
+)
+def Xform "World"
+{{
+{"".join(BALL.format(k) for k in range(3))}
+}}
+"""
+
+
+@pytest.fixture
+def stage(tmp_path):
+    path = tmp_path / "scene.usda"
+    path.write_text(SCENE)
+    return open_stage(path)
+
+
+def make_frames(count, seed=1):
+    """Bodies that all move, from the second frame on; turns stay on one side, so that none changes its sign."""
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=(count, 3, 7)).astype(np.float32)
+    q[..., 3:] = (0.0, 0.0, 0.0, 1.0) + 0.1 * q[..., 3:]
+    q[..., 3:] /= np.linalg.norm(q[..., 3:], axis=-1, keepdims=True)
+    return q, rng.normal(size=(count, 3, 6)).astype(np.float32), rng.normal(size=(count, 3, 3)).astype(np.float32)
+
+
+def add(writer, frames, numbers, **options):
+    for k in numbers:
+        writer.add_frame(k / 128, *(values[k] for values in frames), **options)
+
+
+def read(output):
+    """Time samples of every attribute of a run's cache that has some."""
+    layer = Sdf.Layer.OpenAsAnonymous(str(output.with_name(f"{output.stem}.cache.usdc")))
+    found = {}
+    for path, name in itertools.product(PATHS, (*NAMES, "warpmag:moment")):
+        at = f"{path}.{name}"
+        found[at] = {time: layer.QueryTimeSample(at, time) for time in layer.ListTimeSamplesForPath(at)}
+    return found
+
+
+def assert_has(output, frames, count):
+    """The stage opens with the first ``count`` frames, exactly as far as they are not computed with."""
+    stage = Usd.Stage.Open(str(output))
+    assert not stage.GetCompositionErrors()
+    for index, path in enumerate(PATHS):
+        samples = read(output)
+        for name, values in ((NAMES[0], frames[0][..., :3]), ("warpmag:moment", frames[2])):
+            found = samples[f"{path}.{name}"]
+            assert list(found) == [float(k) for k in range(count)] or (count == 1 and not found)
+            for time, value in found.items():
+                assert np.array_equal(value, values[round(time), index])
+
+
+def test_every_frame_is_there_as_soon_as_it_is_added(tmp_path, stage):
+    output, frames = tmp_path / "run.usda", make_frames(7)
+    with CacheWriter(stage, output, PATHS, PATHS, frames=7) as writer:
+        for k in range(7):
+            add(writer, frames, [k])
+            assert_has(output, frames, k + 1)
+            cache = Sdf.Layer.OpenAsAnonymous(str(tmp_path / "run.cache.usdc"))
+            assert cache.endTimeCode == k
+    assert Sdf.Layer.OpenAsAnonymous(str(output)).endTimeCode == 6.0
+
+
+@pytest.mark.parametrize("planned", [None, 3, 200, 1300])
+def test_samples_are_those_that_usd_itself_would_write(tmp_path, stage, planned):
+    """However many frames were planned; 1,300 need more than one page of references in a row."""
+    output, count = tmp_path / "run.usda", 1300 if planned == 1300 else 200
+    frames = make_frames(count)
+    frames[1][:150, 1] = 0.0  # starts to move late
+    with CacheWriter(stage, output, PATHS, PATHS, frames=planned) as writer:
+        add(writer, frames, range(count))
+    reference = Sdf.Layer.CreateAnonymous(".usdc")
+    for index, path in enumerate(PATHS):
+        for name, kind, values in ((NAMES[0], Gf.Vec3d, frames[0]), ("warpmag:moment", Gf.Vec3f, frames[2])):
+            at = Sdf.Path(f"{path}.{name}")
+            types = {Gf.Vec3d: Sdf.ValueTypeNames.Double3, Gf.Vec3f: Sdf.ValueTypeNames.Vector3f}
+            Sdf.JustCreatePrimAttributeInLayer(reference, at, types[kind], Sdf.VariabilityVarying, False)
+            for time, value in enumerate(values[:, index, :3].tolist()):
+                reference.SetTimeSample(at, float(time), kind(*value))
+    found = read(output)
+    for at in (f"{path}.{name}" for path in PATHS for name in (NAMES[0], "warpmag:moment")):
+        times = reference.ListTimeSamplesForPath(at)
+        assert found[at] == {time: reference.QueryTimeSample(at, time) for time in times}
+    assert len(found[f"{PATHS[1]}.physics:velocity"]) == count
+
+
+def test_a_cache_can_be_edited_and_saved(tmp_path, stage):
+    """USD saves in place, over what it takes for the end of the file."""
+    output, frames = tmp_path / "run.usda", make_frames(100)
+    with CacheWriter(stage, output, PATHS, PATHS) as writer:
+        add(writer, frames, range(100))
+    before = read(output)
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "run.cache.usdc"))
+    layer.SetTimeSample(f"{PATHS[0]}.warpmag:moment", 1000.0, Gf.Vec3f(1.0, 2.0, 3.0))
+    layer.comment = "edited"
+    assert layer.Save()
+    before[f"{PATHS[0]}.warpmag:moment"][1000.0] = Gf.Vec3f(1.0, 2.0, 3.0)
+    assert read(output) == before
+
+
+class Ended(BaseException):
+    """The process is no more."""
+
+
+@pytest.mark.parametrize("how", ["killed", "full"])
+def test_ended_at_any_write_the_stage_has_all_frames(tmp_path, stage, monkeypatch, how):
+    """The cache is written by ``os.pwrite`` alone. Killed, nothing is done any more; a full disk takes a part first."""
+    frames, write = make_frames(150), os.pwrite
+    allowed, taken, done = 0, 0, 0
+
+    def limited(file, data, place):
+        nonlocal taken
+        taken += 1
+        if taken <= allowed:
+            return write(file, data, place)
+        if how == "killed":
+            raise Ended
+        if len(data) > 8 and taken == allowed + 1:
+            return write(file, data[: len(data) // 2], place)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", limited)
+    draw = random.Random(how)
+    for attempt in range(40):
+        output = tmp_path / f"{how}{attempt}" / "run.usda"
+        allowed, taken, done = draw.randrange(600), 0, 0
+        writer = CacheWriter(stage, output, PATHS, PATHS)
+        with pytest.raises((Ended, InputError)) as ended:
+            for done in range(150):
+                add(writer, frames, [done])
+        with contextlib.suppress(Ended):  # gives the files up
+            writer.close(complete=False)
+        assert how == "killed" or "No space left on device" in str(ended.value)
+        if done:
+            assert_has(output, frames, done)
+        else:
+            assert not output.exists()
+
+
+def test_a_run_goes_on_where_it_was(tmp_path, stage, monkeypatch):
+    """Frames that came after the checkpoint are dropped, and those that are added grow the file."""
+    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SHARE", 1e9)
+    output, frames = tmp_path / "run.usda", make_frames(100)
+    first = CacheWriter(stage, output, PATHS, PATHS, frames=20, options={"force": "kelvin"})
+    add(first, frames, range(15), state=lambda: {"seed": np.arange(5)})
+    add(first, make_frames(20, seed=2), range(15, 20))
+    first.close(complete=False)
+    assert sorted(os.listdir(tmp_path)) == ["run.cache.usdc", "run.resume.npz", "run.usda", "scene.usda"]
+    with pytest.raises(InputError, match=r"run\.usda: .*another force: kelvin, now zeeman"):
+        CacheWriter(stage, output, PATHS, PATHS, options={"force": "zeeman"}).resume()
+    with CacheWriter(stage, output, PATHS, PATHS, options={"force": "kelvin"}) as writer:
+        found = writer.resume()
+        assert found.time == 14 / 128 and np.array_equal(found.state["seed"], np.arange(5))
+        assert_has(output, frames, 15)
+        add(writer, frames, range(15, 100))
+    assert_has(output, frames, 100)
+    again = CacheWriter(stage, output, PATHS, PATHS, options={"force": "kelvin"})
+    assert again.resume().state is None
+    again.close()
+    assert sorted(os.listdir(tmp_path)) == ["run.cache.usdc", "run.usda", "scene.usda"]
+
+
+def test_a_checkpoint_that_is_none_is_refused_in_one_line(tmp_path, stage):
+    output = tmp_path / "run.usda"
+    for content in (b"", b"nonsense", b"PK\x03\x04 cut off"):
+        (tmp_path / "run.resume.npz").write_bytes(content)
+        with pytest.raises(InputError, match=r"run\.resume\.npz: cannot be read") as refused:
+            CacheWriter(stage, output, PATHS, PATHS).resume()
+        assert "\n" not in str(refused.value)
+    (tmp_path / "run.resume.npz").unlink()
+    output.write_text("#usda 1.0\n")
+    with pytest.raises(InputError, match=r"run\.usda: nothing to resume"):
+        CacheWriter(stage, output, PATHS, PATHS).resume()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Who else is there
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_two_runs_with_one_output(tmp_path, stage):
+    output, frames = tmp_path / "run.usda", make_frames(3)
+    (tmp_path / "link").symlink_to(tmp_path)
+    with CacheWriter(stage, output, PATHS, PATHS) as first:
+        add(first, frames, [0])
+        for other in (output, tmp_path / "run.usdc", tmp_path / "link" / "run.usda"):  # one cache
+            with pytest.raises(InputError, match=f"^{other}: another run is writing it$"):
+                add(CacheWriter(stage, other, PATHS, PATHS), frames, [0])
+        add(first, frames, [1, 2])
+    assert_has(output, frames, 3)
+    with CacheWriter(stage, output, PATHS, PATHS) as second:
+        add(second, frames, [0])
+
+
+def test_what_a_killed_run_leaves_is_in_nobodys_way(tmp_path, stage):
+    script = (
+        "import sys, time, numpy as np\n"
+        "from warpmag.usd import CacheWriter, open_stage\n"
+        "writer = CacheWriter(open_stage(sys.argv[1]), sys.argv[2], [], [])\n"
+        "writer.add_frame(0.0, np.zeros((0, 7)), np.zeros((0, 6)), np.zeros((0, 3)))\n"
+        "print('there', flush=True)\n"
+        "time.sleep(1000)\n"
+    )
+    output = tmp_path / "out" / "run.usda"
+    command = [sys.executable, "-c", script, str(tmp_path / "scene.usda"), str(output)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "there\n"
+        with pytest.raises(InputError, match="another run is writing it"):
+            add(CacheWriter(stage, output, PATHS, PATHS), make_frames(1), [0])
+        process.send_signal(signal.SIGKILL)
+    assert len(os.listdir(output.parent)) == 4
+    with CacheWriter(stage, output, PATHS, PATHS) as writer:
+        add(writer, make_frames(1), [0])
+    assert sorted(os.listdir(output.parent)) == ["run.cache.usdc", "run.usda"]
+
+
+def test_links_that_somebody_planted_are_not_followed(tmp_path, stage):
+    victim, folder = tmp_path / "victim", tmp_path / "out"
+    victim.write_text("precious")
+    folder.mkdir()
+    names = ["run.usda", "run.cache.usdc", "run.resume.npz"]
+    names += [f".run{middle}.{os.getpid()}.tmp{end}" for middle, end in (("", ".usda"), (".cache", ".usdc"))]
+    for name in names:
+        (folder / name).symlink_to(victim)
+    with CacheWriter(stage, folder / "run.usda", PATHS, PATHS) as writer:
+        add(writer, make_frames(2), [0, 1], state=dict)
+    assert victim.read_text() == "precious"
+    assert_has(folder / "run.usda", make_frames(2), 2)
+    (folder / ".other.lock").symlink_to(victim)
+    with pytest.raises(InputError, match=r"other\.usda: cannot be written"):
+        add(CacheWriter(stage, folder / "other.usda", PATHS, PATHS), make_frames(1), [0])
+    assert victim.read_text() == "precious"
+
+
+def test_files_are_as_readable_as_others(tmp_path, stage):
+    before = os.umask(0o027)
+    try:
+        with CacheWriter(stage, tmp_path / "run.usda", PATHS, PATHS, copy_scene=True) as writer:
+            add(writer, make_frames(1), [0], state=dict)
+            names = ("run.usda", "run.cache.usdc", "run.scene.usdc", "run.resume.npz")
+            assert {(tmp_path / name).stat().st_mode & 0o777 for name in names} == {0o640}
+    finally:
+        os.umask(before)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Scenes of several files, and names
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_copied_scene_has_everything_with_it(tmp_path):
+    """Sublayers, references, payloads and textures, also from folders above the scene's."""
+    project, shared = tmp_path / "project", tmp_path / "shared"
+    (project / "sub").mkdir(parents=True)
+    (shared / "textures").mkdir(parents=True)
+    (shared / "textures" / "iron.png").write_text("a picture")
+    (project / "sub" / "more.usda").write_text('#usda 1.0\nover "World"\n{\n    custom int more = 5\n}\n')
+    ball = '#usda 1.0\n(\n    defaultPrim = "Ball"\n)\n' + BALL.replace("Ball_{}", "Ball").format()
+    (shared / "ball.usda").write_text(ball.replace("{\n}", "{\n    asset file = @./textures/iron.png@\n}"))
+    children = "".join(
+        f'def "Ball_{k}" (\n    {arc} = @../shared/ball.usda@\n)\n{{\n}}\n'
+        for k, arc in enumerate(("references", "payload", "references"))
+    )
+    head = SCENE.split('def Xform "World"')[0].replace("(\n", "(\n    subLayers = [@./sub/more.usda@]\n", 1)
+    (project / "scene.usda").write_text(f'{head}def Xform "World"\n{{\n{children}}}\n')
+    output = tmp_path / "elsewhere" / "run.usda"
+    for _ in range(2):  # the second replaces the first
+        with CacheWriter(open_stage(project / "scene.usda"), output, PATHS, PATHS, copy_scene=True) as writer:
+            add(writer, make_frames(3), range(3))
+    assert sorted(os.listdir(output.parent)) == ["run.cache.usdc", "run.scene", "run.usda"]
+    project.rename(tmp_path / "gone")
+    shared.rename(tmp_path / "gone too")
+    output.parent.rename(tmp_path / "moved")
+    moved = Usd.Stage.Open(str(tmp_path / "moved" / "run.usda"))
+    assert not moved.GetCompositionErrors()
+    assert moved.GetAttributeAtPath("/World.more").Get() == 5
+    for path in PATHS:
+        prim = moved.GetPrimAtPath(path)
+        assert prim.IsA(UsdGeom.Sphere)
+        with open(prim.GetAttribute("file").Get().resolvedPath, encoding="utf-8") as texture:
+            assert texture.read() == "a picture"
+
+
+ODD = [
+    "a b",
+    "a:b",
+    "anon:x",
+    "a@b",
+    "@@@x",
+    "a%20b",
+    "%s",
+    "a[b]",
+    "a{b}",
+    "`x`",
+    "µ漢字",
+    "$x",
+    "<UDIM>",
+    "-x",
+]
+REFUSED = ["a\nb", "a\\b", "a\tb", "a\x7fb", "a\udcffb", "a:SDF_FORMAT_ARGS:b=c", "x" * 300, "x" * 252]
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_names_are_right(tmp_path, monkeypatch, name):
+    folder = tmp_path / name
+    folder.mkdir()
+    (folder / f"{name}.usda").write_text(SCENE)
+    monkeypatch.chdir(folder)
+    for scene, output in ((folder / f"{name}.usda", folder / f"{name}.out.usda"), (f"{name}.usda", f"{name}.usdc")):
+        with CacheWriter(open_stage(scene), output, PATHS, PATHS) as writer:
+            add(writer, make_frames(2), [0, 1])
+        assert Usd.Stage.Open(str(folder / output)).GetPrimAtPath(PATHS[0]).IsA(UsdGeom.Sphere)
+
+
+@pytest.mark.parametrize("name", REFUSED, ids=range(len(REFUSED)))
+def test_names_that_cannot_be_are_refused_in_one_line(tmp_path, stage, name):
+    refusals = [lambda: CacheWriter(stage, tmp_path / f"{name}.usda", [], [])]
+    if len(name) != 252:  # there may be such a scene
+        refusals.append(lambda: open_stage(tmp_path / f"{name}.usda"))
+    for refusal in refusals:
+        with pytest.raises(InputError) as refused:
+            refusal()
+        message = str(refused.value)
+        assert message.isprintable() and "usda" in message
+    assert os.listdir(tmp_path) == ["scene.usda"]
+
+
+def test_home_and_links_to_folders(tmp_path, monkeypatch):
+    """A link leads to a folder elsewhere: from there the way to the scene is another one."""
+    deep = tmp_path / "some" / "where" / "deep"
+    deep.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(deep)
+    (tmp_path / "scene.usda").write_text(SCENE)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with CacheWriter(open_stage("~/link/../../../scene.usda"), "~/link/run.usda", PATHS, PATHS) as writer:
+        add(writer, make_frames(2), [0, 1])
+    assert not (tmp_path / "~").exists()
+    for folder in (tmp_path / "link", deep):
+        stage = Usd.Stage.Open(str(folder / "run.usda"))
+        assert not stage.GetCompositionErrors() and stage.GetPrimAtPath(PATHS[0]).IsA(UsdGeom.Sphere)

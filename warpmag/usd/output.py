@@ -1,0 +1,177 @@
+"""The files of a run on disk: how they come into place, the lock on them, and the checkpoint beside them.
+
+For ``out.usda`` they are ``out.usda`` and ``out.cache.usdc``; ``out.scene.usdc`` or the folder ``out.scene`` where the
+scene is copied; while the run is not complete ``out.resume.npz``; and while it runs ``.out.lock`` and a folder
+``.out.tmp*``. What is written there first is moved into place when it is whole.
+"""
+
+import contextlib
+import errno
+import fcntl
+import glob
+import json
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Tf
+
+from warpmag.errors import InputError
+from warpmag.usd.paths import usable_path
+from warpmag.usd.values import quiet
+
+_SUFFIXES = (".usd", ".usda", ".usdc")
+_SCENES = (".usdc", ".usdz")
+_ABOUT = "about"
+_UNLOCKABLE = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
+"""What file systems say that know no locks."""
+
+
+class Output:
+    """The files of a run.
+
+    Attributes:
+        root: The thin root layer.
+        cache: The layer with the motion.
+        checkpoint: What :meth:`save_checkpoint` writes.
+    """
+
+    def __init__(self, path: str | os.PathLike, scene: set[Path], *, copy_scene: bool = False):
+        """Check that the files can be written; nothing is touched yet.
+
+        Args:
+            path: File of the root layer.
+            scene: Files of the scene, resolved, which must not be overwritten.
+            copy_scene: Whether the scene will be copied.
+
+        Raises:
+            InputError: They cannot; the message says why.
+        """
+        self.root = usable_path(path)
+        if self.root.suffix not in _SUFFIXES:
+            raise InputError(f"{self.root}: the output must end in {', '.join(_SUFFIXES)}")
+        self.cache = self.beside(".cache.usdc")
+        self.checkpoint = self.beside(".resume.npz")
+        self._lock = -1
+        self._folder: Path | None = None
+        with self.errors(self.root):
+            self._check(scene, [self.root, self.cache] + copy_scene * [self.beside(f".scene{end}") for end in _SCENES])
+
+    def beside(self, ending: str) -> Path:
+        """Return the file of the same stem with another ending."""
+        return self.root.with_name(f"{self.root.stem}{ending}")
+
+    def _check(self, scene: set[Path], targets: list[Path]) -> None:
+        for target in targets:
+            if target.resolve() in scene:
+                raise InputError(f"{self.root}: would overwrite {target}, which belongs to the scene")
+            if target.is_dir():
+                raise InputError(f"{self.root}: {target} is a directory")
+        folder = self.root.absolute().parent
+        while not folder.exists():
+            folder = folder.parent
+        if not (folder.is_dir() and os.access(folder, os.W_OK)):
+            raise InputError(f"{self.root}: cannot write to {folder}")
+        longest = f".{self.root.stem}.tmp01234567"
+        if len(os.fsencode(longest)) > os.pathconf(folder, "PC_NAME_MAX"):
+            raise InputError(f"{self.root}: the name is too long")
+
+    @contextlib.contextmanager
+    def errors(self, path: Path) -> Iterator[None]:
+        """Make one line of what goes wrong with a file."""
+        try:
+            with quiet():
+                yield
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        except Tf.ErrorException as error:
+            raise InputError(f"{path}: cannot be written ({' '.join(str(error.args[0]).split())})") from None
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def lock(self) -> None:
+        """Keep other runs off these files until :meth:`close`; the lock of a process that died is none.
+
+        Raises:
+            InputError: Another run has them.
+        """
+        if self._lock >= 0:
+            return
+        path = self.root.with_name(f".{self.root.stem}.lock")
+        with self.errors(self.root):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            while self._lock < 0:
+                self._lock = self._try_lock(path)
+            for left in path.parent.glob(glob.escape(f".{self.root.stem}.tmp") + "?" * 8):
+                shutil.rmtree(left, ignore_errors=True)  # of a run that was killed
+            self._folder = Path(tempfile.mkdtemp(prefix=f".{self.root.stem}.tmp", dir=path.parent))
+
+    def _try_lock(self, path: Path) -> int:
+        """Lock a file; return its descriptor, -1 where its last owner has removed it meanwhile."""
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise InputError(f"{self.root}: another run is writing it") from None
+        except OSError as error:
+            if error.errno not in _UNLOCKABLE:
+                raise
+        if path.exists() and os.path.samestat(os.fstat(descriptor), path.lstat()):
+            return descriptor
+        os.close(descriptor)
+        return -1
+
+    def temporary(self, target: Path) -> Path:
+        """Return where to write what :meth:`place` then moves to ``target``; :meth:`lock` first."""
+        assert self._folder is not None, "lock() comes first"
+        return self._folder / target.name
+
+    def write(self, layer: Sdf.Layer, target: Path) -> None:
+        """Write a layer, to be moved to ``target``."""
+        arguments = {"format": "usda"} if target.suffix == ".usd" else {}  # a thin root is for people to read
+        if not layer.Export(str(self.temporary(target)), args=arguments):
+            raise InputError(f"{target}: cannot be written")
+
+    def place(self, target: Path) -> None:
+        """Move what was written to its place, a folder too."""
+        if target.is_dir() and not target.is_symlink():
+            os.rename(target, self.temporary(target).with_suffix(".old"))
+        os.replace(self.temporary(target), target)
+
+    def close(self) -> None:
+        """Remove what only served the run, and unlock."""
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
+        if self._lock >= 0:
+            self.root.with_name(f".{self.root.stem}.lock").unlink(missing_ok=True)
+            os.close(self._lock)
+            self._lock = -1
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def save_checkpoint(self, about: dict[str, str], arrays: dict[str, np.ndarray]) -> None:
+        """Write a checkpoint, or leave the earlier one."""
+        with open(self.temporary(self.checkpoint), "wb") as file:
+            np.savez(file, **{_ABOUT: np.array(json.dumps(about)), **arrays})
+        self.place(self.checkpoint)
+
+    def load_checkpoint(self) -> tuple[dict[str, str], dict[str, np.ndarray]] | None:
+        """Return the checkpoint, None where there is none.
+
+        Raises:
+            InputError: It cannot be read.
+        """
+        try:
+            with open(self.checkpoint, "rb") as file, np.load(file, allow_pickle=False) as saved:
+                arrays = dict(saved)
+            return json.loads(str(arrays.pop(_ABOUT))), arrays
+        except FileNotFoundError:
+            return None
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise InputError(f"{self.checkpoint}: cannot be read ({' '.join(str(error).split())})") from None

@@ -1,0 +1,139 @@
+"""Turns frames of bodies in the world into transforms and velocities of their prims."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Gf, Usd, UsdGeom
+
+from warpmag.usd.transforms import is_animated
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What the prims of bodies get, rows in their order.
+
+    Attributes:
+        positions: Translations in the parents [m], float64, shape [n, 3].
+        turns: Orientations in the parents, quaternions x y z w, float32, shape [n, 4].
+        linear: Velocities in the bodies' frames [m/s], float32, shape [n, 3].
+        angular: Angular velocities there [degrees/s], float32, shape [n, 3].
+    """
+
+    positions: np.ndarray
+    turns: np.ndarray
+    linear: np.ndarray
+    angular: np.ndarray
+
+
+class Placements:
+    """Places bodies, given in the world, in the parents of their prims.
+
+    Attributes:
+        paths: The prims.
+        scales: Scale of each, apart from that of its parent, shape [n, 3].
+        free: Whether each must leave its parent's transform behind, shape [n].
+    """
+
+    def __init__(self, stage: Usd.Stage, paths: Sequence[str]):
+        """Look at the prims ``paths`` and what is above them."""
+        self.paths = list(paths)
+        self._transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
+        moving, count = set(self.paths), len(self.paths)
+        self.scales, self.free = np.ones((count, 3)), np.zeros(count, dtype=bool)
+        below: dict[int, np.ndarray] = {}
+        for index, path in enumerate(self.paths):
+            prim = stage.GetPrimAtPath(path)
+            world = np.array(self._transforms.GetLocalToWorldTransform(prim))
+            self.scales[index] = np.diag(world[:3, :3] @ _rigid(world)[:3, :3].T)
+            parent = self._parent(prim, moving)
+            self.free[index] = parent is None
+            if parent is not None:
+                self.scales[index] /= _scale(parent)
+                if not np.array_equal(parent, np.eye(4)):
+                    below[index] = parent
+        self._below = np.array(list(below), dtype=int)
+        parents = list(below.values())
+        self._into = np.reshape([np.linalg.inv(parent) for parent in parents], (-1, 4, 4))
+        self._turn_into = np.reshape([_conjugate_rotation(parent) for parent in parents], (-1, 4))
+
+    def _parent(self, prim, moving) -> np.ndarray | None:
+        """Return the parent's world transform, None where the prim must leave it behind.
+
+        That is so where the parent moves, and where it would shear a turning body.
+        """
+        parent = prim.GetParent()
+        above = parent
+        while above and not above.IsPseudoRoot():
+            if str(above.GetPath()) in moving or is_animated(above):
+                return None
+            above = above.GetParent()
+        matrix = np.array(self._transforms.GetLocalToWorldTransform(parent))
+        scale = _scale(matrix)
+        # Scales are often authored in single precision.
+        similar = np.allclose(matrix[:3, :3], scale * _rigid(matrix)[:3, :3], rtol=0.0, atol=1e-6 * abs(scale))
+        return matrix if similar else None
+
+    def place(self, body_q: np.ndarray, body_qd: np.ndarray, last_turns: np.ndarray | None) -> Placed:
+        """Place bodies.
+
+        Args:
+            body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
+            body_qd: Linear velocity of the centre of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
+            last_turns: Orientations of the frame before, next to which those of this one are to be; None in the first.
+        """
+        positions, turns = body_q[:, :3].astype(np.float64), body_q[:, 3:].astype(np.float64)
+        turns /= np.sqrt(_dot(turns, turns))
+        in_body = turns * (-1.0, -1.0, -1.0, 1.0)
+        linear = _rotate(in_body, body_qd[:, :3])
+        angular = _rotate(in_body, np.degrees(body_qd[:, 3:].astype(np.float64)))
+        below = self._below
+        if len(below):
+            local = np.c_[positions[below], np.ones(len(below))]
+            positions[below] = np.einsum("ni,nij->nj", local, self._into)[:, :3]
+            turns[below] = _product(self._turn_into, turns[below])
+        if last_turns is not None:
+            turns *= np.where(_dot(turns, last_turns) < 0.0, -1.0, 1.0)
+        return Placed(positions, *(values.astype(np.float32) for values in (turns, linear, angular)))
+
+
+def _scale(matrix) -> float:
+    """Return the mean scale of a transform, the cube root of its determinant."""
+    return float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+
+
+def _rigid(matrix) -> np.ndarray:
+    """Return position and rotation of a transform, as USD's physics and Newton take them: the body's frame."""
+    transform = Gf.Transform(Gf.Matrix4d(matrix.tolist()))
+    rigid = Gf.Matrix4d().SetRotate(transform.GetRotation())
+    rigid.SetTranslateOnly(transform.GetTranslation())
+    return np.array(rigid)
+
+
+def _conjugate_rotation(matrix) -> np.ndarray:
+    turn = Gf.Transform(Gf.Matrix4d(matrix.tolist())).GetRotation().GetQuat()
+    return np.array([*(-turn.GetImaginary()), turn.GetReal()])
+
+
+def _product(a, b) -> np.ndarray:
+    """Return the product of quaternions x y z w, shape [n, 4]: first ``b``, then ``a``."""
+    va, vb, wa, wb = a[:, :3], b[:, :3], a[:, 3:], b[:, 3:]
+    return np.concatenate([wa * vb + wb * va + _cross(va, vb), wa * wb - _dot(va, vb)], axis=1)
+
+
+def _rotate(turns, vectors) -> np.ndarray:
+    """Rotate ``vectors`` [n, 3] by quaternions ``turns`` [n, 4]."""
+    axis, w = turns[:, :3], turns[:, 3:]
+    across = 2.0 * _cross(axis, vectors)
+    return vectors + w * across + _cross(axis, across)
+
+
+def _cross(a, b) -> np.ndarray:
+    """Return cross products of rows; ``numpy.cross`` takes three times as long."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
+def _dot(a, b) -> np.ndarray:
+    """Return dot products of rows, shape [n, 1]."""
+    return np.einsum("ni,ni->n", a, b)[:, None]
