@@ -8,6 +8,15 @@ namespace warpmag {
 constexpr int STEADY = 3; // solves in a row that make two changes to extrapolate from
 enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // what a world does next
 
+// Writes what other threads write, too, and all of them the same.
+template <class Value> CUDA_CALLABLE inline void set_alike(Value& place, Value value) {
+#if defined(__CUDA_ARCH__)
+    place = value;
+#else
+    __atomic_store(&place, &value, __ATOMIC_RELAXED);
+#endif
+}
+
 // Lets a world iterate; ``stiffness`` is that of some of its moments.
 template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w, double stiffness) {
     auto& world = state.worlds.data[w];
@@ -17,17 +26,17 @@ template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w
 #else
     __atomic_fetch_max((long long*)&world.stiffness, __builtin_bit_cast(long long, stiffness), __ATOMIC_RELAXED);
 #endif
-    world.active = 1;
-    world.evaluations = 0;
-    world.next = state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
-    world.linked = 0;
-    world.plain_steps = 0;
-    world.best = -1.0;
+    set_alike(world.active, 1);
+    set_alike(world.evaluations, 0);
+    set_alike<int>(world.next, state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING);
+    set_alike(world.linked, 0);
+    set_alike(world.plain_steps, 0);
+    set_alike(world.best, -1.0);
     if (state.warm.data[w] == 0) {
-        world.kept = 0;
-        world.slowness = 0.0;
+        set_alike(world.kept, 0);
+        set_alike(world.slowness, 0.0);
     }
-    state.condition.data[0] = 1;
+    set_alike(state.condition.data[0], 1);
 }
 
 // Residual of sums ‖M − f(H)‖² and ‖f(H)‖² (Eq. 12): relative, save where there is no field.

@@ -172,7 +172,7 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     if (warm == STEADY) near = extrapolated_field(state, at, ball.w, ahead);
     if (share() != 0) return stiffness;
     const Vector h0 = get(state.h0, at);
-    if (any(mask_of(length(h0) > Real(0)))) world.in_field = 1;
+    if (any(mask_of(length(h0) > Real(0)))) set_alike(world.in_field, 1);
     Vector s = get(state.s, at);
     // the θ flow with κ = k from no magnetization: exact for a lone ball
     if (warm == 0) {
