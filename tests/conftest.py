@@ -5,10 +5,30 @@ Warp is imported by the ``device`` fixture only, so that tests of host code star
 
 import pytest
 
+UNDEFINED = (
+    *("alignment", "array-bounds", "bool", "builtin", "enum", "float-cast-overflow", "integer-divide-by-zero"),
+    *("nonnull-attribute", "null", "object-size", "pointer-overflow", "return", "returns-nonnull-attribute"),
+    *("shift-base", "shift-exponent", "signed-integer-overflow", "unreachable", "vla-bound"),
+)
+"""What Clang's driver calls ``undefined``, of what kernels can do; the compiler inside Warp knows no groups."""
+SANITIZERS = {
+    "address": f"-fsanitize={','.join(('address', *UNDEFINED))}",
+    "thread": "-fsanitize=thread -mllvm -tsan-instrument-memintrinsics=0",  # GCC's runtime lacks __tsan_memcpy
+}
+"""Flags that instrument native code. Warp refuses ``-fsanitize=address`` alone, which its own build must match."""
+
 
 def pytest_addoption(parser):
     parser.addoption("--device", default="cpu", help="Warp device that tests run on: cpu (default), cuda:0, ...")
     parser.addoption("--long", action="store_true", help="also run the tests marked 'long' (minutes)")
+    parser.addoption("--sanitize", choices=tuple(SANITIZERS), help="instrument native code; what .ci/sanitize uses")
+
+
+def pytest_configure(config):
+    if kind := config.getoption("--sanitize"):
+        import warp as wp  # noqa: PLC0415 - kernels take the flags when they are imported
+
+        wp.config.cpu_compiler_flags = f"-march=native {SANITIZERS[kind]}"
 
 
 def pytest_collection_modifyitems(config, items):
