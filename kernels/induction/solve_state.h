@@ -2,20 +2,12 @@
 //
 // ``State`` is the struct of solve_state.py.
 #pragma once
+#include "shared/alike.h"
 
 namespace warpmag {
 
 constexpr int STEADY = 3; // solves in a row that make two changes to extrapolate from
 enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // what a world does next
-
-// Writes what other threads write, too, and all of them the same.
-template <class Value> CUDA_CALLABLE inline void set_alike(Value& place, Value value) {
-#if defined(__CUDA_ARCH__)
-    place = value;
-#else
-    __atomic_store(&place, &value, __ATOMIC_RELAXED);
-#endif
-}
 
 // Lets a world iterate; ``stiffness`` is that of some of its moments.
 template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w, double stiffness) {
