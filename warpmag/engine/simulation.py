@@ -79,7 +79,7 @@ class Simulation:
             InputError: Something about the scene or an argument is wrong; the message names it.
         """
         check_solver(solver)
-        for name, flag in (("graphs", graphs), ("deterministic", deterministic), ("visuals", visuals)):
+        for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
         self.device = resolve_device(device)
         self._scene = None
