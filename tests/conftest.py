@@ -3,12 +3,42 @@
 Warp is imported by the ``device`` fixture only, so that tests of host code start without it.
 """
 
+from pathlib import Path
+
 import pytest
+from hypothesis import HealthCheck, settings
+
+FOLDER = Path(__file__).parent
+UNDEFINED = (
+    *("alignment", "array-bounds", "bool", "builtin", "enum", "float-cast-overflow", "integer-divide-by-zero"),
+    *("nonnull-attribute", "null", "object-size", "pointer-overflow", "return", "returns-nonnull-attribute"),
+    *("shift-base", "shift-exponent", "signed-integer-overflow", "unreachable", "vla-bound"),
+)
+"""What Clang's driver calls ``undefined``, of what kernels can do; the compiler inside Warp knows no groups."""
+SANITIZERS = {
+    "address": f"-fsanitize={','.join(('address', *UNDEFINED))} -fsanitize-ignorelist={FOLDER}/sanitize_not.txt",
+    "thread": "-fsanitize=thread -mllvm -tsan-instrument-memintrinsics=0",  # GCC's runtime lacks __tsan_memcpy
+}
+"""Flags that instrument native code. Warp refuses ``-fsanitize=address`` alone, which its own build must match."""
 
 
 def pytest_addoption(parser):
     parser.addoption("--device", default="cpu", help="Warp device that tests run on: cpu (default), cuda:0, ...")
     parser.addoption("--long", action="store_true", help="also run the tests marked 'long' (minutes)")
+    parser.addoption("--wild", type=int, default=150, metavar="N", help="wild calls of a function (default: 150)")
+    parser.addoption("--sanitize", choices=tuple(SANITIZERS), help="instrument native code; what .ci/sanitize uses")
+
+
+def pytest_configure(config):
+    slow = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    settings.register_profile(
+        "wild", max_examples=config.getoption("--wild"), deadline=None, suppress_health_check=slow
+    )
+    settings.load_profile("wild")
+    if kind := config.getoption("--sanitize"):
+        import warp as wp  # noqa: PLC0415 - kernels take the flags when they are imported
+
+        wp.config.cpu_compiler_flags = f"-march=native {SANITIZERS[kind]}"
 
 
 def pytest_collection_modifyitems(config, items):

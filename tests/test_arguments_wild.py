@@ -1,22 +1,23 @@
-"""Wild arguments of the array functions: right against the oracle, or an ``InputError``; never anything else.
+"""Wild arguments of every public function: right against the oracle, or an ``InputError``; never anything else.
 
-Hypothesis draws sizes and strengths over eighty decades, in any guise, and values that are none.
+Hypothesis draws sizes and strengths over eighty decades, in any guise, and values that are none; ``--wild 2000`` has it
+draw that many of each.
 """
 
+import contextlib
 import math
 import warnings
 
+import newton
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+import pytest
+from hypothesis import given
 from hypothesis import strategies as st
 from test_arguments import GUISES, MS, Unreadable, X, call
 
 import warpmag
 from warpmag import oracle
 
-WILD = settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
 STRANGE = st.sampled_from(
     [
         *(None, True, "x", b"x", 1j, math.nan, math.inf, -1, 0, 10**400, 1e300, 1e-300, [], {}, np.ma.masked),
@@ -71,7 +72,6 @@ def scales(x, m, radii):
     return (near**3 @ size).max(initial=0.0), 1e-6 * (size * (near**4 @ size)).max(initial=0.0), size.max(initial=0.0)
 
 
-@WILD
 @given(arrangements(), SCALES, st.integers(0, 99), GUISE, st.sampled_from(["float32", "float64"]), st.booleans())
 def test_any_field_and_force(device, arrangement, power, seed, guise, dtype, reference):
     x, _, radii = arrangement
@@ -96,7 +96,6 @@ def test_any_field_and_force(device, arrangement, power, seed, guise, dtype, ref
         assert np.abs(wrench[1] - torque).max() <= rtol * 1e-6 * size[2] * size[0] + tiny
 
 
-@WILD
 @given(arrangements(), SCALES, SCALES, GUISE, st.sampled_from(["float32", "float64"]), st.sampled_from(["", "sources"]))
 def test_any_induction(device, arrangement, field, strength, guise, dtype, beside):
     x, scale, radii = arrangement
@@ -136,9 +135,100 @@ ARGUMENTS = {
 }
 
 
-@WILD
+def chosen(data, names):
+    """Strange values of one to three of some arguments."""
+    some = data.draw(st.lists(st.sampled_from(names.split()), min_size=1, max_size=3))
+    return {argument: data.draw(STRANGE) for argument in some}
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
 @given(st.data())
-def test_any_value_of_any_argument(device, data):
-    name = data.draw(st.sampled_from(list(ARGUMENTS)))
-    chosen = data.draw(st.lists(st.sampled_from(ARGUMENTS[name].split()), min_size=1, max_size=3))
-    outcome(name, device, **{argument: data.draw(STRANGE) for argument in chosen})
+def test_any_value_of_any_argument(device, name, data):
+    outcome(name, device, **chosen(data, ARGUMENTS[name]))
+
+
+@contextlib.contextmanager
+def refusals():
+    """Let a call be refused by an ``InputError`` of one line; anything else fails."""
+    try:
+        yield
+    except warpmag.InputError as error:
+        assert ": " in str(error) and "\n" not in str(error) and len(str(error)) < 1000
+
+
+@given(st.one_of(STRANGE, st.text(), st.sampled_from(["iron", "N42"])))
+def test_any_material(name):
+    with refusals():
+        assert warpmag.material(name).name == name
+
+
+def two_shapes():
+    """A builder with a ball as a body, above a box that stands still."""
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    ball = builder.add_body(xform=((0.0, 0.0, 0.03), (0.0, 0.0, 0.0, 1.0)), label="ball")
+    builder.add_shape_sphere(ball, radius=0.005)
+    builder.add_shape_box(-1, hx=0.01, hy=0.01, hz=0.01, label="box")
+    return builder
+
+
+MAGNETS = {
+    "register_attributes": "builder",
+    "add_inducible": "builder body shape material saturation susceptibility curve moment_spacing",
+    "add_permanent": "builder body shape material magnetization moment_spacing",
+}
+
+
+@pytest.mark.parametrize("name", MAGNETS)
+@given(st.data())
+def test_any_magnet(name, data):
+    """What is taken stands in the attributes as it was given."""
+    given = chosen(data, MAGNETS[name])
+    arguments = {"builder": two_shapes()} | ({} if name == "register_attributes" else {"body": 0})
+    if name == "add_permanent":
+        arguments["magnetization"] = data.draw(st.sampled_from([(0.0, 0.0, 1e6), np.ones(3), [1, 2, 3]]))
+    arguments |= given
+    with refusals():
+        getattr(warpmag, name)(**arguments)
+        values = {key: one.values for key, one in arguments["builder"].custom_attributes.items()}
+        for key, wanted in given.items():
+            if key in ("saturation", "susceptibility", "moment_spacing", "magnetization") and wanted is not None:
+                (found,) = values[f"warpmag:{key}"].values()
+                assert np.array_equal(np.ravel(found), np.ravel(wanted))
+
+
+SETTINGS = "force dynamics contact_model rtol external_field max_evaluations curve"
+
+
+@pytest.fixture(scope="module")
+def magnets(device):
+    """A model of an iron ball above a magnet, and its state."""
+    builder = two_shapes()
+    warpmag.add_inducible(builder, 0)
+    warpmag.add_permanent(builder, shape=1, magnetization=(0.0, 0.0, 1e6), moment_spacing=0.01)
+    model = builder.finalize(device=device)
+    return model, model.state()
+
+
+@given(st.data())
+def test_any_magnetics(magnets, data):
+    """What is taken pulls the ball down to the magnet, or leaves it where the field is that of the void."""
+    model, state = magnets
+    with refusals():
+        magnetics = warpmag.Magnetics(model, **chosen(data, SETTINGS))
+        state.clear_forces()
+        magnetics.apply(state)
+        force = state.body_f.numpy()
+        assert np.isfinite(force).all() and force[0, 2] < 0.0
+
+
+@given(st.data())
+def test_any_simulation(device, data):
+    """What is taken makes a step, after which the ball is somewhere."""
+    names = SETTINGS.replace("max_evaluations ", "") + " step solver device graphs visuals scene"
+    builder = two_shapes()
+    warpmag.add_inducible(builder, 0)
+    with refusals(), contextlib.suppress(warpmag.SimulationError):
+        simulation = warpmag.Simulation(**{"scene": builder, "device": device} | chosen(data, names))
+        simulation.step()
+        assert np.isfinite(simulation.state.body_q.numpy()).all()

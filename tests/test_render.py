@@ -78,10 +78,14 @@ def test_without_a_camera_all_bodies_are_in_the_picture(stage, device, tmp_path)
 
 
 def test_bad_input_is_one_line(stage, tmp_path, capsys):
+    (tmp_path / "file").touch()
     for arguments, text in (
+        (["-o", str(tmp_path / "file" / "a.png")], "a.png: cannot be written ("),
         (["-o", "picture.jpg"], "picture.jpg: a picture is written as .png"),
         (["-o", str(tmp_path / "a.png"), "--frame", "-1"], "has frames 0 to"),
     ):
         assert cli.main(["render", str(stage), *arguments]) == cli.BAD_INPUT
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert line.startswith("warpmag: ") and text in line
+    with pytest.raises(InputError, match="size: must be positive, got 0 x 540"):
+        render(stage, tmp_path / "a.png", width=0)

@@ -35,7 +35,9 @@ def shown(value) -> str:
 
 def real(name: str, value) -> float:
     """Return one real number as a float; :class:`InputError` for anything else, bools among it."""
-    plain = value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
+    plain = value
+    if getattr(value, "shape", None) == () and hasattr(value, "item") and not getattr(value, "mask", False):
+        plain = value.item()
     if isinstance(plain, bool) or not isinstance(plain, numbers.Real):
         raise InputError(f"{name}: must be one real number, got {shown(value)}")
     try:
@@ -66,16 +68,31 @@ def check_not_negative(name: str, value: float) -> None:
 
 def check_finite(name: str, values: tuple[float, ...]) -> None:
     """Raise :class:`InputError` unless ``values`` are three finite numbers."""
-    if not hasattr(values, "__len__") or len(values) != 3:
+    try:
+        three = len(values) == 3
+    except TypeError:  # arrays of no dimension have a length, too, until it is asked for
+        three = False
+    if not three:
         raise InputError(f"{name}: must be three numbers, got {shown(values)}")
     if not all(math.isfinite(real(name, v)) for v in values):
         raise InputError(f"{name}: must be finite, got {tuple(float(v) for v in values)}")
 
 
-def check_count(name: str, value: int) -> None:
-    """Raise :class:`InputError` unless ``value`` is a whole number from 1 to the largest of 32 bits."""
+def check_flag(name: str, value: bool) -> None:
+    """Raise :class:`InputError` unless ``value`` is true or false, as Python or NumPy has it."""
+    if type(value).__name__ not in ("bool", "bool_"):
+        raise InputError(f"{name}: must be True or False, got {shown(value)}")
+
+
+def check_whole(name: str, value: int) -> None:
+    """Raise :class:`InputError` unless ``value`` is a whole number."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise InputError(f"{name}: must be a whole number, got {shown(value)}")
+
+
+def check_count(name: str, value: int) -> None:
+    """Raise :class:`InputError` unless ``value`` is a whole number from 1 to the largest of 32 bits."""
+    check_whole(name, value)
     if not 1 <= value < 2**31:
         raise InputError(f"{name}: must be at least 1 and below 2³¹, got {shown(value)}")
 

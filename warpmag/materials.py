@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 from warpmag.errors import InputError
+from warpmag.magnets import shown
 from warpmag.oracle import MU0
 
 _BOZORTH = "R. M. Bozorth, Ferromagnetism, 1951, table of magnetic materials: permeability at 2 mT, saturation"
@@ -121,7 +122,7 @@ def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> t
 
 def _look_up(owner: str, name: str, kind: str | None = None) -> Material:
     known = [one.name for one in MATERIALS.values() if kind in (None, one.kind)]
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         which = f"{kind} material" if kind else "material"
-        raise InputError(f"{owner}: {name!r} is no {which} known here, which are {', '.join(known)}")
+        raise InputError(f"{owner}: {shown(name)} is no {which} known here, which are {', '.join(known)}")
     return MATERIALS[name]

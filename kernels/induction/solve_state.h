@@ -9,7 +9,7 @@ constexpr int STEADY = 3; // solves in a row that make two changes to extrapolat
 enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // what a world does next
 
 // Lets a world iterate; ``stiffness`` is that of some of its moments.
-template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w, double stiffness) {
+template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w, double stiffness, bool first = true) {
     auto& world = state.worlds.data[w];
     // of positive numbers the larger has the larger bits
 #if defined(__CUDA_ARCH__)
@@ -17,17 +17,12 @@ template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w
 #else
     __atomic_fetch_max((long long*)&world.stiffness, __builtin_bit_cast(long long, stiffness), __ATOMIC_RELAXED);
 #endif
-    world.active = 1;
-    world.evaluations = 0;
+    if (!first) return; // one thread of a CPU says what all of them know
+    world.active = state.condition.data[0] = 1;
+    world.evaluations = world.linked = world.plain_steps = 0;
     world.next = state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
-    world.linked = 0;
-    world.plain_steps = 0;
     world.best = -1.0;
-    if (state.warm.data[w] == 0) {
-        world.kept = 0;
-        world.slowness = 0.0;
-    }
-    state.condition.data[0] = 1;
+    if (state.warm.data[w] == 0) world.kept = 0, world.slowness = 0.0;
 }
 
 // Residual of sums ‖M − f(H)‖² and ‖f(H)‖² (Eq. 12): relative, save where there is no field.

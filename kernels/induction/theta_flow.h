@@ -172,7 +172,7 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     if (warm == STEADY) near = extrapolated_field(state, at, ball.w, ahead);
     if (share() != 0) return stiffness;
     const Vector h0 = get(state.h0, at);
-    if (any(mask_of(length(h0) > Real(0)))) world.in_field = 1;
+    if (any(mask_of(length(h0) > Real(0)))) raise_flag(world.in_field);
     Vector s = get(state.s, at);
     // the θ flow with κ = k from no magnetization: exact for a lone ball
     if (warm == 0) {
@@ -362,7 +362,7 @@ template <class State> inline void make_pass(State& state, int pass, int row) {
         const Number stiffness = start(state, at);
         Real most = 0;
         for (int l = 0; l < at.held; ++l) most = stiffness[l] > most ? stiffness[l] : most;
-        begin_world(state, at.world, most);
+        begin_world(state, at.world, most, row == CHUNK * state.chunk_begin.data[at.world]);
     } else if (pass == FIRST_SWEEP || pass == LAST_SWEEP) {
         sweep(state, at, pass == LAST_SWEEP);
     } else if (pass == MEASURE) {

@@ -36,7 +36,7 @@ CUDA_CALLABLE inline void publish_place(const Arrays& a, int i) {
         const Real* found = a.found_at + 3 * (size_t)(i + l);
         const Real x = row[l] - found[0], y = row[stride + l] - found[1], z = row[2 * stride + l] - found[2];
         const Real limit = MARGIN * row[3 * stride + l];
-        if (!(x * x + y * y + z * z <= limit * limit)) *a.moved = 1;
+        if (!(x * x + y * y + z * z <= limit * limit)) raise_flag(*a.moved);
     }
 }
 

@@ -165,7 +165,8 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
     Number sources = zero, dipoles = zero;
     for (int s = share(); s < slots; s += SHARES) {
         int* const list = list_at(a.near, NEAR_SLOTS, s, i);
-        for (int l = 0; l < WIDTH; ++l) list[l] = s < a.near_count[i + l] ? list[l] : i + l;
+        for (int l = 0; l < WIDTH; ++l)
+            if (s >= a.near_count[i + l]) list[l] = i + l; // others read the slots in use meanwhile
         const Four other = four_at(a.places, 0, list), part = four_at(a.places, 1, list);
         const Number weight = counts > Real(s) ? own_part.x * part.x : zero;
         const Mask live = weight > zero;

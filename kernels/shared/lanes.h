@@ -20,6 +20,8 @@ struct alignas(4 * sizeof(Real)) Four {
     Number x, y, z, w;
 };
 
+// Sets what other threads may set at the same time.
+CUDA_CALLABLE inline void raise_flag(int& flag) { flag = 1; }
 CUDA_CALLABLE inline bool any(Mask mask) { return mask; }
 CUDA_CALLABLE inline Number root(Number x) { return sqrt(x); }
 CUDA_CALLABLE inline Number logarithm(Number x) { return log(x); }
@@ -55,6 +57,7 @@ struct Four {
     Number x, y, z, w;
 };
 
+inline void raise_flag(int& flag) { __atomic_store_n(&flag, 1, __ATOMIC_RELAXED); }
 inline bool any(Mask mask) { return __builtin_reduce_or(mask) != 0; }
 inline Number root(Number x) { return __builtin_elementwise_sqrt(x); }
 inline Number logarithm(Number x) {

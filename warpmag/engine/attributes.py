@@ -13,7 +13,7 @@ import warp as wp
 
 from warpmag import materials
 from warpmag.errors import InputError
-from warpmag.magnets import CURVES, KINDS, SATURATION_OF_IRON, Magnet
+from warpmag.magnets import CURVES, KINDS, SATURATION_OF_IRON, Magnet, check_finite, check_whole, shown
 
 NAMESPACE = "warpmag"
 NO_MAGNET = 0
@@ -45,6 +45,7 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     Args:
         builder: The builder; declaring twice does nothing.
     """
+    _check_builder(builder)
     for name, (dtype, default) in _ATTRIBUTES.items():
         builder.add_custom_attribute(
             newton.ModelBuilder.CustomAttribute(
@@ -89,7 +90,7 @@ def add_inducible(
     values = {name: value for name, value in given.items() if value is not None}
     if material is not None:
         if values:
-            raise InputError(f"material: {material!r} says what {' and '.join(values)} are, give one or the other")
+            raise InputError(f"material: {shown(material)} says what {' and '.join(values)} are, give one or the other")
         values = materials.inducible("material", material)
     magnet = Magnet("inducible", **values, curve=curve, moment_spacing=moment_spacing)
     for index in magnet_shapes(builder, body, shape):
@@ -120,8 +121,7 @@ def add_permanent(
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
             of range.
     """
-    if np.shape(magnetization) != (3,):
-        raise InputError(f"magnetization: must be three numbers, got {magnetization}")
+    check_finite("magnetization", magnetization)
     if material is not None:
         magnetization = materials.permanent("material", material, magnetization)
     for index in magnet_shapes(builder, body, shape):
@@ -134,19 +134,19 @@ def add_permanent(
 
 def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
     """Return the shapes that a magnet on ``body``, or on ``shape`` alone, covers."""
+    _check_builder(builder)
     if f"{NAMESPACE}:kind" not in builder.custom_attributes:
         raise InputError("builder: call warpmag.register_attributes(builder) before magnets are added")
     if shape is not None:
-        if not 0 <= shape < builder.shape_count:
-            raise InputError(f"shape: {shape} is out of range, the builder has {builder.shape_count} shapes")
+        _check_index("shape", shape, builder.shape_count, "shapes")
+        check_whole("body", body)
         if body not in (-1, builder.shape_body[shape]):
             raise InputError(f"shape: {builder.shape_label[shape]} belongs to body {builder.shape_body[shape]}")
         if builder.shape_type[shape] not in _SOLID:
             kind = newton.GeoType(builder.shape_type[shape]).name.lower()
             raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
         return [shape]
-    if not 0 <= body < builder.body_count:
-        raise InputError(f"body: {body} is out of range, the builder has {builder.body_count} bodies")
+    _check_index("body", body, builder.body_count, "bodies")
     shapes = [
         index
         for index in builder.body_shapes[body]
@@ -155,6 +155,17 @@ def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = N
     if not shapes:
         raise InputError(f"{builder.body_label[body]}: has no colliding solid shape yet, add its shapes first")
     return shapes
+
+
+def _check_builder(builder: newton.ModelBuilder) -> None:
+    if not isinstance(builder, newton.ModelBuilder):
+        raise InputError(f"builder: must be a newton.ModelBuilder, got {shown(builder)}")
+
+
+def _check_index(name: str, index: int, count: int, kind: str) -> None:
+    check_whole(name, index)
+    if not 0 <= index < count:
+        raise InputError(f"{name}: {shown(index)} is out of range, the builder has {count} {kind}")
 
 
 def mark_shape(builder: newton.ModelBuilder, shape: int, magnet: Magnet) -> None:

@@ -18,6 +18,7 @@ from warpmag.engine.xpbd import PileXPBD
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, watch_capacity, watch_contacts, watch_flags
 from warpmag.kernels.rigid.newton_views import view_contacts
+from warpmag.magnets import check_token
 
 _NEWTON_GAP = 0.1
 """``ModelBuilder.rigid_gap`` [m] as Newton sets it: the gap of a shape for which nobody chose one."""
@@ -165,6 +166,11 @@ MAXIMAL = ("xpbd", "semi-implicit")
 """Solvers that know each body by its own pose, so that joints need no articulation."""
 
 
+def check_solver(solver: str) -> None:
+    """Raise :class:`InputError` unless a solver of that name is known."""
+    check_token("solver", solver, tuple(SOLVERS))
+
+
 class RigidSolver:
     """One model's collision pipeline and solver.
 
@@ -194,8 +200,7 @@ class RigidSolver:
         Raises:
             InputError: There is no such solver, or it cannot be had or cannot run this model.
         """
-        if solver not in SOLVERS:
-            raise InputError(f"solver: {solver!r} is not one of {', '.join(SOLVERS)}")
+        check_solver(solver)
         self._model, self._name = model, solver
         scale_gaps(model, sizes)
         finite = sizes.thickness[np.isfinite(sizes.thickness)]

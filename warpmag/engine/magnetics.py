@@ -82,7 +82,7 @@ class Magnetics:
             InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would be
                 felt in several.
         """
-        settings = MagneticSettings(tuple(external_field), force, dynamics, contact_model, rtol)
+        settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         settings.check("Magnetics")
         if curve is not None:
             check_token("Magnetics: curve", curve, CURVES)

@@ -12,12 +12,12 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import resolve_device
-from warpmag.engine.contacts import MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes
+from warpmag.engine.contacts import MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError, SimulationError
-from warpmag.magnets import MagneticSettings, check_positive
+from warpmag.magnets import MagneticSettings, check_flag, check_positive, shown
 
 DEFAULT_STEP = 1e-3
 """Time step [s] where neither the user nor the stage gives one: the paper's."""
@@ -76,6 +76,9 @@ class Simulation:
         Raises:
             InputError: Something about the scene or an argument is wrong; the message names it.
         """
+        check_solver(solver)
+        for name, flag in (("graphs", graphs), ("visuals", visuals)):
+            check_flag(name, flag)
         self.device = resolve_device(device)
         self._scene = None
         self.frame_rate, self.frame_count = _FRAME_RATE, None
@@ -84,8 +87,8 @@ class Simulation:
         else:
             builder, settings, own_step = self._open(scene, visuals)
             step = own_step if step is None else step
-        self.step_size = DEFAULT_STEP if step is None else step
-        check_positive("step", self.step_size)
+        check_positive("step", DEFAULT_STEP if step is None else step)
+        self.step_size = DEFAULT_STEP if step is None else float(step)
         self.model = self._finalize(builder, solver, scene)
         laws = {
             "force": settings.force if force is None else force,
@@ -106,6 +109,8 @@ class Simulation:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
         from warpmag.engine.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
 
+        if not isinstance(path, str | os.PathLike):
+            raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {shown(path)}")
         self._scene = import_scene(path, visuals=visuals)
         clock = self._scene.clock
         self.frame_rate = clock.frames_per_second

@@ -14,6 +14,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
+from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings
@@ -86,10 +87,10 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
     """Make the values of ``time_code`` the defaults of the stage, in its session layer.
 
     Newton reads default values only: a pose that is given by time samples alone would be the identity. Inside instances
-    nothing can be held; :func:`survey` finds what would be wrong there.
+    nothing can be held; :func:`survey` finds what would be wrong there. Addresses of a network are blocked.
 
     Raises:
-        InputError: Time samples are of another type than their attribute.
+        InputError: Time samples are of another type than their attribute, or an address cannot be blocked.
     """
     session = stage.GetSessionLayer()
     sampled = [
@@ -108,6 +109,7 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
                 attribute.Set(value)
             elif attribute.GetNumTimeSamples():  # blocked at that time: as if it had never been authored
                 attribute.Block()
+    cut_off(stage)
 
 
 def _at(attribute, time_code):
