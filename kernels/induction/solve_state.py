@@ -205,7 +205,7 @@ def allocate(worlds, inducible, dtype, device):
 def carried_arrays(state) -> dict:
     """Return the arrays of a state that a solve hands on to the next one, by name."""
     names = "near near_count s iterate_s iterate_r history_s history_r best_s best_r mixed_g mixed_moment past_field"
-    names += " past_g past now swept worlds warm error evaluations converged"
+    names += " past_g past now swept worlds warm residual error evaluations converged"
     return {name: getattr(state, name) for name in names.split()}
 
 
