@@ -95,7 +95,9 @@ def test_solves_over_time(contact_model, device, assert_same_bits):
 
 
 def test_a_world_keeps_its_bits_in_company(device):
-    """Sums of a world are cut by what it holds alone."""
+    """On a CPU the sums of a world are cut by what it holds alone."""
+    if device != "cpu":
+        pytest.skip("a GPU shares out the sources of a target by how many targets there are in all")
     x, radii, _ = pile(count=1500)
     found = []
     for companions in (0, 1300):

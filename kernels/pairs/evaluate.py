@@ -105,7 +105,7 @@ class PairEvaluation:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
             return 1, ()
         if self.form == MIRRORED:
-            mirror = mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, device)
+            mirror = mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, targets.dtype, device)
             self._launch_sums = lambda a: mirror_cuda.launch_pair_loop_mirrored(mirror, a.sources, a.partial)
             return mirror.slabs + mirror.splits, ()
         if self.form == FUSED:

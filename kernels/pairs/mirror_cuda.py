@@ -5,7 +5,7 @@ Where they would take too much memory, several passes each add to the partial su
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -42,6 +42,8 @@ _SHAPES = {
     ),
     Quantity.MUTUAL_FORCE: ((7000, MirrorShape(2, 4, 6, 2)), (None, MirrorShape(4, 4, 4, 1))),
 }
+_MOST_DOUBLE_WARPS = 4
+"""Warps of a block whose staging in float64 fits into shared memory."""
 _SLAB_BYTES = 2**28
 """Memory that slabs may take."""
 _MOST_SPLITS, _MOST_STAGES = 32, 32
@@ -90,9 +92,11 @@ class Mirror:
     splits: int
 
 
-def make_mirror(origin: int, count: int, quantity: Quantity, device) -> Mirror:
+def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device) -> Mirror:
     """Plan the walk of ``count`` moments from packed column ``origin`` on."""
     shape = next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
+    if dtype is wp.float64 and shape.warps > _MOST_DOUBLE_WARPS:
+        shape = replace(shape, warps=shape.warps // 2, blocks=2 * shape.blocks)
     tiles = max(math.ceil(count / (32 * shape.moments)), 3)
     tiles += 1 - tiles % 2
     stages = math.ceil(math.ceil(count / tiles) / 32)
