@@ -187,7 +187,8 @@ def solve_induction(
     error = float(system.error.numpy().max(initial=0.0))
     if not math.isfinite(error):
         raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
-    _check_strength(kind, largest(system.h), saturation)
+    strongest = float(np.abs(h if isinstance(h, np.ndarray) else h.numpy()).max(initial=0.0))
+    _check_strength(kind, strongest, saturation)
     result = InductionResult(
         magnetizations=m,
         h_field=h,

@@ -74,7 +74,7 @@ def failure(error: Exception) -> str:
     return "text that is not UTF-8"
 
 
-def _read(path: str) -> str:
+def _read(path: str) -> str:  # pragma: no cover - in the child, which has nothing of coverage's
     """Read a stage with all of its layers to the last value; return why that fails, empty where it does not."""
     from pxr import Sdf, Usd  # noqa: PLC0415 - only the child needs it
 
@@ -87,7 +87,7 @@ def _read(path: str) -> str:
     return ""
 
 
-def _limit_memory() -> None:
+def _limit_memory() -> None:  # pragma: no cover - in the child, too
     """Let the process have half of the machine's memory at most."""
     import resource  # noqa: PLC0415 - not everywhere
 
@@ -96,7 +96,7 @@ def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-if __name__ == "__main__":
+if __name__ == "__main__":  # pragma: no cover - in the child, too
     sys.path[:] = json.loads(sys.argv[1])
     with contextlib.suppress(ImportError, ValueError, OSError):
         _limit_memory()
