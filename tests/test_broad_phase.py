@@ -18,8 +18,8 @@ def random_scene(seed: int, worlds: int, device, largest: float = 0.03) -> newto
     scene = newton.ModelBuilder()
     for _ in range(max(worlds, 1)):
         builder = newton.ModelBuilder()
-        for number in range(150):
-            place = wp.transform(rng.uniform(0.0, 0.09, 3), wp.quat_identity())
+        for number in range(80):
+            place = wp.transform(rng.uniform(0.0, 0.07, 3), wp.quat_identity())
             config = newton.ModelBuilder.ShapeConfig(gap=1e-3, collision_group=int(rng.choice([1, 1, 1, 1, 2, -1, -2])))
             body = -1 if number % 10 == 0 else builder.add_body(xform=place, is_kinematic=number % 17 == 0)
             where = place if body < 0 else wp.transform_identity()
@@ -30,7 +30,7 @@ def random_scene(seed: int, worlds: int, device, largest: float = 0.03) -> newto
             else:
                 radius = rng.choice([0.008, 0.01, largest], p=[0.5, 0.45, 0.05])
                 builder.add_shape_sphere(body, xform=where, radius=radius, cfg=config)
-        for a, b in rng.choice(builder.shape_count, (40, 2)):
+        for a, b in rng.choice(builder.shape_count, (20, 2)):
             if a != b:
                 builder.add_shape_collision_filter_pair(int(a), int(b))
         if worlds:
@@ -68,7 +68,7 @@ def set_motion(model, state, rng, shift: float, speed: float):
     state.body_qd.assign(velocities.astype(np.float32))
 
 
-@pytest.mark.parametrize(("worlds", "seed"), [(0, 0), (1, 1), (5, 2)])
+@pytest.mark.parametrize(("worlds", "seed"), [(0, 0), (3, 2)])
 def test_contacts_are_those_of_all_pairs(worlds, seed, device):
     model = random_scene(seed, worlds, device)
     state, rng = model.state(), np.random.default_rng(seed)
