@@ -3,10 +3,10 @@
 //
 // Up to TILE_SIZE sources (from Python) at a time are kept in the first-level cache. There are two loops over pairs:
 //
-// * add_rows sums a target at a time, whatever the radii.
-// * add_both_ends is for the field and Kelvin's force among moments of one radius. It computes a separation and its
-//   powers once for both ends of a pair: 35 vector operations for two fields, where add_rows takes 28 for one, and 46
-//   for two forces, where it takes 37. Tiles that may hold moments of the same body do not have their forces that way.
+// * add_rows sums a target at a time.
+// * add_both_ends is for the field and Kelvin's force among moments. It computes a separation and its powers once for
+//   both ends of a pair: 33 vector operations for two fields, where add_rows takes 28 for one, and 44 for two forces,
+//   where it takes 37; 4 more where radii differ.
 //
 // Threads take shares of the tiles, the largest first; one that starts late or is interrupted leaves more to the
 // others. No two shares add to the same partial sums of a row, and the finishing kernel adds those up in order, so that
@@ -65,7 +65,9 @@ template <int N> inline Vec3<Real> numbers(Simd (*rows)[N], int i) {
     return {number(rows[0], i), number(rows[1], i), number(rows[2], i)};
 }
 
-template <int N> inline Vec3<Simd> vectors(Simd (*rows)[N], int v) { return {rows[0][v], rows[1][v], rows[2][v]}; }
+template <int N> inline Vec3<Simd> vectors(const Simd (*rows)[N], int v) {
+    return {rows[0][v], rows[1][v], rows[2][v]};
+}
 
 // Rows of an array of packed moments, and of a tile, which has scaled moments, too.
 enum Row { POSITION = 0, RADIUS = 3, MOMENT = 4, LABEL = 7, PACKED_ROWS, SCALED_MOMENT = PACKED_ROWS, TILE_ROWS = 11 };
@@ -97,11 +99,12 @@ struct Tile {
     Simd rows[TILE_ROWS][VECTORS + 2]; // two vectors more than are summed, for a loop that reads ahead
     Simd sums[3][VECTORS];             // sums h at its own moments of pairs that are summed for both ends
     int begin, count = 0, vectors = 0;
-    Real radius; // the one radius of all moments, or 0
+    Real radius; // of the first moment
+    bool alike;  // whether all have that radius
     Real lowest_label, highest_label;
     bool ascending; // whether labels ascend, so that no two moments are of one body
 
-    Source<Simd> source(int v) {
+    Source<Simd> source(int v) const {
         return {cpu::vectors(rows + POSITION, v), cpu::vectors(rows + MOMENT, v),
                 cpu::vectors(rows + SCALED_MOMENT, v)};
     }
@@ -135,7 +138,8 @@ inline void compare(Tile& tile) {
         lowest = __builtin_elementwise_min(lowest, labels[v]);
         highest = __builtin_elementwise_max(highest, labels[v]);
     }
-    tile.radius = __builtin_reduce_max(spread) == 0 ? number(tile.rows[RADIUS], 0) : 0;
+    tile.radius = number(tile.rows[RADIUS], 0);
+    tile.alike = __builtin_reduce_max(spread) == 0;
     tile.lowest_label = __builtin_reduce_min(lowest);
     tile.highest_label = __builtin_reduce_max(highest);
     tile.ascending = true;
@@ -197,53 +201,74 @@ __attribute__((noinline)) void add_rows(const Share& share, Real* out, int colum
     }
 }
 
+// What the pairs of two tiles have in common: they are of points, or of balls that touch at one distance, and of two
+// bodies; or nothing.
+enum class Kind { POINTS, BALLS, ANY };
+
 // Adds each pair of two tiles, or of a tile with itself, to the sums of both its ends. The loop is software pipelined,
 // so that nothing waits for its inverse root: one vector of sources has its separations computed, the one before its
 // roots, and the one before that is summed.
-template <Quantity Q> __attribute__((noinline)) void add_both_ends(Tile& targets, Tile& sources) {
+template <Quantity Q, Kind K> __attribute__((noinline)) void add_both_ends(Tile& targets, Tile& sources) {
     struct Separation {
         Vec3<Simd> r;
         Simd c;
     };
+    struct Target {
+        Vec3<Simd> x;
+        Simd radius, label;
+    };
     const Simd contact = targets.radius + sources.radius, clamp = contact * contact;
     const bool diagonal = &targets == &sources, afresh = diagonal || sources.vectors < 2;
-    const auto separation = [&](const Vec3<Simd>& x, int v) -> Separation {
-        const Vec3<Simd> r = x - vectors(sources.rows + POSITION, v);
-        const Simd d2 = dot(r, r);
-        return {r, d2 > clamp ? d2 : clamp};
+    const auto target = [&](int i) -> Target {
+        return {splat(numbers(targets.rows + POSITION, i)), number(targets.rows[RADIUS], i),
+                number(targets.rows[LABEL], i)};
+    };
+    const auto separation = [&](const Target& t, int v) -> Separation {
+        const Vec3<Simd> r = t.x - vectors(sources.rows + POSITION, v);
+        const Simd d2 = dot(r, r), s = t.radius + sources.rows[RADIUS][v], s2 = K == Kind::ANY ? s * s : clamp;
+        return {r, K == Kind::POINTS || d2 > s2 ? d2 : s2};
+    };
+    const auto inverse = [&](const Target& t, Simd c, int v) -> Simd {
+        if (K == Kind::BALLS) return twice_inverse_root(c);
+        auto wanted = c > 0;
+        if (K == Kind::ANY && Q != Quantity::FIELD) wanted &= t.label != sources.rows[LABEL][v];
+        return wanted ? twice_inverse_root(c) : 0;
     };
     Separation now, next;
     Simd inv;
     const auto sum_row = [&](int i) __attribute__((always_inline)) -> Vec3<Simd> {
-        const Vec3<Simd> x = splat(numbers(targets.rows + POSITION, i)), m = splat(numbers(targets.rows + MOMENT, i));
+        const Target t = target(i), then = target(i + 1);
+        const Vec3<Simd> m = splat(numbers(targets.rows + MOMENT, i));
         const Vec3<Simd> n = splat(numbers(targets.rows + SCALED_MOMENT, i));
         Vec3<Simd> h{};
         int v = 0;
         if (diagonal) {
             // pairs with earlier vectors are summed already; those within a vector are summed for each end apart
             v = i / LANES;
-            auto others = clamp > 0;
-            others[i % LANES] = 0;
             Vec3<Simd> unused{};
-            const Separation s = separation(x, v);
-            add_mirrored_pair<Q>(h, unused, s.r, others ? twice_inverse_root(s.c) : 0, sources.source(v), m, n);
+            const Separation s = separation(t, v);
+            Simd others = inverse(t, s.c, v);
+            others[i % LANES] = 0;
+            add_mirrored_pair<Q>(h, unused, s.r, others, sources.source(v), m, n);
             ++v;
         }
         if (afresh || i == 0) {
-            now = separation(x, v), next = separation(x, v + 1);
-            inv = twice_inverse_root(now.c);
+            now = separation(t, v), next = separation(t, v + 1);
+            inv = inverse(t, now.c, v);
         }
-        const auto sum_vector = [&](const Separation& later) {
-            const Simd next_inv = twice_inverse_root(next.c);
+        const auto sum_vector = [&](const Separation& later, const Target& of_next, int next_v) {
+            const Simd next_inv = inverse(of_next, next.c, next_v);
             Vec3<Simd> g = vectors(sources.sums, v);
             add_mirrored_pair<Q>(h, g, now.r, inv, sources.source(v), m, n);
             sources.sums[0][v] = g.x, sources.sums[1][v] = g.y, sources.sums[2][v] = g.z;
             now = next, next = later, inv = next_inv;
         };
-        for (; v < sources.vectors - 2 * !afresh; ++v) sum_vector(separation(x, v + 2));
+        for (; v < sources.vectors - 2 * !afresh; ++v) sum_vector(separation(t, v + 2), t, v + 1);
         // the next target's first separations
-        const Vec3<Simd> y = splat(numbers(targets.rows + POSITION, i + 1));
-        for (; v < sources.vectors; ++v) sum_vector(separation(y, v + 2 - sources.vectors));
+        for (; v < sources.vectors; ++v) {
+            const int ahead = v + 2 - sources.vectors;
+            sum_vector(separation(then, ahead), ahead ? then : t, ahead ? ahead - 1 : v + 1);
+        }
         return h;
     };
     for (int v = 0; v < targets.vectors; ++v) {
@@ -291,13 +316,10 @@ inline void sum_mirrored(const Share& share, const TileEntry& entry, TargetTile&
     }
     const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
     const bool distinct = Q == Quantity::FIELD || (diagonal ? a.ascending : apart);
-    if (a.radius > 0 && b.radius > 0 && distinct) {
-        add_both_ends<Q>(a, b);
-        if (!diagonal) add_tile_sums(b, mirror_out);
-    } else {
-        add_rows<ROWS<Q>>(share, out, begin, end, b);
-        if (!diagonal) add_rows<ROWS<Q>>(share, mirror_out, entry.source_begin, entry.source_end, a);
-    }
+    if (!(a.alike && b.alike && distinct)) add_both_ends<Q, Kind::ANY>(a, b);
+    else if (a.radius + b.radius > 0) add_both_ends<Q, Kind::BALLS>(a, b);
+    else add_both_ends<Q, Kind::POINTS>(a, b);
+    if (!diagonal) add_tile_sums(b, mirror_out);
 }
 
 // Sums a tile for its targets, about equal parts of its sources at a time.
