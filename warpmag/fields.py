@@ -151,7 +151,7 @@ def _named(radii, target_radii):
 def _packed(kind: Kind, name, radii, largest, positions, moments) -> PackedMoments:
     """Pack one-shot arrays, radii under ``name`` and the largest of them checked before."""
     packed = PackedMoments(
-        kind.scalars(name, 0.0 if radii is None else radii, positions.shape[0]), largest_radius=largest
+        kind.scalars(name, 0.0 if radii is None else radii, positions.shape[0]), largest_radius=largest, moving=False
     )
     packed.pack(positions, moments)
     return packed

@@ -88,7 +88,7 @@ class PairEvaluation:
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         parts, tiles = self._plan_sums(quantity, segments, targets, targets is sources, smoothing)
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
-        self.partial = a.partial = wp.zeros(shape, dtype=dtype, device=device)
+        self.partial = a.partial = (wp.zeros if extra_parts else wp.empty)(shape, dtype=dtype, device=device)
         a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
         a.overlap, a.overlap_count = targets.overlaps, targets.overlap_counts

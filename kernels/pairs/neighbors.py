@@ -66,7 +66,7 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
         count: Number of moments n.
         packed: The packed moments, shape [8, n].
         group: Group of each, shape [n] or longer: only moments of one group are neighbours, none if it is negative.
-        ratio: What is nearer than this times contact is a neighbour.
+        ratio: What is nearer than this times contact is a neighbour; with 1 the neighbours are what overlaps.
         capacity: Neighbours a list can hold.
 
     Returns:
@@ -89,8 +89,11 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
     linked, padded = (0, count + _PADDING) if device.is_cpu else (count, 0)
     lists = lists_type(dtype)()
     lists.packed, lists.group, lists.ratio = packed, group, ratio
-    lists.neighbor, lists.overlap = (wp.zeros((count, capacity), dtype=int, device=device) for _ in range(2))
-    lists.count, lists.overlap_count = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
+    lists.neighbor = (wp.zeros if ratio > 1.0 else wp.empty)((count, capacity), dtype=int, device=device)
+    lists.count = wp.zeros(count, dtype=int, device=device)
+    lists.overlap, lists.overlap_count = lists.neighbor, lists.count
+    if ratio > 1.0:
+        lists.overlap, lists.overlap_count = wp.zeros_like(lists.neighbor), wp.zeros_like(lists.count)
     lists.found_at = wp.full(count, math.inf, dtype=wp.types.vector(3, dtype), device=device)
     lists.moved = wp.ones(1, dtype=int, device=device)
     lists.searching = wp.zeros(1, dtype=int, device=device)
@@ -183,6 +186,8 @@ def launch_find_neighbors(targets, sources, reach: float):
 
 def launch_list_overlaps(targets, sources):
     """List those of each target's neighbours that overlap it; both are lists."""
+    if targets.overlap is targets.neighbor:
+        return
     if targets.packed.device.is_cpu:
         _launch("list_overlaps_of_all(targets, sources, threads, team.data)", targets, sources)
     else:

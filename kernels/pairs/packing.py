@@ -82,7 +82,7 @@ class PackedMoments:
         overlap_counts: How many they are, shape [n].
     """
 
-    def __init__(self, radii, *, largest_radius: float, labels=None, groups=None):
+    def __init__(self, radii, *, largest_radius: float, labels=None, groups=None, moving=True):
         """Allocate for moments of given radii.
 
         Args:
@@ -90,6 +90,7 @@ class PackedMoments:
             largest_radius: The largest of them [m].
             labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means each its own.
             groups: World of each moment, shape [n]; None means one world.
+            moving: Whether they will move, so that lists of neighbours longer than needed pay.
         """
         device, dtype, n = radii.device, radii.dtype, radii.shape[0]
         self.count = n
@@ -101,14 +102,16 @@ class PackedMoments:
         def integers(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
 
-        self.labels = integers(np.arange(n) if labels is None else labels)
-        self.groups = integers(np.zeros(n) if groups is None else groups)
-        pitched = np.zeros((PACKED_ROWS, (1 + -(-n // PITCH)) * PITCH))
-        pitched[3], pitched[7] = largest_radius, -1.0
-        pitched = wp.array(pitched, dtype=dtype, device=device)
+        self.labels = integers(np.arange(n, dtype=np.int32) if labels is None else labels)
+        self.groups = wp.zeros(n, dtype=wp.int32, device=device) if groups is None else integers(groups)
+        pitched = wp.zeros((PACKED_ROWS, (1 + -(-n // PITCH)) * PITCH), dtype=dtype, device=device)
+        pitched[3].fill_(largest_radius)
+        pitched[7].fill_(-1.0)
         self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
-        lists = self._lists = neighbors.allocate(n, self.packed, self.groups)
+        lists = self._lists = neighbors.allocate(
+            n, self.packed, self.groups, ratio=1.0 + neighbors.SKIN if moving else 1.0
+        )
         self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
         self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
 

@@ -1,12 +1,10 @@
 // All-pairs sums, field (Eq. 1) and force (Eqs. 4, 13 and 14), of a work list of tiles on a CPU: in vectors as wide as
 // the machine has them, by several threads.
 //
-// Up to TILE_SIZE sources (from Python) at a time are kept in the first-level cache. There are two loops over pairs:
-//
-// * add_rows sums a target at a time.
-// * add_both_ends is for the field and Kelvin's force among moments. It computes a separation and its powers once for
-//   both ends of a pair: 33 vector operations for two fields, where add_rows takes 28 for one, and 44 for two forces,
-//   where it takes 37; 4 more where radii differ.
+// Up to TILE_SIZE sources (from Python) at a time are kept in the first-level cache. The field and Kelvin's force among
+// moments are summed for both ends of a pair at once, which share the separation and its powers: 33 vector operations
+// make two fields, where one by itself takes 23, and 44 make two forces, where one takes 34. The loop is compiled for
+// what the pairs of two tiles have in common, too: radii that differ cost 3 operations more.
 //
 // Threads take shares of the tiles, the largest first; one that starts late or is interrupted leaves more to the
 // others. No two shares add to the same partial sums of a row, and the finishing kernel adds those up in order, so that
@@ -33,6 +31,13 @@ static_assert(W == 2); // inverse distances are twice_inverse_root(d²)
 // Whether a pair may be summed for both its ends, and what is summed otherwise.
 template <Quantity Q> constexpr bool MUTUAL = Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE;
 template <Quantity Q> constexpr Quantity ROWS = Q == Quantity::MUTUAL_FORCE ? Quantity::FORCE : Q;
+
+// Which of the numbers of Sums there are, and how many.
+template <Quantity Q> constexpr bool is_summed(int k) {
+    if (MUTUAL<Q>) return k >= 3 && k < 6;
+    return Q == Quantity::WRENCH || k < 3 || k == 9;
+}
+template <Quantity Q> constexpr int SUMS = Q == Quantity::WRENCH ? 10 : MUTUAL<Q> ? 3 : 4;
 
 // Exchanges rows and columns of a square of numbers, by blocks of STEP and more.
 template <int STEP, int... L> inline void transpose(Simd (&rows)[LANES], Sequence<int, L...> lanes) {
@@ -110,6 +115,28 @@ struct Tile {
     }
 };
 
+// Finds what moments of a tile have in common.
+inline void compare_radii(Tile& tile) {
+    tile.radius = number(tile.rows[RADIUS], 0);
+    Simd spread = 0;
+    for (int v = 0; v < tile.vectors; ++v)
+        spread = __builtin_elementwise_max(spread, __builtin_elementwise_abs(tile.rows[RADIUS][v] - tile.radius));
+    tile.alike = __builtin_reduce_max(spread) == 0;
+}
+inline void compare_labels(Tile& tile) {
+    const Simd* labels = tile.rows[LABEL];
+    Simd lowest = labels[0], highest = labels[0];
+    for (int v = 0; v < tile.vectors; ++v) {
+        lowest = __builtin_elementwise_min(lowest, labels[v]);
+        highest = __builtin_elementwise_max(highest, labels[v]);
+    }
+    tile.lowest_label = __builtin_reduce_min(lowest);
+    tile.highest_label = __builtin_reduce_max(highest);
+    tile.ascending = true;
+    for (int i = 1; i < tile.count; ++i)
+        tile.ascending &= number(tile.rows[LABEL], i - 1) < number(tile.rows[LABEL], i);
+}
+
 template <Quantity Q> __attribute__((noinline)) void fill(Tile& tile, const Table& table, int begin, int end) {
     tile.begin = begin;
     tile.count = end - begin;
@@ -127,158 +154,130 @@ template <Quantity Q> __attribute__((noinline)) void fill(Tile& tile, const Tabl
             tile.rows[SCALED_MOMENT + c][v] = SCALE * tile.rows[MOMENT + c][v];
             tile.sums[c][v] = 0;
         }
+    compare_radii(tile);
+    if (Q != Quantity::FIELD) compare_labels(tile);
 }
 
-// Finds what moments of a tile have in common.
-inline void compare(Tile& tile) {
-    const Simd *radii = tile.rows[RADIUS], *labels = tile.rows[LABEL];
-    Simd spread = 0, lowest = labels[0], highest = labels[0];
-    for (int v = 0; v < tile.vectors; ++v) {
-        spread = __builtin_elementwise_max(spread, __builtin_elementwise_abs(radii[v] - number(tile.rows[RADIUS], 0)));
-        lowest = __builtin_elementwise_min(lowest, labels[v]);
-        highest = __builtin_elementwise_max(highest, labels[v]);
-    }
-    tile.radius = number(tile.rows[RADIUS], 0);
-    tile.alike = __builtin_reduce_max(spread) == 0;
-    tile.lowest_label = __builtin_reduce_min(lowest);
-    tile.highest_label = __builtin_reduce_max(highest);
-    tile.ascending = true;
-    for (int i = 1; i < tile.count; ++i)
-        tile.ascending &= number(tile.rows[LABEL], i - 1) < number(tile.rows[LABEL], i);
-}
-
-// Sums of a target, packed in a column, over the sources of a tile.
-template <Quantity Q> inline Sums<Simd> sum_row(const Share& share, int column, Tile& tile) {
-    const Table& targets = share.targets;
-    const int own = column - tile.begin;
-    // a moment's own field is left out: its moment is zero, and its label, while its row is summed
-    const bool masked = Q == Quantity::FIELD && targets.data == share.sources.data && own >= 0 && own < tile.count;
+// While it lives, a tile has no moment that is a target itself: a moment's own field is left out.
+struct Own {
+    Tile& sources;
+    int i;
     Real kept[TILE_ROWS];
-    for (int r = MOMENT; r < TILE_ROWS && masked; ++r) {
-        kept[r] = number(tile.rows[r], own);
-        number(tile.rows[r], own) = 0;
-    }
-    const Vec3<Simd> x = splat(targets.vector(POSITION, column));
-    const Vec3<Simd> e = Q == Quantity::FIELD ? Vec3<Simd>{} : splat(share.effective.vector(0, column));
-    const Real radius = targets.row(RADIUS)[column], label = targets.row(LABEL)[column];
-    Sums<Simd> sums;
-    for (int v = 0; v < tile.vectors; ++v) {
-        const Source<Simd> source = tile.source(v);
-        const Vec3<Simd> r = x - source.x;
-        const Simd s = radius + tile.rows[RADIUS][v], s2 = s * s, d2 = dot(r, r), c = d2 > s2 ? d2 : s2;
-        auto wanted = c > 0;
-        if constexpr (Q != Quantity::FIELD) wanted &= label != tile.rows[LABEL][v];
-        add_pair<Q>(sums, r, wanted ? twice_inverse_root(c) : 0, source, e);
-    }
-    for (int r = MOMENT; r < TILE_ROWS && masked; ++r) number(tile.rows[r], own) = kept[r];
-    return sums;
-}
 
-// Adds the sources of a tile to the sums of targets that are packed from a column on.
-template <Quantity Q>
-__attribute__((noinline)) void add_rows(const Share& share, Real* out, int column_begin, int column_end, Tile& tile) {
-    constexpr int SUMS = sizeof(Sums<Simd>) / sizeof(Simd);
-    constexpr auto used = [](int k) {
-        return Q == Quantity::WRENCH || (Q == Quantity::FIELD ? k >= 3 && k < 6 : k < 3 || k == 9);
-    };
-    for (int column = column_begin; column < column_end; column += LANES) {
-        const int held = column_end - column < LANES ? column_end - column : LANES;
-        Simd rows[SUMS][LANES], found[SUMS];
-        for (int l = 0; l < LANES; ++l) {
-            const Sums<Simd> sums = l < held ? sum_row<Q>(share, column + l, tile) : Sums<Simd>{};
-            for (int k = 0; k < SUMS; ++k)
-                if (used(k)) rows[k][l] = ((const Simd*)&sums)[k];
-        }
-        for (int k = 0; k < SUMS; ++k) found[k] = used(k) ? totals(rows[k]) : 0;
-        for (int l = 0; l < held; ++l, out += width(Q)) {
-            const auto sum = [&](int k) { return number(found + k, l); };
-            const auto vector = [&](int k) -> Vec3<Real> { return {sum(k), sum(k + 1), sum(k + 2)}; };
-            const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column + l);
-            Real numbers[width(Q)];
-            results<Q>({vector(0), vector(3), vector(6), sum(9)}, e, numbers);
-            for (int c = 0; c < width(Q); ++c) out[c] += numbers[c];
+    Own(const Share& share, const Tile& targets, Tile& sources, int target, bool left_out)
+        : sources(sources), i(targets.begin + target - sources.begin) {
+        if (!left_out || share.targets.data != share.sources.data || i < 0 || i >= sources.count) i = -1;
+        for (int r = MOMENT; r < TILE_ROWS && i >= 0; ++r) {
+            kept[r] = number(sources.rows[r], i);
+            number(sources.rows[r], i) = 0;
         }
     }
-}
+    ~Own() {
+        for (int r = MOMENT; r < TILE_ROWS && i >= 0; ++r) number(sources.rows[r], i) = kept[r];
+    }
+};
 
 // What the pairs of two tiles have in common: they are of points, or of balls that touch at one distance, and of two
 // bodies; or nothing.
 enum class Kind { POINTS, BALLS, ANY };
 
-// Adds each pair of two tiles, or of a tile with itself, to the sums of both its ends. The loop is software pipelined,
-// so that nothing waits for its inverse root: one vector of sources has its separations computed, the one before its
-// roots, and the one before that is summed.
-template <Quantity Q, Kind K> __attribute__((noinline)) void add_both_ends(Tile& targets, Tile& sources) {
+template <Quantity Q> inline Kind kind_of(const Tile& a, const Tile& b) {
+    const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
+    const bool distinct = Q == Quantity::FIELD || (&a == &b ? a.ascending : apart);
+    if (!(a.alike && b.alike && distinct)) return Kind::ANY;
+    return a.radius + b.radius > 0 ? Kind::BALLS : Kind::POINTS;
+}
+
+// Writes the results of targets to the partial sums, from vectors of each of their sums.
+template <Quantity Q>
+inline void add_results(const Share& share, Real* out, int column, int held, Simd (&rows)[SUMS<Q>][LANES]) {
+    Simd found[10] = {};
+    for (int k = 0, used = 0; k < 10; ++k)
+        if (is_summed<Q>(k)) found[k] = totals(rows[used++]);
+    for (int l = 0; l < held; ++l, out += width(Q)) {
+        const auto sum = [&](int k) { return number(found + k, l); };
+        const auto vector = [&](int k) -> Vec3<Real> { return {sum(k), sum(k + 1), sum(k + 2)}; };
+        const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column + l);
+        Real numbers[width(Q)];
+        results<Q>({vector(0), vector(3), vector(6), sum(9)}, e, numbers);
+        for (int c = 0; c < width(Q); ++c) out[c] += numbers[c];
+    }
+}
+
+// Adds each pair of two tiles to the partial sums of its target; or each pair of two tiles, or of a tile with itself,
+// to the sums of both its ends. The loop is software pipelined, so that nothing waits for its inverse root: one vector
+// of sources has its separations computed, the one before its roots, and the one before that is summed.
+template <Quantity Q, Kind K, bool BOTH>
+__attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile& sources, Real* out) {
     struct Separation {
         Vec3<Simd> r;
         Simd c;
     };
-    struct Target {
-        Vec3<Simd> x;
-        Simd radius, label;
-    };
     const Simd contact = targets.radius + sources.radius, clamp = contact * contact;
-    const bool diagonal = &targets == &sources, afresh = diagonal || sources.vectors < 2;
-    const auto target = [&](int i) -> Target {
-        return {splat(numbers(targets.rows + POSITION, i)), number(targets.rows[RADIUS], i),
-                number(targets.rows[LABEL], i)};
-    };
-    const auto separation = [&](const Target& t, int v) -> Separation {
-        const Vec3<Simd> r = t.x - vectors(sources.rows + POSITION, v);
-        const Simd d2 = dot(r, r), s = t.radius + sources.rows[RADIUS][v], s2 = K == Kind::ANY ? s * s : clamp;
-        return {r, K == Kind::POINTS || d2 > s2 ? d2 : s2};
-    };
-    const auto inverse = [&](const Target& t, Simd c, int v) -> Simd {
-        if (K == Kind::BALLS) return twice_inverse_root(c);
-        auto wanted = c > 0;
-        if (K == Kind::ANY && Q != Quantity::FIELD) wanted &= t.label != sources.rows[LABEL][v];
-        return wanted ? twice_inverse_root(c) : 0;
-    };
-    Separation now, next;
-    Simd inv;
-    const auto sum_row = [&](int i) __attribute__((always_inline)) -> Vec3<Simd> {
-        const Target t = target(i), then = target(i + 1);
-        const Vec3<Simd> m = splat(numbers(targets.rows + MOMENT, i));
-        const Vec3<Simd> n = splat(numbers(targets.rows + SCALED_MOMENT, i));
-        Vec3<Simd> h{};
+    const auto sum_row = [&](int i) __attribute__((always_inline)) -> Sums<Simd> {
+        const auto of_target = [&](int row) { return splat(numbers(targets.rows + row, i)); };
+        const Vec3<Simd> x = of_target(POSITION), n = of_target(SCALED_MOMENT);
+        const Vec3<Simd> e = BOTH ? of_target(MOMENT) : splat(share.effective.vector(0, targets.begin + i));
+        const Real radius = number(targets.rows[RADIUS], i), label = number(targets.rows[LABEL], i);
+        const auto separation = [&](int v) -> Separation {
+            const Vec3<Simd> r = x - vectors(sources.rows + POSITION, v);
+            const Simd d2 = dot(r, r), s = radius + sources.rows[RADIUS][v], s2 = K == Kind::ANY ? s * s : clamp;
+            return {r, K == Kind::POINTS || d2 > s2 ? d2 : s2};
+        };
+        const auto inverse = [&](Simd c, int v) -> Simd {
+            if (K == Kind::BALLS) return twice_inverse_root(c);
+            auto wanted = c > 0;
+            if (K == Kind::ANY && Q != Quantity::FIELD) wanted &= label != sources.rows[LABEL][v];
+            return wanted ? twice_inverse_root(c) : 0;
+        };
+        Sums<Simd> sums;
         int v = 0;
-        if (diagonal) {
+        if (BOTH && &targets == &sources) {
             // pairs with earlier vectors are summed already; those within a vector are summed for each end apart
             v = i / LANES;
-            Vec3<Simd> unused{};
-            const Separation s = separation(t, v);
-            Simd others = inverse(t, s.c, v);
+            const Separation s = separation(v);
+            Simd others = inverse(s.c, v);
             others[i % LANES] = 0;
-            add_mirrored_pair<Q>(h, unused, s.r, others, sources.source(v), m, n);
+            Vec3<Simd> unused{};
+            add_mirrored_pair<Q>(sums.h, unused, s.r, others, sources.source(v), e, n);
             ++v;
         }
-        if (afresh || i == 0) {
-            now = separation(t, v), next = separation(t, v + 1);
-            inv = inverse(t, now.c, v);
-        }
-        const auto sum_vector = [&](const Separation& later, const Target& of_next, int next_v) {
-            const Simd next_inv = inverse(of_next, next.c, next_v);
-            Vec3<Simd> g = vectors(sources.sums, v);
-            add_mirrored_pair<Q>(h, g, now.r, inv, sources.source(v), m, n);
-            sources.sums[0][v] = g.x, sources.sums[1][v] = g.y, sources.sums[2][v] = g.z;
-            now = next, next = later, inv = next_inv;
-        };
-        for (; v < sources.vectors - 2 * !afresh; ++v) sum_vector(separation(t, v + 2), t, v + 1);
-        // the next target's first separations
+        Separation now = separation(v), next = separation(v + 1);
+        Simd inv = inverse(now.c, v);
         for (; v < sources.vectors; ++v) {
-            const int ahead = v + 2 - sources.vectors;
-            sum_vector(separation(then, ahead), ahead ? then : t, ahead ? ahead - 1 : v + 1);
+            const Separation later = separation(v + 2);
+            const Simd next_inv = inverse(next.c, v + 1);
+            if constexpr (BOTH) {
+                Vec3<Simd> g = vectors(sources.sums, v);
+                add_mirrored_pair<Q>(sums.h, g, now.r, inv, sources.source(v), e, n);
+                sources.sums[0][v] = g.x, sources.sums[1][v] = g.y, sources.sums[2][v] = g.z;
+            } else {
+                add_pair<Q>(sums, now.r, inv, sources.source(v), e);
+            }
+            now = next, next = later, inv = next_inv;
         }
-        return h;
+        return sums;
     };
-    for (int v = 0; v < targets.vectors; ++v) {
-        Simd h[3][LANES] = {};
-        for (int l = 0, i = v * LANES; l < LANES && i < targets.count; ++l, ++i) {
-            const Vec3<Simd> sum = sum_row(i);
-            h[0][l] = sum.x, h[1][l] = sum.y, h[2][l] = sum.z;
+    for (int i = 0; i < targets.count; i += LANES) {
+        const int held = targets.count - i < LANES ? targets.count - i : LANES;
+        Simd rows[SUMS<Q>][LANES] = {};
+        for (int l = 0; l < held; ++l) {
+            const Own own(share, targets, sources, i + l, !BOTH && Q == Quantity::FIELD);
+            const Sums<Simd> sums = sum_row(i + l);
+            for (int k = 0, used = 0; k < 10; ++k)
+                if (is_summed<Q>(k)) rows[used++][l] = ((const Simd*)&sums)[k];
         }
-        for (int c = 0; c < 3; ++c) targets.sums[c][v] += totals(h[c]);
+        if constexpr (BOTH)
+            for (int c = 0; c < 3; ++c) targets.sums[c][i / LANES] += totals(rows[c]);
+        else add_results<Q>(share, out + (size_t)i * width(Q), targets.begin + i, held, rows);
     }
+}
+
+template <Quantity Q, bool BOTH> inline void sum_all_pairs(const Share& share, Tile& a, Tile& b, Real* out) {
+    const Kind kind = kind_of<Q>(a, b);
+    if (kind == Kind::ANY) sum_pairs<Q, Kind::ANY, BOTH>(share, a, b, out);
+    else if (kind == Kind::BALLS) sum_pairs<Q, Kind::BALLS, BOTH>(share, a, b, out);
+    else sum_pairs<Q, Kind::POINTS, BOTH>(share, a, b, out);
 }
 
 // Adds sums of pairs that were summed for both ends to the partial sums of a tile's moments.
@@ -294,6 +293,11 @@ __attribute__((noinline)) inline void add_tile_sums(const Tile& tile, Real* out)
 struct TargetTile {
     Tile tile;
     Real* out = nullptr;
+
+    void finish() {
+        if (out) add_tile_sums(tile, out);
+        out = nullptr;
+    }
 };
 
 // Sums a tile for its targets, and the tile with sources and targets exchanged.
@@ -303,33 +307,30 @@ inline void sum_mirrored(const Share& share, const TileEntry& entry, TargetTile&
     Real* const out = share.sums_at<Q>(entry.split, entry.row_begin);
     Real* const mirror_out = share.sums_at<Q>(entry.mirror_split, entry.row_begin + entry.source_begin - begin);
     if (targets.out != out) {
-        add_tile_sums(targets.tile, targets.out);
+        targets.finish();
         targets.out = out;
         fill<Q>(targets.tile, share.sources, begin, end);
-        compare(targets.tile);
     }
-    const bool diagonal = entry.source_begin == begin;
-    Tile &a = targets.tile, &b = diagonal ? a : tile;
-    if (!diagonal) {
-        fill<Q>(b, share.sources, entry.source_begin, entry.source_end);
-        compare(b);
-    }
-    const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
-    const bool distinct = Q == Quantity::FIELD || (diagonal ? a.ascending : apart);
-    if (!(a.alike && b.alike && distinct)) add_both_ends<Q, Kind::ANY>(a, b);
-    else if (a.radius + b.radius > 0) add_both_ends<Q, Kind::BALLS>(a, b);
-    else add_both_ends<Q, Kind::POINTS>(a, b);
-    if (!diagonal) add_tile_sums(b, mirror_out);
+    if (entry.source_begin == begin) return sum_all_pairs<Q, true>(share, targets.tile, targets.tile, nullptr);
+    fill<Q>(tile, share.sources, entry.source_begin, entry.source_end);
+    sum_all_pairs<Q, true>(share, targets.tile, tile, nullptr);
+    add_tile_sums(tile, mirror_out);
 }
 
 // Sums a tile for its targets, about equal parts of its sources at a time.
-template <Quantity Q> inline void sum_sources(const Share& share, const TileEntry& entry, Tile& tile) {
+template <Quantity Q>
+inline void sum_sources(const Share& share, const TileEntry& entry, TargetTile& targets, Tile& tile) {
+    targets.finish();
     const int begin = entry.column_begin, end = begin + entry.row_end - entry.row_begin;
     const int count = entry.source_end - entry.source_begin, parts = (count + TILE_SIZE - 1) / TILE_SIZE;
     for (int first = entry.source_begin; first < entry.source_end; first += tile.count) {
         const int chunks = (count + CHUNK * parts - 1) / (CHUNK * parts), left = entry.source_end - first;
         fill<Q>(tile, share.sources, first, first + (CHUNK * chunks < left ? CHUNK * chunks : left));
-        add_rows<ROWS<Q>>(share, share.sums_at<Q>(entry.split, entry.row_begin), begin, end, tile);
+        for (int i = begin; i < end; i += TILE_SIZE) {
+            fill<Q>(targets.tile, share.targets, i, i + TILE_SIZE < end ? i + TILE_SIZE : end);
+            Real* const out = share.sums_at<Q>(entry.split, entry.row_begin + i - begin);
+            sum_all_pairs<Q, false>(share, targets.tile, tile, out);
+        }
     }
 }
 
@@ -349,10 +350,10 @@ template <Quantity Q> inline void sum_share(const Share& share) {
         if (entry->mirrored) {
             if constexpr (MUTUAL<Q>) sum_mirrored<Q>(share, *entry, targets, tile);
         } else {
-            sum_sources<Q>(share, *entry, tile);
+            sum_sources<ROWS<Q>>(share, *entry, targets, tile);
         }
     }
-    add_tile_sums(targets.tile, targets.out);
+    targets.finish();
 }
 
 // Sums all tiles of ``Arrays``, the struct of work_list.py.

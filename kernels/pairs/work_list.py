@@ -33,8 +33,8 @@ def target_rows(segments, device):
         segments: Integers [k, 4]: target column begin and end, source begin and end.
         device: Warp device.
     """
-    sizes, starts = segments[:, 1] - segments[:, 0], row_starts(segments)
-    target = np.arange(starts[-1]) + np.repeat(segments[:, 0] - starts[:-1], sizes)
+    sizes, starts, segments = segments[:, 1] - segments[:, 0], row_starts(segments), segments.astype(np.int32)
+    target = np.arange(starts[-1], dtype=np.int32) + np.repeat(segments[:, 0] - starts[:-1].astype(np.int32), sizes)
     rows = target, np.repeat(segments[:, 2], sizes), np.repeat(segments[:, 3], sizes)
     return [wp.array(values, dtype=wp.int32, device=device) for values in rows]
 
@@ -114,11 +114,8 @@ def _cut_segment(segment, row, mutual, most):
         # as wide as makes two blocks for each thread, one on the diagonal being half of another
         wanted = 1 if whole or count**2 <= grain else 2 * math.ceil(count / math.sqrt(2.0 * grain))
         stripes = _stripes(t0, t1, wanted)
-        blocks = [
-            _square(shift, stripes[a], stripes[b], b, a, most)
-            for a in range(len(stripes))
-            for b in range(a, len(stripes))
-        ]
+        cut = [_stripes(*ends, -(-(ends[1] - ends[0]) // most)) for ends in stripes]
+        blocks = [_square(shift, cut, a, b) for a in range(len(cut)) for b in range(a, len(cut))]
         parts, rest = len(stripes), [(s0, t0), (t1, s1)]
     for j0, j1 in rest:
         wanted = 1 if whole else math.ceil(count * (j1 - j0) / grain)
@@ -155,17 +152,17 @@ def _idle_rows(starts, written, parts):
     return joined
 
 
-def _square(shift, targets, sources, part, mirror_part, most):
-    """Work and tiles of targets and sources on or above the diagonal; ``shift`` leads from columns to rows."""
-    stripes = [_stripes(*ends, -(-(ends[1] - ends[0]) // most)) for ends in (targets, sources)]
+def _square(shift, stripes, a, b):
+    """Work and tiles of targets in stripe a and sources in stripe b, on or above the diagonal.
+
+    Stripes are cut into ranges of a tile's width; ``shift`` leads from columns to rows.
+    """
+    targets, sources = stripes[a], stripes[b]
     tiles = [
-        (i0 + shift, i1 + shift, i0, j0, j1, part, 1, mirror_part)
-        for i0, i1 in stripes[0]
-        for j0, j1 in stripes[1]
-        if i0 <= j0
+        (i0 + shift, i1 + shift, i0, j0, j1, b, 1, a) for i0, i1 in targets for j0, j1 in sources if a < b or i0 <= j0
     ]
-    pairs = (targets[1] - targets[0]) * (sources[1] - sources[0])
-    return pairs if targets == sources else 2 * pairs, tiles
+    pairs = (targets[-1][1] - targets[0][0]) * (sources[-1][1] - sources[0][0])
+    return pairs if a == b else 2 * pairs, tiles
 
 
 def pair_count(segments) -> int:
