@@ -1,8 +1,9 @@
 """warpmag and its peers, in one run on the same arrays: ``python -m bench.compare [--device cuda:0] [--sizes 243]``.
 
 What is timed is the field of n dipoles at each other, data in place, results left in place: evaluations one after the
-other and one wait at their end. Each peer's field is compared with the float64 oracle on some targets. One JSON line a
-measurement; a peer whose library is missing, or that fails at a size, gets a line that says so.
+other and one wait at their end; of ``h_field`` and ``h_field_balls`` the whole call. Peers take turns. Each field is
+compared with the float64 oracle on some targets. One JSON line a measurement; a peer whose library is missing, or that
+fails at a size, gets a line that says so.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from bench.machine import describe
 from bench.peers import PEERS, Peer
 from warpmag import oracle
 
-SIZES = {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768, 131072, 262144)}
+SIZES = {"cpu": (243, 1032, 2560, 10000, 20000), "cuda": (243, 1032, 2560, 10000, 32768, 131072, 262144)}
 _CHECKED = 32
 """Targets compared with the oracle."""
 _LAPS = 7
@@ -43,32 +44,69 @@ def reference(positions, moments) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def measure(peer: Peer, positions, moments, expected, device, seconds: float) -> dict:
-    """Time one evaluation of a peer, and check what it leaves."""
-    began = time.perf_counter()
-    evaluation = importlib.import_module(f"bench.peers.{peer.name}").prepare(positions, moments, device)
+class Measurement:
+    """One peer at one size: made ready, and timed lap by lap."""
 
-    def lap(count):
+    def __init__(self, peer: Peer, positions, moments, device, seconds: float):
+        """Prepare and run it once, and find how many evaluations make a lap, of ``seconds`` in all."""
+        began = time.perf_counter()
+        self._evaluation = importlib.import_module(f"bench.peers.{peer.name}").prepare(positions, moments, device)
+        self._evaluations, self._times, self._pairs = 1, [], len(positions) ** 2
+        self.lap()
+        self._first = time.perf_counter() - began
+        self.lap()
+        self._evaluations = max(1, round(seconds / _LAPS / self._times[1]))
+        self._times = []
+
+    def lap(self) -> None:
+        """Time one lap, unless evaluations are so long that two are enough."""
+        if self._evaluations == 1 and len(self._times) >= 2:
+            return
         start = time.perf_counter()
-        for _ in range(count):
-            evaluation.run()
-        evaluation.wait()
-        return (time.perf_counter() - start) / count
+        for _ in range(self._evaluations):
+            self._evaluation.run()
+        self._evaluation.wait()
+        self._times.append((time.perf_counter() - start) / self._evaluations)
 
-    lap(1)
-    first = time.perf_counter() - began
-    count = max(1, round(seconds / _LAPS / lap(1)))
-    laps = [lap(count) for _ in range(_LAPS if count > 1 else 2)]
-    targets, fields = expected
-    error = float(np.linalg.norm(evaluation.result()[targets] - fields) / np.linalg.norm(fields))
-    best = min(laps)
-    return {
-        "seconds": best,
-        "median_seconds": float(np.median(laps)),
-        "pairs_per_second": len(positions) ** 2 / best,
-        "error": error,
-        "first_call_seconds": first,
-    }
+    def result(self, expected) -> dict:
+        """Times of an evaluation, and the error of what it leaves."""
+        targets, fields = expected
+        best = min(self._times)
+        return {
+            "seconds": best,
+            "median_seconds": float(np.median(self._times)),
+            "pairs_per_second": self._pairs / best,
+            "error": float(np.linalg.norm(self._evaluation.result()[targets] - fields) / np.linalg.norm(fields)),
+            "first_call_seconds": self._first,
+        }
+
+
+def compare(peers: dict[str, Peer], count: int, device: str, seconds: float) -> dict[str, dict]:
+    """Measure peers at one size, lap by lap in turns: what else the machine does slows all of them down.
+
+    Returns:
+        What there is to say of each, by name.
+    """
+    positions, moments = arrays(count)
+    expected = reference(positions, moments)
+    running, lines = {}, {}
+
+    def attempt(name, call, *arguments):
+        try:
+            with contextlib.redirect_stdout(sys.stderr):  # some libraries talk
+                return call(*arguments)
+        except Exception as problem:  # a peer's failure is a result: the others go on
+            lines[name] = {"failed": f"{type(problem).__name__}: {problem}".splitlines()[0][:200]}
+
+    for name, peer in peers.items():
+        running[name] = attempt(name, Measurement, peer, positions, moments, device, seconds)
+    for _ in range(_LAPS):
+        for name in [name for name in peers if name not in lines]:
+            attempt(name, running[name].lap)
+    for name in [name for name in peers if name not in lines]:
+        result = attempt(name, running[name].result, expected)
+        lines[name] = result or lines[name]
+    return {name: lines[name] for name in peers}
 
 
 def run(device, sizes, names, seconds: float, slowest: float, emit) -> None:
@@ -82,26 +120,14 @@ def run(device, sizes, names, seconds: float, slowest: float, emit) -> None:
         slowest: A peer that once took longer than this for an evaluation [s] is not run at larger sizes.
         emit: Takes each result, a dict.
     """
-    kind = "cpu" if device.is_cpu else "cuda"
     machine = describe(device)
-    gone = set()
+    peers = {p.name.removeprefix("with_"): p for p in PEERS if ("cpu" if device.is_cpu else "cuda") in p.devices}
+    peers = {name: peer for name, peer in peers.items() if not names or name in names}
     for count in sizes:
-        positions, moments = arrays(count)
-        expected = reference(positions, moments)
-        for peer in PEERS:
-            name = peer.name.removeprefix("with_")
-            if kind not in peer.devices or name in gone or (names and name not in names):
-                continue
-            line = {"case": "compare", "peer": name, "count": count}
-            try:
-                with contextlib.redirect_stdout(sys.stderr):  # some libraries talk
-                    line |= measure(peer, positions, moments, expected, str(device), seconds)
-                if line["seconds"] > slowest:
-                    gone.add(name)
-            except Exception as problem:  # a peer's failure is a result: the others go on
-                gone.add(name)
-                line["failed"] = f"{type(problem).__name__}: {problem}".splitlines()[0][:200]
-            emit(line | machine)
+        lines = compare(peers, count, str(device), seconds)
+        for name, line in lines.items():
+            emit({"case": "compare", "peer": name, "count": count} | line | machine)
+        peers = {name: peer for name, peer in peers.items() if lines[name].get("seconds", np.inf) <= slowest}
 
 
 def main(arguments=None) -> None:
