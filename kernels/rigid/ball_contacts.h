@@ -11,10 +11,10 @@ enum Kind { PLANE, BALL, CAPSULE, BOX, KINDS }; // in the order of Newton's type
 
 struct Touch {
     int ball, other;
-    wp::vec3 core; // of the other shape, in its frame [m]
+    wp::vec3 core;    // of the other shape, in its frame [m]
     wp::vec3 towards; // unit vector from the ball to the other shape
-    Real rounding; // by which the other's surface is outside of its core [m]
-    Real separation; // of the surfaces, margins included [m]
+    Real rounding;    // by which the other's surface is outside of its core [m]
+    Real separation;  // of the surfaces, margins included [m]
 };
 
 template <class Arrays> CUDA_CALLABLE inline Real size_of(const Arrays& arrays, int shape, int c) {

@@ -34,8 +34,9 @@ template <class Arrays> CUDA_CALLABLE inline Box swept_box(const Arrays& arrays,
     return box;
 }
 
-// Stores where a ball is in the middle of the substep, with a radius that holds all of its places as far ahead as
-// contacts are sought, and whether the lists are too old for it; or the swept box of another shape.
+// Stores where a ball is in the middle of the substep, with a radius that holds all of its places, and whether the
+// lists are too old for it; or the swept box of another shape. A ball that moves farther than contacts are sought ahead
+// is taken where it is, with that farthest distance around it.
 template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arrays, int target) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     if (target >= balls) {
@@ -50,16 +51,17 @@ template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arr
     const size_t pitch = arrays.lists.packed.strides[0] / sizeof(Real);
     Real* const packed = (Real*)arrays.lists.packed.data + target;
     const Real* const found_at = row_of(arrays.lists.found_at, target);
-    Real swept = 0, moved = 0;
+    Real d[3], way = 0, moved = 0;
+    for (int c = 0; c < 3; ++c) d[c] = displacement(arrays, shape, c), way += d[c] * d[c];
+    way = sqrt(way);
+    const bool far = way > arrays.farthest;
     for (int c = 0; c < 3; ++c) {
-        Real d = displacement(arrays, shape, c);
-        d = d < -arrays.farthest ? -arrays.farthest : d > arrays.farthest ? arrays.farthest : d;
-        const Real x = Real(0.5) * (row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c] + d);
+        const Real sides = row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c];
+        const Real x = Real(0.5) * (far ? sides : sides + d[c]);
         packed[c * pitch] = x;
-        swept += d * d;
         moved += (x - found_at[c]) * (x - found_at[c]);
     }
-    packed[3 * pitch] = arrays.radius.data[target] + Real(0.5) * sqrt(swept);
+    packed[3 * pitch] = arrays.radius.data[target] + (far ? arrays.farthest : Real(0.5) * way);
     const Real found_radius = packed[4 * pitch], grown = packed[3 * pitch] - found_radius;
     if (!(sqrt(moved) + (grown > 0 ? grown : 0) <= SKIN * found_radius)) arrays.lists.moved.data[0] = 1;
 }
@@ -122,6 +124,15 @@ CUDA_CALLABLE inline void try_pair(const Arrays& arrays, int shape, int other, F
     if (is_contact(arrays, touch)) found(a, b, touch);
 }
 
+// Calls visit(lane) for those lanes of a vector that are wanted.
+template <class Visit> CUDA_CALLABLE inline void each_of(Mask wanted, Visit visit) {
+#if defined(__CUDA_ARCH__)
+    if (wanted) visit(0);
+#else
+    for (unsigned bits = bits_of(wanted); bits; bits &= bits - 1) visit(__builtin_ctz(bits));
+#endif
+}
+
 // Whether the swept boxes in columns from ``first`` on meet another.
 CUDA_CALLABLE inline Mask meeting(const Real* boxes, size_t pitch, int first, const Box& own) {
     Mask meet = mask_of(lanes() == lanes());
@@ -151,15 +162,12 @@ CUDA_CALLABLE inline void try_boxes(const Arrays& arrays, int shape, const Box& 
         count = 0;
     }
 #else
-    auto visit = [](unsigned bits, auto each) {
-        for (; bits; bits &= bits - 1) each(__builtin_ctz(bits));
-    };
     for (int block = begin / WIDTH; block * WIDTH < end; block += WIDTH) {
-        visit(bits_of(meeting(arrays.bounds.data, arrays.bounds.shape[1], block, own)), [&](int b) {
+        each_of(meeting(arrays.bounds.data, arrays.bounds.shape[1], block, own), [&](int b) {
             const int first = (block + b) * WIDTH;
             const Mask meet = meeting(arrays.boxes.data, arrays.boxes.shape[1], first, own)
                               & mask_of((lanes() >= begin - first) & (lanes() < end - first));
-            visit(bits_of(meet), [&](int l) { try_pair(arrays, shape, others[first + l], found); });
+            each_of(meet, [&](int l) { try_pair(arrays, shape, others[first + l], found); });
         });
     }
 #endif
@@ -171,12 +179,19 @@ CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Found 
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     int last = arrays.boxes.shape[1];
     if (target < balls) {
+        const Balls own = balls_of(arrays.lists);
         const int count = arrays.lists.count.data[target];
         const bool listed = count <= CAPACITY;
         const int* const list = arrays.lists.neighbor.data + (size_t)CAPACITY * target;
-        for (int n = share(); n < (listed ? count : target); n += SHARES) {
-            const int j = listed ? list[n] : n;
-            if (j < target) try_pair(arrays, shape, arrays.shape.data[j], found);
+        for (int n = share() * WIDTH; n < (listed ? count : target); n += SHARES * WIDTH) {
+            const Index j = listed ? indices(list + n) : n + lanes();
+            const auto earlier = (j < target) & (lanes() < (listed ? count : target) - n);
+            const Index place = earlier ? j : Index(0);
+            const Vector r = {own.x[target] - collect(own.x, place), own.y[target] - collect(own.y, place),
+                              own.z[target] - collect(own.z, place)};
+            const Number reach = own.radius[target] + collect(own.radius, place);
+            each_of((dot(r, r) <= reach * reach) & mask_of(earlier),
+                    [&](int l) { try_pair(arrays, shape, arrays.shape.data[lane_of(place, l)], found); });
         }
     } else {
         last = target - balls;
@@ -223,8 +238,7 @@ CUDA_CALLABLE inline void place_targets(int thread, int threads, Word* team, con
 template <class Arrays> CUDA_CALLABLE inline void put_found(const Arrays& arrays, int n, int a, int b) {
     if (n < arrays.pairs.shape[0]) arrays.pairs.data[n] = wp::vec2i(a, b);
 }
-template <class Arrays>
-CUDA_CALLABLE inline void put_found(const Arrays& arrays, int n, int, int, const Touch& touch) {
+template <class Arrays> CUDA_CALLABLE inline void put_found(const Arrays& arrays, int n, int, int, const Touch& touch) {
     if (n < arrays.contacts.shape0.shape[0]) put_contact(arrays, touch, n);
 }
 
@@ -240,45 +254,49 @@ CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const 
     });
 #else
     // chunks of targets note what they find; where that is too much, it is found again
-    constexpr int ROOM = 16 * TARGETS_AT_ONCE;
-    const int targets = arrays.shape.shape[0], chunks = (targets + TARGETS_AT_ONCE - 1) / TARGETS_AT_ONCE;
-    auto tally_of = [&](int chunk) { return arrays.found.data + (size_t)arrays.found.shape[1] * chunk; };
+    struct Note {
+        int a, b;
+        Touch touch; // if the pair is one of a ball
+    };
+    static_assert(sizeof(Note) == NOTE * sizeof(int), "broad_phase.py gives each note its room");
+    const int targets = arrays.shape.shape[0], chunks = arrays.found.shape[0];
+    auto counts_of = [&](int chunk) { return arrays.found.data + (size_t)arrays.found.shape[1] * chunk; };
+    auto notes_of = [&](int chunk) { return (Note*)(counts_of(chunk) + 2); };
     auto each_target = [&](int chunk, auto visit) {
         const int first = chunk * TARGETS_AT_ONCE, last = first + TARGETS_AT_ONCE;
         for (int t = first; t < (last < targets ? last : targets); ++t) visit(t);
     };
     share_out(team, threads, chunks, 1, [&](int chunk) {
-        int* const tally = tally_of(chunk);
         int count[2] = {}; // of pairs and contacts
         each_target(chunk, [&](int t) {
             keep_radius(arrays, t);
             find_pairs_of(arrays, t, [&](int a, int b, auto... touch) {
                 const int n = count[0] + count[1];
-                if (n < ROOM) tally[2 + 2 * n] = a, tally[3 + 2 * n] = b;
+                if (n < NOTES) notes_of(chunk)[n] = {a, b, Touch(touch)...};
                 ++count[sizeof...(touch)];
             });
         });
-        tally[0] = count[0], tally[1] = count[1];
+        counts_of(chunk)[0] = count[0], counts_of(chunk)[1] = count[1];
     });
     int total[2] = {};
     for (int chunk = 0; chunk < chunks; ++chunk)
         for (int k = 0; k < 2; ++k) {
-            const int count = tally_of(chunk)[k];
-            tally_of(chunk)[k] = total[k];
+            const int count = counts_of(chunk)[k];
+            counts_of(chunk)[k] = total[k];
             total[k] += count;
         }
     arrays.pair_count.data[0] = total[0];
     if (total[1]) arrays.contacts.count.data[0] = total[1];
     share_out(team, threads, chunks, 1, [&](int chunk) {
-        const int *const tally = tally_of(chunk), *const next = chunk + 1 < chunks ? tally_of(chunk + 1) : total;
-        int at[2] = {tally[0], tally[1]};
+        const int *const first = counts_of(chunk), *const next = chunk + 1 < chunks ? counts_of(chunk + 1) : total;
+        int at[2] = {first[0], first[1]};
         const int count = next[0] - at[0] + next[1] - at[1];
         auto put = [&](int a, int b, auto... touch) { put_found(arrays, at[sizeof...(touch)]++, a, b, touch...); };
-        if (count > ROOM) return each_target(chunk, [&](int t) { find_pairs_of(arrays, t, put); });
+        if (count > NOTES) return each_target(chunk, [&](int t) { find_pairs_of(arrays, t, put); });
         for (int n = 0; n < count; ++n) {
-            const int a = tally[2 + 2 * n], b = tally[3 + 2 * n];
-            if (is_touch(arrays, a, b)) put(a, b, touch_of(arrays, a, b));
-            else put(a, b);
+            const Note& note = notes_of(chunk)[n];
+            if (is_touch(arrays, note.a, note.b)) put(note.a, note.b, note.touch);
+            else put(note.a, note.b);
         }
     });
 #endif

@@ -6,7 +6,8 @@ hold what is near, and are made anew only once a ball has moved by a part of its
 with everything, a vector of boxes at a time. Which pairs are kept is decided as Newton does: by worlds, collision
 groups, bodies and excluded pairs, and by whether the boxes meet as they move.
 
-A ball is taken as the ball about the middle of its way that holds it all along. Of two balls whose boxes meet but whose
+A ball is taken as the ball about the middle of its way that holds it all along, or, if it moves farther than contacts
+are sought ahead, about where it is. Of two balls whose boxes meet but whose
 surfaces do not come as near as contacts are sought, the pair is left out.
 
 Pairs of a ball and a ball, plane, box or capsule become contacts at once (``ball_contacts.h``), all others are left to
@@ -34,7 +35,7 @@ _LARGEST = 2.0
 radius sets how wide the search's cells are."""
 _PADDING = 16
 """Boxes that vectors may read beyond the last."""
-_TARGETS_PER_THREAD = 300
+_TARGETS_PER_THREAD = 120
 """Shapes that make another thread of a CPU worth waking."""
 _TARGETS_AT_ONCE = 64
 """Targets that a thread of a CPU takes at a time."""
@@ -43,8 +44,10 @@ _MOST_COMPARISONS = 2e7
 _MANY = 64
 """Other shapes from which a warp of a GPU shares a target, in place of a group of threads."""
 _BLOCK = 128
+_NOTES, _NOTE = 16 * _TARGETS_AT_ONCE, 12
+"""Pairs and contacts that such a chunk of targets notes, and the numbers of each, as in ``broad_phase.h``."""
 _PACKED_ROWS = 5
-KINDS = ("plane", "ball", "capsule", "box")
+PARTNERS = ("plane", "ball", "capsule", "box")
 """Shapes whose contacts with balls are found here, as in ``ball_contacts.h``."""
 _KINEMATIC = 2
 """Newton's flag of bodies that forces do not move."""
@@ -59,8 +62,7 @@ class BroadPhaseArrays:
         lower, upper: Boxes of the shapes [m], enlarged by how far contacts are sought, shape [s].
         displacement: Motion of the shapes within the substep [m], shape [s], or none.
         group, world, body: Collision group, world and body of the shapes, shape [s].
-        kind: Index of each shape's kind in ``KINDS``, or their number for one whose contacts are left to Newton, shape
-            [s].
+        kind: Index of each shape's kind in ``PARTNERS``, or their number if its contacts are left to Newton, shape [s].
         scale: Radius of balls and capsules, half of a capsule's length, half of a box's sides [m], shape [s].
         margin, gap: Distance of each surface from the shape, and up to which contacts are found [m], shape [s].
         frame, placement: Pose of the shapes in the world and in their bodies, shape [s].
@@ -78,8 +80,8 @@ class BroadPhaseArrays:
         lists: Neighbour lists of the balls; packed row 4 holds the radius that a ball was listed with.
         boxes: Swept boxes of the others [m], lower then upper, shape [6, o padded].
         bounds: On a CPU, boxes around those of each vector of others, shape [6, o / 16 padded].
-        found: On a CPU, how many pairs and contacts chunks of targets find, and the shapes of the first of them, shape
-            [t / chunk, 2 + 2 * 16 * chunk].
+        found: On a CPU, how many pairs and contacts chunks of targets find, and notes of them, shape [chunks, 2 + NOTE
+            NOTES].
         pairs, pair_count: Out, the pairs and how many there are, also beyond their room.
         contacts: Out, contacts of balls; Newton's are appended.
     """
@@ -175,10 +177,9 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
         boxes[:3].fill_(np.inf)
         boxes[3:].fill_(-np.inf)
     chunks = -(-len(shape) // _TARGETS_AT_ONCE) if device.is_cpu else 0
-    arrays.found = wp.zeros((chunks, 2 + 2 * 16 * _TARGETS_AT_ONCE), dtype=int, device=device)
+    arrays.found = wp.zeros((chunks, 2 + _NOTE * _NOTES), dtype=int, device=device)
     arrays.farthest = farthest
-    # half of a ball's way is at most half of the diagonal of a cube as wide as it may be swept
-    reach = 2.0 * float(ball_radius[balls].max(initial=0.0)) + np.sqrt(3.0) * farthest
+    reach = 2.0 * float(ball_radius[balls].max(initial=0.0)) + 2.0 * farthest
     return PairSearch(arrays, len(shape), reach, 32 if len(others) >= _MANY else group_threads(device))
 
 
@@ -186,7 +187,7 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
 def _kernel(call: str, group: int):
     options = native_options(
         "rigid/broad_phase.h", dtype=wp.float32, CAPACITY=neighbors.CAPACITY, GROUP=group, BLOCK=_BLOCK, SKIN=_SKIN,
-        KINEMATIC=_KINEMATIC, TARGETS_AT_ONCE=_TARGETS_AT_ONCE,
+        KINEMATIC=_KINEMATIC, TARGETS_AT_ONCE=_TARGETS_AT_ONCE, NOTES=_NOTES, NOTE=_NOTE,
     )  # fmt: skip
     return passes_kernel(f"warpmag::{call}(thread, threads, team.data, arrays);", BroadPhaseArrays, options)
 

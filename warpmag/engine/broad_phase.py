@@ -5,17 +5,18 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.neighbors import carried_lists
-from warpmag.kernels.rigid.broad_phase import KINDS, allocate, launch_find_shape_pairs
+from warpmag.kernels.rigid.broad_phase import PARTNERS, allocate, launch_find_shape_pairs
 from warpmag.kernels.rigid.newton_views import view_contacts
 
 _TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.BOX)
-"""Newton's types of ``KINDS``."""
+"""Newton's types of ``PARTNERS``."""
 
 
 class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
     """Finds the pairs of shapes that may touch; takes the place of the sweep of a ``CollisionPipeline``.
 
-    Once told where to, by :meth:`write_contacts`, it writes the contacts of balls, and leaves out their pairs. See ``kernels.rigid.broad_phase`` for the method, and for the pairs of balls that it leaves out.
+    Once told where to, by :meth:`write_contacts`, it writes the contacts of balls, and leaves out their pairs. See
+    ``kernels.rigid.broad_phase`` for the method, and for the pairs of balls that it leaves out anyway.
     """
 
     def __init__(self, model: newton.Model, farthest: float):
@@ -41,7 +42,7 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
             super().__init__(model.shape_world, shape_flags=model.shape_flags, sort_type="auto", device=model.device)
             return
         a = self._search.arrays
-        a.kind = wp.full(model.shape_count, len(KINDS), dtype=int, device=model.device)
+        a.kind = wp.full(model.shape_count, len(PARTNERS), dtype=int, device=model.device)
         a.scale, a.margin, a.gap = model.shape_scale, model.shape_margin, model.shape_gap
 
     def write_contacts(self, pipeline: newton.CollisionPipeline, contacts: newton.Contacts) -> None:
@@ -54,7 +55,7 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         if self._search is None:
             return
         types = self._model.shape_type.numpy()
-        kinds = np.select([types == kind for kind in _TYPES], np.arange(len(KINDS)), len(KINDS))
+        kinds = np.select([types == kind for kind in _TYPES], np.arange(len(PARTNERS)), len(PARTNERS))
         a = self._search.arrays
         a.kind.assign(kinds.astype(np.int32))
         a.placement, a.frame = self._model.shape_transform, pipeline.geom_transform
