@@ -100,6 +100,30 @@ def test_contacts_are_newtons(scene, device):
     }
 
 
+def test_boxes_apart_are_left_out(device):
+    """None that touches or comes near, and nearly all that are too far apart for contacts."""
+    rng, builder = np.random.default_rng(3), newton.ModelBuilder()
+    for number in range(250):
+        size = np.exp(rng.uniform(np.log(0.001), np.log(0.015), 3))
+        # some stand along each other, whose edges have no normal together
+        axes = turned(rng) if number % 3 else wp.transform_identity()
+        place = wp.transform(wp.vec3(*rng.uniform(0.0, 0.1, 3)), wp.transform_get_rotation(axes))
+        config = newton.ModelBuilder.ShapeConfig(gap=2e-4, margin=float(rng.choice([0.0, 1e-4])), density=1e5)
+        body = builder.add_body(xform=place)
+        builder.add_shape_box(
+            body, xform=turned(rng, (0.0, 0.0, 0.003)), hx=size[0], hy=size[1], hz=size[2], cfg=config
+        )
+    model = builder.finalize(device=device)
+    own, newtons, state = Finder(model, True), Finder(model, False), model.state()
+    for speed in (0.0, 1.0, 20.0):
+        set_motion(model, state, rng, 0.0, speed)
+        found = own.collide(state)
+        assert found.keys() == newtons.collide(state).keys()
+        touching = len({key[:2] for key in found})
+        assert 100 < touching <= own.pairs() < newtons.pairs()
+        assert speed > 0.0 or own.pairs() < 1.1 * touching < 0.5 * newtons.pairs()
+
+
 def test_too_many_contacts_are_counted(device):
     """Both what chunks of targets note and what contacts have room for are exceeded."""
     builder = newton.ModelBuilder()

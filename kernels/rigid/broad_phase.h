@@ -6,6 +6,7 @@
 #pragma once
 #include "pairs/overlaps.h"
 #include "rigid/ball_contacts.h"
+#include "rigid/box_gap.h"
 #include "shared/team.h"
 
 namespace warpmag {
@@ -119,7 +120,10 @@ template <class Arrays, class Found>
 CUDA_CALLABLE inline void try_pair(const Arrays& arrays, int shape, int other, Found found) {
     const int a = shape < other ? shape : other, b = shape < other ? other : shape;
     if (!may_collide(arrays, a, b) || !boxes_meet(arrays, a, b) || is_excluded(arrays, a, b)) return;
-    if (!is_touch(arrays, a, b)) return found(a, b);
+    if (!is_touch(arrays, a, b)) {
+        if (!are_boxes(arrays, a, b) || !boxes_apart(arrays, a, b)) found(a, b);
+        return;
+    }
     const Touch touch = touch_of(arrays, a, b);
     if (is_contact(arrays, touch)) found(a, b, touch);
 }
