@@ -27,6 +27,7 @@ SKIN = 0.6
 """Part of its radius that a moment may move before the lists are made anew. Longer lists take longer to go through, but
 are made less often, and spare induction evaluations (see ``theta_flow``), which predict the moments of neighbours."""
 _BUCKETS_PER_MOMENT = 4
+_BLOCK = 128
 _PADDING = 16
 """Entries that vectors may read beyond the last."""
 
@@ -50,7 +51,9 @@ def lists_type(dtype):
         found_at: wp.array[vec3]
         moved: wp.array[int]
         searching: wp.array[int]
+        searches: wp.array[int]
         bucket: wp.array[int]
+        table: wp.array[wp.uint64]
         cell: wp.array[wp.vec4i]
         before: wp.array[int]
         entries: wp.array2d[int]
@@ -77,8 +80,11 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
             overlap_count: How many they are, shape [n]; where a list is full, its count.
             found_at: Where each moment was when the lists were made [m], shape [n].
             moved: Whether one has moved too far since, shape [1]; set by ``packing``.
-            searching: Whether the last search made lists, shape [1].
-            bucket: On a GPU the moment that was last put into each bucket, on a CPU where it begins, shape [2ᵏ + 1].
+            searching: Whether the last search made lists, shape [1]; on a GPU its number.
+            searches: On a GPU the last search that filled the hash table, shape [1].
+            bucket: On a CPU where each bucket begins, shape [2ᵏ + 1].
+            table: On a GPU the number of the last search that used each bucket, and the moment that it last put there,
+                shape [2ᵏ].
             cell: On a GPU the cell (x, y, z, group) of each moment, shape [n].
             before: On a GPU the moment that was put into its bucket before each, −1 if none, shape [n].
             entries: On a CPU, in the order of buckets, index, cell's x and y, and group, and the bucket of each moment,
@@ -96,9 +102,10 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
         lists.overlap, lists.overlap_count = wp.zeros_like(lists.neighbor), wp.zeros_like(lists.count)
     lists.found_at = wp.full(count, math.inf, dtype=wp.types.vector(3, dtype), device=device)
     lists.moved = wp.ones(1, dtype=int, device=device)
-    lists.searching = wp.zeros(1, dtype=int, device=device)
+    lists.searching, lists.searches = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
     buckets = 2 ** math.ceil(math.log2(_BUCKETS_PER_MOMENT * max(count, 1)))
-    lists.bucket = wp.zeros(buckets + 1, dtype=int, device=device)
+    lists.bucket = wp.zeros(buckets + 1 if device.is_cpu else 0, dtype=int, device=device)
+    lists.table = wp.zeros(0 if device.is_cpu else buckets, dtype=wp.uint64, device=device)
     lists.cell = wp.zeros(linked, dtype=wp.vec4i, device=device)
     lists.before = wp.zeros(linked, dtype=int, device=device)
     lists.entries = wp.zeros((5, padded), dtype=int, device=device)
@@ -128,7 +135,7 @@ def _kernel(call: str, header: str, dtype, capacity: int, group: int):
     @wp.kernel(
         module="unique",
         enable_backward=False,
-        module_options=native_options(header, dtype=dtype, CAPACITY=capacity, GROUP=group),
+        module_options=native_options(header, dtype=dtype, CAPACITY=capacity, GROUP=group, BLOCK=_BLOCK),
     )
     def find_neighbors(
         # inputs:
@@ -156,6 +163,7 @@ def _launch(call: str, targets, sources, dim: int = 1, cells_per_meter: float = 
         dim=dim,
         inputs=[cells_per_meter, threads, members, targets, sources],
         device=device,
+        block_dim=_BLOCK,
     )
 
 
@@ -174,14 +182,11 @@ def launch_find_neighbors(targets, sources, reach: float):
         call = "search_neighbors(targets, sources, cells_per_meter, threads, team.data)"
         _launch(call, targets, sources, cells_per_meter=cells_per_meter)
         return
-    count, source_count = targets.packed.shape[1], sources.packed.shape[1]
     for call, dim in (
-        ("empty_table(thread, targets, sources)", max(sources.bucket.shape[0], count)),
-        ("fill_table(thread, targets, sources, cells_per_meter)", source_count),
-        ("search_cell(thread, targets, sources, cells_per_meter)", 27 * count),
-        ("sort_list(thread, targets)", 32 * count),
+        ("fill_table", max(sources.packed.shape[1], 1)),
+        ("list_neighbors", 32 * targets.packed.shape[1]),
     ):
-        _launch(call, targets, sources, dim, cells_per_meter)
+        _launch(f"{call}(thread, targets, sources, cells_per_meter)", targets, sources, dim, cells_per_meter)
 
 
 def launch_list_overlaps(targets, sources):

@@ -1,10 +1,12 @@
-// Pairs of shapes whose boxes meet within a substep, those of Newton's broad phase.
+// Pairs of shapes whose boxes meet within a substep, those of Newton's broad phase; of balls, their contacts.
 //
 // Targets are balls, then the other shapes, numbered as in broad_phase.py. A ball finds other balls in its list of
 // neighbours; the boxes of other shapes stand in rows of a table, side by side for a vector of them, those of all
 // worlds first.
 #pragma once
 #include "pairs/overlaps.h"
+#include "rigid/ball_contacts.h"
+#include "rigid/box_gap.h"
 #include "shared/team.h"
 
 namespace warpmag {
@@ -33,8 +35,9 @@ template <class Arrays> CUDA_CALLABLE inline Box swept_box(const Arrays& arrays,
     return box;
 }
 
-// Stores where a ball is in the middle of the substep, with a radius that holds all of its places as far ahead as
-// contacts are sought, and whether the lists are too old for it; or the swept box of another shape.
+// Stores where a ball is in the middle of the substep, with a radius that holds all of its places, and whether the
+// lists are too old for it; or the swept box of another shape. A ball that moves farther than contacts are sought ahead
+// is taken where it is, with that farthest distance around it.
 template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arrays, int target) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     if (target >= balls) {
@@ -49,16 +52,17 @@ template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arr
     const size_t pitch = arrays.lists.packed.strides[0] / sizeof(Real);
     Real* const packed = (Real*)arrays.lists.packed.data + target;
     const Real* const found_at = row_of(arrays.lists.found_at, target);
-    Real swept = 0, moved = 0;
+    Real d[3], way = 0, moved = 0;
+    for (int c = 0; c < 3; ++c) d[c] = displacement(arrays, shape, c), way += d[c] * d[c];
+    way = sqrt(way);
+    const bool far = way > arrays.farthest;
     for (int c = 0; c < 3; ++c) {
-        Real d = displacement(arrays, shape, c);
-        d = d < -arrays.farthest ? -arrays.farthest : d > arrays.farthest ? arrays.farthest : d;
-        const Real x = Real(0.5) * (row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c] + d);
+        const Real sides = row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c];
+        const Real x = Real(0.5) * (far ? sides : sides + d[c]);
         packed[c * pitch] = x;
-        swept += d * d;
         moved += (x - found_at[c]) * (x - found_at[c]);
     }
-    packed[3 * pitch] = arrays.radius.data[target] + Real(0.5) * sqrt(swept);
+    packed[3 * pitch] = arrays.radius.data[target] + (far ? arrays.farthest : Real(0.5) * way);
     const Real found_radius = packed[4 * pitch], grown = packed[3 * pitch] - found_radius;
     if (!(sqrt(moved) + (grown > 0 ? grown : 0) <= SKIN * found_radius)) arrays.lists.moved.data[0] = 1;
 }
@@ -83,13 +87,13 @@ template <class Arrays> CUDA_CALLABLE inline bool is_fixed(const Arrays& arrays,
     return body < 0 || (arrays.body_flags.shape[0] && arrays.body_flags.data[body] & KINEMATIC);
 }
 
-// Whether shapes a < b may collide at all.
+// Whether shapes a < b may collide at all, unless they are excluded.
 template <class Arrays> CUDA_CALLABLE inline bool may_collide(const Arrays& arrays, int a, int b) {
     const int body_a = arrays.body.data[a], body_b = arrays.body.data[b];
     const int world_a = arrays.world.data[a], world_b = arrays.world.data[b];
     if (body_a == body_b || (world_a >= 0 && world_b >= 0 && world_a != world_b)) return false;
     if (!arrays.fixed_pairs && is_fixed(arrays, body_a) && is_fixed(arrays, body_b)) return false;
-    return groups_collide(arrays.group.data[a], arrays.group.data[b]) && !is_excluded(arrays, a, b);
+    return groups_collide(arrays.group.data[a], arrays.group.data[b]);
 }
 
 // Whether the boxes of two shapes, which move evenly, meet at some time of the substep.
@@ -110,54 +114,98 @@ template <class Arrays> CUDA_CALLABLE inline bool boxes_meet(const Arrays& array
     return enter <= leave;
 }
 
-// Calls emit(a, b) if a target's shape collides with another.
-template <class Arrays, class Emit>
-CUDA_CALLABLE inline void try_pair(const Arrays& arrays, int shape, int other, Emit emit) {
+// Tries the pair of a target's shape and another: calls found(a, b) if Newton is to look for contacts of a < b, or
+// found(a, b, touch) if they are in contact.
+template <class Arrays, class Found>
+CUDA_CALLABLE inline void try_pair(const Arrays& arrays, int shape, int other, Found found) {
     const int a = shape < other ? shape : other, b = shape < other ? other : shape;
-    if (may_collide(arrays, a, b) && boxes_meet(arrays, a, b)) emit(a, b);
+    if (!may_collide(arrays, a, b) || !boxes_meet(arrays, a, b) || is_excluded(arrays, a, b)) return;
+    if (!is_touch(arrays, a, b)) {
+        if (!are_boxes(arrays, a, b) || !boxes_apart(arrays, a, b)) found(a, b);
+        return;
+    }
+    const Touch touch = touch_of(arrays, a, b);
+    if (is_contact(arrays, touch)) found(a, b, touch);
+}
+
+// Calls visit(lane) for those lanes of a vector that are wanted.
+template <class Visit> CUDA_CALLABLE inline void each_of(Mask wanted, Visit visit) {
+#if defined(__CUDA_ARCH__)
+    if (wanted) visit(0);
+#else
+    for (unsigned bits = bits_of(wanted); bits; bits &= bits - 1) visit(__builtin_ctz(bits));
+#endif
+}
+
+// Whether the swept boxes in columns from ``first`` on meet another.
+CUDA_CALLABLE inline Mask meeting(const Real* boxes, size_t pitch, int first, const Box& own) {
+    Mask meet = mask_of(lanes() == lanes());
+    for (int c = 0; c < 3; ++c)
+        meet &= (numbers(boxes + c * pitch + first) <= own.upper[c])
+                & (numbers(boxes + (c + 3) * pitch + first) >= own.lower[c]);
+    return meet;
 }
 
 // Tries a target's shape with the other shapes ``begin`` to ``end`` whose swept boxes meet its own.
-template <class Arrays, class Emit>
-CUDA_CALLABLE inline void try_boxes(const Arrays& arrays, int shape, const Box& own, int begin, int end, Emit emit) {
-    const Real* const boxes = arrays.boxes.data;
-    const size_t pitch = arrays.boxes.shape[1];
+template <class Arrays, class Found>
+CUDA_CALLABLE inline void try_boxes(const Arrays& arrays, int shape, const Box& own, int begin, int end, Found found) {
     const int* const others = arrays.shape.data + arrays.lists.group.shape[0];
-    for (int first = begin + share(); first < end; first += SHARES * WIDTH) {
-        Mask meet = mask_of(lanes() < end - first);
-        for (int c = 0; c < 3; ++c)
-            meet &= (numbers(boxes + c * pitch + first) <= own.upper[c])
-                    & (numbers(boxes + (c + 3) * pitch + first) >= own.lower[c]);
-        if (!any(meet)) continue;
 #if defined(__CUDA_ARCH__)
-        try_pair(arrays, shape, others[first], emit);
-#else
-        for (unsigned bits = bits_of(meet); bits; bits &= bits - 1)
-            try_pair(arrays, shape, others[first + __builtin_ctz(bits)], emit);
-#endif
+    // what a group finds is tried by all of its threads together
+    constexpr int ROOM = 64;
+    __shared__ int lists[BLOCK / GROUP][ROOM];
+    int* const list = lists[threadIdx.x / GROUP];
+    int count = 0;
+    for (int first = begin; first < end; first += GROUP) {
+        const int i = first + share();
+        count += append(list + count, i, i < end && meeting(arrays.boxes.data, arrays.boxes.shape[1], i, own));
+        if (count <= ROOM - GROUP && first + GROUP < end) continue;
+        __syncwarp(group_mask());
+        for (int n = share(); n < count; n += GROUP) try_pair(arrays, shape, others[list[n]], found);
+        __syncwarp(group_mask());
+        count = 0;
     }
+#else
+    for (int block = begin / WIDTH; block * WIDTH < end; block += WIDTH) {
+        each_of(meeting(arrays.bounds.data, arrays.bounds.shape[1], block, own), [&](int b) {
+            const int first = (block + b) * WIDTH;
+            const Mask meet = meeting(arrays.boxes.data, arrays.boxes.shape[1], first, own)
+                              & mask_of((lanes() >= begin - first) & (lanes() < end - first));
+            each_of(meet, [&](int l) { try_pair(arrays, shape, others[first + l], found); });
+        });
+    }
+#endif
 }
 
-// Calls emit(a, b) for all pairs a < b of which this target is the later one.
-template <class Arrays, class Emit>
-CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Emit emit) {
+// Finds all pairs and contacts of which this target is the later one.
+template <class Arrays, class Found>
+CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Found found) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     int last = arrays.boxes.shape[1];
     if (target < balls) {
+        const Balls own = balls_of(arrays.lists);
         const int count = arrays.lists.count.data[target];
         const bool listed = count <= CAPACITY;
         const int* const list = arrays.lists.neighbor.data + (size_t)CAPACITY * target;
-        for (int n = share(); n < (listed ? count : target); n += SHARES) {
-            const int j = listed ? list[n] : n;
-            if (j < target) try_pair(arrays, shape, arrays.shape.data[j], emit);
+        for (int n = share() * WIDTH; n < (listed ? count : target); n += SHARES * WIDTH) {
+            const Index j = listed ? indices(list + n) : n + lanes();
+            const auto earlier = (j < target) & (lanes() < (listed ? count : target) - n);
+            const Index place = earlier ? j : Index(0);
+            const Vector r = {own.x[target] - collect(own.x, place), own.y[target] - collect(own.y, place),
+                              own.z[target] - collect(own.z, place)};
+            const Number reach = own.radius[target] + collect(own.radius, place);
+            each_of((dot(r, r) <= reach * reach) & mask_of(earlier),
+                    [&](int l) { try_pair(arrays, shape, arrays.shape.data[lane_of(place, l)], found); });
         }
     } else {
         last = target - balls;
     }
     const Box own = swept_box(arrays, shape);
     const wp::vec2i range = arrays.range.data[target];
-    try_boxes(arrays, shape, own, 0, arrays.shared < last ? arrays.shared : last, emit);
-    try_boxes(arrays, shape, own, range[0], range[1] < last ? range[1] : last, emit);
+    try_boxes(arrays, shape, own, 0, arrays.shared < last ? arrays.shared : last, found);
+    // in a world those that cannot move come first, and do not collide with each other
+    if (target < balls || arrays.body.data[shape] >= 0)
+        try_boxes(arrays, shape, own, range[0], range[1] < last ? range[1] : last, found);
 }
 
 // Remembers the radius that a ball was listed with.
@@ -167,49 +215,93 @@ template <class Arrays> CUDA_CALLABLE inline void keep_radius(const Arrays& arra
     if (target < arrays.lists.group.shape[0] && arrays.lists.searching.data[0]) packed[4 * pitch] = packed[3 * pitch];
 }
 
+#if !defined(__CUDA_ARCH__)
+// Boxes around those of each vector of other shapes; none around what pads the last.
+template <class Arrays> inline void bound_boxes(const Arrays& arrays) {
+    const size_t pitch = arrays.boxes.shape[1], blocks = arrays.bounds.shape[1];
+    for (size_t first = 0; first + WIDTH <= pitch; first += WIDTH)
+        for (int c = 0; c < 3; ++c) {
+            const Real* const lower = arrays.boxes.data + c * pitch + first;
+            arrays.bounds.data[c * blocks + first / WIDTH] = __builtin_reduce_min(numbers(lower));
+            arrays.bounds.data[(c + 3) * blocks + first / WIDTH] = __builtin_reduce_max(numbers(lower + 3 * pitch));
+        }
+}
+#endif
+
 template <class Word, class Arrays>
 CUDA_CALLABLE inline void place_targets(int thread, int threads, Word* team, const Arrays& arrays) {
 #if defined(__CUDA_ARCH__)
     if (thread < arrays.shape.shape[0]) place_target(arrays, thread);
 #else
     share_out(team, threads, arrays.shape.shape[0], TARGETS_AT_ONCE, [&](int t) { place_target(arrays, t); });
+    bound_boxes(arrays);
 #endif
 }
 
-// Writes all pairs, in the order of targets on a CPU. More may be found than there is room for.
+// Writes pair n, and contact n; more may be found than there is room for.
+template <class Arrays> CUDA_CALLABLE inline void put_found(const Arrays& arrays, int n, int a, int b) {
+    if (n < arrays.pairs.shape[0]) arrays.pairs.data[n] = wp::vec2i(a, b);
+}
+template <class Arrays> CUDA_CALLABLE inline void put_found(const Arrays& arrays, int n, int, int, const Touch& touch) {
+    if (n < arrays.contacts.shape0.shape[0]) put_contact(arrays, touch, n);
+}
+
+// Writes all pairs and the contacts of balls, on a CPU in the order of targets.
 template <class Word, class Arrays>
 CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const Arrays& arrays) {
-    const int room = arrays.pairs.shape[0];
 #if defined(__CUDA_ARCH__)
     const int target = thread / GROUP;
     if (share() == 0) keep_radius(arrays, target);
-    find_pairs_of(arrays, target, [&](int a, int b) {
-        const int n = atomicAdd(arrays.pair_count.data, 1);
-        if (n < room) arrays.pairs.data[n] = wp::vec2i(a, b);
+    find_pairs_of(arrays, target, [&](int a, int b, auto... touch) {
+        int* const count = sizeof...(touch) ? arrays.contacts.count.data : arrays.pair_count.data;
+        put_found(arrays, atomicAdd(count, 1), a, b, touch...);
     });
 #else
-    const int targets = arrays.shape.shape[0];
-    int* const starts = arrays.starts.data;
-    share_out(team, threads, targets, TARGETS_AT_ONCE, [&](int t) {
-        int count = 0;
-        keep_radius(arrays, t);
-        find_pairs_of(arrays, t, [&](int, int) { ++count; });
-        starts[t] = count;
-    });
-    int total = 0;
-    for (int t = 0; t < targets; ++t) {
-        const int count = starts[t];
-        starts[t] = total;
-        total += count;
-    }
-    arrays.pair_count.data[0] = total;
-    share_out(team, threads, targets, TARGETS_AT_ONCE, [&](int t) {
-        int n = starts[t];
-        if (n == (t + 1 < targets ? starts[t + 1] : total)) return;
-        find_pairs_of(arrays, t, [&](int a, int b) {
-            if (n < room) arrays.pairs.data[n] = wp::vec2i(a, b);
-            ++n;
+    // chunks of targets note what they find; where that is too much, it is found again
+    struct Note {
+        int a, b;
+        Touch touch; // if the pair is one of a ball
+    };
+    static_assert(sizeof(Note) == NOTE * sizeof(int), "broad_phase.py gives each note its room");
+    const int targets = arrays.shape.shape[0], chunks = arrays.found.shape[0];
+    auto counts_of = [&](int chunk) { return arrays.found.data + (size_t)arrays.found.shape[1] * chunk; };
+    auto notes_of = [&](int chunk) { return (Note*)(counts_of(chunk) + 2); };
+    auto each_target = [&](int chunk, auto visit) {
+        const int first = chunk * TARGETS_AT_ONCE, last = first + TARGETS_AT_ONCE;
+        for (int t = first; t < (last < targets ? last : targets); ++t) visit(t);
+    };
+    share_out(team, threads, chunks, 1, [&](int chunk) {
+        int count[2] = {}; // of pairs and contacts
+        each_target(chunk, [&](int t) {
+            keep_radius(arrays, t);
+            find_pairs_of(arrays, t, [&](int a, int b, auto... touch) {
+                const int n = count[0] + count[1];
+                if (n < NOTES) notes_of(chunk)[n] = {a, b, Touch(touch)...};
+                ++count[sizeof...(touch)];
+            });
         });
+        counts_of(chunk)[0] = count[0], counts_of(chunk)[1] = count[1];
+    });
+    int total[2] = {};
+    for (int chunk = 0; chunk < chunks; ++chunk)
+        for (int k = 0; k < 2; ++k) {
+            const int count = counts_of(chunk)[k];
+            counts_of(chunk)[k] = total[k];
+            total[k] += count;
+        }
+    arrays.pair_count.data[0] = total[0];
+    if (total[1]) arrays.contacts.count.data[0] = total[1];
+    share_out(team, threads, chunks, 1, [&](int chunk) {
+        const int *const first = counts_of(chunk), *const next = chunk + 1 < chunks ? counts_of(chunk + 1) : total;
+        int at[2] = {first[0], first[1]};
+        const int count = next[0] - at[0] + next[1] - at[1];
+        auto put = [&](int a, int b, auto... touch) { put_found(arrays, at[sizeof...(touch)]++, a, b, touch...); };
+        if (count > NOTES) return each_target(chunk, [&](int t) { find_pairs_of(arrays, t, put); });
+        for (int n = 0; n < count; ++n) {
+            const Note& note = notes_of(chunk)[n];
+            if (is_touch(arrays, note.a, note.b)) put(note.a, note.b, note.touch);
+            else put(note.a, note.b);
+        }
     });
 #endif
 }

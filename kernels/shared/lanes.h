@@ -36,7 +36,7 @@ CUDA_CALLABLE inline void put(Real* row, Number n) { *row = n; }
 CUDA_CALLABLE inline void put_indices(int* row, Index n) { *row = n; }
 CUDA_CALLABLE inline Number gather(const Real* row, const int* j) { return row[*j]; }
 CUDA_CALLABLE inline Number collect(const Real* row, Index j) { return row[j]; }
-CUDA_CALLABLE inline Real lane_of(Number x, int) { return x; }
+template <class Lanes> CUDA_CALLABLE inline Lanes lane_of(Lanes x, int) { return x; }
 
 CUDA_CALLABLE inline Four four_at(const Real* lines, int quarter, const int* j) {
     return ((const Four*)lines)[4 * (size_t)*j + quarter];
@@ -105,7 +105,7 @@ template <class Places> inline Number collect(const Real* row, Places j) {
     return n;
 #endif
 }
-inline Real lane_of(Number x, int l) { return x[l]; }
+template <class Lanes> inline auto lane_of(Lanes x, int l) { return x[l]; }
 
 template <class T, T... L> struct Sequence {};
 typedef __make_integer_seq<Sequence, int, WIDTH> AllLanes;

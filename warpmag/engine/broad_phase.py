@@ -1,17 +1,22 @@
-"""Newton's broad phase, by lists of neighbouring balls in place of a sort of all shapes."""
+"""Newton's broad phase, by lists of neighbouring balls in place of a sort of all shapes, and the contacts of balls."""
 
 import newton
 import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.neighbors import carried_lists
-from warpmag.kernels.rigid.broad_phase import allocate, launch_find_shape_pairs
+from warpmag.kernels.rigid.broad_phase import PARTNERS, allocate, launch_find_shape_pairs
+from warpmag.kernels.rigid.newton_views import view_contacts
+
+_TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.BOX)
+"""Newton's types of ``PARTNERS``."""
 
 
 class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
     """Finds the pairs of shapes that may touch; takes the place of the sweep of a ``CollisionPipeline``.
 
-    See ``kernels.rigid.broad_phase`` for the method, and for the pairs of balls that it leaves out.
+    Once told where to, by :meth:`write_contacts`, it writes the contacts of balls, and leaves out their pairs. See
+    ``kernels.rigid.broad_phase`` for the method, and for the pairs of balls that it leaves out anyway.
     """
 
     def __init__(self, model: newton.Model, farthest: float):
@@ -26,13 +31,40 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         sought = model.shape_scale.numpy()[:, 0] + model.shape_margin.numpy() + model.shape_gap.numpy()
         self._search = allocate(
             model.shape_world.numpy(),
+            model.shape_body.numpy(),
             colliding,
             np.where(spheres, sought, np.nan),
             farthest=farthest,
             device=wp.get_device(model.device),
         )
+        self._model = model
         if self._search is None:
             super().__init__(model.shape_world, shape_flags=model.shape_flags, sort_type="auto", device=model.device)
+            return
+        a = self._search.arrays
+        a.kind = wp.full(model.shape_count, len(PARTNERS), dtype=int, device=model.device)
+        a.scale, a.margin, a.gap = model.shape_scale, model.shape_margin, model.shape_gap
+
+    def write_contacts(self, pipeline: newton.CollisionPipeline, contacts: newton.Contacts) -> None:
+        """Have the contacts of balls written, too.
+
+        Args:
+            pipeline: The pipeline that finds the pairs of all shapes through this.
+            contacts: Where it writes contacts.
+        """
+        if self._search is None:
+            return
+        types = self._model.shape_type.numpy()
+        kinds = np.select([types == kind for kind in _TYPES], np.arange(len(PARTNERS)), len(PARTNERS))
+        a = self._search.arrays
+        a.kind.assign(kinds.astype(np.int32))
+        a.placement, a.frame = self._model.shape_transform, pipeline.geom_transform
+        a.contacts = view_contacts(self._model, contacts)
+
+    def set_motion(self, state: newton.State, dt: float) -> None:
+        """Tell how bodies move, by ``state``, in the next ``dt`` [s] for which pairs are sought."""
+        if self._search is not None:
+            self._search.arrays.body_qd, self._search.arrays.dt = state.body_qd, dt
 
     def carried(self) -> dict[str, wp.array]:
         """Return the arrays that one search hands on to the next one, by name."""

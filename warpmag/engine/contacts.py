@@ -226,8 +226,11 @@ class RigidSolver:
                 deterministic=self._reduces_in_order(),
                 verify_buffers=False,  # would only print; the counters are read instead
             )
-            self._pipeline.broad_phase = NeighborBroadPhase(self._model, self._speculation)
             self.contacts = self._pipeline.contacts()
+            self._broad_phase = NeighborBroadPhase(self._model, self._speculation)
+            self._pipeline.broad_phase = self._broad_phase
+            if not self._pipeline.deterministic:  # there Newton puts contacts into an order
+                self._broad_phase.write_contacts(self._pipeline, self.contacts)
             self._contact_view = view_contacts(self._model, self.contacts)
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:
@@ -270,11 +273,11 @@ class RigidSolver:
 
     def carried(self) -> dict[str, wp.array]:
         """Return the arrays that one substep hands on to the next one, by name."""
-        broad_phase = self._pipeline.broad_phase
-        return broad_phase.carried() if isinstance(broad_phase, NeighborBroadPhase) else {}
+        return self._broad_phase.carried()
 
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""
+        self._broad_phase.set_motion(state, dt)
         self._pipeline.collide(state, self.contacts, dt=dt)
 
     def step(self, state_in: newton.State, state_out: newton.State, dt: float) -> None:
