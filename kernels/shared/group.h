@@ -10,7 +10,7 @@ constexpr int SHARES = GROUP;
 // Number of this thread in its group.
 CUDA_CALLABLE inline int share() { return threadIdx.x % GROUP; }
 // The threads of its group among those of the warp.
-CUDA_CALLABLE inline unsigned group_mask() { return ((1u << GROUP) - 1u) << (threadIdx.x % 32 / GROUP * GROUP); }
+CUDA_CALLABLE inline unsigned group_mask() { return (~0u >> (32 - GROUP)) << (threadIdx.x % 32 / GROUP * GROUP); }
 // Sum over the threads of a group; all threads of the warp take part.
 CUDA_CALLABLE inline Number group_total(Number part) {
     for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(~0u, part, other);
