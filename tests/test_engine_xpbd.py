@@ -169,6 +169,28 @@ def test_a_substep_repeats_bit_by_bit(kind, device):
             np.testing.assert_array_equal(value, expected)
 
 
+def worlds(kind, device, count=20):
+    """Worlds of some bodies each that overlap, on ground that they share."""
+    builder = newton.ModelBuilder()
+    config = newton.ModelBuilder.ShapeConfig(density=7874.0, gap=0.1 * R, mu=0.5, mu_torsional=0.1, mu_rolling=0.02)
+    for world in range(count):
+        part = newton.ModelBuilder()
+        for i, j, k in list(np.ndindex(2, 3, 3))[world % 3 :]:
+            at = 1.99 * R * (i + 0.1 * k), 1.99 * R * (j - 0.1 * k), (1.05 + 1.89 * k) * R
+            body = part.add_body(xform=wp.transform(at, wp.quat_rpy(0.1 * i, 0.05 * j, 0.2 * k)))
+            add_shape(part, kind, body, config)
+        builder.add_world(part)
+    builder.add_ground_plane(cfg=config)
+    return collided(builder, device)
+
+
+def assert_rounded_alike(ours, theirs):
+    """Poses and velocities after 60 iterations, to the tolerance that Newton's kernels are compared with."""
+    error = 3.0 * 6e-8 * np.abs(theirs[0][:, :3]).max() / DT * 60**0.5  # m/s
+    np.testing.assert_allclose(ours[1][:, :3], theirs[1][:, :3], rtol=0, atol=error)
+    np.testing.assert_allclose(ours[1][:, 3:], theirs[1][:, 3:], rtol=0, atol=error / R)
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_cluster_solves_as_launches_do(kind, device):
@@ -179,9 +201,16 @@ def test_a_cluster_solves_as_launches_do(kind, device):
     )
     for value, expected in zip(left, launches, strict=True):
         np.testing.assert_array_equal(value, expected)
-    error = 3.0 * 6e-8 * np.abs(launches[0][:, :3]).max() / DT * 60**0.5  # m/s, as that of Newton's kernels
-    np.testing.assert_allclose(cluster[1][:, :3], launches[1][:, :3], rtol=0, atol=error)
-    np.testing.assert_allclose(cluster[1][:, 3:], launches[1][:, 3:], rtol=0, atol=error / R)
+    assert_rounded_alike(cluster, launches)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("kind", ["ball", "capsule"])
+def test_a_block_solves_a_world_as_launches_do(kind, device):
+    model, state, contacts = worlds(kind, device)
+    launches, blocks = (substep(altered(**changes), model, state, contacts) for changes in ({"worlds": 0}, {}))
+    assert_rounded_alike(blocks, launches)
+    assert np.abs(launches[1] - state.body_qd.numpy()).max() > 0.1
 
 
 def test_cubes_that_are_pressed_together_keep_their_turn(device):

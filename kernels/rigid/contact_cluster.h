@@ -1,4 +1,5 @@
-// The contact solve of a small scene in one launch: a cluster of blocks of a GPU takes all passes and iterations.
+// All iterations of the contact solve in one launch of a GPU: of a small scene by a cluster of blocks, which takes the
+// passes before and after as well, and of each of many small worlds by a block.
 //
 // The blocks of a cluster run at the same time and meet at a barrier of the hardware, which takes less than a launch.
 // Each keeps the lines of some bodies in its shared memory, where the others read them, and each thread keeps its
@@ -11,7 +12,7 @@ namespace warpmag {
 
 constexpr int QUARTERS = 12; // of a body in shared memory: its motion before and after an iteration, and its matter
 
-// A body that a block moves: its slot, or -1 where another block does, and its sides.
+// A body that a block moves.
 struct Task {
     int slot;
     int2 sides;
@@ -19,11 +20,12 @@ struct Task {
 struct Room {
     Four lines[QUARTERS * LINES];
     Task tasks[LINES];
+    int count;
 };
 
 __device__ inline int block_in_cluster() {
-    int number;
-    asm("mov.u32 %0, %%cluster_ctarank;" : "=r"(number));
+    int number = 0;
+    if constexpr (CLUSTER > 1) asm("mov.u32 %0, %%cluster_ctarank;" : "=r"(number));
     return number;
 }
 // Where what lies here in shared memory lies in that of another block.
@@ -35,7 +37,8 @@ __device__ inline Four* in_block(Four* here, int block) {
 // Waits until all threads of the cluster have come, and sees what they wrote.
 __device__ inline void meet() {
     __syncwarp();
-    asm volatile("barrier.cluster.arrive.release.aligned;\n\tbarrier.cluster.wait.acquire.aligned;" ::: "memory");
+    if constexpr (CLUSTER == 1) __syncthreads();
+    else asm volatile("barrier.cluster.arrive.release.aligned;\n\tbarrier.cluster.wait.acquire.aligned;" ::: "memory");
 }
 // Makes a pass over ``count`` items with all threads of the cluster.
 template <class Pass> __device__ inline void pass_over(int count, Pass pass) {
@@ -54,64 +57,79 @@ __device__ inline void list_all(const Arrays& a) {
     pass_over(a.totals[SIDES], [&](int k) { write_side(k, a); });
 }
 
-// How bodies are shared out: those with many contacts to a few blocks, a body at a time, and all others to the rest, a
-// group of threads each. Lines are kept by the latter.
-struct Plan {
+// How bodies are shared out in a cluster: those with many contacts to a few blocks, a body at a time, and all others to
+// the rest, a group of threads each. Lines are kept by the latter.
+struct ClusterPlan {
     int bodies, wide, wide_blocks, narrow_blocks, block;
-    __device__ explicit Plan(const Arrays& a)
+    __device__ explicit ClusterPlan(const Arrays& a)
         : bodies(a.totals[BODIES]), wide(a.totals[WIDE_BODIES]), wide_blocks(wide < CLUSTER / 2 ? wide : CLUSTER / 2),
           narrow_blocks(CLUSTER - wide_blocks), block(block_in_cluster()) {}
     __device__ bool fits() const { return bodies <= LINES * narrow_blocks; }
     __device__ bool is_wide() const { return block >= narrow_blocks; }
-    __device__ int tasks() const {
-        return is_wide() ? (wide - (block - narrow_blocks) + wide_blocks - 1) / wide_blocks
-                         : (bodies - block + narrow_blocks - 1) / narrow_blocks;
+    __device__ int take_tasks(const Arrays& a, Room& room) const {
+        const int first = is_wide() ? block - narrow_blocks : block, step = is_wide() ? wide_blocks : narrow_blocks;
+        const int count = ((is_wide() ? wide : bodies) - first + step - 1) / step;
+        for (int task = threadIdx.x; task < count; task += BLOCK) {
+            const int slot = is_wide() ? a.wide[first + task * step] : first + task * step;
+            room.tasks[task] = {slot, ((const int2*)a.range)[slot]};
+        }
+        return count;
     }
-    __device__ int slot(const Arrays& a, int task) const {
-        return is_wide() ? a.wide[block - narrow_blocks + task * wide_blocks] : block + task * narrow_blocks;
-    }
-    __device__ Four* line(Room& room, int slot) const {
+    __device__ Four* line(const Arrays&, Room& room, int slot) const {
         return in_block(room.lines + QUARTERS * (slot / narrow_blocks), slot % narrow_blocks);
     }
 };
 
-// Fills a block's shared memory.
-__device__ inline void take_tasks(const Arrays& a, const Plan& plan, Room& room) {
-    for (int task = threadIdx.x; task < plan.tasks(); task += BLOCK) {
-        const int slot = plan.slot(a, task);
-        const int2 sides = ((const int2*)a.range)[slot];
-        room.tasks[task] = {!plan.is_wide() && sides.y - sides.x > WIDE ? -1 : slot, sides};
+// A block has a world for itself.
+struct WorldPlan {
+    int bodies;
+    __device__ explicit WorldPlan(const Arrays& a) : bodies(a.totals[BODIES]) {}
+    __device__ bool is_wide() const { return false; }
+    __device__ int take_tasks(const Arrays& a, Room& room) const {
+        if (threadIdx.x == 0) room.count = 0;
+        __syncthreads();
+        const int last = a.world_first[blockIdx.x + 1];
+        for (int b = a.world_first[blockIdx.x] + threadIdx.x; b < last; b += BLOCK) {
+            if (a.side_count[b] == 0) continue;
+            const int slot = a.slot[b], task = atomicAdd(&room.count, 1);
+            room.tasks[task] = {slot, ((const int2*)a.range)[slot]};
+            a.filled[b] = task; // its sides are counted no more
+        }
+        __syncthreads();
+        return room.count;
     }
-    for (int k = threadIdx.x; k < 8 * plan.tasks() && !plan.is_wide(); k += BLOCK) {
-        const Line line = line_at(a, a.motion, plan.slot(a, k / 8));
-        room.lines[QUARTERS * (k / 8) + k % 8 + k % 8 / 4 * 4] = (k % 8 < 4 ? line.motion : line.matter - 4)[k % 8];
+    __device__ Four* line(const Arrays& a, Room& room, int slot) const {
+        return room.lines + QUARTERS * a.filled[a.body[slot]];
     }
-    meet();
-}
+};
 
 // A side and what the next motion of its other body is away from this one, which for a body that nothing moves is 0.
 struct KeptSide {
     Side side;
     int step;
 };
-__device__ inline KeptSide side_of(const Arrays& a, const Plan& plan, Room& room, int k) {
+template <class Plan> __device__ inline KeptSide side_of(const Arrays& a, const Plan& plan, Room& room, int k) {
     const int j = a.other[k];
     const Contact contact = contact_at(a, k);
     if (j >= plan.bodies) return {{contact, line_at(a, a.motion, j)}, 0};
-    const Four* const line = plan.line(room, j);
+    const Four* const line = plan.line(a, room, j);
     return {{contact, {line, line + 8}}, 4};
 }
 
-// All iterations; where lines are then.
-__device__ inline int iterate_all(const Arrays& a, const Plan& plan, Room& room, int iterations, Real rate, Real dt) {
-    const int tasks = plan.tasks(), teams = plan.is_wide() ? 1 : BLOCK / GROUP, team = threadIdx.x / (BLOCK / teams);
-    const int first = threadIdx.x % (BLOCK / teams);
+// All iterations over a block's tasks; lines are in the first half of what the block keeps of them then, or else in the
+// second.
+template <class Plan>
+__device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room, int tasks, int iterations, Real rate,
+                                   Real dt) {
+    const int teams = plan.is_wide() ? 1 : BLOCK / GROUP, members = BLOCK / teams;
+    const int team = threadIdx.x / members, first = threadIdx.x % members;
     int kept_at = -1;
     KeptSide kept = {};
     Vector kept_pressed = {0, 0, 0};
-    if (tasks <= teams && team < tasks && room.tasks[team].slot >= 0) {
+    if (tasks <= teams && team < tasks) {
         const int2 sides = room.tasks[team].sides;
-        if (sides.x + first < sides.y) kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at);
+        const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
+        if (taken && sides.x + first < sides.y) kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at);
     }
     for (int iteration = 0; iteration < iterations; ++iteration) {
         const int odd = iteration % 2;
@@ -128,18 +146,33 @@ __device__ inline int iterate_all(const Arrays& a, const Plan& plan, Room& room,
         auto totals = [&](Pressure p) { return plan.is_wide() ? block_sums(p) : p; };
         for (int t = team; t < tasks; t += teams) {
             const Task task = room.tasks[t];
-            if (task.slot < 0) continue;
-            Four* const line = plan.is_wide() ? plan.line(room, task.slot) : room.lines + QUARTERS * t;
-            move(a, {line + 4 * odd, line + 8}, line + 4 * (1 - odd), task.sides, true, first, BLOCK / teams, side_at,
+            Four* const line = plan.is_wide() ? plan.line(a, room, task.slot) : room.lines + QUARTERS * t;
+            move(a, {line + 4 * odd, line + 8}, line + 4 * (1 - odd), task.sides, true, first, members, side_at,
                  press_at, totals, rate, dt);
         }
         meet();
     }
-    if (a.with_levers) {
-        if (kept_at >= 0) add_pressed(a, kept_at, kept_pressed);
-        meet();
+    if (!a.with_levers) return;
+    if (kept_at >= 0) add_pressed(a, kept_at, kept_pressed);
+    meet();
+}
+
+// Takes bodies into shared memory, moves them, and writes what they are then.
+template <class Plan>
+__device__ inline void solve_tasks(const Arrays& a, const Plan& plan, Room& room, int iterations, Real rate, Real dt) {
+    const int tasks = plan.take_tasks(a, room), own_lines = plan.is_wide() ? 0 : tasks;
+    if (CLUSTER == 1 && tasks == 0) return;
+    __syncthreads();
+    for (int k = threadIdx.x; k < 8 * own_lines; k += BLOCK) {
+        const Line line = line_at(a, a.motion, room.tasks[k / 8].slot);
+        room.lines[QUARTERS * (k / 8) + k % 8 + k % 8 / 4 * 4] = (k % 8 < 4 ? line.motion : line.matter - 4)[k % 8];
     }
-    return 4 * (iterations % 2);
+    meet();
+    iterate_all(a, plan, room, tasks, iterations, rate, dt);
+    for (int t = threadIdx.x / GROUP; t < own_lines; t += BLOCK / GROUP) {
+        const Four* const line = room.lines + QUARTERS * t;
+        finish_body(a, room.tasks[t].slot, {line + iterations % 2 * 4, line + 8}, dt);
+    }
 }
 
 // The whole solve, or if there are more than ``most`` sides or more bodies than fit, no more than the lists: then
@@ -147,16 +180,16 @@ __device__ inline int iterate_all(const Arrays& a, const Plan& plan, Room& room,
 __device__ inline void solve_in_cluster(const Arrays& a, int iterations, int most, Real rate, Real dt) {
     __shared__ Room room;
     list_all(a);
-    const Plan plan(a);
+    const ClusterPlan plan(a);
     const bool fits = plan.fits() && a.totals[SIDES] <= most;
     if (!fits && threadIdx.x == 0 && plan.block == 0) a.totals[LEFT] = plan.bodies;
-    if (!fits || plan.bodies == 0) return;
-    take_tasks(a, plan, room);
-    const int now = iterate_all(a, plan, room, iterations, rate, dt);
-    for (int t = threadIdx.x / GROUP; t < plan.tasks() && !plan.is_wide(); t += BLOCK / GROUP) {
-        const Four* const line = room.lines + QUARTERS * t;
-        finish_body(a, plan.slot(a, t), {line + now, line + 8}, dt);
-    }
+    if (fits && plan.bodies > 0) solve_tasks(a, plan, room, iterations, rate, dt);
+}
+
+// All iterations in the block's world.
+__device__ inline void solve_world(const Arrays& a, int iterations, Real rate, Real dt) {
+    __shared__ Room room;
+    solve_tasks(a, WorldPlan(a), room, iterations, rate, dt);
 }
 }
 #endif

@@ -2,8 +2,8 @@
 
 Once a substep the contacts that move anything are listed for each body that they move. An iteration then relaxes them
 all at once (``contact_law.h``): each body gathers from its own contacts. On a CPU one launch does all iterations, and
-the impulses of a contact are computed once. On a GPU both bodies compute them. An iteration is a launch there; in a
-small scene all are one, and so are the passes before and after (``contact_cluster.h``).
+the impulses of a contact are computed once. On a GPU both bodies compute them. An iteration is a launch there; those of
+a small scene, or of many small worlds, are one launch together (``contact_cluster.h``).
 """
 
 from dataclasses import dataclass
@@ -24,6 +24,8 @@ _CLUSTER, _CLUSTER_LINES = 16, 208
 """Blocks of a cluster, and bodies whose lines each keeps in 48 KB of shared memory."""
 _CLUSTER_CAPACITY, _CLUSTER_SIDES = 50_000, 12_000
 """Contacts that there may be, and sides that there are, up to which a cluster is faster than launches."""
+_WORLDS, _WORLD_GROUP, _WORLD_LINES = 16, 8, (32, 64, 128, 208)
+"""Worlds from which on each has a block, threads that share a body there, and bodies that such a block may keep."""
 _BLOCK, _WIDE_BLOCKS = 128, 64
 """Threads of a block, and blocks for bodies with many contacts, which are shared by a whole one."""
 _CONTACTS_PER_THREAD = 100
@@ -42,7 +44,7 @@ _OF_CONTACTS = (
 )
 _OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "inertia", "q", "qd")
 _OWN = (
-    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "key"),
+    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "world_first", "key"),
     *("motion", "next_motion", "first_motion", "matter", "side", "pressed", "record"),
 )
 _ADDRESSES = (*_OF_CONTACTS, *_OF_BODIES, "shares", *_OWN)
@@ -69,6 +71,7 @@ class SolveBuffers:
                 other: Line of the body at the other end, shape [2c].
                 side: Contacts as each end sees them, see ``contact_law.h``, shape [2c, 20].
                 wide: Lines of bodies with many contacts, shape [b].
+                world_first: First body of each world that has a block, and the one after the last, shape [worlds + 1].
             and on a CPU, where vectors of contacts are seen from their second bodies,
                 side_count: Sides of each body, shape [b].
                 entry: Contacts that take part, shape [c].
@@ -90,6 +93,8 @@ class SolveBuffers:
         group: Threads of a GPU that share a body, 0 on a CPU.
         cluster: Blocks of a GPU that list the contacts together, and solve them where they are few; 0 for launches.
         most: Most threads of a CPU; most sides that a cluster solves.
+        worlds: Worlds that have a block of a GPU each, 0 for none.
+        world_lines: Bodies that such a block can keep.
     """
 
     arrays: dict[str, wp.array]
@@ -98,6 +103,8 @@ class SolveBuffers:
     group: int
     cluster: int
     most: int
+    worlds: int
+    world_lines: int
 
 
 def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag: int) -> SolveBuffers:
@@ -109,7 +116,9 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
         levers: Whether lever arms are corrected, which balls do not need.
         kinematic_flag: Newton's flag of kinematic bodies.
     """
-    device, inertia, bodies = bodies.inv_mass.device, bodies.inv_inertia.numpy(), len(bodies.inv_mass)
+    device, inertia = bodies.inv_mass.device, bodies.inv_inertia.numpy()
+    world_first, world_lines = _split_worlds(bodies)
+    bodies = len(inertia)
     isotropic = inertia[:, 0, 0, None, None] * np.eye(3)
     lines = -(-bodies // CHUNK) * CHUNK + 3 * CHUNK  # the movable and the others are padded, and the world has a vector
     padded = -(-max(contact_max, 1) // CHUNK) * CHUNK
@@ -130,22 +139,35 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
     arrays["side"] = zeros((1 if device.is_cpu else 2) * padded, _SIDE, dtype=wp.float32)
     arrays["record"] = zeros((2 * padded + padded // CHUNK) if device.is_cpu else 0, _RECORD, dtype=wp.float32)
     arrays["pressed"] = zeros(2 * padded if levers else 0, 4, dtype=wp.float32)
+    arrays["world_first"] = wp.array(world_first, dtype=wp.int32, device=device)
     given = SolveArrays()
     for name in _OWN:
         setattr(given, name, arrays[name].ptr or 0)
     for name, size in zip(_SIZES, (contact_max, bodies, lines, int(levers), kinematic_flag), strict=True):
         setattr(given, name, size)
     is_round = bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all())
-    group = 0 if device.is_cpu else next(group for most, group in _GROUPS if bodies <= most)
-    fits = contact_max <= _CLUSTER_CAPACITY and bodies <= _GROUPS[2][0]
+    group = _WORLD_GROUP if world_lines else next(group for most, group in _GROUPS if bodies <= most)
+    small = contact_max <= _CLUSTER_CAPACITY and bodies <= _GROUPS[2][0] and not world_lines
     return SolveBuffers(
         arrays,
         given,
         round=is_round,
-        group=group,
-        cluster=_most_blocks(device, is_round, group) if fits else 0,
+        group=0 if device.is_cpu else group,
+        cluster=_most_blocks(device, is_round, group) if small else 0,
         most=threads_for(contact_max, 1) if device.is_cpu else _CLUSTER_SIDES,
+        worlds=len(world_first) - 1 if world_lines else 0,
+        world_lines=world_lines,
     )
+
+
+def _split_worlds(bodies: BodyView) -> tuple[np.ndarray, int]:
+    """First bodies of many small worlds, and how many bodies a block has to keep, 0 where blocks do not suit them."""
+    world, movable = bodies.world.numpy(), bodies.inv_mass.numpy() > 0.0
+    so_far = np.maximum.accumulate(world)
+    first = np.searchsorted(so_far, np.arange(world.max(initial=-1) + 2))
+    lines = next((lines for lines in _WORLD_LINES if lines >= np.diff(first).max(initial=0)), 0)
+    suited = len(first) > _WORLDS and ((world == so_far) | ((world < 0) & ~movable)).all()
+    return first, lines if suited and bodies.inv_mass.device.is_cuda and not movable[world < 0].any() else 0
 
 
 def _most_blocks(device, is_round: bool, group: int) -> int:
@@ -160,15 +182,18 @@ def _most_blocks(device, is_round: bool, group: int) -> int:
 
 
 @cache
-def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 1):
+def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines: int = _CLUSTER_LINES):
     """Kernel that calls a function of the device's header, and threads of its blocks on a GPU."""
     header = "rigid/contact_cuda.h" if group else "rigid/contact_cpu.h"
     block, options = _BLOCK, {}
     constants = dict(ROUND=int(is_round), GROUP=group, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
-    if cluster > 1:
-        header, block = "rigid/contact_cluster.h", 512 if is_round else 256  # 128 and 255 registers
+    if cluster:
+        header = "rigid/contact_cluster.h"
+        block = 512 if is_round and cluster > 1 else 256  # leaves them 128 and 255 registers
         options = dict(cluster_dim=cluster, launch_bounds=block)
-        constants |= dict(CLUSTER=cluster, LINES=_CLUSTER_LINES)
+        constants |= dict(CLUSTER=cluster, LINES=lines)
+    if cluster == 1:
+        constants["WIDE"] = 2**30  # groups take all bodies
     constants |= dict(BLOCK=block, CONTACTS_PER_THREAD=_CONTACTS_PER_THREAD)
 
     @wp.func_native(f"warpmag::{call};")
@@ -195,6 +220,7 @@ LIST = "list_sides(thread, warpmag::Arrays(given))"
 WRITE = "write_side(thread, warpmag::Arrays(given))"
 ITERATE = "iterate(thread, warpmag::Arrays(given), number, rate, dt)"
 SOLVE = "solve_in_cluster(warpmag::Arrays(given), number, most, rate, dt)"
+SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number, rate, dt)"
 FINISH = "finish(thread, warpmag::Arrays(given), number, dt)"
 
 
@@ -218,23 +244,26 @@ def launch_solve_contacts(
             setattr(given, name, getattr(view, name).ptr or 0)
     given.shares = 0 if shares is None else shares.ptr
 
-    def launch(call, dim, number=0, cluster=1):
+    def launch(call, dim, number=0, blocks=0, **form):
         inputs = [given, number, relaxation / dt, dt, b.most, team() if device.is_cpu else None]
-        kernel, block = solve_kernel(call, b.round, b.group, cluster)
-        wp.launch(kernel, dim or cluster * block, inputs=inputs, device=device, block_dim=block)
+        kernel, block = solve_kernel(call, b.round, b.group, **form)
+        wp.launch(kernel, dim or blocks * block, inputs=inputs, device=device, block_dim=block)
 
     if device.is_cpu:
         launch(ON_CPU, 1, iterations)
         return
-    groups = b.group * given.bodies
     if b.cluster:
-        launch(SOLVE, 0, iterations, b.cluster)
+        launch(SOLVE, 0, iterations, b.cluster, cluster=b.cluster)
     else:
         b.arrays["counters"].zero_()
         launch(COUNT, given.contact_max)
         launch(PLACE, -(-(given.bodies + 1) // 32) * 32)
         launch(LIST, given.contact_max)
         launch(WRITE, 2 * given.contact_max)
+    if b.worlds:
+        launch(SOLVE_WORLD, 0, iterations, b.worlds, cluster=1, lines=b.world_lines)
+        return
+    groups = b.group * given.bodies
 
     def iterate():
         for iteration in range(iterations):
