@@ -126,7 +126,7 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
     int kept_at = -1;
     KeptSide kept = {};
     Vector kept_pressed = {0, 0, 0};
-    if (tasks <= teams && team < tasks) {
+    if (team < tasks) {
         const int2 sides = room.tasks[team].sides;
         const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
         if (taken && sides.x + first < sides.y) kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at);
@@ -143,7 +143,7 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
             if (k == kept_at) kept_pressed = sum(kept_pressed, p);
             else add_pressed(a, k, p);
         };
-        auto totals = [&](Pressure p) { return plan.is_wide() ? block_sums(p) : p; };
+        auto totals = [&](int sides, Pressure p) { return plan.is_wide() ? block_sums(p, sides) : p; };
         for (int t = team; t < tasks; t += teams) {
             const Task task = room.tasks[t];
             Four* const line = plan.is_wide() ? plan.line(a, room, task.slot) : room.lines + QUARTERS * t;

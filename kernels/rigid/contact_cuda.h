@@ -144,15 +144,15 @@ __device__ inline Pressure press(const Arrays& a, Sides side_at, Presses press_a
     return {group_sums(total.linear), group_sums(total.angular)};
 }
 
-// Sums over a block of the sums of its groups.
-__device__ inline Pressure block_sums(Pressure mine) {
+// Sums over a block of the sums of its groups, of which the first have ``sides``.
+__device__ inline Pressure block_sums(Pressure mine, int sides) {
     constexpr int GROUPS = BLOCK / GROUP;
     __shared__ Pressure parts[GROUPS];
     __syncthreads();
     if (share() == 0) parts[threadIdx.x / GROUP] = mine;
     __syncthreads();
     Pressure total = parts[0];
-    for (int g = 1; g < GROUPS; ++g) {
+    for (int g = 1; g < GROUPS && g * GROUP < sides; ++g) {
         total.linear = sum(total.linear, parts[g].linear);
         total.angular = sum(total.angular, parts[g].angular);
     }
@@ -172,8 +172,8 @@ __device__ inline void move(const Arrays& a, const Line& line, Four* to, int2 si
     Whole whole = read_whole(drift, matter);
     // all of that is read at once, whether it is needed or not
     if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
-    const Pressure p =
-        totals(press(a, side_at, press_at, sides.x + first, sides.y, threads, line, own, inertia, rate, dt));
+    const Pressure p = totals(sides.y - sides.x, press(a, side_at, press_at, sides.x + first, sides.y, threads, line,
+                                                       own, inertia, rate, dt));
     apply(own, whole, p.linear, p.angular, dt);
     if (first == 0) put_body((Real*)to, 0, own, {whole.v, drift.kinematic});
 }
@@ -192,11 +192,11 @@ __device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, 
     const int block = thread / BLOCK;
     if (block < WIDE_BLOCKS) {
         for (int w = block; w < a.totals[WIDE_BODIES]; w += WIDE_BLOCKS)
-            move_slot(a.wide[w], true, threadIdx.x, BLOCK, [](Pressure p) { return block_sums(p); });
+            move_slot(a.wide[w], true, threadIdx.x, BLOCK, [](int sides, Pressure p) { return block_sums(p, sides); });
         return;
     }
     const int slot = (thread - WIDE_BLOCKS * BLOCK) / GROUP;
-    move_slot(slot, slot < a.totals[BODIES], share(), GROUP, [](Pressure p) { return p; });
+    move_slot(slot, slot < a.totals[BODIES], share(), GROUP, [](int, Pressure p) { return p; });
 }
 
 // Ends the solve for the body of a line that a group of threads shares: corrects lever arms, and writes its pose and
