@@ -185,15 +185,16 @@ def _most_blocks(device, is_round: bool, group: int) -> int:
 def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines: int = _CLUSTER_LINES):
     """Kernel that calls a function of the device's header, and threads of its blocks on a GPU."""
     header = "rigid/contact_cuda.h" if group else "rigid/contact_cpu.h"
-    block, options = _BLOCK, {}
+    block = _BLOCK
     constants = dict(ROUND=int(is_round), GROUP=group, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
     if cluster:
         header = "rigid/contact_cluster.h"
         block = 512 if is_round and cluster > 1 else 256  # leaves them 128 and 255 registers
-        options = dict(cluster_dim=cluster, launch_bounds=block)
         constants |= dict(CLUSTER=cluster, LINES=lines)
     if cluster == 1:
+        block = min(block, lines * group)
         constants["WIDE"] = 2**30  # groups take all bodies
+    options = dict(cluster_dim=cluster, launch_bounds=block) if cluster else {}
     constants |= dict(BLOCK=block, CONTACTS_PER_THREAD=_CONTACTS_PER_THREAD)
 
     @wp.func_native(f"warpmag::{call};")
