@@ -91,6 +91,17 @@ class PlainXPBD(PileXPBD):
         self._solve = contact_solve.allocate(contact_max, bodies, levers=False, kinematic_flag=flag)
 
 
+def altered(**changes):
+    """The solver with other settings of its contact solve."""
+
+    class Altered(PileXPBD):
+        def __init__(self, *arguments, **settings):
+            super().__init__(*arguments, **settings)
+            self._solve = dataclasses.replace(self._solve, **changes)
+
+    return Altered
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_substep_is_that_of_newtons_kernels(kind, device):
     """Gaps are differences of positions, known to 6e-8 of the largest in float32, and impulses to that over dt.
@@ -140,25 +151,66 @@ def test_contacts_keep_momentum(device):
 
 @pytest.mark.parametrize("kind", ["ball", "box", "plate"])
 def test_a_substep_repeats_bit_by_bit(kind, device):
-    """By any number of threads, and on a GPU for contacts that were found in any order."""
+    """By any number of threads; on a GPU, by a cluster and by launches, for contacts that were found in any order."""
+    on_gpu = wp.get_device(device).is_cuda
     model, state, contacts = heap(kind, device)
-    first = substep(PileXPBD, model, state, contacts)
-
-    class Shared(PileXPBD):
-        def __init__(self, *arguments, **settings):
-            super().__init__(*arguments, **settings)
-            self._solve = dataclasses.replace(self._solve, threads=3)
-
+    forms = [({}, {}), ({"cluster": 0}, {"cluster": 0})] if on_gpu else [({}, {"most": 3})]
+    first = [substep(altered(**changes), model, state, contacts) for changes, _ in forms]
     order = np.arange(contacts.rigid_contact_count.numpy()[0])
-    if wp.get_device(device).is_cuda:
+    if on_gpu:
         np.random.default_rng(0).shuffle(order)
     for name in "shape0 shape1 point0 point1 offset0 offset1 margin0 margin1 normal".split():
         array = getattr(contacts, f"rigid_contact_{name}")
         values = array.numpy()
         values[: len(order)] = values[order]
         array.assign(values)
-    for value, expected in zip(substep(Shared, model, state, contacts), first, strict=True):
+    for (_, changes), before in zip(forms, first, strict=True):
+        for value, expected in zip(substep(altered(**changes), model, state, contacts), before, strict=True):
+            np.testing.assert_array_equal(value, expected)
+
+
+def worlds(kind, device, count=20):
+    """Worlds of some bodies each that overlap, on ground that they share."""
+    builder = newton.ModelBuilder()
+    config = newton.ModelBuilder.ShapeConfig(density=7874.0, gap=0.1 * R, mu=0.5, mu_torsional=0.1, mu_rolling=0.02)
+    for world in range(count):
+        part = newton.ModelBuilder()
+        for i, j, k in list(np.ndindex(2, 3, 3))[world % 3 :]:
+            at = 1.99 * R * (i + 0.1 * k), 1.99 * R * (j - 0.1 * k), (1.05 + 1.89 * k) * R
+            body = part.add_body(xform=wp.transform(at, wp.quat_rpy(0.1 * i, 0.05 * j, 0.2 * k)))
+            add_shape(part, kind, body, config)
+        builder.add_world(part)
+    builder.add_ground_plane(cfg=config)
+    return collided(builder, device)
+
+
+def assert_rounded_alike(ours, theirs):
+    """Poses and velocities after 60 iterations, to the tolerance that Newton's kernels are compared with."""
+    error = 3.0 * 6e-8 * np.abs(theirs[0][:, :3]).max() / DT * 60**0.5  # m/s
+    np.testing.assert_allclose(ours[1][:, :3], theirs[1][:, :3], rtol=0, atol=error)
+    np.testing.assert_allclose(ours[1][:, 3:], theirs[1][:, 3:], rtol=0, atol=error / R)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_cluster_solves_as_launches_do(kind, device):
+    """What is too much for it, launches solve to the same bits; compilers may round what it solves otherwise."""
+    model, state, contacts = heap(kind, device)
+    launches, left, cluster = (
+        substep(altered(**changes), model, state, contacts) for changes in ({"cluster": 0}, {"most": 10}, {})
+    )
+    for value, expected in zip(left, launches, strict=True):
         np.testing.assert_array_equal(value, expected)
+    assert_rounded_alike(cluster, launches)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("kind", ["ball", "capsule"])
+def test_a_block_solves_a_world_as_launches_do(kind, device):
+    model, state, contacts = worlds(kind, device)
+    launches, blocks = (substep(altered(**changes), model, state, contacts) for changes in ({"worlds": 0}, {}))
+    assert_rounded_alike(blocks, launches)
+    assert np.abs(launches[1] - state.body_qd.numpy()).max() > 0.1
 
 
 def test_cubes_that_are_pressed_together_keep_their_turn(device):

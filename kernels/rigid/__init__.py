@@ -7,7 +7,7 @@
 | broad_phase | pairs of shapes that may touch |
 | monitor | motion, penetration, buffers and induction of each substep |
 | stepping | the state machine of a step: substeps, attempts, log |
-| contact_solve | XPBD's iterations over contacts; their law and the correction of lever arms in `contact_law.h` |
+| contact_solve | XPBD's iterations over contacts; law in `contact_law.h`, all in a launch in `contact_cluster.h` |
 | mass_splitting | a correction to XPBD: shares of bodies that many contacts push |
 
 Contacts are collisions of rigid bodies here; near contacts of magnets are in ``near_contact``. May import ``shared``

@@ -10,7 +10,7 @@
 #if defined(__CUDA_ARCH__)
 namespace warpmag {
 
-enum Total { BODIES, SIDES, IMMOVABLE, WIDE_BODIES }; // entries of ``totals``
+enum Total { BODIES, SIDES, IMMOVABLE, WIDE_BODIES, LEFT, TOTALS }; // entries of ``totals``, and their number
 
 // For contact c: counts it for the bodies that it moves.
 __device__ inline void count_sides(int c, const Arrays& a) {
@@ -98,84 +98,111 @@ struct Pressure {
     Vector linear, angular;
 };
 
-// What each ``threads``-th contact of a body does, from k to last.
-__device__ inline Pressure press(const Arrays& a, const Real* motion, int k, int last, int threads, int slot,
-                                 const Body& own, const Inertia& inertia, Real rate, Real dt) {
+// Where the motion and the matter of a body stand.
+struct Line {
+    const Four *motion, *matter;
+};
+__device__ inline Line line_at(const Arrays& a, const Real* motion, int i) {
+    return {(const Four*)motion + 4 * (size_t)i, (const Four*)a.matter + 4 * (size_t)i};
+}
+// A contact, and the body at its other end.
+struct Side {
+    Contact contact;
+    Line other;
+};
+__device__ inline Contact contact_at(const Arrays& a, int k) {
+    return read_contact([&](int quarter) { return ((const Four*)a.side)[SIDE / 4 * (size_t)k + quarter]; });
+}
+__device__ inline void add_pressed(const Arrays& a, int k, Vector p) {
+    Four& pressed = ((Four*)a.pressed)[k];
+    pressed = {pressed.x + p.x, pressed.y + p.y, pressed.z + p.z, 0};
+}
+
+// What each ``threads``-th contact of a body does, from k to last. ``side_at`` gives contacts, and ``press_at`` is told
+// what they press with.
+template <class Sides, class Presses>
+__device__ inline Pressure press(const Arrays& a, Sides side_at, Presses press_at, int k, int last, int threads,
+                                 const Line& line, const Body& own, const Inertia& inertia, Real rate, Real dt) {
     Pressure total = {{0, 0, 0}, {0, 0, 0}};
     for (; k < last; k += threads) {
-        const int j = a.other[k];
-        const Contact contact =
-            read_contact([&](int quarter) { return ((const Four*)a.side)[SIDE / 4 * (size_t)k + quarter]; });
-        const Body other = read_body([&](int quarter) { return four_at(motion, quarter, &j); });
+        const Side side = side_at(k);
+        const Contact& contact = side.contact;
+        const Body other = read_body([&](int quarter) { return side.other.motion[quarter]; });
         const Vector r = arm(own, contact.point), other_r = arm(other, contact.other_point);
         const Number distance = gap(contact, own, other, r, other_r);
         if (!(distance < 0)) continue;
-        const Inertia other_inertia = read_inertia([&](int quarter) { return four_at(a.matter, quarter, &j); });
+        const Inertia other_inertia = read_inertia([&](int quarter) { return side.other.matter[quarter]; });
         auto drifts = [&](int end) {
-            return read_drift([&](int quarter) { return own_four(motion, quarter, end == 1 ? slot : j); });
+            return read_drift([&](int quarter) { return (end == 1 ? line : side.other).motion[quarter]; });
         };
         const Impulse p =
             contact_impulse(contact, own, other, inertia, other_inertia, distance, r, other_r, drifts, rate, dt);
         total.linear = sum(total.linear, p.linear);
         total.angular = sum(total.angular, p.own);
-        if (a.with_levers) {
-            Four& pressed = ((Four*)a.pressed)[k];
-            pressed = {pressed.x + p.linear.x, pressed.y + p.linear.y, pressed.z + p.linear.z, 0};
-        }
+        if (a.with_levers) press_at(k, p.linear);
     }
     return {group_sums(total.linear), group_sums(total.angular)};
 }
 
-// Sums over a block of the sums of its groups.
-__device__ inline Pressure block_sums(Pressure mine) {
+// Sums over a block of the sums of its groups, of which the first have ``sides``.
+__device__ inline Pressure block_sums(Pressure mine, int sides) {
     constexpr int GROUPS = BLOCK / GROUP;
     __shared__ Pressure parts[GROUPS];
     __syncthreads();
     if (share() == 0) parts[threadIdx.x / GROUP] = mine;
     __syncthreads();
     Pressure total = parts[0];
-    for (int g = 1; g < GROUPS; ++g) {
+    for (int g = 1; g < GROUPS && g * GROUP < sides; ++g) {
         total.linear = sum(total.linear, parts[g].linear);
         total.angular = sum(total.angular, parts[g].angular);
     }
     return total;
 }
 
+// Moves the body of a line by what ``threads`` threads, of which this is the one of number ``first``, sum up of its
+// contacts, unless they are ``WIDE`` where these are not.
+template <class Sides, class Presses, class Totals>
+__device__ inline void move(const Arrays& a, const Line& line, Four* to, int2 sides, bool taken, int first, int threads,
+                            Sides side_at, Presses press_at, Totals totals, Real rate, Real dt) {
+    auto motion = [&](int quarter) { return line.motion[quarter]; };
+    auto matter = [&](int quarter) { return line.matter[quarter]; };
+    Body own = read_body(motion);
+    const Drift drift = read_drift(motion);
+    const Inertia inertia = read_inertia(matter);
+    Whole whole = read_whole(drift, matter);
+    // all of that is read at once, whether it is needed or not
+    if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
+    const Pressure p = totals(sides.y - sides.x, press(a, side_at, press_at, sides.x + first, sides.y, threads, line,
+                                                       own, inertia, rate, dt));
+    apply(own, whole, p.linear, p.angular, dt);
+    if (first == 0) put_body((Real*)to, 0, own, {whole.v, drift.kinematic});
+}
+
 // One iteration: moves the body that a group of threads shares, from one array of motions to the other. The first
 // blocks take the bodies with many contacts, a whole block each.
 __device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, Real dt) {
     const Real* const from = odd ? a.next_motion : a.motion;
-    Real* const to = odd ? a.motion : a.next_motion;
-    auto move = [&](int slot, bool taken, int first, int threads, auto totals) {
-        const int2 sides = ((const int2*)a.range)[slot];
-        auto motion = [&](int quarter) { return own_four(from, quarter, slot); };
-        auto matter = [&](int quarter) { return own_four(a.matter, quarter, slot); };
-        Body own = read_body(motion);
-        const Drift drift = read_drift(motion);
-        const Inertia inertia = read_inertia(matter);
-        Whole whole = read_whole(drift, matter);
-        // all of that is read at once, whether it is needed or not
-        if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
-        const Pressure p = totals(press(a, from, sides.x + first, sides.y, threads, slot, own, inertia, rate, dt));
-        apply(own, whole, p.linear, p.angular, dt);
-        if (first == 0) put_body(to, slot, own, {whole.v, drift.kinematic});
+    Four* const to = (Four*)(odd ? a.motion : a.next_motion);
+    auto side_at = [&](int k) { return Side{contact_at(a, k), line_at(a, from, a.other[k])}; };
+    auto press_at = [&](int k, Vector p) { add_pressed(a, k, p); };
+    auto move_slot = [&](int slot, bool taken, int first, int threads, auto totals) {
+        move(a, line_at(a, from, slot), to + 4 * (size_t)slot, ((const int2*)a.range)[slot], taken, first, threads,
+             side_at, press_at, totals, rate, dt);
     };
     const int block = thread / BLOCK;
     if (block < WIDE_BLOCKS) {
         for (int w = block; w < a.totals[WIDE_BODIES]; w += WIDE_BLOCKS)
-            move(a.wide[w], true, threadIdx.x, BLOCK, [](Pressure p) { return block_sums(p); });
+            move_slot(a.wide[w], true, threadIdx.x, BLOCK, [](int sides, Pressure p) { return block_sums(p, sides); });
         return;
     }
     const int slot = (thread - WIDE_BLOCKS * BLOCK) / GROUP;
-    move(slot, slot < a.totals[BODIES], share(), GROUP, [](Pressure p) { return p; });
+    move_slot(slot, slot < a.totals[BODIES], share(), GROUP, [](int, Pressure p) { return p; });
 }
 
-// Ends the solve for the body that a group of threads shares: corrects lever arms, and writes its pose and velocities.
-__device__ inline void finish(int thread, const Arrays& a, int odd, Real dt) {
-    const int slot = thread / GROUP;
-    if (slot >= a.totals[BODIES]) return;
-    const Real* const lines = odd ? a.next_motion : a.motion;
-    auto motion = [&](int quarter) { return own_four(lines, quarter, slot); };
+// Ends the solve for the body of a line that a group of threads shares: corrects lever arms, and writes its pose and
+// velocities.
+__device__ inline void finish_body(const Arrays& a, int slot, const Line& line, Real dt) {
+    auto motion = [&](int quarter) { return line.motion[quarter]; };
     Body body = read_body(motion);
     Drift drift = read_drift(motion);
     if (a.with_levers) {
@@ -187,11 +214,15 @@ __device__ inline void finish(int thread, const Arrays& a, int odd, Real dt) {
             const Vector linear = {pressed.x, pressed.y, pressed.z};
             angular = sum(angular, lever_correction(body, mean, {point.x, point.y, point.z}, linear, dt));
         }
-        Whole whole = read_whole(drift, [&](int quarter) { return own_four(a.matter, quarter, slot); });
+        Whole whole = read_whole(drift, [&](int quarter) { return line.matter[quarter]; });
         apply(body, whole, {0, 0, 0}, group_sums(angular), dt);
         drift.v = whole.v;
     }
     if (share() == 0) end_lines(a, body, drift, slot, 1);
+}
+__device__ inline void finish(int thread, const Arrays& a, int odd, Real dt) {
+    const int slot = thread / GROUP;
+    if (slot < a.totals[BODIES]) finish_body(a, slot, line_at(a, odd ? a.next_motion : a.motion, slot), dt);
 }
 }
 #endif

@@ -19,7 +19,7 @@ struct Arrays {
     Real *q, *qd;
     // own
     const Real* shares;
-    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide;
+    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide, *world_first;
     unsigned long long* key;
     Real *motion, *next_motion, *first_motion, *matter, *side, *pressed, *record;
 

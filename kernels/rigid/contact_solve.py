@@ -2,7 +2,8 @@
 
 Once a substep the contacts that move anything are listed for each body that they move. An iteration then relaxes them
 all at once (``contact_law.h``): each body gathers from its own contacts. On a CPU one launch does all iterations, and
-the impulses of a contact are computed once. On a GPU an iteration is a launch, and both bodies compute them.
+the impulses of a contact are computed once. On a GPU both bodies compute them. An iteration is a launch there; those of
+a small scene, or of many small worlds, are one launch together (``contact_cluster.h``).
 """
 
 from dataclasses import dataclass
@@ -17,8 +18,14 @@ from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import CHUNK, LINE
 from warpmag.kernels.shared.team import team, threads_for
 
-_GROUPS = ((6_000, 8), (20_000, 4), (2**31, 2))
+_GROUPS = ((100, 32), (400, 16), (6_000, 8), (20_000, 4), (2**31, 2))
 """Bodies up to which so many threads of a GPU share each, measured with three contacts a body on an H200."""
+_CLUSTER, _CLUSTER_LINES = 16, 208
+"""Blocks of a cluster, and bodies whose lines each keeps in 48 KB of shared memory."""
+_CLUSTER_CAPACITY, _CLUSTER_SIDES = 50_000, 12_000
+"""Contacts that there may be, and sides that there are, up to which a cluster is faster than launches."""
+_WORLDS, _WORLD_GROUP, _WORLD_LINES = 16, 8, (32, 64, 128, 208)
+"""Worlds from which on each has a block, threads that share a body there, and bodies that such a block may keep."""
 _BLOCK, _WIDE_BLOCKS = 128, 64
 """Threads of a block, and blocks for bodies with many contacts, which are shared by a whole one."""
 _CONTACTS_PER_THREAD = 100
@@ -27,6 +34,8 @@ _ROUND = 1e-6
 """Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
 _SIDE, _RECORD = 20, 8
 """Numbers of a side and of a record; as in ``contact_lines.h``."""
+_TOTALS, _LEFT = 5, 4
+"""Number of totals, and which is that of bodies left to launches; as in ``contact_cuda.h``."""
 
 _SIZES = ("contact_max", "bodies", "lines", "with_levers", "kinematic_flag")
 _OF_CONTACTS = (
@@ -35,7 +44,7 @@ _OF_CONTACTS = (
 )
 _OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "inertia", "q", "qd")
 _OWN = (
-    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "key"),
+    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "world_first", "key"),
     *("motion", "next_motion", "first_motion", "matter", "side", "pressed", "record"),
 )
 _ADDRESSES = (*_OF_CONTACTS, *_OF_BODIES, "shares", *_OWN)
@@ -55,13 +64,14 @@ class SolveBuffers:
 
     Attributes:
         arrays: The arrays: on a GPU
-                totals: Numbers of bodies and sides that take part, of bodies that nothing moves, and of those with many
-                    contacts, shape [4].
+                totals: Numbers of bodies and sides that take part, of bodies that nothing moves, of those with many
+                    contacts, and of bodies that a cluster leaves to launches, shape [5].
                 side_count, filled: Sides of each body, and how many of them are listed, shape [b].
                 entry, key: Side, twice its contact plus its end, and shapes of it, by bodies, shape [2c].
                 other: Line of the body at the other end, shape [2c].
                 side: Contacts as each end sees them, see ``contact_law.h``, shape [2c, 20].
                 wide: Lines of bodies with many contacts, shape [b].
+                world_first: First body of each world that has a block, and the one after the last, shape [worlds + 1].
             and on a CPU, where vectors of contacts are seen from their second bodies,
                 side_count: Sides of each body, shape [b].
                 entry: Contacts that take part, shape [c].
@@ -81,14 +91,20 @@ class SolveBuffers:
         given: Their sizes and addresses, and what else the kernels are given.
         round: Whether every body has the same inertia about all axes.
         group: Threads of a GPU that share a body, 0 on a CPU.
-        threads: Most threads of a CPU.
+        cluster: Blocks of a GPU that list the contacts together, and solve them where they are few; 0 for launches.
+        most: Most threads of a CPU; most sides that a cluster solves.
+        worlds: Worlds that have a block of a GPU each, 0 for none.
+        world_lines: Bodies that such a block can keep.
     """
 
     arrays: dict[str, wp.array]
     given: Any
     round: bool
     group: int
-    threads: int
+    cluster: int
+    most: int
+    worlds: int
+    world_lines: int
 
 
 def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag: int) -> SolveBuffers:
@@ -100,7 +116,9 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
         levers: Whether lever arms are corrected, which balls do not need.
         kinematic_flag: Newton's flag of kinematic bodies.
     """
-    device, inertia, bodies = bodies.inv_mass.device, bodies.inv_inertia.numpy(), len(bodies.inv_mass)
+    device, inertia = bodies.inv_mass.device, bodies.inv_inertia.numpy()
+    world_first, world_lines = _split_worlds(bodies)
+    bodies = len(inertia)
     isotropic = inertia[:, 0, 0, None, None] * np.eye(3)
     lines = -(-bodies // CHUNK) * CHUNK + 3 * CHUNK  # the movable and the others are padded, and the world has a vector
     padded = -(-max(contact_max, 1) // CHUNK) * CHUNK
@@ -108,9 +126,9 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
     def zeros(*shape, dtype=wp.int32):
         return wp.zeros(shape, dtype=dtype, device=device)
 
-    counters = zeros(4 + 2 * bodies)
-    arrays = {"counters": counters, "totals": counters[:4], "side_count": counters[4 : 4 + bodies]}
-    arrays["filled"] = counters[4 + bodies :]
+    counters = zeros(_TOTALS + 2 * bodies)
+    arrays = {"counters": counters, "totals": counters[:_TOTALS], "side_count": counters[_TOTALS : _TOTALS + bodies]}
+    arrays["filled"] = counters[_TOTALS + bodies :]
     arrays |= {"slot": zeros(bodies), "range": zeros(lines, 2), "entry": zeros(2 * padded), "other": zeros(4 * padded)}
     arrays["body"] = wp.full(lines, -1, dtype=wp.int32, device=device)
     arrays["wide"] = zeros(max(bodies, padded // CHUNK))
@@ -121,51 +139,89 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
     arrays["side"] = zeros((1 if device.is_cpu else 2) * padded, _SIDE, dtype=wp.float32)
     arrays["record"] = zeros((2 * padded + padded // CHUNK) if device.is_cpu else 0, _RECORD, dtype=wp.float32)
     arrays["pressed"] = zeros(2 * padded if levers else 0, 4, dtype=wp.float32)
+    arrays["world_first"] = wp.array(world_first, dtype=wp.int32, device=device)
     given = SolveArrays()
     for name in _OWN:
         setattr(given, name, arrays[name].ptr or 0)
     for name, size in zip(_SIZES, (contact_max, bodies, lines, int(levers), kinematic_flag), strict=True):
         setattr(given, name, size)
+    is_round = bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all())
+    group = _WORLD_GROUP if world_lines else next(group for most, group in _GROUPS if bodies <= most)
+    small = contact_max <= _CLUSTER_CAPACITY and bodies <= _GROUPS[2][0] and not world_lines
     return SolveBuffers(
         arrays,
         given,
-        round=bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all()),
-        group=0 if device.is_cpu else next(group for most, group in _GROUPS if bodies <= most),
-        threads=threads_for(contact_max, 1),
+        round=is_round,
+        group=0 if device.is_cpu else group,
+        cluster=_most_blocks(device, is_round, group) if small else 0,
+        most=threads_for(contact_max, 1) if device.is_cpu else _CLUSTER_SIDES,
+        worlds=len(world_first) - 1 if world_lines else 0,
+        world_lines=world_lines,
     )
 
 
+def _split_worlds(bodies: BodyView) -> tuple[np.ndarray, int]:
+    """First bodies of many small worlds, and how many bodies a block has to keep, 0 where blocks do not suit them."""
+    world, movable = bodies.world.numpy(), bodies.inv_mass.numpy() > 0.0
+    so_far = np.maximum.accumulate(world)
+    first = np.searchsorted(so_far, np.arange(world.max(initial=-1) + 2))
+    lines = next((lines for lines in _WORLD_LINES if lines >= np.diff(first).max(initial=0)), 0)
+    suited = len(first) > _WORLDS and ((world == so_far) | ((world < 0) & ~movable)).all()
+    return first, lines if suited and bodies.inv_mass.device.is_cuda and not movable[world < 0].any() else 0
+
+
+def _most_blocks(device, is_round: bool, group: int) -> int:
+    """Blocks of the largest cluster that a device runs, 0 if none."""
+    if device.is_cpu or device.arch < 90 or device.get_cuda_compile_arch() < 90:
+        return 0
+    for blocks in (_CLUSTER, _CLUSTER // 2):
+        kernel, block = solve_kernel(SOLVE, is_round, group, blocks)
+        if wp.get_cuda_max_cluster_dim(kernel, device, block_dim=block) == blocks:
+            return blocks
+    return 0
+
+
 @cache
-def solve_kernel(call: str, is_round: bool, group: int):
-    """Kernel that calls a function of the device's header."""
+def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines: int = _CLUSTER_LINES):
+    """Kernel that calls a function of the device's header, and threads of its blocks on a GPU."""
     header = "rigid/contact_cuda.h" if group else "rigid/contact_cpu.h"
-    constants = dict(ROUND=int(is_round), GROUP=group, BLOCK=_BLOCK, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
-    constants["CONTACTS_PER_THREAD"] = _CONTACTS_PER_THREAD
+    block = _BLOCK
+    constants = dict(ROUND=int(is_round), GROUP=group, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
+    if cluster:
+        header = "rigid/contact_cluster.h"
+        block = 512 if is_round and cluster > 1 else 256  # leaves them 128 and 255 registers
+        constants |= dict(CLUSTER=cluster, LINES=lines)
+    if cluster == 1:
+        block = min(block, lines * group)
+        constants["WIDE"] = 2**30  # groups take all bodies
+    options = dict(cluster_dim=cluster, launch_bounds=block) if cluster else {}
+    constants |= dict(BLOCK=block, CONTACTS_PER_THREAD=_CONTACTS_PER_THREAD)
 
     @wp.func_native(f"warpmag::{call};")
     def run(
-        thread: int, given: SolveArrays, number: int, rate: float, dt: float, threads: int, team: wp.array2d[wp.uint64]
+        thread: int, given: SolveArrays, number: int, rate: float, dt: float, most: int, team: wp.array2d[wp.uint64]
     ): ...
 
     @wp.kernel(
         module="unique",
         enable_backward=False,
         module_options=native_options(header, dtype=wp.float32, **constants),
+        **options,
     )
-    def solve_contacts(
-        given: SolveArrays, number: int, rate: float, dt: float, threads: int, team: wp.array2d[wp.uint64]
-    ):
-        run(wp.tid(), given, number, rate, dt, threads, team)
+    def solve_contacts(given: SolveArrays, number: int, rate: float, dt: float, most: int, team: wp.array2d[wp.uint64]):
+        run(wp.tid(), given, number, rate, dt, most, team)
 
-    return solve_contacts
+    return solve_contacts, block
 
 
-ON_CPU = "solve_contacts(warpmag::Arrays(given), number, rate, dt, threads, team.data)"
+ON_CPU = "solve_contacts(warpmag::Arrays(given), number, rate, dt, most, team.data)"
 COUNT = "count_sides(thread, warpmag::Arrays(given))"
 PLACE = "place_body(thread, warpmag::Arrays(given))"
 LIST = "list_sides(thread, warpmag::Arrays(given))"
 WRITE = "write_side(thread, warpmag::Arrays(given))"
 ITERATE = "iterate(thread, warpmag::Arrays(given), number, rate, dt)"
+SOLVE = "solve_in_cluster(warpmag::Arrays(given), number, most, rate, dt)"
+SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number, rate, dt)"
 FINISH = "finish(thread, warpmag::Arrays(given), number, dt)"
 
 
@@ -189,23 +245,32 @@ def launch_solve_contacts(
             setattr(given, name, getattr(view, name).ptr or 0)
     given.shares = 0 if shares is None else shares.ptr
 
-    def launch(call, dim, number=0):
-        inputs = [given, number, relaxation / dt, dt, b.threads, team() if device.is_cpu else None]
-        wp.launch(solve_kernel(call, b.round, b.group), dim, inputs=inputs, device=device, block_dim=_BLOCK)
+    def launch(call, dim, number=0, blocks=0, **form):
+        inputs = [given, number, relaxation / dt, dt, b.most, team() if device.is_cpu else None]
+        kernel, block = solve_kernel(call, b.round, b.group, **form)
+        wp.launch(kernel, dim or blocks * block, inputs=inputs, device=device, block_dim=block)
 
     if device.is_cpu:
         launch(ON_CPU, 1, iterations)
         return
+    if b.cluster:
+        launch(SOLVE, 0, iterations, b.cluster, cluster=b.cluster)
+    else:
+        b.arrays["counters"].zero_()
+        launch(COUNT, given.contact_max)
+        launch(PLACE, -(-(given.bodies + 1) // 32) * 32)
+        launch(LIST, given.contact_max)
+        launch(WRITE, 2 * given.contact_max)
+    if b.worlds:
+        launch(SOLVE_WORLD, 0, iterations, b.worlds, cluster=1, lines=b.world_lines)
+        return
     groups = b.group * given.bodies
-    b.arrays["counters"].zero_()
-    launch(COUNT, given.contact_max)
-    launch(PLACE, -(-(given.bodies + 1) // 32) * 32)
-    launch(LIST, given.contact_max)
-    launch(WRITE, 2 * given.contact_max)
 
     def iterate():
         for iteration in range(iterations):
             launch(ITERATE, _WIDE_BLOCKS * _BLOCK + groups, iteration % 2)
         launch(FINISH, groups, iterations % 2)
 
-    wp.capture_if(b.arrays["totals"][:1], iterate)
+    left = _LEFT if b.cluster else 0
+    if not b.cluster or 2 * given.contact_max > b.most or given.bodies > b.cluster // 2 * _CLUSTER_LINES:
+        wp.capture_if(b.arrays["totals"][left : left + 1], iterate)
