@@ -1,12 +1,16 @@
 """Faults of values, transforms, times and meshes: refused before Newton sees them, in one line that names the prim."""
 
+import logging
 import warnings
 
+import newton
 import pytest
 from pxr import Usd
 
+from warpmag.engine.scene import import_scene
 from warpmag.errors import InputError
 from warpmag.usd import check, open_stage, read_magnets, refusals, stage_clock, survey
+from warpmag.usd.values import _DECLARED
 
 METRES = 'metersPerUnit = 1\nkilogramsPerUnit = 1\nupAxis = "Z"'
 APIS = "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"
@@ -266,3 +270,46 @@ def test_what_no_schema_asks_for_is_a_warning(tmp_path):
         "/Rubber: physics:density has no effect: the prim has no PhysicsMassAPI or PhysicsMaterialAPI",
         "/Rubber: physics:restitution has no effect: the prim has no PhysicsMaterialAPI",
     ]
+
+
+DECLARED = 'custom float newton:my:thing = 1 (customData = {string assignment = "model"\nstring frequency = "body"})'
+DECLARATIONS = {  # a line in the scene, what is said of it and how gravely
+    "by a name of no schema": ("custom float newton:my:thing = 1", "no schema has it, and its customData", "warning"),
+    "for what Newton does not know": (DECLARED.replace("body", "bodies"), "no schema has it, and its", "warning"),
+    "by a number": (DECLARED.replace('string assignment = "model"', "int assignment = 5"), "the assignment 5", "error"),
+    "by a relationship": ("custom rel newton:my:thing = </Ball>", "is a relationship, but in no schema", "error"),
+}
+
+
+@pytest.mark.parametrize("case", DECLARATIONS)
+def test_attributes_that_a_scene_declares(device, tmp_path, capfd, case):
+    line, message, severity = DECLARATIONS[case]
+    path = write(tmp_path, f'def PhysicsScene "Scene"\n{{\n{line}\n}}\n{ball()}')
+    found = [one for one in survey(open_stage(path)).findings if "newton:my:thing" in one.message]
+    assert {(one.where, one.severity) for one in found if message in one.message} == {("/Scene", severity)}
+    if severity == "warning":
+        assert any("newton:my:thing" in line for line in import_scene(path).warnings)
+        assert capfd.readouterr().err == ""  # nor does Newton say it again
+
+
+def test_sound_declarations_reach_newton(device, tmp_path, capfd):
+    options = "int newton:timeStepsPerSecond = 500\nfloat newton:joint_drive_gains_scaling = 1"
+    path = write(tmp_path, f'def PhysicsScene "Scene"\n{{\n{DECLARED}\n{options}\n}}\n{ball()}')
+    assert survey(open_stage(path)).findings == []
+    assert "my:thing" in import_scene(path).builder.custom_attributes
+    assert capfd.readouterr().err == ""
+
+
+def test_what_newton_takes_as_declared():
+    assert {one.name.lower() for one in newton.Model.AttributeAssignment} == set(_DECLARED["assignment"])
+    contacts = {"contact", "contact_rigid", "contact_soft"}  # which a builder refuses
+    assert {one.name.lower() for one in newton.Model.AttributeFrequency} == {*_DECLARED["frequency"], *contacts}
+
+
+def test_what_newton_logs_is_kept_off_stderr_or_one_line(capfd):
+    log = logging.getLogger("newton._src.usd.utils")
+    with refusals("s.usda", "import"):
+        log.warning("a remark")
+    with pytest.raises(InputError, match="cannot import all of it .Skipping /A"), refusals("s.usda", "import"):
+        log.warning("Skipping %s", "/A")
+    assert capfd.readouterr().err == ""

@@ -22,7 +22,15 @@ from warpmag.usd.guard import readable
 from warpmag.usd.paths import full_path, usable_path
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
-from warpmag.usd.values import Finding, attribute_findings, check_type, declared, finding_of, quiet
+from warpmag.usd.values import (
+    Finding,
+    attribute_findings,
+    check_type,
+    declaration_findings,
+    declared,
+    finding_of,
+    quiet,
+)
 
 _SESSION = re.compile(r",@anon:[^@]*@")
 """How USD names a stage's session layer, by an address that is another one each time."""
@@ -224,6 +232,8 @@ def _read_scene(stage, prims, contents) -> None:
             contents.findings.append(Finding(str(prim.GetPath()), f"{SCENE_API} on a prim that is not a PhysicsScene"))
     for prim in found[1:]:
         contents.findings.append(Finding(str(prim.GetPath()), "one PhysicsScene of several: only the first is read"))
+    for prim in found[:1]:
+        contents.findings += declaration_findings(prim)
     if found and has_api(found[0], SCENE_API):
         try:
             contents.settings = settings_of(found[0])
