@@ -99,7 +99,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
     path, verdict.form, verdict.done = make(number, seed, place, sources)
     (place / "done.txt").write_text(json.dumps([verdict.form, verdict.done]), encoding="utf-8")
     output = place / "out" / "out.usda"
-    with _recorded() as simulations:
+    with _recorded() if command is in_process else contextlib.nullcontext([]) as simulations:
         verdict.check, told, stderr_of_check = command("check", str(path))
         verdict.run, _, stderr_of_run = command(
             "run", str(path), "--frames", "1", "--device", device, "-o", str(output)
