@@ -7,14 +7,16 @@ import newton
 import pytest
 from pxr import Usd
 
+from warpmag import Simulation
 from warpmag.engine.scene import import_scene
-from warpmag.errors import InputError
+from warpmag.errors import InputError, SimulationError
 from warpmag.usd import check, open_stage, read_magnets, refusals, stage_clock, survey
 from warpmag.usd.values import _DECLARED
 
 METRES = 'metersPerUnit = 1\nkilogramsPerUnit = 1\nupAxis = "Z"'
 APIS = "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"
 TETRAHEDRON = "point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]"
+TO_BALL = "rel physics:body1 = </Ball>"
 CORNERS = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
 
 
@@ -313,3 +315,43 @@ def test_what_newton_logs_is_kept_off_stderr_or_one_line(capfd):
     with pytest.raises(InputError, match="cannot import all of it .Skipping /A"), refusals("s.usda", "import"):
         log.warning("Skipping %s", "/A")
     assert capfd.readouterr().err == ""
+
+
+def hinged(operation, value):
+    """A ball on a hinge to a frame that is no body."""
+    order = f'uniform token[] xformOpOrder = ["{operation.split()[1]}"]'
+    frame = f'def Xform "Frame"\n{{\n{operation} = {value}\n{order}\n}}\n'
+    return f'{ball()}{frame}def PhysicsRevoluteJoint "Joint"\n{{\nrel physics:body0 = </Frame>\n{TO_BALL}\n}}\n'
+
+
+@pytest.mark.parametrize(
+    ("operation", "value", "message"),
+    [
+        ("float xformOp:translate", "2", "xformOp:translate has a type or value that USD cannot compose"),
+        ("float3 xformOp:scale", "(0, 0, 0)", "transform has a scale of zero"),
+        ("double3 xformOp:translate", "(nan, 0, 0)", "transform is not finite"),
+        ("double3 xformOp:translate", "(1e30, 0, 0)", "transform reaches 1e+30"),
+    ],
+)
+def test_a_joint_to_a_frame_that_is_nowhere(tmp_path, operation, value, message):
+    report = check(write(tmp_path, hinged(operation, value)))
+    assert [one.where for one in report.refusals if message in one.message] == ["/Frame"]
+
+
+@pytest.mark.parametrize(("apart", "warned"), [(1e-5, False), (3e-4, True), (0.5, True)])
+def test_ends_of_a_joint_that_are_apart(tmp_path, apart, warned):
+    report = check(write(tmp_path, hinged("double3 xformOp:translate", f"({apart}, 0, 0)")))
+    assert not report.refusals
+    found = [str(one) for one in report.warnings if one.where == "/Joint"]
+    assert found == [f"/Joint: its ends are {apart:g} m apart at the start, and a run begins by pulling"] * warned
+
+
+def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
+    simulation = Simulation(write(tmp_path, hinged("double3 xformOp:translate", "(0.5, 0, 0)")), device=device)
+
+    def end():
+        raise SimulationError("step 1: /Ball has left")
+
+    monkeypatch.setattr(simulation._stepper, "look", end)
+    with pytest.raises(SimulationError, match="/Ball has left; the ends of the joint /Joint were apart at the start"):
+        simulation.step()

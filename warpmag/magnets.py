@@ -7,7 +7,7 @@ words whether it comes from a stage, from the command line or from a script.
 import math
 import numbers
 import reprlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from warpmag.errors import InputError
 
@@ -169,6 +169,10 @@ class MagneticSettings:
         check_force(f"{name}: force", self.force, self.contact_model)
         check_token(f"{name}: dynamics", self.dynamics, DYNAMICS)
         check_rtol(f"{name}: rtol", self.rtol)
+
+    def replaced(self, **given) -> "MagneticSettings":
+        """Return settings with those of ``given`` that are not None, unchecked, in the place of these."""
+        return replace(self, **{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True)

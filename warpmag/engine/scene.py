@@ -11,7 +11,16 @@ import warp as wp
 from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, StageMagnets
-from warpmag.usd import GroundedJoint, StageClock, enabled_joints, inspect, open_stage, prepare_joints, refusals
+from warpmag.usd import (
+    GroundedJoint,
+    StageClock,
+    enabled_joints,
+    inspect,
+    open_stage,
+    prepare_joints,
+    refusals,
+    strained_joints,
+)
 
 
 @dataclass(frozen=True)
@@ -25,6 +34,7 @@ class ImportedScene:
         magnets: What the stage says about magnets.
         bodies: Body of each rigid-body prim.
         magnet_shapes: Shapes of each magnet prim.
+        strained: Joints whose ends should be at one place and are not.
         warnings: What the user should know about the stage, a line each.
     """
 
@@ -34,6 +44,7 @@ class ImportedScene:
     magnets: StageMagnets
     bodies: dict[str, int]
     magnet_shapes: dict[str, list[int]]
+    strained: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
@@ -54,7 +65,7 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
         raise InputError(str(report.refusals[0]))
     clock, contents = report.clock, report.contents
     assert clock is not None, "a clock that is wrong is a reason to refuse"
-    grounded = prepare_joints(stage)
+    strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage)
     builder = newton.ModelBuilder()
     register_attributes(builder)
     found = _add_stage(builder, stage, path, visuals)
@@ -70,7 +81,16 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
         _place_on_ground(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
-    return ImportedScene(stage, builder, clock, magnets, bodies, covered, tuple(map(str, report.warnings)))
+    return ImportedScene(
+        stage=stage,
+        builder=builder,
+        clock=clock,
+        magnets=magnets,
+        bodies=bodies,
+        magnet_shapes=covered,
+        strained=strained,
+        warnings=tuple(map(str, report.warnings)),
+    )
 
 
 def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:

@@ -8,11 +8,18 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
-from warpmag.usd.values import Finding
+from warpmag.errors import InputError
+from warpmag.usd.transforms import TransformCheck
+from warpmag.usd.values import Finding, value_of
 
 _AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
+_MEETING = (UsdPhysics.FixedJoint, UsdPhysics.RevoluteJoint, UsdPhysics.SphericalJoint)
+"""Joints whose ends are at one place."""
+_PLACES = ("physics:localPos0", "physics:localPos1")
+_APART, _ROUNDING = 1e-4, 1e-5
+"""How far apart ends may start [m], and in parts of their coordinates: poses are often single precision."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +56,38 @@ class _End:
 
 def joint_findings(stage: Usd.Stage) -> Iterator[Finding]:
     """Yield what is wrong with the joints of a stage."""
+    transforms = TransformCheck()
     for joint in enabled_joints(stage):
         path = str(joint.GetPath())
+        for end in _ends(stage, joint):
+            if end.prim:
+                yield from transforms.findings(end.prim)
         if problem := _problem(stage, joint):
             yield Finding(path, problem)
         elif not any(end.moves for end in _ends(stage, joint)):
             yield Finding(path, "joins things that do not move, and is left out", "warning")
+    for path, gap in strained_joints(stage).items():
+        yield Finding(path, f"its ends are {gap:.3g} m apart at the start, and a run begins by pulling", "warning")
+
+
+def strained_joints(stage: Usd.Stage) -> dict[str, float]:
+    """Return how far the ends of joints are apart at the start [m], where they should be at one place and are not."""
+    places, found = UsdGeom.XformCache(Usd.TimeCode.Default()), {}
+    for joint in enabled_joints(stage):
+        ends = _ends(stage, joint)
+        if not (any(joint.GetPrim().IsA(kind) for kind in _MEETING) and all(end.prim for end in ends)):
+            continue
+        try:
+            one, other = (
+                places.GetLocalToWorldTransform(end.prim).Transform(Gf.Vec3d(value_of(joint.GetPrim(), name)))
+                for end, name in zip(ends, _PLACES, strict=True)
+            )
+        except (InputError, Tf.ErrorException):  # among the findings of the attributes and ends
+            continue
+        gap = (one - other).GetLength()
+        if any(end.moves for end in ends) and gap > _APART + _ROUNDING * one.GetLength():
+            found[str(joint.GetPath())] = gap
+    return found
 
 
 def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:
