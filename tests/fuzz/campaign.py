@@ -71,11 +71,11 @@ def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Pat
     chance = random.Random(f"{seed}-{number}")
     form, source = chance.choice(FORMS), sources[number % len(sources)]
     path = folder / f"{number:05}.usda"
-    done = mutate(source, path, chance.randrange(1 << 40), fewest=1 if form == "usda" else 0)
+    done, layer = mutate(source, path, chance.randrange(1 << 40), fewest=1 if form == "usda" else 0)
     if form == "text":
         done += "; " + damage.spoil_text(path, chance)
     elif form != "usda":
-        path = damage.to_crate(path) if form == "crate" else damage.to_package(path, chance)
+        path = damage.to_crate(layer, path) if form == "crate" else damage.to_package(layer, path, chance)
         done += "; " + damage.spoil_bytes(path, chance)
     return path, form, f"{source.stem}: {done}"
 

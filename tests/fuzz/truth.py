@@ -225,6 +225,7 @@ def _moments(reading, result):
         if written is None:
             yield f"no moment of {prim.GetPath()}"
             continue
+        written = np.array(written, dtype=float)  # squares of floats overflow
         if reading.get(prim, "warpmag:kind", "inducible") != "permanent" or reading.get(prim, "warpmag:material"):
             continue
         whole = prim in reading.bodies
@@ -238,7 +239,7 @@ def _moments(reading, result):
         at_rest = np.abs(after - before).max() < 0.1  # a moment is that of the last substep, and a body may spin
         apart = at_rest and np.linalg.norm(given @ after - written) > 0.2 * size
         if apart or not math.isclose(size, np.linalg.norm(written), rel_tol=1e-3):
-            yield f"moment of {prim.GetPath()}: {np.array(written)} for {given @ after}"
+            yield f"moment of {prim.GetPath()}: {written} for {given @ after}"
 
 
 def _turn(cache, prim) -> np.ndarray:
