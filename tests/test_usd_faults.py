@@ -1,6 +1,7 @@
 """Faults of values, transforms, times and meshes: refused before Newton sees them, in one line that names the prim."""
 
 import logging
+import os
 import warnings
 
 import newton
@@ -355,3 +356,23 @@ def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
     monkeypatch.setattr(simulation._stepper, "look", end)
     with pytest.raises(SimulationError, match="/Ball has left; the ends of the joint /Joint were apart at the start"):
         simulation.step()
+
+
+def test_a_point_instancer_as_a_collider_of_a_magnet(tmp_path):
+    body = ball('def PointInstancer "Shape" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}', kind="Xform")
+    report = check(write(tmp_path, body.replace('"PhysicsCollisionAPI", ', "", 1)))
+    assert [str(one) for one in report.refusals] == [
+        "/Ball: a magnet without colliders that are solid: no shape to magnetize"
+    ]
+
+
+def test_a_file_that_changed_is_read_again(tmp_path):
+    """USD keeps the layers of open stages, and gives them out as they were."""
+    first = open_stage(write(tmp_path, ball()))
+    path = write(tmp_path, ball(radius="double radius = 0.007"))
+    os.utime(path, ns=(1, 1))  # another time than the clock's last tick
+    again = open_stage(path)
+    assert again.GetPrimAtPath("/Ball").GetAttribute("radius").Get() == 0.007
+    again.GetPrimAtPath("/Ball").GetAttribute("radius").Set(0.006)  # unsaved: whoever has it open wants it so
+    assert open_stage(path).GetPrimAtPath("/Ball").GetAttribute("radius").Get() == 0.006
+    assert first

@@ -48,24 +48,33 @@ class ImportedScene:
     warnings: tuple[str, ...]
 
 
-def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: float | None = None) -> ImportedScene:
+def import_scene(
+    path: str | os.PathLike,
+    *,
+    visuals: bool = False,
+    time_code: float | None = None,
+    articulations: bool = False,
+    curve: str | None = None,
+) -> ImportedScene:
     """Read a stage and everything magnetic on it.
 
     Args:
         path: USD file.
         visuals: Also import what is only seen, for a viewer.
         time_code: The moment at which bodies stand; by default the start of the stage.
+        articulations: Whether joints are wanted in trees, as solvers of generalized coordinates take them.
+        curve: Magnetization curve in the place of the magnets' own.
 
     Raises:
         InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
     """
     stage = open_stage(path, time_code)
-    report = inspect(stage, path)
+    report = inspect(stage, path, curve=curve)
     if report.refusals:
         raise InputError(str(report.refusals[0]))
     clock, contents = report.clock, report.contents
     assert clock is not None, "a clock that is wrong is a reason to refuse"
-    strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage)
+    strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)
     builder = newton.ModelBuilder()
     register_attributes(builder)
     found = _add_stage(builder, stage, path, visuals)
@@ -73,7 +82,7 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
     bodies, shapes, joints = found["path_body_map"], found["path_shape_map"], found["path_joint_map"]
     for prim in contents.bodies:
         if prim not in bodies:
-            raise InputError(f"{prim}: Newton imports no body from it, as from one that only excluded joints hold")
+            raise InputError(f"{prim}: Newton imports no body from it")
     for joint in enabled_joints(stage):
         if str(joint.GetPath()) not in joints:
             raise InputError(f"{joint.GetPath()}: Newton imports no joint from it")

@@ -80,7 +80,9 @@ class Simulation:
         for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
         self.device = resolve_device(device)
-        builder, settings, own_step = self._open(scene, visuals)
+        builder, settings, own_step = self._open(
+            scene, visuals=visuals, articulations=solver not in MAXIMAL, curve=curve
+        )
         self.step_size = _time_step(step, own_step)
         self.model = self._finalize(builder, solver, scene)
         settings = settings.replaced(
@@ -90,7 +92,7 @@ class Simulation:
         self._prepare(solver, graphs)
         self._options = self._options_of(settings, curve, solver)
 
-    def _open(self, scene: str | os.PathLike | newton.ModelBuilder, visuals: bool) -> tuple:
+    def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
         self._scene, self.frame_rate, self.frame_count = None, _FRAME_RATE, None
         if isinstance(scene, newton.ModelBuilder):
@@ -99,7 +101,7 @@ class Simulation:
 
         if not isinstance(scene, str | os.PathLike):
             raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {shown(scene)}")
-        self._scene = import_scene(scene, visuals=visuals)
+        self._scene = import_scene(scene, **choices)
         clock = self._scene.clock
         self.frame_rate = clock.frames_per_second
         seconds = (clock.end - clock.start) / clock.time_codes_per_second

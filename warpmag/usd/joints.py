@@ -18,6 +18,9 @@ _AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 _MEETING = (UsdPhysics.FixedJoint, UsdPhysics.RevoluteJoint, UsdPhysics.SphericalJoint)
 """Joints whose ends are at one place."""
 _PLACES = ("physics:localPos0", "physics:localPos1")
+_ROOTS = ("PhysicsArticulationRootAPI", "NewtonArticulationRootAPI")
+"""What makes a prim the root of an articulation; the second brings the first along."""
+_SELF_COLLISION = "newton:selfCollisionEnabled"
 _APART, _ROUNDING = 1e-4, 1e-5
 """How far apart ends may start [m], and in parts of their coordinates: poses are often single precision."""
 
@@ -97,15 +100,22 @@ def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:
     return [joint for joint in joints if joint.GetJointEnabledAttr().Get()]
 
 
-def prepare_joints(stage: Usd.Stage) -> list[GroundedJoint]:
+def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[GroundedJoint]:
     """Rewrite joints that Newton reads otherwise than USD means them, in the stage's session layer.
 
     Joints with a kinematic body as ``body1`` hang on the world then, those between two things that do not move are
     disabled, and axes that a generic joint does not limit are free in so many words.
 
+    Args:
+        stage: The stage.
+        articulations: Whether joints are wanted in trees. Newton takes nothing but trees, from parent to child, with
+            all their bodies in them; where each joint counts for itself, the roots only stand in the way of the rest.
+
     Returns:
         The joints between a body that moves and something that does not, but for kinematic bodies as ``body0``.
     """
+    if not articulations:
+        _drop_articulations(stage)
     grounded = []
     for path in [joint.GetPath() for joint in enabled_joints(stage)]:
         joint = UsdPhysics.Joint.Get(stage, path)
@@ -127,6 +137,16 @@ def prepare_joints(stage: Usd.Stage) -> list[GroundedJoint]:
             if len(still) == 2:
                 joint.GetJointEnabledAttr().Set(False)
     return grounded
+
+
+def _drop_articulations(stage: Usd.Stage) -> None:
+    """Take the roots of articulations off, but for those within which bodies do not collide."""
+    for path in [prim.GetPath() for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())]:
+        prim = stage.GetPrimAtPath(path)
+        if prim.HasAPI(UsdPhysics.ArticulationRootAPI) and prim.GetAttribute(_SELF_COLLISION).Get() is not False:
+            with Usd.EditContext(stage, stage.GetSessionLayer()):
+                for schema in _ROOTS:
+                    _editable(stage, path).RemoveAppliedSchema(schema)
 
 
 def _editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:

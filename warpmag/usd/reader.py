@@ -17,8 +17,9 @@ from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
-from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings
+from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
+from warpmag.usd.materials import material_findings
 from warpmag.usd.paths import full_path, usable_path
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
@@ -80,6 +81,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     try:
         with quiet():  # what USD has to say goes into the error
             stage = Usd.Stage.Open(str(full_path(file)))
+            _refresh(stage)
             broken = [str(error) for error in stage.GetCompositionErrors()]
     except FAILURES as error:
         raise InputError(f"{path}: not a USD file ({failure(error)})") from None
@@ -88,6 +90,13 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     with readable(str(path)):
         hold(stage, start_of(stage) if time_code is None else time_code)
     return stage
+
+
+def _refresh(stage: Usd.Stage) -> None:
+    """Read layers again whose files have changed since this process read them, but for those with unsaved edits."""
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not layer.dirty:
+            layer.Reload()
 
 
 @quiet()
@@ -173,6 +182,7 @@ def survey(stage: Usd.Stage) -> StageContents:
     for prim in prims:
         if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
             _read_magnet(prim, transforms, contents)
+    contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))
     return contents
@@ -260,9 +270,14 @@ def _read_magnet(prim, transforms, contents) -> None:
     except InputError as error:
         contents.findings.append(finding_of(path, error))
     faulty = {finding.where for finding in contents.findings if finding.severity == "error"}
-    for one in _prims_of_magnet(prim):
-        if is_collider(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one):
-            contents.findings += magnet_findings(one)
+    sound = [
+        one
+        for one in _prims_of_magnet(prim)
+        if is_collider(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one)
+    ]
+    contents.findings += [finding for one in sound for finding in magnet_findings(one)]
+    if path in contents.magnets and path not in faulty:
+        contents.findings += spacing_findings(prim, sound, contents.magnets[path].moment_spacing)
 
 
 def _prims_of_magnet(prim) -> Iterator[Usd.Prim]:
