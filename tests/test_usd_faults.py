@@ -6,7 +6,7 @@ import warnings
 
 import newton
 import pytest
-from pxr import Usd
+from pxr import Sdf, Usd, UsdGeom
 
 from warpmag import Simulation
 from warpmag.engine.scene import import_scene
@@ -376,3 +376,22 @@ def test_a_file_that_changed_is_read_again(tmp_path):
     again.GetPrimAtPath("/Ball").GetAttribute("radius").Set(0.006)  # unsaved: whoever has it open wants it so
     assert open_stage(path).GetPrimAtPath("/Ball").GetAttribute("radius").Get() == 0.006
     assert first
+
+
+def test_samples_of_the_order_of_operations_are_nothing_to_usd(tmp_path):
+    order = 'uniform token[] xformOpOrder = ["xformOp:translate"]'
+    samples = 'uniform token[] xformOpOrder.timeSamples = { 0: [], 1: ["!resetXformStack!"] }'
+    stage = open_stage(write(tmp_path, ball("double3 xformOp:translate = (1, 2, 3)", order, samples)))
+    matrix = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(stage.GetPrimAtPath("/Ball"))
+    assert tuple(matrix.ExtractTranslation()) == (1.0, 2.0, 3.0)
+
+
+def test_metadata_that_cannot_be_read(tmp_path):
+    layer = Sdf.Layer.CreateAnonymous()
+    layer.ImportFromString(write(tmp_path, ball()).read_text())
+    layer.documentation = "a note that a byte is changed of"
+    path = tmp_path / "stage.usdc"
+    layer.Export(str(path))
+    path.write_bytes(path.read_bytes().replace(b"a note that", b"a n\x80te that"))
+    report = check(path)
+    assert [str(one) for one in report.refusals] == [f"{path}: documentation cannot be read (text that is not UTF-8)"]

@@ -35,6 +35,7 @@ from warpmag.usd.values import (
 
 _SESSION = re.compile(r",@anon:[^@]*@")
 """How USD names a stage's session layer, by an address that is another one each time."""
+_ORDER = "xformOpOrder"
 
 
 @dataclass
@@ -104,7 +105,8 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
     """Make the values of ``time_code`` the defaults of the stage, in its session layer.
 
     Newton reads default values only: a pose that is given by time samples alone would be the identity. Inside instances
-    nothing can be held; :func:`survey` finds what would be wrong there. Addresses of a network are blocked.
+    nothing can be held; :func:`survey` finds what would be wrong there. The order of transform operations stays: USD
+    itself never asks for its samples. Addresses of a network are blocked.
 
     Raises:
         InputError: Time samples are of another type than their attribute, or an address cannot be blocked.
@@ -119,7 +121,7 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
     for attribute in sampled:  # what an earlier call held would hide the samples
         if spec := session.GetAttributeAtPath(attribute.GetPath()):
             spec.ClearDefaultValue()
-    values = [(attribute, _at(attribute, time_code)) for attribute in sampled]
+    values = [(attribute, _at(attribute, time_code)) for attribute in sampled if attribute.GetName() != _ORDER]
     with Usd.EditContext(stage, session):
         for attribute, value in values:
             if value is not None:
@@ -171,7 +173,7 @@ def describe(path: str | os.PathLike) -> str:
 def survey(stage: Usd.Stage) -> StageContents:
     """Find out what a stage holds and everything that is wrong with it."""
     contents = StageContents()
-    contents.findings += unit_findings(stage)
+    contents.findings += [*_metadata_findings(stage), *unit_findings(stage)]
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     inside = _instanced_prims(stage, prims, contents.findings)
     transforms = TransformCheck()
@@ -186,6 +188,16 @@ def survey(stage: Usd.Stage) -> StageContents:
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))
     return contents
+
+
+def _metadata_findings(stage) -> Iterator[Finding]:
+    """Yield which metadata of the stage cannot be read, of a file that is damaged; a run copies them."""
+    root = stage.GetRootLayer().pseudoRoot
+    for key in root.ListInfoKeys():
+        try:
+            root.GetInfo(key)
+        except (UnicodeDecodeError, Tf.ErrorException) as error:
+            yield Finding(stage_name(stage), f"{key} cannot be read ({failure(error)})")
 
 
 def _read_prim(prim, transforms, contents) -> None:
