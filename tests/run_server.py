@@ -3,7 +3,7 @@
 As a program it reads lines of JSON from its standard input: the arguments of a command, a file for its messages and one
 for the times of its frames. The first command it runs itself, which loads everything that a run needs. For each of the
 others it forks a process that runs it, and answers with its number and, once that has ended, with how it ended, as
-``subprocess`` counts it.
+``subprocess`` counts it. A GPU does not survive a fork, so it is hidden from all of them.
 """
 
 import json
@@ -70,4 +70,5 @@ class RunServer:
 
 
 if __name__ == "__main__":
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
     _serve()

@@ -1,6 +1,7 @@
 """The command: what it prints, what it writes, how it ends."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -204,3 +205,32 @@ def test_an_interrupted_run_leaves_the_frames_so_far(scene, device, tmp_path):
     assert "Traceback" not in rest
     stage = Usd.Stage.Open(str(out))
     assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").HasAuthoredValue()
+
+
+DRIVER = r"""
+#include <stdint.h>
+#include <string.h>
+static int version(int *value) { *value = 13000; return 0; }
+static int begin(unsigned flags) { return 100; }
+static int text(int code, const char **value) { *value = "no CUDA-capable device is detected"; return 0; }
+static int none(void) { return 100; }
+int cuGetProcAddress(const char *name, void **found, int version_, uint64_t flags, void *status) {
+    *found = !strcmp(name, "cuDriverGetVersion") ? (void *)version : !strcmp(name, "cuInit") ? (void *)begin
+        : !strcmp(name, "cuGetErrorString") ? (void *)text : (void *)none;
+    return 0;
+}
+"""
+
+
+@pytest.mark.skipif(not shutil.which("gcc"), reason="makes a CUDA driver with gcc")
+def test_a_hidden_gpu_is_no_news(tmp_path):
+    (tmp_path / "driver.c").write_text(DRIVER)
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", "libcuda.so", "driver.c"], cwd=tmp_path, check=True)
+    quiet = "from warpmag.cli import _quiet_warp; _quiet_warp(); import warp; assert not warp.get_cuda_devices()"
+    environment = os.environ | {"LD_LIBRARY_PATH": f"{tmp_path}:{os.environ.get('LD_LIBRARY_PATH', '')}"}
+    loud = subprocess.run(
+        [sys.executable, "-c", "import warp; warp.init()"], env=environment, capture_output=True, text=True
+    )
+    assert "no CUDA-capable device is detected" in loud.stderr  # the driver is taken
+    done = subprocess.run([sys.executable, "-c", quiet], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

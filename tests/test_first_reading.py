@@ -95,3 +95,13 @@ def test_text_that_is_no_text(tmp_path):
     path.write_bytes(HEAD.encode() + b'def "\xff\xfe" {}\n')
     with pytest.raises(InputError, match="stage.usda: not a USD file"):
         open_stage(path)
+
+
+def test_a_table_of_contents_beyond_the_end_is_damage(tmp_path, capfd):
+    path = crate(tmp_path / "stage.usdc")
+    data = bytearray(path.read_bytes())
+    data[-8:] = (1 << 62).to_bytes(8, "little")  # size of the last section
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"stage.usdc: damaged: its table of contents names bytes beyond its end"):
+        open_stage(path)
+    assert capfd.readouterr().err == ""

@@ -1,7 +1,12 @@
 """Stages spoiled at random: each ends in one line, or in a run that says what the stage says."""
 
+import os
+import signal
+import time
+
 import pytest
-from fuzz.campaign import BAD_INPUT, in_process, judge, make
+from fuzz import campaign
+from fuzz.campaign import BAD_INPUT, Campaign, Verdict, in_process, judge, make
 from fuzz.sources import author
 
 COUNT, SEED = 60, 20
@@ -28,3 +33,26 @@ def test_spoiled_stages_are_refused_or_run(device, sources, tmp_path):
     assert [(one.number, one.done, one.problems) for one in verdicts if one.problems] == []
     refused = sum(one.run == BAD_INPUT for one in verdicts)
     assert COUNT // 5 < refused < COUNT  # the mutator does neither too little nor too much
+
+
+@pytest.mark.parametrize(("batch", "workers"), [(1, 1), (1, 3), (5, 2), (50, 4)])
+def test_a_campaign_survives_its_workers(batch, workers, tmp_path, monkeypatch):
+    def judge_or_die(number, seed, folder, *_):
+        (folder / f"{number:05}").mkdir(exist_ok=True)
+        if number == 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if number == 7:
+            time.sleep(60.0)
+        if number == 11:
+            raise ValueError("odd")
+        return Verdict(number, "usda", f"{seed}-{number}", 2, 2, problems=["much"] if number == 13 else [])
+
+    monkeypatch.setattr(campaign, "judge", judge_or_die)
+    monkeypatch.setattr(campaign, "WALL_SECONDS", 1.0)
+    found = {one.number: one for one in Campaign(5, tmp_path, [], batch, workers).verdicts(range(20))}
+    assert sorted(found) == list(range(20))
+    problems = {number: " ".join(one.problems) for number, one in found.items() if one.problems}
+    assert problems.keys() == {3, 7, 11, 13}
+    assert problems[3] == "died of SIGKILL" and problems[7] == "hung for 1.0 s" and "ValueError" in problems[11]
+    assert {one.done for one in found.values() if not one.problems} == {f"5-{n}" for n in {*range(20)} - {3, 7, 11, 13}}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00003", "00007", "00011", "00013"]

@@ -1,16 +1,23 @@
 """Faults of values, transforms, times and meshes: refused before Newton sees them, in one line that names the prim."""
 
+import logging
+import os
 import warnings
 
+import newton
 import pytest
-from pxr import Usd
+from pxr import Sdf, Usd, UsdGeom
 
-from warpmag.errors import InputError
+from warpmag import Simulation
+from warpmag.engine.scene import import_scene
+from warpmag.errors import InputError, SimulationError
 from warpmag.usd import check, open_stage, read_magnets, refusals, stage_clock, survey
+from warpmag.usd.values import _DECLARED
 
 METRES = 'metersPerUnit = 1\nkilogramsPerUnit = 1\nupAxis = "Z"'
 APIS = "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"
 TETRAHEDRON = "point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]"
+TO_BALL = "rel physics:body1 = </Ball>"
 CORNERS = [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
 
 
@@ -266,3 +273,125 @@ def test_what_no_schema_asks_for_is_a_warning(tmp_path):
         "/Rubber: physics:density has no effect: the prim has no PhysicsMassAPI or PhysicsMaterialAPI",
         "/Rubber: physics:restitution has no effect: the prim has no PhysicsMaterialAPI",
     ]
+
+
+DECLARED = 'custom float newton:my:thing = 1 (customData = {string assignment = "model"\nstring frequency = "body"})'
+DECLARATIONS = {  # a line in the scene, what is said of it and how gravely
+    "by a name of no schema": ("custom float newton:my:thing = 1", "no schema has it, and its customData", "warning"),
+    "for what Newton does not know": (DECLARED.replace("body", "bodies"), "no schema has it, and its", "warning"),
+    "by a number": (DECLARED.replace('string assignment = "model"', "int assignment = 5"), "the assignment 5", "error"),
+    "by a relationship": ("custom rel newton:my:thing = </Ball>", "is a relationship, but in no schema", "error"),
+}
+
+
+@pytest.mark.parametrize("case", DECLARATIONS)
+def test_attributes_that_a_scene_declares(device, tmp_path, capfd, case):
+    line, message, severity = DECLARATIONS[case]
+    path = write(tmp_path, f'def PhysicsScene "Scene"\n{{\n{line}\n}}\n{ball()}')
+    found = [one for one in survey(open_stage(path)).findings if "newton:my:thing" in one.message]
+    assert {(one.where, one.severity) for one in found if message in one.message} == {("/Scene", severity)}
+    if severity == "warning":
+        assert any("newton:my:thing" in line for line in import_scene(path).warnings)
+        assert capfd.readouterr().err == ""  # nor does Newton say it again
+
+
+def test_sound_declarations_reach_newton(device, tmp_path, capfd):
+    options = "int newton:timeStepsPerSecond = 500\nfloat newton:joint_drive_gains_scaling = 1"
+    path = write(tmp_path, f'def PhysicsScene "Scene"\n{{\n{DECLARED}\n{options}\n}}\n{ball()}')
+    assert survey(open_stage(path)).findings == []
+    assert "my:thing" in import_scene(path).builder.custom_attributes
+    assert capfd.readouterr().err == ""
+
+
+def test_what_newton_takes_as_declared():
+    assert {one.name.lower() for one in newton.Model.AttributeAssignment} == set(_DECLARED["assignment"])
+    contacts = {"contact", "contact_rigid", "contact_soft"}  # which a builder refuses
+    assert {one.name.lower() for one in newton.Model.AttributeFrequency} == {*_DECLARED["frequency"], *contacts}
+
+
+def test_what_newton_logs_is_kept_off_stderr_or_one_line(capfd):
+    log = logging.getLogger("newton._src.usd.utils")
+    with refusals("s.usda", "import"):
+        log.warning("a remark")
+    with pytest.raises(InputError, match="cannot import all of it .Skipping /A"), refusals("s.usda", "import"):
+        log.warning("Skipping %s", "/A")
+    assert capfd.readouterr().err == ""
+
+
+def hinged(operation, value):
+    """A ball on a hinge to a frame that is no body."""
+    order = f'uniform token[] xformOpOrder = ["{operation.split()[1]}"]'
+    frame = f'def Xform "Frame"\n{{\n{operation} = {value}\n{order}\n}}\n'
+    return f'{ball()}{frame}def PhysicsRevoluteJoint "Joint"\n{{\nrel physics:body0 = </Frame>\n{TO_BALL}\n}}\n'
+
+
+@pytest.mark.parametrize(
+    ("operation", "value", "message"),
+    [
+        ("float xformOp:translate", "2", "xformOp:translate has a type or value that USD cannot compose"),
+        ("float3 xformOp:scale", "(0, 0, 0)", "transform has a scale of zero"),
+        ("double3 xformOp:translate", "(nan, 0, 0)", "transform is not finite"),
+        ("double3 xformOp:translate", "(1e30, 0, 0)", "transform reaches 1e+30"),
+    ],
+)
+def test_a_joint_to_a_frame_that_is_nowhere(tmp_path, operation, value, message):
+    report = check(write(tmp_path, hinged(operation, value)))
+    assert [one.where for one in report.refusals if message in one.message] == ["/Frame"]
+
+
+@pytest.mark.parametrize(("apart", "warned"), [(1e-5, False), (3e-4, True), (0.5, True)])
+def test_ends_of_a_joint_that_are_apart(tmp_path, apart, warned):
+    report = check(write(tmp_path, hinged("double3 xformOp:translate", f"({apart}, 0, 0)")))
+    assert not report.refusals
+    found = [str(one) for one in report.warnings if one.where == "/Joint"]
+    assert found == [f"/Joint: its ends are {apart:g} m apart at the start, and a run begins by pulling"] * warned
+
+
+def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
+    simulation = Simulation(write(tmp_path, hinged("double3 xformOp:translate", "(0.5, 0, 0)")), device=device)
+
+    def end():
+        raise SimulationError("step 1: /Ball has left")
+
+    monkeypatch.setattr(simulation._stepper, "look", end)
+    with pytest.raises(SimulationError, match="/Ball has left; the ends of the joint /Joint were apart at the start"):
+        simulation.step()
+
+
+def test_a_point_instancer_as_a_collider_of_a_magnet(tmp_path):
+    body = ball('def PointInstancer "Shape" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}', kind="Xform")
+    report = check(write(tmp_path, body.replace('"PhysicsCollisionAPI", ', "", 1)))
+    assert [str(one) for one in report.refusals] == [
+        "/Ball: a magnet without colliders that are solid: no shape to magnetize"
+    ]
+
+
+def test_a_file_that_changed_is_read_again(tmp_path):
+    """USD keeps the layers of open stages, and gives them out as they were."""
+    first = open_stage(write(tmp_path, ball()))
+    path = write(tmp_path, ball(radius="double radius = 0.007"))
+    os.utime(path, ns=(1, 1))  # another time than the clock's last tick
+    again = open_stage(path)
+    assert again.GetPrimAtPath("/Ball").GetAttribute("radius").Get() == 0.007
+    again.GetPrimAtPath("/Ball").GetAttribute("radius").Set(0.006)  # unsaved: whoever has it open wants it so
+    assert open_stage(path).GetPrimAtPath("/Ball").GetAttribute("radius").Get() == 0.006
+    assert first
+
+
+def test_samples_of_the_order_of_operations_are_nothing_to_usd(tmp_path):
+    order = 'uniform token[] xformOpOrder = ["xformOp:translate"]'
+    samples = 'uniform token[] xformOpOrder.timeSamples = { 0: [], 1: ["!resetXformStack!"] }'
+    stage = open_stage(write(tmp_path, ball("double3 xformOp:translate = (1, 2, 3)", order, samples)))
+    matrix = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(stage.GetPrimAtPath("/Ball"))
+    assert tuple(matrix.ExtractTranslation()) == (1.0, 2.0, 3.0)
+
+
+def test_metadata_that_cannot_be_read(tmp_path):
+    layer = Sdf.Layer.CreateAnonymous()
+    layer.ImportFromString(write(tmp_path, ball()).read_text())
+    layer.documentation = "a note that a byte is changed of"
+    path = tmp_path / "stage.usdc"
+    layer.Export(str(path))
+    path.write_bytes(path.read_bytes().replace(b"a note that", b"a n\x80te that"))
+    report = check(path)
+    assert [str(one) for one in report.refusals] == [f"{path}: documentation cannot be read (text that is not UTF-8)"]

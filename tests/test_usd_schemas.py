@@ -15,10 +15,10 @@ from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.usd import author_magnet, author_settings, open_stage, read_magnets, schemas
 
 MAGNETS = {
-    "/Iron": Magnet(saturation=1.2e6, susceptibility=3.5, curve="langevin", moment_spacing=0.001),
+    "/Iron": Magnet(saturation=1.2e6, susceptibility=3.5, curve="langevin", moment_spacing=0.125),
     "/Ideal": Magnet(),
     "/Steel": Magnet(curve="clamped", susceptibility=1e-3),
-    "/Bar": Magnet(kind="permanent", magnetization=(1e6, -2.5e5, 0.125), moment_spacing=0.02),
+    "/Bar": Magnet(kind="permanent", magnetization=(1e6, -2.5e5, 0.125), moment_spacing=0.25),
 }
 SETTINGS = MagneticSettings(external_field=(1e3, -2e4, 0.5), force="zeeman", dynamics="theta-euler", rtol=1e-4)
 

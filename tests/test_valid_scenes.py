@@ -266,6 +266,57 @@ def test_permanent_magnets_attract_as_dipoles(device, tmp_path):
     np.testing.assert_allclose(speeds[:, 2], (expected, -expected), rtol=0.01)  # they come 0.2 % closer
 
 
+SQUARE = [
+    ball(name, place)
+    for name, place in zip("ABCD", [(0, 0, 1), (0.05, 0, 1), (0.05, 0, 1.05), (0, 0, 1.05)], strict=True)
+]
+UP, DOWN = (0, 0, 0.025), (0, 0, -0.025)
+SIDES = [("A", "B", RIGHT, LEFT), ("B", "C", UP, DOWN), ("C", "D", LEFT, RIGHT), ("D", "A", DOWN, UP)]
+LOOP = [*SQUARE, *(joint("Revolute", *side, name=side[0] + side[1]) for side in SIDES)]
+PIN = joint("Revolute", None, "A", (0, 0, 1), (0, 0, 0), name="Pin")
+ARTICULATIONS = {
+    "a joint that it excludes": [
+        *(A, B, C, PIN, CHAIN[0]),
+        CHAIN[1].replace("point3f", "bool physics:excludeFromArticulation = 1\n    point3f", 1),
+    ],
+    "a joint named from its end": [A, B, C, PIN, CHAIN[0], joint("Spherical", "C", "B", LEFT, RIGHT, name="CB")],
+    "a loop": [*LOOP, PIN],
+    "a loop in the air": LOOP,
+    "two trees": [A, B, C, ball("D", (0.15, 0, 1)), CHAIN[0], joint("Spherical", "C", "D", RIGHT, LEFT, name="CD")],
+    "a root on a body of another one": [
+        *(A, B.replace('"PhysicsMassAPI"', '"PhysicsMassAPI", "PhysicsArticulationRootAPI"'), C, PIN, *CHAIN),
+    ],
+}
+
+
+@pytest.mark.parametrize("case", ARTICULATIONS)
+def test_an_articulation_moves_as_its_joints_do(case, device, tmp_path):
+    """The default solver knows joints one by one: a root above them changes nothing but rounding."""
+    found = []
+    for root in ("", '(prepend apiSchemas = ["PhysicsArticulationRootAPI"])'):
+        (folder := tmp_path / f"root{len(root)}").mkdir()
+        inner = "".join(ARTICULATIONS[case]).replace("World/", "World/R/")
+        simulation = Simulation(write(folder, physics(), f'def Xform "R" {root} {{\n{inner}}}\n'), device=device)
+        poses, _ = advance(simulation, 0.05)
+        found.append(dict(zip(simulation.model.body_label, poses[:, :3], strict=True)))
+    assert found[0].keys() == found[1].keys() and len(found[0]) >= 3
+    fallen = max(1.0 - pose[2] for pose in found[0].values())
+    assert fallen > 1e-3
+    for label, pose in found[0].items():
+        np.testing.assert_allclose(found[1][label], pose, atol=2e-3 * fallen, err_msg=label)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_an_articulation_whose_bodies_pass_through_each_other_stays_one(kept, device, tmp_path):
+    schemas = '"PhysicsArticulationRootAPI", "NewtonArticulationRootAPI"'
+    inner = "".join([A, B, *CHAIN[:1]]).replace("World/", "World/R/")
+    flag = f"bool newton:selfCollisionEnabled = {int(not kept)}"
+    path = write(tmp_path, physics(), f'def Xform "R" (prepend apiSchemas = [{schemas}]) {{\n{flag}\n{inner}}}\n')
+    model = Simulation(path, device=device).model
+    inside = model.joint_articulation.numpy()[model.joint_label.index("/World/R/AB")] >= 0
+    assert inside == kept
+
+
 REFUSED = {
     "no magnets": ([physics(), ball("A", (0, 0, 1), magnet=False)], "no magnets: no prim has WarpmagMagnetAPI"),
     "nothing at all": ([], "no magnets: no prim has WarpmagMagnetAPI"),
@@ -281,25 +332,43 @@ REFUSED = {
     ),
     "curves": (
         [A, B.replace("double radius", 'uniform token warpmag:curve = "langevin"\n double radius')],
-        "its magnets have the curves langevin, tanh",
+        "/World/B: warpmag:curve is langevin, but tanh on /World/A",
     ),
-    "an excluded joint": (
-        [
-            'def Xform "R" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {\n',
-            *(A, B, C, CHAIN[0].replace("World/", "World/R/")),
-            CHAIN[1].replace("World/", "World/R/").replace("point3f", "bool physics:excludeFromArticulation = 1\n#", 1),
-            "}\n",
-        ],
-        "/World/R/C: Newton imports no body from it",
+    "a spacing that is too small": (
+        [physics(), ball("A", (0, 0, 1), "float warpmag:momentSpacing = 1e-5")],
+        "/World/A: warpmag:momentSpacing 1e-05 m needs more than 20000 moments for one body",
     ),
+    "a saturation beyond single precision": (
+        [physics(), ball("A", (0, 0, 1), "float warpmag:saturationMagnetization = 1e30")],
+        "/World/A: saturation magnetization: must be 1e-12 to 1e+15, got 1e+30",
+    ),
+    **{
+        f"a physics material that is {state}": (
+            [
+                physics(),
+                ball("A", (0, 0, 1), "rel material:binding:physics = </World/Rubber>").replace(
+                    '"PhysicsMassAPI"', '"PhysicsMassAPI", "MaterialBindingAPI"'
+                ),
+                f'{kind} Material "Rubber" ({active} prepend apiSchemas = ["PhysicsMaterialAPI"]) {{}}\n',
+            ],
+            f"/World/A: its physics material /World/Rubber is {state}",
+        )
+        for state, kind, active in (
+            ("inactive", "def", "active = false\n"),
+            ("abstract", "class", ""),
+            ("not defined", "over", ""),
+        )
+    },
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_run_is_told_by_both(case, device, tmp_path, capsys):
     parts, message = REFUSED[case]
-    [error], _ = told(write(tmp_path, *parts), tmp_path, device, capsys)
+    path = write(tmp_path, *parts)
+    [error], _ = told(path, tmp_path, device, capsys)
     assert message in error
+    assert error in map(str, check(path).refusals)  # without Newton
 
 
 WARNED = {

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.errors import InputError
-from warpmag.magnets import check_token, shown
+from warpmag.magnets import MATERIAL_RANGE, check_token, shown
 
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
 RADIUS_RANGE = {wp.float32: (5e-8, 2e4), wp.float64: (1e-30, 1e30)}
@@ -19,8 +19,6 @@ FARTHEST = {wp.float32: 1e7, wp.float64: 1e30}
 REFERENCE_RADIUS_RANGE = {wp.float32: (1e-6, 2e4), wp.float64: (1e-30, 1e30)}
 REFERENCE_FARTHEST = {wp.float32: 5e4, wp.float64: 1e30}
 """The same of the plain loop, which has r⁶ of overlapping balls."""
-MATERIAL_RANGE = {wp.float32: (1e-12, 1e15), wp.float64: (1e-100, 1e100)}
-"""Least and largest saturation [A/m] and finite susceptibility, by Warp scalar type."""
 LEAST_OF_FORCE = {wp.float32: 1e-18, wp.float64: 1e-150}
 """Least of the largest component of moments [A·m²], by Warp scalar type: products of smaller ones have no digits."""
 CELLS = 1e9
@@ -132,7 +130,7 @@ def host_positive(name: str, value, count: int, dtype, *, infinite: bool = False
     array = host_scalars(name, value, count, infinite=infinite)
     if not (array > 0.0).all():
         raise InputError(f"{name}: must be positive, got {array.min():g}")
-    least, most = MATERIAL_RANGE[dtype]
+    least, most = MATERIAL_RANGE[name_of(dtype)]
     outside = (array < least) | (np.isfinite(array) & (array > most))
     if outside.any():
         raise InputError(range_message(name, "", array[outside][0], (least, most), dtype))

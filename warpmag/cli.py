@@ -348,13 +348,13 @@ def _quiet_warp() -> None:
 
     warp.config.log_level = warp.LOG_ERROR
     warp.config.enable_backward = False  # nothing here is differentiated, and it doubles the time to compile
-    with _without_lines("Could not find or load the NVIDIA CUDA driver"):
+    with _without_lines("Could not find or load the NVIDIA CUDA driver", "no CUDA-capable device is detected"):
         warp.init()
 
 
 @contextlib.contextmanager
-def _without_lines(text: str) -> Iterator[None]:
-    """Drop the lines with ``text`` from what native code writes to stderr."""
+def _without_lines(*texts: str) -> Iterator[None]:
+    """Drop the lines with one of ``texts`` from what native code writes to stderr."""
     sys.stderr.flush()
     saved = os.dup(2)
     with tempfile.TemporaryFile() as caught:
@@ -366,7 +366,7 @@ def _without_lines(text: str) -> Iterator[None]:
             os.close(saved)
             caught.seek(0)
             for line in caught.read().decode(errors="replace").splitlines():
-                if text not in line:
+                if not any(text in line for text in texts):
                     print(line, file=sys.stderr)
 
 

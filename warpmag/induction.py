@@ -132,6 +132,85 @@ def solve_induction(
         ConvergenceWarning: ``max_evaluations`` did not suffice; the result is the best that was found.
     """
     kind = resolve_kind(positions, dtype, device)
+    balls = _read_balls(kind, positions, radii, saturation, susceptibility, external_field, sources)
+    system = balls.make_system(
+        kind, curve=curve, dynamics=dynamics, contact_model=contact_model, rtol=rtol, max_evaluations=max_evaluations
+    )
+    if initial is not None:
+        system.start_from(kind.vectors("initial", initial, balls.count))
+    system.solve()
+    source_positions, source_moments = (None, None) if sources is None else sources
+    given = {
+        "positions": positions,
+        "radii": balls.radii,
+        "saturation": balls.saturation,
+        "external_field": external_field,
+        "sources: positions": source_positions,
+        "sources: moments": source_moments,
+        "initial": initial,
+    }
+    result = _read_result(kind, system, balls, given)
+    if not result.converged:
+        reached = f"error {result.error:.2g} > rtol {rtol:g} after max_evaluations = {max_evaluations}"
+        warnings.warn(f"solve_induction: did not converge, {reached}", ConvergenceWarning, stacklevel=2)
+    return result
+
+
+@dataclass(frozen=True)
+class _Balls:
+    """n inducible balls in an applied field, and k permanent magnets, on the device or still on the host.
+
+    Attributes:
+        positions: Centres [m], Warp, shape [n].
+        radii: Radii [m], shape [n].
+        saturation: Saturation magnetizations [A/m], shape [n].
+        susceptibility: Susceptibilities [dimensionless], shape [n].
+        external: Applied field [A/m], Warp, shape [n].
+        source_positions: Places of the permanent magnets [m], Warp, shape [k].
+        source_moments: Their moments [A·m²], Warp, shape [k].
+    """
+
+    positions: wp.array
+    radii: np.ndarray
+    saturation: np.ndarray
+    susceptibility: np.ndarray
+    external: wp.array
+    source_positions: wp.array
+    source_moments: wp.array
+
+    @property
+    def count(self) -> int:
+        """How many they are."""
+        return self.positions.shape[0]
+
+    def make_system(self, kind: Kind, **choices) -> MomentSystem:
+        """Return them as moments, the permanent ones last, before a solve."""
+        n, k = self.count, self.source_positions.shape[0]
+
+        def with_sources(values, others):
+            return np.concatenate([values, np.full(k, others)])
+
+        system = MomentSystem(
+            radii=with_sources(self.radii, 0.0),
+            permanent=np.arange(n + k) >= n,
+            movable=np.arange(n + k) < n,
+            saturation=with_sources(self.saturation, 1.0),
+            susceptibility=with_sources(self.susceptibility, 1.0),
+            lone_torque=True,
+            dtype=name_of(kind.dtype),
+            device=kind.device,
+            **choices,
+        )
+        wp.copy(system.external_field, self.external, count=n)
+        wp.copy(system.positions, self.positions, count=n)
+        if k:
+            wp.copy(system.positions, self.source_positions, dest_offset=n, count=k)
+            wp.copy(system.moments, self.source_moments, dest_offset=n, count=k)
+        return system
+
+
+def _read_balls(kind: Kind, positions, radii, saturation, susceptibility, external_field, sources) -> _Balls:
+    """Return the arguments of :func:`solve_induction` as arrays; raises ``InputError`` for those that cannot be."""
     size = host_radii("radii", radii, kind.dtype)
     farthest = farthest_place(kind.dtype, 2.0 * float(size.max(initial=0.0)))
     x = kind.vectors("positions", positions, farthest=farthest)
@@ -140,56 +219,29 @@ def solve_induction(
     if not (size > 0.0).all():
         raise InputError(f"radii: must be positive, got {size.min():g}")
     external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
-    source_x, source_m = _sources(kind, sources, farthest)
-    k = source_x.shape[0]
-
-    saturation = host_positive("saturation", saturation, n, kind.dtype)
-    susceptibility = host_positive("susceptibility", susceptibility, n, kind.dtype, infinite=True)
-
-    def with_sources(values, others):
-        return np.concatenate([values, np.full(k, others)])
-
-    system = MomentSystem(
-        radii=with_sources(size, 0.0),
-        permanent=np.arange(n + k) >= n,
-        movable=np.arange(n + k) < n,
-        saturation=with_sources(saturation, 1.0),
-        susceptibility=with_sources(susceptibility, 1.0),
-        curve=curve,
-        dynamics=dynamics,
-        contact_model=contact_model,
-        rtol=rtol,
-        max_evaluations=max_evaluations,
-        lone_torque=True,
-        dtype=dtype,
-        device=kind.device,
+    source_positions, source_moments = _sources(kind, sources, farthest)
+    return _Balls(
+        positions=x,
+        radii=size,
+        saturation=host_positive("saturation", saturation, n, kind.dtype),
+        susceptibility=host_positive("susceptibility", susceptibility, n, kind.dtype, infinite=True),
+        external=external,
+        source_positions=source_positions,
+        source_moments=source_moments,
     )
-    wp.copy(system.external_field, external, count=n)
-    wp.copy(system.positions, x, count=n)
-    if k:
-        wp.copy(system.positions, source_x, dest_offset=n, count=k)
-        wp.copy(system.moments, source_m, dest_offset=n, count=k)
-    if initial is not None:
-        system.start_from(kind.vectors("initial", initial, n))
-    system.solve()
+
+
+def _read_result(kind: Kind, system: MomentSystem, balls: _Balls, given: dict) -> InductionResult:
+    """Return what a solve ended with; raises ``InputError`` where that is not finite or was not to be resolved."""
+    n = balls.count
     m, h = (kind.finish(array, n) for array in (system.magnetizations(), system.h))
-    source_positions, source_moments = (None, None) if sources is None else sources
-    given = {
-        "positions": positions,
-        "radii": size,
-        "saturation": saturation,
-        "external_field": external_field,
-        "sources: positions": source_positions,
-        "sources: moments": source_moments,
-        "initial": initial,
-    }
     _check_finite(kind, n, given, magnetization=m, field=h)
     error = float(system.error.numpy().max(initial=0.0))
     if not math.isfinite(error):
         raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
     strongest = float(np.abs(h if isinstance(h, np.ndarray) else h.numpy()).max(initial=0.0))
-    _check_strength(kind, strongest, saturation)
-    result = InductionResult(
+    _check_strength(kind, strongest, balls.saturation)
+    return InductionResult(
         magnetizations=m,
         h_field=h,
         error=error,
@@ -200,10 +252,6 @@ def solve_induction(
         _given=given,
         _count=n,
     )
-    if not result.converged:
-        reached = f"error {result.error:.2g} > rtol {rtol:g} after max_evaluations = {max_evaluations}"
-        warnings.warn(f"solve_induction: did not converge, {reached}", ConvergenceWarning, stacklevel=2)
-    return result
 
 
 def _sources(kind: Kind, sources, farthest):

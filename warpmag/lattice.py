@@ -220,6 +220,12 @@ def ball(radius: float) -> Lattice:
     return Lattice(np.zeros((1, 3)), np.array([4.0 / 3.0 * np.pi * r**3]), np.zeros(1, int))
 
 
+def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
+    """Whether a body whose shapes have these bounding boxes [m] gets no more than :data:`LARGEST_COUNT` moments."""
+    with np.errstate(over="ignore"):
+        return not sum(np.prod(box / spacing) for box in boxes) > 4.0 * LARGEST_COUNT
+
+
 def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
     """Fill a body with moments.
 
@@ -237,7 +243,7 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
     if not (np.isfinite(spacing) and spacing >= 0.0):
         raise InputError(f"spacing: must be zero or positive and finite, got {spacing}")
     if spacing > 0.0:
-        if sum(np.prod((p.upper - p.lower) / spacing) for p in parts) > 4.0 * LARGEST_COUNT:
+        if not fits([p.upper - p.lower for p in parts], spacing):
             raise InputError(f"spacing: {spacing} m needs more than {LARGEST_COUNT} moments for one body")
         return _fill(parts, spacing)
     spacing = (sum(p.volume for p in parts) / AUTOMATIC_COUNT) ** (1.0 / 3.0)

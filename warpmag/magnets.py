@@ -7,7 +7,7 @@ words whether it comes from a stage, from the command line or from a script.
 import math
 import numbers
 import reprlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from warpmag.errors import InputError
 
@@ -20,6 +20,9 @@ DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 
 ACCURACY = {"float32": 2e-6, "float64": 1e-13}
 """Relative L2 error of all-pairs sums in each precision that tests hold them to: no tolerance below it is met."""
+
+MATERIAL_RANGE = {"float32": (1e-12, 1e15), "float64": (1e-100, 1e100)}
+"""Least and largest saturation [A/m] and finite susceptibility, by the precision of a solve."""
 
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
@@ -57,6 +60,14 @@ def check_positive(name: str, value: float, *, infinite: bool = False) -> None:
     number = real(name, value)
     if not number > 0.0 or (math.isinf(number) and not infinite):
         raise InputError(f"{name}: must be positive{'' if infinite else ' and finite'}, got {number:g}")
+
+
+def check_material(name: str, value: float, *, infinite: bool = False) -> None:
+    """Raise :class:`InputError` unless ``value`` is a saturation or a susceptibility that single precision resolves."""
+    check_positive(name, value, infinite=infinite)
+    least, most = MATERIAL_RANGE["float32"]
+    if not (least <= value <= most or math.isinf(value)):
+        raise InputError(f"{name}: must be {least:g} to {most:g}, got {float(value):g}")
 
 
 def check_not_negative(name: str, value: float) -> None:
@@ -135,8 +146,8 @@ class Magnet:
         """Raise :class:`InputError` naming ``name`` (a prim path or body label) if a value is out of range."""
         check_token(f"{name}: kind", self.kind, KINDS)
         if self.kind == "inducible":
-            check_positive(f"{name}: saturation magnetization", self.saturation)
-            check_positive(f"{name}: susceptibility", self.susceptibility, infinite=True)
+            check_material(f"{name}: saturation magnetization", self.saturation)
+            check_material(f"{name}: susceptibility", self.susceptibility, infinite=True)
             check_token(f"{name}: curve", self.curve, CURVES)
         else:
             check_finite(f"{name}: magnetization", self.magnetization)
@@ -169,6 +180,10 @@ class MagneticSettings:
         check_force(f"{name}: force", self.force, self.contact_model)
         check_token(f"{name}: dynamics", self.dynamics, DYNAMICS)
         check_rtol(f"{name}: rtol", self.rtol)
+
+    def replaced(self, **given) -> "MagneticSettings":
+        """Return settings with those of ``given`` that are not None, unchecked, in the place of these."""
+        return replace(self, **{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True)

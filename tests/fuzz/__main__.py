@@ -3,10 +3,11 @@
     python -m tests.fuzz --count 3000 --seed 7              each stage in a process of its own
     python -m tests.fuzz --count 300 --seed 7 --batch 100   a hundred of them in one process
     python -m tests.fuzz --count 100 --seed 7 --fresh       each command in a fresh interpreter
+    python -m tests.fuzz --count 3000 --workers 14          fourteen processes at a time
     python -m tests.fuzz --seed 7 --only 1234               one stage, which is kept in the folder
 
 Stages with problems are kept in the folder, beside ``verdicts.jsonl`` with a line about each stage. Ends with 1 where
-there are problems.
+there are problems. Everything runs on the CPU: a GPU does not survive a fork, so it is hidden from the start.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # USD's threads do not survive a fork
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # nor does CUDA
 
 
 def main() -> int:
@@ -28,6 +30,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="which stages (default: %(default)s)")
     parser.add_argument("--only", type=int, metavar="N", help="number of the only stage, which is kept")
     parser.add_argument("--batch", type=int, default=1, help="stages of one process (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=1, help="processes at a time (default: %(default)s)")
     parser.add_argument("--fresh", action="store_true", help="a fresh interpreter for each command")
     parser.add_argument("-o", "--output", type=Path, default=Path("fuzz_out"), help="folder (default: %(default)s)")
     options = parser.parse_args()
@@ -38,24 +41,43 @@ def main() -> int:
     folder = options.output.absolute()
     sources = author(folder / "sources")
     campaign = Campaign(
-        options.seed, folder, sources, batch=options.batch, fresh=options.fresh, keep=options.only is not None
+        options.seed,
+        folder,
+        sources,
+        batch=options.batch,
+        workers=options.workers,
+        fresh=options.fresh,
+        keep=options.only is not None,
     )
     if not options.fresh:
         warm_up(sources)
     numbers = [options.only] if options.only is not None else range(options.first, options.first + options.count)
-    ends, slowest = Counter(), 0.0
+    table, slowest = Counter(), 0.0
     with open(folder / "verdicts.jsonl", "a", encoding="utf-8") as file:
         for verdict in campaign.verdicts(list(numbers)):
             print(json.dumps(asdict(verdict), ensure_ascii=False), file=file, flush=True)
-            ends[{0: "accepted", 2: "refused"}.get(verdict.run, "neither")] += 1
-            ends["with problems"] += bool(verdict.problems)
+            table[verdict.form, {0: "run", 2: "refused"}.get(verdict.run, "neither")] += 1
+            table[verdict.form, "problems"] += bool(verdict.problems)
             slowest = max(slowest, verdict.seconds)
             if verdict.problems or options.only is not None:
                 print(
-                    f"{verdict.number} {verdict.done}\n    {verdict.line}", *verdict.problems, sep="\n    ", flush=True
+                    f"seed {options.seed}, {verdict.number}: {verdict.done}\n    {verdict.line}",
+                    *verdict.problems,
+                    sep="\n    ",
+                    flush=True,
                 )
-    print(", ".join(f"{count} {end}" for end, count in ends.items()), f"slowest {slowest:.0f} s of CPU time", sep="; ")
-    return 1 if ends["with problems"] else 0
+    _print_table(table)
+    print(f"slowest {slowest:.0f} s of CPU time")
+    return 1 if any(count for (_, end), count in table.items() if end == "problems") else 0
+
+
+def _print_table(table: Counter) -> None:
+    """Print how many stages of each form ended how."""
+    ends, forms = ("run", "refused", "neither", "problems"), [*dict.fromkeys(form for form, _ in table)]
+    print(f"{'':10}", *(f"{end:>10}" for end in ends))
+    for form in sorted(forms):
+        print(f"{form:10}", *(f"{table[form, end]:10}" for end in ends))
+    print(f"{'all':10}", *(f"{sum(table[form, end] for form in forms):10}" for end in ends))
 
 
 if __name__ == "__main__":

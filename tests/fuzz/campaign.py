@@ -10,7 +10,7 @@ import os
 import random
 import re
 import resource
-import select
+import selectors
 import shutil
 import signal
 import subprocess
@@ -36,6 +36,9 @@ OK, FAILED, BAD_INPUT = 0, 1, 2
 _LONGEST_LINE = 1000
 _ROOT = Path(__file__).resolve().parents[2]
 _FRESH = {name: value for name, value in os.environ.items() if name != "PXR_WORK_THREAD_LIMIT"}
+_CAUSES = ("overlapped at the start", "apart at the start", "too fast for the shortest substep")
+"""What may end a run of a sound stage, and has to be named then."""
+_READING = re.compile("USD's reader dies of it|USD did not read it within")
 _EXPECTED = re.compile(r"^warpmag: |^$|^\S+: loading|frame/s|s/frame|frame \[")
 
 
@@ -69,11 +72,11 @@ def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Pat
     chance = random.Random(f"{seed}-{number}")
     form, source = chance.choice(FORMS), sources[number % len(sources)]
     path = folder / f"{number:05}.usda"
-    done = mutate(source, path, chance.randrange(1 << 40), fewest=1 if form == "usda" else 0)
+    done, layer = mutate(source, path, chance.randrange(1 << 40), fewest=1 if form == "usda" else 0)
     if form == "text":
         done += "; " + damage.spoil_text(path, chance)
     elif form != "usda":
-        path = damage.to_crate(path) if form == "crate" else damage.to_package(path, chance)
+        path = damage.to_crate(layer, path) if form == "crate" else damage.to_package(layer, path, chance)
         done += "; " + damage.spoil_bytes(path, chance)
     return path, form, f"{source.stem}: {done}"
 
@@ -99,7 +102,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
     path, verdict.form, verdict.done = make(number, seed, place, sources)
     (place / "done.txt").write_text(json.dumps([verdict.form, verdict.done]), encoding="utf-8")
     output = place / "out" / "out.usda"
-    with _recorded() as simulations:
+    with _recorded() if command is in_process else contextlib.nullcontext([]) as simulations:
         verdict.check, told, stderr_of_check = command("check", str(path))
         verdict.run, _, stderr_of_run = command(
             "run", str(path), "--frames", "1", "--device", device, "-o", str(output)
@@ -111,7 +114,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
     verdict.problems += _disagreements(verdict.check, errors, verdict.run, refusals)
     if verdict.run == BAD_INPUT and output.exists():
         verdict.problems.append("a refused run wrote")
-    if verdict.run == FAILED and "overlapped at the start" not in verdict.line:
+    if verdict.run == FAILED and not any(cause in verdict.line for cause in _CAUSES):
         verdict.problems.append(f"failed: {verdict.line}")
     if verdict.run == OK:
         verdict.problems += differences(path, output, simulations[-1] if simulations else None)
@@ -201,6 +204,8 @@ def _disagreements(check: int, errors: list[str], run: int, refusals: list[str])
     """Return what ``check`` and ``run`` do not say alike."""
     if (check == BAD_INPUT) != (run == BAD_INPUT):
         return [f"check ends with {check}, run with {run}: {(errors or refusals or ['nothing said'])[0][:200]}"]
+    if all(lines and _READING.search(lines[0]) for lines in (errors, refusals)):  # now it takes too long, now too much
+        return []
     if run == BAD_INPUT and refusals and refusals[0] not in errors:
         return [f"run says {refusals[0][:150]!r}, check {errors[0][:150] if errors else 'nothing'!r}"]
     return []
@@ -208,13 +213,16 @@ def _disagreements(check: int, errors: list[str], run: int, refusals: list[str])
 
 @dataclass
 class Campaign:
-    """Many mutants, so and so many to a worker process.
+    """Many mutants, so and so many to a worker process, and so and so many workers at a time.
+
+    What becomes of a mutant depends on seed and number alone, so that neither changes the result.
 
     Attributes:
         seed: Which ones.
         folder: Where they are written; those without problems are removed again.
         sources: Stages that are spoiled.
         batch: Mutants that one worker does before the next one starts.
+        workers: Workers at a time.
         fresh: Whether each command gets an interpreter of its own.
         keep: Whether mutants without problems are kept, too.
     """
@@ -223,49 +231,34 @@ class Campaign:
     folder: Path
     sources: list[Path]
     batch: int = 1
+    workers: int = 1
     fresh: bool = False
     keep: bool = False
 
     def verdicts(self, numbers: list[int]) -> Iterator[Verdict]:
-        """Yield what became of each of the mutants."""
-        left = list(numbers)
-        while left:
-            for verdict in self._worker(left[: self.batch]):
-                left.remove(verdict.number)
-                if not (verdict.problems or self.keep):
-                    shutil.rmtree(self.folder / f"{verdict.number:05}")
-                yield verdict
+        """Yield what became of each of the mutants, in the order in which they end."""
+        left, running = list(numbers), selectors.DefaultSelector()
+        while left or running.get_map():
+            while left and len(running.get_map()) < self.workers:
+                worker = _Worker(self, left[: self.batch])
+                running.register(worker.results, selectors.EVENT_READ, worker)
+                del left[: self.batch]
+            ready = [key.data for key, _ in running.select(timeout=1.0)]
+            for worker in [key.data for key in running.get_map().values()]:
+                verdicts, ended = worker.heard() if worker in ready else worker.late()
+                if ended:
+                    running.unregister(worker.results)
+                    verdicts += worker.end()
+                    left[:0] = worker.left
+                for verdict in verdicts:
+                    if not (verdict.problems or self.keep):
+                        shutil.rmtree(self.folder / f"{verdict.number:05}")
+                    yield verdict
 
-    def _worker(self, numbers: list[int]) -> Iterator[Verdict]:
-        """Yield the verdicts of one worker; the last one is about its death if it dies."""
-        inward, outward = os.pipe()
-        process = os.fork()
-        if not process:
-            os.close(inward)
-            self._work(numbers, outward)
-        os.close(outward)
-        count, ended = 0, ""
-        with os.fdopen(inward, "rb") as results:
-            while count < len(numbers):
-                if not select.select([results], [], [], WALL_SECONDS)[0]:
-                    os.kill(process, signal.SIGKILL)
-                    ended = f"hung for {WALL_SECONDS} s"
-                    break
-                line = results.readline()
-                if not line:
-                    break
-                count += 1
-                yield Verdict(**json.loads(line))
-        _, status = os.waitpid(process, 0)
-        if count < len(numbers):
-            ended = ended or f"died of {signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else status}"
-            note = self.folder / f"{numbers[count]:05}" / "done.txt"
-            form, done = json.loads(note.read_text(encoding="utf-8")) if note.exists() else ("", "the mutator itself")
-            yield Verdict(numbers[count], form, done, problems=[ended])
-
-    def _work(self, numbers: list[int], outward: int) -> None:
-        """Be a worker, and never return."""
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    def work(self, numbers: list[int], outward: int) -> None:
+        """Be a worker that writes its verdicts to a pipe, and never return."""
+        if not self.fresh:  # CUDA's driver takes more addresses than that when it starts
+            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         command = in_fresh_process if self.fresh else in_process
         for number in numbers:
@@ -277,3 +270,51 @@ class Campaign:
                 verdict = Verdict(number, problems=[traceback.format_exc()])
             os.write(outward, json.dumps(asdict(verdict)).encode() + b"\n")
         os._exit(0)
+
+
+class _Worker:
+    """A worker process, as the campaign sees it.
+
+    Attributes:
+        results: The pipe of its verdicts.
+        left: Mutants that it has not done yet.
+    """
+
+    def __init__(self, campaign: Campaign, numbers: list[int]):
+        self._folder, self.left = campaign.folder, list(numbers)
+        self.results, outward = os.pipe()
+        self._process = os.fork()
+        if not self._process:
+            os.close(self.results)
+            campaign.work(numbers, outward)
+        os.close(outward)
+        self._begun, self._heard, self._hung = b"", time.monotonic(), False
+
+    def heard(self) -> tuple[list[Verdict], bool]:
+        """Return the verdicts that have come, and whether these were all."""
+        data = os.read(self.results, 1 << 20)
+        *lines, self._begun = (self._begun + data).split(b"\n")
+        verdicts = [Verdict(**json.loads(line)) for line in lines]
+        for verdict in verdicts:
+            self.left.remove(verdict.number)
+        self._heard = time.monotonic()
+        return verdicts, not data
+
+    def late(self) -> tuple[list[Verdict], bool]:
+        """Return whether it hangs, which ends it, in the form of :meth:`heard`."""
+        self._hung = time.monotonic() - self._heard > WALL_SECONDS
+        if self._hung:
+            os.kill(self._process, signal.SIGKILL)
+        return [], self._hung
+
+    def end(self) -> list[Verdict]:
+        """Wait for its end; return a verdict about the mutant that it died of, if it did."""
+        os.close(self.results)
+        _, status = os.waitpid(self._process, 0)
+        if not self.left:
+            return []
+        number = self.left.pop(0)
+        died = f"died of {signal.Signals(os.WTERMSIG(status)).name if os.WIFSIGNALED(status) else status}"
+        note = self._folder / f"{number:05}" / "done.txt"
+        form, done = json.loads(note.read_text(encoding="utf-8")) if note.exists() else ("", "the mutator itself")
+        return [Verdict(number, form, done, problems=[f"hung for {WALL_SECONDS} s" if self._hung else died])]

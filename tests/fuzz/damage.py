@@ -64,16 +64,16 @@ def spoil_bytes(path: Path, chance: random.Random) -> str:
     return f"{('zeros', 'noise', 'a splice')[kind - 4]} of {length} bytes at {place} of {size}"
 
 
-def to_crate(path: Path) -> Path:
-    """Write a stage as a crate file beside it."""
+def to_crate(layer: Sdf.Layer, path: Path) -> Path:
+    """Write a stage that lies at ``path`` as a crate file beside it."""
     target = path.with_suffix(".usdc")
-    Sdf.Layer.FindOrOpen(str(path)).Export(str(target))
+    layer.Export(str(target))
     return target
 
 
-def to_package(path: Path, chance: random.Random) -> Path:
+def to_package(layer: Sdf.Layer, path: Path, chance: random.Random) -> Path:
     """Pack a stage, as USD wants it or not quite: compressed, not aligned, the stage not first, nested."""
-    inner = chance.choice((path, to_crate(path)))
+    inner = chance.choice((path, to_crate(layer, path)))
     target = path.with_suffix(".usdz")
     with zipfile.ZipFile(target, "w", chance.choice((zipfile.ZIP_STORED,) * 3 + (zipfile.ZIP_DEFLATED,))) as package:
         if chance.random() < 0.2:

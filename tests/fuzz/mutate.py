@@ -100,8 +100,12 @@ KINDS = ("Sphere", "Cube", "Capsule", "Cylinder", "Cone", "Plane", "Mesh", "Xfor
 JOINTS = ("PhysicsFixedJoint", "PhysicsRevoluteJoint", "PhysicsPrismaticJoint", "PhysicsSphericalJoint", "PhysicsJoint")
 
 
-def mutate(scene: Path, target: Path, seed: int, fewest: int = 1) -> str:
-    """Write a copy of ``scene`` with ``fewest`` to three faults to ``target``, and return what was done."""
+def mutate(scene: Path, target: Path, seed: int, fewest: int = 1) -> tuple[str, Sdf.Layer]:
+    """Write a copy of ``scene`` with ``fewest`` to three faults to ``target``.
+
+    Returns:
+        What was done, and the layer: USD itself cannot read all texts that it writes.
+    """
     chance = random.Random(seed)
     layer = Sdf.Layer.CreateNew(str(target))
     layer.TransferContent(Sdf.Layer.FindOrOpen(str(scene)))
@@ -113,7 +117,7 @@ def mutate(scene: Path, target: Path, seed: int, fewest: int = 1) -> str:
         except Tf.ErrorException:  # USD does not let a layer hold it
             done.append(f"no {fault.__name__}")
     layer.Save()
-    return "; ".join(done)
+    return "; ".join(done), layer
 
 
 def authored_value(layer, prims, chance) -> str:

@@ -11,7 +11,16 @@ import warp as wp
 from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, StageMagnets
-from warpmag.usd import GroundedJoint, StageClock, enabled_joints, inspect, open_stage, prepare_joints, refusals
+from warpmag.usd import (
+    GroundedJoint,
+    StageClock,
+    enabled_joints,
+    inspect,
+    open_stage,
+    prepare_joints,
+    refusals,
+    strained_joints,
+)
 
 
 @dataclass(frozen=True)
@@ -25,6 +34,7 @@ class ImportedScene:
         magnets: What the stage says about magnets.
         bodies: Body of each rigid-body prim.
         magnet_shapes: Shapes of each magnet prim.
+        strained: Joints whose ends should be at one place and are not.
         warnings: What the user should know about the stage, a line each.
     """
 
@@ -34,27 +44,37 @@ class ImportedScene:
     magnets: StageMagnets
     bodies: dict[str, int]
     magnet_shapes: dict[str, list[int]]
+    strained: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
-def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: float | None = None) -> ImportedScene:
+def import_scene(
+    path: str | os.PathLike,
+    *,
+    visuals: bool = False,
+    time_code: float | None = None,
+    articulations: bool = False,
+    curve: str | None = None,
+) -> ImportedScene:
     """Read a stage and everything magnetic on it.
 
     Args:
         path: USD file.
         visuals: Also import what is only seen, for a viewer.
         time_code: The moment at which bodies stand; by default the start of the stage.
+        articulations: Whether joints are wanted in trees, as solvers of generalized coordinates take them.
+        curve: Magnetization curve in the place of the magnets' own.
 
     Raises:
         InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
     """
     stage = open_stage(path, time_code)
-    report = inspect(stage, path)
+    report = inspect(stage, path, curve=curve)
     if report.refusals:
         raise InputError(str(report.refusals[0]))
     clock, contents = report.clock, report.contents
     assert clock is not None, "a clock that is wrong is a reason to refuse"
-    grounded = prepare_joints(stage)
+    strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)
     builder = newton.ModelBuilder()
     register_attributes(builder)
     found = _add_stage(builder, stage, path, visuals)
@@ -62,7 +82,7 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
     bodies, shapes, joints = found["path_body_map"], found["path_shape_map"], found["path_joint_map"]
     for prim in contents.bodies:
         if prim not in bodies:
-            raise InputError(f"{prim}: Newton imports no body from it, as from one that only excluded joints hold")
+            raise InputError(f"{prim}: Newton imports no body from it")
     for joint in enabled_joints(stage):
         if str(joint.GetPath()) not in joints:
             raise InputError(f"{joint.GetPath()}: Newton imports no joint from it")
@@ -70,7 +90,16 @@ def import_scene(path: str | os.PathLike, *, visuals: bool = False, time_code: f
         _place_on_ground(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
-    return ImportedScene(stage, builder, clock, magnets, bodies, covered, tuple(map(str, report.warnings)))
+    return ImportedScene(
+        stage=stage,
+        builder=builder,
+        clock=clock,
+        magnets=magnets,
+        bodies=bodies,
+        magnet_shapes=covered,
+        strained=strained,
+        warnings=tuple(map(str, report.warnings)),
+    )
 
 
 def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:

@@ -80,43 +80,40 @@ class Simulation:
         for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
         self.device = resolve_device(device)
-        self._scene = None
-        self.frame_rate, self.frame_count = _FRAME_RATE, None
-        if isinstance(scene, newton.ModelBuilder):
-            builder, settings = scene, MagneticSettings()
-        else:
-            builder, settings, own_step = self._open(scene, visuals)
-            step = own_step if step is None else step
-        check_positive("step", DEFAULT_STEP if step is None else step)
-        self.step_size = DEFAULT_STEP if step is None else float(step)
+        builder, settings, own_step = self._open(
+            scene, visuals=visuals, articulations=solver not in MAXIMAL, curve=curve
+        )
+        self.step_size = _time_step(step, own_step)
         self.model = self._finalize(builder, solver, scene)
-        laws = {
-            "force": settings.force if force is None else force,
-            "dynamics": settings.dynamics if dynamics is None else dynamics,
-            "contact_model": settings.contact_model if contact_model is None else contact_model,
-            "rtol": settings.rtol if rtol is None else rtol,
-            "external_field": settings.external_field if external_field is None else external_field,
-            "curve": curve,
-        }
-        self._magnetics = Magnetics(self.model, **laws)
+        settings = settings.replaced(
+            force=force, dynamics=dynamics, contact_model=contact_model, rtol=rtol, external_field=external_field
+        )
+        self._magnetics = Magnetics(self.model, curve=curve, **vars(settings))
         self._prepare(solver, graphs)
-        kind = "cuda" if self._magnetics.system.device.is_cuda else "cpu"
-        choices = laws | {"step": self.step_size, "solver": solver, "device": kind}
-        choices["external_field"] = tuple(np.asarray(laws["external_field"], dtype=float).tolist())
-        self._options = {name.replace("_", " "): str(value) for name, value in choices.items()}
+        self._options = self._options_of(settings, curve, solver)
 
-    def _open(self, path: str | os.PathLike, visuals: bool) -> tuple:
+    def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
+        self._scene, self.frame_rate, self.frame_count = None, _FRAME_RATE, None
+        if isinstance(scene, newton.ModelBuilder):
+            return scene, MagneticSettings(), None
         from warpmag.engine.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
 
-        if not isinstance(path, str | os.PathLike):
-            raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {shown(path)}")
-        self._scene = import_scene(path, visuals=visuals)
+        if not isinstance(scene, str | os.PathLike):
+            raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {shown(scene)}")
+        self._scene = import_scene(scene, **choices)
         clock = self._scene.clock
         self.frame_rate = clock.frames_per_second
         seconds = (clock.end - clock.start) / clock.time_codes_per_second
         self.frame_count = round(seconds * self.frame_rate) or None
         return self._scene.builder, self._scene.magnets.settings, clock.step
+
+    def _options_of(self, settings: MagneticSettings, curve: str | None, solver: str) -> dict[str, str]:
+        """Return by what a run differs from others of its scene, in words: only an equal one can be resumed."""
+        kind = "cuda" if self._magnetics.system.device.is_cuda else "cpu"
+        options = {**vars(settings), "curve": curve, "step": self.step_size, "solver": solver, "device": kind}
+        options["external_field"] = tuple(np.asarray(settings.external_field, dtype=float).tolist())
+        return {name.replace("_", " "): str(value) for name, value in options.items()}
 
     def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
         """Make the model."""
@@ -239,10 +236,19 @@ class Simulation:
             for report in self._stepper.look():
                 self._statistics.add_step(report)
         except SimulationError as error:
-            if not self._statistics.overlapping:
+            if not (cause := self._cause()):
                 raise
-            cause = "bodies overlapped at the start, and pushing them apart may turn them faster and faster"
             raise SimulationError(f"{error}; {cause}") from None
+
+    def _cause(self) -> str:
+        """Return why the state may have left all finite numbers, as far as the start and the run so far tell."""
+        if self._statistics.overlapping:
+            return "bodies overlapped at the start, and pushing them apart may turn them faster and faster"
+        if self._scene and self._scene.strained:
+            return f"the ends of the joint {self._scene.strained[0]} were apart at the start, and it pulls at them"
+        if self._statistics.capped:
+            return "bodies were moving too fast for the shortest substep before"
+        return ""
 
     def _positions(self) -> np.ndarray:
         return self.state.body_q.numpy()[self._moving, :3].astype(float)
@@ -396,6 +402,13 @@ class Simulation:
         pairs = node[np.stack(sides, axis=1)]
         touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
         return find_held(pairs[touching], holds, fixed)[: model.body_count]
+
+
+def _time_step(given: float | None, own: float | None) -> float:
+    """Return the time step [s]: the one that is given, else the scene's own, else the default."""
+    step = next(one for one in (given, own, DEFAULT_STEP) if one is not None)
+    check_positive("step", step)
+    return float(step)
 
 
 def _check_articulations(builder: newton.ModelBuilder, solver: str) -> None:

@@ -9,7 +9,7 @@ from warpmag.usd.schemas import author_magnet, author_settings  # isort: skip  (
 from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
 from warpmag.usd.guard import refusals
-from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints
+from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
 from warpmag.usd.paths import usable_path
 from warpmag.usd.reader import (
     StageContents,
@@ -44,6 +44,7 @@ __all__ = [
     "read_magnets",
     "refusals",
     "stage_clock",
+    "strained_joints",
     "survey",
     "usable_path",
 ]

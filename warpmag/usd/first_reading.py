@@ -52,6 +52,8 @@ def first_reading(path: str | os.PathLike) -> str:
         return f"USD did not read it within {limit:.0f} s"
     except OSError:  # no interpreter to start: an application with Python inside
         return ""
+    if b"posix_madvise" in done.stderr:  # which USD says of every reading, past everything that could keep it quiet
+        return "damaged: its table of contents names bytes beyond its end"
     if done.returncode < 0:
         return f"USD's reader dies of it ({signal.Signals(-done.returncode).name})"
     with contextlib.suppress(ValueError):

@@ -45,6 +45,19 @@ def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
             yield Finding(str(prim.GetPath()), str(error))
 
 
+def spacing_findings(magnet: Usd.Prim, colliders: list[Usd.Prim], spacing: float) -> Iterator[Finding]:
+    """Yield why the colliders of a magnet, which are sound, cannot be filled with moments at a spacing [m]."""
+    boxes = []
+    for prim in colliders if spacing > 0.0 else ():
+        lower, upper = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
+        boxes.append(np.subtract(upper, lower).astype(float) * np.linalg.norm(_axes(prim), axis=1))
+    if not lattice.fits(boxes, spacing):
+        yield Finding(
+            str(magnet.GetPath()),
+            f"warpmag:momentSpacing {spacing:g} m needs more than {lattice.LARGEST_COUNT} moments for one body",
+        )
+
+
 def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
     """Yield why a viewer could not read the faces of a mesh that is only seen; it may have none."""
     try:

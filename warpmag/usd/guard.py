@@ -1,6 +1,7 @@
 """Turns what USD or Newton raises over a stage, or warns about and then leaves out, into one line about the stage."""
 
 import contextlib
+import logging
 import re
 import warnings
 from collections.abc import Iterator
@@ -13,6 +14,8 @@ from warpmag.usd.values import quiet
 
 _LOSSES = re.compile(r"[Ss]kipp|Invalid|Ignoring(?! body-level density)|unspecified|zero mass|not imported|result\.")
 """What a warning says by which something of the stage is lost; the others are remarks."""
+_TOLD = "Custom attribute '"
+"""What a warning begins with of which the reader has told already, and named the prim."""
 
 
 @contextlib.contextmanager
@@ -24,7 +27,7 @@ def refusals(where: str, what: str) -> Iterator[None]:
         what: What the block does with it.
     """
     try:
-        with quiet(), warnings.catch_warnings(record=True) as caught:
+        with quiet(), _logged() as logged, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             yield
     except InputError:
@@ -32,9 +35,28 @@ def refusals(where: str, what: str) -> Iterator[None]:
     except Exception as error:  # of any kind: nothing of Newton's or Warp's is to reach the user as a traceback
         said = failure(error) if isinstance(error, Tf.ErrorException) else _line(error)
         raise InputError(f"{where}: Newton cannot {what} it ({said or type(error).__name__})") from None
-    for one in caught:
-        if _LOSSES.search(_line(one.message)):
-            raise InputError(f"{where}: Newton cannot {what} all of it ({_line(one.message)})")
+    for said in (*(_line(one.message) for one in caught), *logged):
+        if _LOSSES.search(said) and not said.startswith(_TOLD):
+            raise InputError(f"{where}: Newton cannot {what} all of it ({said})")
+
+
+@contextlib.contextmanager
+def _logged() -> Iterator[list[str]]:
+    """Yield the warnings that Newton logs meanwhile, a line each, which nobody else gets."""
+    lines, logger = [], logging.getLogger("newton")
+
+    class _Lines(logging.Handler):
+        def emit(self, record):
+            lines.append(_line(record.getMessage()))
+
+    handler, before = _Lines(logging.WARNING), logger.propagate
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield lines
+    finally:
+        logger.propagate = before
+        logger.removeHandler(handler)
 
 
 @contextlib.contextmanager

@@ -8,11 +8,21 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
-from warpmag.usd.values import Finding
+from warpmag.errors import InputError
+from warpmag.usd.transforms import TransformCheck
+from warpmag.usd.values import Finding, value_of
 
 _AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
+_MEETING = (UsdPhysics.FixedJoint, UsdPhysics.RevoluteJoint, UsdPhysics.SphericalJoint)
+"""Joints whose ends are at one place."""
+_PLACES = ("physics:localPos0", "physics:localPos1")
+_ROOTS = ("PhysicsArticulationRootAPI", "NewtonArticulationRootAPI")
+"""What makes a prim the root of an articulation; the second brings the first along."""
+_SELF_COLLISION = "newton:selfCollisionEnabled"
+_APART, _ROUNDING = 1e-4, 1e-5
+"""How far apart ends may start [m], and in parts of their coordinates: poses are often single precision."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +59,38 @@ class _End:
 
 def joint_findings(stage: Usd.Stage) -> Iterator[Finding]:
     """Yield what is wrong with the joints of a stage."""
+    transforms = TransformCheck()
     for joint in enabled_joints(stage):
         path = str(joint.GetPath())
+        for end in _ends(stage, joint):
+            if end.prim:
+                yield from transforms.findings(end.prim)
         if problem := _problem(stage, joint):
             yield Finding(path, problem)
         elif not any(end.moves for end in _ends(stage, joint)):
             yield Finding(path, "joins things that do not move, and is left out", "warning")
+    for path, gap in strained_joints(stage).items():
+        yield Finding(path, f"its ends are {gap:.3g} m apart at the start, and a run begins by pulling", "warning")
+
+
+def strained_joints(stage: Usd.Stage) -> dict[str, float]:
+    """Return how far the ends of joints are apart at the start [m], where they should be at one place and are not."""
+    places, found = UsdGeom.XformCache(Usd.TimeCode.Default()), {}
+    for joint in enabled_joints(stage):
+        ends = _ends(stage, joint)
+        if not (any(joint.GetPrim().IsA(kind) for kind in _MEETING) and all(end.prim for end in ends)):
+            continue
+        try:
+            one, other = (
+                places.GetLocalToWorldTransform(end.prim).Transform(Gf.Vec3d(value_of(joint.GetPrim(), name)))
+                for end, name in zip(ends, _PLACES, strict=True)
+            )
+        except (InputError, Tf.ErrorException):  # among the findings of the attributes and ends
+            continue
+        gap = (one - other).GetLength()
+        if any(end.moves for end in ends) and gap > _APART + _ROUNDING * one.GetLength():
+            found[str(joint.GetPath())] = gap
+    return found
 
 
 def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:
@@ -64,15 +100,22 @@ def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:
     return [joint for joint in joints if joint.GetJointEnabledAttr().Get()]
 
 
-def prepare_joints(stage: Usd.Stage) -> list[GroundedJoint]:
+def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[GroundedJoint]:
     """Rewrite joints that Newton reads otherwise than USD means them, in the stage's session layer.
 
     Joints with a kinematic body as ``body1`` hang on the world then, those between two things that do not move are
     disabled, and axes that a generic joint does not limit are free in so many words.
 
+    Args:
+        stage: The stage.
+        articulations: Whether joints are wanted in trees. Newton takes nothing but trees, from parent to child, with
+            all their bodies in them; where each joint counts for itself, the roots only stand in the way of the rest.
+
     Returns:
         The joints between a body that moves and something that does not, but for kinematic bodies as ``body0``.
     """
+    if not articulations:
+        _drop_articulations(stage)
     grounded = []
     for path in [joint.GetPath() for joint in enabled_joints(stage)]:
         joint = UsdPhysics.Joint.Get(stage, path)
@@ -94,6 +137,16 @@ def prepare_joints(stage: Usd.Stage) -> list[GroundedJoint]:
             if len(still) == 2:
                 joint.GetJointEnabledAttr().Set(False)
     return grounded
+
+
+def _drop_articulations(stage: Usd.Stage) -> None:
+    """Take the roots of articulations off, but for those within which bodies do not collide."""
+    for path in [prim.GetPath() for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())]:
+        prim = stage.GetPrimAtPath(path)
+        if prim.HasAPI(UsdPhysics.ArticulationRootAPI) and prim.GetAttribute(_SELF_COLLISION).Get() is not False:
+            with Usd.EditContext(stage, stage.GetSessionLayer()):
+                for schema in _ROOTS:
+                    _editable(stage, path).RemoveAppliedSchema(schema)
 
 
 def _editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:

@@ -17,15 +17,25 @@ from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
-from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings
+from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
+from warpmag.usd.materials import material_findings
 from warpmag.usd.paths import full_path, usable_path
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
-from warpmag.usd.values import Finding, attribute_findings, check_type, declared, finding_of, quiet
+from warpmag.usd.values import (
+    Finding,
+    attribute_findings,
+    check_type,
+    declaration_findings,
+    declared,
+    finding_of,
+    quiet,
+)
 
 _SESSION = re.compile(r",@anon:[^@]*@")
 """How USD names a stage's session layer, by an address that is another one each time."""
+_ORDER = "xformOpOrder"
 
 
 @dataclass
@@ -72,6 +82,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     try:
         with quiet():  # what USD has to say goes into the error
             stage = Usd.Stage.Open(str(full_path(file)))
+            _refresh(stage)
             broken = [str(error) for error in stage.GetCompositionErrors()]
     except FAILURES as error:
         raise InputError(f"{path}: not a USD file ({failure(error)})") from None
@@ -82,12 +93,20 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     return stage
 
 
+def _refresh(stage: Usd.Stage) -> None:
+    """Read layers again whose files have changed since this process read them, but for those with unsaved edits."""
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not layer.dirty:
+            layer.Reload()
+
+
 @quiet()
 def hold(stage: Usd.Stage, time_code: float) -> None:
     """Make the values of ``time_code`` the defaults of the stage, in its session layer.
 
     Newton reads default values only: a pose that is given by time samples alone would be the identity. Inside instances
-    nothing can be held; :func:`survey` finds what would be wrong there. Addresses of a network are blocked.
+    nothing can be held; :func:`survey` finds what would be wrong there. The order of transform operations stays: USD
+    itself never asks for its samples. Addresses of a network are blocked.
 
     Raises:
         InputError: Time samples are of another type than their attribute, or an address cannot be blocked.
@@ -102,7 +121,7 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
     for attribute in sampled:  # what an earlier call held would hide the samples
         if spec := session.GetAttributeAtPath(attribute.GetPath()):
             spec.ClearDefaultValue()
-    values = [(attribute, _at(attribute, time_code)) for attribute in sampled]
+    values = [(attribute, _at(attribute, time_code)) for attribute in sampled if attribute.GetName() != _ORDER]
     with Usd.EditContext(stage, session):
         for attribute, value in values:
             if value is not None:
@@ -154,7 +173,7 @@ def describe(path: str | os.PathLike) -> str:
 def survey(stage: Usd.Stage) -> StageContents:
     """Find out what a stage holds and everything that is wrong with it."""
     contents = StageContents()
-    contents.findings += unit_findings(stage)
+    contents.findings += [*_metadata_findings(stage), *unit_findings(stage)]
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     inside = _instanced_prims(stage, prims, contents.findings)
     transforms = TransformCheck()
@@ -165,9 +184,20 @@ def survey(stage: Usd.Stage) -> StageContents:
     for prim in prims:
         if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
             _read_magnet(prim, transforms, contents)
+    contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))
     return contents
+
+
+def _metadata_findings(stage) -> Iterator[Finding]:
+    """Yield which metadata of the stage cannot be read, of a file that is damaged; a run copies them."""
+    root = stage.GetRootLayer().pseudoRoot
+    for key in root.ListInfoKeys():
+        try:
+            root.GetInfo(key)
+        except (UnicodeDecodeError, Tf.ErrorException) as error:
+            yield Finding(stage_name(stage), f"{key} cannot be read ({failure(error)})")
 
 
 def _read_prim(prim, transforms, contents) -> None:
@@ -224,6 +254,8 @@ def _read_scene(stage, prims, contents) -> None:
             contents.findings.append(Finding(str(prim.GetPath()), f"{SCENE_API} on a prim that is not a PhysicsScene"))
     for prim in found[1:]:
         contents.findings.append(Finding(str(prim.GetPath()), "one PhysicsScene of several: only the first is read"))
+    for prim in found[:1]:
+        contents.findings += declaration_findings(prim)
     if found and has_api(found[0], SCENE_API):
         try:
             contents.settings = settings_of(found[0])
@@ -250,9 +282,14 @@ def _read_magnet(prim, transforms, contents) -> None:
     except InputError as error:
         contents.findings.append(finding_of(path, error))
     faulty = {finding.where for finding in contents.findings if finding.severity == "error"}
-    for one in _prims_of_magnet(prim):
-        if is_collider(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one):
-            contents.findings += magnet_findings(one)
+    sound = [
+        one
+        for one in _prims_of_magnet(prim)
+        if is_collider(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one)
+    ]
+    contents.findings += [finding for one in sound for finding in magnet_findings(one)]
+    if path in contents.magnets and path not in faulty:
+        contents.findings += spacing_findings(prim, sound, contents.magnets[path].moment_spacing)
 
 
 def _prims_of_magnet(prim) -> Iterator[Usd.Prim]:

@@ -12,7 +12,7 @@ from pxr import Gf, Plug, Sdf, Usd
 
 from warpmag import materials
 from warpmag.errors import InputError
-from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_finite, check_positive, check_token
+from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_finite, check_material, check_token
 from warpmag.usd.values import number, text, vector
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
@@ -66,7 +66,7 @@ def magnet_of(prim: Usd.Prim) -> Magnet:
     check_token(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve, CURVES)  # what its kind has no use for, too
     check_finite(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
     for field, infinite in (("saturation", False), ("susceptibility", True)):
-        check_positive(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
+        check_material(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
     return magnet
 
 

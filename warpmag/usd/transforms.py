@@ -65,8 +65,8 @@ class TransformCheck:
             yield Finding(path, "a sphere scaled unevenly would be imported as a ball: make it a mesh")
 
     def is_sound(self, prim: Usd.Prim) -> bool:
-        """Whether USD can compose the transform of a prim whose findings have been asked for."""
-        return self._sound[prim.GetPath()]
+        """Whether the findings of a prim have been asked for, and USD can compose its transform."""
+        return self._sound.get(prim.GetPath(), False)
 
     def _lineage_findings(self, prim) -> Iterator[Finding]:
         lineage = []

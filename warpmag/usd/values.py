@@ -75,6 +75,18 @@ _SCHEMAS = (
     "NewtonArticulationRootAPI",
 )
 
+_DECLARED = {
+    "assignment": ("model", "state", "control", "contact"),
+    "frequency": (
+        *("once", "joint", "joint_dof", "joint_coord", "joint_constraint", "body", "shape", "articulation", "world"),
+        *("particle", "edge", "triangle", "tetrahedron", "spring", "constraint_mimic", "attachment_particle_body"),
+        *("tendon", "tendon_guide", "tendon_segment", "curve", "surface", "volume"),
+    ),
+}
+"""What the customData of an attribute have to say by which a scene declares it to Newton."""
+_OPTIONS = ("newton:joint_drive_gains_scaling", "newton:collapse_fixed_joints")
+"""What Newton reads of a scene besides, though no schema has it."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -159,6 +171,25 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
         if name in _OF_SCHEMAS and name not in prim.GetPrimDefinition().GetPropertyNames():
             schemas = " or ".join(one for one in _SCHEMAS[:4] if name in _defaults(one))
             yield Finding(str(prim.GetPath()), f"{name} has no effect: the prim has no {schemas}", "warning")
+
+
+def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
+    """Yield what is wrong with properties of a scene that no schema has: Newton takes them for declarations."""
+    path, schemas = str(scene.GetPath()), {*scene.GetPrimDefinition().GetPropertyNames(), *_known(), *_OPTIONS}
+    for one in scene.GetAuthoredPropertiesInNamespace("newton"):
+        name = one.GetName()
+        if name in schemas:
+            continue
+        if not isinstance(one, Usd.Attribute):
+            yield Finding(path, f"{name} is a relationship, but in no schema: Newton takes it for an attribute")
+            continue
+        given = {key: one.GetCustomDataByKey(key) for key in _DECLARED}
+        for key, value in given.items():
+            if value and not isinstance(value, str):
+                yield Finding(path, f"{name} has the {key} {_shown(value)} in its customData, which must be text")
+        if any(str(given[key]).lower() not in allowed for key, allowed in _DECLARED.items()):
+            message = "no schema has it, and its customData do not declare it with an assignment and a frequency"
+            yield Finding(path, f"{name} has no effect: {message}", "warning")
 
 
 def instance_finding(attribute: Usd.Attribute) -> Finding | None:
