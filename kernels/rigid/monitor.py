@@ -6,11 +6,11 @@ minima do not depend on the order of threads, so that a run repeats bit by bit.
 ``peaks`` [float32]: maxima, see the ``PEAK_*`` indices.
 ``counts`` [int32]: see the ``COUNT_*`` indices; from ``COUNT_CAPACITIES`` on, the fill of each buffer watched.
 
-How far bodies move in a substep matters where they touch: the normal of a contact is taken to stay as it was found, and
-bodies that slide along each other by the part s of a radius press each other by some s²/4 of it. Bodies that fly
-together do not, and those that fly alone, or straight at each other, only have to be seen coming: a contact is known
-before the bodies reach it, from up to twice the thickness of the thickest. Motion is measured by velocities, which say
-how far a body has come in the last substep, held by its contacts, where the forces on it alone would say otherwise.
+A substep takes the plane between two bodies that are about to touch for what it was when the substep began. So it must
+be short where bodies glide along each other and touch: they would be stopped where they pass, and slip between others
+that no plane keeps them from. Bodies that fly together do not glide, those that fly alone or straight at each other
+only have to be seen coming, and those that part do not touch. Motion is measured by velocities: they say how far a body
+has come in the last substep, held by its contacts, where the forces on it alone would say otherwise.
 """
 
 import warp as wp
@@ -19,13 +19,14 @@ from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bo
 
 wp.set_module_options({"enable_backward": False})
 
-PEAK_TRAVEL = 0  # motion in one substep that tells, over the thickness of the thinner body [1]
-PEAK_LONG_TRAVEL = 1  # the same in a substep twice as long
-PEAK_SPEED = 2  # speed of a body's centre of mass [m/s]
-PEAK_OVERLAP = 3  # penetration over the thickness of the thinner body [1]
-PEAK_DEPTH = 4  # penetration [m]
-PEAK_ERROR = 5  # magnetization error [1]
-PEAKS = 6
+PEAK_TRAVEL = 0  # motion in a substep that tells, over the thickness of the thinner body [1]
+PEAK_NEXT_TRAVEL = 1  # the same in the substep that would follow
+PEAK_LONG_TRAVEL = 2  # the same in any of these if it were twice as long
+PEAK_SPEED = 3  # speed of a body's centre of mass [m/s]
+PEAK_OVERLAP = 4  # penetration over the thickness of the thinner body [1]
+PEAK_DEPTH = 5  # penetration [m]
+PEAK_ERROR = 6  # magnetization error [1]
+PEAKS = 7
 
 COUNT_BAD_BODY = 0  # first body whose state was not finite, by substeps; else NO_BODY
 COUNT_EVALUATIONS = 1  # field evaluations, summed over substeps
@@ -40,9 +41,12 @@ STAGES = 3
 INDUCTION, FORCE, RIGID = range(STAGES)
 
 FREE = 0.25
-"""Weight of the motion of a body's centre against motion along contacts."""
-_NEAR = 0.1
-"""Distance from which bodies count as in contact, over the thickness of the thinner one."""
+"""Weight of a body's own motion against gliding along another: contacts are sought as far ahead as twice its thickness,
+and two bodies may meet."""
+
+
+NEXT = -1
+"""Number of the substep that would follow those of an attempt."""
 
 
 @wp.struct
@@ -105,27 +109,27 @@ def launch_mark(w: Watched, stage: int):
 
 
 @wp.func
-def _take_travel(w: Watched, travel: float, long_travel: float):
-    wp.atomic_max(w.peaks, PEAK_TRAVEL, travel)
+def _take_travel(w: Watched, travel: float, long_travel: float, substep: int):
+    wp.atomic_max(w.peaks, wp.where(substep == NEXT, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
     wp.atomic_max(w.peaks, PEAK_LONG_TRAVEL, long_travel)
 
 
 @wp.func
 def _watch_body(w: Watched, bodies: BodyView, body: int, substep: int, dt: float):
-    """Note a body that is not finite; take how far another one moves into the peaks, weighed for being alone."""
+    """Note a body that is not finite; take how far it moves into the peaks, weighed as alone."""
     total = wp.abs(bodies.q[body][0])
     for k in range(1, 7):
         total += wp.abs(bodies.q[body][k])
     for k in range(6):
         total += wp.abs(bodies.qd[body][k])
     if not wp.isfinite(total):
-        wp.atomic_min(w.counts, COUNT_BAD_BODY, (w.substeps[0] + substep) * bodies.qd.shape[0] + body)
+        wp.atomic_min(w.counts, COUNT_BAD_BODY, (w.substeps[0] + wp.max(substep, 0)) * bodies.qd.shape[0] + body)
     thickness = w.thickness[body]
     if thickness < wp.inf:
         speed = wp.length(wp.spatial_top(bodies.qd[body]))
-        spin = wp.length(wp.spatial_bottom(bodies.qd[body]))
-        travel = (FREE * speed + w.reach[body] * spin) * dt / thickness
-        _take_travel(w, travel, 2.0 * travel)
+        turning = w.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
+        travel = FREE * (speed + turning) * dt / thickness
+        _take_travel(w, travel, 2.0 * travel, substep)
         wp.atomic_max(w.peaks, PEAK_SPEED, speed)
 
 
@@ -149,10 +153,12 @@ def _watch_contact(
     contacts: ContactView,
     bodies: BodyView,
     i: int,
+    substep: int,
     dt: float,
     overlap_threshold: float,
     overlaps: wp.array[float],
 ):
+    """Note a contact's depth; take how far its bodies glide along each other into the peaks if they touch."""
     overlaps[i] = -wp.inf
     body0, body1 = contact_bodies(contacts, i)
     thickness = wp.min(_body_thickness(w, body0), _body_thickness(w, body1))
@@ -168,9 +174,8 @@ def _watch_contact(
     moved = (_body_velocity(bodies, body1) - _body_velocity(bodies, body0)) * (dt / thickness)
     apart = wp.dot(contacts.normal[i], moved)
     along = wp.length(moved - apart * contacts.normal[i])
-    reached = apart - overlap < _NEAR
-    reached_later = 2.0 * apart - overlap < _NEAR
-    _take_travel(w, wp.where(reached, along, 0.0), wp.where(reached_later, 2.0 * along, 0.0))
+    touch, touch_later = apart < overlap, 2.0 * apart < overlap
+    _take_travel(w, wp.where(touch, along, 0.0), wp.where(touch_later, 2.0 * along, 0.0), substep)
 
 
 @wp.kernel
@@ -196,7 +201,7 @@ def _watch(
     if i < bodies.qd.shape[0]:
         _watch_body(w, bodies, i, substep, dt)
     if i < contact_count(contacts):
-        _watch_contact(w, contacts, bodies, i, dt, overlap_threshold, overlaps_out)
+        _watch_contact(w, contacts, bodies, i, substep, dt, overlap_threshold, overlaps_out)
 
 
 def watch(w: Watched, contacts: ContactView, bodies: BodyView, overlaps, *, substep, longest: float, threshold: float):
@@ -210,7 +215,7 @@ def watch(w: Watched, contacts: ContactView, bodies: BodyView, overlaps, *, subs
         contacts: The contacts.
         bodies: The bodies.
         overlaps: Out, depth of each contact over the thickness of its thinner body, shape [contact_max].
-        substep: Substeps since ``w.substeps`` were counted.
+        substep: Substeps since ``w.substeps`` were counted, or ``NEXT``.
         longest: Length of the substeps of the first level [s].
         threshold: Overlap from which on a contact is counted.
     """

@@ -12,8 +12,6 @@ predicted by velocities, so that they neither lag nor lead. Two substeps always 
 one of the first level, while the motion in the last attempt keeps their poses close to each other.
 """
 
-from functools import cache
-
 import numpy as np
 import warp as wp
 
@@ -97,31 +95,36 @@ class StateCopies:
 
     Attributes:
         own, saved: Where each array begins, shape [arrays].
-        ends: Words of all arrays up to the end of each, shape [arrays].
+        sizes: Bytes of each array, shape [arrays].
+        ends: Whole words of all arrays up to the end of each, shape [arrays].
     """
 
     own: wp.array[wp.uint64]
     saved: wp.array[wp.uint64]
+    sizes: wp.array[wp.int32]
     ends: wp.array[wp.int32]
 
 
-@cache
-def _copy_function(word):
-    @wp.func
-    def copy(
-        chunk: int, source_in: wp.array[wp.uint64], target_in: wp.array[wp.uint64], ends_in: wp.array[wp.int32]
-    ):
-        part = int(0)
-        begin = int(0)
-        for i in range(chunk * _CHUNK, wp.min((chunk + 1) * _CHUNK, ends_in[ends_in.shape[0] - 1])):
-            while i >= ends_in[part]:
-                begin = ends_in[part]
-                part += 1
-            source = wp.array(ptr=source_in[part], shape=(ends_in[part],), dtype=word)
-            target = wp.array(ptr=target_in[part], shape=(ends_in[part],), dtype=word)
-            target[i - begin] = source[i - begin]
-
-    return copy
+@wp.func
+def _copy_chunk(chunk: int, copies: StateCopies, sources: wp.array[wp.uint64], targets: wp.array[wp.uint64]):
+    """Copy some words, and with the first ones the bytes that fill none."""
+    parts = copies.ends.shape[0]
+    part = int(0)
+    begin = int(0)
+    for i in range(chunk * _CHUNK, wp.min((chunk + 1) * _CHUNK, copies.ends[parts - 1])):
+        while i >= copies.ends[part]:
+            begin = copies.ends[part]
+            part += 1
+        source = wp.array(ptr=sources[part], shape=(copies.sizes[part] // 4,), dtype=wp.uint32)
+        target = wp.array(ptr=targets[part], shape=(copies.sizes[part] // 4,), dtype=wp.uint32)
+        target[i - begin] = source[i - begin]
+    if chunk == 0:
+        for k in range(parts):
+            size = copies.sizes[k]
+            source_bytes = wp.array(ptr=sources[k], shape=(size,), dtype=wp.uint8)
+            target_bytes = wp.array(ptr=targets[k], shape=(size,), dtype=wp.uint8)
+            for i in range(size // 4 * 4, size):
+                target_bytes[i] = source_bytes[i]
 
 
 @wp.func
@@ -143,23 +146,18 @@ def _open_attempt(a: StepArrays):
     a.ticks[STAGES] = now()
 
 
-@cache
-def _copy_kernels(word):
-    copy = _copy_function(word)
+@wp.kernel
+def _begin_step(a: StepArrays, copies: StateCopies):
+    if a.status[STATUS_HALT] == RUNNING:
+        _copy_chunk(wp.tid(), copies, copies.own, copies.saved)
+        if wp.tid() == 0:
+            _open_attempt(a)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def begin_step(a: StepArrays, copies: StateCopies):
-        if a.status[STATUS_HALT] == RUNNING:
-            copy(wp.tid(), copies.own, copies.saved, copies.ends)
-            if wp.tid() == 0:
-                _open_attempt(a)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def restore(a: StepArrays, copies: StateCopies):
-        if a.flags[FLAG_REJECTED] != 0:
-            copy(wp.tid(), copies.saved, copies.own, copies.ends)
-
-    return begin_step, restore
+@wp.kernel
+def _restore(a: StepArrays, copies: StateCopies):
+    if a.flags[FLAG_REJECTED] != 0:
+        _copy_chunk(wp.tid(), copies, copies.saved, copies.own)
 
 
 @wp.kernel
@@ -249,7 +247,9 @@ def _judge(a: StepArrays):
     _log_step(a, level)
     calm = overlap < 0.5 * a.overlap or (pressed and not helped)
     next_level = int(level)
-    if calm and long_travel < a.ease * a.travel and level > 0:
+    if a.peaks[monitor.PEAK_NEXT_TRAVEL] > a.travel:
+        next_level = wp.min(level + 1, LEVELS - 1)
+    elif calm and long_travel < a.ease * a.travel and level > 0:
         next_level = level - 1
     a.status[STATUS_LEVEL] = next_level
     a.status[STATUS_SHARING] = _sharing(next_level, long_travel, level, a.shared_travel)
@@ -302,6 +302,7 @@ class StepMachine:
             a.flags[k : k + 1] for k in range(FLAGS)
         )
         self.sharing = a.status[STATUS_SHARING : STATUS_SHARING + 1]
+        self.forget_contacts()
 
     def watched(self, thickness, reach) -> monitor.Watched:
         """Return what the monitor is to watch.
@@ -337,24 +338,24 @@ class StepMachine:
             state: Contiguous arrays.
             saved: Arrays like them.
         """
-        sizes = [one.size * wp.types.type_size_in_bytes(one.dtype) for one in state]
-        self._word = wp.uint32 if all(size % 4 == 0 for size in sizes) else wp.uint8
-        ends = np.cumsum(sizes) // wp.types.type_size_in_bytes(self._word)
         device = self.arrays.status.device
-        self._chunks = max(1, -(-int(ends[-1]) // _CHUNK)) if state else 1
-        self._copies = StateCopies()
-        for name, arrays in (("own", state), ("saved", saved)):
-            addresses = np.array([one.ptr for one in arrays], np.uint64)
-            setattr(self._copies, name, wp.array(addresses, dtype=wp.uint64, device=device))
-        self._copies.ends = wp.array(ends, dtype=wp.int32, device=device)
+        sizes = np.array([one.size * wp.types.type_size_in_bytes(one.dtype) for one in state], np.int32)
+        ends = np.cumsum(sizes // 4, dtype=np.int32)
+        self._kept = state, saved  # alive: kernels know addresses alone
+        self._chunks = max(1, -(-int(ends[-1]) // _CHUNK))
+        self._copies = copies = StateCopies()
+        copies.own, copies.saved = (
+            wp.array(np.array([one.ptr for one in arrays], np.uint64), device=device) for arrays in (state, saved)
+        )
+        copies.sizes, copies.ends = (wp.array(values, device=device) for values in (sizes, ends))
 
     def begin_step(self) -> None:
         """Save the state and let a step be attempted, unless stepping is halted."""
-        self._launch(_copy_kernels(self._word)[0], self._copies, dim=self._chunks)
+        self._launch(_begin_step, self._copies, dim=self._chunks)
 
     def restore(self) -> None:
         """Take the state back to where the step began if the attempt was rejected."""
-        self._launch(_copy_kernels(self._word)[1], self._copies, dim=self._chunks)
+        self._launch(_restore, self._copies, dim=self._chunks)
 
     def end_pair(self, level: int) -> None:
         """Count two substeps of ``level`` as done."""

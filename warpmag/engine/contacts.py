@@ -291,7 +291,7 @@ class RigidSolver:
         Args:
             watched: What is watched; its ``fills`` are those of this solver.
             state: The state that was collided.
-            substep: Substeps since the monitor counted them.
+            substep: Substeps since the monitor counted them, or its ``NEXT``.
             longest: Length of the substeps of the first level [s].
             threshold: Overlap from which a contact is counted, over the thickness of the thinner body.
         """

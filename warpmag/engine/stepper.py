@@ -29,9 +29,9 @@ from warpmag.kernels.rigid.bodies import predict_poses
 from warpmag.kernels.rigid.newton_views import view_bodies
 
 TRAVEL_LIMIT = 0.25
-"""How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
-_SHARED_TRAVEL_LIMIT = 1.0
-"""How far a body may move, in parts of its thickness, while more than two substeps share their forces."""
+"""How far a body may glide along another in a substep, in parts of its thickness, see ``kernels.rigid.monitor``."""
+_SHARED_TRAVEL_LIMIT = 0.5
+"""The same while more than two substeps share their forces: a ball that flies alone moves two radii meanwhile."""
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
 _EASE = 0.8
@@ -40,7 +40,6 @@ _FUTILE = 0.8
 """Substeps of half the length that leave more than this part of a penetration do not press less, however short."""
 _RECORDS = 64
 """Steps that may be done before the host looks; on a CPU, which it waits for anyway, it looks after each."""
-
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class StepReport:
         attempts: How often it was done, 1 if the first attempt held.
         capped: Whether a body moved farther in a substep than allowed, with the shortest substeps there are.
         regrown: Whether buffers had to grow.
-        travel: Farthest predicted motion in a substep over the thickness of the body.
+        travel: Farthest motion in a substep that tells, over the thickness of the body, see ``kernels.rigid.monitor``.
         speed: Highest speed of a body [m/s].
         overlap: Deepest penetration over the thickness of the thinner body.
         depth: Deepest penetration [m].
@@ -325,13 +324,13 @@ class Stepper:
         machine = self._machine
         for level, remaining in enumerate(machine.remaining):
             wp.capture_while(remaining, self._advance_twice, level=level)
-        self._find_first_contacts()
+        self._find_first_contacts(substep=monitor.NEXT)
         machine.judge()
         machine.restore()
 
     def _advance_twice(self, level: int) -> None:
         machine, dt = self._machine, self._longest / (1 << level)
-        wp.capture_if(machine.contacts_due, self._find_first_contacts)
+        wp.capture_if(machine.contacts_due, self._find_first_contacts, substep=0)
         if level == 1:  # two substeps are all that share
             self._share_forces(dt)
         elif level > 1:
@@ -346,16 +345,16 @@ class Stepper:
             self._solver.step(now, then, dt)
         machine.end_pair(level)
 
-    def _find_first_contacts(self) -> None:
+    def _find_first_contacts(self, substep: int) -> None:
         """Find the contacts that two substeps start from.
 
         They hold for the longest substep, so that those at the end of a step serve the next one, whatever its level.
         """
-        self._find_contacts(self._state, self._longest, 0)
+        self._find_contacts(self._state, self._longest, substep)
 
-    def _find_contacts(self, state: newton.State, horizon: float, half: int) -> None:
+    def _find_contacts(self, state: newton.State, horizon: float, substep: int) -> None:
         self._solver.collide(state, horizon)
-        self._solver.watch(self._watched, state, substep=half, longest=self._longest, threshold=0.0)
+        self._solver.watch(self._watched, state, substep=substep, longest=self._longest, threshold=0.0)
 
     def _share_forces(self, dt: float) -> None:
         predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
