@@ -1,9 +1,11 @@
 """The state machine of a step against its rules in Python."""
 
+import newton
 import numpy as np
 import pytest
 import warp as wp
 
+from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.kernels.rigid import monitor, stepping
 
 TRAVEL, SHARED_TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 1.0, 0.008, 0.8, 0.8, 2, 100
@@ -16,6 +18,7 @@ class Rules:
         self.level = self.done = self.attempts = self.regrown = 0
         self.overlap, self.pressed_before, self.halt = 0.0, np.inf, "no"
         self.motion = 0.0  # in a substep of the first level
+        self.known = False  # the contacts of the present state
 
     @property
     def sharing(self):
@@ -23,7 +26,7 @@ class Rules:
         fitting = [n for n in (2**k for k in range(self.level + 1)) if self.motion * n / 2**self.level <= SHARED_TRAVEL]
         return min(2**self.level, max([2, *fitting]))
 
-    def judge(self, travel, long_travel, overlap, lost, fill):
+    def judge(self, travel, next_travel, long_travel, overlap, lost, fill):
         """Returns what becomes of the attempt, and the record of a step that is done."""
         self.attempts += 1
         motion = long_travel / 2 * 2**self.level
@@ -43,7 +46,9 @@ class Rules:
         record = (FEWEST * 2**self.level, self.attempts, travel > TRAVEL, self.regrown)
         self.done, self.attempts, self.regrown = self.done + 1, 0, 0
         self.overlap, self.pressed_before, self.motion = overlap, np.inf, motion
-        if long_travel < EASE * TRAVEL and (overlap < 0.5 * OVERLAP or (pressed and not helped)) and self.level:
+        if next_travel > TRAVEL:
+            self.level = min(self.level + 1, stepping.LEVELS - 1)
+        elif long_travel < EASE * TRAVEL and (overlap < 0.5 * OVERLAP or (pressed and not helped)) and self.level:
             self.level -= 1
         return "done", record
 
@@ -53,20 +58,36 @@ def machine(device):
     limits = {"travel": TRAVEL, "shared_travel": SHARED_TRAVEL, "overlap": OVERLAP, "ease": EASE, "futile": FUTILE}
     machine = stepping.StepMachine(16, 1, device, **limits, fewest=FEWEST)
     machine.arrays.capacities.fill_(CAPACITY)
+    machine.keep([wp.zeros(1, dtype=float, device=device)], [wp.zeros(1, dtype=float, device=device)])
     return machine
 
 
-def report(arrays, travel, long_travel, overlap, lost, fill):
+def report(arrays, travel, next_travel, long_travel, overlap, lost, fill):
     """Stand in for the monitor."""
     peaks, counts = arrays.peaks.numpy(), arrays.counts.numpy()
     assert (peaks == 0.0).all() and counts[monitor.COUNT_BAD_BODY] == monitor.NO_BODY
-    peaks[[monitor.PEAK_TRAVEL, monitor.PEAK_LONG_TRAVEL]] = travel, long_travel
+    peaks[[monitor.PEAK_TRAVEL, monitor.PEAK_NEXT_TRAVEL, monitor.PEAK_LONG_TRAVEL]] = travel, next_travel, long_travel
     peaks[[monitor.PEAK_OVERLAP, monitor.PEAK_ERROR]] = overlap, 0.125
     counts[monitor.COUNT_EVALUATIONS], counts[monitor.COUNT_CAPACITIES] = 7, fill
     if lost:
         counts[monitor.COUNT_BAD_BODY] = 3
     arrays.peaks.assign(peaks)
     arrays.counts.assign(counts)
+
+
+def run_attempt(machine, rules, shared):
+    """Go through the substeps of an attempt, and note the level and how many substeps share forces."""
+    pairs = 0
+    while machine.remaining[rules.level].numpy()[0]:
+        if rules.level:
+            assert machine.sharing.numpy()[0] == rules.sharing
+            assert machine.forces_due.numpy()[0] == (2 * pairs % rules.sharing == 0)
+            shared.add((rules.level, rules.sharing))
+        assert machine.arrays.status.numpy()[stepping.STATUS_SUBSTEPS] == 2 * pairs
+        assert machine.contacts_due.numpy()[0] == (pairs > 0 or not rules.known)
+        machine.end_pair(rules.level)
+        pairs += 1
+    assert 2 * pairs == FEWEST * 2**rules.level
 
 
 def test_the_device_follows_the_rules(machine):
@@ -76,25 +97,19 @@ def test_the_device_follows_the_rules(machine):
     for _ in range(300):
         machine.begin_step()
         while machine.attempting.numpy()[0]:
-            machine.begin_attempt()
             wanted = [machine.remaining[level].numpy()[0] for level in range(stepping.LEVELS)]
             assert wanted == [level == rules.level for level in range(stepping.LEVELS)]
-            pairs = 0
-            while machine.remaining[rules.level].numpy()[0]:
-                if rules.level:
-                    assert machine.sharing.numpy()[0] == rules.sharing
-                    assert machine.forces_due.numpy()[0] == (2 * pairs % rules.sharing == 0)
-                    shared.add((rules.level, rules.sharing))
-                machine.end_pair(rules.level)
-                pairs += 1
-            assert 2 * pairs == FEWEST * 2**rules.level
-            travel = np.float32(rng.choice([0.01, 0.08, 0.3]))
-            long_travel = np.float32(travel * rng.uniform(2.0, 4.0))  # 0.2 is the limit of easing
+            run_attempt(machine, rules, shared)
+            travel = np.float32(rng.choice([0.01, 0.08, 0.3], p=[0.65, 0.2, 0.15]))
+            next_travel = np.float32(rng.choice([0.01, 0.08, 0.3], p=[0.65, 0.2, 0.15]))
+            long_travel = np.float32(max(travel, next_travel) * rng.uniform(2.0, 4.0))  # 0.2 is the limit of easing
             overlap = np.float32(rng.choice([0.001, 0.005, 0.01, 0.02], p=[0.6, 0.2, 0.1, 0.1]))
             lost, fill = rng.random() < 0.05, int(rng.choice([50, CAPACITY, 101], p=[0.8, 0.15, 0.05]))
-            report(arrays, travel, long_travel, overlap, lost, fill)
+            report(arrays, travel, next_travel, long_travel, overlap, lost, fill)
             record_at = rules.done % 16
-            outcome, record = rules.judge(float(travel), float(long_travel), float(overlap), lost, fill)
+            motion = (float(travel), float(next_travel), float(long_travel))
+            outcome, record = rules.judge(*motion, float(overlap), lost, fill)
+            rules.known = outcome == "done"
             machine.judge()
             assert machine.attempting.numpy()[0] == (outcome == "again")
             assert arrays.flags.numpy()[stepping.FLAG_REJECTED] == (outcome != "done")
@@ -123,25 +138,85 @@ def test_the_device_follows_the_rules(machine):
 
 def test_time_is_counted_for_the_stage_that_it_was_spent_in(machine):
     arrays = machine.arrays
-    machine.begin_attempt()
+    watched = machine.watched(np.ones(1), np.zeros(1))
+    machine.begin_step()
     work = wp.zeros(1 << 20, dtype=float, device=arrays.ticks.device)
     for _ in range(20):
         wp.copy(work, wp.ones_like(work))
-    machine.mark(1)
-    machine.mark(2)
+    monitor.launch_mark(watched, monitor.FORCE)
+    monitor.launch_mark(watched, monitor.RIGID)
     ticks = arrays.ticks.numpy().astype(float)
-    assert ticks[0] == 0.0
-    assert ticks[1] > 0.0
+    assert ticks[monitor.INDUCTION] == 0.0
+    assert ticks[monitor.FORCE] > 0.0
 
 
-def test_arrays_of_any_type_are_copied_where_a_flag_stands(machine):
-    arrays = machine.arrays
+@pytest.mark.parametrize("flags", [0, 7])
+def test_a_state_of_any_arrays_is_saved_and_restored(machine, device, flags):
+    """Arrays of all types and lengths, bytes that fill no word among them where there are ``flags``."""
     rng = np.random.default_rng(1)
-    for dtype, width in ((wp.transform, 7), (wp.spatial_vector, 6), (wp.float32, 1), (wp.vec3, 3)):
-        values = rng.normal(size=(50, width)).astype(np.float32).squeeze()
-        source = wp.array(values, dtype=dtype, device=arrays.flags.device)
-        target = wp.zeros_like(source)
-        for flag, expected in ((0, np.zeros_like(values)), (1, values)):
-            arrays.flags.fill_(flag)
-            machine.copy_where(stepping.FLAG_REJECTED, source, target)
-            np.testing.assert_array_equal(target.numpy(), expected)
+    kinds = ((wp.transform, 7, 50), (wp.spatial_vector, 6, 50), (wp.float32, 1, 3), (wp.vec3, 3, 1), (wp.float64, 1, 5))
+    values = [rng.normal(size=(count, width)).squeeze() for _, width, count in kinds]
+    own = [wp.array(one, dtype=dtype, device=device) for one, (dtype, _, _) in zip(values, kinds, strict=True)]
+    if flags:
+        own.append(wp.array(rng.random(flags) < 0.5, dtype=wp.bool, device=device))
+    saved = [wp.zeros_like(one) for one in own]
+    machine.keep(own, saved)
+    before = [one.numpy() for one in own]
+
+    machine.set_status(stepping.STATUS_HALT, stepping.PAUSED)
+    machine.begin_step()
+    assert all(not one.numpy().any() for one in saved)
+    machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
+    machine.begin_step()
+    for one, expected in zip(saved, before, strict=True):
+        np.testing.assert_array_equal(one.numpy(), expected)
+
+    for one in own:
+        one.zero_()
+    machine.restore()  # nothing was rejected yet
+    assert all(not one.numpy().any() for one in own)
+    report(machine.arrays, 2.0 * TRAVEL, 0.0, 0.0, 0.0, False, 0)
+    machine.judge()
+    machine.restore()
+    for one, expected in zip(own, before, strict=True):
+        np.testing.assert_array_equal(one.numpy(), expected)
+
+
+GLIDING = {  # velocities of two balls of radius 1 beside each other along x, their gap, what tells within 0.1, and 0.2
+    "together": ((0.0, 9.0, 0.0), (0.0, 9.0, 0.0), 0.0, 0.9 * monitor.FREE, 0.9 * monitor.FREE),
+    "gliding, pressed": ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), -0.001, 0.2, 0.2),
+    "gliding, parting": ((-0.1, -1.0, 0.0), (0.1, 1.0, 0.0), 0.001, 0.1005 * monitor.FREE, 0.1005 * monitor.FREE),
+    "gliding, touching soon": ((0.2, -1.0, 0.0), (0.0, 1.0, 0.0), 0.01, 0.2, 0.2),
+    "gliding, touching later": ((0.2, -1.0, 0.0), (0.0, 1.0, 0.0), 0.03, 0.102 * monitor.FREE, 0.2),
+    "gliding past": ((0.2, -1.0, 0.0), (0.0, 1.0, 0.0), 0.05, 0.102 * monitor.FREE, 0.102 * monitor.FREE),
+    "meeting": ((2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), 0.1, 0.2 * monitor.FREE, 0.2 * monitor.FREE),
+}
+
+
+@pytest.mark.parametrize("case", GLIDING)
+@pytest.mark.parametrize("level", [0, 2])
+def test_what_tells_is_how_bodies_glide_along_each_other_where_they_touch(case, level, machine, device):
+    *velocities, gap, here, later = GLIDING[case]
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for x, velocity in zip((0.0, 2.0 + gap), velocities, strict=True):
+        ball = builder.add_body(xform=wp.transform(wp.vec3(x, 0.0, 0.0), wp.quat_identity()))
+        builder.add_shape_sphere(ball, radius=1.0)
+        builder.body_qd[ball] = (*velocity, 0.0, 0.0, 50.0)  # balls may turn
+    model = builder.finalize(device=device)
+    sizes = body_sizes(model)
+    solver = RigidSolver(model, sizes)
+    watched = machine.watched(sizes.thickness, sizes.reach)
+    watched.fills = wp.array(solver.fills(), dtype=wp.uint64, device=device)
+    watched.counts = wp.zeros(monitor.COUNT_CAPACITIES + len(solver.buffers), dtype=wp.int32, device=device)
+    machine.set_status(stepping.STATUS_LEVEL, level)
+    state = model.state()
+    solver.collide(state, 0.4)
+    for substep, where in ((1, monitor.PEAK_TRAVEL), (monitor.NEXT, monitor.PEAK_NEXT_TRAVEL)):
+        watched.peaks.zero_()
+        solver.watch(watched, state, substep=substep, longest=0.1 * 2**level, threshold=0.0)
+        peaks = watched.peaks.numpy()
+        other = monitor.PEAK_TRAVEL + monitor.PEAK_NEXT_TRAVEL - where
+        assert peaks[where] == pytest.approx(here, rel=1e-3) and peaks[other] == 0.0
+        assert peaks[monitor.PEAK_LONG_TRAVEL] == pytest.approx(2.0 * later, rel=1e-3)
+        assert peaks[monitor.PEAK_DEPTH] == pytest.approx(max(0.0, -gap), abs=1e-6)
+    assert watched.counts.numpy()[monitor.COUNT_CAPACITIES :].tolist() == [1, 1]  # pairs, contacts

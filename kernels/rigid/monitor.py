@@ -5,9 +5,12 @@ minima do not depend on the order of threads, so that a run repeats bit by bit.
 
 ``peaks`` [float32]: maxima, see the ``PEAK_*`` indices.
 ``counts`` [int32]: see the ``COUNT_*`` indices; from ``COUNT_CAPACITIES`` on, the fill of each buffer watched.
-``thickness`` [body_count]: how far a body may move before it can pass through another [m], the radius of a ball;
-infinite for bodies that do not move by forces.
-``reach`` [body_count]: how far a turn moves the surface of a body per radian [m], zero for a ball.
+
+A substep takes the plane between two bodies that are about to touch for what it was when the substep began. So it must
+be short where bodies glide along each other and touch: they would be stopped where they pass, and slip between others
+that no plane keeps them from. Bodies that fly together do not glide, those that fly alone or straight at each other
+only have to be seen coming, and those that part do not touch. Motion is measured by velocities: they say how far a body
+has come in the last substep, held by its contacts, where the forces on it alone would say otherwise.
 """
 
 import warp as wp
@@ -16,15 +19,16 @@ from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bo
 
 wp.set_module_options({"enable_backward": False})
 
-PEAK_TRAVEL = 0  # predicted motion of a body in one substep over its thickness [1]
-PEAK_LONG_TRAVEL = 1  # the same in a substep twice as long
-PEAK_SPEED = 2  # speed of a body's centre of mass [m/s]
-PEAK_OVERLAP = 3  # penetration over the thickness of the thinner body [1]
-PEAK_DEPTH = 4  # penetration [m]
-PEAK_ERROR = 5  # magnetization error [1]
-PEAKS = 6
+PEAK_TRAVEL = 0  # motion in a substep that tells, over the thickness of the thinner body [1]
+PEAK_NEXT_TRAVEL = 1  # the same in the substep that would follow
+PEAK_LONG_TRAVEL = 2  # the same in any of these if it were twice as long
+PEAK_SPEED = 3  # speed of a body's centre of mass [m/s]
+PEAK_OVERLAP = 4  # penetration over the thickness of the thinner body [1]
+PEAK_DEPTH = 5  # penetration [m]
+PEAK_ERROR = 6  # magnetization error [1]
+PEAKS = 7
 
-COUNT_BAD_BODY = 0  # first body whose state was not finite, see ``stepping``; else NO_BODY
+COUNT_BAD_BODY = 0  # first body whose state was not finite, by substeps; else NO_BODY
 COUNT_EVALUATIONS = 1  # field evaluations, summed over substeps
 COUNT_UNCONVERGED = 2  # substeps whose induction did not converge
 COUNT_OVERLAPS = 3  # contacts deeper than a threshold
@@ -32,97 +36,192 @@ COUNT_CAPACITIES = 4
 
 NO_BODY = 2**31 - 1
 
+STAGES = 3
+"""Stages whose time is measured: induction, forces, rigid bodies."""
+INDUCTION, FORCE, RIGID = range(STAGES)
 
-@wp.kernel
-def _watch_motion(
-    # inputs:
-    bodies: BodyView,
-    gravity_in: wp.array[wp.vec3],
-    thickness_in: wp.array[float],
-    reach_in: wp.array[float],
-    dt: float,
-    # outputs:
-    peaks_out: wp.array[float],
-):
-    """Bound how far the surface of each body moves without contacts: |v| dt + |a| dt²/2, and the same of turning."""
-    body = wp.tid()
-    thickness = thickness_in[body]
-    if thickness == wp.inf:
-        return
-    speed = wp.length(wp.spatial_top(bodies.qd[body]))
-    gravity = gravity_in[bodies.world[body]]
-    acceleration = wp.length(wp.spatial_top(bodies.f[body]) * bodies.inv_mass[body] + gravity)
-    steady = speed * dt
-    gained = 0.5 * acceleration * dt * dt
-    reach = reach_in[body]
-    if reach > 0.0:
-        rotation = wp.transform_get_rotation(bodies.q[body])
-        torque = wp.quat_rotate_inv(rotation, wp.spatial_bottom(bodies.f[body]))
-        steady += reach * wp.length(wp.spatial_bottom(bodies.qd[body])) * dt
-        gained += 0.5 * reach * wp.length(bodies.inv_inertia[body] * torque) * dt * dt
-    wp.atomic_max(peaks_out, PEAK_TRAVEL, (steady + gained) / thickness)
-    wp.atomic_max(peaks_out, PEAK_LONG_TRAVEL, (2.0 * steady + 4.0 * gained) / thickness)
-    wp.atomic_max(peaks_out, PEAK_SPEED, speed)
+FREE = 0.25
+"""Weight of a body's own motion against gliding along another: contacts are sought as far ahead as twice its thickness,
+and two bodies may meet."""
 
 
-def watch_motion(bodies: BodyView, gravity, thickness, reach, dt: float, peaks):
-    """Take the bodies' predicted motion in the next ``dt`` and in twice that, and their speed, into ``peaks``."""
-    inputs = [bodies, gravity, thickness, reach, dt]
-    wp.launch(_watch_motion, dim=len(thickness), inputs=inputs, outputs=[peaks], device=peaks.device)
+NEXT = -1
+"""Number of the substep that would follow those of an attempt."""
+
+
+@wp.struct
+class Watched:
+    """What is watched, and where it goes.
+
+    Attributes:
+        thickness: How far a body may move before it can pass through another [m], the radius of a ball; infinite for
+            bodies that do not move by forces. Shape [body_count].
+        reach: How far a turn moves the surface of a body per radian [m], zero for a ball. Shape [body_count].
+        fills: Addresses of the numbers that tell how full each buffer is, 0 for what :func:`watch_flags` watches.
+        level: How often substeps were halved, shape [1].
+        substeps: Substeps done in this attempt, shape [1].
+        ticks: Time spent in each stage since the last step was accepted, then the time of the last mark; nanoseconds on
+            a GPU, clock cycles on a CPU.
+        peaks, counts: See above.
+    """
+
+    thickness: wp.array[float]
+    reach: wp.array[float]
+    fills: wp.array[wp.uint64]
+    level: wp.array[wp.int32]
+    substeps: wp.array[wp.int32]
+    ticks: wp.array[wp.uint64]
+    peaks: wp.array[float]
+    counts: wp.array[wp.int32]
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    unsigned long long t;
+    asm volatile("mov.u64 %0, %globaltimer;" : "=l"(t));
+    return t;
+#elif defined(__aarch64__)
+    return __builtin_arm_rsr64("cntvct_el0");
+#else
+    return __builtin_readcyclecounter();
+#endif
+""")
+def now() -> wp.uint64:
+    """Time of the device: nanoseconds on a GPU, clock cycles on a CPU."""
 
 
 @wp.func
-def _body_thickness(thickness: wp.array[float], body: int) -> float:
-    if body < 0:
-        return wp.inf
-    return thickness[body]
+def mark_time(ticks: wp.array[wp.uint64], stage: int):
+    """Count the time since the last mark as spent in ``stage``."""
+    time = now()
+    ticks[stage] = ticks[stage] + time - ticks[STAGES]
+    ticks[STAGES] = time
 
 
 @wp.kernel
-def _watch_contacts(
-    # inputs:
+def _mark(w: Watched, stage: int):
+    mark_time(w.ticks, stage)
+
+
+def launch_mark(w: Watched, stage: int):
+    """Count the time since the last mark, or since the attempt began, as spent in ``stage``."""
+    wp.launch(_mark, dim=1, inputs=[w, stage], device=w.peaks.device)
+
+
+@wp.func
+def _take_travel(w: Watched, travel: float, long_travel: float, substep: int):
+    wp.atomic_max(w.peaks, wp.where(substep == NEXT, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
+    wp.atomic_max(w.peaks, PEAK_LONG_TRAVEL, long_travel)
+
+
+@wp.func
+def _watch_body(w: Watched, bodies: BodyView, body: int, substep: int, dt: float):
+    """Note a body that is not finite; take how far it moves into the peaks, weighed as alone."""
+    total = wp.abs(bodies.q[body][0])
+    for k in range(1, 7):
+        total += wp.abs(bodies.q[body][k])
+    for k in range(6):
+        total += wp.abs(bodies.qd[body][k])
+    if not wp.isfinite(total):
+        wp.atomic_min(w.counts, COUNT_BAD_BODY, (w.substeps[0] + wp.max(substep, 0)) * bodies.qd.shape[0] + body)
+    thickness = w.thickness[body]
+    if thickness < wp.inf:
+        speed = wp.length(wp.spatial_top(bodies.qd[body]))
+        turning = w.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
+        travel = FREE * (speed + turning) * dt / thickness
+        _take_travel(w, travel, 2.0 * travel, substep)
+        wp.atomic_max(w.peaks, PEAK_SPEED, speed)
+
+
+@wp.func
+def _body_thickness(w: Watched, body: int) -> float:
+    if body < 0:
+        return wp.inf
+    return w.thickness[body]
+
+
+@wp.func
+def _body_velocity(bodies: BodyView, body: int) -> wp.vec3:
+    if body < 0:
+        return wp.vec3(0.0)
+    return wp.spatial_top(bodies.qd[body])
+
+
+@wp.func
+def _watch_contact(
+    w: Watched,
     contacts: ContactView,
-    body_q_in: wp.array[wp.transform],
-    thickness_in: wp.array[float],
+    bodies: BodyView,
+    i: int,
+    substep: int,
+    dt: float,
+    overlap_threshold: float,
+    overlaps: wp.array[float],
+):
+    """Note a contact's depth; take how far its bodies glide along each other into the peaks if they touch."""
+    overlaps[i] = -wp.inf
+    body0, body1 = contact_bodies(contacts, i)
+    thickness = wp.min(_body_thickness(w, body0), _body_thickness(w, body1))
+    if thickness == wp.inf:
+        return
+    depth = contact_depth(contacts, bodies.q, i)
+    overlap = depth / thickness
+    overlaps[i] = overlap
+    wp.atomic_max(w.peaks, PEAK_DEPTH, depth)
+    wp.atomic_max(w.peaks, PEAK_OVERLAP, overlap)
+    if overlap > overlap_threshold:
+        wp.atomic_add(w.counts, COUNT_OVERLAPS, 1)
+    moved = (_body_velocity(bodies, body1) - _body_velocity(bodies, body0)) * (dt / thickness)
+    apart = wp.dot(contacts.normal[i], moved)
+    along = wp.length(moved - apart * contacts.normal[i])
+    touch, touch_later = apart < overlap, 2.0 * apart < overlap
+    _take_travel(w, wp.where(touch, along, 0.0), wp.where(touch_later, 2.0 * along, 0.0), substep)
+
+
+@wp.kernel
+def _watch(
+    # inputs:
+    w: Watched,
+    contacts: ContactView,
+    bodies: BodyView,
+    substep: int,
+    longest: float,
     overlap_threshold: float,
     # outputs:
     overlaps_out: wp.array[float],
-    peaks_out: wp.array[float],
-    counts_out: wp.array[wp.int32],
 ):
     i = wp.tid()
-    if i >= contact_count(contacts):
-        return
-    overlaps_out[i] = -wp.inf
-    body0, body1 = contact_bodies(contacts, i)
-    thickness = wp.min(_body_thickness(thickness_in, body0), _body_thickness(thickness_in, body1))
-    if thickness == wp.inf:
-        return
-    depth = contact_depth(contacts, body_q_in, i)
-    overlaps_out[i] = depth / thickness
-    wp.atomic_max(peaks_out, PEAK_DEPTH, depth)
-    wp.atomic_max(peaks_out, PEAK_OVERLAP, depth / thickness)
-    if depth > overlap_threshold * thickness:
-        wp.atomic_add(counts_out, COUNT_OVERLAPS, 1)
+    dt = longest / float(1 << w.level[0])
+    if i == 0:
+        mark_time(w.ticks, RIGID)
+    if i < w.fills.shape[0]:
+        if w.fills[i] != wp.uint64(0):
+            fill = wp.array(ptr=w.fills[i], shape=(1,), dtype=wp.int32)
+            w.counts[COUNT_CAPACITIES + i] = wp.max(w.counts[COUNT_CAPACITIES + i], fill[0])
+    if i < bodies.qd.shape[0]:
+        _watch_body(w, bodies, i, substep, dt)
+    if i < contact_count(contacts):
+        _watch_contact(w, contacts, bodies, i, substep, dt, overlap_threshold, overlaps_out)
 
 
-def watch_contacts(contacts: ContactView, body_q, thickness, overlap_threshold: float, overlaps, peaks, counts):
-    """Write the depth of each contact over the thickness of its thinner body into ``overlaps`` [contact_max].
+def watch(w: Watched, contacts: ContactView, bodies: BodyView, overlaps, *, substep, longest: float, threshold: float):
+    """Take a state whose contacts were just found into ``peaks`` and ``counts``, and mark the time of rigid bodies.
 
-    The largest goes into ``peaks``, the number of those above ``overlap_threshold`` into ``counts``.
+    ``COUNT_BAD_BODY`` is the lowest body that was not finite in the first such substep, plus the number of that substep
+    times that of the bodies: magnets pass what is not finite to all others within a substep.
+
+    Args:
+        w: What is watched.
+        contacts: The contacts.
+        bodies: The bodies.
+        overlaps: Out, depth of each contact over the thickness of its thinner body, shape [contact_max].
+        substep: Substeps since ``w.substeps`` were counted, or ``NEXT``.
+        longest: Length of the substeps of the first level [s].
+        threshold: Overlap from which on a contact is counted.
     """
-    inputs, outputs = [contacts, body_q, thickness, overlap_threshold], [overlaps, peaks, counts]
-    wp.launch(_watch_contacts, dim=len(overlaps), inputs=inputs, outputs=outputs, device=peaks.device)
-
-
-@wp.kernel
-def _watch_capacity(fill_in: wp.array[wp.int32], index: int, counts_out: wp.array[wp.int32]):
-    counts_out[index] = wp.max(counts_out[index], fill_in[0])
-
-
-def watch_capacity(fill, index: int, counts):
-    """Take the fill of one buffer, ``fill`` [1], into the maximum ``counts[index]``."""
-    wp.launch(_watch_capacity, dim=1, inputs=[fill, index], outputs=[counts], device=counts.device)
+    dim = max(len(overlaps), len(w.thickness), len(w.fills), 1)
+    inputs = [w, contacts, bodies, substep, longest, threshold]
+    wp.launch(_watch, dim=dim, inputs=inputs, outputs=[overlaps], device=w.peaks.device)
 
 
 @wp.kernel
@@ -139,13 +238,12 @@ def watch_flags(flags, index: int, counts):
 @wp.kernel
 def _watch_induction(
     # inputs:
+    w: Watched,
     error_in: wp.array[wp.float64],
     evaluations_in: wp.array[wp.int32],
     converged_in: wp.array[wp.int32],
-    # outputs:
-    peaks_out: wp.array[float],
-    counts_out: wp.array[wp.int32],
 ):
+    mark_time(w.ticks, INDUCTION)
     error = error_in[0]
     evaluations = evaluations_in[0]
     converged = converged_in[0]
@@ -153,13 +251,12 @@ def _watch_induction(
         error = wp.max(error, error_in[world])
         evaluations = wp.max(evaluations, evaluations_in[world])
         converged = wp.min(converged, converged_in[world])
-    peaks_out[PEAK_ERROR] = wp.max(peaks_out[PEAK_ERROR], float(error))
-    counts_out[COUNT_EVALUATIONS] = counts_out[COUNT_EVALUATIONS] + evaluations
+    w.peaks[PEAK_ERROR] = wp.max(w.peaks[PEAK_ERROR], float(error))
+    w.counts[COUNT_EVALUATIONS] = w.counts[COUNT_EVALUATIONS] + evaluations
     if converged == 0:
-        counts_out[COUNT_UNCONVERGED] = counts_out[COUNT_UNCONVERGED] + 1
+        w.counts[COUNT_UNCONVERGED] = w.counts[COUNT_UNCONVERGED] + 1
 
 
-def watch_induction(error, evaluations, converged, peaks, counts):
-    """Take the outcome of one induction, an entry per world, into ``peaks`` and ``counts``."""
-    inputs, outputs = [error, evaluations, converged], [peaks, counts]
-    wp.launch(_watch_induction, dim=1, inputs=inputs, outputs=outputs, device=peaks.device)
+def watch_induction(w: Watched, error, evaluations, converged):
+    """Take the outcome of one induction, an entry per world, into ``peaks`` and ``counts``, and mark its time."""
+    wp.launch(_watch_induction, dim=1, inputs=[w, error, evaluations, converged], device=w.peaks.device)

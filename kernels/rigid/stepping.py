@@ -12,12 +12,11 @@ predicted by velocities, so that they neither lag nor lead. Two substeps always 
 one of the first level, while the motion in the last attempt keeps their poses close to each other.
 """
 
-from functools import cache
-
 import numpy as np
 import warp as wp
 
 from warpmag.kernels.rigid import monitor
+from warpmag.kernels.rigid.monitor import STAGES, now
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,22 +26,24 @@ LEVELS = 5
 FLAG_ATTEMPT = 0  # the step is to be attempted (again)
 FLAG_REJECTED = 1  # the last attempt was rejected
 FLAG_FORCES = 2  # the next substeps need forces of their own
-FLAG_LEVEL = 3  # first of LEVELS: substeps of this level remain to be done
-FLAGS = 8
+FLAG_CONTACTS = 3  # the contacts known are not those of the present state
+FLAG_LEVEL = 4  # first of LEVELS: substeps of this level remain to be done
+FLAGS = FLAG_LEVEL + LEVELS
 
 STATUS_HALT = 0  # why steps do nothing: one of the reasons below
 STATUS_DONE = 1  # steps done
 STATUS_LEVEL = 2  # level of the substeps
 STATUS_ATTEMPTS = 3  # attempts at the step under way
 STATUS_REMAINING = 4  # pairs of substeps that this attempt still has to do
-STATUS_REGROWN = 5  # buffers grew since the last step; set by the host
-STATUS_SHARING = 6  # substeps that share their forces, a power of two; beyond the first level
-STATUSES = 7
+STATUS_SUBSTEPS = 5  # substeps that it has done
+STATUS_REGROWN = 6  # buffers grew since the last step; set by the host
+STATUS_SHARING = 7  # substeps that share their forces, a power of two; beyond the first level
+STATUSES = 8
 
 RUNNING, OVERFLOW, NOT_FINITE, PAUSED = range(4)
 """Values of ``STATUS_HALT``; the host pauses."""
-STAGES = 3
-"""Stages whose time is measured: induction, forces, rigid bodies."""
+_CHUNK = 16
+"""Words of a state that a thread copies."""
 
 LOG_SUBSTEPS, LOG_ATTEMPTS, LOG_CAPPED, LOG_REGROWN, LOG_EVALUATIONS, LOG_UNCONVERGED = range(6)
 LOG_PEAKS = 6  # first of monitor.PEAKS
@@ -88,48 +89,52 @@ class StepArrays:
     fewest: int
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    unsigned long long t;
-    asm volatile("mov.u64 %0, %globaltimer;" : "=l"(t));
-    return t;
-#elif defined(__aarch64__)
-    return __builtin_arm_rsr64("cntvct_el0");
-#else
-    return __builtin_readcyclecounter();
-#endif
-""")
-def now() -> wp.uint64:
-    """Time of the device: nanoseconds on a GPU, clock cycles on a CPU."""
+@wp.struct
+class StateCopies:
+    """Arrays of a state and of its copy, as addresses.
+
+    Attributes:
+        own, saved: Where each array begins, shape [arrays].
+        sizes: Bytes of each array, shape [arrays].
+        ends: Whole words of all arrays up to the end of each, shape [arrays].
+    """
+
+    own: wp.array[wp.uint64]
+    saved: wp.array[wp.uint64]
+    sizes: wp.array[wp.int32]
+    ends: wp.array[wp.int32]
 
 
-@wp.kernel
-def _begin_step(a: StepArrays):
-    a.flags[FLAG_ATTEMPT] = wp.where(a.status[STATUS_HALT] == RUNNING, 1, 0)
+@wp.func
+def _copy_chunk(chunk: int, copies: StateCopies, sources: wp.array[wp.uint64], targets: wp.array[wp.uint64]):
+    """Copy some words, and with the first ones the bytes that fill none."""
+    parts = copies.ends.shape[0]
+    part = int(0)
+    begin = int(0)
+    for i in range(chunk * _CHUNK, wp.min((chunk + 1) * _CHUNK, copies.ends[parts - 1])):
+        while i >= copies.ends[part]:
+            begin = copies.ends[part]
+            part += 1
+        source = wp.array(ptr=sources[part], shape=(copies.sizes[part] // 4,), dtype=wp.uint32)
+        target = wp.array(ptr=targets[part], shape=(copies.sizes[part] // 4,), dtype=wp.uint32)
+        target[i - begin] = source[i - begin]
+    if chunk == 0:
+        for k in range(parts):
+            size = copies.sizes[k]
+            source_bytes = wp.array(ptr=sources[k], shape=(size,), dtype=wp.uint8)
+            target_bytes = wp.array(ptr=targets[k], shape=(size,), dtype=wp.uint8)
+            for i in range(size // 4 * 4, size):
+                target_bytes[i] = source_bytes[i]
 
 
-@wp.kernel
-def _set_status(a: StepArrays, index: int, value: int):
-    a.status[index] = value
-
-
-@cache
-def _copy_kernel(dtype):
-    # A generic kernel would do, but graphs on the CPU replay the wrong one of its overloads (Warp 1.19).
-    @wp.kernel(module="unique", enable_backward=False)
-    def copy_where(flags_in: wp.array[wp.int32], flag: int, source_in: wp.array[dtype], target_out: wp.array[dtype]):
-        i = wp.tid()
-        if flags_in[flag] != 0:
-            target_out[i] = source_in[i]
-
-    return copy_where
-
-
-@wp.kernel
-def _begin_attempt(a: StepArrays):
-    a.status[STATUS_ATTEMPTS] = a.status[STATUS_ATTEMPTS] + 1
+@wp.func
+def _open_attempt(a: StepArrays):
+    """Clear what the monitor writes and open the loop of the present level."""
     level = a.status[STATUS_LEVEL]
+    a.status[STATUS_ATTEMPTS] = a.status[STATUS_ATTEMPTS] + 1
     a.status[STATUS_REMAINING] = (a.fewest // 2) << level
+    a.status[STATUS_SUBSTEPS] = 0
+    a.flags[FLAG_ATTEMPT] = 1
     a.flags[FLAG_FORCES] = 1
     for k in range(LEVELS):
         a.flags[FLAG_LEVEL + k] = wp.where(k == level, 1, 0)
@@ -142,29 +147,35 @@ def _begin_attempt(a: StepArrays):
 
 
 @wp.kernel
-def _mark(a: StepArrays, stage: int):
-    time = now()
-    a.ticks[stage] = a.ticks[stage] + time - a.ticks[STAGES]
-    a.ticks[STAGES] = time
+def _begin_step(a: StepArrays, copies: StateCopies):
+    if a.status[STATUS_HALT] == RUNNING:
+        _copy_chunk(wp.tid(), copies, copies.own, copies.saved)
+        if wp.tid() == 0:
+            _open_attempt(a)
 
 
 @wp.kernel
-def _watch_finite(a: StepArrays, half: int, body_q_in: wp.array[wp.transform], body_qd_in: wp.array[wp.spatial_vector]):
-    body = wp.tid()
-    total = wp.abs(body_q_in[body][0])
-    for k in range(1, 7):
-        total += wp.abs(body_q_in[body][k])
-    for k in range(6):
-        total += wp.abs(body_qd_in[body][k])
-    if not wp.isfinite(total):
-        pair = ((a.fewest // 2) << a.status[STATUS_LEVEL]) - a.status[STATUS_REMAINING]
-        wp.atomic_min(a.counts, monitor.COUNT_BAD_BODY, (2 * pair + half) * body_q_in.shape[0] + body)
+def _restore(a: StepArrays, copies: StateCopies):
+    if a.flags[FLAG_REJECTED] != 0:
+        _copy_chunk(wp.tid(), copies, copies.saved, copies.own)
+
+
+@wp.kernel
+def _set_status(a: StepArrays, index: int, value: int):
+    a.status[index] = value
+
+
+@wp.kernel
+def _forget_contacts(a: StepArrays):
+    a.flags[FLAG_CONTACTS] = 1
 
 
 @wp.kernel
 def _end_pair(a: StepArrays, level: int):
     remaining = a.status[STATUS_REMAINING] - 1
     a.status[STATUS_REMAINING] = remaining
+    a.status[STATUS_SUBSTEPS] = a.status[STATUS_SUBSTEPS] + 2
+    a.flags[FLAG_CONTACTS] = 1
     a.flags[FLAG_LEVEL + level] = wp.where(remaining > 0, 1, 0)
     # when forces are due, the pairs that remain are a multiple of those that share them
     a.flags[FLAG_FORCES] = wp.where((2 * remaining) % wp.max(a.status[STATUS_SHARING], 2) == 0, 1, 0)
@@ -206,6 +217,7 @@ def _log_step(a: StepArrays, level: int):
 def _judge(a: StepArrays):
     a.flags[FLAG_ATTEMPT] = 0
     a.flags[FLAG_REJECTED] = 1
+    a.flags[FLAG_CONTACTS] = 1
     for k in range(a.capacities.shape[0]):
         if a.counts[monitor.COUNT_CAPACITIES + k] > a.capacities[k]:
             a.status[STATUS_HALT] = OVERFLOW
@@ -220,21 +232,24 @@ def _judge(a: StepArrays):
     if (a.peaks[monitor.PEAK_TRAVEL] > a.travel or (pressed and helped) or lost) and level + 1 < LEVELS:
         a.status[STATUS_LEVEL] = level + 1
         a.status[STATUS_SHARING] = _sharing(level + 1, long_travel, level, a.shared_travel)
-        a.flags[FLAG_ATTEMPT] = 1
         if pressed:
             a.last_overlap[1] = overlap
+        _open_attempt(a)
         return
     if lost:
         a.status[STATUS_HALT] = NOT_FINITE
         return
 
     a.flags[FLAG_REJECTED] = 0
+    a.flags[FLAG_CONTACTS] = 0
     a.last_overlap[0] = overlap
     a.last_overlap[1] = wp.inf
     _log_step(a, level)
     calm = overlap < 0.5 * a.overlap or (pressed and not helped)
     next_level = int(level)
-    if calm and long_travel < a.ease * a.travel and level > 0:
+    if a.peaks[monitor.PEAK_NEXT_TRAVEL] > a.travel:
+        next_level = wp.min(level + 1, LEVELS - 1)
+    elif calm and long_travel < a.ease * a.travel and level > 0:
         next_level = level - 1
     a.status[STATUS_LEVEL] = next_level
     a.status[STATUS_SHARING] = _sharing(next_level, long_travel, level, a.shared_travel)
@@ -257,6 +272,7 @@ class StepMachine:
         arrays: Its arrays and limits.
         attempting: Condition: the step is to be attempted (again).
         forces_due: Condition: the next substeps need forces of their own.
+        contacts_due: Condition: the contacts known are not those of the present state.
         sharing: Number of substeps that share their forces, shape [1].
         remaining: Condition for each level: substeps of it remain to be done.
     """
@@ -282,10 +298,27 @@ class StepMachine:
         a.capacities = zeros(capacities, wp.int32)
         for name, limit in limits.items():
             setattr(a, name, limit)
-        self.attempting, self.forces_due, *self.remaining = (
-            a.flags[k : k + 1] for k in (FLAG_ATTEMPT, FLAG_FORCES, *range(FLAG_LEVEL, FLAG_LEVEL + LEVELS))
+        self.attempting, _, self.forces_due, self.contacts_due, *self.remaining = (
+            a.flags[k : k + 1] for k in range(FLAGS)
         )
         self.sharing = a.status[STATUS_SHARING : STATUS_SHARING + 1]
+        self.forget_contacts()
+
+    def watched(self, thickness, reach) -> monitor.Watched:
+        """Return what the monitor is to watch.
+
+        Args:
+            thickness, reach: Sizes of the bodies [m], see ``monitor``, shape [body_count].
+        """
+        a, watched = self.arrays, monitor.Watched()
+        watched.thickness, watched.reach = (
+            wp.array(values, dtype=float, device=a.status.device) for values in (thickness, reach)
+        )
+        watched.fills = wp.zeros(len(a.capacities), dtype=wp.uint64, device=a.status.device)
+        watched.level = a.status[STATUS_LEVEL : STATUS_LEVEL + 1]
+        watched.substeps = a.status[STATUS_SUBSTEPS : STATUS_SUBSTEPS + 1]
+        watched.ticks, watched.peaks, watched.counts = a.ticks, a.peaks, a.counts
+        return watched
 
     def _launch(self, kernel, *inputs, dim: int = 1) -> None:
         wp.launch(kernel, dim=dim, inputs=[self.arrays, *inputs], device=self.arrays.status.device)
@@ -294,33 +327,35 @@ class StepMachine:
         """Change one of the ``STATUS_*`` entries, for the host."""
         self._launch(_set_status, index, value)
 
-    def begin_step(self) -> None:
-        """Let a step be attempted, unless stepping is halted."""
-        self._launch(_begin_step)
+    def forget_contacts(self) -> None:
+        """Have contacts found anew before the next substep: the state, or what finds them, may have changed."""
+        self._launch(_forget_contacts)
 
-    def copy_where(self, flag: int, source, target) -> None:
-        """Copy an array if a flag is set."""
-        inputs = [self.arrays.flags, flag, source]
-        wp.launch(_copy_kernel(source.dtype), len(source), inputs=inputs, outputs=[target], device=source.device)
-
-    def begin_attempt(self) -> None:
-        """Clear what the monitor writes and open the loop of the present level."""
-        self._launch(_begin_attempt)
-
-    def mark(self, stage: int) -> None:
-        """Count the time since the last mark, or since the attempt began, as spent in ``stage``."""
-        self._launch(_mark, stage)
-
-    def watch_finite(self, half: int, state) -> None:
-        """Note the first body whose pose or velocity is not finite: magnets pass that to all others within a substep.
-
-        ``COUNT_BAD_BODY`` is the number of the substep times that of the bodies, plus the lowest such body in it.
+    def keep(self, state: list, saved: list) -> None:
+        """Say which arrays make up a state, and which their copies.
 
         Args:
-            half: Which substep of a pair begins with ``state``, 0 or 1.
-            state: The state.
+            state: Contiguous arrays.
+            saved: Arrays like them.
         """
-        self._launch(_watch_finite, half, state.body_q, state.body_qd, dim=len(state.body_q))
+        device = self.arrays.status.device
+        sizes = np.array([one.size * wp.types.type_size_in_bytes(one.dtype) for one in state], np.int32)
+        ends = np.cumsum(sizes // 4, dtype=np.int32)
+        self._kept = state, saved  # alive: kernels know addresses alone
+        self._chunks = max(1, -(-int(ends[-1]) // _CHUNK))
+        self._copies = copies = StateCopies()
+        copies.own, copies.saved = (
+            wp.array(np.array([one.ptr for one in arrays], np.uint64), device=device) for arrays in (state, saved)
+        )
+        copies.sizes, copies.ends = (wp.array(values, device=device) for values in (sizes, ends))
+
+    def begin_step(self) -> None:
+        """Save the state and let a step be attempted, unless stepping is halted."""
+        self._launch(_begin_step, self._copies, dim=self._chunks)
+
+    def restore(self) -> None:
+        """Take the state back to where the step began if the attempt was rejected."""
+        self._launch(_restore, self._copies, dim=self._chunks)
 
     def end_pair(self, level: int) -> None:
         """Count two substeps of ``level`` as done."""

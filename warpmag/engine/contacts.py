@@ -16,8 +16,8 @@ import warp as wp
 from warpmag.engine.broad_phase import NeighborBroadPhase
 from warpmag.engine.xpbd import PileXPBD
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, watch_capacity, watch_contacts, watch_flags
-from warpmag.kernels.rigid.newton_views import view_contacts
+from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, Watched, watch, watch_flags
+from warpmag.kernels.rigid.newton_views import view_bodies, view_contacts
 from warpmag.magnets import check_token
 
 _NEWTON_GAP = 0.1
@@ -284,20 +284,25 @@ class RigidSolver:
         """Advance by ``dt`` [s] with the contacts of the last :meth:`collide`; capturable in a graph."""
         self._solver.step(state_in, state_out, None, self.contacts, dt)
 
-    def watch(self, state: newton.State, thickness: wp.array, overlap_threshold: float, peaks, counts) -> None:
+    def fills(self) -> np.ndarray:
+        """Return the addresses of the fills of all buffers, 0 where these are flags."""
+        return np.array([0 if one.fill.dtype is wp.bool else one.fill.ptr for one in self.buffers], np.uint64)
+
+    def watch(self, watched: Watched, state: newton.State, *, substep: int, longest: float, threshold: float) -> None:
         """Report to the monitor the contacts at ``state`` and how full each buffer is; capturable in a graph.
 
         Args:
+            watched: What is watched; its ``fills`` are those of this solver.
             state: The state that was collided.
-            thickness: Thickness of each body [m], infinite for bodies that forces do not move.
-            overlap_threshold: Overlap from which a contact is counted, over the thickness of the thinner body.
-            peaks: Maxima, see ``kernels.rigid.monitor``.
-            counts: Counts, see ``kernels.rigid.monitor``.
+            substep: Substeps since the monitor counted them, or its ``NEXT``.
+            longest: Length of the substeps of the first level [s].
+            threshold: Overlap from which a contact is counted, over the thickness of the thinner body.
         """
-        watch_contacts(self._contact_view, state.body_q, thickness, overlap_threshold, self.overlaps, peaks, counts)
+        bodies = view_bodies(self._model, state)
+        watch(watched, self._contact_view, bodies, self.overlaps, substep=substep, longest=longest, threshold=threshold)
         for index, buffer in enumerate(self.buffers):
-            watch = watch_flags if buffer.fill.dtype is wp.bool else watch_capacity
-            watch(buffer.fill, COUNT_CAPACITIES + index, counts)
+            if buffer.fill.dtype is wp.bool:
+                watch_flags(buffer.fill, COUNT_CAPACITIES + index, watched.counts)
 
     def grow(self, fills: np.ndarray) -> bool:
         """Enlarge the buffers that overflowed; contacts and graphs are void afterwards.

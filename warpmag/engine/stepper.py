@@ -29,9 +29,9 @@ from warpmag.kernels.rigid.bodies import predict_poses
 from warpmag.kernels.rigid.newton_views import view_bodies
 
 TRAVEL_LIMIT = 0.25
-"""How far a body may move in a substep, in parts of its thickness, by its velocity and the forces on it."""
-_SHARED_TRAVEL_LIMIT = 1.0
-"""How far a body may move, in parts of its thickness, while more than two substeps share their forces."""
+"""How far a body may glide along another in a substep, in parts of its thickness, see ``kernels.rigid.monitor``."""
+_SHARED_TRAVEL_LIMIT = 0.5
+"""The same while more than two substeps share their forces: a ball that flies alone moves two radii meanwhile."""
 OVERLAP_LIMIT = 0.008
 """How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
 _EASE = 0.8
@@ -40,8 +40,6 @@ _FUTILE = 0.8
 """Substeps of half the length that leave more than this part of a penetration do not press less, however short."""
 _RECORDS = 64
 """Steps that may be done before the host looks; on a CPU, which it waits for anyway, it looks after each."""
-
-INDUCTION, FORCE, RIGID = range(stepping.STAGES)
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class StepReport:
         attempts: How often it was done, 1 if the first attempt held.
         capped: Whether a body moved farther in a substep than allowed, with the shortest substeps there are.
         regrown: Whether buffers had to grow.
-        travel: Farthest predicted motion in a substep over the thickness of the body.
+        travel: Farthest motion in a substep that tells, over the thickness of the body, see ``kernels.rigid.monitor``.
         speed: Highest speed of a body [m/s].
         overlap: Deepest penetration over the thickness of the thinner body.
         depth: Deepest penetration [m].
@@ -82,7 +80,6 @@ class Stepper:
     """Steps one model with its magnets.
 
     Attributes:
-        state: The present state, once :meth:`look` has been called.
         steps: Steps asked for so far.
         capture_failure: Why a step could not be captured in a graph; empty if it could, or was not tried.
     """
@@ -114,10 +111,9 @@ class Stepper:
         self._step = step
         # Even, so that a step ends in the state that it began in.
         self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
-        self.state, self._other, self._saved = model.state(), model.state(), model.state()
+        self._longest = step / self._fewest
+        self._state, self._other, self._saved = model.state(), model.state(), model.state()
         self._shared = model.state()  # between the poses that some substeps start from, and the forces there
-        self._thickness = wp.array(sizes.thickness, dtype=float, device=self._device)
-        self._reach = wp.array(sizes.reach, dtype=float, device=self._device)
         self._machine = stepping.StepMachine(
             _RECORDS,
             len(solver.buffers),
@@ -129,7 +125,9 @@ class Stepper:
             futile=_FUTILE,
             fewest=self._fewest,
         )
+        self._machine.keep(_arrays(self._state), _arrays(self._saved))
         self._arrays = self._machine.arrays
+        self._watched = self._machine.watched(sizes.thickness, sizes.reach)
         self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
         if self._device.is_cuda:
             self._mirrors = {
@@ -146,11 +144,19 @@ class Stepper:
     def _prepare(self) -> None:
         """Fit everything to the solver's buffers, whose number does not change."""
         self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
+        self._watched.fills.assign(self._solver.fills())
+        self._machine.forget_contacts()
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
     # What the host does
     # -----------------------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> newton.State:
+        """The present state, once :meth:`look` has been called; it may be changed."""
+        self._machine.forget_contacts()
+        return self._state
 
     @property
     def due(self) -> bool:
@@ -280,7 +286,7 @@ class Stepper:
     def _carried(self) -> dict[str, wp.array]:
         """Return the arrays that a step hands on to the next one, by name."""
         machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
-        parts = {"state": dict(enumerate(_arrays(self.state))), "machine": machine}
+        parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
         parts |= {"magnetics": self._magnetics.system.carried(), "solver": self._solver.carried()}
         return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
@@ -295,13 +301,15 @@ class Stepper:
         while True:
             a.peaks.zero_()
             a.counts.zero_()
-            self._find_contacts(self.state, 0.0, overlap_threshold)
+            self._solver.collide(self._state, 0.0)
+            self._solver.watch(self._watched, self._state, substep=0, longest=0.0, threshold=overlap_threshold)
             if not self._solver.grow(self._fills()):
                 break
             self._prepare()
         peaks, counts = self._read("peaks"), self._read("counts")
         overlap = float(peaks[monitor.PEAK_OVERLAP])
         a.last_overlap.assign(np.array([overlap, math.inf], np.float32))
+        self._machine.forget_contacts()
         return overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -310,59 +318,55 @@ class Stepper:
 
     def _run_step(self) -> None:
         self._machine.begin_step()
-        self._copy_state(stepping.FLAG_ATTEMPT, self.state, self._saved)
         wp.capture_while(self._machine.attempting, self._attempt)
 
     def _attempt(self) -> None:
         machine = self._machine
-        machine.begin_attempt()
         for level, remaining in enumerate(machine.remaining):
             wp.capture_while(remaining, self._advance_twice, level=level)
-        self._find_contacts(self.state, 0.0, 0.0)
-        machine.watch_finite(0, self.state)
-        machine.mark(RIGID)
+        self._find_first_contacts(substep=monitor.NEXT)
         machine.judge()
-        self._copy_state(stepping.FLAG_REJECTED, self._saved, self.state)
+        machine.restore()
 
     def _advance_twice(self, level: int) -> None:
-        dt = self._step / (self._fewest << level)
+        machine, dt = self._machine, self._longest / (1 << level)
+        wp.capture_if(machine.contacts_due, self._find_first_contacts, substep=0)
         if level == 1:  # two substeps are all that share
             self._share_forces(dt)
         elif level > 1:
-            wp.capture_if(self._machine.forces_due, self._share_forces, dt=dt)
-        for half, (now, then) in enumerate(((self.state, self._other), (self._other, self.state))):
-            self._machine.watch_finite(half, now)
+            wp.capture_if(machine.forces_due, self._share_forces, dt=dt)
+        for half, (now, then) in enumerate(((self._state, self._other), (self._other, self._state))):
+            if half:
+                self._find_contacts(now, dt, half)
             if level == 0:
                 self._magnetize(now)
             else:
                 wp.copy(now.body_f, self._shared.body_f)
-            bodies, peaks = view_bodies(self._model, now), self._arrays.peaks
-            monitor.watch_motion(bodies, self._model.gravity, self._thickness, self._reach, dt, peaks)
-            self._find_contacts(now, dt, 0.0)
             self._solver.step(now, then, dt)
-        self._machine.end_pair(level)
+        machine.end_pair(level)
+
+    def _find_first_contacts(self, substep: int) -> None:
+        """Find the contacts that two substeps start from.
+
+        They hold for the longest substep, so that those at the end of a step serve the next one, whatever its level.
+        """
+        self._find_contacts(self._state, self._longest, substep)
+
+    def _find_contacts(self, state: newton.State, horizon: float, substep: int) -> None:
+        self._solver.collide(state, horizon)
+        self._solver.watch(self._watched, state, substep=substep, longest=self._longest, threshold=0.0)
 
     def _share_forces(self, dt: float) -> None:
-        predict_poses(view_bodies(self._model, self.state), self._machine.sharing, dt, self._shared.body_q)
+        predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
         self._magnetize(self._shared)
 
     def _magnetize(self, state: newton.State) -> None:
-        a, machine, system = self._arrays, self._machine, self._magnetics.system
+        system = self._magnetics.system
         state.clear_forces()
-        machine.mark(RIGID)
         self._magnetics.induce(state)
-        monitor.watch_induction(system.error, system.evaluations, system.converged, a.peaks, a.counts)
-        machine.mark(INDUCTION)
+        monitor.watch_induction(self._watched, system.error, system.evaluations, system.converged)
         self._magnetics.add_forces(state)
-        machine.mark(FORCE)
-
-    def _find_contacts(self, state: newton.State, dt: float, overlap_threshold: float) -> None:
-        self._solver.collide(state, dt)
-        self._solver.watch(state, self._thickness, overlap_threshold, self._arrays.peaks, self._arrays.counts)
-
-    def _copy_state(self, flag: int, source: newton.State, target: newton.State) -> None:
-        for one, other in zip(_arrays(source), _arrays(target), strict=True):
-            self._machine.copy_where(flag, one, other)
+        monitor.launch_mark(self._watched, monitor.FORCE)
 
 
 def _clear_error(device) -> None:
