@@ -44,6 +44,9 @@ from warpmag.errors import InputError
 AUTOMATIC_COUNT = 729
 """Moments of one body at automatic spacing, at most (see the table above): 9³, a cube's."""
 
+LEAST_ACROSS = 4
+"""Cells across an inducible shape at automatic spacing, at least: a sheet, a nail."""
+
 LARGEST_COUNT = 20_000
 """Moments of one body at any spacing; a smaller spacing is refused as a mistake."""
 
@@ -58,6 +61,28 @@ Values = Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True)
+class Pieces:
+    """What one shape fills of the cells of its grid, and the moments that stand for it.
+
+    Attributes:
+        sides: Sides of a cell [m], shape [3].
+        index: Place of each piece's cell in the grid, shape [p, 3].
+        filled: Share of each subcell that the piece fills, shape [p, a, b, c].
+        piece, moment, share: Piece, moment, and the share of the piece that belongs to the moment, shape [entries].
+        position, rotation: Origin of the grid's frame in the body's [m], and rotation to it, shapes [3] and [3, 3].
+    """
+
+    sides: np.ndarray
+    index: np.ndarray
+    filled: np.ndarray
+    piece: np.ndarray
+    moment: np.ndarray
+    share: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+
+
+@dataclass(frozen=True)
 class Lattice:
     """Moments that stand for one solid body.
 
@@ -65,11 +90,13 @@ class Lattice:
         positions: Positions of the moments [m], body frame, shape [n, 3].
         volumes: Volumes of the moments [m³], shape [n]; their sum is the volume of the body.
         owners: Index of the shape that each moment belongs to, non-decreasing, shape [n].
+        pieces: The parts of cells that they stand for, of each shape that has moments; none of a ball.
     """
 
     positions: np.ndarray
     volumes: np.ndarray
     owners: np.ndarray
+    pieces: tuple[Pieces, ...] = ()
 
     @property
     def radii(self) -> np.ndarray:
@@ -220,13 +247,14 @@ def ball(radius: float) -> Lattice:
     return Lattice(np.zeros((1, 3)), np.array([4.0 / 3.0 * np.pi * r**3]), np.zeros(1, int))
 
 
-def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
+def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1) -> Lattice:
     """Fill a body with moments.
 
     Args:
         solids: The shapes of one body, posed in its frame. Where they overlap, the earlier one fills the place.
         spacing: Distance between moments [m]; 0 chooses one that needs about, and at most,
             :data:`AUTOMATIC_COUNT` moments. A spacing larger than a shape gives that shape one moment.
+        across: Cells across a shape at automatic spacing, at least; they are as much flatter where that is more.
 
     Returns:
         The lattice. Its volume is exact if no two shapes overlap, else known to the fine test grid, about 1 %.
@@ -239,31 +267,41 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
     if spacing > 0.0:
         if sum(np.prod((p.upper - p.lower) / spacing) for p in parts) > 4.0 * LARGEST_COUNT:
             raise InputError(f"spacing: {spacing} m needs more than {LARGEST_COUNT} moments for one body")
-        return _fill(parts, spacing)
+        return _fill(parts, spacing, 1)
     spacing = (sum(p.volume for p in parts) / AUTOMATIC_COUNT) ** (1.0 / 3.0)
-    lattice = _fill(parts, spacing)
+    lattice = _fill(parts, spacing, across)
     while len(lattice.volumes) > AUTOMATIC_COUNT:
         spacing *= max(1.02, (len(lattice.volumes) / AUTOMATIC_COUNT) ** (1.0 / 3.0))
-        lattice = _fill(parts, spacing)
+        lattice = _fill(parts, spacing, across)
     return lattice
 
 
-def _fill(parts: Sequence[Solid], spacing: float) -> Lattice:
-    filled = [_fill_part(part, parts[:k], spacing) for k, part in enumerate(parts)]
-    owners = np.repeat(np.arange(len(parts)), [len(volumes) for _, volumes in filled])
-    return Lattice(np.concatenate([p for p, _ in filled]), np.concatenate([v for _, v in filled]), owners)
+def _fill(parts: Sequence[Solid], spacing: float, across: int) -> Lattice:
+    filled = [_fill_part(part, parts[:k], spacing, across) for k, part in enumerate(parts)]
+    counts = [len(one.volumes) for one in filled]
+    pieces, first = [], 0
+    for one, count in zip(filled, counts, strict=True):
+        pieces += [replace(part, moment=part.moment + first) for part in one.pieces]
+        first += count
+    return Lattice(
+        np.concatenate([one.positions for one in filled]),
+        np.concatenate([one.volumes for one in filled]),
+        np.repeat(np.arange(len(parts)), counts),
+        tuple(pieces),
+    )
 
 
-def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [m], body frame, and volumes [m³] of the moments of what ``part`` adds to the ``earlier`` ones."""
+def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float, across: int) -> Lattice:
+    """Moments, in the body's frame, of what ``part`` adds to the ``earlier`` ones."""
     sides = part.upper - part.lower
-    counts = np.maximum(np.rint(sides / spacing).astype(int), 1)
+    counts = np.maximum(np.rint(sides / spacing).astype(int), across)
     cells = part.lower + (_grid(counts) + 0.5) * (sides / counts)
     splits = np.maximum(np.ceil(_FINE_POINTS / counts).astype(int), 3)
+    splits = np.where(splits > 8, -(-splits // 8) * 8, splits)  # which demagnetizing tensors join to 8
     offsets = ((_grid(splits) + 0.5) / splits - 0.5) * (sides / counts)
     others = [other for other in earlier if _boxes_meet(part, other)]
 
-    hits, sums, whole = np.empty(len(cells)), np.empty((len(cells), 3)), 0.0
+    hits, sums, whole = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
     step = max(1, _CHUNK // len(offsets))
     for start in range(0, len(cells), step):
         chunk = cells[start : start + step]
@@ -272,28 +310,34 @@ def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float) -> tuple[n
         whole += free.sum()
         for other in others:
             free[free] = ~other.contains(part.to_body(points[free]))
-        free = free.reshape(len(chunk), -1).astype(float)
-        hits[start : start + step] = free.sum(axis=1)
-        sums[start : start + step] = hits[start : start + step, None] * chunk + free @ offsets
+        free = hits[start : start + step] = free.reshape(len(chunk), -1)
+        sums[start : start + step] = free.sum(axis=1)[:, None] * chunk + free @ offsets
     if whole == 0.0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
-    if not hits.any():
-        return np.empty((0, 3)), np.empty(0)
+    held = hits.any(axis=1)
+    if not held.any():
+        return Lattice(np.empty((0, 3)), np.empty(0), np.empty(0, int))
 
-    positions, weights = _joined(hits, sums)
-    if hits.sum() == whole:  # nothing taken away: the exact centroid is known
+    hits, counted = hits[held], hits[held].sum(axis=1).astype(float)
+    positions, weights, shares = _joined(counted, sums[held])
+    if counted.sum() == whole:  # nothing taken away: the exact centroid is known
         positions += part.centroid - weights @ positions / weights.sum()
-    return part.to_body(positions), weights * (part.volume / whole)
+    filled = hits.reshape(-1, *splits).astype(float)
+    pieces = Pieces(sides / counts, _grid(counts)[held], filled, *shares, part.position, part.rotation)
+    volumes = weights * (part.volume / whole)
+    return Lattice(part.to_body(positions), volumes, np.zeros(len(volumes), int), (pieces,))
 
 
-def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids and hit counts of the cells, those filled by less than half joined with their nearest neighbours."""
-    held = hits > 0
-    hits, sums = hits[held], sums[held]
+def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple]:
+    """Centroids and hit counts of the cells, those filled by less than half joined with their nearest neighbours.
+
+    Also returned are which cell is joined with which, and the share of it.
+    """
     centroids = sums / hits[:, None]
     full = hits >= 0.5 * hits.max()
     weights, moments = hits[full], sums[full]
     scattered = np.flatnonzero(~full)
+    joined = [(np.flatnonzero(full), np.arange(len(weights)), np.ones(len(weights)))]
     step = max(1, _CHUNK // len(weights))
     for start in range(0, len(scattered), step):
         rows = scattered[start : start + step]
@@ -303,7 +347,9 @@ def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         shares /= shares.sum(axis=1, keepdims=True)
         weights = weights + hits[rows] @ shares
         moments = moments + shares.T @ sums[rows]
-    return moments / weights[:, None], weights
+        given, taker = np.nonzero(shares)
+        joined.append((rows[given], taker, shares[given, taker]))
+    return moments / weights[:, None], weights, tuple(np.concatenate(one) for one in zip(*joined, strict=True))
 
 
 def _boxes_meet(a: Solid, b: Solid) -> bool:
