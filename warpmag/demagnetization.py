@@ -11,22 +11,25 @@ lies inside counts: cells are resolved by a grid of subcells, and their tensors 
 bodies right: of whole cells, which leave steps, a sphere takes 10 % too much however fine they are.
 
 The sums over all pairs already give each pair of cells as two balls (``kernels/pairs/pair_law.py``). A coupling is what
-is to be added to that: for cells nearer than :data:`REACH` the exact tensor less that of the balls, and for a cell itself
-less the 1/3 that the magnetization law of a ball contains.
+is to be added to that: for cells nearer than :data:`EXACT_REACH` the exact tensor less that of the balls, and for a
+cell itself less the 1/3 that the magnetization law of a ball contains.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from warpmag.lattice import Lattice, Pieces, _grid
+from warpmag.lattice import Lattice, Pieces, grid
 from warpmag.oracle import radial_factors
 
-REACH = 3.0
+EXACT_REACH = 3.0
 """Distance up to which two cells of a body are exact, in longest sides of its cells (see ``tests/test_cells.py``)."""
 
 _SUBCELLS = 8
 """Subcells that resolve a cell which the surface cuts, along each axis, at most."""
+
+_PLACES = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+"""Rows and columns of the six numbers of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
 
 _BATCH = 1 << 22
 """Numbers in a temporary array (tens of MB)."""
@@ -64,7 +67,14 @@ def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
     weights = (-1.0, 2.0, -1.0)
     for k, weight in np.ndenumerate(np.multiply.outer(np.multiply.outer(weights, weights), weights)):
         x, y, z = (at + (np.array(k) - 1) * unit).T
-        parts = _diagonal(x, y, z), _diagonal(y, x, z), _diagonal(z, y, x), _mixed(x, y, z), _mixed(x, z, y), _mixed(y, z, x)
+        parts = (
+            _diagonal(x, y, z),
+            _diagonal(y, x, z),
+            _diagonal(z, y, x),
+            _mixed(x, y, z),
+            _mixed(x, z, y),
+            _mixed(y, z, x),
+        )
         total += weight * np.stack(parts, axis=1)
     total[:, 3:] *= signs[:, [0, 0, 1]] * signs[:, [1, 2, 2]]
     return total / (4.0 * np.pi * unit.prod())
@@ -106,12 +116,11 @@ def _arctan(a, b):
     return np.where(b != 0.0, np.arctan(a / np.where(b != 0.0, b, 1.0)), 0.0)
 
 
-def coupling(lattice: Lattice, radii: np.ndarray, reach: float = REACH) -> Coupling:
+def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) -> Coupling:
     """What the pair sums lack between the moments of one body.
 
     Args:
-        lattice: Its moments with their cells. Moments of different shapes, and those without cells, are left to the pair
-            sums.
+        lattice: Its moments with their cells. Moments of different shapes are left to the pair sums.
         radii: Radii of the balls that the pair sums take them for [m], shape [n].
         reach: Distance up to which pairs are exact, in longest sides of the cells.
     """
@@ -132,7 +141,7 @@ def _pair_law(r, a, b, same):
     """H = T m of the pair sums, in six numbers [1/m³]; of a moment itself −M/3, which the curve of a ball contains."""
     g1, g2, _ = radial_factors(np.linalg.norm(r, axis=1), a, b)
     g1, g2 = np.where(same, -1.0 / a**3, g1), np.where(same, 0.0, g2)
-    products = r[:, [0, 1, 2, 0, 0, 1]] * r[:, [0, 1, 2, 1, 2, 2]]
+    products = r[:, _PLACES[0]] * r[:, _PLACES[1]]
     return (g1[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) + g2[:, None] * products) / (4.0 * np.pi)
 
 
@@ -183,18 +192,47 @@ def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     result = np.empty((len(p), 6))
     offsets, which = np.unique(apart[whole], axis=0, return_inverse=True)
     result[whole] = cuboid_tensors(offsets, part.sides)[which.reshape(-1)]
-    # cells that touch have to be those of the solid to their surface; of others it matters how much is where
-    for rows, filled in ((near, _sharp(_coarser(part.filled, _SUBCELLS))), (far, _coarser(part.filled, 2))):
-        if len(rows):
-            result[rows] = _cut_tensors(part.sides, filled, p[rows], q[rows], apart[rows])
+    if len(near):
+        filled = _sharp(_coarser(part.filled, _SUBCELLS))
+        result[near] = _cut_tensors(part.sides, filled, p[near], q[near], apart[near])
+    if len(far):
+        result[far] = _expanded_tensors(part, p[far], q[far])
     return result
+
+
+def _expanded_tensors(part: Pieces, p, q) -> np.ndarray:
+    """The same for pieces that do not touch: dipoles at the centroids, and what their second moments add."""
+    split = np.array(part.filled.shape[1:])
+    points, size = (grid(split) + 0.5) / split * part.sides, part.sides / split
+    weights = part.filled.reshape(len(part.filled), -1) / split.prod()
+    volume = weights.sum(axis=1)
+    centre = weights @ points / volume[:, None]
+    spread = np.einsum("pa,ak,al->pkl", weights, points, points) / volume[:, None, None]
+    spread += np.diag(size**2 / 12.0) - centre[:, :, None] * centre[:, None, :]
+    r = (part.index[p] - part.index[q]) * part.sides + centre[p] - centre[q]
+    s, one = spread[p] + spread[q], np.eye(3)
+    d = np.linalg.norm(r, axis=1)[:, None, None]
+    turned = np.einsum("nkl,nl->nk", s, r)
+    along, trace = np.einsum("nk,nk->n", turned, r)[:, None, None], np.trace(s, axis1=1, axis2=2)[:, None, None]
+    rr, rs = r[:, :, None] * r[:, None, :], r[:, :, None] * turned[:, None, :]
+    tensor = (
+        one / d**3
+        - 3.0 * rr / d**5
+        - 0.5
+        * (
+            105.0 * along * rr / d**9
+            - 15.0 * (along * one + trace * rr + 2.0 * (rs + np.swapaxes(rs, 1, 2))) / d**7
+            + 3.0 * (trace * one + 2.0 * s) / d**5
+        )
+    )
+    return (tensor * (volume[p] * volume[q])[:, None, None] * part.sides.prod() / (4.0 * np.pi))[:, *_PLACES]
 
 
 def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarray:
     """The same for pieces that are cut, from the tensors of their subcells."""
     split = np.array(filled.shape[1:])
-    table = cuboid_tensors(_grid(reach := (np.abs(apart).max(axis=0) + 1) * split), sides / split).reshape(*reach, 6)
-    between = _grid(split)[:, None] - _grid(split)
+    table = cuboid_tensors(grid(reach := (np.abs(apart).max(axis=0) + 1) * split), sides / split).reshape(*reach, 6)
+    between = grid(split)[:, None] - grid(split)
     flat = filled.reshape(len(filled), -1)
     result = np.empty((len(p), 6))
     offsets, which = np.unique(apart, axis=0, return_inverse=True)
@@ -219,19 +257,17 @@ def _sharp(filled: np.ndarray) -> np.ndarray:
 
 
 def _coarser(filled: np.ndarray, most: int) -> np.ndarray:
-    """Filled shares of fewer subcells, ``most`` along each axis, of a cell that has ``k`` times as many, or any odd."""
+    """Filled shares of fewer subcells, at most ``most`` along an axis; where there are more, that divides them."""
     for axis, size in enumerate(filled.shape[1:], start=1):
         if size > most:
-            edges = np.arange(most + 1) * size / most
-            # share of each fine subcell that lies in each coarse one
-            overlap = np.clip(np.minimum(np.arange(size) + 1, edges[1:, None]) - np.maximum(np.arange(size), edges[:-1, None]), 0, None)
-            filled = np.moveaxis(np.tensordot(overlap / (size / most), filled, axes=(1, axis)), 0, axis)
+            shape = (*filled.shape[:axis], most, size // most, *filled.shape[axis + 1 :])
+            filled = filled.reshape(shape).mean(axis=axis + 1)
     return filled
 
 
 def _turned(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Symmetric tensors in six numbers, turned."""
-    rows, columns = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+    rows, columns = _PLACES
     full = np.empty((len(six), 3, 3))
     full[:, rows, columns] = full[:, columns, rows] = six
     return (rotation @ full @ rotation.T)[:, rows, columns]

@@ -28,10 +28,8 @@ Which radius a moment's ball gets matters where another ball touches the body. B
 off (n of 12 to 8). An inducible lattice needs them, for its equilibrium to stay unique. A permanent one does not: with
 balls inscribed in the cells (:attr:`Lattice.inner_radii`) a touching ball sees the point dipoles of the table.
 
-Limit: neighbours in a lattice of such balls overlap, and the averaged law counts that overlap as demagnetizing. A
-lattice of ideally permeable balls therefore behaves like a material of susceptibility 9.5 (1/χ is a third of the
-overlap with all neighbours, 0.106), a cube of it takes a moment of 2.6 V H0 instead of 3.64 V H0. Near saturation this
-no longer matters.
+The moments of an inducible body act on each other as what they are, parts of cells (``demagnetization.py``), which
+:class:`Pieces` describe. Its cells are flatter than wide where it is thin, so that it is :data:`LEAST_ACROSS` across.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,6 +37,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from warpmag.closed_mesh import check_closed, welded, winding_number
 from warpmag.errors import InputError
 
 AUTOMATIC_COUNT = 729
@@ -54,7 +53,7 @@ _FINE_POINTS = 32
 """Test points across a shape, along each axis, at least."""
 
 _CHUNK = 1 << 18
-"""Test points, or pairs of point and triangle, evaluated at a time (some tens of MB)."""
+"""Test points evaluated at a time (some tens of MB)."""
 
 
 Values = Sequence[float] | np.ndarray
@@ -220,8 +219,8 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
         vertices: Vertices [m], shape [n, 3].
         faces: Indices of each triangle's vertices, shape [m, 3] or flat.
     """
-    points, triangles = _welded(vertices, faces)
-    _check_closed(triangles)
+    points, triangles = welded(vertices, faces)
+    check_closed(triangles)
     corners = points[triangles]
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))  # tetrahedra from there keep the digits of a far mesh
     local = corners - middle
@@ -230,7 +229,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     if abs(volume) <= 1e-9 * float((upper - lower).max()) ** 3:
         raise InputError("mesh: encloses no volume")
     centroid = middle + (parts[:, None] * local.sum(axis=1)).sum(axis=0) / (4.0 * volume)
-    winding = _winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
+    winding = winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
     solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda p: winding(p) != 0)
     turns, samples = _turns(solid, winding)
     if np.isin(turns, (0, 1)).all():
@@ -295,10 +294,10 @@ def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float, across: in
     """Moments, in the body's frame, of what ``part`` adds to the ``earlier`` ones."""
     sides = part.upper - part.lower
     counts = np.maximum(np.rint(sides / spacing).astype(int), across)
-    cells = part.lower + (_grid(counts) + 0.5) * (sides / counts)
+    cells = part.lower + (grid(counts) + 0.5) * (sides / counts)
     splits = np.maximum(np.ceil(_FINE_POINTS / counts).astype(int), 3)
     splits = np.where(splits > 8, -(-splits // 8) * 8, splits)  # which demagnetizing tensors join to 8
-    offsets = ((_grid(splits) + 0.5) / splits - 0.5) * (sides / counts)
+    offsets = ((grid(splits) + 0.5) / splits - 0.5) * (sides / counts)
     others = [other for other in earlier if _boxes_meet(part, other)]
 
     hits, sums, whole = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
@@ -323,12 +322,13 @@ def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float, across: in
     if counted.sum() == whole:  # nothing taken away: the exact centroid is known
         positions += part.centroid - weights @ positions / weights.sum()
     filled = hits.reshape(-1, *splits).astype(float)
-    pieces = Pieces(sides / counts, _grid(counts)[held], filled, *shares, part.position, part.rotation)
+    piece, moment, share = shares
+    pieces = Pieces(sides / counts, grid(counts)[held], filled, piece, moment, share, part.position, part.rotation)
     volumes = weights * (part.volume / whole)
     return Lattice(part.to_body(positions), volumes, np.zeros(len(volumes), int), (pieces,))
 
 
-def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple]:
+def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """Centroids and hit counts of the cells, those filled by less than half joined with their nearest neighbours.
 
     Also returned are which cell is joined with which, and the share of it.
@@ -359,7 +359,7 @@ def _boxes_meet(a: Solid, b: Solid) -> bool:
     return bool((np.abs(middle_a - middle_b) < reach).all())
 
 
-def _grid(counts: np.ndarray) -> np.ndarray:
+def grid(counts: np.ndarray) -> np.ndarray:
     """Index triples of a grid, shape [product of counts, 3]."""
     return np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -372,101 +372,8 @@ def _lengths(name: str, values: Values, count: int) -> np.ndarray:
     return array
 
 
-def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh, equal vertices joined, triangles that lost a corner dropped."""
-    points, triangles = np.asarray(vertices, float), np.asarray(faces)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise InputError(f"mesh: vertices must be finite and of shape [n, 3], got shape {points.shape}")
-    if triangles.size == 0 or triangles.size % 3 or triangles.dtype.kind not in "iu":
-        raise InputError("mesh: faces must be triples of indices")
-    triangles = triangles.reshape(-1, 3).astype(np.int64)
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise InputError(f"mesh: faces name a vertex outside 0 to {len(points) - 1}")
-    size = float(np.ptp(points, axis=0).max())
-    keys = np.rint((points - points.min(axis=0)) / max(1e-6 * size, np.finfo(float).tiny))  # float32 files
-    _, first, joined = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    triangles = joined.reshape(-1)[triangles]
-    a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
-    if len(triangles) == 0:
-        raise InputError("mesh: encloses no volume")
-    return points[first], triangles
-
-
-def _check_closed(triangles: np.ndarray) -> None:
-    start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
-    edges, which = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0, return_inverse=True)
-    balance = np.bincount(which.reshape(-1), np.where(start < end, 1.0, -1.0))
-    if balance.any():
-        open_edges = int(np.count_nonzero(balance))
-        raise InputError(
-            f"mesh: not closed and consistently oriented: {open_edges} of {len(edges)} edges lack their counterpart"
-        )
-
-
-def _winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Winding number of a closed mesh as a function of points, from the triangles that a ray along +z passes.
-
-    A ray through an edge or a vertex counts exactly once: the side of an edge on which a point lies is computed from
-    the edge's end points in the order of their indices, so that both of its triangles see the same answer. Triangles
-    are sorted into square columns of the xy plane, a point meets those of its own column only.
-    """
-    corners = points[triangles]
-    flat = corners[:, :, :2]
-    lower = points[:, :2].min(axis=0)
-    columns = int(np.clip(np.sqrt(len(triangles)), 1, 128))
-    width = np.maximum((points[:, :2].max(axis=0) - lower) / columns, np.finfo(float).tiny)
-    first = np.minimum(((flat.min(axis=1) - lower) / width).astype(int), columns - 1)
-    spans = np.minimum(((flat.max(axis=1) - lower) / width).astype(int), columns - 1) - first + 1
-    entries = np.repeat(np.arange(len(triangles)), spans.prod(axis=1))
-    rank = _ranks(spans.prod(axis=1))
-    column = (first[entries, 0] + rank // spans[entries, 1]) * columns + first[entries, 1] + rank % spans[entries, 1]
-    entries = entries[np.argsort(column, kind="stable")]
-    sizes = np.bincount(column, minlength=columns * columns)
-    starts = np.cumsum(sizes) - sizes
-
-    low = np.minimum(triangles, np.roll(triangles, -1, axis=1))
-    high = np.maximum(triangles, np.roll(triangles, -1, axis=1))
-    forward = triangles == low
-    origin, along = points[low, :2], points[high, :2] - points[low, :2]
-
-    def turns(p: np.ndarray) -> np.ndarray:
-        cell = ((p[:, :2] - lower) / width).astype(int)
-        cell = np.clip(cell, 0, columns - 1)
-        cell = cell[:, 0] * columns + cell[:, 1]
-        result = np.zeros(len(p), int)
-        ends = np.cumsum(sizes[cell])
-        begin = 0
-        while begin < len(p):
-            done = ends[begin - 1] if begin else 0
-            stop = max(begin + 1, int(np.searchsorted(ends, done + _CHUNK, side="right")))
-            rows = np.arange(begin, stop)
-            who = np.repeat(rows, sizes[cell[rows]])
-            t = entries[starts[cell[who]] + _ranks(sizes[cell[rows]])]
-            away = p[who, None, :2] - origin[t]
-            side = along[t, :, 0] * away[:, :, 1] - along[t, :, 1] * away[:, :, 0]
-            left = (side >= 0.0) == forward[t]
-            up, down = left.all(axis=1), ~left.any(axis=1)
-            met = np.flatnonzero(up | down)
-            opposite = np.abs(side[met][:, [1, 2, 0]])  # edge k, from corner k to k + 1, faces corner k + 2
-            total = opposite.sum(axis=1)
-            height = (opposite * corners[t[met], :, 2]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
-            above = height > p[who[met], 2]
-            sign = np.where(up[met], 1, -1) * above
-            result[begin:stop] = np.bincount(who[met] - begin, sign, minlength=stop - begin).astype(int)
-            begin = stop
-        return result
-
-    return turns
-
-
-def _ranks(counts: np.ndarray) -> np.ndarray:
-    """0 … counts[0] − 1, 0 … counts[1] − 1, and so on, in one array."""
-    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-
-
 def _turns(solid: Solid, winding: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Winding numbers at a grid of points in the bounding box, and the points."""
     counts = np.full(3, _FINE_POINTS)
-    points = solid.lower + (_grid(counts) + 0.5) * ((solid.upper - solid.lower) / counts)
+    points = solid.lower + (grid(counts) + 0.5) * ((solid.upper - solid.lower) / counts)
     return winding(points), points

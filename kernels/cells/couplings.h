@@ -1,8 +1,8 @@
-// Adds to the field at the cells of bodies what the sums over pairs lack between the cells of one body: H_i += Σ T_ij m_j
+// Adds to the field at the cells of bodies what the sums over pairs lack between cells of one body: H_i += Σ T_ij m_j
 // with tensors T_ij of the body's frame.
 //
 // Two passes: moments are turned into the frame of their body, then sums into the world. On a CPU a pass works on a
-// vector of cells, on a GPU a group of threads has one. ``Couplings`` is the struct of couplings.py; from Python: GROUP.
+// vector of cells, on a GPU a group of threads has one. Takes GROUP; ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "shared/group.h"
 #include "shared/team.h"
@@ -35,7 +35,7 @@ CUDA_CALLABLE inline Vector turned_back(const Rotation& r, Vector v) {
             a[0][2] * v.x + a[1][2] * v.y + a[2][2] * v.z};
 }
 
-// Sum over the entries of cells whose lists begin at ``row`` of the tables: those of a chunk are as long as its longest.
+// Sum over the entries of cells that stand at ``row`` of the tables: lists of a chunk are as long as its longest.
 template <class Couplings>
 CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const moments, int row) {
     const int chunk = row / CHUNK, lane = row % CHUNK;
