@@ -28,10 +28,8 @@ Which radius a moment's ball gets matters where another ball touches the body. B
 off (n of 12 to 8). An inducible lattice needs them, for its equilibrium to stay unique. A permanent one does not: with
 balls inscribed in the cells (:attr:`Lattice.inner_radii`) a touching ball sees the point dipoles of the table.
 
-Limit: neighbours in a lattice of such balls overlap, and the averaged law counts that overlap as demagnetizing. A
-lattice of ideally permeable balls therefore behaves like a material of susceptibility 9.5 (1/χ is a third of the
-overlap with all neighbours, 0.106), a cube of it takes a moment of 2.6 V H0 instead of 3.64 V H0. Near saturation this
-no longer matters.
+The moments of an inducible body act on each other as what they are, parts of cells (``demagnetization.py``), which
+:class:`Pieces` describe. Its cells are flatter than wide where it is thin, so that it is :data:`LEAST_ACROSS` across.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,10 +37,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from warpmag.closed_mesh import check_closed, welded, winding_number
 from warpmag.errors import InputError
 
 AUTOMATIC_COUNT = 729
 """Moments of one body at automatic spacing, at most (see the table above): 9³, a cube's."""
+
+LEAST_ACROSS = 4
+"""Cells across an inducible shape at automatic spacing, at least: a sheet, a nail."""
 
 LARGEST_COUNT = 20_000
 """Moments of one body at any spacing; a smaller spacing is refused as a mistake."""
@@ -51,10 +53,32 @@ _FINE_POINTS = 32
 """Test points across a shape, along each axis, at least."""
 
 _CHUNK = 1 << 18
-"""Test points, or pairs of point and triangle, evaluated at a time (some tens of MB)."""
+"""Test points evaluated at a time (some tens of MB)."""
 
 
 Values = Sequence[float] | np.ndarray
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """What one shape fills of the cells of its grid, and the moments that stand for it.
+
+    Attributes:
+        sides: Sides of a cell [m], shape [3].
+        index: Place of each piece's cell in the grid, shape [p, 3].
+        filled: Share of each subcell that the piece fills, shape [p, a, b, c].
+        piece, moment, share: Piece, moment, and the share of the piece that belongs to the moment, shape [entries].
+        position, rotation: Origin of the grid's frame in the body's [m], and rotation to it, shapes [3] and [3, 3].
+    """
+
+    sides: np.ndarray
+    index: np.ndarray
+    filled: np.ndarray
+    piece: np.ndarray
+    moment: np.ndarray
+    share: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -65,11 +89,13 @@ class Lattice:
         positions: Positions of the moments [m], body frame, shape [n, 3].
         volumes: Volumes of the moments [m³], shape [n]; their sum is the volume of the body.
         owners: Index of the shape that each moment belongs to, non-decreasing, shape [n].
+        pieces: The parts of cells that they stand for, of each shape that has moments; none of a ball.
     """
 
     positions: np.ndarray
     volumes: np.ndarray
     owners: np.ndarray
+    pieces: tuple[Pieces, ...] = ()
 
     @property
     def radii(self) -> np.ndarray:
@@ -193,8 +219,8 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
         vertices: Vertices [m], shape [n, 3].
         faces: Indices of each triangle's vertices, shape [m, 3] or flat.
     """
-    points, triangles = _welded(vertices, faces)
-    _check_closed(triangles)
+    points, triangles = welded(vertices, faces)
+    check_closed(triangles)
     corners = points[triangles]
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))  # tetrahedra from there keep the digits of a far mesh
     local = corners - middle
@@ -203,7 +229,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     if abs(volume) <= 1e-9 * float((upper - lower).max()) ** 3:
         raise InputError("mesh: encloses no volume")
     centroid = middle + (parts[:, None] * local.sum(axis=1)).sum(axis=0) / (4.0 * volume)
-    winding = _winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
+    winding = winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
     solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda p: winding(p) != 0)
     turns, samples = _turns(solid, winding)
     if np.isin(turns, (0, 1)).all():
@@ -226,13 +252,14 @@ def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
         return not sum(np.prod(box / spacing) for box in boxes) > 4.0 * LARGEST_COUNT
 
 
-def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
+def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1) -> Lattice:
     """Fill a body with moments.
 
     Args:
         solids: The shapes of one body, posed in its frame. Where they overlap, the earlier one fills the place.
         spacing: Distance between moments [m]; 0 chooses one that needs about, and at most,
             :data:`AUTOMATIC_COUNT` moments. A spacing larger than a shape gives that shape one moment.
+        across: Cells across a shape at automatic spacing, at least; they are as much flatter where that is more.
 
     Returns:
         The lattice. Its volume is exact if no two shapes overlap, else known to the fine test grid, about 1 %.
@@ -245,31 +272,41 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0) -> Lattice:
     if spacing > 0.0:
         if not fits([p.upper - p.lower for p in parts], spacing):
             raise InputError(f"spacing: {spacing} m needs more than {LARGEST_COUNT} moments for one body")
-        return _fill(parts, spacing)
+        return _fill(parts, spacing, 1)
     spacing = (sum(p.volume for p in parts) / AUTOMATIC_COUNT) ** (1.0 / 3.0)
-    lattice = _fill(parts, spacing)
+    lattice = _fill(parts, spacing, across)
     while len(lattice.volumes) > AUTOMATIC_COUNT:
         spacing *= max(1.02, (len(lattice.volumes) / AUTOMATIC_COUNT) ** (1.0 / 3.0))
-        lattice = _fill(parts, spacing)
+        lattice = _fill(parts, spacing, across)
     return lattice
 
 
-def _fill(parts: Sequence[Solid], spacing: float) -> Lattice:
-    filled = [_fill_part(part, parts[:k], spacing) for k, part in enumerate(parts)]
-    owners = np.repeat(np.arange(len(parts)), [len(volumes) for _, volumes in filled])
-    return Lattice(np.concatenate([p for p, _ in filled]), np.concatenate([v for _, v in filled]), owners)
+def _fill(parts: Sequence[Solid], spacing: float, across: int) -> Lattice:
+    filled = [_fill_part(part, parts[:k], spacing, across) for k, part in enumerate(parts)]
+    counts = [len(one.volumes) for one in filled]
+    pieces, first = [], 0
+    for one, count in zip(filled, counts, strict=True):
+        pieces += [replace(part, moment=part.moment + first) for part in one.pieces]
+        first += count
+    return Lattice(
+        np.concatenate([one.positions for one in filled]),
+        np.concatenate([one.volumes for one in filled]),
+        np.repeat(np.arange(len(parts)), counts),
+        tuple(pieces),
+    )
 
 
-def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [m], body frame, and volumes [m³] of the moments of what ``part`` adds to the ``earlier`` ones."""
+def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float, across: int) -> Lattice:
+    """Moments, in the body's frame, of what ``part`` adds to the ``earlier`` ones."""
     sides = part.upper - part.lower
-    counts = np.maximum(np.rint(sides / spacing).astype(int), 1)
-    cells = part.lower + (_grid(counts) + 0.5) * (sides / counts)
+    counts = np.maximum(np.rint(sides / spacing).astype(int), across)
+    cells = part.lower + (grid(counts) + 0.5) * (sides / counts)
     splits = np.maximum(np.ceil(_FINE_POINTS / counts).astype(int), 3)
-    offsets = ((_grid(splits) + 0.5) / splits - 0.5) * (sides / counts)
+    splits = np.where(splits > 8, -(-splits // 8) * 8, splits)  # which demagnetizing tensors join to 8
+    offsets = ((grid(splits) + 0.5) / splits - 0.5) * (sides / counts)
     others = [other for other in earlier if _boxes_meet(part, other)]
 
-    hits, sums, whole = np.empty(len(cells)), np.empty((len(cells), 3)), 0.0
+    hits, sums, whole = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
     step = max(1, _CHUNK // len(offsets))
     for start in range(0, len(cells), step):
         chunk = cells[start : start + step]
@@ -278,28 +315,35 @@ def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float) -> tuple[n
         whole += free.sum()
         for other in others:
             free[free] = ~other.contains(part.to_body(points[free]))
-        free = free.reshape(len(chunk), -1).astype(float)
-        hits[start : start + step] = free.sum(axis=1)
-        sums[start : start + step] = hits[start : start + step, None] * chunk + free @ offsets
+        free = hits[start : start + step] = free.reshape(len(chunk), -1)
+        sums[start : start + step] = free.sum(axis=1)[:, None] * chunk + free @ offsets
     if whole == 0.0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
-    if not hits.any():
-        return np.empty((0, 3)), np.empty(0)
+    held = hits.any(axis=1)
+    if not held.any():
+        return Lattice(np.empty((0, 3)), np.empty(0), np.empty(0, int))
 
-    positions, weights = _joined(hits, sums)
-    if hits.sum() == whole:  # nothing taken away: the exact centroid is known
+    hits, counted = hits[held], hits[held].sum(axis=1).astype(float)
+    positions, weights, shares = _joined(counted, sums[held])
+    if counted.sum() == whole:  # nothing taken away: the exact centroid is known
         positions += part.centroid - weights @ positions / weights.sum()
-    return part.to_body(positions), weights * (part.volume / whole)
+    filled = hits.reshape(-1, *splits).astype(float)
+    piece, moment, share = shares
+    pieces = Pieces(sides / counts, grid(counts)[held], filled, piece, moment, share, part.position, part.rotation)
+    volumes = weights * (part.volume / whole)
+    return Lattice(part.to_body(positions), volumes, np.zeros(len(volumes), int), (pieces,))
 
 
-def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids and hit counts of the cells, those filled by less than half joined with their nearest neighbours."""
-    held = hits > 0
-    hits, sums = hits[held], sums[held]
+def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """Centroids and hit counts of the cells, those filled by less than half joined with their nearest neighbours.
+
+    Also returned are which cell is joined with which, and the share of it.
+    """
     centroids = sums / hits[:, None]
     full = hits >= 0.5 * hits.max()
     weights, moments = hits[full], sums[full]
     scattered = np.flatnonzero(~full)
+    joined = [(np.flatnonzero(full), np.arange(len(weights)), np.ones(len(weights)))]
     step = max(1, _CHUNK // len(weights))
     for start in range(0, len(scattered), step):
         rows = scattered[start : start + step]
@@ -309,7 +353,9 @@ def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         shares /= shares.sum(axis=1, keepdims=True)
         weights = weights + hits[rows] @ shares
         moments = moments + shares.T @ sums[rows]
-    return moments / weights[:, None], weights
+        given, taker = np.nonzero(shares)
+        joined.append((rows[given], taker, shares[given, taker]))
+    return moments / weights[:, None], weights, tuple(np.concatenate(one) for one in zip(*joined, strict=True))
 
 
 def _boxes_meet(a: Solid, b: Solid) -> bool:
@@ -319,7 +365,7 @@ def _boxes_meet(a: Solid, b: Solid) -> bool:
     return bool((np.abs(middle_a - middle_b) < reach).all())
 
 
-def _grid(counts: np.ndarray) -> np.ndarray:
+def grid(counts: np.ndarray) -> np.ndarray:
     """Index triples of a grid, shape [product of counts, 3]."""
     return np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -332,101 +378,8 @@ def _lengths(name: str, values: Values, count: int) -> np.ndarray:
     return array
 
 
-def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh, equal vertices joined, triangles that lost a corner dropped."""
-    points, triangles = np.asarray(vertices, float), np.asarray(faces)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise InputError(f"mesh: vertices must be finite and of shape [n, 3], got shape {points.shape}")
-    if triangles.size == 0 or triangles.size % 3 or triangles.dtype.kind not in "iu":
-        raise InputError("mesh: faces must be triples of indices")
-    triangles = triangles.reshape(-1, 3).astype(np.int64)
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise InputError(f"mesh: faces name a vertex outside 0 to {len(points) - 1}")
-    size = float(np.ptp(points, axis=0).max())
-    keys = np.rint((points - points.min(axis=0)) / max(1e-6 * size, np.finfo(float).tiny))  # float32 files
-    _, first, joined = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    triangles = joined.reshape(-1)[triangles]
-    a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
-    if len(triangles) == 0:
-        raise InputError("mesh: encloses no volume")
-    return points[first], triangles
-
-
-def _check_closed(triangles: np.ndarray) -> None:
-    start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
-    edges, which = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0, return_inverse=True)
-    balance = np.bincount(which.reshape(-1), np.where(start < end, 1.0, -1.0))
-    if balance.any():
-        open_edges = int(np.count_nonzero(balance))
-        raise InputError(
-            f"mesh: not closed and consistently oriented: {open_edges} of {len(edges)} edges lack their counterpart"
-        )
-
-
-def _winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Winding number of a closed mesh as a function of points, from the triangles that a ray along +z passes.
-
-    A ray through an edge or a vertex counts exactly once: the side of an edge on which a point lies is computed from
-    the edge's end points in the order of their indices, so that both of its triangles see the same answer. Triangles
-    are sorted into square columns of the xy plane, a point meets those of its own column only.
-    """
-    corners = points[triangles]
-    flat = corners[:, :, :2]
-    lower = points[:, :2].min(axis=0)
-    columns = int(np.clip(np.sqrt(len(triangles)), 1, 128))
-    width = np.maximum((points[:, :2].max(axis=0) - lower) / columns, np.finfo(float).tiny)
-    first = np.minimum(((flat.min(axis=1) - lower) / width).astype(int), columns - 1)
-    spans = np.minimum(((flat.max(axis=1) - lower) / width).astype(int), columns - 1) - first + 1
-    entries = np.repeat(np.arange(len(triangles)), spans.prod(axis=1))
-    rank = _ranks(spans.prod(axis=1))
-    column = (first[entries, 0] + rank // spans[entries, 1]) * columns + first[entries, 1] + rank % spans[entries, 1]
-    entries = entries[np.argsort(column, kind="stable")]
-    sizes = np.bincount(column, minlength=columns * columns)
-    starts = np.cumsum(sizes) - sizes
-
-    low = np.minimum(triangles, np.roll(triangles, -1, axis=1))
-    high = np.maximum(triangles, np.roll(triangles, -1, axis=1))
-    forward = triangles == low
-    origin, along = points[low, :2], points[high, :2] - points[low, :2]
-
-    def turns(p: np.ndarray) -> np.ndarray:
-        cell = ((p[:, :2] - lower) / width).astype(int)
-        cell = np.clip(cell, 0, columns - 1)
-        cell = cell[:, 0] * columns + cell[:, 1]
-        result = np.zeros(len(p), int)
-        ends = np.cumsum(sizes[cell])
-        begin = 0
-        while begin < len(p):
-            done = ends[begin - 1] if begin else 0
-            stop = max(begin + 1, int(np.searchsorted(ends, done + _CHUNK, side="right")))
-            rows = np.arange(begin, stop)
-            who = np.repeat(rows, sizes[cell[rows]])
-            t = entries[starts[cell[who]] + _ranks(sizes[cell[rows]])]
-            away = p[who, None, :2] - origin[t]
-            side = along[t, :, 0] * away[:, :, 1] - along[t, :, 1] * away[:, :, 0]
-            left = (side >= 0.0) == forward[t]
-            up, down = left.all(axis=1), ~left.any(axis=1)
-            met = np.flatnonzero(up | down)
-            opposite = np.abs(side[met][:, [1, 2, 0]])  # edge k, from corner k to k + 1, faces corner k + 2
-            total = opposite.sum(axis=1)
-            height = (opposite * corners[t[met], :, 2]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
-            above = height > p[who[met], 2]
-            sign = np.where(up[met], 1, -1) * above
-            result[begin:stop] = np.bincount(who[met] - begin, sign, minlength=stop - begin).astype(int)
-            begin = stop
-        return result
-
-    return turns
-
-
-def _ranks(counts: np.ndarray) -> np.ndarray:
-    """0 … counts[0] − 1, 0 … counts[1] − 1, and so on, in one array."""
-    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-
-
 def _turns(solid: Solid, winding: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Winding numbers at a grid of points in the bounding box, and the points."""
     counts = np.full(3, _FINE_POINTS)
-    points = solid.lower + (_grid(counts) + 0.5) * ((solid.upper - solid.lower) / counts)
+    points = solid.lower + (grid(counts) + 0.5) * ((solid.upper - solid.lower) / counts)
     return winding(points), points

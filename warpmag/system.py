@@ -1,7 +1,7 @@
 """All magnetic moments of a simulation on one device: induction and forces, every buffer allocated once."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +19,7 @@ from warpmag.arrays import (
 )
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
+from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
 from warpmag.kernels.near_contact import near_pairs
@@ -39,7 +40,7 @@ class _Layout:
         permanent: Whether it is permanent.
         bodies: Its body.
         movable: Whether the force on it is wanted.
-        lone: Whether it is inducible and its body's only one, which is parallel to the field that turns it.
+        lone: Whether it is an inducible ball, its body's only moment, which is parallel to the field that turns it.
     """
 
     radii: np.ndarray
@@ -84,6 +85,14 @@ def _layout(radii, worlds, permanent, bodies, movable, dtype) -> _Layout:
     return _Layout(radii, worlds, permanent, bodies, movable, ~permanent & (size[body] == 1))
 
 
+def _with_cells(layout: _Layout, couplings) -> _Layout:
+    """The same layout, in which a body that has cells is no ball, even if it has only one."""
+    cells = np.zeros(len(layout.radii), bool)
+    for first, coupling in couplings:
+        cells[first : first + len(coupling.start) - 1] = True
+    return replace(layout, lone=layout.lone & ~cells)
+
+
 class MomentSystem:
     """Moments that are brought to equilibrium and feel forces, again and again.
 
@@ -113,6 +122,8 @@ class MomentSystem:
         damping: Damping α [dimensionless] of ``llg``; None means its default.
         lone_torque: Whether an inducible body of one moment gets its torque m × H, which only tells how far the
             solve is from converged: in equilibrium the two are parallel.
+        couplings: What the moments of a body lack among themselves as balls: of each body that has cells the first
+            of its moments, and the ``demagnetization.Coupling`` of all of them.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
 
@@ -120,6 +131,8 @@ class MomentSystem:
         InputError: An argument is out of range.
 
     Attributes:
+        rotations: Rotation of each body of ``couplings``, from its frame to the world's (x, y, z, w), shape [bodies];
+            written by the caller before :meth:`solve`. None without them.
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
@@ -157,6 +170,7 @@ class MomentSystem:
         step=None,
         damping=None,
         lone_torque=False,
+        couplings=(),
         dtype="float32",
         device=None,
     ):
@@ -167,7 +181,7 @@ class MomentSystem:
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         check_rtol("rtol", rtol, dtype)
         check_count("max_evaluations", max_evaluations)
-        layout = _layout(radii, worlds, permanent, bodies, movable, self.dtype)
+        layout = _with_cells(_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
         self.rtol, self.max_evaluations, self.contact_model = float(rtol), int(max_evaluations), contact_model
         self._force = force
         near = contact_model == "multipole"
@@ -175,6 +189,7 @@ class MomentSystem:
         saturation, susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
+        self._make_cells(couplings)
         self._evaluate_wrench(layout, turned)
         self._near = self._make_near_contacts(layout, turned, saturation, susceptibility, curve) if near else None
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
@@ -229,6 +244,10 @@ class MomentSystem:
         mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
         # near contacts write one more partial sum
         self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
+
+    def _make_cells(self, couplings):
+        self._cells = CellCouplings(couplings, self.moments, self.h, self.dtype) if couplings else None
+        self.rotations = self._cells.rotations if self._cells is not None else None
 
     def _evaluate_wrench(self, layout: _Layout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
@@ -332,9 +351,11 @@ class MomentSystem:
         near = self._near
         if near is None:
             self._mutual.launch()
-            return
-        near_pairs.launch_sweeps(near)
-        self._mutual.launch(wait=lambda: near_pairs.wait_for_field(near))
+        else:
+            near_pairs.launch_sweeps(near)
+            self._mutual.launch(wait=lambda: near_pairs.wait_for_field(near))
+        if self._cells is not None:
+            self._cells.launch()
 
     def _end_sweeps(self):
         """Have what is launched next wait for what near contacts do beside."""

@@ -68,6 +68,20 @@ def gather_moments(body_q, magnets: BodyMoments, positions, moments):
 
 
 @wp.kernel
+def _gather_rotations(
+    body_q_in: wp.array[wp.transform], bodies_in: wp.array[wp.int32], rotations_out: wp.array[wp.quat]
+):
+    k = wp.tid()
+    if bodies_in[k] >= 0:
+        rotations_out[k] = wp.transform_get_rotation(body_q_in[bodies_in[k]])
+
+
+def gather_rotations(body_q, bodies, rotations):
+    """Write the rotations of ``bodies``; that of one fixed in the world, −1, stays."""
+    wp.launch(_gather_rotations, len(bodies), [body_q, bodies], [rotations], device=rotations.device)
+
+
+@wp.kernel
 def _add_wrenches(
     # inputs:
     magnets: BodyMoments,

@@ -9,7 +9,7 @@ import warp as wp
 from warpmag.engine.attributes import marked_shapes
 from warpmag.engine.sampling import BodyLattice, ShapeSampler
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.bodies import BodyMoments, add_wrenches, gather_moments, sum_moments
+from warpmag.kernels.rigid.bodies import BodyMoments, add_wrenches, gather_moments, gather_rotations, sum_moments
 from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_token
 from warpmag.system import MomentSystem
 
@@ -97,6 +97,10 @@ class Magnetics:
         def spread(values, dtype=float):
             return np.repeat(np.asarray(values, dtype=dtype), counts)
 
+        first = np.cumsum(counts) - counts
+        celled = [(k, one) for k, one in zip(first, self.magnets, strict=True) if one.lattice.coupling is not None]
+        couplings = [(int(k), one.lattice.coupling) for k, one in celled]
+        self._celled = wp.array([one.body for _, one in celled], dtype=wp.int32, device=self._model.device)
         magnets = [one.magnet for one in self.magnets]
         flags = self._model.body_flags  # None in a model without bodies
         kinematic = [] if flags is None else (flags.numpy() & _KINEMATIC) != 0
@@ -117,6 +121,7 @@ class Magnetics:
             contact_model=settings.contact_model,
             rtol=settings.rtol,
             max_evaluations=max_evaluations,
+            couplings=couplings,
             device=self._model.device,
         )
 
@@ -167,6 +172,8 @@ class Magnetics:
     def induce(self, state: newton.State) -> None:
         """Bring the inducible magnets to equilibrium at the poses of ``state``, starting from where they were."""
         gather_moments(state.body_q, self._body_moments, self.system.positions, self.system.moments)
+        if self.system.rotations is not None:
+            gather_rotations(state.body_q, self._celled, self.system.rotations)
         self.system.solve()
 
     def add_forces(self, state: newton.State) -> None:

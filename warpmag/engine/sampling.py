@@ -7,6 +7,7 @@ import newton
 import numpy as np
 
 from warpmag import lattice
+from warpmag.demagnetization import Coupling, coupling
 from warpmag.errors import InputError
 
 
@@ -19,12 +20,15 @@ class BodyLattice:
         volumes: Volumes [m³], shape [n].
         radii: Radii of the balls that the moments are averaged over [m], shape [n].
         counts: Moments of each shape, in the order of the shapes.
+        coupling: What inducible moments lack among themselves as balls, as cells of the body; None of permanent ones
+            and of balls.
     """
 
     positions: np.ndarray
     volumes: np.ndarray
     radii: np.ndarray
     counts: np.ndarray
+    coupling: Coupling | None = None
 
 
 class ShapeSampler:
@@ -71,10 +75,12 @@ class ShapeSampler:
                 np.ones(len(shapes), dtype=int),
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
-        filled = lattice.fill(solids, spacing)
+        filled = lattice.fill(solids, spacing, 1 if permanent else lattice.LEAST_ACROSS)
         counts = np.bincount(filled.owners, minlength=len(solids))
-        radii = filled.inner_radii if permanent else filled.radii
-        return BodyLattice(filled.positions, filled.volumes, radii, counts)
+        if permanent:
+            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts)
+        cells = coupling(filled, filled.radii)
+        return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells)
 
     def _are_balls_apart(self, shapes: list[int]) -> bool:
         if (self._types[shapes] != newton.GeoType.SPHERE).any():

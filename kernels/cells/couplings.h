@@ -1,0 +1,90 @@
+// Adds to the field at the cells of bodies what the sums over pairs lack between cells of one body: H_i += Σ T_ij m_j
+// with tensors T_ij of the body's frame.
+//
+// Two passes: moments are turned into the frame of their body, then sums into the world. On a CPU a pass works on a
+// vector of cells, on a GPU a group of threads has one. Takes GROUP; ``Couplings`` is the struct of couplings.py.
+#pragma once
+#include "shared/group.h"
+#include "shared/team.h"
+
+namespace warpmag {
+
+constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
+
+enum CellPass { TURN, ADD }; // as in couplings.py
+
+// Rows of the rotation of a body.
+struct Rotation {
+    Real rows[3][3];
+};
+
+template <class Quaternion> CUDA_CALLABLE inline Rotation rotation_of(const Quaternion& q) {
+    const Real x = q[0], y = q[1], z = q[2], w = q[3];
+    return {{{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
+             {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
+             {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}}};
+}
+CUDA_CALLABLE inline Vector turned(const Rotation& r, Vector v) {
+    const auto& a = r.rows;
+    return {a[0][0] * v.x + a[0][1] * v.y + a[0][2] * v.z, a[1][0] * v.x + a[1][1] * v.y + a[1][2] * v.z,
+            a[2][0] * v.x + a[2][1] * v.y + a[2][2] * v.z};
+}
+CUDA_CALLABLE inline Vector turned_back(const Rotation& r, Vector v) {
+    const auto& a = r.rows;
+    return {a[0][0] * v.x + a[1][0] * v.y + a[2][0] * v.z, a[0][1] * v.x + a[1][1] * v.y + a[2][1] * v.z,
+            a[0][2] * v.x + a[1][2] * v.y + a[2][2] * v.z};
+}
+
+// Sum over the entries of cells that stand at ``row`` of the tables: lists of a chunk are as long as its longest.
+template <class Couplings>
+CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const moments, int row) {
+    const int chunk = row / CHUNK, lane = row % CHUNK;
+    const int end = c.slot_begin.data[chunk + 1];
+    const size_t pitch = c.turned.strides[0] / sizeof(Real);
+    Vector h = {0, 0, 0};
+#pragma unroll 4
+    for (int slot = c.slot_begin.data[chunk] + share(); slot < end; slot += SHARES) {
+        const int* const other = c.other.data + (size_t)slot * CHUNK + lane;
+        const Real* const t = c.tensor.data + (size_t)slot * (TENSOR * CHUNK) + lane;
+        const Index j = indices(other);
+        const Vector m = {collect(moments, j), collect(moments + pitch, j), collect(moments + 2 * pitch, j)};
+        const Number xx = numbers(t), yy = numbers(t + CHUNK), zz = numbers(t + 2 * CHUNK);
+        const Number xy = numbers(t + 3 * CHUNK), xz = numbers(t + 4 * CHUNK), yz = numbers(t + 5 * CHUNK);
+        h = sum(h, {xx * m.x + xy * m.y + xz * m.z, xy * m.x + yy * m.y + yz * m.z, xz * m.x + yz * m.y + zz * m.z});
+    }
+    return group_sums(h);
+}
+
+// Makes a pass over the cells from ``row`` on.
+template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Couplings& c, int pass, int row) {
+    const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, how many, first row of the body and of its tables
+    const int offset = row % CHUNK, left = chunk[1] - offset, held = left < 0 ? 0 : left > WIDTH ? WIDTH : left;
+    if (held == 0) return;
+    const int i = chunk[0] + offset;
+    const Rotation rotation = rotation_of(c.rotation.data[c.body.data[row / CHUNK]]);
+    Real* const own = c.turned.data + row;
+    const size_t pitch = c.turned.strides[0] / sizeof(Real);
+    if (pass == TURN) {
+        const Vector m = turned_back(rotation, vectors((const Real*)c.moments.data + 3 * (size_t)i, held));
+        if (share() != 0) return;
+        put(own, m.x);
+        put(own + pitch, m.y);
+        put(own + 2 * pitch, m.z);
+        return;
+    }
+    const Vector h = sum_entries(c, c.turned.data + chunk[2], row - chunk[2] + chunk[3]);
+    if (share() != 0) return;
+    Real* const field = (Real*)c.h.data + 3 * (size_t)i;
+    put_vectors(field, held, sum(vectors(field, held), turned(rotation, h)));
+}
+
+template <class Word, class Couplings>
+CUDA_CALLABLE inline void add_couplings(int thread, int first, int last, int threads, Word* team, const Couplings& c) {
+#if defined(__CUDA_ARCH__)
+    make_cell_pass(c, first, thread / GROUP);
+#else
+    run_passes(team, threads, first, last, CHUNK * c.chunk.shape[0], WIDTH,
+               [&](int pass, int row) { make_cell_pass(c, pass, row); });
+#endif
+}
+}

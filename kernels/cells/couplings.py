@@ -1,0 +1,134 @@
+"""Couplings between the cells of bodies, and the launches that add their field.
+
+A table belongs to a shape and serves all bodies of that shape. It has a list of entries for each cell, in chunks of
+``passes.CHUNK`` cells side by side, with as many slots as the longest list of the chunk:
+
+    slot_begin: First slot of each chunk of all tables, and the end.
+    other: The cell of its body that an entry is about, shape [slots · CHUNK].
+    tensor: T_ij [1/m³], rows xx, yy, zz, xy, xz, yz of CHUNK numbers for each slot, flat; zero where a list has ended.
+
+Bodies refer to them, in as many chunks:
+
+    chunk: First moment, how many moments, first row of the body, and first row of its table, shape [chunks].
+    body: Which body it is of, shape [chunks].
+    rotation: Rotation of each body, from its frame to the world's (x, y, z, w), shape [bodies].
+    moments: Moments [A·m²], shape [n]; those of a body follow each other.
+    turned: Moments in the frames of their bodies, shape [3, chunks · CHUNK].
+    h: Field that is added to [A/m], shape [n].
+"""
+
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.passes import CHUNK, passes_kernel
+from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.team import team, threads_for
+
+TURN, ADD = range(2)
+"""The passes, in order; as in ``couplings.h``."""
+_CELLS_PER_THREAD = 500
+"""Cells that make another thread of a CPU worth waking."""
+
+
+@cache
+def couplings_type(dtype):
+    """Type of the couplings; the module says what its arrays are."""
+    vec3, quaternion = wp.types.vector(3, dtype), wp.types.quaternion(dtype)
+
+    @wp.struct
+    class Couplings:
+        slot_begin: wp.array[int]
+        other: wp.array[int]
+        tensor: wp.array[dtype]
+        chunk: wp.array[wp.vec4i]
+        body: wp.array[int]
+        rotation: wp.array[quaternion]
+        moments: wp.array[vec3]
+        turned: wp.array2d[dtype]
+        h: wp.array[vec3]
+
+    return Couplings
+
+
+def _table(start, other, tensor):
+    """Slots of a table's chunks, and their entries: numbers of cells and tensors."""
+    counts = np.diff(start)
+    chunks = -(-len(counts) // CHUNK)
+    cell = np.repeat(np.arange(len(counts)), counts)
+    padded = np.append(counts, np.zeros(chunks * CHUNK - len(counts), int)).reshape(chunks, CHUNK)
+    slots = padded.max(axis=1, initial=0)
+    begin = np.cumsum(slots) - slots
+    slot = begin[cell // CHUNK] + np.arange(len(cell)) - np.repeat(start[:-1], counts)
+    others = np.zeros((int(slots.sum()), CHUNK), np.int32)
+    tensors = np.zeros((int(slots.sum()), 6, CHUNK))
+    others[slot, cell % CHUNK] = other
+    tensors[slot, :, cell % CHUNK] = tensor
+    return slots, others, tensors
+
+
+@cache
+def _kernel(dtype, group: int):
+    call = "warpmag::add_couplings(thread, first, last, threads, team.data, arrays);"
+    return passes_kernel(call, couplings_type(dtype), native_options("cells/couplings.h", dtype=dtype, GROUP=group))
+
+
+class CellCouplings:
+    """What one set of bodies adds to a field, again and again in the same arrays.
+
+    Args:
+        bodies: Of each body the first moment, and the coupling of its cells: ``start``, ``other`` and ``tensor``, a
+            list for each (see ``warpmag.demagnetization``). Bodies with one and the same coupling share its table.
+        moments: Moments [A·m²], Warp array, shape [n].
+        h: Field to add to [A/m], Warp array, shape [n].
+        dtype: Warp scalar type.
+
+    Attributes:
+        rotations: Rotation of each body, from its frame to the world's, shape [bodies]; written by the caller.
+        entries: Pairs of cells that one evaluation sums.
+    """
+
+    def __init__(self, bodies, moments, h, dtype):
+        """Lay out the tables on the device of the moments."""
+        self._couplings = c = couplings_type(dtype)()
+        c.moments, c.h = moments, h
+        self._lay_out(bodies, dtype, h.device)
+        self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
+        device, rows = h.device, c.turned.shape[1]
+        group, threads = group_threads(device), threads_for(rows, _CELLS_PER_THREAD)
+
+        def record(first: int, last: int):
+            inputs = [first, last + 1, threads, None if device.is_cuda else team(), c]
+            dim = group * rows if device.is_cuda else 1
+            return wp.launch(_kernel(dtype, group), dim=dim, inputs=inputs, device=device, record_cmd=True)
+
+        self._launches = [record(TURN, TURN), record(ADD, ADD)] if device.is_cuda else [record(TURN, ADD)]
+
+    def _lay_out(self, bodies, dtype, device):
+        c, found, tables, chunks, body = self._couplings, {}, [], [], []
+        for number, (first, coupling) in enumerate(bodies):
+            if id(coupling) not in found:
+                found[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
+                tables.append(_table(coupling.start, coupling.other, coupling.tensor))
+            count, row = len(coupling.start) - 1, CHUNK * len(chunks)
+            starts = range(0, count, CHUNK)
+            chunks += [(first + k, min(CHUNK, count - k), row, found[id(coupling)]) for k in starts]
+            body += [number] * len(starts)
+        slots, others, tensors = (np.concatenate(parts) for parts in zip(*tables, strict=True))
+
+        def put(values, kind):
+            return wp.array(np.ascontiguousarray(values), dtype=kind, device=device)
+
+        c.slot_begin = put(np.append(0, np.cumsum(slots)).astype(np.int32), wp.int32)
+        c.other, c.tensor = put(others.reshape(-1), wp.int32), put(tensors.reshape(-1), dtype)
+        c.chunk, c.body = put(np.array(chunks, np.int32), wp.vec4i), put(np.array(body, np.int32), wp.int32)
+        identity = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(bodies), 4))
+        c.rotation = put(identity, wp.types.quaternion(dtype))
+        c.turned = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
+
+    def launch(self):
+        """Add to the field what the couplings make of the moments."""
+        for one in self._launches:
+            one.launch()

@@ -1,0 +1,273 @@
+"""Demagnetizing tensors of the cells that a solid is divided into.
+
+A lattice (``lattice.py``) divides a solid into cells, each uniformly magnetized. Averaged over each other, they make an
+operator H_i = −Σ_j N_ij M_j that is symmetric and positive, with eigenvalues between 0 and 1: it is the true one
+restricted to such magnetizations. Ellipsoids are therefore exact up to rounding of their shape, and anything else comes
+out a little too stiff: a cube of 9³ cells and χ = ∞ takes a moment of 3.58 V H0 of 3.64 V H0.
+
+The tensor of two equal cuboids on one grid is that of Newell, Williams and Dunlop, "A generalization of the
+demagnetizing tensor for nonuniform magnetization" (1993), Eqs. 27, 28 and 32. Where a surface cuts a cell, only what
+lies inside counts: cells are resolved by a grid of subcells, and their tensors added up. That is what makes curved
+bodies right: of whole cells, which leave steps, a sphere takes 10 % too much however fine they are.
+
+The sums over all pairs already give each pair of cells as two balls (``kernels/pairs/pair_law.py``). A coupling is what
+is to be added to that: for cells nearer than :data:`EXACT_REACH` the exact tensor less that of the balls, and for a
+cell itself less the 1/3 that the magnetization law of a ball contains.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpmag.lattice import Lattice, Pieces, grid
+from warpmag.oracle import radial_factors
+
+EXACT_REACH = 3.0
+"""Distance up to which two cells of a body are exact, in longest sides of its cells (see ``tests/test_cells.py``)."""
+
+_SUBCELLS = 8
+"""Subcells that resolve a cell which the surface cuts, along each axis, at most."""
+
+_PLACES = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+"""Rows and columns of the six numbers of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
+
+_BATCH = 1 << 22
+"""Numbers in a temporary array (tens of MB)."""
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """What the pair sums lack between moments of one body, in its frame: H_i += Σ T_ij m_j.
+
+    Attributes:
+        start: First entry of each moment, and the end, shape [n + 1].
+        other: Moment j of each entry, ascending, shape [entries].
+        tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
+    """
+
+    start: np.ndarray
+    other: np.ndarray
+    tensor: np.ndarray
+
+
+def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Demagnetizing tensors of equal cuboids, one averaged over the other (Newell, Williams and Dunlop 1993).
+
+    Args:
+        offsets: From one centre to the other in sides, shape [n, 3].
+        sides: Sides of the cuboids, shape [3].
+
+    Returns:
+        N, xx, yy, zz, xy, xz, yz, of H = −N M, shape [n, 6].
+    """
+    unit = np.asarray(sides, float) / np.max(sides)
+    at = np.abs(np.asarray(offsets, float)) * unit
+    signs = np.where(np.asarray(offsets) < 0, -1.0, 1.0)
+    total = np.zeros((len(at), 6))
+    weights = (-1.0, 2.0, -1.0)
+    for k, weight in np.ndenumerate(np.multiply.outer(np.multiply.outer(weights, weights), weights)):
+        x, y, z = (at + (np.array(k) - 1) * unit).T
+        parts = (
+            _diagonal(x, y, z),
+            _diagonal(y, x, z),
+            _diagonal(z, y, x),
+            _mixed(x, y, z),
+            _mixed(x, z, y),
+            _mixed(y, z, x),
+        )
+        total += weight * np.stack(parts, axis=1)
+    total[:, 3:] *= signs[:, [0, 0, 1]] * signs[:, [1, 2, 2]]
+    return total / (4.0 * np.pi * unit.prod())
+
+
+def _diagonal(x, y, z):
+    """f of Newell, Williams and Dunlop, Eq. 27, without terms that cancel."""
+    x, y, z = np.abs(x), np.abs(y), np.abs(z)
+    r = np.sqrt(x * x + y * y + z * z)
+    return (
+        0.5 * y * (z * z - x * x) * _arsinh(y, np.hypot(x, z))
+        + 0.5 * z * (y * y - x * x) * _arsinh(z, np.hypot(x, y))
+        - x * y * z * np.arctan2(y * z, x * r)
+        + (2.0 * x * x - y * y - z * z) * r / 6.0
+    )
+
+
+def _mixed(x, y, z):
+    """g of Newell, Williams and Dunlop, Eq. 32."""
+    r = np.sqrt(x * x + y * y + z * z)
+    return (
+        x * y * z * _arsinh(z, np.hypot(x, y))
+        + y * (3.0 * z * z - y * y) / 6.0 * _arsinh(x, np.hypot(y, z))
+        + x * (3.0 * z * z - x * x) / 6.0 * _arsinh(y, np.hypot(x, z))
+        - z**3 / 6.0 * _arctan(x * y, z * r)
+        - 0.5 * z * y * y * _arctan(x * z, y * r)
+        - 0.5 * z * x * x * _arctan(y * z, x * r)
+        - x * y * r / 3.0
+    )
+
+
+def _arsinh(a, b):
+    """Inverse hyperbolic sine of a/b; what multiplies it vanishes with b."""
+    return np.where(b > 0.0, np.arcsinh(a / np.where(b > 0.0, b, 1.0)), 0.0)
+
+
+def _arctan(a, b):
+    """Inverse tangent of a/b; what multiplies it vanishes with b."""
+    return np.where(b != 0.0, np.arctan(a / np.where(b != 0.0, b, 1.0)), 0.0)
+
+
+def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) -> Coupling:
+    """What the pair sums lack between the moments of one body.
+
+    Args:
+        lattice: Its moments with their cells. Moments of different shapes are left to the pair sums.
+        radii: Radii of the balls that the pair sums take them for [m], shape [n].
+        reach: Distance up to which pairs are exact, in longest sides of the cells.
+    """
+    x, volumes = lattice.positions, lattice.volumes
+    entries, tensors = [np.empty((2, 0), int)], [np.empty((0, 6))]
+    for part in lattice.pieces:
+        (i, j), exact = _part_tensors(part, lattice, reach)
+        entries.append(np.stack([i, j]))
+        exact = -exact / np.sqrt(volumes[i] * volumes[j])[:, None]
+        tensors.append(exact - _pair_law(x[i] - x[j], radii[i], radii[j], i == j))
+    (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
+    order = np.lexsort((j, i))
+    start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
+    return Coupling(start, j[order], tensor[order])
+
+
+def _pair_law(r, a, b, same):
+    """H = T m of the pair sums, in six numbers [1/m³]; of a moment itself −M/3, which the curve of a ball contains."""
+    g1, g2, _ = radial_factors(np.linalg.norm(r, axis=1), a, b)
+    g1, g2 = np.where(same, -1.0 / a**3, g1), np.where(same, 0.0, g2)
+    products = r[:, _PLACES[0]] * r[:, _PLACES[1]]
+    return (g1[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) + g2[:, None] * products) / (4.0 * np.pi)
+
+
+def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (i, j) of near moments of one shape, shape [2, pairs], and N_ij √(V_i V_j) over V in six numbers."""
+    first, count = int(part.moment.min(initial=0)), len(np.unique(part.moment))
+    local = (lattice.positions[first : first + count] - part.position) @ part.rotation
+    i, j = _near_pairs(local, reach * float(part.sides.max()))
+    volume = np.bincount(part.moment - first, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece], count)
+    order = np.argsort(part.moment, kind="stable")
+    piece, share = part.piece[order], part.share[order]
+    begin = np.searchsorted(part.moment[order] - first, np.arange(count + 1))
+    held = np.diff(begin)
+    # every pair of pieces of a pair of moments
+    pairs = held[i] * held[j]
+    pair = np.repeat(np.arange(len(i)), pairs)
+    rank = np.arange(len(pair)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
+    a, b = begin[i[pair]] + rank // held[j[pair]], begin[j[pair]] + rank % held[j[pair]]
+    p, q = piece[a], piece[b]
+    key, which = np.unique(np.minimum(p, q) * len(part.index) + np.maximum(p, q), return_inverse=True)
+    values = _piece_tensors(part, key // len(part.index), key % len(part.index))[which]
+    weight = share[a] * share[b]
+    sums = np.stack([np.bincount(pair, weight * values[:, c], len(i)) for c in range(6)], axis=1)
+    sums /= np.sqrt(volume[i] * volume[j])[:, None]
+    both = i != j
+    pairs = np.concatenate([np.stack([i, j]), np.stack([j[both], i[both]])], axis=1) + first
+    return pairs, _turned(np.concatenate([sums, sums[both]]), part.rotation)
+
+
+def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs i ≤ j of points not farther apart than ``reach``."""
+    found = []
+    step = max(1, _BATCH // max(1, 3 * len(points)))
+    for begin in range(0, len(points), step):
+        apart = points[begin : begin + step, None] - points
+        i, j = np.nonzero((apart**2).sum(axis=2) <= reach * reach * (1.0 + 1e-9))
+        found.append(np.stack([i + begin, j]))
+    i, j = np.concatenate(found, axis=1)
+    return i[i <= j], j[i <= j]
+
+
+def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """∫∫ over two pieces of cells, over the volume of a cell, of the demagnetizing kernel, shape [pairs, 6]."""
+    apart = part.index[p] - part.index[q]
+    full = part.filled.min(axis=(1, 2, 3)) == 1.0
+    whole, touching = full[p] & full[q], (np.abs(apart) <= 1).all(axis=1)
+    near, far = np.flatnonzero(~whole & touching), np.flatnonzero(~whole & ~touching)
+    result = np.empty((len(p), 6))
+    offsets, which = np.unique(apart[whole], axis=0, return_inverse=True)
+    result[whole] = cuboid_tensors(offsets, part.sides)[which.reshape(-1)]
+    if len(near):
+        filled = _sharp(_coarser(part.filled, _SUBCELLS))
+        result[near] = _cut_tensors(part.sides, filled, p[near], q[near], apart[near])
+    if len(far):
+        result[far] = _expanded_tensors(part, p[far], q[far])
+    return result
+
+
+def _expanded_tensors(part: Pieces, p, q) -> np.ndarray:
+    """The same for pieces that do not touch: dipoles at the centroids, and what their second moments add."""
+    split = np.array(part.filled.shape[1:])
+    points, size = (grid(split) + 0.5) / split * part.sides, part.sides / split
+    weights = part.filled.reshape(len(part.filled), -1) / split.prod()
+    volume = weights.sum(axis=1)
+    centre = weights @ points / volume[:, None]
+    spread = np.einsum("pa,ak,al->pkl", weights, points, points) / volume[:, None, None]
+    spread += np.diag(size**2 / 12.0) - centre[:, :, None] * centre[:, None, :]
+    r = (part.index[p] - part.index[q]) * part.sides + centre[p] - centre[q]
+    s, one = spread[p] + spread[q], np.eye(3)
+    d = np.linalg.norm(r, axis=1)[:, None, None]
+    turned = np.einsum("nkl,nl->nk", s, r)
+    along, trace = np.einsum("nk,nk->n", turned, r)[:, None, None], np.trace(s, axis1=1, axis2=2)[:, None, None]
+    rr, rs = r[:, :, None] * r[:, None, :], r[:, :, None] * turned[:, None, :]
+    tensor = (
+        one / d**3
+        - 3.0 * rr / d**5
+        - 0.5
+        * (
+            105.0 * along * rr / d**9
+            - 15.0 * (along * one + trace * rr + 2.0 * (rs + np.swapaxes(rs, 1, 2))) / d**7
+            + 3.0 * (trace * one + 2.0 * s) / d**5
+        )
+    )
+    return (tensor * (volume[p] * volume[q])[:, None, None] * part.sides.prod() / (4.0 * np.pi))[:, *_PLACES]
+
+
+def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarray:
+    """The same for pieces that are cut, from the tensors of their subcells."""
+    split = np.array(filled.shape[1:])
+    table = cuboid_tensors(grid(reach := (np.abs(apart).max(axis=0) + 1) * split), sides / split).reshape(*reach, 6)
+    between = grid(split)[:, None] - grid(split)
+    flat = filled.reshape(len(filled), -1)
+    result = np.empty((len(p), 6))
+    offsets, which = np.unique(apart, axis=0, return_inverse=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    ends = np.append(0, np.cumsum(np.bincount(which.reshape(-1))))
+    for k, offset in enumerate(offsets):
+        rows = order[ends[k] : ends[k + 1]]
+        steps = offset * split + between
+        tensors = table[tuple(np.abs(np.moveaxis(steps, -1, 0)))]
+        signs = np.where(steps < 0, -1.0, 1.0)
+        tensors[..., 3:] *= signs[..., [0, 0, 1]] * signs[..., [1, 2, 2]]
+        left, right = flat[p[rows]], flat[q[rows]]
+        for c in range(6):
+            result[rows, c] = ((left @ tensors[..., c]) * right).sum(axis=1)
+    return result / split.prod()
+
+
+def _sharp(filled: np.ndarray) -> np.ndarray:
+    """Subcells that are full or empty, with the same mean."""
+    inside = (filled >= np.minimum(0.5, filled.max(axis=(1, 2, 3), keepdims=True))).astype(float)
+    return inside * (filled.mean(axis=(1, 2, 3)) / inside.mean(axis=(1, 2, 3)))[:, None, None, None]
+
+
+def _coarser(filled: np.ndarray, most: int) -> np.ndarray:
+    """Filled shares of fewer subcells, at most ``most`` along an axis; where there are more, that divides them."""
+    for axis, size in enumerate(filled.shape[1:], start=1):
+        if size > most:
+            shape = (*filled.shape[:axis], most, size // most, *filled.shape[axis + 1 :])
+            filled = filled.reshape(shape).mean(axis=axis + 1)
+    return filled
+
+
+def _turned(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Symmetric tensors in six numbers, turned."""
+    rows, columns = _PLACES
+    full = np.empty((len(six), 3, 3))
+    full[:, rows, columns] = full[:, columns, rows] = six
+    return (rotation @ full @ rotation.T)[:, rows, columns]
