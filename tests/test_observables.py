@@ -262,3 +262,71 @@ def test_set_and_measured_in_a_graph(device):
         graphed = probe.b.numpy()
         work()
         np.testing.assert_array_equal(graphed, probe.b.numpy())
+
+
+def sensor_model(device):
+    """A static magnet, and two turned boards with a site each; the boards' quarter turn takes x to y."""
+    builder = new_builder()
+    add_ball(builder, (0.0, 0.0, 0.0), (0.0, 0.0, M))
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.5 * math.pi)
+    for k in range(2):
+        board = builder.add_body(xform=wp.transform((0.04 + 0.02 * k, 0.0, 0.0), turn))
+        builder.add_shape_box(board, hx=R, hy=R, hz=0.001)
+        upright = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), math.pi)
+        builder.add_site(board, xform=wp.transform((0.0, 0.0, 0.01), upright), label=f"hall_{k}")
+    model = builder.finalize(device=device)
+    magnetics = warpmag.Magnetics(model)
+    magnetics.set_external_field((1000.0, 0.0, 0.0))
+    return model, magnetics
+
+
+def test_a_magnetometer_reads_in_the_frame_of_its_site(device):
+    model, magnetics = sensor_model(device)
+    state = model.state()
+    magnetics.apply(state)
+    sensor = warpmag.SensorMagnetometer(model, magnetics, sites="*hall_?")
+    sensor.update(state)
+    places = np.array([[0.04, 0.0, 0.01], [0.06, 0.0, 0.01]])
+    b = oracle.MU0 * (
+        oracle.h_field(np.zeros((1, 3)), np.array([[0.0, 0.0, M * VOLUME]]), places) + np.array([1000.0, 0.0, 0.0])
+    )
+    expected = np.stack([b[:, 1], b[:, 0], -b[:, 2]], axis=1)  # turned back about z, then half a turn about x
+    np.testing.assert_allclose(sensor.flux_density.numpy(), expected, atol=SINGLE * np.abs(b).max())
+
+
+def test_a_magnetometers_noise_and_range(device):
+    model, magnetics = sensor_model(device)
+    state = model.state()
+    magnetics.apply(state)
+    exact = warpmag.SensorMagnetometer(model, magnetics, sites=["*hall_1"])
+    exact.update(state)
+    noisy = warpmag.SensorMagnetometer(model, magnetics, sites="*hall_1", noise=1e-6, seed=3)
+    readings = []
+    for _ in range(300):
+        noisy.update(state)
+        readings.append(noisy.flux_density.numpy()[0].copy())
+    errors = np.array(readings) - exact.flux_density.numpy()[0]
+    # 900 numbers: their mean is within 4/30, and their standard deviation within 4/√1800 of what is wanted
+    assert abs(errors.mean()) < 1e-6 * 4.0 / 30.0
+    assert abs(errors.std() / 1e-6 - 1.0) < 0.1
+    narrow = warpmag.SensorMagnetometer(model, magnetics, sites="*hall_1", saturation=1e-4)
+    narrow.update(state)
+    np.testing.assert_allclose(
+        narrow.flux_density.numpy(), np.clip(exact.flux_density.numpy(), -1e-4, 1e-4), rtol=SINGLE
+    )
+
+
+def test_magnetometers_that_cannot_be(device):
+    model, magnetics = sensor_model(device)
+    ball = model.shape_label[0]
+    for arguments, text in (
+        ({"sites": "nothing"}, "sites: no label matches"),
+        ({"sites": ball}, "is no site"),
+        ({"sites": [0]}, "sites: 0 is no site"),
+        ({"sites": [99]}, "sites: 99 is no site"),
+        ({"sites": []}, "sites: no label matches"),
+        ({"sites": "*hall*", "noise": -1.0}, "noise"),
+        ({"sites": "*hall*", "saturation": 0.0}, "saturation"),
+    ):
+        with pytest.raises(warpmag.InputError, match=text):
+            warpmag.SensorMagnetometer(model, magnetics, **arguments)

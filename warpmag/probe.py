@@ -103,4 +103,4 @@ class FieldProbe:
         for evaluation in self._gradients:
             evaluation.launch()
         if self._gradients:
-            launch_store_gradients(*self._rows, self.gradient)
+            launch_store_gradients(self._rows, self.gradient)

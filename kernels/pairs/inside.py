@@ -110,12 +110,12 @@ def _gradient_kernel(vec3, mat33):
     return store_gradients
 
 
-def launch_store_gradients(along_x, along_y, along_z, gradients):
-    """Write gradients [A/m²], matrices of shape [p], from the derivatives of H along the axes, vectors of shape [p]."""
+def launch_store_gradients(along, gradients):
+    """Write gradients [A/m²], matrices of shape [p], from the three derivatives of H along the axes, vectors."""
     wp.launch(
-        _gradient_kernel(along_x.dtype, gradients.dtype),
+        _gradient_kernel(along[0].dtype, gradients.dtype),
         dim=len(gradients),
-        inputs=[along_x, along_y, along_z],
+        inputs=along,
         outputs=[gradients],
         device=gradients.device,
     )
