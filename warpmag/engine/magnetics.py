@@ -232,10 +232,12 @@ class Magnetics:
 
     def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
         """Vectors on the model's device, as many as one of ``counts``, from a Warp array or from numbers."""
-        kind = Kind(wp.get_device(self._model.device), wp.float32, warp_out=False)
-        if isinstance(value, (wp.array, wp.indexedarray)):
-            found = kind.vectors(name, value)
+        if isinstance(value, wp.array):  # only looked at from outside: it may be in a graph
+            if value.dtype is not wp.vec3 or value.ndim != 1 or value.device != self._model.device:
+                raise InputError(f"{name}: must be a Warp array of vec3 on {self._model.device}")
+            found = value
         else:
+            kind = Kind(wp.get_device(self._model.device), wp.float32, warp_out=False)
             found = kind.vectors(name, np.atleast_2d(host_array(name, value)))
         if len(found) not in counts:
             wanted = " or ".join(f"[{count}, 3]" for count in dict.fromkeys(counts))
