@@ -29,7 +29,10 @@ OWNERS = {
     "warp": (
         "warpmag/engine",
         "warpmag/cli.py",
-        *(f"warpmag/{name}.py" for name in ("arrays", "dynamics", "fields", "induction", "snapshot", "system")),
+        *(
+            f"warpmag/{name}.py"
+            for name in ("arrays", "dynamics", "fields", "induction", "probe", "snapshot", "system")
+        ),
     ),
 }
 """What of ``warpmag/`` may import a library."""

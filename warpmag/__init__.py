@@ -21,6 +21,7 @@ _HOMES = {
     "add_inducible": "warpmag.engine.attributes",
     "add_permanent": "warpmag.engine.attributes",
     "Magnetics": "warpmag.engine.magnetics",
+    "SensorMagnetometer": "warpmag.engine.magnetometer",
     "Simulation": "warpmag.engine.simulation",
 }
 

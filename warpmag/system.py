@@ -21,6 +21,7 @@ from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.induction import solve_state
+from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
 from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs.evaluate import PairEvaluation
@@ -137,6 +138,8 @@ class MomentSystem:
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
         dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
+        worlds: World of each moment, NumPy, shape [n].
+        world_ranges: For each world its first moment, its first permanent one, and the end.
         h: Field at inducible moments [A/m], external and all other moments', of which the dynamics ``theta`` makes M =
             f(H) when it ends, shape [n].
         forces: Forces [N] on those that may move, shape [n], by :meth:`apply_forces`.
@@ -191,6 +194,7 @@ class MomentSystem:
         self._evaluate_field(layout, near)
         self._make_cells(couplings)
         self._evaluate_wrench(layout, turned)
+        self._energies = None
         self._near = self._make_near_contacts(layout, turned, saturation, susceptibility, curve) if near else None
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
         self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
@@ -236,7 +240,9 @@ class MomentSystem:
 
     def _evaluate_field(self, layout: _Layout, near: bool):
         """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
-        ranges, packed, state = layout.ranges(), self._packed, self._induction
+        self.worlds, self.world_ranges = layout.worlds, layout.ranges()
+        ranges = self.world_ranges
+        packed, state = self._packed, self._induction
         applied = [(first, middle, middle, last) for first, middle, last in ranges]
         self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self.external_field, state.h0)
         if self._applied.pair_count == 0:
@@ -367,6 +373,37 @@ class MomentSystem:
         m = wp.empty_like(self.moments)
         launch_divide_by_volume(self.moments, self._packed.radii, m)
         return m
+
+    def energy(self) -> np.ndarray:
+        """Energy of each world's moments as :meth:`solve` left them [J], float64, shape [worlds].
+
+        That of magnetization curves and of all fields; its gradient by positions is minus Kelvin's force. Permanent
+        moments of one body add a constant. Waits for the device.
+
+        Raises:
+            InputError: The contact model is not ``dipole``.
+        """
+        if self.contact_model != "dipole":
+            raise InputError(f"contact_model: the energy of {self.contact_model} is not known, only that of dipole")
+        if self._energies is None:
+            self._make_energy()
+        assert self._energies is not None
+        self._permanents.launch()
+        energies, state = self._energies, self._induction
+        fields = state.h, state.h0, self._permanents_field, self.external_field
+        launch_energy(self.radii, self.moments, self._material, *fields, energies)
+        each = energies.numpy()
+        return np.array([each[first:last].sum() for first, _, last in self.world_ranges])
+
+    def _make_energy(self):
+        """Allocate what only the energy needs."""
+        segments = [(middle, last, middle, last) for _, middle, last in self.world_ranges if last > middle]
+        nothing = wp.zeros_like(self.moments)
+        self._permanents_field = wp.zeros_like(self.moments)
+        self._permanents = PairEvaluation(
+            Quantity.FIELD, segments, self._packed, self._packed, nothing, self._permanents_field
+        )
+        self._energies = wp.zeros(self.count, dtype=wp.float64, device=self.device)
 
     def apply_forces(self, force=None):
         """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""

@@ -91,4 +91,25 @@ CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve) {
     for (int step = 0; step < 8; ++step) x += (3 * bounded - x * langevin_ratio(x)) / langevin_slope(x);
     return x / (3 * bounded);
 }
+
+// Area under c from 0 to s, in double: the co-energy of a curve.
+CUDA_CALLABLE inline double curve_area(double s, int curve) {
+    const double z = s * s;
+    if (curve == CLAMPED) return s < 1 ? z / 2 : s - 0.5;
+    if (curve == FROHLICH) { // s − ln(1 + s)
+        if (s > 0.02) return s - wp::log(1 + s);
+        double series = 0;
+        for (int k = 8; k >= 2; --k) series = 1.0 / k - s * series;
+        return z * series;
+    }
+    if (curve == LANGEVIN) { // ln(sinh x / x) / 3
+        const double x = 3 * s, y = x * x;
+        if (x > 20) return (x - wp::log(2 * x)) / 3;
+        if (x > 0.3) return wp::log(wp::sinh(x) / x) / 3;
+        return y * (1.0 / 6 - y * (1.0 / 180 - y * (1.0 / 2835 - y * (1.0 / 37800 - y / 467775)))) / 3;
+    }
+    if (s > 20) return s - 0.6931471805599453; // ln cosh s
+    if (s > 0.1) return wp::log(wp::cosh(s));
+    return z * (0.5 - z * (1.0 / 12 - z * (1.0 / 45 - z * (17.0 / 2520 - z * 31 / 14175))));
+}
 }

@@ -52,6 +52,11 @@ for _dtype in (wp.float32, wp.float64):
         """Derivative c'(s) for s ≥ 0."""
         ...
 
+    @wp.func_native("return warpmag::curve_area(double(s), curve);")
+    def curve_area(s: _dtype, curve: int) -> wp.float64:
+        """Area ∫ c ds from 0 to ``s``."""
+        ...
+
     @wp.func_native("return warpmag::inverse_curve_ratio(c, curve);")
     def inverse_curve_ratio(c: _dtype, curve: int) -> _dtype:
         """s/c of the reduced field s that makes reduced magnetization ``c``; a saturated one gets a large finite s."""

@@ -28,7 +28,11 @@ class BodyMoments:
     Attributes:
         body: Body of each moment, -1 where the magnet is fixed in the world, shape [n].
         permanent: Whether the moment is permanent, shape [n].
-        local_positions, local_moments: Position [m] and permanent moment [A·m²] in the body's frame, shape [n].
+        local_positions: Position in the body's frame [m], shape [n].
+        volumes: Volume of each moment [m³], shape [n].
+        shape: Shape that the moment belongs to, shape [n].
+        shape_frames, magnetizations: Frame of each shape in its body's, and its permanent magnetization in that frame
+            [A/m]: arrays of the model, shape [shapes].
         body_list, body_run_start: Bodies with moments, and the first run of each, shape [b] and [b + 1].
         runs: First moment of each run, and the one after its last, shape [r].
         kinematic_flag: Newton's flag of bodies that forces do not move.
@@ -37,7 +41,10 @@ class BodyMoments:
     body: wp.array[wp.int32]
     permanent: wp.array[wp.bool]
     local_positions: wp.array[wp.vec3]
-    local_moments: wp.array[wp.vec3]
+    volumes: wp.array[float]
+    shape: wp.array[wp.int32]
+    shape_frames: wp.array[wp.transform]
+    magnetizations: wp.array[wp.vec3]
     body_list: wp.array[wp.int32]
     body_run_start: wp.array[wp.int32]
     runs: wp.array[wp.vec2i]
@@ -58,7 +65,9 @@ def _gather_moments(
         frame = body_q_in[body]
     positions_out[i] = wp.transform_point(frame, magnets.local_positions[i])
     if magnets.permanent[i]:
-        moments_out[i] = wp.transform_vector(frame, magnets.local_moments[i])
+        shape = magnets.shape[i]
+        moment = magnets.volumes[i] * magnets.magnetizations[shape]
+        moments_out[i] = wp.transform_vector(frame, wp.transform_vector(magnets.shape_frames[shape], moment))
 
 
 def gather_moments(body_q, magnets: BodyMoments, positions, moments):
@@ -79,6 +88,40 @@ def _gather_rotations(
 def gather_rotations(body_q, bodies, rotations):
     """Write the rotations of ``bodies``; that of one fixed in the world, −1, stays."""
     wp.launch(_gather_rotations, len(bodies), [body_q, bodies], [rotations], device=rotations.device)
+
+
+@wp.kernel
+def _set_magnetization(
+    magnetization_in: wp.array[wp.vec3],
+    shapes_in: wp.array[wp.int32],
+    shape_body_in: wp.array[wp.int32],
+    shape_frames_in: wp.array[wp.transform],
+    magnetizations_out: wp.array[wp.vec3],
+):
+    shape = shapes_in[wp.tid()]
+    magnetization = magnetization_in[0]
+    if shape_body_in[shape] >= 0:
+        magnetization = wp.quat_rotate_inv(wp.transform_get_rotation(shape_frames_in[shape]), magnetization)
+    magnetizations_out[shape] = magnetization
+
+
+def set_magnetization(magnetization, shapes, model, magnets: BodyMoments):
+    """Give shapes a permanent magnetization [A/m], shape [1], in the frame of their body, their own where static."""
+    inputs = [magnetization, shapes, model.shape_body, magnets.shape_frames]
+    wp.launch(_set_magnetization, len(shapes), inputs=inputs, outputs=[magnets.magnetizations], device=shapes.device)
+
+
+@wp.kernel
+def _set_external_field(
+    field_in: wp.array[wp.vec3], world_in: wp.array[wp.int32], external_field_out: wp.array[wp.vec3]
+):
+    i = wp.tid()
+    external_field_out[i] = field_in[wp.min(world_in[i], field_in.shape[0] - 1)]
+
+
+def set_external_field(field, worlds, external_field):
+    """Give each moment the external field [A/m] of its world, or the only one there is."""
+    wp.launch(_set_external_field, len(worlds), inputs=[field, worlds], outputs=[external_field], device=worlds.device)
 
 
 @wp.kernel

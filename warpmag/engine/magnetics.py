@@ -6,11 +6,21 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.engine.attributes import marked_shapes
+from warpmag.arrays import Kind, farthest_place, host_array
+from warpmag.engine.attributes import NAMESPACE, marked_shapes
 from warpmag.engine.sampling import BodyLattice, ShapeSampler
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.bodies import BodyMoments, add_wrenches, gather_moments, gather_rotations, sum_moments
+from warpmag.kernels.rigid.bodies import (
+    BodyMoments,
+    add_wrenches,
+    gather_moments,
+    gather_rotations,
+    set_external_field,
+    set_magnetization,
+    sum_moments,
+)
 from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_token
+from warpmag.probe import FieldProbe
 from warpmag.system import MomentSystem
 
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
@@ -86,7 +96,7 @@ class Magnetics:
         settings.check("Magnetics")
         if curve is not None:
             check_token("Magnetics: curve", curve, CURVES)
-        self.magnets = _find_magnets(model)
+        self.magnets, self._worlds = _find_magnets(model)
         self._model = model
         self.system = self._make_system(settings, max_evaluations, curve)
         self._map_bodies()
@@ -133,7 +143,8 @@ class Magnetics:
         body = np.repeat([one.body for one in self.magnets], counts)
         permanent = np.repeat([one.magnet.kind == "permanent" for one in self.magnets], counts)
         self._volumes = np.concatenate([one.volumes for one in lattices])
-        local = self._volumes[:, None] * np.repeat([one.magnet.magnetization for one in self.magnets], counts, axis=0)
+        self.shapes = np.concatenate([one.shapes for one in self.magnets])
+        of_shape = np.concatenate([one.counts for one in lattices])
 
         start = np.concatenate([[0], np.cumsum(counts)])
         run_body = np.array([one.body for one in self.magnets])
@@ -147,18 +158,28 @@ class Magnetics:
         self._body_moments = moments = BodyMoments()
         moments.body, moments.permanent = put(body, wp.int32), put(permanent, wp.bool)
         moments.local_positions = put(np.concatenate([one.positions for one in lattices]), wp.vec3)
-        moments.local_moments = put(local, wp.vec3)
+        moments.volumes, moments.shape = put(self._volumes, float), put(np.repeat(self.shapes, of_shape), wp.int32)
+        moments.shape_frames = self._model.shape_transform
+        moments.magnetizations = getattr(self._model, NAMESPACE).magnetization
         moments.body_list = put(bodies[dynamic], wp.int32)
         moments.body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
         moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
         moments.kinematic_flag = _KINEMATIC
 
-        self.shapes = np.concatenate([one.shapes for one in self.magnets])
-        self._parts = np.concatenate([[0], np.cumsum(np.concatenate([one.counts for one in lattices]))])
+        self._parts = np.concatenate([[0], np.cumsum(of_shape)])
         volume = np.concatenate([[0.0], np.cumsum(self._volumes)])
         self.shape_volumes = np.diff(volume[self._parts])
         self._part_start = put(self._parts, wp.int32)
         self._totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=device)
+        self._newton_world = put(np.maximum(self._worlds, 0)[self.system.worlds], wp.int32)
+        fixed = np.repeat(
+            [one.magnet.kind == "permanent" for one in self.magnets], [len(one.shapes) for one in self.magnets]
+        )
+        shape_body = self._model.shape_body.numpy()
+        shapes = self.shapes[fixed]
+        shapes = shapes[np.argsort(shape_body[shapes], kind="stable")]
+        self._permanent_shapes, self._permanent_list = shapes, put(shapes, wp.int32)
+        self._permanent_bodies = shape_body[shapes]
 
     def apply(self, state: newton.State) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
@@ -181,6 +202,117 @@ class Magnetics:
         self.system.apply_forces()
         system = self.system
         add_wrenches(self._body_moments, self._model, state, system.positions, system.forces, system.torques)
+
+    def set_external_field(self, external_field) -> None:
+        """Set the uniform applied field of all worlds, or of each; capturable in a graph if given as a Warp array.
+
+        Args:
+            external_field: H0 [A/m], world frame, shape [3] or [worlds, 3], rows by the model's worlds; NumPy, or a
+                Warp array of vectors on the model's device, shape [1] or [worlds], whose values are not checked.
+
+        Raises:
+            InputError: It is of another shape, or not finite.
+        """
+        field = self._vectors("external_field", external_field, (1, max(self._model.world_count, 1)))
+        set_external_field(field, self._newton_world, self.system.external_field)
+
+    def set_magnetization(self, magnetization, *, body: int = -1, shape: int | None = None) -> None:
+        """Set what a permanent magnet is magnetized to; capturable in a graph if given as a Warp array.
+
+        It is the model's attribute ``model.warpmag.magnetization`` that is set, in the frame of each shape. Who writes
+        there has the same effect.
+
+        Args:
+            magnetization: M [A/m] in the frame of the body, of the shape if that is static, shape [3]; NumPy, or a Warp
+                array of one vector on the model's device, whose value is not checked.
+            body: The body, with all its permanent shapes.
+            shape: Instead of these only this one.
+
+        Raises:
+            InputError: There is no such permanent magnet, or the magnetization is of another shape, or not finite.
+        """
+        which = self._permanent_bodies == body if shape is None else self._permanent_shapes == shape
+        found = np.flatnonzero(which)
+        if not len(found) or (shape is None and body < 0):
+            raise InputError(f"set_magnetization: {'body' if shape is None else 'shape'} has no permanent magnet")
+        shapes = self._permanent_list[int(found[0]) : int(found[-1]) + 1]
+        set_magnetization(self._vectors("magnetization", magnetization, (1,)), shapes, self._model, self._body_moments)
+
+    def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
+        """Vectors on the model's device, as many as one of ``counts``, from a Warp array or from numbers."""
+        if isinstance(value, wp.array):  # only looked at from outside: it may be in a graph
+            if value.dtype is not wp.vec3 or value.ndim != 1 or value.device != self._model.device:
+                raise InputError(f"{name}: must be a Warp array of vec3 on {self._model.device}")
+            found = value
+        else:
+            kind = Kind(wp.get_device(self._model.device), wp.float32, warp_out=False)
+            found = kind.vectors(name, np.atleast_2d(host_array(name, value)))
+        if len(found) not in counts:
+            wanted = " or ".join(f"[{count}, 3]" for count in dict.fromkeys(counts))
+            raise InputError(f"{name}: shape must be [3] or {wanted}, got {list(np.shape(value))}")
+        return found
+
+    def probe(self, points, *, worlds=None, gradients: bool = False) -> FieldProbe:
+        """Return what measures the field at points; :meth:`FieldProbe.measure` is capturable in a graph.
+
+        Args:
+            points: The points [m], shape [p, 3], NumPy, or a Warp array of vectors on the model's device.
+            worlds: World of the model that each is in, a number or shape [p]; None means the only one with magnets.
+            gradients: Whether gradients are wanted.
+
+        Raises:
+            InputError: A point is not finite, or too far away (see ``warpmag.arrays``), or its world holds no magnets.
+        """
+        largest = max(float(one.lattice.radii.max()) for one in self.magnets)
+        kind = Kind(self.system.device, self.system.dtype, warp_out=False)
+        points = kind.vectors("points", points, farthest=farthest_place(self.system.dtype, largest))
+        probe = FieldProbe(self.system, len(points), worlds=self._numbers_of(worlds, len(points)), gradients=gradients)
+        wp.copy(probe.points, points)
+        return probe
+
+    def _numbers_of(self, worlds, count: int) -> np.ndarray:
+        """Number of each point's world among those that hold magnets, shape [count]."""
+        if worlds is None:
+            if len(self._worlds) > 1:
+                raise InputError(f"worlds: must be given, {len(self._worlds)} worlds hold magnets")
+            return np.zeros(count, int)
+        worlds = np.asarray(worlds)
+        if worlds.dtype.kind not in "iu" or worlds.shape not in ((), (count,)):
+            raise InputError(
+                f"worlds: must be whole numbers, one or {count}, got {worlds.dtype} of {list(worlds.shape)}"
+            )
+        strangers = worlds[~np.isin(worlds, self._worlds)]
+        if strangers.size:
+            raise InputError(f"worlds: world {strangers.flat[0]} holds no magnets")
+        return np.broadcast_to(np.searchsorted(self._worlds, worlds), count)
+
+    def h_field(self, points, *, worlds=None) -> np.ndarray:
+        """Return the field H [A/m] at points, shape [p, 3], as :meth:`probe` measures it."""
+        return self._measured(points, worlds).h.numpy()
+
+    def b_field(self, points, *, worlds=None) -> np.ndarray:
+        """Return the flux density B [T] at points, inside bodies too, shape [p, 3], as :meth:`probe` measures it."""
+        return self._measured(points, worlds).b.numpy()
+
+    def field_gradient(self, points, *, worlds=None) -> np.ndarray:
+        """Return the gradient ∂H_i/∂x_k [A/m²] at points, shape [p, 3, 3], as :meth:`probe` measures it."""
+        gradient = self._measured(points, worlds, gradients=True).gradient
+        assert gradient is not None
+        return gradient.numpy()
+
+    def _measured(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
+        probe = self.probe(points, worlds=worlds, gradients=gradients)
+        probe.measure()
+        return probe
+
+    def energy(self) -> np.ndarray:
+        """Return the energy of the magnets of each world as they are now [J], shape [worlds]; zero without magnets.
+
+        See :meth:`MomentSystem.energy`: its gradient by positions is minus Kelvin's force.
+        """
+        energies = np.zeros(max(self._model.world_count, 1))
+        energies[np.maximum(self._worlds, 0)] = self.system.energy()
+        return energies
 
     def shape_moments(self) -> np.ndarray:
         """Return the total moment of each magnetic shape [A·m²], world frame, rows as :attr:`shapes`, shape [n, 3].
@@ -213,8 +345,12 @@ def _only_curve(magnets: list[Magnet]) -> str:
     return curves.pop() if curves else "tanh"
 
 
-def _find_magnets(model: newton.Model) -> list[BodyMagnet]:
-    """Group the marked shapes of ``model`` into magnets and sample them, in the order that the system wants."""
+def _find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
+    """Group the marked shapes of ``model`` into magnets and sample them, in the order that the system wants.
+
+    Returns:
+        The magnets, and the Newton worlds that hold them, -1 where there are none.
+    """
     body_of, rotations = model.shape_body.numpy().tolist(), model.shape_transform.numpy()[:, 3:].tolist()
     groups: list[tuple[Magnet, int, list[int]]] = []
     of_body: dict[int, list[tuple[Magnet, int, list[int]]]] = {}
@@ -228,7 +364,7 @@ def _find_magnets(model: newton.Model) -> list[BodyMagnet]:
         else:
             groups.append((magnet, body, [shape]))
             of_body.setdefault(body, []).append(groups[-1])
-    worlds = _number_worlds(model, [shapes[0] for _, _, shapes in groups])
+    worlds, held = _number_worlds(model, [shapes[0] for _, _, shapes in groups])
     sampler = ShapeSampler(model)
     magnets = [
         BodyMagnet(
@@ -240,7 +376,7 @@ def _find_magnets(model: newton.Model) -> list[BodyMagnet]:
         )
         for (magnet, body, shapes), world in zip(groups, worlds, strict=True)
     ]
-    return sorted(magnets, key=lambda one: (one.world, one.magnet.kind == "permanent", one.body, one.shapes))
+    return sorted(magnets, key=lambda one: (one.world, one.magnet.kind == "permanent", one.body, one.shapes)), held
 
 
 def _alike(a: Magnet, b: Magnet) -> bool:
@@ -251,8 +387,8 @@ def _alike(a: Magnet, b: Magnet) -> bool:
     return bool(difference <= 1e-5 * np.linalg.norm(a.magnetization))
 
 
-def _number_worlds(model: newton.Model, shapes: list[int]) -> list[int]:
-    """Return the world of each shape, counted among the worlds that hold magnets.
+def _number_worlds(model: newton.Model, shapes: list[int]) -> tuple[list[int], np.ndarray]:
+    """Return the world of each shape, counted among the worlds that hold magnets, and these, -1 if there are no worlds.
 
     A magnet outside all worlds belongs to the only one that holds magnets, if there is only one.
     """
@@ -261,4 +397,5 @@ def _number_worlds(model: newton.Model, shapes: list[int]) -> list[int]:
     if len(held) > 1 and (worlds < 0).any():
         label = model.shape_label[shapes[int(np.argmax(worlds < 0))]]
         raise InputError(f"{label}: a magnet outside all worlds, while {len(held)} worlds hold magnets of their own")
-    return [int(np.searchsorted(held, world)) if world >= 0 else 0 for world in worlds]
+    numbers = [int(np.searchsorted(held, world)) if world >= 0 else 0 for world in worlds]
+    return numbers, held if len(held) else np.array([-1])

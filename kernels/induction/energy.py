@@ -1,0 +1,87 @@
+"""Energy of moments in equilibrium.
+
+The moments' energy is that of their magnetization curves and their interaction,
+
+    E = μ0 Σ_i [V Φ(M) − ½ m·(H − H0) − m·H0]  −  μ0 Σ_p [½ m·H_p + m·H_e],
+
+over inducible moments i in the field H0 of everything that they do not magnetize themselves, and permanent ones p in
+each other's field H_p and the external one H_e. Φ' = f⁻¹, so that E is least in equilibrium, where V Φ = m·H − V Ψ(H)
+with the co-energy Ψ' = f: there it is
+
+    E = μ0 Σ_i [½ m·(H − H0) − V Ψ(H)]  −  μ0 Σ_p [½ m·H_p + m·H_e],
+
+and, being least, its gradient by positions is minus Kelvin's force (Kim and Han 2022, Eqs. 13, 14).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpmag.kernels.material.curves import curve_area
+from warpmag.kernels.pairs.packing import ball_volume
+from warpmag.kernels.pairs.wrench import MU0
+from warpmag.kernels.shared.native import native_options
+
+
+@cache
+def _energy_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.func
+    def product(a: vec3, b: vec3):
+        return (
+            wp.float64(a[0]) * wp.float64(b[0])
+            + wp.float64(a[1]) * wp.float64(b[1])
+            + wp.float64(a[2]) * wp.float64(b[2])
+        )
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
+    def energy(
+        # inputs:
+        inducible: wp.array[int],
+        radii: wp.array[dtype],
+        moments: wp.array[vec3],
+        saturation: wp.array[dtype],
+        slope: wp.array[dtype],
+        curve: wp.array[int],
+        h: wp.array[vec3],
+        h0: wp.array[vec3],
+        h_permanent: wp.array[vec3],
+        external_field: wp.array[vec3],
+        # outputs:
+        energy_out: wp.array[wp.float64],
+    ):
+        i = wp.tid()
+        half = wp.float64(0.5)
+        if inducible[i] != 0:
+            area = curve_area(slope[i] * wp.length(h[i]) / saturation[i], curve[i])
+            unit = wp.float64(saturation[i]) * wp.float64(saturation[i]) / wp.float64(slope[i])
+            volume = wp.float64(ball_volume(radii[i]))
+            e = half * product(moments[i], h[i] - h0[i]) - volume * unit * area
+        else:
+            e = -half * product(moments[i], h_permanent[i]) - product(moments[i], external_field[i])
+        energy_out[i] = wp.float64(wp.static(MU0)) * e
+
+    return energy
+
+
+def launch_energy(radii, moments, material, h, h0, h_permanent, external_field, energies):
+    """Write each moment's share of the energy [J].
+
+    Args:
+        radii: Radii of the moments' balls [m], shape [n].
+        moments: Moments in equilibrium [A·m²], shape [n].
+        material: Their ``curves.CurveParameters``.
+        h, h0: Field at the inducible moments, and what of it is applied [A/m], shape [n].
+        h_permanent: Field of other permanent moments at the permanent ones [A/m], shape [n].
+        external_field: External field [A/m], shape [n].
+        energies: Out, shape [n], float64.
+    """
+    inputs = [material.inducible, radii, moments, material.saturation, material.slope, material.curve]
+    wp.launch(
+        _energy_kernel(radii.dtype),
+        dim=len(radii),
+        inputs=[*inputs, h, h0, h_permanent, external_field],
+        outputs=[energies],
+        device=radii.device,
+    )
