@@ -51,6 +51,7 @@ class Simulation:
         dynamics: str | None = None,
         contact_model: str | None = None,
         rtol: float | None = None,
+        max_evaluations: int = 1000,
         external_field: tuple[float, float, float] | None = None,
         curve: str | None = None,
         device: str | None = None,
@@ -67,6 +68,7 @@ class Simulation:
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
+            max_evaluations: Field evaluations after which induction gives up.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
             curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
             device: Warp device; by default Warp's.
@@ -97,6 +99,7 @@ class Simulation:
             "rtol": settings.rtol if rtol is None else rtol,
             "external_field": settings.external_field if external_field is None else external_field,
             "curve": curve,
+            "max_evaluations": max_evaluations,
         }
         self._magnetics = Magnetics(self.model, **laws)
         self._prepare(solver, graphs)
