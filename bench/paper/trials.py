@@ -36,6 +36,7 @@ class Trial:
         device: Name of the Warp device.
         patience: Time after which the run is ended [s], the first step not counted.
         rtol: Magnetization error at which induction ends.
+        max_evaluations: Field evaluations after which it ends at the latest.
         force: Force law in place of the method's own.
         parameters: Parameters of the scene's script, where it is not to be as bundled.
     """
@@ -46,6 +47,7 @@ class Trial:
     device: str
     patience: float
     rtol: float = 1e-3
+    max_evaluations: int = 1000
     force: str | None = None
     parameters: dict = field(default_factory=dict)
 
@@ -123,6 +125,7 @@ def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
         curve=method.curve,
         force=trial.force or method.force,
         rtol=trial.rtol,
+        max_evaluations=trial.max_evaluations,
         device=trial.device,
     )
 

@@ -109,9 +109,16 @@ def launch_mark(w: Watched, stage: int):
 
 
 @wp.func
+def _raise(peaks: wp.array[float], which: int, value: float):
+    """Take a value into a maximum; most are below it, and need no atomic."""
+    if value > peaks[which]:
+        wp.atomic_max(peaks, which, value)
+
+
+@wp.func
 def _take_travel(w: Watched, travel: float, long_travel: float, substep: int):
-    wp.atomic_max(w.peaks, wp.where(substep == NEXT, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
-    wp.atomic_max(w.peaks, PEAK_LONG_TRAVEL, long_travel)
+    _raise(w.peaks, wp.where(substep == NEXT, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
+    _raise(w.peaks, PEAK_LONG_TRAVEL, long_travel)
 
 
 @wp.func
@@ -130,7 +137,7 @@ def _watch_body(w: Watched, bodies: BodyView, body: int, substep: int, dt: float
         turning = w.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
         travel = FREE * (speed + turning) * dt / thickness
         _take_travel(w, travel, 2.0 * travel, substep)
-        wp.atomic_max(w.peaks, PEAK_SPEED, speed)
+        _raise(w.peaks, PEAK_SPEED, speed)
 
 
 @wp.func
@@ -167,8 +174,8 @@ def _watch_contact(
     depth = contact_depth(contacts, bodies.q, i)
     overlap = depth / thickness
     overlaps[i] = overlap
-    wp.atomic_max(w.peaks, PEAK_DEPTH, depth)
-    wp.atomic_max(w.peaks, PEAK_OVERLAP, overlap)
+    _raise(w.peaks, PEAK_DEPTH, depth)
+    _raise(w.peaks, PEAK_OVERLAP, overlap)
     if overlap > overlap_threshold:
         wp.atomic_add(w.counts, COUNT_OVERLAPS, 1)
     moved = (_body_velocity(bodies, body1) - _body_velocity(bodies, body0)) * (dt / thickness)

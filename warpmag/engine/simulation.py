@@ -51,6 +51,7 @@ class Simulation:
         dynamics: str | None = None,
         contact_model: str | None = None,
         rtol: float | None = None,
+        max_evaluations: int = 1000,
         external_field: tuple[float, float, float] | None = None,
         curve: str | None = None,
         device: str | None = None,
@@ -67,6 +68,7 @@ class Simulation:
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
+            max_evaluations: Field evaluations after which induction gives up.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
             curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
             device: Warp device; by default Warp's.
@@ -88,9 +90,9 @@ class Simulation:
         settings = settings.replaced(
             force=force, dynamics=dynamics, contact_model=contact_model, rtol=rtol, external_field=external_field
         )
-        self._magnetics = Magnetics(self.model, curve=curve, **vars(settings))
+        self._magnetics = Magnetics(self.model, curve=curve, max_evaluations=max_evaluations, **vars(settings))
         self._prepare(solver, graphs)
-        self._options = self._options_of(settings, curve, solver)
+        self._options = self._options_of(settings, solver, curve=curve, max_evaluations=max_evaluations)
 
     def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
@@ -108,10 +110,10 @@ class Simulation:
         self.frame_count = round(seconds * self.frame_rate) or None
         return self._scene.builder, self._scene.magnets.settings, clock.step
 
-    def _options_of(self, settings: MagneticSettings, curve: str | None, solver: str) -> dict[str, str]:
+    def _options_of(self, settings: MagneticSettings, solver: str, **others) -> dict[str, str]:
         """Return by what a run differs from others of its scene, in words: only an equal one can be resumed."""
         kind = "cuda" if self._magnetics.system.device.is_cuda else "cpu"
-        options = {**vars(settings), "curve": curve, "step": self.step_size, "solver": solver, "device": kind}
+        options = {**vars(settings), **others, "step": self.step_size, "solver": solver, "device": kind}
         options["external_field"] = tuple(np.asarray(settings.external_field, dtype=float).tolist())
         return {name.replace("_", " "): str(value) for name, value in options.items()}
 
