@@ -105,3 +105,18 @@ def test_a_table_of_contents_beyond_the_end_is_damage(tmp_path, capfd):
     with pytest.raises(InputError, match=r"stage.usdc: damaged: its table of contents names bytes beyond its end"):
         open_stage(path)
     assert capfd.readouterr().err == ""
+
+
+def test_a_reader_that_computes_without_end(tmp_path, monkeypatch):
+    """The process gets a limit of CPU time, so that a machine with other things to do changes nothing."""
+    path = crate(tmp_path / "stage.usdc")
+    run = subprocess.run
+
+    def busy(command, **options):
+        assert int(command[-1]) == 30
+        program = f"import signal, runpy; reading = runpy.run_path({first_reading.__file__!r}); reading['_limit'](1)"
+        return run([sys.executable, "-c", f"{program}\nwhile True: pass"], **options)
+
+    monkeypatch.setattr(subprocess, "run", busy)
+    with pytest.raises(InputError, match="stage.usdc: USD did not read it within 30 s"):
+        open_stage(path)

@@ -20,6 +20,9 @@ DEEPEST_NESTING = 5_000
 FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError)
 """What USD raises over a stage; its own errors are of the first kind."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 1e7
+"""CPU time that a reading may take [s], and bytes for which it may take a second more."""
+_LOADED = 2
+"""How many times that it may take on a machine that has other things to do."""
 _TEXT = b"#usda"
 _OPENING, _CLOSING = b"{[(", b"}])"
 _OTHERS = bytes(set(range(256)) - {*_OPENING, *_CLOSING})
@@ -44,16 +47,19 @@ def first_reading(path: str | os.PathLike) -> str:
             return f"brackets are nested more than {DEEPEST_NESTING} deep"
         if b"@" not in content:  # no other file
             return ""
-    command = [sys.executable or "", "-S", "-E", __file__, json.dumps(sys.path), str(path)]
-    limit = _SECONDS + size / _BYTES_PER_SECOND
+    limit = round(_SECONDS + size / _BYTES_PER_SECOND)
+    command = [sys.executable or "", "-S", "-E", __file__, json.dumps(sys.path), str(path), str(limit)]
+    late = f"USD did not read it within {limit} s"
     try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=limit)
+        done = subprocess.run(command, capture_output=True, check=False, timeout=_LOADED * limit)
     except subprocess.TimeoutExpired:
-        return f"USD did not read it within {limit:.0f} s"
+        return late
     except OSError:  # no interpreter to start: an application with Python inside
         return ""
     if b"posix_madvise" in done.stderr:  # which USD says of every reading, past everything that could keep it quiet
         return "damaged: its table of contents names bytes beyond its end"
+    if done.returncode == -signal.SIGXCPU:
+        return late
     if done.returncode < 0:
         return f"USD's reader dies of it ({signal.Signals(-done.returncode).name})"
     with contextlib.suppress(ValueError):
@@ -89,17 +95,18 @@ def _read(path: str) -> str:  # pragma: no cover - in the child, which has nothi
     return ""
 
 
-def _limit_memory() -> None:  # pragma: no cover - in the child, too
-    """Let the process have half of the machine's memory at most."""
+def _limit(seconds: int) -> None:  # pragma: no cover - in the child, too
+    """Let the process have half of the machine's memory at most, and so much CPU time [s]."""
     import resource  # noqa: PLC0415 - not everywhere
 
     half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     resource.setrlimit(resource.RLIMIT_AS, (half, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
 
 
 if __name__ == "__main__":  # pragma: no cover - in the child, too
     sys.path[:] = json.loads(sys.argv[1])
     with contextlib.suppress(ImportError, ValueError, OSError):
-        _limit_memory()
+        _limit(int(sys.argv[3]))
     print(json.dumps(_read(sys.argv[2])))
