@@ -118,6 +118,7 @@ CUDA_CALLABLE inline Impulse contact_impulse(const Contact& c, const Body& own, 
     p.linear = scaled(push, n);
     p.own = cross(r, p.linear);
     p.other = cross(p.linear, other_r);
+    if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return p;
 
     r = arm(own, c.rub), other_r = arm(other, c.other_rub);
     Vector slip = sum(less(own.x, other.x), less(r, other_r));
