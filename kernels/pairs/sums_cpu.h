@@ -213,40 +213,50 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
         Vec3<Simd> r;
         Simd c;
     };
+    struct Target {
+        Vec3<Simd> x;
+        Simd radius, label;
+    };
     const Simd contact = targets.radius + sources.radius, clamp = contact * contact;
+    const bool diagonal = &targets == &sources, afresh = diagonal || sources.vectors < 2;
+    const auto of_target = [&](int row, int i) { return splat(numbers(targets.rows + row, i)); };
+    const auto target = [&](int i) -> Target {
+        return {of_target(POSITION, i), number(targets.rows[RADIUS], i), number(targets.rows[LABEL], i)};
+    };
+    const auto separation = [&](const Target& t, int v) -> Separation {
+        const Vec3<Simd> r = t.x - vectors(sources.rows + POSITION, v);
+        const Simd d2 = dot(r, r), s = t.radius + sources.rows[RADIUS][v], s2 = K == Kind::ANY ? s * s : clamp;
+        return {r, K == Kind::POINTS || d2 > s2 ? d2 : s2};
+    };
+    const auto inverse = [&](const Target& t, Simd c, int v) -> Simd {
+        if (K == Kind::BALLS) return twice_inverse_root(c);
+        auto wanted = c > 0;
+        if (K == Kind::ANY && Q != Quantity::FIELD) wanted &= t.label != sources.rows[LABEL][v];
+        return wanted ? twice_inverse_root(c) : 0;
+    };
+    Separation now, next;
+    Simd inv;
     const auto sum_row = [&](int i) __attribute__((always_inline)) -> Sums<Simd> {
-        const auto of_target = [&](int row) { return splat(numbers(targets.rows + row, i)); };
-        const Vec3<Simd> x = of_target(POSITION), n = of_target(SCALED_MOMENT);
-        const Vec3<Simd> e = BOTH ? of_target(MOMENT) : splat(share.effective.vector(0, targets.begin + i));
-        const Real radius = number(targets.rows[RADIUS], i), label = number(targets.rows[LABEL], i);
-        const auto separation = [&](int v) -> Separation {
-            const Vec3<Simd> r = x - vectors(sources.rows + POSITION, v);
-            const Simd d2 = dot(r, r), s = radius + sources.rows[RADIUS][v], s2 = K == Kind::ANY ? s * s : clamp;
-            return {r, K == Kind::POINTS || d2 > s2 ? d2 : s2};
-        };
-        const auto inverse = [&](Simd c, int v) -> Simd {
-            if (K == Kind::BALLS) return twice_inverse_root(c);
-            auto wanted = c > 0;
-            if (K == Kind::ANY && Q != Quantity::FIELD) wanted &= label != sources.rows[LABEL][v];
-            return wanted ? twice_inverse_root(c) : 0;
-        };
+        const Target t = target(i), then = target(i + 1);
+        const Vec3<Simd> e = BOTH ? of_target(MOMENT, i) : splat(share.effective.vector(0, targets.begin + i));
+        const Vec3<Simd> n = of_target(SCALED_MOMENT, i);
         Sums<Simd> sums;
         int v = 0;
-        if (BOTH && &targets == &sources) {
+        if (diagonal) {
             // pairs with earlier vectors are summed already; those within a vector are summed for each end apart
             v = i / LANES;
-            const Separation s = separation(v);
-            Simd others = inverse(s.c, v);
+            const Separation s = separation(t, v);
+            Simd others = inverse(t, s.c, v);
             others[i % LANES] = 0;
             Vec3<Simd> unused{};
             add_mirrored_pair<Q>(sums.h, unused, s.r, others, sources.source(v), e, n);
             ++v;
         }
-        Separation now = separation(v), next = separation(v + 1);
-        Simd inv = inverse(now.c, v);
-        for (; v < sources.vectors; ++v) {
-            const Separation later = separation(v + 2);
-            const Simd next_inv = inverse(next.c, v + 1);
+        if (afresh || i == 0) {
+            now = separation(t, v), next = separation(t, v + 1);
+            inv = inverse(t, now.c, v);
+        }
+        const auto sum_vector = [&](const Separation& later, Simd next_inv) {
             if constexpr (BOTH) {
                 Vec3<Simd> g = vectors(sources.sums, v);
                 add_mirrored_pair<Q>(sums.h, g, now.r, inv, sources.source(v), e, n);
@@ -255,6 +265,12 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
                 add_pair<Q>(sums, now.r, inv, sources.source(v), e);
             }
             now = next, next = later, inv = next_inv;
+        };
+        for (; v < sources.vectors - 2 * !afresh; ++v) sum_vector(separation(t, v + 2), inverse(t, next.c, v + 1));
+        // the next target's first separations
+        for (; v < sources.vectors; ++v) {
+            const int ahead = v + 2 - sources.vectors;
+            sum_vector(separation(then, ahead), ahead ? inverse(then, next.c, ahead - 1) : inverse(t, next.c, v + 1));
         }
         return sums;
     };

@@ -5,12 +5,13 @@ other, are the target rows. A tile is a row of ``TILE_COLUMNS`` integers, see ``
 """
 
 import math
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
 
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
@@ -82,10 +83,18 @@ def cpu_tiles(segments, mutual: bool, dtype):
             above the diagonal only, each standing for its mirror image.
         dtype: Warp scalar type of the sums.
     """
-    pairs, starts = pair_count(segments), row_starts(segments).tolist()
+    tiles, begin, parts = _cut(tuple(map(tuple, segments.tolist())), mutual, tile_size(dtype))
+    threads = min(threads_for(pair_count(segments), _PAIRS_PER_THREAD), max(len(begin) - 1, 1))
+    return tiles, begin, parts, threads
+
+
+@lru_cache(maxsize=4)
+def _cut(segments, mutual: bool, most: int):
+    """Tiles, where each share begins, and the number of partial sums; kept for one-shot calls that repeat."""
+    starts = row_starts(np.array(segments, np.int64).reshape(-1, 4)).tolist()
     blocks, written = [], []
-    for segment, row in zip(segments.tolist(), starts[:-1], strict=True):
-        found, parts = _cut_segment(segment, row, mutual, tile_size(dtype))
+    for segment, row in zip(segments, starts[:-1], strict=True):
+        found, parts = _cut_segment(segment, row, mutual, most)
         blocks += found
         written.append(parts)
     parts = max([1, *written])
@@ -98,8 +107,7 @@ def cpu_tiles(segments, mutual: bool, dtype):
             begun = 0
         begun += work
         tiles += block
-    threads = min(threads_for(pairs, _PAIRS_PER_THREAD), max(len(begin), 1))
-    return tiles, [*begin, len(tiles)], parts, threads
+    return np.reshape(np.array(tiles, np.int32), (-1, TILE_COLUMNS)), [*begin, len(tiles)], parts
 
 
 def _cut_segment(segment, row, mutual, most):
