@@ -108,7 +108,7 @@ class PackedMoments:
         pitched = wp.array(pitched, dtype=dtype, device=device)
         self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
-        lists = self._lists = neighbors.allocate(n, self.packed, self.groups)
+        lists = self._lists = neighbors.allocate(n, self.packed, self.groups, reach=2.0 * largest_radius)
         self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
         self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
 
@@ -137,7 +137,9 @@ class PackedMoments:
         reach = sources.largest_radius + self.largest_radius
         if reach == 0.0 or self.count == 0 or sources.count == 0:
             return
-        neighbors.launch_find_neighbors(self._lists, sources._lists, reach)
+        if sources is not self:
+            self._lists.reach.fill_(reach)
+        neighbors.launch_find_neighbors(self._lists, sources._lists)
         neighbors.launch_list_overlaps(self._lists, sources._lists)
 
 
