@@ -67,6 +67,7 @@ CANDIDATES = 64
 """Balls that may be listed as near, or about to be."""
 MARGIN = 0.05
 """Part of its radius that a ball may move before near balls are sought anew."""
+_RATIO = 0.5 * contact_table.REACH + MARGIN
 NEAR_SLOTS = 32
 """Slots for near balls; balls that do not overlap have at most about 24."""
 CONTACT_SLOTS = 16
@@ -188,7 +189,6 @@ def allocate(
     """
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
-
     field_row = np.full(n, -1)
     field_row[field.target.numpy()] = np.arange(field.count)
 
@@ -198,8 +198,9 @@ def allocate(
         return wp.array(chosen, dtype=dtype if isinstance(other, float) else wp.int32, device=device)
 
     group = padded(worlds, -1)
-    lists = neighbors.allocate(n, packed.packed, group, ratio=0.5 * contact_table.REACH + MARGIN, capacity=CANDIDATES)
     radii = packed.radii.numpy()
+    reach = 2.0 * float(np.max(radii, initial=0.0, where=eligible))
+    lists = neighbors.allocate(n, packed.packed, group, reach=reach, ratio=_RATIO, capacity=CANDIDATES)
     kinds, material = _material_arrays(radii, eligible, susceptibility, saturation, padded)
     arrays = _pair_arrays(balls, dtype, device) | material
     arrays |= {
@@ -222,7 +223,7 @@ def allocate(
         lists=lists,
         arrays=arrays,
         given=_addresses(arrays, balls=balls, moment_stride=stride, kinds=kinds, curve=curve),
-        reach=2.0 * float(np.max(radii, initial=0.0, where=eligible)),
+        reach=reach,
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
@@ -342,7 +343,7 @@ def launch_find_pairs(b: NearContactBuffers):
         return
     with _beside(b):
         _launch(b, "Places", 0, 1)
-        neighbors.launch_find_neighbors(b.lists, b.lists, b.reach)
+        neighbors.launch_find_neighbors(b.lists, b.lists)
         _launch(b, "Pairs", 0, 2)
 
 

@@ -20,6 +20,11 @@ template <class Lists> CUDA_CALLABLE inline Balls balls_of(const Lists& lists) {
     return {x, x + pitch, x + 2 * pitch, x + 3 * pitch};
 }
 
+// What is near is nearer than a cell is wide, however the quotient is rounded.
+template <class Lists> CUDA_CALLABLE inline double cells_per_meter_of(const Lists& targets) {
+    return 1.0 / ((targets.ratio + 1e-6) * targets.reach.data[0]);
+}
+
 // Cell of a moment of some group.
 CUDA_CALLABLE inline Cell cell_of(const Balls& balls, int i, int group, double cells_per_meter) {
     const double place[3] = {balls.x[i] * cells_per_meter, balls.y[i] * cells_per_meter, balls.z[i] * cells_per_meter};

@@ -44,6 +44,7 @@ def lists_type(dtype):
         packed: wp.array2d[dtype]
         group: wp.array[int]
         ratio: wp.float64
+        reach: wp.array[wp.float64]
         neighbor: wp.array2d[int]
         count: wp.array[int]
         overlap: wp.array2d[int]
@@ -62,18 +63,19 @@ def lists_type(dtype):
     return NeighborLists
 
 
-def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
+def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capacity=CAPACITY):
     """Allocate the lists of moments, empty.
 
     Args:
         count: Number of moments n.
         packed: The packed moments, shape [8, n].
         group: Group of each, shape [n] or longer: only moments of one group are neighbours, none if it is negative.
+        reach: Distance of the farthest contact [m].
         ratio: What is nearer than this times contact is a neighbour; with 1 the neighbours are what overlaps.
         capacity: Neighbours a list can hold.
 
     Returns:
-        A Warp struct of these and
+        A Warp struct of these, the reach as an array of shape [1], and
             neighbor: Indices of the neighbours, ascending, shape [n, capacity].
             count: How many there are, also beyond the capacity, shape [n].
             overlap: Indices of what overlaps each, ascending, shape [n, capacity].
@@ -95,6 +97,7 @@ def allocate(count: int, packed, group, *, ratio=1.0 + SKIN, capacity=CAPACITY):
     linked, padded = (0, count + _PADDING) if device.is_cpu else (count, 0)
     lists = lists_type(dtype)()
     lists.packed, lists.group, lists.ratio = packed, group, ratio
+    lists.reach = wp.full(1, reach, dtype=wp.float64, device=device)
     lists.neighbor = (wp.zeros if ratio > 1.0 else wp.empty)((count, capacity), dtype=int, device=device)
     lists.count = wp.zeros(count, dtype=int, device=device)
     lists.overlap, lists.overlap_count = lists.neighbor, lists.count
@@ -127,7 +130,6 @@ def _kernel(call: str, header: str, dtype, capacity: int, group: int):
         thread: int,
         targets: lists,
         sources: lists,
-        cells_per_meter: wp.float64,
         threads: int,
         team: wp.array2d[wp.uint64],
     ): ...
@@ -139,19 +141,18 @@ def _kernel(call: str, header: str, dtype, capacity: int, group: int):
     )
     def find_neighbors(
         # inputs:
-        cells_per_meter: wp.float64,
         threads: int,
         team: wp.array2d[wp.uint64],
         # in and out:
         targets: lists,
         sources: lists,
     ):
-        run(wp.tid(), targets, sources, cells_per_meter, threads, team)
+        run(wp.tid(), targets, sources, threads, team)
 
     return find_neighbors
 
 
-def _launch(call: str, targets, sources, dim: int = 1, cells_per_meter: float = 0.0):
+def _launch(call: str, targets, sources, dim: int = 1):
     """Launch threads that call a function of the device's header; on a CPU one, which shares the work out."""
     device = targets.packed.device
     header, threads, members = "pairs/neighbors_cuda.h", 0, None
@@ -161,32 +162,28 @@ def _launch(call: str, targets, sources, dim: int = 1, cells_per_meter: float = 
     wp.launch(
         _kernel(call, header, targets.packed.dtype, targets.neighbor.shape[1], group_threads(device)),
         dim=dim,
-        inputs=[cells_per_meter, threads, members, targets, sources],
+        inputs=[threads, members, targets, sources],
         device=device,
         block_dim=_BLOCK,
     )
 
 
-def launch_find_neighbors(targets, sources, reach: float):
+def launch_find_neighbors(targets, sources):
     """List the sources near each target, if targets have moved too far since the last time.
 
     Args:
-        targets: Lists of the targets.
+        targets: Lists of the targets; their reach is that of both.
         sources: Lists of the sources, whose hash table is used; the targets' own if both are the same moments, none of
             which is its own neighbour.
-        reach: Distance of the farthest contact [m].
     """
-    # what is near is nearer than a cell is wide, however the quotient is rounded
-    cells_per_meter = 1.0 / ((targets.ratio + 1e-6) * reach)
     if targets.packed.device.is_cpu:
-        call = "search_neighbors(targets, sources, cells_per_meter, threads, team.data)"
-        _launch(call, targets, sources, cells_per_meter=cells_per_meter)
+        _launch("search_neighbors(targets, sources, threads, team.data)", targets, sources)
         return
     for call, dim in (
         ("fill_table", max(sources.packed.shape[1], 1)),
         ("list_neighbors", 32 * targets.packed.shape[1]),
     ):
-        _launch(f"{call}(thread, targets, sources, cells_per_meter)", targets, sources, dim, cells_per_meter)
+        _launch(f"{call}(thread, targets, sources)", targets, sources, dim)
 
 
 def launch_list_overlaps(targets, sources):

@@ -91,11 +91,11 @@ inline void write_sorted(int* list, int count, int* out) {
 
 // Lists each target's neighbours anew if moments have moved too far.
 template <class Lists>
-inline void search_neighbors(const Lists& targets, const Lists& sources, double cells_per_meter, int threads,
-                             Word* team) {
+inline void search_neighbors(const Lists& targets, const Lists& sources, int threads, Word* team) {
     targets.searching.data[0] = targets.moved.data[0];
     if (targets.moved.data[0] == 0) return;
     targets.moved.data[0] = 0;
+    const double cells_per_meter = cells_per_meter_of(targets);
     const SortedSources sorted = sort_sources(sources, cells_per_meter);
     const Balls balls = balls_of(targets);
     const bool same = targets.count.data == sources.count.data;

@@ -20,12 +20,11 @@ __device__ inline int last_of(Entry entry, int search) {
 }
 
 // Puts source j into the list of its bucket, if moments have moved too far since the last search.
-template <class Lists>
-__device__ inline void fill_table(int j, const Lists& targets, const Lists& sources, double cells_per_meter) {
+template <class Lists> __device__ inline void fill_table(int j, const Lists& targets, const Lists& sources) {
     const int search = targets.moved.data[0] ? sources.searches.data[0] + 1 : 0;
     if (j == 0) targets.searching.data[0] = search;
     if (search == 0 || j >= sources.packed.shape[1]) return;
-    const Cell cell = cell_of(balls_of(sources), j, sources.group.data[j], cells_per_meter);
+    const Cell cell = cell_of(balls_of(sources), j, sources.group.data[j], cells_per_meter_of(targets));
     cells_of(sources)[j] = cell;
     if (cell.group < 0) return;
     Entry* const last = (Entry*)sources.table.data + bucket_of(cell, sources.table.shape[0]);
@@ -33,8 +32,7 @@ __device__ inline void fill_table(int j, const Lists& targets, const Lists& sour
 }
 
 // Lists the neighbours of target thread / 32 in ascending order: each entry comes behind as many as are smaller.
-template <class Lists>
-__device__ inline void list_neighbors(int thread, const Lists& targets, const Lists& sources, double cells_per_meter) {
+template <class Lists> __device__ inline void list_neighbors(int thread, const Lists& targets, const Lists& sources) {
     const int search = targets.searching.data[0], i = thread / 32, c = thread % 32;
     if (search == 0) return;
     if (thread == 0) targets.moved.data[0] = 0, sources.searches.data[0] = search;
@@ -46,7 +44,7 @@ __device__ inline void list_neighbors(int thread, const Lists& targets, const Li
     const bool same = targets.count.data == sources.count.data;
     const Balls own = balls_of(targets), others = balls_of(sources);
     const Real x = own.x[i], y = own.y[i], z = own.z[i], radius = own.radius[i], ratio = (Real)targets.ratio;
-    Cell sought = same ? cells_of(sources)[i] : cell_of(own, i, targets.group.data[i], cells_per_meter);
+    Cell sought = same ? cells_of(sources)[i] : cell_of(own, i, targets.group.data[i], cells_per_meter_of(targets));
     if (sought.group >= 0 && c < 27) {
         sought = {sought.x + c / 9 - 1, sought.y + c / 3 % 3 - 1, sought.z + c % 3 - 1, sought.group};
         int j = last_of(sources.table.data[bucket_of(sought, sources.table.shape[0])], search);

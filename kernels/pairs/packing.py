@@ -109,9 +109,9 @@ class PackedMoments:
         pitched[7].fill_(-1.0)
         self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
-        lists = self._lists = neighbors.allocate(
-            n, self.packed, self.groups, ratio=1.0 + neighbors.SKIN if moving else 1.0
-        )
+        ratio = 1.0 + neighbors.SKIN if moving else 1.0
+        lists = neighbors.allocate(n, self.packed, self.groups, reach=2.0 * largest_radius, ratio=ratio)
+        self._lists = lists
         self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
         self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
 
@@ -140,7 +140,9 @@ class PackedMoments:
         reach = sources.largest_radius + self.largest_radius
         if reach == 0.0 or self.count == 0 or sources.count == 0:
             return
-        neighbors.launch_find_neighbors(self._lists, sources._lists, reach)
+        if sources is not self:
+            self._lists.reach.fill_(reach)
+        neighbors.launch_find_neighbors(self._lists, sources._lists)
         neighbors.launch_list_overlaps(self._lists, sources._lists)
 
 

@@ -35,6 +35,23 @@ template <class Arrays> CUDA_CALLABLE inline Box swept_box(const Arrays& arrays,
     return box;
 }
 
+#if defined(__CUDA_ARCH__)
+// Takes a distance of contact into the largest, which was set to zero; positive numbers are in the order of their bits.
+template <class Lists> __device__ inline void note_reach(const Lists& lists, double reach) {
+    auto* const largest = (unsigned long long*)lists.reach.data;
+    const auto bits = (unsigned long long)__double_as_longlong(reach);
+    if (isfinite(reach) && bits > *largest) atomicMax(largest, bits);
+}
+#else
+// The largest distance of contact, once all balls are placed.
+template <class Lists> inline void find_reach(const Lists& lists) {
+    const Balls balls = balls_of(lists);
+    Real radius = 0;
+    for (int i = 0; i < lists.group.shape[0]; ++i) radius = balls.radius[i] > radius ? balls.radius[i] : radius;
+    lists.reach.data[0] = 2.0 * radius;
+}
+#endif
+
 // Stores where a ball is in the middle of the substep, with a radius that holds all of its places, and whether the
 // lists are too old for it; or the swept box of another shape. A ball that moves farther than contacts are sought ahead
 // is taken where it is, with that farthest distance around it.
@@ -63,6 +80,9 @@ template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arr
         moved += (x - found_at[c]) * (x - found_at[c]);
     }
     packed[3 * pitch] = arrays.radius.data[target] + (far ? arrays.farthest : Real(0.5) * way);
+#if defined(__CUDA_ARCH__)
+    note_reach(arrays.lists, 2.0 * packed[3 * pitch]);
+#endif
     const Real found_radius = packed[4 * pitch], grown = packed[3 * pitch] - found_radius;
     if (!(sqrt(moved) + (grown > 0 ? grown : 0) <= SKIN * found_radius)) arrays.lists.moved.data[0] = 1;
 }
@@ -234,6 +254,7 @@ CUDA_CALLABLE inline void place_targets(int thread, int threads, Word* team, con
     if (thread < arrays.shape.shape[0]) place_target(arrays, thread);
 #else
     share_out(team, threads, arrays.shape.shape[0], TARGETS_AT_ONCE, [&](int t) { place_target(arrays, t); });
+    find_reach(arrays.lists);
     bound_boxes(arrays);
 #endif
 }
@@ -252,6 +273,7 @@ CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const 
 #if defined(__CUDA_ARCH__)
     const int target = thread / GROUP;
     if (share() == 0) keep_radius(arrays, target);
+    if (thread == 0) arrays.lists.reach.data[0] = 0; // for the next search
     find_pairs_of(arrays, target, [&](int a, int b, auto... touch) {
         int* const count = sizeof...(touch) ? arrays.contacts.count.data : arrays.pair_count.data;
         put_found(arrays, atomicAdd(count, 1), a, b, touch...);

@@ -77,7 +77,8 @@ class BroadPhaseArrays:
         range: Others in the world of each target, begin and end, shape [t].
         shared: Others of all worlds.
         radius: Radii of the balls with how far contacts are sought [m], shape [b].
-        lists: Neighbour lists of the balls; packed row 4 holds the radius that a ball was listed with.
+        lists: Neighbour lists of the balls; packed row 4 holds the radius that a ball was listed with, and the reach is
+            that of the balls as they are.
         boxes: Swept boxes of the others [m], lower then upper, shape [6, o padded].
         bounds: On a CPU, boxes around those of each vector of others, shape [6, o / 16 padded].
         found: On a CPU, how many pairs and contacts chunks of targets find, and notes of them, shape [chunks, 2 + NOTE
@@ -125,13 +126,11 @@ class PairSearch:
     Attributes:
         arrays: What the passes work on.
         targets: Number of targets.
-        reach: Distance of the farthest pair of balls [m].
         group: Threads of a GPU that share a target.
     """
 
     arrays: Any
     targets: int
-    reach: float
     group: int
 
 
@@ -170,7 +169,8 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
     arrays.radius = wp.array(ball_radius[balls], dtype=float, device=device)
     packed = wp.zeros((_PACKED_ROWS, max(len(balls), 1)), dtype=float, device=device)
     group = integers(worlds[balls])
-    arrays.lists = neighbors.allocate(len(balls), packed, group, ratio=1.0 + _SKIN)
+    # the reach is that of the present balls
+    arrays.lists = neighbors.allocate(len(balls), packed, group, reach=0.0, ratio=1.0 + _SKIN)
     sizes = -(-len(others) // _PADDING) * _PADDING, len(others) // _PADDING
     arrays.boxes, arrays.bounds = (wp.empty((6, n + _PADDING), dtype=float, device=device) for n in sizes)
     for boxes in (arrays.boxes, arrays.bounds):
@@ -179,8 +179,7 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
     chunks = -(-len(shape) // _TARGETS_AT_ONCE) if device.is_cpu else 0
     arrays.found = wp.zeros((chunks, 2 + _NOTE * _NOTES), dtype=int, device=device)
     arrays.farthest = farthest
-    reach = 2.0 * float(ball_radius[balls].max(initial=0.0)) + 2.0 * farthest
-    return PairSearch(arrays, len(shape), reach, 32 if len(others) >= _MANY else group_threads(device))
+    return PairSearch(arrays, len(shape), 32 if len(others) >= _MANY else group_threads(device))
 
 
 @cache
@@ -199,7 +198,7 @@ def launch_find_shape_pairs(search: PairSearch) -> None:
     arrays = search.arrays
     _launch("place_targets", search, 1)
     if arrays.radius.shape[0]:
-        neighbors.launch_find_neighbors(arrays.lists, arrays.lists, search.reach)
+        neighbors.launch_find_neighbors(arrays.lists, arrays.lists)
     _launch("find_pairs", search, search.group)
 
 
