@@ -395,3 +395,9 @@ def test_metadata_that_cannot_be_read(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"a note that", b"a n\x80te that"))
     report = check(path)
     assert [str(one) for one in report.refusals] == [f"{path}: documentation cannot be read (text that is not UTF-8)"]
+
+
+def test_offsets_of_sublayers_are_no_metadata_to_copy(tmp_path):
+    write(tmp_path, ball()).rename(tmp_path / "below.usda")
+    path = write(tmp_path, "", f"{METRES}\nsubLayers = [@./below.usda@ (offset = 2; scale = 2)]")
+    assert check(path).refusals == ()

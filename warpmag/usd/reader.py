@@ -36,6 +36,8 @@ from warpmag.usd.values import (
 _SESSION = re.compile(r",@anon:[^@]*@")
 """How USD names a stage's session layer, by an address that is another one each time."""
 _ORDER = "xformOpOrder"
+_COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")
+"""Metadata of a layer that layers above it get from it."""
 
 
 @dataclass
@@ -190,12 +192,17 @@ def survey(stage: Usd.Stage) -> StageContents:
     return contents
 
 
+def copied_metadata(root: Sdf.Layer) -> list[str]:
+    """Return the names of those metadata of a root layer that a root above it has to repeat."""
+    return [key for key in root.pseudoRoot.ListInfoKeys() if key not in _COMPOSED]
+
+
 def _metadata_findings(stage) -> Iterator[Finding]:
     """Yield which metadata of the stage cannot be read, of a file that is damaged; a run copies them."""
-    root = stage.GetRootLayer().pseudoRoot
-    for key in root.ListInfoKeys():
+    root = stage.GetRootLayer()
+    for key in copied_metadata(root):
         try:
-            root.GetInfo(key)
+            root.pseudoRoot.GetInfo(key)
         except (UnicodeDecodeError, Tf.ErrorException) as error:
             yield Finding(stage_name(stage), f"{key} cannot be read ({failure(error)})")
 

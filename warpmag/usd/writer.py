@@ -24,11 +24,11 @@ from warpmag.usd.clock import stage_clock
 from warpmag.usd.output import Output
 from warpmag.usd.paths import path_between
 from warpmag.usd.placements import Placements
+from warpmag.usd.reader import copied_metadata
 from warpmag.usd.samples import END_MARK, SampleFile, time_mark
 from warpmag.usd.scene_copy import copy_scene
 from warpmag.usd.schemas import MOMENT
 
-_COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")  # metadata that sublayers do hand up
 _TRANSLATE, _ORIENT, _SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
 _TYPES = Sdf.ValueTypeNames
 _CHECKPOINT_SECONDS = 1.0
@@ -340,9 +340,8 @@ class CacheWriter:
     def _root_layer(self) -> Sdf.Layer:
         scene = self._stage.GetRootLayer()
         root = Sdf.Layer.CreateAnonymous()
-        for key in scene.pseudoRoot.ListInfoKeys():
-            if key not in _COMPOSED:
-                root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
+        for key in copied_metadata(scene):
+            root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
         self._set_metadata(root, self._code(self._last_time))
         root.subLayerPaths[:] = [f"./{self._output.cache.name}", self._below]
         return root
