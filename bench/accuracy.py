@@ -32,7 +32,8 @@ from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
 from bench.reference import clusters, cuboids, spheres
 from bench.reference.fall import DURATION, fall
-from bench.run import RUNNERS, make_system, measure
+from bench.run import RUNNERS, make_system
+from bench.timing import measure
 from warpmag import oracle
 from warpmag.magnets import CONTACT_MODELS
 from warpmag.system import MomentSystem

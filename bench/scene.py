@@ -1,5 +1,6 @@
 """A running scene: what its steps cost on the device and on the host, and what they did."""
 
+import contextlib
 import copy
 import re
 import tempfile
@@ -10,7 +11,9 @@ import numpy as np
 import warp as wp
 
 from bench.cases import PILES
+from bench.timing import measure
 from warpmag import Simulation
+from warpmag.engine.capture import without_allocations
 from warpmag.scenes_usd import balls_up
 
 _SETTLING, _STEPS = 32, 60
@@ -52,6 +55,7 @@ def run_scene(count: int, device) -> dict:
         "ti_ms": induction,
         "tf_ms": force,
         "tr_ms": rigid,
+        **parts_of_a_substep(simulation),
         "magnetics_share": (induction + force) / rigid,
         "capture_failure": simulation.capture_failure,
         "host_us": 1e6 * float(np.median(host)),
@@ -64,4 +68,36 @@ def run_scene(count: int, device) -> dict:
         "unconverged": after.unconverged,
         "overlap": after.overlap,
         "first_call_seconds": first,
+    }
+
+
+def parts_of_a_substep(simulation: Simulation) -> dict:
+    """Measure what rigid bodies cost in a substep of the present state, each part alone.
+
+    Returns:
+        Times of the search for pairs (and for contacts of balls with it), of Newton's narrow phase and of the solver
+        [ms], contacts and iterations.
+    """
+    solver, stepper, device = simulation._solver, simulation._stepper, simulation.model.device
+    now, then, dt = stepper.state, stepper._other, stepper._longest
+    solver.collide(now, dt)
+    contacts = int(solver.contacts.rigid_contact_count.numpy()[0])
+    narrow = solver._pipeline.narrow_phase
+
+    def alone(work) -> float:
+        with without_allocations(device, stepper._workspace):
+            return 1e3 * measure(work, device, seconds=0.2)
+
+    both = alone(lambda: solver.collide(now, dt))
+    with contextlib.ExitStack() as restored:
+        restored.callback(setattr, narrow, "launch_custom_write", narrow.launch_custom_write)
+        narrow.launch_custom_write = lambda **arguments: None
+        search = alone(lambda: solver.collide(now, dt))
+    solver.collide(now, dt)
+    return {
+        "search_ms": search,
+        "narrow_ms": both - search,
+        "solve_ms": alone(lambda: solver.step(now, then, dt)),
+        "contacts": contacts,
+        "iterations": solver._solver.iterations,
     }
