@@ -147,7 +147,7 @@ def _pair_law(r, a, b, same):
 
 def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (i, j) of near moments of one shape, shape [2, pairs], and N_ij √(V_i V_j) over V in six numbers."""
-    first, count = int(part.moment.min(initial=0)), len(np.unique(part.moment))
+    first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     i, j = _near_pairs(local, reach * float(part.sides.max()))
     volume = np.bincount(part.moment - first, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece], count)

@@ -20,8 +20,8 @@ class BodyLattice:
         volumes: Volumes [m³], shape [n].
         radii: Radii of the balls that the moments are averaged over [m], shape [n].
         counts: Moments of each shape, in the order of the shapes.
-        coupling: What inducible moments lack among themselves as balls, as cells of the body; None of permanent ones
-            and of balls.
+        coupling: What inducible moments of one shape lack among themselves as balls; None of permanent ones, of balls,
+            and of several shapes.
     """
 
     positions: np.ndarray
@@ -75,11 +75,12 @@ class ShapeSampler:
                 np.ones(len(shapes), dtype=int),
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
-        filled = lattice.fill(solids, spacing, 1 if permanent else lattice.LEAST_ACROSS)
+        filled = lattice.fill(solids, spacing, 1 if permanent or len(solids) > 1 else lattice.LEAST_ACROSS)
         counts = np.bincount(filled.owners, minlength=len(solids))
         if permanent:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts)
-        cells = coupling(filled, filled.radii)
+        # between shapes, which have grids of their own, there are balls; mixed with cells these may have no solution
+        cells = coupling(filled, filled.radii) if len(filled.pieces) == 1 else None
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells)
 
     def _are_balls_apart(self, shapes: list[int]) -> bool:
