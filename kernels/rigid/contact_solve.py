@@ -20,10 +20,9 @@ from warpmag.kernels.shared.team import team, threads_for
 
 _GROUPS = ((100, 32), (400, 16), (6_000, 8), (20_000, 4), (2**31, 2))
 """Bodies up to which so many threads of a GPU share each, measured with three contacts a body on an H200."""
-_CLUSTER, _CLUSTER_LINES = 16, 208
-"""Blocks of a cluster, and bodies whose lines each keeps in 48 KB of shared memory."""
-_CLUSTER_CAPACITY, _CLUSTER_SIDES = 50_000, 12_000
-"""Contacts that there may be, and sides that there are, up to which a cluster is faster than launches."""
+_CLUSTER, _CLUSTER_CAPACITY, _SIDES_PER_BLOCK = 16, 50_000, 375
+"""Blocks of a cluster, contacts that there may be for it to list them, and sides for each block that it iterates over:
+more take longer than a launch, going by Balls Up (1,500 sides, a third of a launch) and Falling Magnet (10,000)."""
 _WORLDS, _WORLD_GROUP, _WORLD_LINES = 16, 8, (32, 64, 128, 208)
 """Worlds from which on each has a block, threads that share a body there, and bodies that such a block may keep."""
 _BLOCK, _WIDE_BLOCKS = 128, 64
@@ -148,13 +147,14 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
     is_round = bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all())
     group = _WORLD_GROUP if world_lines else next(group for most, group in _GROUPS if bodies <= most)
     small = contact_max <= _CLUSTER_CAPACITY and bodies <= _GROUPS[2][0] and not world_lines
+    cluster = _most_blocks(device, is_round, group) if small else 0
     return SolveBuffers(
         arrays,
         given,
         round=is_round,
         group=0 if device.is_cpu else group,
-        cluster=_most_blocks(device, is_round, group) if small else 0,
-        most=threads_for(contact_max, 1) if device.is_cpu else _CLUSTER_SIDES,
+        cluster=cluster,
+        most=threads_for(contact_max, 1) if device.is_cpu else _SIDES_PER_BLOCK * cluster,
         worlds=len(world_first) - 1 if world_lines else 0,
         world_lines=world_lines,
     )
@@ -181,19 +181,24 @@ def _most_blocks(device, is_round: bool, group: int) -> int:
     return 0
 
 
+def _teams(is_round: bool, group: int) -> int:
+    """Bodies that a block of a cluster moves at a time; its threads may have 128 registers, or else 255."""
+    return (512 if is_round else 256) // group
+
+
 @cache
-def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines: int = _CLUSTER_LINES):
+def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines: int = 0):
     """Kernel that calls a function of the device's header, and threads of its blocks on a GPU."""
     header = "rigid/contact_cuda.h" if group else "rigid/contact_cpu.h"
     block = _BLOCK
     constants = dict(ROUND=int(is_round), GROUP=group, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
-    if cluster:
-        header = "rigid/contact_cluster.h"
-        block = 512 if is_round and cluster > 1 else 256  # leaves them 128 and 255 registers
-        constants |= dict(CLUSTER=cluster, LINES=lines)
-    if cluster == 1:
-        block = min(block, lines * group)
+    if cluster > 1:
+        header, lines = "rigid/contact_cluster.h", _teams(is_round, group)
+        block = lines * group
+    elif cluster == 1:
+        header, block = "rigid/contact_cluster.h", min(256, lines * group)
         constants["WIDE"] = 2**30  # groups take all bodies
+    constants |= dict(CLUSTER=cluster, LINES=lines)
     options = dict(cluster_dim=cluster, launch_bounds=block) if cluster else {}
     constants |= dict(BLOCK=block, CONTACTS_PER_THREAD=_CONTACTS_PER_THREAD)
 
@@ -272,5 +277,5 @@ def launch_solve_contacts(
         launch(FINISH, groups, iterations % 2)
 
     left = _LEFT if b.cluster else 0
-    if not b.cluster or 2 * given.contact_max > b.most or given.bodies > b.cluster // 2 * _CLUSTER_LINES:
+    if not b.cluster or 2 * given.contact_max > b.most or given.bodies > b.cluster // 2 * _teams(b.round, b.group):
         wp.capture_if(b.arrays["totals"][left : left + 1], iterate)
