@@ -4,7 +4,7 @@
 namespace warpmag {
 
 // 2/√c. On AVX-512 by Newton's steps from an estimate good to 2⁻¹⁴, in 4 operations: a root and a quotient of a vector
-// occupy a divider for 22 cycles (Sapphire Rapids; 16 on Zen 4), more than all else of a pair. On AVX2 they take half
+// occupy a divider for 22 cycles (Sapphire Rapids; 16 on Zen 4), as long as all else of a pair. On AVX2 they take half
 // of that, beside the sums, and the estimate is good to 2⁻¹² only: the steps that it needs cost as much or more.
 #if defined(__CUDA_ARCH__)
 CUDA_CALLABLE inline Real twice_inverse_root(Real c) { return 2 * rsqrt(c); }
