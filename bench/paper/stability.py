@@ -66,10 +66,8 @@ VARIANTS = (
     Variant("warpmag, Eq. 4", force="zeeman"),
     Variant("warpmag, Eq. 4, saturated", force="zeeman", saturated=True),
     *(
-        Variant(
-            f"kim2018{', saturated' * saturated}, κ = {step:g}, {most}", "kim2018", None, saturated, most, step, 0.2
-        )
-        for saturated in (False, True)
+        Variant(f"kim2018{suffix}, κ = {step:g}, {most}", "kim2018", None, bool(suffix), most, step, part=0.2)
+        for suffix in ("", ", saturated")
         for step, most in ((STEP, 10), (STEP, 30), (STEP, 100), (1.0, 10), (1.0, 100))
     ),
 )
@@ -108,6 +106,9 @@ add up to. The paper gives no strengths; its "excessively strong" magnets, and i
 (section 6.1), are about saturation. "Saturated" are the same scenes where the magnets saturate what they hold: balls at
 {balls["saturation"]:g} A/m in place of 1.7e6, letters at {letters["saturation"]:g} A/m with a moment of
 {letters["moment"]:g} A·m² in place of 12.
+
+"kim2018" are pairs of submagnetizations, Eq. 7 and Kelvin's force, for {VARIANTS[-1].part * seconds:g} s; then the step
+κ of the pairs, and how many field evaluations an induction may take. The paper gives neither.
 
 A ball that hangs on one other swings for good where there is no friction: in Balls Up a single one may carry the RMS,
 and the median tells how the others are.
