@@ -7,6 +7,7 @@ import warp as wp
 
 from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.kernels.rigid import monitor, stepping
+from warpmag.kernels.rigid.newton_views import BodyView, view_bodies
 
 TRAVEL, SHARED_TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 1.0, 0.008, 0.8, 0.8, 2, 100
 
@@ -138,13 +139,12 @@ def test_the_device_follows_the_rules(machine):
 
 def test_time_is_counted_for_the_stage_that_it_was_spent_in(machine):
     arrays = machine.arrays
-    watched = machine.watched(np.ones(1), np.zeros(1))
+    watched = machine.watched(np.zeros(0), np.zeros(0))
     machine.begin_step()
     work = wp.zeros(1 << 20, dtype=float, device=arrays.ticks.device)
     for _ in range(20):
         wp.copy(work, wp.ones_like(work))
-    monitor.launch_mark(watched, monitor.FORCE)
-    monitor.launch_mark(watched, monitor.RIGID)
+    monitor.watch_forces(watched, BodyView(), wp.zeros(1, dtype=wp.vec3, device=arrays.ticks.device), 1e-3)
     ticks = arrays.ticks.numpy().astype(float)
     assert ticks[monitor.INDUCTION] == 0.0
     assert ticks[monitor.FORCE] > 0.0
@@ -219,4 +219,25 @@ def test_what_tells_is_how_bodies_glide_along_each_other_where_they_touch(case, 
         assert peaks[where] == pytest.approx(here, rel=1e-3) and peaks[other] == 0.0
         assert peaks[monitor.PEAK_LONG_TRAVEL] == pytest.approx(2.0 * later, rel=1e-3)
         assert peaks[monitor.PEAK_DEPTH] == pytest.approx(max(0.0, -gap), abs=1e-6)
-    assert watched.counts.numpy()[monitor.COUNT_CAPACITIES :].tolist() == [1, 1]  # pairs, contacts
+    assert watched.counts.numpy()[monitor.COUNT_CAPACITIES + 1] == 1  # contacts
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_what_tells_is_how_far_forces_pull(level, machine, device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -3.0))
+    ball = builder.add_body()
+    builder.add_shape_sphere(ball, radius=0.5)
+    builder.add_body(is_kinematic=True)  # which forces do not move
+    model = builder.finalize(device=device)
+    sizes = body_sizes(model)
+    watched = machine.watched(sizes.thickness, sizes.reach)
+    machine.set_status(stepping.STATUS_LEVEL, level)
+    state = model.state()
+    forces = np.zeros((2, 6), dtype=np.float32)
+    forces[:, 0] = 4.0 * model.body_mass.numpy()[0], 1e6
+    state.body_f.assign(forces)
+    monitor.watch_forces(watched, view_bodies(model, state), model.gravity, 0.1 * 2**level)
+    pulled = 0.5 * 5.0 * 0.1**2 / 0.5  # 5 m/s² in 0.1 s
+    peaks = watched.peaks.numpy()
+    assert peaks[monitor.PEAK_TRAVEL] == pytest.approx(pulled, rel=1e-5)
+    assert peaks[monitor.PEAK_LONG_TRAVEL] == pytest.approx(4.0 * pulled, rel=1e-5)

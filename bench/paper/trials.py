@@ -13,8 +13,10 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
+from unittest import mock
 
 import warpmag
+from warpmag import dynamics
 from warpmag.errors import SimulationError
 from warpmag.magnets import METHODS
 from warpmag.scenes_usd import bundled
@@ -37,6 +39,7 @@ class Trial:
         patience: Time after which the run is ended [s], the first step not counted.
         rtol: Magnetization error at which induction ends.
         max_evaluations: Field evaluations after which it ends at the latest.
+        pair_step: Step κ of pairs of submagnetizations, see ``warpmag.dynamics``.
         force: Force law in place of the method's own.
         parameters: Parameters of the scene's script, where it is not to be as bundled.
     """
@@ -48,6 +51,7 @@ class Trial:
     patience: float
     rtol: float = 1e-3
     max_evaluations: int = 1000
+    pair_step: float = dynamics.STEP
     force: str | None = None
     parameters: dict = field(default_factory=dict)
 
@@ -119,15 +123,16 @@ def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
     if trial.parameters:
         stage = folder / f"{trial.scene}.usdc"
         import_module(f"warpmag.scenes_usd.{trial.scene}").author(stage, **trial.parameters)
-    return warpmag.Simulation(
-        stage,
-        dynamics=method.dynamics,
-        curve=method.curve,
-        force=trial.force or method.force,
-        rtol=trial.rtol,
-        max_evaluations=trial.max_evaluations,
-        device=trial.device,
-    )
+    with mock.patch.object(dynamics, "STEP", trial.pair_step):  # a scene leaves it at its default
+        return warpmag.Simulation(
+            stage,
+            dynamics=method.dynamics,
+            curve=method.curve,
+            force=trial.force or method.force,
+            rtol=trial.rtol,
+            max_evaluations=trial.max_evaluations,
+            device=trial.device,
+        )
 
 
 def outcome_head() -> list[str]:

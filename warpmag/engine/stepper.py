@@ -29,7 +29,8 @@ from warpmag.kernels.rigid.bodies import predict_poses
 from warpmag.kernels.rigid.newton_views import view_bodies
 
 TRAVEL_LIMIT = 0.25
-"""How far a body may glide along another in a substep, in parts of its thickness, see ``kernels.rigid.monitor``."""
+"""How far a body may glide along another, or forces may pull it, in a substep, in parts of its thickness; see
+``kernels.rigid.monitor``."""
 _SHARED_TRAVEL_LIMIT = 0.5
 """The same while more than two substeps share their forces: a ball that flies alone moves two radii meanwhile."""
 OVERLAP_LIMIT = 0.008
@@ -366,7 +367,8 @@ class Stepper:
         self._magnetics.induce(state)
         monitor.watch_induction(self._watched, system.error, system.evaluations, system.converged)
         self._magnetics.add_forces(state)
-        monitor.launch_mark(self._watched, monitor.FORCE)
+        bodies = view_bodies(self._model, state)
+        monitor.watch_forces(self._watched, bodies, self._model.gravity, self._longest)
 
 
 def _clear_error(device) -> None:
