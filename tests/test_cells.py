@@ -166,6 +166,27 @@ def test_operator_of_a_body_is_positive(solid):
     assert values[-1] < 1.0
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.004, 0.009, 0.01])
+def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
+    """Two cubes of 10 mm and infinite permeability, also in one place, from whatever start."""
+    body = lattice.fill(lattice.box([0.005] * 3), 0.0025)
+    n, coupling = len(body.volumes), demagnetization.coupling(body, body.radii)
+    found = []
+    for seed in range(3):
+        system = MomentSystem(
+            radii=np.tile(body.radii, 2), bodies=np.repeat([0, 1], n), saturation=1.7e6, external_field=(0.0, 0.0, 1e3),
+            couplings=[(0, coupling), (n, coupling)], rtol=1e-8, max_evaluations=3000, dtype="float64", device=device,
+        )  # fmt: skip
+        system.positions.assign(np.concatenate([body.positions, body.positions + np.array([apart, 0.0, 0.0])]))
+        start = np.random.default_rng(seed).normal(size=(2 * n, 3)) * (1e6 if seed else 0.0)
+        system.start_from(wp.array(np.clip(start, -9e5, 9e5), dtype=wp.vec3d, device=device))
+        system.solve()
+        assert system.converged.numpy().tolist() == [1]
+        found.append(system.moments.numpy())
+    for other in found[1:]:
+        assert np.linalg.norm(other - found[0]) < 1e-6 * np.linalg.norm(found[0])  # rtol, and what slowness makes of it
+
+
 def coenergy(system):
     """μ0/2 Σ m·H0 of inducible moments that do not saturate, for an applied field H0 [J]."""
     system.solve()
