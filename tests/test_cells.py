@@ -129,7 +129,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-@pytest.mark.parametrize("susceptibility", [1.0, 179.0, math.inf])
+@pytest.mark.parametrize("susceptibility", [179.0, math.inf])
 def test_ellipsoids_take_the_moment_of_the_closed_form(device, name, susceptibility):
     """2 %: a surface cuts cells of a quarter to a ninth of the width, of which eighths are resolved."""
     axes, solid = SHAPES[name]
