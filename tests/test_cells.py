@@ -10,6 +10,7 @@ import warp as wp
 from scipy.integrate import quad
 
 import warpmag
+from bench.reference import boxes
 from warpmag import demagnetization, lattice, oracle
 from warpmag.system import MomentSystem
 
@@ -128,7 +129,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-@pytest.mark.parametrize("susceptibility", [1.0, 179.0, math.inf])
+@pytest.mark.parametrize("susceptibility", [179.0, math.inf])
 def test_ellipsoids_take_the_moment_of_the_closed_form(device, name, susceptibility):
     """2 %: a surface cuts cells of a quarter to a ninth of the width, of which eighths are resolved."""
     axes, solid = SHAPES[name]
@@ -137,7 +138,15 @@ def test_ellipsoids_take_the_moment_of_the_closed_form(device, name, susceptibil
     np.testing.assert_allclose(found, 1.0 / (demagnetizing_factors(axes) + 1.0 / susceptibility)[[0, 2]], rtol=2e-2)
 
 
-def test_cubes_and_rods_approach_published_values(device):
+@pytest.mark.parametrize("sides", [(1.0, 1.0, 5.0), (1.0, 1.0, 10.0), (5.0, 5.0, 1.0), (10.0, 10.0, 1.0)])
+def test_rods_and_sheets_take_the_moment_of_a_surface_integral_equation(device, sides):
+    """5 % at the default spacing, always too little; the reference with 192 rectangles is good to 0.2 %."""
+    body = lattice.fill(lattice.box(0.5 * np.array(sides)), across=lattice.LEAST_ACROSS)
+    error = polarizability(body, math.inf, device) / boxes.moments(sides, 8)[[0, 2]] - 1.0
+    assert (error < 0.0).all() and (error > -0.05).all()
+
+
+def test_cubes_approach_the_published_value(device):
     """A cube of infinite permeability takes 3.6442 V H0 (Sihvola et al. 2004; Helsing and Perfekt 2013).
 
     Cells of uniform magnetization are a little too stiff, by a part that falls with their side.
@@ -164,6 +173,27 @@ def test_operator_of_a_body_is_positive(solid):
     values = np.linalg.eigvalsh(matrix)
     assert values[0] > 0.0
     assert values[-1] < 1.0
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.004, 0.009, 0.01])
+def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
+    """Two cubes of 10 mm and infinite permeability, also in one place, from whatever start."""
+    body = lattice.fill(lattice.box([0.005] * 3), 0.0025)
+    n, coupling = len(body.volumes), demagnetization.coupling(body, body.radii)
+    found = []
+    for seed in range(3):
+        system = MomentSystem(
+            radii=np.tile(body.radii, 2), bodies=np.repeat([0, 1], n), saturation=1.7e6, external_field=(0.0, 0.0, 1e3),
+            couplings=[(0, coupling), (n, coupling)], rtol=1e-8, max_evaluations=3000, dtype="float64", device=device,
+        )  # fmt: skip
+        system.positions.assign(np.concatenate([body.positions, body.positions + np.array([apart, 0.0, 0.0])]))
+        start = np.random.default_rng(seed).normal(size=(2 * n, 3)) * (1e6 if seed else 0.0)
+        system.start_from(wp.array(np.clip(start, -9e5, 9e5), dtype=wp.vec3d, device=device))
+        system.solve()
+        assert system.converged.numpy().tolist() == [1]
+        found.append(system.moments.numpy())
+    for other in found[1:]:
+        assert np.linalg.norm(other - found[0]) < 1e-6 * np.linalg.norm(found[0])  # rtol, and what slowness makes of it
 
 
 def coenergy(system):

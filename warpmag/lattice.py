@@ -43,8 +43,10 @@ from warpmag.errors import InputError
 AUTOMATIC_COUNT = 729
 """Moments of one body at automatic spacing, at most (see the table above): 9³, a cube's."""
 
-LEAST_ACROSS = 4
-"""Cells across an inducible shape at automatic spacing, at least: a sheet, a nail."""
+LEAST_ACROSS = 2
+"""Cells across an inducible shape at automatic spacing, at least. More of them, which are flatter then, make a sheet
+worse: of 10:10:1 and χ = ∞, 19·19·2 cells take 3.9 % too little in its plane after 39 evaluations, 13·13·4 6.2 % after
+206."""
 
 LARGEST_COUNT = 20_000
 """Moments of one body at any spacing; a smaller spacing is refused as a mistake."""

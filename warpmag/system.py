@@ -192,7 +192,7 @@ class MomentSystem:
         saturation, susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
-        self._make_cells(couplings)
+        self._make_cells(layout, couplings)
         self._evaluate_wrench(layout, turned)
         self._energies = None
         self._near = self._make_near_contacts(layout, turned, saturation, susceptibility, curve) if near else None
@@ -251,8 +251,9 @@ class MomentSystem:
         # near contacts write one more partial sum
         self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
 
-    def _make_cells(self, couplings):
-        self._cells = CellCouplings(couplings, self.moments, self.h, self.dtype) if couplings else None
+    def _make_cells(self, layout: _Layout, couplings):
+        worlds = [(first, middle) for first, middle, _ in layout.ranges()]
+        self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h) if couplings else None
         self.rotations = self._cells.rotations if self._cells is not None else None
 
     def _evaluate_wrench(self, layout: _Layout, turned):
@@ -334,6 +335,8 @@ class MomentSystem:
         packed.find_overlaps()
         if self._mutual.count == 0:
             return
+        if self._cells is not None:
+            self._cells.start()
         if self._applied.pair_count:
             self._applied.launch()
         self.dynamics.start()

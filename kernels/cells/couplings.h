@@ -1,17 +1,18 @@
 // Adds to the field at the cells of bodies what the sums over pairs lack between cells of one body: H_i += Σ T_ij m_j
 // with tensors T_ij of the body's frame.
 //
-// Two passes: moments are turned into the frame of their body, then sums into the world. On a CPU a pass works on a
-// vector of cells, on a GPU a group of threads has one. Takes GROUP; ``Couplings`` is the struct of couplings.py.
+// Two passes: moments are turned into the frame of their body, then sums into the world; and one before, where cells of
+// two bodies overlap. On a CPU a pass works on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY,
+// GROUP and HARDENING; ``Couplings`` is the struct of couplings.py.
 #pragma once
-#include "shared/group.h"
+#include "pairs/overlap_volume.h"
 #include "shared/team.h"
 
 namespace warpmag {
 
 constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
 
-enum CellPass { TURN, ADD }; // as in couplings.py
+enum CellPass { HARDEN, TURN, ADD }; // as in couplings.py
 
 // Rows of the rotation of a body.
 struct Rotation {
@@ -55,12 +56,28 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
     return group_sums(h);
 }
 
+// What the overlap of cells with those of other bodies adds to their demagnetizing factor, over their volume [1/m³].
+template <class Couplings> CUDA_CALLABLE inline Number hardness_of(const Couplings& c, int chunk, int i, int held) {
+    const Real* const packed = (const Real*)c.packed.data;
+    const size_t pitch = c.packed.strides[0] / sizeof(Real);
+    const Real *const radii = packed + 3 * pitch, *const labels = packed + 7 * pitch;
+    auto foreign = [=](Index a, Index b) { return mask_of(collect(labels, a) != collect(labels, b)); };
+    const auto& world = c.world.data[chunk]; // its first inducible moment, and the end of them
+    const Number volume = shared_volumes(c, i, held, world[0], world[1], foreign), radius = some(radii + i, held, 1);
+    return Real(HARDENING / 4.18879020478639) * volume / (radius * radius * radius);
+}
+
 // Makes a pass over the cells from ``row`` on.
 template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Couplings& c, int pass, int row) {
     const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, how many, first row of the body and of its tables
     const int offset = row % CHUNK, left = chunk[1] - offset, held = left < 0 ? 0 : left > WIDTH ? WIDTH : left;
     if (held == 0) return;
     const int i = chunk[0] + offset;
+    if (pass == HARDEN) {
+        const Number hardness = hardness_of(c, row / CHUNK, i, held);
+        if (share() == 0) put(c.hardness.data + row, hardness);
+        return;
+    }
     const Rotation rotation = rotation_of(c.rotation.data[c.body.data[row / CHUNK]]);
     Real* const own = c.turned.data + row;
     const size_t pitch = c.turned.strides[0] / sizeof(Real);
@@ -72,8 +89,10 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
         put(own + 2 * pitch, m.z);
         return;
     }
-    const Vector h = sum_entries(c, c.turned.data + chunk[2], row - chunk[2] + chunk[3]);
+    const Vector sums = sum_entries(c, c.turned.data + chunk[2], row - chunk[2] + chunk[3]);
     if (share() != 0) return;
+    const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
+    const Vector h = less(sums, scaled(numbers(c.hardness.data + row), m));
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
     put_vectors(field, held, sum(vectors(field, held), turned(rotation, h)));
 }

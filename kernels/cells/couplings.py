@@ -14,7 +14,15 @@ Bodies refer to them, in as many chunks:
     rotation: Rotation of each body, from its frame to the world's (x, y, z, w), shape [bodies].
     moments: Moments [A·m²], shape [n]; those of a body follow each other.
     turned: Moments in the frames of their bodies, shape [3, chunks · CHUNK].
+    world: First inducible moment of the chunk's world, and the end of them, shape [chunks].
+    packed, overlap, overlap_count: All moments, packed, and what overlaps each (``packing.PackedMoments``).
+    hardness: What is added to the demagnetizing factor, over the volume [1/m³], shape [chunks · CHUNK].
     h: Field that is added to [A/m], shape [n].
+
+Cells of different bodies act on each other as balls. Where these overlap, balls within the bodies would, too, count as
+demagnetizing, and cells do not: the operator of bodies that intersect would be no longer positive, and induction have
+several solutions. So a cell is demagnetized by ``HARDENING`` times the part of it that it shares with cells of other
+bodies. Bodies that only touch share a tenth of a cell, whose demagnetizing factor grows by 0.02.
 """
 
 from functools import cache
@@ -22,12 +30,15 @@ from functools import cache
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import CHUNK, passes_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
-TURN, ADD = range(2)
+HARDENING = 0.2
+"""Demagnetizing factor of a cell that wholly lies in another body's; least eigenvalues with 0.15 are down to -0.001."""
+HARDEN, TURN, ADD = range(3)
 """The passes, in order; as in ``couplings.h``."""
 _CELLS_PER_THREAD = 500
 """Cells that make another thread of a CPU worth waking."""
@@ -48,6 +59,11 @@ def couplings_type(dtype):
         rotation: wp.array[quaternion]
         moments: wp.array[vec3]
         turned: wp.array2d[dtype]
+        world: wp.array[wp.vec2i]
+        packed: wp.array2d[dtype]
+        overlap: wp.array2d[int]
+        overlap_count: wp.array[int]
+        hardness: wp.array[dtype]
         h: wp.array[vec3]
 
     return Couplings
@@ -72,7 +88,8 @@ def _table(start, other, tensor):
 @cache
 def _kernel(dtype, group: int):
     call = "warpmag::add_couplings(thread, first, last, threads, team.data, arrays);"
-    return passes_kernel(call, couplings_type(dtype), native_options("cells/couplings.h", dtype=dtype, GROUP=group))
+    constants = {"CAPACITY": CAPACITY, "GROUP": group, "HARDENING": HARDENING}
+    return passes_kernel(call, couplings_type(dtype), native_options("cells/couplings.h", dtype=dtype, **constants))
 
 
 class CellCouplings:
@@ -81,20 +98,23 @@ class CellCouplings:
     Args:
         bodies: Of each body the first moment, and the coupling of its cells: ``start``, ``other`` and ``tensor``, a
             list for each (see ``warpmag.demagnetization``). Bodies with one and the same coupling share its table.
+        worlds: First inducible moment of each world, and the end of them, shape [worlds, 2].
+        packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
-        dtype: Warp scalar type.
 
     Attributes:
         rotations: Rotation of each body, from its frame to the world's, shape [bodies]; written by the caller.
         entries: Pairs of cells that one evaluation sums.
     """
 
-    def __init__(self, bodies, moments, h, dtype):
+    def __init__(self, bodies, worlds, packed, moments, h):
         """Lay out the tables on the device of the moments."""
+        dtype = packed.dtype
         self._couplings = c = couplings_type(dtype)()
-        c.moments, c.h = moments, h
-        self._lay_out(bodies, dtype, h.device)
+        c.moments, c.h, c.packed = moments, h, packed.packed
+        c.overlap, c.overlap_count = packed.overlaps, packed.overlap_counts
+        self._lay_out(bodies, np.asarray(worlds), dtype, h.device)
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
         device, rows = h.device, c.turned.shape[1]
         group, threads = group_threads(device), threads_for(rows, _CELLS_PER_THREAD)
@@ -104,9 +124,10 @@ class CellCouplings:
             dim = group * rows if device.is_cuda else 1
             return wp.launch(_kernel(dtype, group), dim=dim, inputs=inputs, device=device, record_cmd=True)
 
+        self._start = record(HARDEN, HARDEN)
         self._launches = [record(TURN, TURN), record(ADD, ADD)] if device.is_cuda else [record(TURN, ADD)]
 
-    def _lay_out(self, bodies, dtype, device):
+    def _lay_out(self, bodies, worlds, dtype, device):
         c, found, tables, chunks, body = self._couplings, {}, [], [], []
         for number, (first, coupling) in enumerate(bodies):
             if id(coupling) not in found:
@@ -127,6 +148,13 @@ class CellCouplings:
         identity = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(bodies), 4))
         c.rotation = put(identity, wp.types.quaternion(dtype))
         c.turned = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
+        c.hardness = wp.zeros(CHUNK * len(chunks), dtype=dtype, device=device)
+        world = np.searchsorted(worlds[:, 0], [first for first, *_ in chunks], side="right") - 1
+        c.world = put(worlds[world].astype(np.int32), wp.vec2i)
+
+    def start(self):
+        """Begin a solve where the moments are now."""
+        self._start.launch()
 
     def launch(self):
         """Add to the field what the couplings make of the moments."""

@@ -6,8 +6,7 @@
 #pragma once
 #include "induction/theta_step.h"
 #include "material/curves.h"
-#include "pairs/neighbor_lists.h"
-#include "pairs/pair_law.h"
+#include "pairs/overlap_volume.h"
 #include "shared/group.h"
 #include "shared/team.h"
 
@@ -127,21 +126,9 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
 //
 // Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
 // above 1/3 − (1 + max o_i), which is −2/3 without overlap: hence a step length that converges for any arrangement.
-template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Place& at, Four ball) {
-    const Real* const packed = (const Real*)state.packed.data;
-    const size_t pitch = state.packed.strides[0] / sizeof(Real);
-    Index self = Index(at.i);
-#if !defined(__CUDA_ARCH__)
-    for (int l = 0; l < at.held; ++l) self[l] += l;
-#endif
-    Number volume = 0;
-    auto add = [&](Index j, Mask listed) {
-        auto row = [&](int c) { return collect(packed + c * pitch, j); };
-        const Vector r = {ball.x - row(0), ball.y - row(1), ball.z - row(2)};
-        volume += shared_volume(dot(r, r), ball.w, row(3), listed & mask_of(j != self));
-    };
-    walk_lists(state.overlap.data, state.overlap_count.data, self, at.held, Index(at.begin), Index(at.end), add);
-    return group_sum(volume);
+template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Place& at) {
+    auto others = [](Index i, Index j) { return mask_of(j != i); };
+    return shared_volumes(state, at.i, at.held, at.begin, at.end, others);
 }
 
 // 4π times the field [A/m] of neighbours at the last solution, further by ``ahead`` of its change from the one before.
@@ -167,7 +154,7 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     const Real ahead = (Real)world.ahead;
     const Four ball = balls_at(state, at);
     const Material material = material_of(state, at);
-    const Number stiffness = material.slope * (total_overlap(state, at, ball) + Real(2.0 / 3.0));
+    const Number stiffness = material.slope * (total_overlap(state, at) + Real(2.0 / 3.0));
     Vector near = {0, 0, 0};
     if (warm == STEADY) near = extrapolated_field(state, at, ball.w, ahead);
     if (share() != 0) return stiffness;
