@@ -120,3 +120,13 @@ def test_a_reader_that_computes_without_end(tmp_path, monkeypatch):
     monkeypatch.setattr(subprocess, "run", busy)
     with pytest.raises(InputError, match="stage.usdc: USD did not read it within 30 s"):
         open_stage(path)
+
+
+def test_a_short_text_of_millions_of_prims(tmp_path):
+    """Each prim has ten of the next kind."""
+    path = tmp_path / "stage.usda"
+    inner = "".join(f'def "x{k}" (references = </{{}}>) {{{{}}}}\n' for k in range(10))
+    levels = [f'def "C{level}" {{\n{inner.format(*[f"C{level + 1}"] * 10)}}}\n' for level in range(7)]
+    path.write_text(HEAD + "".join(levels) + 'def "C7" {}\n')
+    with pytest.raises(InputError, match="holds more than 500000 prims|did not read it within 30 s|reader dies of it"):
+        open_stage(path)

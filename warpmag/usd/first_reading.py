@@ -1,8 +1,8 @@
 """Reads a stage once in a process of its own, because USD's reader may take its process with it.
 
 Text nested 100,000 deep overflows its stack; a binary file, one of 1,800 in which bytes were changed at random, made it
-take all the memory there is for minutes. A single text file that is not nested that deep is read at once: a process of
-its own costs a quarter of a second.
+take all the memory there is for minutes; a short text whose prims refer to each other may stand for millions of prims.
+A single text file without any of that is read at once: a process of its own costs a quarter of a second.
 
 This file is also what that process runs, without importing anything of warpmag.
 """
@@ -13,10 +13,12 @@ import os
 import signal
 import subprocess
 import sys
-from itertools import accumulate
+from itertools import accumulate, islice
 
 DEEPEST_NESTING = 5_000
 """Brackets within brackets of a text. USD reads 10,000 on the stack of a main thread, and dies of 100,000."""
+MOST_PRIMS = 500_000
+"""Prims of a stage."""
 FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError)
 """What USD raises over a stage; its own errors are of the first kind."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 1e7
@@ -24,6 +26,8 @@ _SECONDS, _BYTES_PER_SECOND = 30.0, 1e7
 _LOADED = 2
 """How many times that it may take on a machine that has other things to do."""
 _TEXT = b"#usda"
+_ARCS = (b"@", b"references", b"payload", b"inherits", b"specializes", b"prototypes")
+"""What a text holds by which other files, or prims again, become part of it."""
 _OPENING, _CLOSING = b"{[(", b"}])"
 _OTHERS = bytes(set(range(256)) - {*_OPENING, *_CLOSING})
 
@@ -45,7 +49,7 @@ def first_reading(path: str | os.PathLike) -> str:
     if content.startswith(_TEXT):
         if _depth(content) > DEEPEST_NESTING:
             return f"brackets are nested more than {DEEPEST_NESTING} deep"
-        if b"@" not in content:  # no other file
+        if not any(arc in content for arc in _ARCS):
             return ""
     limit = round(_SECONDS + size / _BYTES_PER_SECOND)
     command = [sys.executable or "", "-S", "-E", __file__, json.dumps(sys.path), str(path), str(limit)]
@@ -88,6 +92,9 @@ def _read(path: str) -> str:  # pragma: no cover - in the child, which has nothi
 
     try:
         stage = Usd.Stage.Open(path)
+        prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
+        if sum(1 for _ in islice(prims, MOST_PRIMS + 1)) > MOST_PRIMS:
+            return f"holds more than {MOST_PRIMS} prims"
         for layer in stage.GetUsedLayers():
             Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
     except FAILURES as error:
