@@ -11,7 +11,8 @@
 // Accelerate Multibody Dynamics with Friction and Contact"). Pushes that are never taken back, as in Newton's kernels,
 // end somewhere without overlap; these end at the least impulses that do it.
 //
-// The sum acts at one point, half-way between the surfaces, on both bodies, where they are before the substep.
+// The sum acts at one point between the surfaces on both bodies, where they are before the substep, nearer to the
+// surface of the lighter one.
 // Positions that move with their own velocity keep their momentum, so angular momentum is kept, too. Lever arms at the
 // new poses have turned by ω dt and do not: bodies that strong forces press together would turn ever faster, at the
 // rate a dt/r for accelerations a.
@@ -127,12 +128,12 @@ CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pos
                                       Real relaxation, Real dt) {
     const Vector n = t.normal, apart = less(own.x, other.x);
     const Vector rub = turned(own.q, t.rub), other_rub = turned(other.q, t.other_rub);
-    const Number part = body.inv_mass / (body.inv_mass + other_body.inv_mass);
+    const Number total = body.inv_mass + other_body.inv_mass;
     const Vector apart_there = sum(apart, less(rub, other_rub));
     Contact c;
     c.normal = n;
-    c.arm = less(rub, scaled(1 - part, apart_there));
-    c.other_arm = sum(other_rub, scaled(part, apart_there));
+    c.arm = less(rub, scaled(quotient(other_body.inv_mass, total), apart_there));
+    c.other_arm = sum(other_rub, scaled(quotient(body.inv_mass, total), apart_there));
     const Vector points = less(turned(own.q, t.point), turned(other.q, t.other_point));
     c.gap_speed = (dot(n, sum(apart, points)) - t.margin) / dt;
     // kinematic bodies lend their surfaces a velocity, of which gaps do not tell
