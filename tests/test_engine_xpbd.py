@@ -341,3 +341,31 @@ def test_cubes_that_are_pressed_together_keep_their_turn(device):
         now, then = then, now
     assert contacts.rigid_contact_count.numpy()[0] >= 4
     assert turn() == pytest.approx(start, rel=1e-4)  # 200 substeps whose rounding errors of 1e-7 need not cancel
+
+
+@pytest.mark.parametrize("seconds", [0.5, pytest.param(10.0, marks=pytest.mark.long)])
+def test_a_stack_of_boxes_stays(seconds, device):
+    """Ten boxes, of which the lowest bears ten times its weight; a tenth of a radius in 10 s is what they may creep."""
+    builder = newton.ModelBuilder()
+    config = newton.ModelBuilder.ShapeConfig(density=7874.0, mu=0.5, gap=0.1 * R)
+    builder.add_ground_plane(cfg=config)
+    for level in range(10):
+        body = builder.add_body(xform=wp.transform((0.0, 0.0, (1 + 2 * level) * R), wp.quat_rpy(0.0, 0.0, 0.1 * level)))
+        builder.add_shape_box(body, hx=R, hy=R, hz=R, cfg=config)
+    model = builder.finalize(device=device)
+    model.joint_count = 0
+    solver = PileXPBD(model, CAPACITY, iterations=30, rigid_contact_relaxation=0.35, rigid_contact_con_weighting=False)
+    pipeline = newton.CollisionPipeline(model, rigid_contact_max=CAPACITY)
+    contacts, now, then = pipeline.contacts(), model.state(), model.state()
+
+    def run(seconds):
+        nonlocal now, then
+        for _ in range(round(seconds / DT)):
+            pipeline.collide(now, contacts)
+            solver.step(now, then, None, contacts, DT)
+            now, then = then, now
+        return now.body_q.numpy()[:, :3].astype(float)
+
+    before = run(0.1)
+    crept = np.linalg.norm(run(seconds) - before, axis=1).max()
+    assert crept < 0.1 * R * seconds / 10.0
