@@ -10,7 +10,7 @@
 #if defined(__CUDA_ARCH__)
 namespace warpmag {
 
-constexpr int QUARTERS = 12; // of a body in shared memory: its motion before and after an iteration, and its matter
+constexpr int QUARTERS = 6; // of a body in shared memory: its motion before and after an iteration, and its inertia
 
 // A body that a block moves.
 struct Task {
@@ -48,13 +48,13 @@ template <class Pass> __device__ inline void pass_over(int count, Pass pass) {
 }
 
 // Lists the sides of bodies.
-__device__ inline void list_all(const Arrays& a) {
+__device__ inline void list_all(const Arrays& a, Real relaxation, Real dt) {
     const int found = a.found();
     pass_over(TOTALS + 2 * a.bodies, [&](int k) { a.totals[k] = 0; }); // the counters follow each other
     pass_over(found, [&](int c) { count_sides(c, a); });
     pass_over((a.bodies + 32) / 32 * 32, [&](int b) { place_body(b, a); });
     pass_over(found, [&](int c) { list_sides(c, a); });
-    pass_over(a.totals[SIDES], [&](int k) { write_side(k, a); });
+    pass_over(a.totals[SIDES], [&](int k) { write_side(k, a, relaxation, dt); });
 }
 
 // How bodies are shared out in a cluster: those with many contacts to a few blocks, a body at a time, and all others to
@@ -113,19 +113,18 @@ template <class Plan> __device__ inline KeptSide side_of(const Arrays& a, const 
     const Contact contact = contact_at(a, k);
     if (j >= plan.bodies) return {{contact, line_at(a, a.motion, j)}, 0};
     const Four* const line = plan.line(a, room, j);
-    return {{contact, {line, line + 8}}, 4};
+    return {{contact, {line, line + 4}}, 2};
 }
 
 // All iterations over a block's tasks; lines are in the first half of what the block keeps of them then, or else in the
 // second.
 template <class Plan>
-__device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room, int tasks, int iterations, Real rate,
-                                   Real dt) {
+__device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room, int tasks, int iterations) {
     const int teams = plan.is_wide() ? 1 : BLOCK / GROUP, members = BLOCK / teams;
     const int team = threadIdx.x / members, first = threadIdx.x % members;
     int kept_at = -1;
     KeptSide kept = {};
-    Vector kept_pressed = {0, 0, 0};
+    Given kept_given = {};
     if (team < tasks) {
         const int2 sides = room.tasks[team].sides;
         const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
@@ -139,57 +138,53 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
             its.side.other.motion += odd * its.step;
             return its.side;
         };
-        auto press_at = [&](int k, Vector p) {
-            if (k == kept_at) kept_pressed = sum(kept_pressed, p);
-            else add_pressed(a, k, p);
+        auto press_at = [&](int k, auto press) {
+            if (k == kept_at) return press(kept_given);
+            Given given = given_at(a, k);
+            const Impulse added = press(given);
+            put_given_of(a, k, given);
+            return added;
         };
         auto totals = [&](int sides, Pressure p) { return plan.is_wide() ? block_sums(p, sides) : p; };
         for (int t = team; t < tasks; t += teams) {
             const Task task = room.tasks[t];
             Four* const line = plan.is_wide() ? plan.line(a, room, task.slot) : room.lines + QUARTERS * t;
-            move(a, {line + 4 * odd, line + 8}, line + 4 * (1 - odd), task.sides, true, first, members, side_at,
-                 press_at, totals, rate, dt);
+            move({line + 2 * odd, line + 4}, line + 2 * (1 - odd), task.sides, true, first, members, side_at, press_at,
+                 totals, momentum_at(iteration, iterations));
         }
         meet();
     }
-    if (!a.with_levers) return;
-    if (kept_at >= 0) add_pressed(a, kept_at, kept_pressed);
-    meet();
 }
 
 // Takes bodies into shared memory, moves them, and writes what they are then.
 template <class Plan>
-__device__ inline void solve_tasks(const Arrays& a, const Plan& plan, Room& room, int iterations, Real rate, Real dt) {
+__device__ inline void solve_tasks(const Arrays& a, const Plan& plan, Room& room, int iterations) {
     const int tasks = plan.take_tasks(a, room), own_lines = plan.is_wide() ? 0 : tasks;
     if (CLUSTER == 1 && tasks == 0) return;
     __syncthreads();
-    for (int k = threadIdx.x; k < 8 * own_lines; k += BLOCK) {
-        const Line line = line_at(a, a.motion, room.tasks[k / 8].slot);
-        room.lines[QUARTERS * (k / 8) + k % 8 + k % 8 / 4 * 4] = (k % 8 < 4 ? line.motion : line.matter - 4)[k % 8];
-    }
+    for (int k = threadIdx.x; k < 4 * own_lines; k += BLOCK)
+        room.lines[QUARTERS * (k / 4) + k % 4 + k % 4 / 2 * 2] = own_four(a.motion, k % 4, room.tasks[k / 4].slot);
     meet();
-    iterate_all(a, plan, room, tasks, iterations, rate, dt);
-    for (int t = threadIdx.x / GROUP; t < own_lines; t += BLOCK / GROUP) {
-        const Four* const line = room.lines + QUARTERS * t;
-        finish_body(a, room.tasks[t].slot, {line + iterations % 2 * 4, line + 8}, dt);
-    }
+    iterate_all(a, plan, room, tasks, iterations);
+    for (int t = threadIdx.x / GROUP; t < own_lines; t += BLOCK / GROUP)
+        finish_body(a, room.tasks[t].slot, room.lines + QUARTERS * t + iterations % 2 * 2);
 }
 
 // The whole solve, or if there are more than ``most`` sides or more bodies than fit, no more than the lists: then
 // ``totals[LEFT]`` tells so.
-__device__ inline void solve_in_cluster(const Arrays& a, int iterations, int most, Real rate, Real dt) {
+__device__ inline void solve_in_cluster(const Arrays& a, int iterations, int most, Real relaxation, Real dt) {
     __shared__ Room room;
-    list_all(a);
+    list_all(a, relaxation, dt);
     const ClusterPlan plan(a);
     const bool fits = plan.fits() && a.totals[SIDES] <= most;
     if (!fits && threadIdx.x == 0 && plan.block == 0) a.totals[LEFT] = plan.bodies;
-    if (fits && plan.bodies > 0) solve_tasks(a, plan, room, iterations, rate, dt);
+    if (fits && plan.bodies > 0) solve_tasks(a, plan, room, iterations);
 }
 
 // All iterations in the block's world.
-__device__ inline void solve_world(const Arrays& a, int iterations, Real rate, Real dt) {
+__device__ inline void solve_world(const Arrays& a, int iterations) {
     __shared__ Room room;
-    solve_tasks(a, WorldPlan(a), room, iterations, rate, dt);
+    solve_tasks(a, WorldPlan(a), room, iterations);
 }
 }
 #endif

@@ -41,23 +41,23 @@ inline Lists list_contacts(const Arrays& a) {
     return lists;
 }
 
-// Writes the contacts that take part, as their second bodies see them, in vectors; the last is filled up with contacts
-// that are never closed.
+// Puts down the contacts that take part, as their second bodies see them, in vectors; the last is filled up with
+// contacts that are never closed.
 inline void write_contacts(const Arrays& a, const Lists& lists) {
     for (int k = 0; k < rounded(lists.contacts); ++k) {
-        Real* const place = rows_at(a.side, SIDE, k);
+        Real* const place = rows_at(a.side, TOUCH, k);
         int* const other = list_at(a.other, 4, 0, k);
         for (int end = 0; end < 2; ++end) {
             other[end * CHUNK] = a.lines - 1;
             other[(2 + end) * CHUNK] = 2 * a.contact_max + k / WIDTH; // of nothing that moves
         }
-        for (int r = 0; r < 3 * a.with_levers; ++r) rows_at(a.pressed, 3, k)[r * CHUNK] = 0;
+        for (int r = 0; r < GIVEN; ++r) rows_at(a.given, GIVEN, k)[r * CHUNK] = 0;
         a.wide[k / WIDTH] = 0;
         if (k >= lists.contacts) {
-            for (int r = 0; r < SIDE; ++r) place[r * CHUNK] = r == 3 ? -1 : 0;
+            for (int r = 0; r < TOUCH; ++r) place[r * CHUNK] = r == 3 ? -1 : 0;
             continue;
         }
-        put_side(a, a.entry[k], 1, place, CHUNK);
+        put_touch(a, a.entry[k], 1, place, CHUNK);
         int ends[2];
         ends_of(a, a.entry[k], ends);
         for (int end = 0; end < 2; ++end) {
@@ -89,57 +89,56 @@ inline void put_records(const Arrays& a, int k, Vector linear, Vector own, Vecto
 }
 
 struct Pair {
-    Contact contact;
     Body own, other;
     const int *own_line, *other_line;
 };
+inline auto fours_at(const Real* lines, const int* j) {
+    return [=](int quarter) { return four_at(lines, quarter, j); };
+}
 inline Pair pair_at(const Arrays& a, int k) {
     const int* const lines = list_at(a.other, 4, 0, k);
-    const Real* const rows = rows_at(a.side, SIDE, k);
-    auto body = [&](const int* j) { return read_body([&](int quarter) { return four_at(a.motion, quarter, j); }); };
-    auto row = [&](int r) { return numbers(rows + r * CHUNK); };
-    auto fours = [&](int q) { return Four{row(4 * q), row(4 * q + 1), row(4 * q + 2), row(4 * q + 3)}; };
-    return {read_contact(fours), body(lines + CHUNK), body(lines), lines + CHUNK, lines};
+    return {read_body(fours_at(a.motion, lines + CHUNK)), read_body(fours_at(a.motion, lines)), lines + CHUNK, lines};
 }
-inline auto matter_at(const Arrays& a, const int* j) {
-    return [&a, j](int quarter) { return four_at(a.matter, quarter, j); };
+// Reads and writes rows by four.
+inline auto rows_of(Real* rows) {
+    return [=](int q) {
+        auto row = [=](int r) { return numbers(rows + (4 * q + r) * CHUNK); };
+        return Four{row(0), row(1), row(2), row(3)};
+    };
+}
+inline auto put_rows(Real* rows) {
+    return [=](int q, Four f) {
+        const Number row[4] = {f.x, f.y, f.z, f.w};
+        for (int r = 0; r < 4; ++r) put(rows + (4 * q + r) * CHUNK, row[r]);
+    };
 }
 
-inline void press_contacts(const Arrays& a, int k, Real rate, Real dt) {
+inline void prepare_contacts(const Arrays& a, int k, Real relaxation, Real dt) {
     const Pair p = pair_at(a, k);
-    const Vector r = arm(p.own, p.contact.point), other_r = arm(p.other, p.contact.other_point);
-    const Number distance = gap(p.contact, p.own, p.other, r, other_r);
-    // what was written in an iteration in which none was closed still holds
+    Real* const rows = rows_at(a.side, TOUCH, k);
+    auto inertia = [&](const int* line) { return read_inertia(fours_at(a.motion, line)); };
+    auto pose = [&](const int* line) { return read_pose(fours_at(a.pose, line)); };
+    put_contact(prepared(read_touch(rows_of(rows)), pose(p.own_line), pose(p.other_line), p.own, p.other,
+                         inertia(p.own_line), inertia(p.other_line), relaxation, dt),
+                put_rows(rows));
+}
+
+inline void press_contacts(const Arrays& a, int k, Real momentum) {
+    const Pair p = pair_at(a, k);
+    const Contact c = read_contact(rows_of(rows_at(a.side, TOUCH, k)));
+    Real* const rows = rows_at(a.given, GIVEN, k);
+    Given given = read_given(rows_of(rows));
+    const Impulse added = press(c, p.own, p.other, given, momentum);
+    // what was written in an iteration that added nothing still holds
     int& quiet = a.wide[k / WIDTH];
-    const bool closed = any(distance < 0);
-    if (!closed && quiet) return;
-    quiet = !closed;
-    const Inertia own = read_inertia(matter_at(a, p.own_line)), other = read_inertia(matter_at(a, p.other_line));
-    auto drifts = [&](int end) {
-        const int* const line = end == 1 ? p.own_line : p.other_line;
-        return read_drift([&](int quarter) { return four_at(a.motion, quarter, line); });
-    };
-    const Impulse found =
-        contact_impulse(p.contact, p.own, p.other, own, other, distance, r, other_r, drifts, rate, dt);
-    put_records(a, k, found.linear, found.own, found.other);
-    if (!a.with_levers) return;
-    Real* const pressed = rows_at(a.pressed, 3, k);
-    put_vector(pressed, sum(own_vector(pressed), found.linear));
+    const bool adds = any(dot(added.linear, added.linear) + dot(added.turn, added.turn) != 0);
+    put_given(given, put_rows(rows));
+    if (!adds && quiet) return;
+    quiet = !adds;
+    put_records(a, k, added.linear, on_own(c, added), on_other(c, added));
 }
 
-inline void correct_levers(const Arrays& a, int k, Real dt) {
-    const Pair p = pair_at(a, k);
-    const Vector linear = own_vector(rows_at(a.pressed, 3, k)), none = scaled(0, linear);
-    auto correction = [&](const Body& body, const int* line, Vector point, Vector impulse) {
-        const Body first = read_body([&](int quarter) { return four_at(a.first_motion, quarter, line); });
-        const Vector spin = scaled(Real(0.5), sum(body.spin, first.spin));
-        return lever_correction(body, spin, point, impulse, dt);
-    };
-    put_records(a, k, none, correction(p.own, p.own_line, p.contact.point, linear),
-                correction(p.other, p.other_line, p.contact.other_point, scaled(-1, linear)));
-}
-
-inline void move_bodies(const Arrays& a, int i, Real dt) {
+inline void move_bodies(const Arrays& a, int i) {
     typedef Real Record __attribute__((ext_vector_type(RECORD)));
     Real totals[WIDTH * LINE];
     for (int l = 0; l < WIDTH; ++l) {
@@ -155,13 +154,11 @@ inline void move_bodies(const Arrays& a, int i, Real dt) {
     const Four linear = own_four(totals, 0, 0), angular = own_four(totals, 1, 0);
     auto motion = [&](int quarter) { return own_four(a.motion, quarter, i); };
     Body body = read_body(motion);
-    Drift drift = read_drift(motion);
-    Whole whole = read_whole(drift, [&](int quarter) { return own_four(a.matter, quarter, i); });
-    apply(body, whole, {linear.x, linear.y, linear.z}, {angular.x, angular.y, angular.z}, dt);
-    put_body(a.motion, i, body, {whole.v, drift.kinematic});
+    apply(body, read_inertia(motion), {linear.x, linear.y, linear.z}, {angular.x, angular.y, angular.z});
+    put_body(a.motion, i, body);
 }
 
-inline void solve_contacts(const Arrays& a, int iterations, Real rate, Real dt, int threads, Word* team) {
+inline void solve_contacts(const Arrays& a, int iterations, Real relaxation, Real dt, int threads, Word* team) {
     const Lists lists = list_contacts(a);
     if (lists.contacts == 0) return;
     write_contacts(a, lists);
@@ -169,19 +166,19 @@ inline void solve_contacts(const Arrays& a, int iterations, Real rate, Real dt, 
     begin_lines(a, a.lines - WIDTH);
     const int helpful = lists.contacts / CONTACTS_PER_THREAD;
     threads = helpful < 1 ? 1 : helpful < threads ? helpful : threads;
-    const int passes = 2 * (iterations + a.with_levers);
+    const int passes = 2 * iterations;
     for (int first = 0; first < passes; first += MOST_PASSES) {
         const int last = passes - first < MOST_PASSES ? passes - first : MOST_PASSES;
         auto items = [&](int pass) { return pass % 2 == 0 ? lists.contacts : lists.bodies; };
         run_passes(team, threads, 0, last, items, WIDTH, [&](int pass, int i) {
-            if (pass % 2 == 1) move_bodies(a, i, dt);
-            else if (first + pass < 2 * iterations) press_contacts(a, i, rate, dt);
-            else correct_levers(a, i, dt);
+            if (first + pass == 0) prepare_contacts(a, i, relaxation, dt);
+            if (pass % 2 == 1) move_bodies(a, i);
+            else press_contacts(a, i, momentum_at((first + pass) / 2, iterations));
         });
     }
     for (int i = 0; i < lists.bodies; i += WIDTH) {
-        auto motion = [&](int quarter) { return own_four(a.motion, quarter, i); };
-        end_lines(a, read_body(motion), read_drift(motion), i, lists.bodies - i);
+        const Body body = read_body([&](int quarter) { return own_four(a.motion, quarter, i); });
+        end_lines(a, body, i, lists.bodies - i);
     }
 }
 }

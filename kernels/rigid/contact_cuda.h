@@ -72,8 +72,15 @@ __device__ inline bool touches_before(const Arrays& a, int c, int d) {
     return a.margin0[c] + a.margin1[c] < a.margin0[d] + a.margin1[d];
 }
 
+__device__ inline Given given_at(const Arrays& a, int k) {
+    return read_given([&](int quarter) { return ((const Four*)a.given)[GIVEN / 4 * (size_t)k + quarter]; });
+}
+__device__ inline void put_given_of(const Arrays& a, int k, const Given& given) {
+    put_given(given, [&](int quarter, Four f) { ((Four*)a.given)[GIVEN / 4 * (size_t)k + quarter] = f; });
+}
+
 // For entry k of the lists: writes the side to where it comes among those of its body.
-__device__ inline void write_side(int k, const Arrays& a) {
+__device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real dt) {
     if (k >= a.totals[SIDES]) return;
     const int c = a.entry[k] / 2, end = a.entry[k] % 2;
     int ends[2];
@@ -88,9 +95,19 @@ __device__ inline void write_side(int k, const Arrays& a) {
             place += touches_before(a, d, c) || (m < k && !touches_before(a, c, d));
         }
     }
-    put_side(a, c, end, a.side + SIDE * (size_t)place, 1);
-    a.other[place] = a.line_of(ends[1 - end]);
-    if (a.with_levers) ((Four*)a.pressed)[place] = {0, 0, 0, 0};
+    Real touch[TOUCH];
+    put_touch(a, c, end, touch, 1);
+    const int other = a.line_of(ends[1 - end]);
+    a.other[place] = other;
+    auto fours = [](const Real* lines, int i) { return [=](int quarter) { return own_four(lines, quarter, i); }; };
+    const auto own_motion = fours(a.motion, slot), other_motion = fours(a.motion, other);
+    put_contact(prepared(read_touch([&](int q) {
+                             return Four{touch[4 * q], touch[4 * q + 1], touch[4 * q + 2], touch[4 * q + 3]};
+                         }),
+                         read_pose(fours(a.pose, slot)), read_pose(fours(a.pose, other)), read_body(own_motion),
+                         read_body(other_motion), read_inertia(own_motion), read_inertia(other_motion), relaxation, dt),
+                [&](int quarter, Four f) { put_four(a.side, quarter, place, f); });
+    put_given_of(a, place, {});
 }
 
 // Sums of impulses on a body, over the threads that share it.
@@ -98,12 +115,12 @@ struct Pressure {
     Vector linear, angular;
 };
 
-// Where the motion and the matter of a body stand.
+// Where the motion and the inertia of a body stand.
 struct Line {
-    const Four *motion, *matter;
+    const Four *motion, *inertia;
 };
 __device__ inline Line line_at(const Arrays& a, const Real* motion, int i) {
-    return {(const Four*)motion + 4 * (size_t)i, (const Four*)a.matter + 4 * (size_t)i};
+    return {(const Four*)motion + 4 * (size_t)i, (const Four*)a.motion + 4 * (size_t)i + 2};
 }
 // A contact, and the body at its other end.
 struct Side {
@@ -111,35 +128,22 @@ struct Side {
     Line other;
 };
 __device__ inline Contact contact_at(const Arrays& a, int k) {
-    return read_contact([&](int quarter) { return ((const Four*)a.side)[SIDE / 4 * (size_t)k + quarter]; });
-}
-__device__ inline void add_pressed(const Arrays& a, int k, Vector p) {
-    Four& pressed = ((Four*)a.pressed)[k];
-    pressed = {pressed.x + p.x, pressed.y + p.y, pressed.z + p.z, 0};
+    return read_contact([&](int quarter) { return own_four(a.side, quarter, k); });
 }
 
-// What each ``threads``-th contact of a body does, from k to last. ``side_at`` gives contacts, and ``press_at`` is told
-// what they press with.
+// What each ``threads``-th contact of a body does, from k to last. ``side_at`` gives contacts, and ``press_at`` lets a
+// function change what they have given.
 template <class Sides, class Presses>
-__device__ inline Pressure press(const Arrays& a, Sides side_at, Presses press_at, int k, int last, int threads,
-                                 const Line& line, const Body& own, const Inertia& inertia, Real rate, Real dt) {
+__device__ inline Pressure press_all(Sides side_at, Presses press_at, int k, int last, int threads, const Body& own,
+                                     Real momentum) {
     Pressure total = {{0, 0, 0}, {0, 0, 0}};
     for (; k < last; k += threads) {
         const Side side = side_at(k);
-        const Contact& contact = side.contact;
         const Body other = read_body([&](int quarter) { return side.other.motion[quarter]; });
-        const Vector r = arm(own, contact.point), other_r = arm(other, contact.other_point);
-        const Number distance = gap(contact, own, other, r, other_r);
-        if (!(distance < 0)) continue;
-        const Inertia other_inertia = read_inertia([&](int quarter) { return side.other.matter[quarter]; });
-        auto drifts = [&](int end) {
-            return read_drift([&](int quarter) { return (end == 1 ? line : side.other).motion[quarter]; });
-        };
-        const Impulse p =
-            contact_impulse(contact, own, other, inertia, other_inertia, distance, r, other_r, drifts, rate, dt);
-        total.linear = sum(total.linear, p.linear);
-        total.angular = sum(total.angular, p.own);
-        if (a.with_levers) press_at(k, p.linear);
+        const Impulse added =
+            press_at(k, [&](Given& given) { return press(side.contact, own, other, given, momentum); });
+        total.linear = sum(total.linear, added.linear);
+        total.angular = sum(total.angular, on_own(side.contact, added));
     }
     return {group_sums(total.linear), group_sums(total.angular)};
 }
@@ -162,32 +166,34 @@ __device__ inline Pressure block_sums(Pressure mine, int sides) {
 // Moves the body of a line by what ``threads`` threads, of which this is the one of number ``first``, sum up of its
 // contacts, unless they are ``WIDE`` where these are not.
 template <class Sides, class Presses, class Totals>
-__device__ inline void move(const Arrays& a, const Line& line, Four* to, int2 sides, bool taken, int first, int threads,
-                            Sides side_at, Presses press_at, Totals totals, Real rate, Real dt) {
-    auto motion = [&](int quarter) { return line.motion[quarter]; };
-    auto matter = [&](int quarter) { return line.matter[quarter]; };
-    Body own = read_body(motion);
-    const Drift drift = read_drift(motion);
-    const Inertia inertia = read_inertia(matter);
-    Whole whole = read_whole(drift, matter);
+__device__ inline void move(const Line& line, Four* to, int2 sides, bool taken, int first, int threads, Sides side_at,
+                            Presses press_at, Totals totals, Real momentum) {
+    Body own = read_body([&](int quarter) { return line.motion[quarter]; });
+    const Inertia inertia = read_inertia([&](int quarter) { return line.inertia[quarter - 2]; });
     // all of that is read at once, whether it is needed or not
     if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
-    const Pressure p = totals(sides.y - sides.x, press(a, side_at, press_at, sides.x + first, sides.y, threads, line,
-                                                       own, inertia, rate, dt));
-    apply(own, whole, p.linear, p.angular, dt);
-    if (first == 0) put_body((Real*)to, 0, own, {whole.v, drift.kinematic});
+    const Pressure p =
+        totals(sides.y - sides.x, press_all(side_at, press_at, sides.x + first, sides.y, threads, own, momentum));
+    apply(own, inertia, p.linear, p.angular);
+    if (first == 0) put_body((Real*)to, 0, own);
 }
 
 // One iteration: moves the body that a group of threads shares, from one array of motions to the other. The first
 // blocks take the bodies with many contacts, a whole block each.
-__device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, Real dt) {
+__device__ inline void iterate(int thread, const Arrays& a, int iteration, int iterations) {
+    const bool odd = iteration % 2;
     const Real* const from = odd ? a.next_motion : a.motion;
     Four* const to = (Four*)(odd ? a.motion : a.next_motion);
     auto side_at = [&](int k) { return Side{contact_at(a, k), line_at(a, from, a.other[k])}; };
-    auto press_at = [&](int k, Vector p) { add_pressed(a, k, p); };
+    auto press_at = [&](int k, auto press) {
+        Given given = given_at(a, k);
+        const Impulse added = press(given);
+        put_given_of(a, k, given);
+        return added;
+    };
     auto move_slot = [&](int slot, bool taken, int first, int threads, auto totals) {
-        move(a, line_at(a, from, slot), to + 4 * (size_t)slot, ((const int2*)a.range)[slot], taken, first, threads,
-             side_at, press_at, totals, rate, dt);
+        move(line_at(a, from, slot), to + 4 * (size_t)slot, ((const int2*)a.range)[slot], taken, first, threads,
+             side_at, press_at, totals, momentum_at(iteration, iterations));
     };
     const int block = thread / BLOCK;
     if (block < WIDE_BLOCKS) {
@@ -199,30 +205,13 @@ __device__ inline void iterate(int thread, const Arrays& a, int odd, Real rate, 
     move_slot(slot, slot < a.totals[BODIES], share(), GROUP, [](int, Pressure p) { return p; });
 }
 
-// Ends the solve for the body of a line that a group of threads shares: corrects lever arms, and writes its pose and
-// velocities.
-__device__ inline void finish_body(const Arrays& a, int slot, const Line& line, Real dt) {
-    auto motion = [&](int quarter) { return line.motion[quarter]; };
-    Body body = read_body(motion);
-    Drift drift = read_drift(motion);
-    if (a.with_levers) {
-        const Body first = read_body([&](int quarter) { return own_four(a.first_motion, quarter, slot); });
-        const Vector mean = scaled(Real(0.5), sum(body.spin, first.spin));
-        Vector angular = {0, 0, 0};
-        for (int k = a.range[2 * slot] + share(); k < a.range[2 * slot + 1]; k += GROUP) {
-            const Four point = ((const Four*)a.side)[SIDE / 4 * (size_t)k], pressed = ((const Four*)a.pressed)[k];
-            const Vector linear = {pressed.x, pressed.y, pressed.z};
-            angular = sum(angular, lever_correction(body, mean, {point.x, point.y, point.z}, linear, dt));
-        }
-        Whole whole = read_whole(drift, [&](int quarter) { return line.matter[quarter]; });
-        apply(body, whole, {0, 0, 0}, group_sums(angular), dt);
-        drift.v = whole.v;
-    }
-    if (share() == 0) end_lines(a, body, drift, slot, 1);
+// Ends the solve for the body of a line that a group of threads shares: writes its velocities.
+__device__ inline void finish_body(const Arrays& a, int slot, const Four* motion) {
+    if (share() == 0) end_lines(a, read_body([&](int quarter) { return motion[quarter]; }), slot, 1);
 }
-__device__ inline void finish(int thread, const Arrays& a, int odd, Real dt) {
+__device__ inline void finish(int thread, const Arrays& a, int odd) {
     const int slot = thread / GROUP;
-    if (slot < a.totals[BODIES]) finish_body(a, slot, line_at(a, odd ? a.next_motion : a.motion, slot), dt);
+    if (slot < a.totals[BODIES]) finish_body(a, slot, line_at(a, odd ? a.next_motion : a.motion, slot).motion);
 }
 }
 #endif

@@ -1,18 +1,26 @@
-// XPBD for rigid bodies in contact: the impulses of a contact in one iteration, and how they move a body.
+// XPBD for rigid bodies in contact, for a substep: the impulses of a contact in one iteration, and how they move a
+// body.
 //
-// Newton's equations (newton/_src/solvers/xpbd/kernels.py: solve_body_contact_positions, apply_body_deltas), with
-// points about centres of mass. A contact is seen from one of its two bodies, the own one, and looks the same from the
-// other: its impulses there are opposite, whichever of the two computes them.
+// Newton's conditions (newton/_src/solvers/xpbd/kernels.py: solve_body_contact_positions): at the end of the substep
+// surfaces do not overlap, and friction stops what slips, spins and rolls as far as the push in a contact allows it.
+// XPBD moves bodies with their new velocities, x' = x + dt v', so that these are conditions on velocities, taken to
+// first order in the turn of a substep: exact for balls. Three things differ from Newton's kernels:
 //
-// Lever arms are corrected, or contacts do not keep angular momentum. XPBD moves bodies with their new velocities, then
-// takes contacts, and the lever arms of their impulses, at the new poses. A position that moves with its own velocity
-// keeps its momentum, but lever arms r have turned by ω dt. With contact points a and b that coincided before the
-// substep, opposite impulses p change the angular momentum of two bodies by dt (ω_a × r_a − ω_b × r_b) × p. That is
-// negligible in a light touch, but turns a heap that strong forces press together ever faster: at the rate a dt/r for
-// accelerations a. Balls are not affected: the lever arms of their contacts point along the normal. With the lever arms
-// from before the substep the sum is right. So once contacts are solved, the angular impulses − dt (ω × r) × p are
-// added to each body. Iterations apply impulses in portions, and ω changes with them: the mean of ω before and after is
-// taken. Friction, too, is taken to act at the shape's contact point, short of its margin.
+// A contact keeps the sum of its impulses, and an iteration may take back what was too much of it, down to no push:
+// projected gradients with Nesterov's momentum (Mazhar, Heyn, Negrut and Tasora 2015, "Using Nesterov's Method to
+// Accelerate Multibody Dynamics with Friction and Contact"). Pushes that are never taken back, as in Newton's kernels,
+// end somewhere without overlap; these end at the least impulses that do it.
+//
+// The sum acts at one point between the surfaces on both bodies, where they are before the substep, nearer to the
+// surface of the lighter one.
+// Positions that move with their own velocity keep their momentum, so angular momentum is kept, too. Lever arms at the
+// new poses have turned by ω dt and do not: bodies that strong forces press together would turn ever faster, at the
+// rate a dt/r for accelerations a.
+//
+// No speed is too low to be kept.
+//
+// A contact is seen from one of its two bodies, the own one, and looks the same from the other: its impulses there are
+// opposite to the last bit, whichever of the two computes them.
 #pragma once
 #include "shared/inverse_root.h"
 #include "shared/vectors.h"
@@ -26,163 +34,175 @@ struct Symmetric {
     Number xx, yy, zz, xy, yz, zx;
 };
 
-CUDA_CALLABLE inline Vector imaginary(Quaternion q) { return {q.x, q.y, q.z}; }
 CUDA_CALLABLE inline Vector turned(Quaternion q, Vector a) {
-    const Vector t = scaled(2, cross(imaginary(q), a));
-    return sum(sum(a, scaled(q.w, t)), cross(imaginary(q), t));
-}
-CUDA_CALLABLE inline Vector turned_back(Quaternion q, Vector a) {
-    const Vector t = scaled(2, cross(imaginary(q), a));
-    return sum(less(a, scaled(q.w, t)), cross(imaginary(q), t));
+    const Vector axis = {q.x, q.y, q.z}, t = scaled(2, cross(axis, a));
+    return sum(sum(a, scaled(q.w, t)), cross(axis, t));
 }
 CUDA_CALLABLE inline Vector times(const Symmetric& s, Vector a) {
     return {s.xx * a.x + s.xy * a.y + s.zx * a.z, s.xy * a.x + s.yy * a.y + s.yz * a.z,
             s.zx * a.x + s.yz * a.y + s.zz * a.z};
 }
+// A tensor of a frame that was turned.
+CUDA_CALLABLE inline Symmetric turned(Quaternion q, const Symmetric& s) {
+    const Number none = q.w * Real(0), one = none + 1;
+    auto row = [&](Vector axis) { return turned(q, times(s, turned({-q.x, -q.y, -q.z, q.w}, axis))); };
+    const Vector x = row({one, none, none}), y = row({none, one, none}), z = row({none, none, one});
+    return {x.x, y.y, z.z, x.y, y.z, z.x};
+}
 
-// A body at the beginning of an iteration: centre of mass, orientation and angular velocity. Its contacts split it into
-// shares (mass_splitting.py): the inverse mass of a share, and if it is ROUND (from Python: all bodies are) its inverse
-// inertia about any axis.
-struct Body {
-    Vector x, spin;
+// Where a body is before the substep: its centre of mass and orientation.
+struct Pose {
+    Vector x;
     Quaternion q;
-    Number ease, spin_ease;
 };
-// If it is not, the inverse inertia of a share in its frame.
+// How it moves, and its inverse mass and, if it is ROUND (from Python: all bodies are), inverse inertia about any axis.
+struct Body {
+    Vector v, spin;
+    Number inv_mass, inv_inertia;
+};
+// If it is not, its inverse inertia in the world's frame; and the number of shares that contacts split it into
+// (mass_splitting.py).
 struct Inertia {
     Symmetric inverse;
+    Number shares;
 };
-// A contact from its own body's side: points about the centres of mass in the bodies' frames, where surfaces rub, the
-// unit normal from the other body to the own one, the sum of the margins, coefficients of friction, and whether one of
-// the bodies is kinematic: 1 or 0.
-struct Contact {
+// A contact as it was found, from its own body's side: points about the centres of mass in the bodies' frames, where
+// surfaces rub, the unit normal from the other body to the own one, the sum of the margins, coefficients of friction,
+// and whether the own and the other body are kinematic: 1 or 0.
+struct Touch {
     Vector point, other_point, rub, other_rub, normal;
-    Number margin, drifting, mu, torsional, rolling;
+    Number margin, mu, torsional, rolling, kinematic, other_kinematic;
 };
-// On the own body, and angular on the other, where the opposite linear one acts.
+// A contact as iterations need it: arms from the centres of mass to where impulses act, the speed at which a gap may
+// close, and impulses for a unit of speed that pushes, slips and turns.
+struct Contact {
+    Vector normal, arm, other_arm;
+    Number gap_speed, push_rate, rub_rate, turn_rate, mu, torsional, rolling;
+};
+// On the own body, and the angular one besides that of its arm; the other body gets the opposite.
 struct Impulse {
-    Vector linear, own, other;
+    Vector linear, turn;
 };
 
-CUDA_CALLABLE inline Vector arm(const Body& body, Vector point) { return turned(body.q, point); }
-// Distance of the surfaces along the normal, negative where they overlap.
-CUDA_CALLABLE inline Number gap(const Contact& c, const Body& own, const Body& other, Vector r, Vector other_r) {
-    return dot(c.normal, sum(less(own.x, other.x), less(r, other_r))) - c.margin;
+CUDA_CALLABLE inline Vector spun(const Body& body, const Inertia& inertia, Vector torque) {
+    if constexpr (ROUND) return scaled(body.inv_inertia, torque);
+    return times(inertia.inverse, torque);
 }
+// How easily impulses at an arm along a and along b move a share of a body along b and along a.
+CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector arm, Vector a, Vector b) {
+    return inertia.shares * (body.inv_mass * dot(a, b) + dot(cross(arm, a), spun(body, inertia, cross(arm, b))));
+}
+// How easily an angular impulse turns a share of a body at most.
+CUDA_CALLABLE inline Number turn_ease(const Body& body, const Inertia& inertia) {
+    if constexpr (ROUND) return inertia.shares * body.inv_inertia;
+    const Symmetric& s = inertia.inverse;
+    auto size = [](Number x) { return larger(x, -x); };
+    const Number xy = size(s.xy), yz = size(s.yz), zx = size(s.zx);
+    return inertia.shares * larger(s.xx + xy + zx, larger(s.yy + xy + yz, s.zz + yz + zx));
+}
+// Quotients of nothing are nothing.
+CUDA_CALLABLE inline Number quotient(Number a, Number b) { return b > 0 ? a / b : a * Real(0); }
 
-// Quotients and inverse lengths of nothing are nothing.
-CUDA_CALLABLE inline Number quotient(Number a, Number b) {
-#if defined(__CUDA_ARCH__)
-    return b > 0 ? __fdividef(a, b) : 0;
-#else
-    return b > 0 ? a / b : a * Real(0);
-#endif
-}
 CUDA_CALLABLE inline Number inverse_length(Vector a) {
     const Number square = dot(a, a);
     return square > Real(1e-30) ? Real(0.5) * twice_inverse_root(square) : square * Real(0);
 }
-
-// How easily an angular impulse turns a share of a body about it: the energy of a unit impulse along an axis, and of a
-// unit impulse at an arm, where it also moves the body.
-CUDA_CALLABLE inline Number spin_ease(const Body& body, const Inertia& inertia, Vector axis) {
-    if constexpr (ROUND) return body.spin_ease;
-    const Vector local = turned_back(body.q, axis);
-    return dot(local, times(inertia.inverse, local));
+CUDA_CALLABLE inline Vector at_most(Vector a, Number length) {
+    const Number one = length * Real(0) + 1;
+    return scaled(dot(a, a) > length * length ? length * inverse_length(a) : one, a);
 }
-CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector r, Vector along) {
-    const Vector about = cross(r, along);
-    const Number length = ROUND ? dot(about, about) : about.x * Real(0) + 1;
-    return body.ease + length * spin_ease(body, inertia, about);
+// Some unit vector across a unit vector.
+CUDA_CALLABLE inline Vector across(Vector n) {
+    const Number none = n.x * Real(0);
+    const auto steep = n.x * n.x > Real(0.5);
+    const Vector t = {steep ? n.y : none, steep ? -n.x : n.z, steep ? none : -n.y};
+    return scaled(inverse_length(t), t);
 }
 
-// The velocity that a kinematic body lends its surface, of which positions do not tell.
-struct Drift {
-    Vector v;
-    Number kinematic; // 1 or 0
-};
-CUDA_CALLABLE inline Vector drift_at(const Drift& drift, const Body& body, Vector r) {
-    return scaled(drift.kinematic, sum(drift.v, cross(body.spin, r)));
-}
+// Friction is relaxed by this part of what pushes are: it turns balls besides, and with momentum all of it diverges.
+constexpr Real FRICTION = Real(0.35);
 
-// Impulses of a contact whose surfaces overlap by −``distance``, at arms r. ``rate`` is the relaxation over dt,
-// ``drifts`` gives the drifts of the own (1) and the other body (0), and is asked where one is kinematic.
-template <class Drifts>
-CUDA_CALLABLE inline Impulse contact_impulse(const Contact& c, const Body& own, const Body& other,
-                                             const Inertia& inertia, const Inertia& other_inertia, Number distance,
-                                             Vector r, Vector other_r, Drifts drifts, Real rate, Real dt) {
-    const Vector n = c.normal;
-    const Number push_ease = ease(own, inertia, r, n) + ease(other, other_inertia, other_r, n);
-    const Number push = distance < 0 ? quotient(-rate * distance, push_ease) : distance * Real(0);
-    Impulse p;
-    p.linear = scaled(push, n);
-    p.own = cross(r, p.linear);
-    p.other = cross(p.linear, other_r);
-    if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return p;
-
-    r = arm(own, c.rub), other_r = arm(other, c.other_rub);
-    Vector slip = sum(less(own.x, other.x), less(r, other_r));
-    if (any(c.drifting > 0)) {
-        const Vector drift = less(drift_at(drifts(1), own, r), drift_at(drifts(0), other, other_r));
-        slip = sum(slip, scaled(dt, drift));
-    }
-    slip = less(slip, scaled(dot(n, slip), n));
-    const Vector along = scaled(inverse_length(slip), slip);
-    const Number rub_ease = ease(own, inertia, r, along) + ease(other, other_inertia, other_r, along);
-    const Vector rub = scaled(-smaller(quotient(rate * dot(along, slip), rub_ease), c.mu * push), along);
-    p.linear = sum(p.linear, rub);
-    p.own = sum(p.own, cross(r, rub));
-    p.other = sum(p.other, cross(rub, other_r));
-
-    const Vector turn = less(own.spin, other.spin);
-    const Number twist = dot(turn, n), twist_most = c.torsional * push;
-    const Vector roll = less(turn, scaled(twist, n)), about = scaled(inverse_length(roll), roll);
-    auto stop = [&](Vector axis) { // the angular impulse that stops a unit of speed about an axis
-        return quotient(push * Real(0) + rate * dt,
-                        spin_ease(own, inertia, axis) + spin_ease(other, other_inertia, axis));
+// Prepares a contact for iterations that relax it by a part of what it lacks.
+CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pose& other, const Body& body,
+                                      const Body& other_body, const Inertia& inertia, const Inertia& other_inertia,
+                                      Real relaxation, Real dt) {
+    const Vector n = t.normal, apart = less(own.x, other.x);
+    const Vector rub = turned(own.q, t.rub), other_rub = turned(other.q, t.other_rub);
+    const Number total = body.inv_mass + other_body.inv_mass;
+    const Vector apart_there = sum(apart, less(rub, other_rub));
+    Contact c;
+    c.normal = n;
+    c.arm = less(rub, scaled(quotient(other_body.inv_mass, total), apart_there));
+    c.other_arm = sum(other_rub, scaled(quotient(body.inv_mass, total), apart_there));
+    const Vector points = less(turned(own.q, t.point), turned(other.q, t.other_point));
+    c.gap_speed = (dot(n, sum(apart, points)) - t.margin) / dt;
+    // kinematic bodies lend their surfaces a velocity, of which gaps do not tell
+    const Vector drift = sum(body.v, cross(body.spin, c.arm)), its = cross(other_body.spin, c.other_arm);
+    const Vector other_drift = sum(other_body.v, its);
+    c.gap_speed -= t.kinematic * dot(n, drift) - t.other_kinematic * dot(n, other_drift);
+    auto both = [&](Vector a, Vector b) {
+        return ease(body, inertia, c.arm, a, b) + ease(other_body, other_inertia, c.other_arm, a, b);
     };
-    const Number torsion = larger(smaller(twist * stop(n), twist_most), -twist_most);
-    const Number rolling = smaller(dot(about, roll) * stop(about), c.rolling * push);
-    const Vector friction = sum(scaled(torsion, n), scaled(rolling, about));
-    p.own = less(p.own, friction);
-    p.other = sum(p.other, friction);
-    return p;
+    // the easiest direction across the normal, from those of two axes
+    const Vector a = across(n), b = cross(n, a);
+    const Number aa = both(a, a), ab = both(a, b), bb = both(b, b), half = Real(0.5) * (aa - bb);
+    const Number rub_ease = Real(0.5) * (aa + bb) + root(half * half + ab * ab), none = n.x * Real(0);
+    c.push_rate = quotient(none + relaxation, both(n, n));
+    c.rub_rate = quotient(none + FRICTION * relaxation, rub_ease);
+    c.turn_rate =
+        quotient(none + FRICTION * relaxation, turn_ease(body, inertia) + turn_ease(other_body, other_inertia));
+    c.mu = t.mu, c.torsional = t.torsional, c.rolling = t.rolling;
+    return c;
 }
 
-// What is missing in the angular impulse of a contact on a body, whose mean spin is given, for a linear impulse there.
-CUDA_CALLABLE inline Vector lever_correction(const Body& body, Vector mean_spin, Vector point, Vector linear, Real dt) {
-    return scaled(-dt, cross(cross(mean_spin, arm(body, point)), linear));
+// The impulse of a contact after an iteration, from one that its bodies have and from how they move: it does not pull,
+// and its push limits friction.
+CUDA_CALLABLE inline Impulse relaxed(const Contact& c, const Body& own, const Body& other, Impulse p) {
+    const Vector mine = sum(own.v, cross(own.spin, c.arm)), its = sum(other.v, cross(other.spin, c.other_arm));
+    const Vector slip = less(mine, its);
+    const Number opening = dot(slip, c.normal), none = opening * Real(0);
+    const Number push = larger(dot(p.linear, c.normal) - c.push_rate * (opening + c.gap_speed), none);
+    const Vector pressed = scaled(push, c.normal);
+    if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return {pressed, scaled(none, c.normal)};
+    const Vector linear = less(p.linear, scaled(c.rub_rate, slip));
+    const Vector turn = less(p.turn, scaled(c.turn_rate, less(own.spin, other.spin)));
+    const Number about = dot(turn, c.normal), twist = c.torsional * push;
+    const Vector rub = at_most(less(linear, scaled(dot(linear, c.normal), c.normal)), c.mu * push);
+    const Vector roll = at_most(less(turn, scaled(about, c.normal)), c.rolling * push);
+    return {sum(rub, pressed), sum(roll, scaled(larger(smaller(about, twist), -twist), c.normal))};
 }
 
-// What moves a body as a whole: velocity, inverse mass and inertia in its frame.
-struct Whole {
-    Vector v;
-    Number inv_mass;
-    Symmetric inverse, inertia;
+CUDA_CALLABLE inline Impulse change(Impulse from, Impulse to) {
+    return {less(to.linear, from.linear), less(to.turn, from.turn)};
+}
+
+// What a contact has given its bodies: its impulse after the last iteration, and that with momentum, which they have.
+struct Given {
+    Impulse last, ahead;
 };
+// Nesterov's momentum: the part of its last change that an impulse goes on by. It is bounded, so that nothing has to
+// tell when to begin anew, and the last iteration leaves impulses that contacts admit.
+CUDA_CALLABLE inline Real momentum_at(int iteration, int iterations) {
+    const Real part = Real(iteration) / (iteration + 3);
+    return iteration == iterations - 1 ? 0 : part < Real(0.8) ? part : Real(0.8);
+}
+// One iteration of a contact: returns the impulse that it adds.
+CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body& other, Given& given, Real momentum) {
+    const Impulse now = relaxed(c, own, other, given.ahead), gain = change(given.last, now);
+    const Impulse ahead = {sum(now.linear, scaled(momentum, gain.linear)), sum(now.turn, scaled(momentum, gain.turn))};
+    const Impulse added = change(given.ahead, ahead);
+    given = {now, ahead};
+    return added;
+}
+// The angular impulses of an impulse about the centres of mass.
+CUDA_CALLABLE inline Vector on_own(const Contact& c, Impulse p) { return sum(cross(c.arm, p.linear), p.turn); }
+CUDA_CALLABLE inline Vector on_other(const Contact& c, Impulse p) {
+    return scaled(-1, sum(cross(c.other_arm, p.linear), p.turn));
+}
 
-// Moves a body by the sum of impulses and angular impulses; its velocities change with its pose.
-CUDA_CALLABLE inline void apply(Body& body, Whole& whole, Vector linear, Vector angular, Real dt) {
-    const Vector change = scaled(whole.inv_mass, linear);
-    Vector gain = scaled(whole.inverse.xx, angular);
-    if constexpr (!ROUND) {
-        const Vector spin = turned_back(body.q, body.spin), spun = times(whole.inverse, turned_back(body.q, angular));
-        const Vector both =
-            sum(cross(spun, times(whole.inertia, sum(spin, spun))), cross(spin, times(whole.inertia, spun)));
-        gain = turned(body.q, less(spun, scaled(dt, times(whole.inverse, both))));
-    }
-    body.x = sum(body.x, scaled(dt, change));
-    const Vector half = scaled(Real(0.5) * dt, gain), axis = imaginary(body.q);
-    const Vector turn = sum(axis, sum(scaled(body.q.w, half), cross(half, axis)));
-    const Number w = body.q.w - dot(half, axis);
-    const Number unit = Real(0.5) * twice_inverse_root(dot(turn, turn) + w * w);
-    body.q = {unit * turn.x, unit * turn.y, unit * turn.z, unit * w};
-    // Newton's solver lets what is this slow rest
-    constexpr Real REST = Real(1e-4);
-    const Vector v = sum(whole.v, change), spin = sum(body.spin, gain);
-    const Number none = w * Real(0), moves = dot(v, v) < REST * REST ? none : none + 1;
-    const Number spins = dot(spin, spin) < REST * REST ? none : none + 1;
-    whole.v = scaled(moves, v);
-    body.spin = scaled(spins, spin);
+// Moves a body by the sums of impulses and angular impulses.
+CUDA_CALLABLE inline void apply(Body& body, const Inertia& inertia, Vector linear, Vector angular) {
+    body.v = sum(body.v, scaled(body.inv_mass, linear));
+    body.spin = sum(body.spin, spun(body, inertia, angular));
 }
 }

@@ -10,18 +10,18 @@ namespace warpmag {
 
 // As ``SolveArrays`` in contact_solve.py.
 struct Arrays {
-    int contact_max, bodies, lines, with_levers, kinematic_flag;
+    int contact_max, bodies, lines, kinematic_flag;
     // of Newton's contacts, then of its bodies
     const int *count, *shape0, *shape1, *shape_body;
     const Real *point0, *point1, *offset0, *offset1, *normal, *margin0, *margin1, *mu, *mu_torsional, *mu_rolling;
     const int* flags;
-    const Real *com, *inv_mass, *inv_inertia, *inertia;
-    Real *q, *qd;
+    const Real *com, *inv_mass, *inv_inertia, *q;
+    Real* qd;
     // own
     const Real* shares;
     int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide, *world_first;
     unsigned long long* key;
-    Real *motion, *next_motion, *first_motion, *matter, *side, *pressed, *record;
+    Real *motion, *next_motion, *pose, *side, *given, *record;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "SolveArrays has the same members in the same order");
@@ -34,43 +34,60 @@ struct Arrays {
     CUDA_CALLABLE int line_of(int b) const { return b < 0 ? lines - 1 : slot[b]; }
 };
 
-constexpr int SIDE = 20, RECORD = 8; // numbers of a side, and of an impulse record, both in fours
+constexpr int TOUCH = 20, GIVEN = 12, RECORD = 8; // numbers of a contact as found, of its impulses, and of a record
 
-// Reads by four numbers, which ``fours`` gives for a quarter of a line.
+// Reads by four numbers, which ``fours`` gives for a quarter of a line, and writes so.
 template <class Fours> CUDA_CALLABLE inline Body read_body(Fours motion) {
-    const Four a = motion(0), b = motion(1), c = motion(2);
-    return {{a.x, a.y, a.z}, {c.x, c.y, c.z}, {b.x, b.y, b.z, b.w}, a.w, c.w};
+    const Four a = motion(0), b = motion(1);
+    return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, a.w, b.w};
 }
-template <class Fours> CUDA_CALLABLE inline Drift read_drift(Fours motion) {
-    const Four d = motion(3);
-    return {{d.x, d.y, d.z}, d.w};
+template <class Fours> CUDA_CALLABLE inline Inertia read_inertia(Fours motion) {
+    const Four a = motion(2), b = motion(3);
+    return {{a.x, a.y, a.z, b.x, b.y, b.z}, a.w};
 }
-// Of a share, which is smaller than the whole by a number that stands beside the inverse inertia.
-template <class Fours> CUDA_CALLABLE inline Inertia read_inertia(Fours matter) {
-    if constexpr (ROUND) return {};
-    const Four a = matter(0), b = matter(1);
-    return {{a.w * a.x, a.w * a.y, a.w * a.z, a.w * b.x, a.w * b.y, a.w * b.z}};
+template <class Fours> CUDA_CALLABLE inline Pose read_pose(Fours pose) {
+    const Four a = pose(0), b = pose(1);
+    return {{a.x, a.y, a.z}, {b.x, b.y, b.z, b.w}};
 }
-// Of the whole body, of which motion is given, too.
-template <class Fours> CUDA_CALLABLE inline Whole read_whole(const Drift& motion, Fours matter) {
-    const Four a = matter(0), b = matter(1), c = matter(2), d = matter(3);
-    return {motion.v, b.w, {a.x, a.y, a.z, b.x, b.y, b.z}, {c.x, c.y, c.z, d.x, d.y, d.z}};
+template <class Fours> CUDA_CALLABLE inline Touch read_touch(Fours side) {
+    const Four a = side(0), b = side(1), c = side(2), d = side(3), e = side(4);
+    // whether the bodies are kinematic is one number: 1 for the own and 2 for the other one
+    const Number none = e.w * Real(0), its = e.w > Real(1.5) ? none + 1 : none;
+    return {{a.x, a.y, a.z},
+            {b.x, b.y, b.z},
+            {c.x, c.y, c.z},
+            {d.x, d.y, d.z},
+            {e.x, e.y, e.z},
+            a.w,
+            b.w,
+            c.w,
+            d.w,
+            e.w - 2 * its,
+            its};
 }
 template <class Fours> CUDA_CALLABLE inline Contact read_contact(Fours side) {
-    const Four a = side(0), b = side(1), c = side(2), d = side(3), e = side(4);
-    return {
-        {a.x, a.y, a.z}, {b.x, b.y, b.z}, {c.x, c.y, c.z}, {d.x, d.y, d.z}, {e.x, e.y, e.z}, a.w, b.w, c.w, d.w, e.w};
+    const Four a = side(0), b = side(1), c = side(2), d = side(3);
+    return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, {c.x, c.y, c.z}, a.w, b.w, c.w, d.x, d.y, d.z, d.w};
 }
-CUDA_CALLABLE inline void put_body(Real* motion, int i, const Body& body, const Drift& drift) {
-    put_four(motion, 0, i, {body.x.x, body.x.y, body.x.z, body.ease});
-    put_four(motion, 1, i, {body.q.x, body.q.y, body.q.z, body.q.w});
-    put_four(motion, 2, i, {body.spin.x, body.spin.y, body.spin.z, body.spin_ease});
-    put_four(motion, 3, i, {drift.v.x, drift.v.y, drift.v.z, drift.kinematic});
+template <class Fours> CUDA_CALLABLE inline Given read_given(Fours given) {
+    const Four a = given(0), b = given(1), c = given(2);
+    return {{{a.x, a.y, a.z}, {a.w, b.x, b.y}}, {{b.z, b.w, c.x}, {c.y, c.z, c.w}}};
 }
-
-CUDA_CALLABLE inline void put_symmetric(Real* quarters, const Real* matrix) {
-    quarters[0] = matrix[0], quarters[1] = matrix[4], quarters[2] = matrix[8];
-    quarters[4] = matrix[1], quarters[5] = matrix[5], quarters[6] = matrix[2];
+template <class PutFours> CUDA_CALLABLE inline void put_given(const Given& g, PutFours put) {
+    const Vector &a = g.last.linear, &b = g.last.turn, &c = g.ahead.linear, &d = g.ahead.turn;
+    put(0, Four{a.x, a.y, a.z, b.x});
+    put(1, Four{b.y, b.z, c.x, c.y});
+    put(2, Four{c.z, d.x, d.y, d.z});
+}
+template <class PutFours> CUDA_CALLABLE inline void put_contact(const Contact& c, PutFours put) {
+    put(0, Four{c.normal.x, c.normal.y, c.normal.z, c.gap_speed});
+    put(1, Four{c.arm.x, c.arm.y, c.arm.z, c.push_rate});
+    put(2, Four{c.other_arm.x, c.other_arm.y, c.other_arm.z, c.rub_rate});
+    put(3, Four{c.turn_rate, c.mu, c.torsional, c.rolling});
+}
+CUDA_CALLABLE inline void put_body(Real* motion, int i, const Body& body) {
+    put_four(motion, 0, i, {body.v.x, body.v.y, body.v.z, body.inv_mass});
+    put_four(motion, 1, i, {body.spin.x, body.spin.y, body.spin.z, body.inv_inertia});
 }
 
 // Centres of mass of the bodies of lines i in their frames.
@@ -85,41 +102,44 @@ CUDA_CALLABLE inline Vector centers(const Arrays& a, int i) {
 CUDA_CALLABLE inline void begin_lines(const Arrays& a, int i) {
     for (int l = 0; l < WIDTH; ++l) {
         const int b = a.body[i + l];
-        Real *const motion = a.motion + LINE * (size_t)(i + l), *const matter = a.matter + LINE * (size_t)(i + l);
-        for (int k = 0; k < LINE; ++k) motion[k] = matter[k] = 0;
-        motion[7] = matter[3] = 1;
+        Real *const motion = a.motion + LINE * (size_t)(i + l), *const pose = a.pose + LINE * (size_t)(i + l);
+        for (int k = 0; k < LINE; ++k) motion[k] = pose[k] = 0;
+        pose[7] = motion[11] = 1;
         if (b < 0) continue;
         for (int c = 0; c < 3; ++c) {
-            motion[c] = a.q[7 * (size_t)b + c];
-            motion[12 + c] = a.qd[6 * (size_t)b + c];
-            motion[8 + c] = a.qd[6 * (size_t)b + 3 + c];
+            motion[c] = a.qd[6 * (size_t)b + c];
+            motion[4 + c] = a.qd[6 * (size_t)b + 3 + c];
+            pose[c] = a.q[7 * (size_t)b + c];
         }
-        for (int c = 0; c < 4; ++c) motion[4 + c] = a.q[7 * (size_t)b + 3 + c];
-        if (a.shares) matter[3] = a.shares[b];
-        put_symmetric(matter, a.inv_inertia + 9 * (size_t)b);
-        put_symmetric(matter + 8, a.inertia + 9 * (size_t)b);
-        motion[3] = matter[3] * a.inv_mass[b];
-        matter[7] = a.inv_mass[b];
-        motion[11] = matter[3] * matter[0];
-        motion[15] = a.kinematic(b);
+        for (int c = 0; c < 4; ++c) pose[4 + c] = a.q[7 * (size_t)b + 3 + c];
+        motion[3] = a.inv_mass[b];
+        if (a.shares) motion[11] = a.shares[b];
+        const Real* const inverse = a.inv_inertia + 9 * (size_t)b;
+        motion[7] = motion[8] = inverse[0], motion[9] = inverse[4], motion[10] = inverse[8];
+        motion[12] = inverse[1], motion[13] = inverse[5], motion[14] = inverse[2];
     }
     auto motion = [&](int quarter) { return own_four(a.motion, quarter, i); };
-    Body body = read_body(motion);
-    body.x = sum(body.x, turned(body.q, centers(a, i)));
-    put_body(a.motion, i, body, read_drift(motion));
-    if (a.next_motion) put_body(a.next_motion, i, body, read_drift(motion));
-    if (a.with_levers) put_body(a.first_motion, i, body, read_drift(motion));
+    Pose pose = read_pose([&](int quarter) { return own_four(a.pose, quarter, i); });
+    pose.x = sum(pose.x, turned(pose.q, centers(a, i)));
+    put_four(a.pose, 0, i, {pose.x.x, pose.x.y, pose.x.z, 0 * pose.x.x});
+    Inertia inertia = read_inertia(motion);
+    if constexpr (!ROUND) inertia.inverse = turned(pose.q, inertia.inverse);
+    const Symmetric& s = inertia.inverse;
+    const Body body = read_body(motion);
+    Real* const copies[2] = {a.motion, a.next_motion};
+    for (Real* lines : copies) {
+        if (!lines) continue;
+        put_body(lines, i, body);
+        put_four(lines, 2, i, {s.xx, s.yy, s.zz, inertia.shares});
+        put_four(lines, 3, i, {s.xy, s.yz, s.zx, 0 * s.xx});
+    }
 }
 
-// Writes the poses and velocities of lines i, of which ``held`` are bodies.
-CUDA_CALLABLE inline void end_lines(const Arrays& a, const Body& body, const Drift& drift, int i, int held) {
-    const Vector origin = less(body.x, turned(body.q, centers(a, i)));
+// Writes the velocities of lines i, of which ``held`` are bodies.
+CUDA_CALLABLE inline void end_lines(const Arrays& a, const Body& body, int i, int held) {
     for (int l = 0; l < WIDTH && l < held; ++l) {
-        Real *const q = a.q + 7 * (size_t)a.body[i + l], *const qd = a.qd + 6 * (size_t)a.body[i + l];
-        q[0] = lane_of(origin.x, l), q[1] = lane_of(origin.y, l), q[2] = lane_of(origin.z, l);
-        q[3] = lane_of(body.q.x, l), q[4] = lane_of(body.q.y, l), q[5] = lane_of(body.q.z, l);
-        q[6] = lane_of(body.q.w, l);
-        qd[0] = lane_of(drift.v.x, l), qd[1] = lane_of(drift.v.y, l), qd[2] = lane_of(drift.v.z, l);
+        Real* const qd = a.qd + 6 * (size_t)a.body[i + l];
+        qd[0] = lane_of(body.v.x, l), qd[1] = lane_of(body.v.y, l), qd[2] = lane_of(body.v.z, l);
         qd[3] = lane_of(body.spin.x, l), qd[4] = lane_of(body.spin.y, l), qd[5] = lane_of(body.spin.z, l);
     }
 }
@@ -130,8 +150,8 @@ CUDA_CALLABLE inline bool ends_of(const Arrays& a, int c, int (&ends)[2]) {
     return ends[0] != ends[1] && (a.movable(ends[0]) || a.movable(ends[1]));
 }
 
-// Writes contact c as seen from one of its ends; its numbers are ``stride`` apart.
-CUDA_CALLABLE inline void put_side(const Arrays& a, int c, int end, Real* place, int stride) {
+// Writes contact c as it was found, seen from one of its ends; its numbers are ``stride`` apart.
+CUDA_CALLABLE inline void put_touch(const Arrays& a, int c, int end, Real* place, int stride) {
     const int shapes[2] = {a.shape0[c], a.shape1[c]};
     const Real* const points[2] = {a.point0 + 3 * (size_t)c, a.point1 + 3 * (size_t)c};
     const Real* const offsets[2] = {a.offset0 + 3 * (size_t)c, a.offset1 + 3 * (size_t)c};
@@ -146,9 +166,9 @@ CUDA_CALLABLE inline void put_side(const Arrays& a, int c, int end, Real* place,
     for (int k = 0; k < 3; ++k) place[(16 + k) * stride] = (end == 1 ? 1 : -1) * a.normal[3 * (size_t)c + k];
     auto mean = [&](const Real* of_shape) { return Real(0.5) * (of_shape[shapes[0]] + of_shape[shapes[1]]); };
     place[3 * stride] = a.margin0[c] + a.margin1[c];
-    place[7 * stride] = a.kinematic(a.body_of(shapes[0])) || a.kinematic(a.body_of(shapes[1]));
-    place[11 * stride] = mean(a.mu);
-    place[15 * stride] = mean(a.mu_torsional);
-    place[19 * stride] = mean(a.mu_rolling);
+    place[7 * stride] = mean(a.mu);
+    place[11 * stride] = mean(a.mu_torsional);
+    place[15 * stride] = mean(a.mu_rolling);
+    place[19 * stride] = a.kinematic(a.body_of(shapes[end])) + 2 * a.kinematic(a.body_of(shapes[1 - end]));
 }
 }

@@ -31,20 +31,20 @@ _CONTACTS_PER_THREAD = 100
 """Contacts that make another thread of a CPU worth its start: an iteration over them takes 1 to 2 µs."""
 _ROUND = 1e-6
 """Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
-_SIDE, _RECORD = 20, 8
-"""Numbers of a side and of a record; as in ``contact_lines.h``."""
+_TOUCH, _GIVEN, _RECORD = 20, 12, 8
+"""Numbers of a contact as found, of its impulses, and of a record; as in ``contact_lines.h``."""
 _TOTALS, _LEFT = 5, 4
 """Number of totals, and which is that of bodies left to launches; as in ``contact_cuda.h``."""
 
-_SIZES = ("contact_max", "bodies", "lines", "with_levers", "kinematic_flag")
+_SIZES = ("contact_max", "bodies", "lines", "kinematic_flag")
 _OF_CONTACTS = (
     *("count", "shape0", "shape1", "shape_body", "point0", "point1", "offset0", "offset1", "normal"),
     *("margin0", "margin1", "mu", "mu_torsional", "mu_rolling"),
 )
-_OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "inertia", "q", "qd")
+_OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "q", "qd")
 _OWN = (
     *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "world_first", "key"),
-    *("motion", "next_motion", "first_motion", "matter", "side", "pressed", "record"),
+    *("motion", "next_motion", "pose", "side", "given", "record"),
 )
 _ADDRESSES = (*_OF_CONTACTS, *_OF_BODIES, "shares", *_OWN)
 _DOC = "Sizes, and where arrays begin; as ``Arrays`` in ``contact_lines.h``."
@@ -68,14 +68,16 @@ class SolveBuffers:
                 side_count, filled: Sides of each body, and how many of them are listed, shape [b].
                 entry, key: Side, twice its contact plus its end, and shapes of it, by bodies, shape [2c].
                 other: Line of the body at the other end, shape [2c].
-                side: Contacts as each end sees them, see ``contact_law.h``, shape [2c, 20].
+                side: Contacts as each end sees them, see ``contact_law.h``, shape [2c, LINE].
+                given: Impulses that each end has been given, shape [2c, 12].
                 wide: Lines of bodies with many contacts, shape [b].
                 world_first: First body of each world that has a block, and the one after the last, shape [worlds + 1].
             and on a CPU, where vectors of contacts are seen from their second bodies,
                 side_count: Sides of each body, shape [b].
                 entry: Contacts that take part, shape [c].
                 other: Lines of the first and second body and their records, shape [c padded / CHUNK, 4, CHUNK].
-                side: The contacts, shape [c padded / CHUNK, 20, CHUNK].
+                side: The contacts, as found and then as prepared, shape [c padded / CHUNK, 20, CHUNK].
+                given: Impulses that they have given, shape [c padded / CHUNK, 12, CHUNK].
                 record: Impulses on each side, by bodies, and one for each vector of what nothing moves, shape
                     [2c + c padded / CHUNK, 8].
                 wide: Whether records of a vector of contacts are zero, shape [c padded / CHUNK].
@@ -83,10 +85,9 @@ class SolveBuffers:
                 slot: Line of each body, shape [b].
                 body: Body of each line, -1 for the world, shape [lines].
                 range: First of the sides of a line's body, and the one after the last, shape [lines, 2].
-                motion, next_motion: Lines of what moves, before and on a GPU after an iteration, shape [lines, LINE].
-                first_motion: The same before contacts, for lever arms, shape [lines, LINE].
-                matter: Lines of what does not, shape [lines, LINE].
-                pressed: Impulses of all iterations, for lever arms, shape [2c, 4] or [c padded / CHUNK, 3, CHUNK].
+                motion, next_motion: Lines of velocities, before and on a GPU after an iteration, and of inverse
+                    masses and inertias, shape [lines, LINE].
+                pose: Lines of where bodies are before the substep, shape [lines, LINE].
         given: Their sizes and addresses, and what else the kernels are given.
         round: Whether every body has the same inertia about all axes.
         group: Threads of a GPU that share a body, 0 on a CPU.
@@ -106,13 +107,12 @@ class SolveBuffers:
     world_lines: int
 
 
-def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag: int) -> SolveBuffers:
+def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> SolveBuffers:
     """Allocate the buffers.
 
     Args:
         contact_max: Most contacts.
         bodies: The bodies.
-        levers: Whether lever arms are corrected, which balls do not need.
         kinematic_flag: Newton's flag of kinematic bodies.
     """
     device, inertia = bodies.inv_mass.device, bodies.inv_inertia.numpy()
@@ -132,17 +132,17 @@ def allocate(contact_max: int, bodies: BodyView, *, levers: bool, kinematic_flag
     arrays["body"] = wp.full(lines, -1, dtype=wp.int32, device=device)
     arrays["wide"] = zeros(max(bodies, padded // CHUNK))
     arrays["key"] = zeros(0 if device.is_cpu else 2 * padded, dtype=wp.uint64)
-    arrays |= {name: zeros(lines, LINE, dtype=wp.float32) for name in ("motion", "matter")}
+    arrays |= {name: zeros(lines, LINE, dtype=wp.float32) for name in ("motion", "pose")}
     arrays["next_motion"] = zeros(0 if device.is_cpu else lines, LINE, dtype=wp.float32)
-    arrays["first_motion"] = zeros(lines if levers else 0, LINE, dtype=wp.float32)
-    arrays["side"] = zeros((1 if device.is_cpu else 2) * padded, _SIDE, dtype=wp.float32)
+    sides = padded if device.is_cpu else 2 * padded
+    arrays["side"] = zeros(sides, _TOUCH if device.is_cpu else LINE, dtype=wp.float32)
+    arrays["given"] = zeros(sides, _GIVEN, dtype=wp.float32)
     arrays["record"] = zeros((2 * padded + padded // CHUNK) if device.is_cpu else 0, _RECORD, dtype=wp.float32)
-    arrays["pressed"] = zeros(2 * padded if levers else 0, 4, dtype=wp.float32)
     arrays["world_first"] = wp.array(world_first, dtype=wp.int32, device=device)
     given = SolveArrays()
     for name in _OWN:
         setattr(given, name, arrays[name].ptr or 0)
-    for name, size in zip(_SIZES, (contact_max, bodies, lines, int(levers), kinematic_flag), strict=True):
+    for name, size in zip(_SIZES, (contact_max, bodies, lines, kinematic_flag), strict=True):
         setattr(given, name, size)
     is_round = bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all())
     group = _WORLD_GROUP if world_lines else next(group for most, group in _GROUPS if bodies <= most)
@@ -181,9 +181,9 @@ def _most_blocks(device, is_round: bool, group: int) -> int:
     return 0
 
 
-def _teams(is_round: bool, group: int) -> int:
-    """Bodies that a block of a cluster moves at a time; its threads may have 128 registers, or else 255."""
-    return (512 if is_round else 256) // group
+def _teams(group: int) -> int:
+    """Bodies that a block of a cluster moves at a time; its threads may have 128 registers."""
+    return 512 // group
 
 
 @cache
@@ -193,7 +193,7 @@ def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines:
     block = _BLOCK
     constants = dict(ROUND=int(is_round), GROUP=group, WIDE=16 + 4 * group, WIDE_BLOCKS=_WIDE_BLOCKS)
     if cluster > 1:
-        header, lines = "rigid/contact_cluster.h", _teams(is_round, group)
+        header, lines = "rigid/contact_cluster.h", _teams(group)
         block = lines * group
     elif cluster == 1:
         header, block = "rigid/contact_cluster.h", min(256, lines * group)
@@ -204,7 +204,13 @@ def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines:
 
     @wp.func_native(f"warpmag::{call};")
     def run(
-        thread: int, given: SolveArrays, number: int, rate: float, dt: float, most: int, team: wp.array2d[wp.uint64]
+        thread: int,
+        given: SolveArrays,
+        number: int,
+        relaxation: float,
+        dt: float,
+        most: int,
+        team: wp.array2d[wp.uint64],
     ): ...
 
     @wp.kernel(
@@ -213,32 +219,35 @@ def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines:
         module_options=native_options(header, dtype=wp.float32, **constants),
         **options,
     )
-    def solve_contacts(given: SolveArrays, number: int, rate: float, dt: float, most: int, team: wp.array2d[wp.uint64]):
-        run(wp.tid(), given, number, rate, dt, most, team)
+    def solve_contacts(
+        given: SolveArrays, number: int, relaxation: float, dt: float, most: int, team: wp.array2d[wp.uint64]
+    ):
+        run(wp.tid(), given, number, relaxation, dt, most, team)
 
     return solve_contacts, block
 
 
-ON_CPU = "solve_contacts(warpmag::Arrays(given), number, rate, dt, most, team.data)"
+ON_CPU = "solve_contacts(warpmag::Arrays(given), number, relaxation, dt, most, team.data)"
 COUNT = "count_sides(thread, warpmag::Arrays(given))"
 PLACE = "place_body(thread, warpmag::Arrays(given))"
 LIST = "list_sides(thread, warpmag::Arrays(given))"
-WRITE = "write_side(thread, warpmag::Arrays(given))"
-ITERATE = "iterate(thread, warpmag::Arrays(given), number, rate, dt)"
-SOLVE = "solve_in_cluster(warpmag::Arrays(given), number, most, rate, dt)"
-SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number, rate, dt)"
-FINISH = "finish(thread, warpmag::Arrays(given), number, dt)"
+WRITE = "write_side(thread, warpmag::Arrays(given), relaxation, dt)"
+ITERATE = "iterate(thread, warpmag::Arrays(given), number, most)"
+SOLVE = "solve_in_cluster(warpmag::Arrays(given), number, most, relaxation, dt)"
+SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number)"
+FINISH = "finish(thread, warpmag::Arrays(given), number)"
 
 
 def launch_solve_contacts(
     b: SolveBuffers, contacts: ContactView, bodies: BodyView, shares, *, iterations: int, relaxation: float, dt: float
 ):
-    """Move bodies out of their contacts.
+    """Change velocities so that bodies end a substep out of their contacts.
 
     Args:
         b: Buffers.
         contacts: The contacts.
-        bodies: The bodies after ``dt`` without contacts; ``q`` and ``qd`` of those with contacts are changed.
+        bodies: The bodies as contacts found them, with the velocities that they have without contacts; ``qd`` of those
+            with contacts is changed.
         shares: Number of shares that contacts split each body into, shape [bodies], or None for whole bodies.
         iterations: Number of iterations.
         relaxation: Part of its correction that each contact is given in an iteration.
@@ -250,8 +259,8 @@ def launch_solve_contacts(
             setattr(given, name, getattr(view, name).ptr or 0)
     given.shares = 0 if shares is None else shares.ptr
 
-    def launch(call, dim, number=0, blocks=0, **form):
-        inputs = [given, number, relaxation / dt, dt, b.most, team() if device.is_cpu else None]
+    def launch(call, dim, number=0, blocks=0, most=0, **form):
+        inputs = [given, number, relaxation, dt, most or b.most, team() if device.is_cpu else None]
         kernel, block = solve_kernel(call, b.round, b.group, **form)
         wp.launch(kernel, dim or blocks * block, inputs=inputs, device=device, block_dim=block)
 
@@ -273,9 +282,9 @@ def launch_solve_contacts(
 
     def iterate():
         for iteration in range(iterations):
-            launch(ITERATE, _WIDE_BLOCKS * _BLOCK + groups, iteration % 2)
+            launch(ITERATE, _WIDE_BLOCKS * _BLOCK + groups, iteration, most=iterations)
         launch(FINISH, groups, iterations % 2)
 
     left = _LEFT if b.cluster else 0
-    if not b.cluster or 2 * given.contact_max > b.most or given.bodies > b.cluster // 2 * _teams(b.round, b.group):
+    if not b.cluster or 2 * given.contact_max > b.most or given.bodies > b.cluster // 2 * _teams(b.group):
         wp.capture_if(b.arrays["totals"][left : left + 1], iterate)

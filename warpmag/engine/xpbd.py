@@ -1,12 +1,14 @@
 """Newton's XPBD, corrected for bodies that are pressed together, whose work follows contacts.
 
-Corners of boxes that lie face to face together overshoot what each of them corrects, and turn the boxes by themselves.
-Bodies that are no balls are therefore split among their contacts (``kernels.rigid.mass_splitting``), and the lever arms
-of contact impulses are corrected (``kernels/rigid/contact_law.h``).
+Corners of boxes that lie face to face together overshoot what each of them corrects. Bodies that are no balls are
+therefore split among their contacts (``kernels.rigid.mass_splitting``).
 
 Newton's solver launches every iteration over all contacts that its buffers may hold, and adds them up with atomics, in
 another order in every run. Rigid bodies are moved by ``kernels.rigid.contact_solve`` instead, which solves the same
-equations and gives the same bits in every run.
+conditions and gives the same bits in every run. It keeps momentum and angular momentum, which Newton's lever arms and
+its damping of spins do not, and needs half the iterations (``kernels/rigid/contact_law.h``). Its end is Newton's own
+where no push overshoots. In heaps Newton's pushes do, stay, and make its end depend on its relaxation: these are the
+least that leave no overlap.
 """
 
 import contextlib
@@ -17,35 +19,39 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.rigid import contact_solve
+from warpmag.kernels.rigid.free_motion import launch_accelerate, launch_move
 from warpmag.kernels.rigid.mass_splitting import launch_count_shares, launch_split_masses
 from warpmag.kernels.rigid.newton_views import BodyView, view_bodies, view_contacts
 
+_KINEMATIC = int(newton.BodyFlags.KINEMATIC)
+
 
 class PileXPBD(newton.solvers.SolverXPBD):
-    """Newton's XPBD with masses split among contacts, and with corrected lever arms of their impulses.
+    """Newton's XPBD with masses split among contacts, whose impulses keep momentum and angular momentum.
 
     Models with joints, particles, tendons, restitution or moving surfaces take Newton's own steps, with split masses.
     """
 
-    def __init__(self, model: newton.Model, contact_max: int, **settings):
+    def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
         """Set up the solver.
 
         Args:
             model: The model.
             contact_max: Most contacts.
+            contact_iterations: Iterations where there are none but contacts; by default as many as Newton's.
             settings: Those of Newton's solver.
         """
         super().__init__(model, **settings)
         splits = ~_single_balls(model)
         self._splits = wp.array(splits.astype(np.int32), dtype=wp.int32, device=model.device) if splits.any() else None
+        self._contact_iterations = contact_iterations or self.iterations
         self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
         self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         others = model.joint_count, model.particle_count, model.tendon_segment_count, self.enable_restitution
         self._solve = None
         if not any(others) and not self.rigid_contact_con_weighting:
-            flag = int(newton.BodyFlags.KINEMATIC)
             bodies = self._view_bodies(model.state())
-            self._solve = contact_solve.allocate(contact_max, bodies, levers=bool(splits.any()), kinematic_flag=flag)
+            self._solve = contact_solve.allocate(contact_max, bodies, kinematic_flag=_KINEMATIC)
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; as Newton's."""
@@ -59,16 +65,18 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
     def _step_bodies(self, state_in, state_out, contacts, dt) -> None:
         assert self._solve is not None
-        self.integrate_bodies(self.model, state_in, state_out, dt, self.angular_damping)
+        before, after = self._view_bodies(state_in), self._view_bodies(state_out)
+        launch_accelerate(before, self.model.gravity, _KINEMATIC, dt, state_out.body_q, state_out.body_qd)
         contact_solve.launch_solve_contacts(
             self._solve,
             view_contacts(self.model, contacts),
-            self._view_bodies(state_out),
+            after,
             self._shares if self._splits is not None else None,
-            iterations=self.iterations,
+            iterations=self._contact_iterations,
             relaxation=self.rigid_contact_relaxation,
             dt=dt,
         )
+        launch_move(after, _KINEMATIC, dt)
 
     def _view_bodies(self, state) -> BodyView:
         """Return the bodies, of which forces and contacts do not move the kinematic ones."""
