@@ -296,7 +296,8 @@ def test_attributes_that_a_scene_declares(device, tmp_path, capfd, case):
 
 
 def test_sound_declarations_reach_newton(device, tmp_path, capfd):
-    options = "int newton:timeStepsPerSecond = 500\nfloat newton:joint_drive_gains_scaling = 1"
+    options = "int newton:timeStepsPerSecond = 500\nfloat newton:joint_drive_gains_scaling = 1\n"
+    options += "uniform float newton:xpbd:rigidContactRelaxation = 0.8"  # of a schema that is not applied
     path = write(tmp_path, f'def PhysicsScene "Scene"\n{{\n{DECLARED}\n{options}\n}}\n{ball()}')
     assert survey(open_stage(path)).findings == []
     assert "my:thing" in import_scene(path).builder.custom_attributes

@@ -175,7 +175,7 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
 
 def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
     """Yield what is wrong with properties of a scene that no schema has: Newton takes them for declarations."""
-    path, schemas = str(scene.GetPath()), {*scene.GetPrimDefinition().GetPropertyNames(), *_known(), *_OPTIONS}
+    path, schemas = str(scene.GetPath()), {*scene.GetPrimDefinition().GetPropertyNames(), *_of_newton(), *_OPTIONS}
     for one in scene.GetAuthoredPropertiesInNamespace("newton"):
         name = one.GetName()
         if name in schemas:
@@ -252,6 +252,14 @@ def declared(attribute: Usd.Attribute):
 def _known() -> dict[str, object]:
     """Defaults of what Newton reads by name alone, applied schema or not."""
     return {name: value for schema in _SCHEMAS for name, value in _defaults(schema).items()}
+
+
+@cache
+def _of_newton() -> frozenset[str]:
+    """Attributes of all of Newton's schemas that can be applied, some of which it reads where they are not."""
+    types = Tf.Type.FindByName("UsdAPISchemaBase").GetAllDerivedTypes()
+    names = [str(Usd.SchemaRegistry.GetSchemaTypeName(one)) for one in types]
+    return frozenset(attribute for name in names if name.startswith("Newton") for attribute in _defaults(name))
 
 
 @cache
