@@ -6,8 +6,8 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from test_broad_phase import FARTHEST, SUBSTEP, random_scene, set_motion
 
-from tests.test_broad_phase import FARTHEST, SUBSTEP, random_scene, set_motion
 from warpmag.engine.broad_phase import NeighborBroadPhase
 
 FIELDS = ("point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
