@@ -452,8 +452,17 @@ def letter(name):
 """
 
 
-def test_two_letters_at_one_place_end_in_a_line_that_says_why(device, tmp_path):
+def test_two_letters_at_one_place_fly_apart_and_a_line_says_why(device, tmp_path):
     simulation = Simulation(write(tmp_path, physics(0.0), letter("A"), letter("B")), device=device)
     assert any("overlap at the start" in line for line in simulation.warnings())
+    advance(simulation, 0.2)
+    velocities = simulation.state.body_qd.numpy()[:, :3]
+    assert np.linalg.norm(velocities[0]) > 0.1
+    np.testing.assert_allclose(velocities[0], -velocities[1], atol=1e-4 * np.abs(velocities).max())  # equal masses
+
+
+def test_what_leaves_all_finite_numbers_is_told_with_what_was_wrong_before(device, tmp_path):
+    simulation = Simulation(write(tmp_path, physics(0.0), letter("A"), letter("B")), device=device)
+    simulation.state.body_qd.fill_(math.inf)
     with pytest.raises(SimulationError, match="has left all finite numbers; bodies overlapped at the start"):
         advance(simulation, 0.2)
