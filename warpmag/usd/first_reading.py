@@ -60,15 +60,16 @@ def first_reading(path: str | os.PathLike) -> str:
         return late
     except OSError:  # no interpreter to start: an application with Python inside
         return ""
-    if b"posix_madvise" in done.stderr:  # which USD says of every reading, past everything that could keep it quiet
-        return "damaged: its table of contents names bytes beyond its end"
     if done.returncode == -signal.SIGXCPU:
         return late
     if done.returncode < 0:
         return f"USD's reader dies of it ({signal.Signals(-done.returncode).name})"
+    why = ""
     with contextlib.suppress(ValueError):
-        return str(json.loads(done.stdout))
-    return ""
+        why = str(json.loads(done.stdout))
+    if not why and b"posix_madvise" in done.stderr:  # which USD would say again, past all that could keep it quiet
+        return "damaged: its table of contents names bytes beyond its end"
+    return why
 
 
 def _depth(text: bytes) -> int:
