@@ -25,6 +25,9 @@ _SECONDS, _BYTES_PER_SECOND = 30.0, 1e7
 """CPU time that a reading may take [s], and bytes for which it may take a second more."""
 _LOADED = 2
 """How many times that it may take on a machine that has other things to do."""
+_FILLED = {"MALLOC_PERTURB_": "165"}
+"""Has glibc fill new memory with what is no zero: of some damaged files USD reads more than it wrote, and takes what
+happens to be there."""
 _TEXT = b"#usda"
 _ARCS = (b"@", b"references", b"payload", b"inherits", b"specializes", b"prototypes")
 """What a text holds by which other files, or prims again, become part of it."""
@@ -55,7 +58,9 @@ def first_reading(path: str | os.PathLike) -> str:
     command = [sys.executable or "", "-S", "-E", __file__, json.dumps(sys.path), str(path), str(limit)]
     late = f"USD did not read it within {limit} s"
     try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=_LOADED * limit)
+        done = subprocess.run(
+            command, capture_output=True, check=False, timeout=_LOADED * limit, env=os.environ | _FILLED
+        )
     except subprocess.TimeoutExpired:
         return late
     except OSError:  # no interpreter to start: an application with Python inside
