@@ -164,7 +164,12 @@ def matrices(model, state, contacts):
 CONTACT = "shape0 shape1 point0 point1 offset0 offset1 normal margin0 margin1".split()
 
 
-@pytest.mark.parametrize("kind", ["ball", "capsule", "dumbbell", "plate"])
+OFF = pytest.mark.xfail(strict=True, reason="ends 1.4 % of the correction away, for a reason that is not known")
+
+
+@pytest.mark.parametrize(
+    "kind", ["ball", "capsule", "dumbbell", "plate", pytest.param("mesh", marks=[pytest.mark.long, OFF])]
+)
 def test_a_substep_pushes_as_little_as_it_has_to(kind, device):
     """Without friction contacts ask for a convex problem, the least impulses that leave no overlap; here in float64."""
     model, state, contacts = heap(kind, device, ground=False)
