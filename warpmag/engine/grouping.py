@@ -1,0 +1,95 @@
+"""The magnets of a Newton model: which of its marked shapes are one, and in which world."""
+
+from dataclasses import dataclass, replace
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.engine.attributes import marked_shapes
+from warpmag.engine.sampling import BodyLattice, ShapeSampler
+from warpmag.errors import InputError
+from warpmag.magnets import Magnet
+
+
+@dataclass(frozen=True)
+class BodyMagnet:
+    """Shapes of one body that are one magnet.
+
+    Attributes:
+        magnet: The material, magnetization in the frame of the body.
+        body: The body, -1 for a magnet fixed in the world.
+        shapes: The shapes, together one volume.
+        world: The world, counted among those that hold magnets.
+        lattice: The sampled moments in the frame of the body, grouped by shape.
+    """
+
+    magnet: Magnet
+    body: int
+    shapes: tuple[int, ...]
+    world: int
+    lattice: BodyLattice
+
+
+def only_curve(magnets: list[Magnet]) -> str:
+    """Return the magnetization curve of all inducible magnets, which must be the same one."""
+    curves = {one.curve for one in magnets if one.kind == "inducible"}
+    if len(curves) > 1:
+        raise InputError(f"model: its magnets have the curves {', '.join(sorted(curves))}; give all the same")
+    return curves.pop() if curves else "tanh"
+
+
+def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
+    """Group the marked shapes of ``model`` into magnets and sample them, in the order that the system wants.
+
+    Returns:
+        The magnets, and the Newton worlds that hold them, -1 where there are none.
+    """
+    body_of, rotations = model.shape_body.numpy().tolist(), model.shape_transform.numpy()[:, 3:].tolist()
+    groups: list[tuple[Magnet, int, list[int]]] = []
+    of_body: dict[int, list[tuple[Magnet, int, list[int]]]] = {}
+    for shape, magnet in marked_shapes(model).items():
+        body = body_of[shape]
+        turned = wp.quat_rotate(wp.quat(*rotations[shape]), wp.vec3(*magnet.magnetization))
+        magnet = replace(magnet, magnetization=tuple(turned))
+        alike = [group for group in of_body.get(body, []) if body >= 0 and _alike(group[0], magnet)]
+        if alike:
+            alike[0][2].append(shape)
+        else:
+            groups.append((magnet, body, [shape]))
+            of_body.setdefault(body, []).append(groups[-1])
+    worlds, held = _number_worlds(model, [shapes[0] for _, _, shapes in groups])
+    sampler = ShapeSampler(model)
+    magnets = [
+        BodyMagnet(
+            magnet,
+            body,
+            tuple(shapes),
+            world,
+            sampler.sample(shapes, magnet.moment_spacing, magnet.kind == "permanent"),
+        )
+        for (magnet, body, shapes), world in zip(groups, worlds, strict=True)
+    ]
+    return sorted(magnets, key=lambda one: (one.world, one.magnet.kind == "permanent", one.body, one.shapes)), held
+
+
+def _alike(a: Magnet, b: Magnet) -> bool:
+    """Return whether two magnets of one body are the same material, magnetized alike up to rounding."""
+    if replace(a, magnetization=b.magnetization) != b:
+        return False
+    difference = np.linalg.norm(np.subtract(a.magnetization, b.magnetization))
+    return bool(difference <= 1e-5 * np.linalg.norm(a.magnetization))
+
+
+def _number_worlds(model: newton.Model, shapes: list[int]) -> tuple[list[int], np.ndarray]:
+    """Return the world of each shape, counted among the worlds that hold magnets, and these, -1 if there are no worlds.
+
+    A magnet outside all worlds belongs to the only one that holds magnets, if there is only one.
+    """
+    worlds = model.shape_world.numpy()[shapes]
+    held = np.unique(worlds[worlds >= 0])
+    if len(held) > 1 and (worlds < 0).any():
+        label = model.shape_label[shapes[int(np.argmax(worlds < 0))]]
+        raise InputError(f"{label}: a magnet outside all worlds, while {len(held)} worlds hold magnets of their own")
+    numbers = [int(np.searchsorted(held, world)) if world >= 0 else 0 for world in worlds]
+    return numbers, held if len(held) else np.array([-1])
