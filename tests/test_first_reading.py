@@ -130,3 +130,14 @@ def test_a_short_text_of_millions_of_prims(tmp_path):
     path.write_text(HEAD + "".join(levels) + 'def "C7" {}\n')
     with pytest.raises(InputError, match="holds more than 500000 prims|did not read it within 30 s|reader dies of it"):
         open_stage(path)
+
+
+def test_text_that_is_not_utf8_is_refused(tmp_path):
+    """USD prints an error of Python's for such a token, and takes it as if it were not there."""
+    path = crate(tmp_path / "stage.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    Sdf.AttributeSpec(layer.GetPrimAtPath("/World"), "kind", Sdf.ValueTypeNames.Token).default = "inducible"
+    layer.Save()
+    path.write_bytes(path.read_bytes().replace(b"inducible", b"inducibl\x94"))
+    with pytest.raises(InputError, match=r"stage.usdc: damaged: text that is not UTF-8"):
+        open_stage(path)

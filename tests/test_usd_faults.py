@@ -348,6 +348,27 @@ def test_ends_of_a_joint_that_are_apart(tmp_path, apart, warned):
     assert found == [f"/Joint: its ends are {apart:g} m apart at the start, and a run begins by pulling"] * warned
 
 
+@pytest.mark.parametrize(("place", "apart"), [("(0, 0, 0.5)", 0.0), ("(0.3, 0, 0.5)", 0.3), ("(0, 0.4, 0)", 0.4)])
+def test_ends_of_a_prismatic_joint_may_be_apart_along_its_axis(tmp_path, place, apart):
+    turned = "quatf physics:localRot0 = (0.70710678, 0, -0.70710678, 0)"  # takes X to Z
+    joint = hinged("double3 xformOp:translate", place).replace("Revolute", "Prismatic")
+    joint = joint.replace(TO_BALL, f'{TO_BALL}\nuniform token physics:axis = "X"\n{turned}')
+    found = [str(one) for one in check(write(tmp_path, joint)).warnings if one.where == "/Joint"]
+    assert found == [f"/Joint: its ends are {apart:g} m apart at the start, and a run begins by pulling"] * (apart > 0)
+
+
+def test_a_run_that_ends_names_a_field_beyond_all_measure(device, tmp_path, monkeypatch):
+    simulation = Simulation(write(tmp_path, ball()), device=device)
+    simulation.magnetics.set_external_field((0.0, 1e9, 0.0))
+
+    def end():
+        raise SimulationError("step 1: /Ball has left")
+
+    monkeypatch.setattr(simulation._stepper, "look", end)
+    with pytest.raises(SimulationError, match=r"/Ball has left; an applied field of 1e\+09 A/m turns magnets too fast"):
+        simulation.step()
+
+
 def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
     simulation = Simulation(write(tmp_path, hinged("double3 xformOp:translate", "(0.5, 0, 0)")), device=device)
 

@@ -389,6 +389,14 @@ def test_warnings_of_both_are_the_same(case, device, tmp_path, capsys):
     assert any(message in warning for warning in warnings)
 
 
+def test_a_body_that_is_marked_as_a_collider_itself(device, tmp_path, capsys):
+    """An Xform has no shape to collide with, or to fill with moments: those of its children count."""
+    inner = ball("Shape", (0, 0, 0), body=False, magnet=False)
+    schemas = '"PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"'
+    body = f'def Xform "A" (prepend apiSchemas = [{schemas}]) {{\nfloat warpmag:momentSpacing = 0.01\n{inner}}}\n'
+    assert told(write(tmp_path, physics(field=FIELD), body), tmp_path, device, capsys)[0] == []
+
+
 def test_a_broken_rule_of_usd_is_a_warning(device, tmp_path, capsys):
     path = write(tmp_path, A)
     path.write_text(path.read_text().replace('defaultPrim = "World"', ""))

@@ -28,8 +28,9 @@ from .truth import differences
 
 FORMS = ("usda",) * 13 + ("text",) * 3 + ("crate",) * 3 + ("package",)
 """How mutants lie on disk, as often as here: sound text, damaged text, damaged crate files, damaged packages."""
-CPU_SECONDS, WALL_SECONDS = 60, 300
-"""Time that a stage may take [s]; wall time allows for a loaded machine."""
+CPU_SECONDS, WALL_SECONDS = 150, 600
+"""Time that a stage may take [s], up to 80 of which are for compiling contacts of a new kind of shape; wall time allows
+for a loaded machine."""
 MEMORY = 8 << 30
 """Address space of a worker [bytes]."""
 OK, FAILED, BAD_INPUT = 0, 1, 2

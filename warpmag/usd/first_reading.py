@@ -28,6 +28,12 @@ _LOADED = 2
 _FILLED = {"MALLOC_PERTURB_": "165"}
 """Has glibc fill new memory with what is no zero: of some damaged files USD reads more than it wrote, and takes what
 happens to be there."""
+_NOT_TEXT = "text that is not UTF-8"
+_PRINTED = {
+    b"posix_madvise": "damaged: its table of contents names bytes beyond its end",
+    b"UnicodeDecodeError": f"damaged: {_NOT_TEXT}",
+}
+"""What USD prints of damaged files, without an error, and what it means."""
 _TEXT = b"#usda"
 _ARCS = (b"@", b"references", b"payload", b"inherits", b"specializes", b"prototypes")
 """What a text holds by which other files, or prims again, become part of it."""
@@ -72,9 +78,9 @@ def first_reading(path: str | os.PathLike) -> str:
     why = ""
     with contextlib.suppress(ValueError):
         why = str(json.loads(done.stdout))
-    if not why and b"posix_madvise" in done.stderr:  # which USD would say again, past all that could keep it quiet
-        return "damaged: its table of contents names bytes beyond its end"
-    return why
+    # what USD prints itself it would print again, past all that could keep it quiet
+    printed = [meaning for words, meaning in _PRINTED.items() if words in done.stderr]
+    return why or "".join(printed[:1])
 
 
 def _depth(text: bytes) -> int:
@@ -89,7 +95,7 @@ def failure(error: Exception) -> str:
         with contextlib.suppress(UnicodeDecodeError):  # it may quote the file
             said = getattr(error.args[0], "commentary", error.args[0]) if error.args else ""
             return (str(said).strip().splitlines() or [type(error).__name__])[0]
-    return "text that is not UTF-8"
+    return _NOT_TEXT
 
 
 def _read(path: str) -> str:  # pragma: no cover - in the child, which has nothing of coverage's
@@ -99,8 +105,11 @@ def _read(path: str) -> str:  # pragma: no cover - in the child, which has nothi
     try:
         stage = Usd.Stage.Open(path)
         prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
-        if sum(1 for _ in islice(prims, MOST_PRIMS + 1)) > MOST_PRIMS:
-            return f"holds more than {MOST_PRIMS} prims"
+        for count, prim in enumerate(islice(prims, MOST_PRIMS + 1), 1):
+            if count > MOST_PRIMS:
+                return f"holds more than {MOST_PRIMS} prims"
+            for attribute in prim.GetAuthoredAttributes():
+                attribute.Get()
         for layer in stage.GetUsedLayers():
             Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
     except FAILURES as error:

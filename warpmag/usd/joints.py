@@ -16,7 +16,7 @@ from warpmag.usd.values import Finding, value_of
 
 _AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 _MEETING = (UsdPhysics.FixedJoint, UsdPhysics.RevoluteJoint, UsdPhysics.SphericalJoint)
-"""Joints whose ends are at one place."""
+"""Joints whose ends are at one place; those of a prismatic joint are on its axis."""
 _PLACES = ("physics:localPos0", "physics:localPos1")
 _ROOTS = ("PhysicsArticulationRootAPI", "NewtonArticulationRootAPI")
 """What makes a prim the root of an articulation; the second brings the first along."""
@@ -74,23 +74,32 @@ def joint_findings(stage: Usd.Stage) -> Iterator[Finding]:
 
 
 def strained_joints(stage: Usd.Stage) -> dict[str, float]:
-    """Return how far the ends of joints are apart at the start [m], where they should be at one place and are not."""
+    """Return how far the ends of joints are apart at the start [m], in ways that the joint does not leave free."""
     places, found = UsdGeom.XformCache(Usd.TimeCode.Default()), {}
     for joint in enabled_joints(stage):
-        ends = _ends(stage, joint)
-        if not (any(joint.GetPrim().IsA(kind) for kind in _MEETING) and all(end.prim for end in ends)):
+        ends, slides = _ends(stage, joint), joint.GetPrim().IsA(UsdPhysics.PrismaticJoint)
+        if not (slides or any(joint.GetPrim().IsA(kind) for kind in _MEETING)) or not all(end.prim for end in ends):
             continue
         try:
+            frames = [places.GetLocalToWorldTransform(end.prim) for end in ends]
             one, other = (
-                places.GetLocalToWorldTransform(end.prim).Transform(Gf.Vec3d(value_of(joint.GetPrim(), name)))
-                for end, name in zip(ends, _PLACES, strict=True)
+                frame.Transform(Gf.Vec3d(value_of(joint.GetPrim(), name)))
+                for frame, name in zip(frames, _PLACES, strict=True)
             )
+            axis = frames[0].TransformDir(_axis(joint.GetPrim())).GetNormalized() if slides else Gf.Vec3d(0.0)
         except (InputError, Tf.ErrorException):  # among the findings of the attributes and ends
             continue
-        gap = (one - other).GetLength()
+        gap = (one - other - axis * ((one - other) * axis)).GetLength()
         if any(end.moves for end in ends) and gap > _APART + _ROUNDING * one.GetLength():
             found[str(joint.GetPath())] = gap
     return found
+
+
+def _axis(joint: Usd.Prim) -> Gf.Vec3d:
+    """Return the direction in which a prismatic joint slides, in the frame of what ``body0`` names."""
+    axis = Gf.Vec3d(0.0)
+    axis["XYZ".index(value_of(joint, "physics:axis"))] = 1.0
+    return Gf.Rotation(Gf.Quatd(value_of(joint, "physics:localRot0"))).TransformDir(axis)
 
 
 def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:

@@ -292,7 +292,7 @@ def _read_magnet(prim, transforms, contents) -> None:
     sound = [
         one
         for one in _prims_of_magnet(prim)
-        if is_collider(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one)
+        if is_collider(one) and is_solid(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one)
     ]
     contents.findings += [finding for one in sound for finding in magnet_findings(one)]
     if path in contents.magnets and path not in faulty:
