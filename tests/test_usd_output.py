@@ -49,9 +49,11 @@ def make_frames(count, seed=1):
     return q, rng.normal(size=(count, 3, 6)).astype(np.float32), rng.normal(size=(count, 3, 3)).astype(np.float32)
 
 
-def add(writer, frames, numbers, **options):
+def add(writer, frames, numbers, state=None):
     for k in numbers:
-        writer.add_frame(k / 128, *(values[k] for values in frames), **options)
+        writer.add_frame(k / 128, *(values[k] for values in frames))
+        if writer.save_due:
+            writer.save(state() if state else None)
 
 
 def read(output):

@@ -18,7 +18,8 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class Recorder:
     """Takes the frames of a simulation.
 
-    Frames are written as they come. What interrupts a run waits until the frame that is being written is whole.
+    Frames are written as they come, on a GPU during the steps that follow. What interrupts a run waits until the frame
+    that is being written is whole.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class Recorder:
         shapes = list(scene.magnet_shapes.values())
         row = {shape: index for index, shape in enumerate(magnetics.shapes.tolist())}
         self._magnetics = magnetics
+        self._taken: tuple | None = None
         self._bodies = np.array(list(scene.bodies.values()), dtype=int)
         self._shapes = np.array([row[shape] for of_prim in shapes for shape in of_prim], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
@@ -54,7 +56,7 @@ class Recorder:
             return self._writer.resume()
 
     def add_frame(self, time: float, state, save: Callable[[], dict[str, np.ndarray]] | None) -> None:
-        """Write a frame.
+        """Take a frame, and write it; on a GPU :meth:`write` does that, while the next steps run.
 
         Args:
             time: Time since the start [s].
@@ -64,13 +66,29 @@ class Recorder:
         moments = self._magnetics.shape_moments()[self._shapes]
         totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
         body_q, body_qd = state.body_q.numpy()[self._bodies], state.body_qd.numpy()[self._bodies]
+        self.write()
+        self._taken = (time, body_q, body_qd, totals)
+        if self._writer.save_due:
+            self.write()
+            with _interrupts_held():
+                self._writer.save(save() if save else None)
+        elif not self._magnetics.system.device.is_cuda:
+            self.write()
+
+    def write(self) -> None:
+        """Write the frame that has been taken, if it has not been written yet."""
         with _interrupts_held():
-            self._writer.add_frame(time, body_q, body_qd, totals, save)
+            if taken := self._taken:
+                self._taken = None
+                self._writer.add_frame(*taken)
 
     def close(self, complete: bool) -> None:
         """Close the files; unless the run is complete, it can be resumed."""
-        with _interrupts_held():
-            self._writer.close(complete)
+        try:
+            self.write()
+        finally:
+            with _interrupts_held():
+                self._writer.close(complete)
 
 
 @contextlib.contextmanager

@@ -28,6 +28,8 @@ _OVERLAP = 1e-4
 _TOUCHING = 0.05
 """Bodies closer than this part of their thickness touch, for the count of held ones."""
 _FRAME_RATE = 60.0
+_AHEAD = 4
+"""Steps that a GPU is given before the host writes the frame before them."""
 _STRONGEST_FIELD = 1e8
 """Applied field above which it is named where a run ends [A/m]; the strongest of laboratories are ten times less."""
 """Output frames per second [Hz] of a scene that is no stage."""
@@ -315,8 +317,11 @@ class Simulation:
                 target = self._steps_at(frame)
                 if target <= self._stepper.steps and (frame or resumed):
                     continue  # done before, or steps are longer than frames: several would stand at one time
+                ahead = min(self._stepper.steps + _AHEAD, target)
                 while self._stepper.steps < target:
                     self.step()
+                    if recorder and self._stepper.steps == ahead:
+                        recorder.write()
                 self._follow()
                 figures.wall_seconds = before + time.perf_counter() - began
                 if recorder:

@@ -117,7 +117,7 @@ class CacheWriter:
         self._last_turns: np.ndarray | None = None
         self._last_time = -np.inf
         self._below = ""
-        self._checkpoint_due = 0.0
+        self._save_time = 0.0
 
     def __enter__(self) -> "CacheWriter":
         """Return the writer itself."""
@@ -189,7 +189,6 @@ class CacheWriter:
         body_q: np.ndarray,
         body_qd: np.ndarray,
         moments: np.ndarray,
-        state: Callable[[], dict[str, np.ndarray]] | None = None,
     ) -> None:
         """Write one frame.
 
@@ -198,7 +197,6 @@ class CacheWriter:
             body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
             body_qd: Linear velocity of the centre of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
             moments: Moments of the magnets [A·m²], world frame, shape [m, 3].
-            state: Returns all that the run needs to go on from this frame; called about once a second.
 
         Raises:
             InputError: It cannot be written; the stage has the frames before.
@@ -216,11 +214,32 @@ class CacheWriter:
             self._samples = self._begin(time, values)
         else:
             self._append(self._samples, time, values)
-        now = clock_time.monotonic()
-        if now >= self._checkpoint_due:
-            self._save(self._samples, state() if state else None)
-            spent = clock_time.monotonic() - now
-            self._checkpoint_due = now + max(_CHECKPOINT_SECONDS, spent / _CHECKPOINT_SHARE)
+
+    @property
+    def save_due(self) -> bool:
+        """Whether :meth:`save` should be called after the next frame: about once a second."""
+        return clock_time.monotonic() >= self._save_time
+
+    def save(self, state: dict[str, np.ndarray] | None) -> None:
+        """Write what changes with every frame besides the cache, after at least one frame.
+
+        Args:
+            state: All that the run needs to go on from the last frame; None if it cannot be resumed.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        assert self._samples is not None
+        began = clock_time.monotonic()
+        self._place_root()
+        if state is not None:
+            about = {**self._about, "time": repr(self._last_time)}
+            arrays = {f"file/{name}": array for name, array in self._samples.places().items()}
+            arrays |= {f"state/{name}": array for name, array in state.items()}
+            with self._output.errors(self._output.checkpoint):
+                self._output.save_checkpoint(about, arrays)
+        spent = clock_time.monotonic() - began
+        self._save_time = began + max(_CHECKPOINT_SECONDS, spent / _CHECKPOINT_SHARE)
 
     def close(self, complete: bool = True) -> None:
         """Close the files; a second call does nothing.
@@ -278,17 +297,6 @@ class CacheWriter:
         data = np.concatenate([np.ascontiguousarray(one).view(np.uint8).ravel() for one in values])
         with self._output.errors(self._output.cache):
             samples.append(self._code(time), data, changed)
-
-    def _save(self, samples: SampleFile, state: dict[str, np.ndarray] | None) -> None:
-        """Write what changes with every frame besides the cache."""
-        self._place_root()
-        if state is None:
-            return
-        about = {**self._about, "time": repr(self._last_time)}
-        arrays = {f"file/{name}": array for name, array in samples.places().items()}
-        arrays |= {f"state/{name}": array for name, array in state.items()}
-        with self._output.errors(self._output.checkpoint):
-            self._output.save_checkpoint(about, arrays)
 
     def _write_scene_and_root(self) -> list[Path]:
         """Write copies of the scene and the root, without placing them; return what to place before the root."""
