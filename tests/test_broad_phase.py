@@ -41,22 +41,31 @@ def random_scene(seed: int, worlds: int, device, largest: float = 0.03) -> newto
     return scene.finalize(device=device)
 
 
-def find(model, state, broad_phase) -> tuple[set, list]:
-    """Pairs of shapes, and contacts: both shapes and the first one's point [m]."""
-    pipeline = newton.CollisionPipeline(
-        model, broad_phase="nxn", speculative_contact_gap_max=FARTHEST, rigid_contact_max=100_000, verify_buffers=False
-    )
-    if broad_phase is not None:
-        pipeline.broad_phase = broad_phase
-    contacts = pipeline.contacts()
-    pipeline.collide(state, contacts, dt=SUBSTEP)
-    count = int(pipeline.broad_phase_pair_count.numpy()[0])
-    pairs = list(map(tuple, pipeline.broad_phase_shape_pairs.numpy()[:count].tolist()))
-    assert len(set(pairs)) == len(pairs)
-    count = int(contacts.rigid_contact_count.numpy()[0])
-    shapes = [getattr(contacts, f"rigid_contact_shape{side}").numpy()[:count] for side in (0, 1)]
-    points = contacts.rigid_contact_point0.numpy()[:count]
-    return set(pairs), sorted(zip(*map(list, shapes), points.tolist(), strict=True))
+class Search:
+    """Finds pairs and contacts of a model, by Newton's comparison of all pairs or by another search in its place."""
+
+    def __init__(self, model, broad_phase=None):
+        self.pipeline = newton.CollisionPipeline(
+            model,
+            broad_phase="nxn",
+            speculative_contact_gap_max=FARTHEST,
+            rigid_contact_max=100_000,
+            verify_buffers=False,
+        )
+        if broad_phase is not None:
+            self.pipeline.broad_phase = broad_phase
+        self.contacts = self.pipeline.contacts()
+
+    def find(self, state) -> tuple[set, list]:
+        """Pairs of shapes, and contacts: both shapes and the first one's point [m]."""
+        self.pipeline.collide(state, self.contacts, dt=SUBSTEP)
+        count = int(self.pipeline.broad_phase_pair_count.numpy()[0])
+        pairs = list(map(tuple, self.pipeline.broad_phase_shape_pairs.numpy()[:count].tolist()))
+        assert len(set(pairs)) == len(pairs)
+        count = int(self.contacts.rigid_contact_count.numpy()[0])
+        shapes = [getattr(self.contacts, f"rigid_contact_shape{side}").numpy()[:count] for side in (0, 1)]
+        points = self.contacts.rigid_contact_point0.numpy()[:count]
+        return set(pairs), sorted(zip(*map(list, shapes), points.tolist(), strict=True))
 
 
 def set_motion(model, state, rng, shift: float, speed: float):
@@ -72,13 +81,13 @@ def set_motion(model, state, rng, shift: float, speed: float):
 def test_contacts_are_those_of_all_pairs(worlds, seed, device):
     model = random_scene(seed, worlds, device)
     state, rng = model.state(), np.random.default_rng(seed)
-    own = NeighborBroadPhase(model, FARTHEST)
+    newtons, own = Search(model), Search(model, NeighborBroadPhase(model, FARTHEST))
     balls = model.shape_type.numpy() == newton.GeoType.SPHERE
     # still, and moved by less and by more than lists allow; slow, and faster than contacts are sought ahead
     for shift, speed in ((0.0, 0.0), (1e-3, 0.1), (1e-3, 10.0), (1e-3, 100.0), (0.01, 1.0), (1e-4, 0.0)):
         set_motion(model, state, rng, shift, speed)
-        pairs, contacts = find(model, state, None)
-        found, own_contacts = find(model, state, own)
+        pairs, contacts = newtons.find(state)
+        found, own_contacts = own.find(state)
         assert own_contacts == contacts
         assert found <= pairs
         assert {pair for pair in pairs - found if not balls[list(pair)].all()} == set()
@@ -91,9 +100,8 @@ def test_crowded_balls_are_found(device):
     for place in np.random.default_rng(0).normal(0.0, 0.004, (150, 3)):
         builder.add_shape_sphere(builder.add_body(xform=wp.transform(place, wp.quat_identity())), radius=0.005)
     model = builder.finalize(device=device)
-    own = NeighborBroadPhase(model, FARTHEST)
-    contacts = find(model, model.state(), None)[1]
-    found, own_contacts = find(model, model.state(), own)
+    contacts = Search(model).find(model.state())[1]
+    found, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())
     assert own_contacts == contacts
     assert len(found) > 64 * 150 / 2
 
@@ -101,9 +109,8 @@ def test_crowded_balls_are_found(device):
 def test_many_other_shapes_are_swept(device, monkeypatch):
     monkeypatch.setattr("warpmag.kernels.rigid.broad_phase._MOST_COMPARISONS", 100)
     model = random_scene(3, 2, device)
-    own = NeighborBroadPhase(model, FARTHEST)
-    pairs, contacts = find(model, model.state(), None)
-    found, own_contacts = find(model, model.state(), own)
+    pairs, contacts = Search(model).find(model.state())
+    found, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())
     assert (found, own_contacts) == (pairs, contacts)
 
 
@@ -111,4 +118,4 @@ def test_nothing_collides(device):
     builder = newton.ModelBuilder()
     builder.add_body()
     model = builder.finalize(device=device)
-    assert find(model, model.state(), NeighborBroadPhase(model, FARTHEST)) == (set(), [])
+    assert Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state()) == (set(), [])

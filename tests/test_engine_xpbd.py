@@ -31,14 +31,19 @@ def add_shape(builder, kind, body, config):
             builder.add_shape_sphere(body, xform=wp.transform(at), radius=radius, cfg=config)
 
 
+def search(model):
+    """Newton's search for contacts, in the form that a run compiles, too, although nothing is sought ahead."""
+    pipeline = newton.CollisionPipeline(model, rigid_contact_max=CAPACITY, speculative_contact_gap_max=0.0)
+    return pipeline, pipeline.contacts()
+
+
 def collided(builder, device):
     """The model, its state and its contacts."""
     model = builder.finalize(device=device)
     model.joint_count = 0  # all of them free
     state = model.state()
-    pipeline = newton.CollisionPipeline(model, rigid_contact_max=CAPACITY)
-    contacts = pipeline.contacts()
-    pipeline.collide(state, contacts)
+    pipeline, contacts = search(model)
+    pipeline.collide(state, contacts, dt=DT)
     return model, state, contacts
 
 
@@ -209,9 +214,8 @@ def test_a_clump_keeps_momentum_and_angular_momentum(kind, device):
     In each, float32 rounds a velocity and a position of some tens of bodies by 3e-8: 1e-6 in all where errors add up as
     squares, ten times that where they do not.
     """
-    model, state, contacts = heap(kind, device, ground=False)
-    pipeline, other = newton.CollisionPipeline(model, rigid_contact_max=CAPACITY), model.state()
-    contacts = pipeline.contacts()
+    model, state, _ = heap(kind, device, ground=False)
+    (pipeline, contacts), other = search(model), model.state()
     settings = {"rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
     solver = PileXPBD(model, CAPACITY, iterations=20, **settings)
     mass, inertia = model.body_mass.numpy().astype(float), model.body_inertia.numpy().astype(float)
@@ -237,7 +241,7 @@ def test_a_clump_keeps_momentum_and_angular_momentum(kind, device):
         forces = np.zeros((len(mass), 6), np.float32)
         forces[:, :3] = -2e4 * mass[:, None] * (x - mass @ x / mass.sum())
         state.body_f.assign(forces)
-        pipeline.collide(state, contacts)
+        pipeline.collide(state, contacts, dt=DT)
         solver.step(state, other, None, contacts, DT)
         state, other = other, state
         speed = max(speed, np.abs(state.body_qd.numpy()[:, :3]).max())
@@ -326,8 +330,7 @@ def test_cubes_that_are_pressed_together_keep_their_turn(device):
     model = builder.finalize(device=device)
     model.joint_count = 0
     solver = PileXPBD(model, CAPACITY, iterations=60, rigid_contact_relaxation=0.35, rigid_contact_con_weighting=False)
-    pipeline = newton.CollisionPipeline(model, rigid_contact_max=CAPACITY)
-    contacts, now, then = pipeline.contacts(), model.state(), model.state()
+    (pipeline, contacts), now, then = search(model), model.state(), model.state()
     mass, inertia = model.body_mass.numpy()[0], model.body_inertia.numpy()[0, 2, 2]
 
     def turn():
@@ -341,7 +344,7 @@ def test_cubes_that_are_pressed_together_keep_their_turn(device):
         forces = np.zeros((2, 6), np.float32)
         forces[:, :3] = mass * pull * np.array([along, -along])
         now.body_f.assign(forces)
-        pipeline.collide(now, contacts)
+        pipeline.collide(now, contacts, dt=dt)
         solver.step(now, then, None, contacts, dt)
         now, then = then, now
     assert contacts.rigid_contact_count.numpy()[0] >= 4
@@ -360,13 +363,12 @@ def test_a_stack_of_boxes_stays(seconds, device):
     model = builder.finalize(device=device)
     model.joint_count = 0
     solver = PileXPBD(model, CAPACITY, iterations=30, rigid_contact_relaxation=0.35, rigid_contact_con_weighting=False)
-    pipeline = newton.CollisionPipeline(model, rigid_contact_max=CAPACITY)
-    contacts, now, then = pipeline.contacts(), model.state(), model.state()
+    (pipeline, contacts), now, then = search(model), model.state(), model.state()
 
     def run(seconds):
         nonlocal now, then
         for _ in range(round(seconds / DT)):
-            pipeline.collide(now, contacts)
+            pipeline.collide(now, contacts, dt=DT)
             solver.step(now, then, None, contacts, DT)
             now, then = then, now
         return now.body_q.numpy()[:, :3].astype(float)

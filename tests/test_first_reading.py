@@ -122,14 +122,25 @@ def test_a_reader_that_computes_without_end(tmp_path, monkeypatch):
         open_stage(path)
 
 
-def test_a_short_text_of_millions_of_prims(tmp_path):
-    """Each prim has ten of the next kind."""
-    path = tmp_path / "stage.usda"
+def multiplied(path, levels):
+    """A short text of ``10**levels`` prims and more: each has ten of the next kind."""
     inner = "".join(f'def "x{k}" (references = </{{}}>) {{{{}}}}\n' for k in range(10))
-    levels = [f'def "C{level}" {{\n{inner.format(*[f"C{level + 1}"] * 10)}}}\n' for level in range(7)]
-    path.write_text(HEAD + "".join(levels) + 'def "C7" {}\n')
+    kinds = [f'def "C{level}" {{\n{inner.format(*[f"C{level + 1}"] * 10)}}}\n' for level in range(levels)]
+    path.write_text(HEAD + "".join(kinds) + f'def "C{levels}" {{}}\n')
+    return path
+
+
+def test_a_short_text_of_too_many_prims(tmp_path, monkeypatch):
+    monkeypatch.setattr(first_reading, "MOST_PRIMS", 3_000)
+    with pytest.raises(InputError, match="stage.usda: holds more than 3000 prims"):
+        open_stage(multiplied(tmp_path / "stage.usda", 4))
+    assert open_stage(multiplied(tmp_path / "fewer.usda", 3))
+
+
+@pytest.mark.long
+def test_a_short_text_of_millions_of_prims(tmp_path):
     with pytest.raises(InputError, match="holds more than 500000 prims|did not read it within 30 s|reader dies of it"):
-        open_stage(path)
+        open_stage(multiplied(tmp_path / "stage.usda", 7))
 
 
 def test_text_that_is_not_utf8_is_refused(tmp_path):

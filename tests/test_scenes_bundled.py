@@ -185,13 +185,16 @@ def test_crystal_balls_have_a_strong_and_a_weak_magnet(tmp_path, strength, field
 def test_other_counts_and_sizes(tmp_path):
     path = tmp_path / "scene.usdc"
     falling_magnet.author(path, balls=61, layers=3, radius=0.003, magnet_radius=0.01, friction=0.2)
-    assert len(check(path).magnets("inducible")) == 61 and not check(path).findings
+    found = check(path)
+    assert len(found.magnets("inducible")) == 61 and not found.findings
     sakura_tree.author(path, balls=3000, branches=12, radius=0.002, height=0.3, spacing=0.012, seed=1)
-    assert len(check(path).magnets("inducible")) == 3000 and not check(path).findings
-    assert 3 <= len(check(path).magnets("permanent")) <= 12
+    found = check(path)
+    assert len(found.magnets("inducible")) == 3000 and not found.findings
+    assert 3 <= len(found.magnets("permanent")) <= 12
     assert _least_gap(*_balls(open_stage(path))) > 0.0
     crystal_balls.author(path, columns=5, rows=7, bar=1, bar_rows=1)
-    assert len(check(path).magnets("inducible")) == 34 and not check(path).findings
+    found = check(path)
+    assert len(found.magnets("inducible")) == 34 and not found.findings
 
 
 @pytest.mark.parametrize(
@@ -215,8 +218,9 @@ def test_saturation_can_be_chosen(tmp_path, author, parameters, body):
 def test_other_letters(tmp_path):
     path = tmp_path / "scene.usdc"
     alphabets.author(path, columns=3, rows=2, layers=1, size=0.05, thickness=0.01)
-    names = [one.rpartition("/")[2] for one in check(path).magnets("inducible")]
-    assert names == ["A_000", "B_001", "C_002", "D_003", "E_004", "F_005"] and not check(path).findings
+    found = check(path)
+    names = [one.rpartition("/")[2] for one in found.magnets("inducible")]
+    assert names == ["A_000", "B_001", "C_002", "D_003", "E_004", "F_005"] and not found.findings
 
 
 @pytest.mark.parametrize(

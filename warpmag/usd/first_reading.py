@@ -61,7 +61,8 @@ def first_reading(path: str | os.PathLike) -> str:
         if not any(arc in content for arc in _ARCS):
             return ""
     limit = round(_SECONDS + size / _BYTES_PER_SECOND)
-    command = [sys.executable or "", "-S", "-E", __file__, json.dumps(sys.path), str(path), str(limit)]
+    program = [sys.executable or "", "-S", "-E", __file__]
+    command = [*program, json.dumps(sys.path), str(path), str(MOST_PRIMS), str(limit)]
     late = f"USD did not read it within {limit} s"
     try:
         done = subprocess.run(
@@ -98,16 +99,16 @@ def failure(error: Exception) -> str:
     return _NOT_TEXT
 
 
-def _read(path: str) -> str:  # pragma: no cover - in the child, which has nothing of coverage's
-    """Read a stage with all of its layers to the last value; return why that fails, empty where it does not."""
+def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, which has nothing of coverage's
+    """Read a stage of so many prims at most, to the last value of its layers; return why that fails, or nothing."""
     from pxr import Sdf, Usd  # noqa: PLC0415 - only the child needs it
 
     try:
         stage = Usd.Stage.Open(path)
         prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
-        for count, prim in enumerate(islice(prims, MOST_PRIMS + 1), 1):
-            if count > MOST_PRIMS:
-                return f"holds more than {MOST_PRIMS} prims"
+        for count, prim in enumerate(islice(prims, most + 1), 1):
+            if count > most:
+                return f"holds more than {most} prims"
             for attribute in prim.GetAuthoredAttributes():
                 attribute.Get()
         for layer in stage.GetUsedLayers():
@@ -130,5 +131,5 @@ def _limit(seconds: int) -> None:  # pragma: no cover - in the child, too
 if __name__ == "__main__":  # pragma: no cover - in the child, too
     sys.path[:] = json.loads(sys.argv[1])
     with contextlib.suppress(ImportError, ValueError, OSError):
-        _limit(int(sys.argv[3]))
-    print(json.dumps(_read(sys.argv[2])))
+        _limit(int(sys.argv[4]))
+    print(json.dumps(_read(sys.argv[2], int(sys.argv[3]))))
