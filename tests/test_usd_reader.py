@@ -311,11 +311,17 @@ def test_animated_values_are_held_at_the_start(tmp_path):
     assert path.read_text() == text
 
 
-def test_held_kinematic_animation_is_reported(tmp_path):
+def test_keys_of_a_kinematic_body_are_read_and_those_within_a_body_reported(tmp_path):
     moving = "double3 xformOp:translate.timeSamples = { 0: (0, 0, 0), 10: (1, 0, 0) }\n"
-    moving += 'uniform token[] xformOpOrder = ["xformOp:translate"]\nbool physics:kinematicEnabled = 1'
-    findings = survey(open_stage(write(tmp_path, ball(moving)))).findings
-    assert [(finding.where, finding.severity) for finding in findings] == [("/Ball", "warning")]
+    moving += 'uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+    contents = survey(open_stage(write(tmp_path, ball(moving + "bool physics:kinematicEnabled = 1"))))
+    assert not contents.findings
+    (operation,) = contents.motions["/Ball"].operations
+    assert (operation.kind, operation.keys.times.tolist()) == ("translate", [0.0, 10.0])
+    part = ball(moving, name="Part", apis=("PhysicsCollisionAPI",))
+    body = 'def Xform "Tool" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "WarpmagMagnetAPI"])\n{\n' + part + "}"
+    findings = survey(open_stage(write(tmp_path, body, name="b.usda"))).findings
+    assert [(finding.where, finding.severity) for finding in findings] == [("/Tool/Part", "warning")]
 
 
 def test_report(tmp_path):

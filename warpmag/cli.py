@@ -188,6 +188,9 @@ def _check(options) -> int:
         f"bodies      {len(contents.bodies)} ({len(contents.kinematic)} kinematic), {len(contents.colliders)} colliders"
     )
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
+    if contents.motions or contents.magnetization_keys or contents.field_keys:
+        field = ", the external field" if contents.field_keys else ""
+        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{field}")
     settings = contents.settings
     field = ", ".join(f"{value:g}" for value in settings.external_field)
     laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"

@@ -7,6 +7,7 @@
 | broad_phase | pairs of shapes that may touch |
 | monitor | motion, penetration, buffers and induction of each substep |
 | stepping | the state machine of a step: substeps, attempts, log |
+| keyed_poses | poses and velocities of kinematic bodies whose transforms are keyed |
 | free_motion | what forces change in velocities, and velocities in poses |
 | contact_solve | XPBD's iterations over contacts; law in `contact_law.h`, all in a launch in `contact_cluster.h` |
 | mass_splitting | a correction to XPBD: shares of bodies that many contacts push |

@@ -181,6 +181,12 @@ def _end_pair(a: StepArrays, level: int):
     a.flags[FLAG_FORCES] = wp.where((2 * remaining) % wp.max(a.status[STATUS_SHARING], 2) == 0, 1, 0)
 
 
+@wp.kernel
+def _tell_time(a: StepArrays, step: wp.float64, longest: wp.float64, time_out: wp.array[wp.float64]):
+    substeps = wp.float64(a.status[STATUS_SUBSTEPS]) / wp.float64(1 << a.status[STATUS_LEVEL])
+    time_out[0] = wp.float64(a.status[STATUS_DONE]) * step + substeps * longest
+
+
 @wp.func
 def _sharing(level: int, long_travel: float, seen_at: int, limit: float) -> int:
     """Number of substeps of ``level`` to share forces, from the motion in two substeps of level ``seen_at``."""
@@ -356,6 +362,16 @@ class StepMachine:
     def restore(self) -> None:
         """Take the state back to where the step began if the attempt was rejected."""
         self._launch(_restore, self._copies, dim=self._chunks)
+
+    def tell_time(self, step: float, longest: float, time) -> None:
+        """Write the time at which the next two substeps begin [s] into ``time`` [1].
+
+        Args:
+            step: Length of a step [s].
+            longest: Length of the substeps of the first level [s].
+            time: Out.
+        """
+        self._launch(_tell_time, wp.float64(step), wp.float64(longest), time)
 
     def end_pair(self, level: int) -> None:
         """Count two substeps of ``level`` as done."""

@@ -165,6 +165,8 @@ SOLVERS: dict[str, Callable] = {
 """Rigid-body solvers by name; the first is the default and the one that piles are tested with."""
 UNRESUMABLE = ("mujoco",)
 """Solvers that start each step from what they keep to themselves of the last one, which no checkpoint has."""
+AHEAD = ("xpbd",)
+"""Solvers whose contacts are to be closed at the end of a step, where they want kinematic bodies to stand already."""
 MAXIMAL = ("xpbd", "semi-implicit")
 """Solvers that know each body by its own pose, so that joints need no articulation."""
 

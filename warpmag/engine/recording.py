@@ -37,13 +37,15 @@ class Recorder:
         row = {shape: index for index, shape in enumerate(magnetics.shapes.tolist())}
         self._magnetics = magnetics
         self._taken: tuple | None = None
-        self._bodies = np.array(list(scene.bodies.values()), dtype=int)
+        # keyed bodies have samples of their own
+        own = {prim: body for prim, body in scene.bodies.items() if body not in scene.keys.motions}
+        self._bodies = np.array(list(own.values()), dtype=int)
         self._shapes = np.array([row[shape] for of_prim in shapes for shape in of_prim], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
         self._writer = CacheWriter(
             scene.stage,
             output,
-            list(scene.bodies),
+            list(own),
             list(scene.magnet_shapes),
             copy_scene=copy_scene,
             frames=frames,

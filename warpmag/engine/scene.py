@@ -1,7 +1,7 @@
 """From a USD stage to a Newton builder whose shapes carry the stage's magnets."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import newton
@@ -10,10 +10,12 @@ import warp as wp
 
 from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
 from warpmag.errors import InputError
+from warpmag.keyed import Keys, SceneKeys
 from warpmag.magnets import Magnet, StageMagnets
 from warpmag.usd import (
     GroundedJoint,
     StageClock,
+    StageContents,
     enabled_joints,
     inspect,
     open_stage,
@@ -34,6 +36,7 @@ class ImportedScene:
         magnets: What the stage says about magnets.
         bodies: Body of each rigid-body prim.
         magnet_shapes: Shapes of each magnet prim.
+        keys: What follows time samples.
         strained: Joints whose ends should be at one place and are not.
         warnings: What the user should know about the stage, a line each.
     """
@@ -44,6 +47,7 @@ class ImportedScene:
     magnets: StageMagnets
     bodies: dict[str, int]
     magnet_shapes: dict[str, list[int]]
+    keys: SceneKeys
     strained: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -97,6 +101,7 @@ def import_scene(
         magnets=magnets,
         bodies=bodies,
         magnet_shapes=covered,
+        keys=_scene_keys(builder, stage, contents, clock, bodies, covered),
         strained=strained,
         warnings=tuple(map(str, report.warnings)),
     )
@@ -147,9 +152,33 @@ def _mark_magnets(
         else:
             raise InputError(f"{prim}: a magnet of which Newton imported neither body nor shape")
         for shape in covered[prim]:
-            turn = builder.shape_transform[shape].q if prim in bodies else _axis_turn(stage, prim)
+            turn = _shape_turn(builder, stage, prim, shape, bodies)
             mark_shape(builder, shape, _in_shape_frame(magnet, turn))
     return covered
+
+
+def _scene_keys(builder, stage, contents: StageContents, clock: StageClock, bodies, covered) -> SceneKeys:
+    """Return what follows time samples, in seconds and in Newton's words."""
+
+    def in_seconds(keys):
+        return keys.in_seconds(clock.start, clock.time_codes_per_second)
+
+    def in_shape_frame(keys: Keys, prim: str, shape: int) -> Keys:
+        turn = np.array(wp.quat_to_matrix(_shape_turn(builder, stage, prim, shape, bodies))).reshape(3, 3)
+        return replace(keys, values=keys.values @ turn)  # each turned back
+
+    motions = {bodies[prim]: in_seconds(motion) for prim, motion in contents.motions.items()}
+    magnetizations = {
+        shape: in_shape_frame(in_seconds(keys), prim, shape)
+        for prim, keys in contents.magnetization_keys.items()
+        for shape in covered[prim]
+    }
+    return SceneKeys(motions, magnetizations, contents.field_keys and in_seconds(contents.field_keys))
+
+
+def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
+    """Return how the frame of a shape is turned from that of the magnet prim that it belongs to."""
+    return builder.shape_transform[shape].q if prim in bodies else _axis_turn(stage, prim)
 
 
 def _in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:

@@ -5,6 +5,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import newton
@@ -12,7 +13,8 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import resolve_device
-from warpmag.engine.contacts import MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
+from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
+from warpmag.engine.drive import Drive
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -95,7 +97,7 @@ class Simulation:
             force=force, dynamics=dynamics, contact_model=contact_model, rtol=rtol, external_field=external_field
         )
         self._magnetics = Magnetics(self.model, curve=curve, max_evaluations=max_evaluations, **vars(settings))
-        self._prepare(solver, graphs)
+        self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
         self._options = self._options_of(settings, solver, curve=curve, max_evaluations=max_evaluations)
 
     def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
@@ -138,7 +140,16 @@ class Simulation:
                 raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {what} is not finite")
         return model
 
-    def _prepare(self, solver: str, graphs: bool) -> None:
+    def _drive(self, solver: str, own_field: bool) -> Drive | None:
+        """Return what lets the model follow the keys of its stage, those of the field if that is the stage's own."""
+        if self._scene is None:
+            return None
+        keys = self._scene.keys if own_field else replace(self._scene.keys, field=None)
+        if not (keys.motions or keys.magnetizations or keys.field):
+            return None
+        return Drive(self.model, self._magnetics, keys, ahead=solver in AHEAD)
+
+    def _prepare(self, solver: str, graphs: bool, drive: Drive | None) -> None:
         """Set up what moves the bodies, and look at how they start."""
         self._sizes = sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver)
@@ -150,6 +161,7 @@ class Simulation:
             step=self.step_size,
             longest_substep=LONGEST_SUBSTEP,
             graphs=graphs,
+            drive=drive,
         )
         self._moving = np.array(
             sorted({one.body for one in self._magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int

@@ -22,6 +22,7 @@ import warp as wp
 from warpmag import snapshot
 from warpmag.engine.capture import Workspace, without_allocations
 from warpmag.engine.contacts import BodySizes, RigidSolver
+from warpmag.engine.drive import Drive
 from warpmag.engine.magnetics import Magnetics
 from warpmag.errors import SimulationError
 from warpmag.kernels.rigid import monitor, stepping
@@ -95,6 +96,7 @@ class Stepper:
         step: float,
         longest_substep: float,
         graphs: bool = True,
+        drive: Drive | None = None,
     ):
         """Prepare to step.
 
@@ -106,8 +108,9 @@ class Stepper:
             step: Time step [s].
             longest_substep: Upper limit of a substep [s].
             graphs: Capture a step in a graph where the device and the solver allow it.
+            drive: What follows keys.
         """
-        self._model, self._magnetics, self._solver = model, magnetics, solver
+        self._model, self._magnetics, self._solver, self._drive = model, magnetics, solver, drive
         self._device = wp.get_device(model.device)
         self._step = step
         # Even, so that a step ends in the state that it began in.
@@ -140,6 +143,8 @@ class Stepper:
         self.capture_failure = ""
         self._cold: set[int] = set()
         self.steps = self._reported = 0
+        if drive:
+            drive.place(self._state, 0.0, self._longest)
         self._prepare()
 
     def _prepare(self) -> None:
@@ -331,6 +336,8 @@ class Stepper:
 
     def _advance_twice(self, level: int) -> None:
         machine, dt = self._machine, self._longest / (1 << level)
+        if self._drive:
+            machine.tell_time(self._step, self._longest, self._drive.time)
         wp.capture_if(machine.contacts_due, self._find_first_contacts, substep=0)
         if level == 1:  # two substeps are all that share
             self._share_forces(dt)
@@ -340,11 +347,21 @@ class Stepper:
             if half:
                 self._find_contacts(now, dt, half)
             if level == 0:
+                if self._drive:
+                    self._drive.set_values(half * dt)
                 self._magnetize(now)
             else:
                 wp.copy(now.body_f, self._shared.body_f)
-            self._solver.step(now, then, dt)
+            self._move(now, then, half * dt, dt)
         machine.end_pair(level)
+
+    def _move(self, now: newton.State, then: newton.State, begin: float, dt: float) -> None:
+        """Do a substep of ``dt`` [s] that begins ``begin`` [s] after the pair that it is of."""
+        if self._drive:
+            self._drive.lead(now, begin, dt)
+        self._solver.step(now, then, dt)
+        if self._drive:
+            self._drive.place(then, begin + dt, self._longest)
 
     def _find_first_contacts(self, substep: int) -> None:
         """Find the contacts that two substeps start from.
@@ -359,6 +376,8 @@ class Stepper:
 
     def _share_forces(self, dt: float) -> None:
         predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
+        if self._drive:
+            self._drive.set_values(0.0, shared=self._machine.sharing, substep=dt)
         self._magnetize(self._shared)
 
     def _magnetize(self, state: newton.State) -> None:

@@ -78,7 +78,11 @@ def inspect(stage: Usd.Stage, path: str | os.PathLike, *, curve: str | None = No
 
 def _report(stage: Usd.Stage, path: str | os.PathLike, curve: str | None) -> StageReport:
     contents = survey(stage)
-    findings = [*contents.findings, *joint_findings(stage), *([] if curve else _curve_findings(contents))]
+    findings = [
+        *contents.findings,
+        *joint_findings(stage, contents.motions),
+        *([] if curve else _curve_findings(contents)),
+    ]
     try:
         clock = stage_clock(stage)
     except InputError as error:

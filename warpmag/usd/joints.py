@@ -5,7 +5,7 @@ that of the world. Both are found here.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
@@ -57,8 +57,8 @@ class _End:
     moves: bool
 
 
-def joint_findings(stage: Usd.Stage) -> Iterator[Finding]:
-    """Yield what is wrong with the joints of a stage."""
+def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Finding]:
+    """Yield what is wrong with the joints of a stage, of which keys move the bodies ``keyed``."""
     transforms = TransformCheck()
     for joint in enabled_joints(stage):
         path = str(joint.GetPath())
@@ -67,10 +67,19 @@ def joint_findings(stage: Usd.Stage) -> Iterator[Finding]:
                 yield from transforms.findings(end.prim)
         if problem := _problem(stage, joint):
             yield Finding(path, problem)
+        elif keyed and (carrier := _hung_on(stage, joint)) in keyed:
+            message = "by physics:body1, which Newton would hold still: name it as physics:body0"
+            yield Finding(path, f"hangs on {carrier}, which keys move, {message}")
         elif not any(end.moves for end in _ends(stage, joint)):
             yield Finding(path, "joins things that do not move, and is left out", "warning")
     for path, gap in strained_joints(stage).items():
         yield Finding(path, f"its ends are {gap:.3g} m apart at the start, and a run begins by pulling", "warning")
+
+
+def _hung_on(stage, joint) -> str:
+    """Return the body that is ``physics:body1`` of a joint whose other end moves, empty where there is none."""
+    one, other = _ends(stage, joint)
+    return str(other.body.GetPath()) if one.moves and other.body else ""
 
 
 def strained_joints(stage: Usd.Stage) -> dict[str, float]:

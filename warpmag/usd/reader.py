@@ -13,16 +13,27 @@ from dataclasses import dataclass, field
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
+from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
+from warpmag.usd.keyed import KeyReader, make_kinematic
 from warpmag.usd.materials import material_findings
 from warpmag.usd.paths import full_path, usable_path
-from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
-from warpmag.usd.transforms import TransformCheck, is_animated, is_body, is_collider
+from warpmag.usd.schemas import (
+    MAGNET_API,
+    SCENE_API,
+    field_keys,
+    has_api,
+    magnet_of,
+    magnetization_keys,
+    moment_of,
+    settings_of,
+)
+from warpmag.usd.transforms import TransformCheck, is_body, is_collider
 from warpmag.usd.values import (
     Finding,
     attribute_findings,
@@ -51,6 +62,9 @@ class StageContents:
         magnets: Magnets whose attributes are sound.
         initial_moments: Authored moments [A·m²], world frame.
         settings: Magnetic settings of the first physics scene.
+        motions: How keys move kinematic bodies, at time codes.
+        field_keys: Keys of the external field [A/m] at time codes, None where it is constant.
+        magnetization_keys: Keys of permanent magnets whose magnetization [A/m] is not constant.
         findings: Errors and warnings.
     """
 
@@ -60,6 +74,9 @@ class StageContents:
     magnets: dict[str, Magnet] = field(default_factory=dict)
     initial_moments: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     settings: MagneticSettings = field(default_factory=MagneticSettings)
+    motions: dict[str, Motion] = field(default_factory=dict)
+    field_keys: Keys | None = None
+    magnetization_keys: dict[str, Keys] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
 
 
@@ -108,10 +125,12 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
 
     Newton reads default values only: a pose that is given by time samples alone would be the identity. Inside instances
     nothing can be held; :func:`survey` finds what would be wrong there. The order of transform operations stays: USD
-    itself never asks for its samples. Addresses of a network are blocked.
+    itself never asks for its samples. Addresses of a network are blocked. Colliders that keys move and that are no
+    rigid bodies become kinematic ones.
 
     Raises:
-        InputError: Time samples are of another type than their attribute, or an address cannot be blocked.
+        InputError: Time samples are of another type than their attribute, an address cannot be blocked, or what keys
+            move cannot become a body.
     """
     session = stage.GetSessionLayer()
     sampled = [
@@ -131,6 +150,7 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
             elif attribute.GetNumTimeSamples():  # blocked at that time: as if it had never been authored
                 attribute.Block()
     cut_off(stage)
+    make_kinematic(stage, {one.GetPrim().GetPath() for one in sampled if one.GetName().startswith("xformOp:")})
 
 
 def _at(attribute, time_code):
@@ -178,14 +198,14 @@ def survey(stage: Usd.Stage) -> StageContents:
     contents.findings += [*_metadata_findings(stage), *unit_findings(stage)]
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     inside = _instanced_prims(stage, prims, contents.findings)
-    transforms = TransformCheck()
+    transforms, keys = TransformCheck(), KeyReader(stage)
     for prim in prims:
         if str(prim.GetPath()) not in inside:
-            _read_prim(prim, transforms, contents)
-    _read_scene(stage, prims, contents)
+            _read_prim(prim, transforms, keys, contents)
+    _read_scene(stage, prims, keys, contents)
     for prim in prims:
         if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
-            _read_magnet(prim, transforms, contents)
+            _read_magnet(prim, transforms, keys, contents)
     contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))
@@ -207,7 +227,7 @@ def _metadata_findings(stage) -> Iterator[Finding]:
             yield Finding(stage_name(stage), f"{key} cannot be read ({failure(error)})")
 
 
-def _read_prim(prim, transforms, contents) -> None:
+def _read_prim(prim, transforms, keys, contents) -> None:
     """Note what a prim is for rigid bodies, and what is wrong with it."""
     path = str(prim.GetPath())
     body, collider = is_body(prim), is_collider(prim)
@@ -216,16 +236,30 @@ def _read_prim(prim, transforms, contents) -> None:
         contents.bodies.append(path)
         if UsdPhysics.RigidBodyAPI(prim).GetKinematicEnabledAttr().Get():
             contents.kinematic.append(path)
-            if transforms.is_sound(prim) and is_animated(prim):
-                contents.findings.append(Finding(path, "animated and kinematic: a run holds it still", "warning"))
+            faults += _read_motion(prim, keys, contents) if transforms.is_sound(prim) and not faults else ()
     if collider:
         contents.colliders.append(path)
+        owner = None if body else _body_above(prim)
+        if owner and keys.moves(prim, owner):
+            message = f"keys move it within its rigid body {owner.GetPath()}, which keeps its shape"
+            contents.findings.append(Finding(path, message, "warning"))
     faults += attribute_findings(prim, shape=body or collider)
     if collider and not faults and transforms.is_sound(prim):
         faults += shape_findings(prim)
     elif prim.IsA(UsdGeom.Mesh) and not collider:
         faults += mesh_findings(prim)
     contents.findings += faults
+
+
+def _read_motion(prim, keys, contents) -> Iterator[Finding]:
+    """Note how keys move a kinematic body; yield why it cannot follow them."""
+    path = str(prim.GetPath())
+    try:
+        if keys.moves(prim):
+            contents.motions[path] = motion = keys.motion(prim)
+            yield from keys.findings(prim, motion)
+    except InputError as error:
+        yield finding_of(path, error)
 
 
 def _instanced_prims(stage, prims, findings) -> set[str]:
@@ -253,7 +287,7 @@ def _instanced_prims(stage, prims, findings) -> set[str]:
     return inside
 
 
-def _read_scene(stage, prims, contents) -> None:
+def _read_scene(stage, prims, keys, contents) -> None:
     """Read the magnetic settings of the first physics scene, the one that Newton takes."""
     found = scenes(stage)
     for prim in prims:
@@ -266,11 +300,12 @@ def _read_scene(stage, prims, contents) -> None:
     if found and has_api(found[0], SCENE_API):
         try:
             contents.settings = settings_of(found[0])
+            contents.field_keys = field_keys(found[0], keys)
         except InputError as error:
             contents.findings.append(finding_of(str(found[0].GetPath()), error))
 
 
-def _read_magnet(prim, transforms, contents) -> None:
+def _read_magnet(prim, transforms, keys, contents) -> None:
     """Read one magnet into ``contents``, or what is wrong with it."""
     path = str(prim.GetPath())
     body, collider = is_body(prim), is_collider(prim)
@@ -284,6 +319,8 @@ def _read_magnet(prim, transforms, contents) -> None:
         contents.findings.append(Finding(path, f"its rigid body {owner.GetPath()} is a magnet already"))
     try:
         contents.magnets[path] = magnet_of(prim)
+        if curve := magnetization_keys(prim, contents.magnets[path], keys):
+            contents.magnetization_keys[path] = curve
         if moment := moment_of(prim):
             contents.initial_moments[path] = moment
     except InputError as error:

@@ -12,8 +12,10 @@ from pxr import Gf, Plug, Sdf, Usd
 
 from warpmag import materials
 from warpmag.errors import InputError
+from warpmag.keyed import Keys
 from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_finite, check_material, check_token
-from warpmag.usd.values import number, text, vector
+from warpmag.usd.keyed import KeyReader
+from warpmag.usd.values import instance_finding, number, text, vector
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
 
@@ -98,6 +100,33 @@ def settings_of(prim: Usd.Prim) -> MagneticSettings:
     settings = _read(prim, _SETTINGS_ATTRIBUTES, MagneticSettings())
     settings.check(str(prim.GetPath()))
     return settings
+
+
+def field_keys(prim: Usd.Prim, keys: KeyReader) -> Keys | None:
+    """Read the time samples of a scene's external field [A/m], None where it is constant."""
+    return keys.keys(prim, _SETTINGS_ATTRIBUTES["external_field"], _finite_vector)
+
+
+def magnetization_keys(prim: Usd.Prim, magnet: Magnet, keys: KeyReader) -> Keys | None:
+    """Read the time samples of a permanent magnet's magnetization [A/m], None where it is constant."""
+    name = _MAGNET_ATTRIBUTES["magnetization"]
+    if magnet.kind != "permanent":
+        return None
+    if finding := instance_finding(prim.GetAttribute(name)):
+        raise InputError(str(finding))
+    material = prim.GetAttribute(MATERIAL).Get()
+
+    def read(where: str, value) -> tuple:
+        given = _finite_vector(where, value)
+        return materials.permanent(where, material, given) if material else given
+
+    return keys.keys(prim, name, read)
+
+
+def _finite_vector(name: str, value) -> tuple[float, float, float]:
+    found = vector(name, value)
+    check_finite(name, found)
+    return found
 
 
 def has_api(prim: Usd.Prim, name: str) -> bool:

@@ -1,0 +1,247 @@
+"""Poses of kinematic bodies whose transforms are keyed.
+
+A body's frame is a product of transforms, each of which follows keys of its own, as in USD: what turns by angles goes
+along arcs, not along chords between poses. The product is taken in double precision at the moment that is asked for.
+Velocities are those that lead from one moment to another: v = (c₁ − c₀)/Δt of the centre of mass, ω = the rotation
+vector from q₀ to q₁ over Δt. A solver that moves everything by its velocities sees the body go where it stands next.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpmag.kernels.shared.keyed import (
+    KeyedValues,
+    key_before,
+    keyed_number,
+    keyed_quaternion,
+    keyed_values,
+    part_after,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+TRANSFORMS = (
+    *("translate", "scale", "orient", "matrix"),
+    *("rotateXYZ", "rotateXZY", "rotateYXZ", "rotateYZX", "rotateZXY", "rotateZYX"),
+)
+_TRANSLATE, _SCALE, _ORIENT, _MATRIX, _ROTATE = (wp.constant(k) for k in range(5))
+_RADIANS = wp.constant(wp.float64(np.pi / 180.0))
+
+
+@wp.struct
+class KeyedPoses:
+    """Bodies that follow keys, for b bodies with o transforms.
+
+    Attributes:
+        keyed: The keys, a curve for each transform.
+        kind: Index of each in ``TRANSFORMS``, shape [o].
+        inverse: 1 for those that are undone, shape [o].
+        first: First transform of each body, the outermost, and the one after the last, shape [b + 1].
+        body: The bodies, shape [b].
+        com: Centres of mass in the frames of all bodies [m].
+        joint: Free joint of each body, -1 if it has none, shape [b].
+        joint_q_start, joint_qd_start, parent_frame, child_frame: Newton's, of all joints.
+    """
+
+    keyed: KeyedValues
+    kind: wp.array[wp.int32]
+    inverse: wp.array[wp.int32]
+    first: wp.array[wp.int32]
+    body: wp.array[wp.int32]
+    com: wp.array[wp.vec3]
+    joint: wp.array[wp.int32]
+    joint_q_start: wp.array[wp.int32]
+    joint_qd_start: wp.array[wp.int32]
+    parent_frame: wp.array[wp.transform]
+    child_frame: wp.array[wp.transform]
+
+
+@wp.func
+def _about(axis: int, angle: wp.float64) -> wp.quatd:
+    unit = wp.vec3d()
+    unit[axis] = wp.float64(1.0)
+    return wp.quat_from_axis_angle(unit, angle * _RADIANS)
+
+
+@wp.func
+def _turned_by(order: int, angles: wp.vec3d) -> wp.quatd:
+    """Rotation by three angles [degrees]; of the six orders of axes, each pair begins with the same one."""
+    first = order // 2
+    second = (first + 1) % 3
+    if order % 2 == 0:
+        second = wp.where(first == 1, 0, wp.where(first == 0, 1, 0))
+    else:
+        second = wp.where(first == 2, 1, 2)
+    third = 3 - first - second
+    return _about(third, angles[third]) * _about(second, angles[second]) * _about(first, angles[first])
+
+
+@wp.func
+def _placed(position: wp.vec3d, rotation: wp.mat33d) -> wp.mat44d:
+    none = wp.float64(0.0)
+    return wp.mat44d(
+        rotation[0, 0], rotation[0, 1], rotation[0, 2], position[0],
+        rotation[1, 0], rotation[1, 1], rotation[1, 2], position[1],
+        rotation[2, 0], rotation[2, 1], rotation[2, 2], position[2],
+        none, none, none, wp.float64(1.0),
+    )  # fmt: skip
+
+
+@wp.func
+def _operation(poses: KeyedPoses, o: int, time: wp.float64) -> wp.mat44d:
+    """Matrix of a transform at a time, which acts on columns."""
+    key = key_before(poses.keyed, o, time)
+    part = part_after(poses.keyed, o, key, time)
+    kind = poses.kind[o]
+    matrix = wp.identity(n=4, dtype=wp.float64)
+    if kind == _MATRIX:
+        for i in range(4):
+            for j in range(4):
+                matrix[i, j] = keyed_number(poses.keyed, o, key, part, 4 * j + i)
+        return matrix
+    none = wp.vec3d()
+    if kind == _ORIENT:
+        return _placed(none, wp.quat_to_matrix(keyed_quaternion(poses.keyed, o, key, part)))
+    three = wp.vec3d()
+    for i in range(3):
+        three[i] = keyed_number(poses.keyed, o, key, part, i)
+    if kind == _TRANSLATE:
+        return _placed(three, wp.identity(n=3, dtype=wp.float64))
+    if kind == _SCALE:
+        return _placed(none, wp.diag(three))
+    return _placed(none, wp.quat_to_matrix(_turned_by(kind - _ROTATE, three)))
+
+
+@wp.func
+def _pose(poses: KeyedPoses, k: int, time: wp.float64) -> wp.transformd:
+    """Frame of a body at a time: its scale is left out, as Newton does."""
+    matrix = wp.identity(n=4, dtype=wp.float64)
+    for o in range(poses.first[k], poses.first[k + 1]):
+        step = _operation(poses, o, time)
+        if poses.inverse[o] != 0:
+            step = wp.inverse(step)
+        matrix = matrix * step
+    rotation = wp.mat33d()
+    for j in range(3):
+        axis = wp.normalize(wp.vec3d(matrix[0, j], matrix[1, j], matrix[2, j]))
+        for i in range(3):
+            rotation[i, j] = axis[i]
+    position = wp.vec3d(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+    return wp.transformd(position, wp.normalize(wp.quat_from_matrix(rotation)))
+
+
+@wp.func
+def _single(v: wp.vec3d) -> wp.vec3:
+    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
+
+
+@wp.func
+def _write_joint(
+    poses: KeyedPoses, joint: int, pose: wp.transform, qd: wp.spatial_vector, joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+):  # fmt: skip
+    """Coordinates and speeds of a free joint, which count from its frames."""
+    parent = poses.parent_frame[joint]
+    local = wp.transform_inverse(parent) * pose * poses.child_frame[joint]
+    for k in range(7):
+        joint_q[poses.joint_q_start[joint] + k] = local[k]
+    turn = wp.transform_get_rotation(parent)
+    linear, angular = wp.quat_rotate_inv(turn, wp.spatial_top(qd)), wp.quat_rotate_inv(turn, wp.spatial_bottom(qd))
+    for k in range(3):
+        joint_qd[poses.joint_qd_start[joint] + k] = linear[k]
+        joint_qd[poses.joint_qd_start[joint] + 3 + k] = angular[k]
+
+
+@wp.kernel
+def _place(
+    # inputs:
+    poses: KeyedPoses,
+    time_in: wp.array[wp.float64],
+    begin: wp.float64,
+    duration: wp.float64,
+    at_end: int,
+    # outputs:
+    body_q_out: wp.array[wp.transform],
+    body_qd_out: wp.array[wp.spatial_vector],
+    joint_q_out: wp.array[float],
+    joint_qd_out: wp.array[float],
+):
+    k = wp.tid()
+    body = poses.body[k]
+    here, there = _pose(poses, k, time_in[0] + begin), _pose(poses, k, time_in[0] + begin + duration)
+    com = wp.vec3d(poses.com[body])
+    moved = wp.transform_point(there, com) - wp.transform_point(here, com)
+    turn = wp.transform_get_rotation(there) * wp.quat_inverse(wp.transform_get_rotation(here))
+    axis, w = wp.vec3d(turn[0], turn[1], turn[2]), turn[3]
+    if w < wp.float64(0.0):
+        axis, w = -axis, -w
+    sine = wp.length(axis)
+    rate = wp.float64(2.0)  # of a small angle over its sine
+    if sine > wp.float64(1e-12):
+        rate = wp.float64(2.0) * wp.atan2(sine, w) / sine
+    qd = wp.spatial_vector(_single(moved / duration), _single((rate / duration) * axis))
+    at = wp.where(at_end != 0, there, here)
+    p, q = wp.transform_get_translation(at), wp.transform_get_rotation(at)
+    pose = wp.transform(_single(p), wp.quat(float(q[0]), float(q[1]), float(q[2]), float(q[3])))
+    body_q_out[body] = pose
+    body_qd_out[body] = qd
+    if poses.joint[k] >= 0:
+        _write_joint(poses, poses.joint[k], pose, qd, joint_q_out, joint_qd_out)
+
+
+@dataclass(frozen=True)
+class PosedBodies:
+    """Bodies of a model that follow keys by a clock.
+
+    Attributes:
+        arrays: What the kernels are given.
+        time: Time on the device [s], shape [1].
+    """
+
+    arrays: Any
+    time: wp.array
+
+
+def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time: wp.array) -> PosedBodies:
+    """Return bodies that follow keys.
+
+    Args:
+        bodies: Of each body its transforms, the outermost first, with ``kind``, ``keys`` and ``inverse``.
+        joints: Free joint of each of these bodies, -1 if it has none.
+        model: Newton's model.
+        time: Time on the device [s], float64, shape [1].
+    """
+    operations = [one for own in bodies.values() for one in own]
+
+    def put(values):
+        return wp.array(np.array(values, np.int32), dtype=wp.int32, device=time.device)
+
+    a = KeyedPoses()
+    a.keyed = keyed_values([one.keys for one in operations], time.device)
+    a.kind = put([TRANSFORMS.index(one.kind) for one in operations])
+    a.inverse = put([one.inverse for one in operations])
+    a.first, a.body, a.joint = put(np.cumsum([0, *map(len, bodies.values())])), put(list(bodies)), put(joints)
+    a.com = model.body_com
+    if model.joint_count:
+        a.joint_q_start, a.joint_qd_start = model.joint_q_start, model.joint_qd_start
+        a.parent_frame, a.child_frame = model.joint_X_p, model.joint_X_c
+    return PosedBodies(a, time)
+
+
+def launch_place(bodies: PosedBodies, state, begin: float, duration: float, *, at_end: bool):
+    """Place bodies of a state, and give them the velocities that lead them through a time; capturable in a graph.
+
+    Args:
+        bodies: The bodies.
+        state: Newton's state; its free joints get the same.
+        begin: When that time begins [s], since the clock's.
+        duration: How long it is [s].
+        at_end: Whether they are to stand where they do at its end, not at its beginning.
+    """
+    inputs = [bodies.arrays, bodies.time, wp.float64(begin), wp.float64(duration), int(at_end)]
+    outputs = [state.body_q, state.body_qd, state.joint_q, state.joint_qd]
+    wp.launch(_place, dim=len(bodies.arrays.body), inputs=inputs, outputs=outputs, device=bodies.time.device)

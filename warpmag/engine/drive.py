@@ -1,0 +1,83 @@
+"""Lets a model follow keys while it is stepped: poses of kinematic bodies, magnetizations, the external field.
+
+Keys lie on the device and are looked up at its time, which repeated and shortened substeps move as they must.
+"""
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.engine.attributes import NAMESPACE
+from warpmag.engine.magnetics import Magnetics
+from warpmag.kernels.rigid.keyed_poses import launch_place, pose_bodies
+from warpmag.kernels.shared.keyed import follow, launch_follow
+from warpmag.keyed import SceneKeys
+
+
+class Drive:
+    """What of one model follows keys; every method only launches kernels.
+
+    Attributes:
+        time: Time on the device [s], to be kept by who steps, float64, shape [1].
+    """
+
+    def __init__(self, model: newton.Model, magnetics: Magnetics, keys: SceneKeys, *, ahead: bool):
+        """Put the keys on the device.
+
+        Args:
+            model: The model.
+            magnetics: Its magnets.
+            keys: What follows what.
+            ahead: Whether the solver wants kinematic bodies where they stand at the end of its step.
+        """
+        self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
+        self._magnetics, self._ahead = magnetics, ahead
+        self._bodies = None
+        if keys.motions:
+            operations = {body: motion.operations for body, motion in keys.motions.items()}
+            self._bodies = pose_bodies(operations, _free_joints(model, list(operations)), model, self.time)
+        curves, targets = [], []
+        for shape, curve in keys.magnetizations.items():
+            curves.append(curve)
+            targets.append(getattr(model, NAMESPACE).magnetization[shape : shape + 1])
+        self._field = None
+        if keys.field is not None:
+            self._field = wp.zeros(1, dtype=wp.vec3, device=model.device)
+            curves.append(keys.field)
+            targets.append(self._field)
+        self._followers = follow(curves, targets, self.time) if curves else None
+
+    def set_values(self, offset: float, *, shared: wp.array | None = None, substep: float = 0.0) -> None:
+        """Set magnetizations and the field to what they are some seconds after :attr:`time`.
+
+        Args:
+            offset: The seconds.
+            shared: Substeps that share these values, see ``kernels.shared.keyed.launch_follow``.
+            substep: Length of these [s].
+        """
+        if self._followers is not None:
+            launch_follow(self._followers, offset, shared=shared, substep=substep)
+        if self._field is not None:
+            self._magnetics.set_external_field(self._field)
+
+    def lead(self, state: newton.State, begin: float, dt: float) -> None:
+        """Make kinematic bodies ready for a substep of ``dt`` [s] that begins ``begin`` [s] after :attr:`time`."""
+        if self._bodies is not None:
+            launch_place(self._bodies, state, begin, dt, at_end=self._ahead)
+
+    def place(self, state: newton.State, begin: float, horizon: float) -> None:
+        """Place kinematic bodies ``begin`` [s] after :attr:`time`, with the velocities of the next ``horizon`` [s].
+
+        Contacts are sought with these.
+        """
+        if self._bodies is not None:
+            launch_place(self._bodies, state, begin, horizon, at_end=False)
+
+
+def _free_joints(model: newton.Model, bodies: list[int]) -> list[int]:
+    """Return the free joint of each body, -1 if it has none."""
+    if not model.joint_count:
+        return [-1] * len(bodies)
+    free = np.flatnonzero(model.joint_type.numpy() == newton.JointType.FREE)
+    of_body = dict(zip(model.joint_child.numpy()[free].tolist(), free.tolist(), strict=True))
+    return [of_body.get(body, -1) for body in bodies]
