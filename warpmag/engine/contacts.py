@@ -283,9 +283,9 @@ class RigidSolver:
         self._broad_phase.set_motion(state, dt)
         self._pipeline.collide(state, self.contacts, dt=dt)
 
-    def step(self, state_in: newton.State, state_out: newton.State, dt: float) -> None:
+    def step(self, state_in: newton.State, state_out: newton.State, dt: float, control: newton.Control) -> None:
         """Advance by ``dt`` [s] with the contacts of the last :meth:`collide`; capturable in a graph."""
-        self._solver.step(state_in, state_out, None, self.contacts, dt)
+        self._solver.step(state_in, state_out, control, self.contacts, dt)
 
     def fills(self) -> np.ndarray:
         """Return the addresses of the fills of all buffers, 0 where these are flags."""
