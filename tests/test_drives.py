@@ -1,6 +1,7 @@
 """Joints, their drives and weak pulls: periods and paths against closed forms, with each solver."""
 
 import math
+import sys
 
 import newton
 import numpy as np
@@ -16,7 +17,12 @@ from warpmag.errors import InputError
 G, MU0 = 9.81, 4e-7 * math.pi  # m/s², H/m
 STEP = 1e-3  # s
 EXTENT = np.array((0.01, 0.002, 0.001))  # half of it, of a bar or a needle [m]
-SOLVERS = ("xpbd", "featherstone", "steel", pytest.param("mujoco", marks=pytest.mark.long))
+SOLVERS = (
+    "xpbd",
+    "featherstone",
+    "steel",
+    *(pytest.param(name, marks=pytest.mark.long) for name in ("mujoco", "kamino")),
+)
 
 
 def scene(gravity=0.0):
@@ -210,3 +216,38 @@ def test_a_weak_pull_moves_a_body_that_rebounds(device):
         solver.step(now, then, None, contacts, 5e-4)
         now, then = then, now
     assert now.body_qd.numpy()[ball, 2] == pytest.approx(-0.15 * 20 * 5e-4, rel=1e-4)
+
+
+def test_a_solver_that_is_not_installed_names_what_installs_it(device, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    monkeypatch.setattr(newton.solvers.SolverMuJoCo, "_mujoco_warp", None)
+    with pytest.raises(InputError, match=r"^solver mujoco: needs what `pip install 'warpmag\[solvers\]'` installs \("):
+        Simulation(servo()[0], solver="mujoco", device=device)
+
+
+@pytest.mark.parametrize(
+    ("solver", "message"),
+    [
+        (
+            "semi-implicit",
+            "^joint_1: a joint of a body that is too light for the solver semi-implicit, whose joints are",
+        ),
+        ("kamino", "^solver kamino: .*DISTANCE"),
+        ("vbd", "^solver vbd: .*DISTANCE"),
+    ],
+)
+def test_what_a_solver_cannot_take_is_refused(solver, message, device):
+    builder = servo()[0]
+    if solver != "semi-implicit":
+        ball = builder.add_link()
+        builder.add_shape_sphere(ball, radius=5e-3)
+        builder.add_joint_distance(-1, ball, max_distance=0.1)
+    with pytest.raises(InputError, match=message):
+        Simulation(builder, solver=solver, device=device)
+
+
+def test_vbd_says_what_it_is_not_for(device):
+    simulation = Simulation(servo()[0], solver="vbd", device=device)
+    assert any(line.startswith("solver vbd: bodies that magnets press together") for line in simulation.warnings())
+    simulation.step()
+    assert np.isfinite(simulation.state.body_q.numpy()).all()

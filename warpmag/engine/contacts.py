@@ -161,11 +161,13 @@ SOLVERS: dict[str, Callable] = {
     "mujoco": _mujoco,
     "semi-implicit": lambda model, contact_max: newton.solvers.SolverSemiImplicit(model),
     "featherstone": lambda model, contact_max: newton.solvers.SolverFeatherstone(model),
+    "kamino": lambda model, contact_max: newton.solvers.SolverKamino(model),
+    "vbd": lambda model, contact_max: newton.solvers.SolverVBD(model, iterations=20),
 }
 """Rigid-body solvers by name; the first is the default and the one that piles are tested with."""
-UNRESUMABLE = ("mujoco",)
+UNRESUMABLE = ("mujoco", "kamino", "vbd")
 """Solvers that start each step from what they keep to themselves of the last one, which no checkpoint has."""
-MAXIMAL = ("xpbd", "semi-implicit")
+MAXIMAL = ("xpbd", "semi-implicit", "kamino", "vbd")
 """Solvers that know each body by its own pose, so that joints need no articulation."""
 
 
@@ -238,7 +240,10 @@ class RigidSolver:
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:
                 self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
-            except (ImportError, NotImplementedError, TypeError, ValueError, RuntimeError) as error:
+            except ImportError as error:
+                reason = f"needs what `pip install 'warpmag[solvers]'` installs ({error.__cause__ or error})"
+                raise InputError(f"solver {self._name}: {reason}") from None
+            except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
                 raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None
         narrow = self._pipeline.narrow_phase
         self.buffers = [

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpmag.arrays import resolve_device
 from warpmag.engine.contacts import MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
-from warpmag.engine.fitness import check_articulations, check_control
+from warpmag.engine.fitness import check_articulations, check_control, check_joint_springs, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -128,8 +128,11 @@ class Simulation:
             whole.add_builder(builder)
             whole.add_link(is_kinematic=True)
             builder = whole
+        if solver == "vbd":
+            builder.color()  # VBD moves bodies that touch nothing in common at once
         with wp.ScopedDevice(self.device), self._refusals(scene):
             model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
+        check_joint_springs(model, solver, LONGEST_SUBSTEP)
         for name in ("body_q", "body_qd"):
             bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
             if bad.any():
@@ -230,7 +233,8 @@ class Simulation:
 
     def warnings(self) -> list[str]:
         """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
-        return [*(self._scene.warnings if self._scene else ()), *self.statistics.warnings()]
+        known = *(self._scene.warnings if self._scene else ()), *solver_warnings(self._options["solver"])
+        return [*known, *self.statistics.warnings()]
 
     @property
     def capture_failure(self) -> str:
