@@ -97,7 +97,7 @@ def parts_of_a_substep(simulation: Simulation) -> dict:
     return {
         "search_ms": search,
         "narrow_ms": both - search,
-        "solve_ms": alone(lambda: solver.step(now, then, dt)),
+        "solve_ms": alone(lambda: solver.step(now, then, dt, stepper.control)),
         "contacts": contacts,
         "iterations": solver._solver.iterations,
     }

@@ -16,7 +16,7 @@ from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, check_rto
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes; 0 where all went well, ``STOPPED`` and the signal's number where a signal ended it."""
 
-_SOLVERS = ("xpbd", "steel", "mujoco", "semi-implicit", "featherstone")
+_SOLVERS = ("xpbd", "steel", "mujoco", "semi-implicit", "featherstone", "kamino", "vbd")
 _VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
 _OUTPUT_FOLDER = Path("warpmag_out")
 

@@ -10,6 +10,7 @@
 | keyed_poses | poses and velocities of kinematic bodies whose transforms are keyed |
 | free_motion | what forces change in velocities, and velocities in poses |
 | contact_solve | XPBD's iterations over contacts; law in `contact_law.h`, all in a launch in `contact_cluster.h` |
+| joints | what XPBD's iterations over joints lack in Newton's kernels: moments, drives, slow motion |
 | mass_splitting | a correction to XPBD: shares of bodies that many contacts push |
 
 Contacts are collisions of rigid bodies here; near contacts of magnets are in ``near_contact``. May import ``shared``

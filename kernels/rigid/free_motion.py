@@ -79,7 +79,11 @@ def launch_accelerate(bodies: BodyView, gravity, kinematic_flag: int, dt: float,
     wp.launch(_accelerate, dim=len(q), inputs=inputs, outputs=[q, qd], device=q.device)
 
 
-def launch_move(bodies: BodyView, kinematic_flag: int, dt: float):
-    """Move bodies with their velocities for ``dt`` [s]; their spins change as they turn, their momenta do not."""
+def launch_move(bodies: BodyView, kinematic_flag: int, dt: float, q=None, qd=None):
+    """Move bodies with their velocities for ``dt`` [s]; their spins change as they turn, their momenta do not.
+
+    Poses and velocities are written into ``q`` and ``qd``, if there are any, where kinematic bodies stay as they are.
+    """
     inputs = [bodies, kinematic_flag, dt]
-    wp.launch(_move, dim=len(bodies.q), inputs=inputs, outputs=[bodies.q, bodies.qd], device=bodies.q.device)
+    outputs = [bodies.q if q is None else q, bodies.qd if qd is None else qd]
+    wp.launch(_move, dim=len(bodies.q), inputs=inputs, outputs=outputs, device=bodies.q.device)

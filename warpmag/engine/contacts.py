@@ -161,13 +161,15 @@ SOLVERS: dict[str, Callable] = {
     "mujoco": _mujoco,
     "semi-implicit": lambda model, contact_max: newton.solvers.SolverSemiImplicit(model),
     "featherstone": lambda model, contact_max: newton.solvers.SolverFeatherstone(model),
+    "kamino": lambda model, contact_max: newton.solvers.SolverKamino(model),
+    "vbd": lambda model, contact_max: newton.solvers.SolverVBD(model, iterations=20),
 }
 """Rigid-body solvers by name; the first is the default and the one that piles are tested with."""
-UNRESUMABLE = ("mujoco",)
+UNRESUMABLE = ("mujoco", "kamino", "vbd")
 """Solvers that start each step from what they keep to themselves of the last one, which no checkpoint has."""
 AHEAD = ("xpbd",)
 """Solvers whose contacts are to be closed at the end of a step, where they want kinematic bodies to stand already."""
-MAXIMAL = ("xpbd", "semi-implicit")
+MAXIMAL = ("xpbd", "semi-implicit", "kamino", "vbd")
 """Solvers that know each body by its own pose, so that joints need no articulation."""
 
 
@@ -240,7 +242,10 @@ class RigidSolver:
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:
                 self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
-            except (ImportError, NotImplementedError, TypeError, ValueError, RuntimeError) as error:
+            except ImportError as error:
+                reason = f"needs what `pip install 'warpmag[solvers]'` installs ({error.__cause__ or error})"
+                raise InputError(f"solver {self._name}: {reason}") from None
+            except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
                 raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None
         narrow = self._pipeline.narrow_phase
         self.buffers = [
@@ -285,9 +290,9 @@ class RigidSolver:
         self._broad_phase.set_motion(state, dt)
         self._pipeline.collide(state, self.contacts, dt=dt)
 
-    def step(self, state_in: newton.State, state_out: newton.State, dt: float) -> None:
+    def step(self, state_in: newton.State, state_out: newton.State, dt: float, control: newton.Control) -> None:
         """Advance by ``dt`` [s] with the contacts of the last :meth:`collide`; capturable in a graph."""
-        self._solver.step(state_in, state_out, None, self.contacts, dt)
+        self._solver.step(state_in, state_out, control, self.contacts, dt)
 
     def fills(self) -> np.ndarray:
         """Return the addresses of the fills of all buffers, 0 where these are flags."""

@@ -15,6 +15,7 @@ import warp as wp
 from warpmag.arrays import resolve_device
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
+from warpmag.engine.fitness import check_articulations, check_control, check_joint_springs, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -125,14 +126,17 @@ class Simulation:
 
     def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
         """Make the model."""
-        _check_articulations(builder, solver)
+        check_articulations(builder, solver)
         if not builder.body_count:  # Newton allocates nothing for bodies then; one without shapes changes nothing
             whole = newton.ModelBuilder()
             whole.add_builder(builder)
             whole.add_link(is_kinematic=True)
             builder = whole
+        if solver == "vbd":
+            builder.color()  # VBD moves bodies that touch nothing in common at once
         with wp.ScopedDevice(self.device), self._refusals(scene):
             model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
+        check_joint_springs(model, solver, LONGEST_SUBSTEP)
         for name in ("body_q", "body_qd"):
             bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
             if bad.any():
@@ -214,6 +218,22 @@ class Simulation:
         return self._stepper.state
 
     @property
+    def control(self) -> newton.Control:
+        """Forces and targets of joints, as the scene has them at first; what a step in a graph reads, too.
+
+        Assign to its arrays between steps, ``simulation.control.joint_target_q.assign(...)``, or write into them by
+        kernels of your own. Another control of this model may be put in its place, which makes a graph anew.
+        """
+        return self._stepper.control
+
+    @control.setter
+    def control(self, control: newton.Control) -> None:
+        self._look()
+        check_control(control, self.model)
+        if control is not self._stepper.control:
+            self._stepper.control = control
+
+    @property
     def magnetics(self) -> Magnetics:
         """Its magnets, as of the present state; waits as :attr:`state` does."""
         self._look()
@@ -227,7 +247,8 @@ class Simulation:
 
     def warnings(self) -> list[str]:
         """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
-        return [*(self._scene.warnings if self._scene else ()), *self.statistics.warnings()]
+        known = *(self._scene.warnings if self._scene else ()), *solver_warnings(self._options["solver"])
+        return [*known, *self.statistics.warnings()]
 
     @property
     def capture_failure(self) -> str:
@@ -433,19 +454,3 @@ def _time_step(given: float | None, own: float | None) -> float:
     step = next(one for one in (given, own, DEFAULT_STEP) if one is not None)
     check_positive("step", step)
     return float(step)
-
-
-def _check_articulations(builder: newton.ModelBuilder, solver: str) -> None:
-    """Refuse joints outside articulations to solvers that know bodies by their articulations alone."""
-    if solver in MAXIMAL:
-        return
-    joints = list(
-        zip(builder.joint_label, builder.joint_articulation, builder.joint_parent, builder.joint_child, strict=True)
-    )
-    inside = {body for _, articulation, *bodies in joints if articulation >= 0 for body in bodies}
-    for label, articulation, parent, child in joints:
-        if articulation < 0 and parent >= 0 and child not in inside:
-            raise InputError(
-                f"{label}: a joint outside all articulations, which the solver {solver} cannot take, but "
-                f"{' and '.join(MAXIMAL)} can; or apply PhysicsArticulationRootAPI above it"
-            )

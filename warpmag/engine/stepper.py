@@ -117,6 +117,7 @@ class Stepper:
         self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
         self._longest = step / self._fewest
         self._state, self._other, self._saved = model.state(), model.state(), model.state()
+        self._control = model.control()
         self._shared = model.state()  # between the poses that some substeps start from, and the forces there
         self._machine = stepping.StepMachine(
             _RECORDS,
@@ -163,6 +164,16 @@ class Stepper:
         """The present state, once :meth:`look` has been called; it may be changed."""
         self._machine.forget_contacts()
         return self._state
+
+    @property
+    def control(self) -> newton.Control:
+        """Forces and targets of joints; its arrays may be changed between steps, or another put in its place."""
+        return self._control
+
+    @control.setter
+    def control(self, control: newton.Control) -> None:
+        self._control = control
+        self._graph, self._warm = None, False
 
     @property
     def due(self) -> bool:
@@ -293,6 +304,7 @@ class Stepper:
         """Return the arrays that a step hands on to the next one, by name."""
         machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
         parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
+        parts["control"] = dict(enumerate(_arrays(self._control)))
         parts |= {"magnetics": self._magnetics.system.carried(), "solver": self._solver.carried()}
         return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
@@ -359,7 +371,7 @@ class Stepper:
         """Do a substep of ``dt`` [s] that begins ``begin`` [s] after the pair that it is of."""
         if self._drive:
             self._drive.lead(now, begin, dt)
-        self._solver.step(now, then, dt)
+        self._solver.step(now, then, dt, self._control)
         if self._drive:
             self._drive.place(then, begin + dt, self._longest)
 
@@ -397,8 +409,8 @@ def _clear_error(device) -> None:
         wp.utils.radix_sort_pairs(nothing, wp.zeros_like(nothing), 1)
 
 
-def _arrays(state: newton.State) -> list[wp.array]:
-    """Return what a state remembers, flat; forces are cleared before each substep."""
+def _arrays(state: newton.State | newton.Control) -> list[wp.array]:
+    """Return what a state remembers, or a control holds, flat; forces on bodies are cleared before each substep."""
     found = []
     for name, value in vars(state).items():
         if isinstance(value, newton.Model.AttributeNamespace):

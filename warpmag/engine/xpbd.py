@@ -18,8 +18,10 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.joints import JointSolve
 from warpmag.kernels.rigid import contact_solve
 from warpmag.kernels.rigid.free_motion import launch_accelerate, launch_move
+from warpmag.kernels.rigid.joints import launch_move_by
 from warpmag.kernels.rigid.mass_splitting import launch_count_shares, launch_split_masses
 from warpmag.kernels.rigid.newton_views import BodyView, view_bodies, view_contacts
 
@@ -29,7 +31,8 @@ _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 class PileXPBD(newton.solvers.SolverXPBD):
     """Newton's XPBD with masses split among contacts, whose impulses keep momentum and angular momentum.
 
-    Models with joints, particles, tendons, restitution or moving surfaces take Newton's own steps, with split masses.
+    Models with joints take the steps of :mod:`warpmag.engine.joints`, and those with particles, tendons, restitution,
+    moving surfaces or joints that mimic others Newton's own, with split masses.
     """
 
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
@@ -47,11 +50,19 @@ class PileXPBD(newton.solvers.SolverXPBD):
         self._contact_iterations = contact_iterations or self.iterations
         self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
         self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
-        others = model.joint_count, model.particle_count, model.tendon_segment_count, self.enable_restitution
-        self._solve = None
-        if not any(others) and not self.rigid_contact_con_weighting:
+        others = model.particle_count, model.tendon_segment_count, self.enable_restitution
+        self._solve = self._joints = None
+        plain = not any(others) and not self.rigid_contact_con_weighting
+        if plain and not model.joint_count:
             bodies = self._view_bodies(model.state())
             self._solve = contact_solve.allocate(contact_max, bodies, kinematic_flag=_KINEMATIC)
+        elif plain and not self._has_joint_mimics:
+            self._joints = JointSolve(
+                model,
+                iterations=self.iterations,
+                contact_relaxation=self.rigid_contact_relaxation,
+                joint_relaxation=self.joint_linear_relaxation,
+            )
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; as Newton's."""
@@ -59,6 +70,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
             launch_count_shares(view_contacts(self.model, contacts), state_in.body_q, self._splits, self._shares)
         if self._solve is not None and contacts.rigid_contact_surface_velocity is None:
             self._step_bodies(state_in, state_out, contacts, dt)
+            return
+        if self._joints is not None:
+            self._step_joints(state_in, state_out, control, contacts, dt)
             return
         with self._splitting():
             super().step(state_in, state_out, control, contacts, dt, observables=observables)
@@ -78,6 +92,12 @@ class PileXPBD(newton.solvers.SolverXPBD):
         )
         launch_move(after, _KINEMATIC, dt)
 
+    def _step_joints(self, state_in, state_out, control, contacts, dt) -> None:
+        assert self._joints is not None
+        before, after = self._view_bodies(state_in), self._view_bodies(state_out)
+        control = control or self.model.control(clone_variables=False)
+        self._joints.step(before, after, self._contact_masses(), control, contacts, dt)
+
     def _view_bodies(self, state) -> BodyView:
         """Return the bodies, of which forces and contacts do not move the kinematic ones."""
         bodies = view_bodies(self.model, state)
@@ -87,29 +107,29 @@ class PileXPBD(newton.solvers.SolverXPBD):
     @contextlib.contextmanager
     def _splitting(self) -> Iterator[None]:
         """Let Newton's contacts act on their share of each body's mass."""
-        if self._splits is None:
-            yield
-            return
         self._whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
-        launch_split_masses(self._shares, self._whole, self._split)
-        with self._masses(self._split):
-            yield
-
-    def _apply_body_deltas(self, *arguments, **options):
-        """Move whole bodies by what contacts did to their shares."""
-        if self._splits is None:
-            return super()._apply_body_deltas(*arguments, **options)
-        with self._masses(self._whole):
-            return super()._apply_body_deltas(*arguments, **options)
-
-    @contextlib.contextmanager
-    def _masses(self, masses) -> Iterator[None]:
-        before = self.body_inv_mass_effective, self.body_inv_inertia_effective
-        self.body_inv_mass_effective, self.body_inv_inertia_effective = masses
+        self.body_inv_mass_effective, self.body_inv_inertia_effective = self._contact_masses()
         try:
             yield
         finally:
-            self.body_inv_mass_effective, self.body_inv_inertia_effective = before
+            self.body_inv_mass_effective, self.body_inv_inertia_effective = self._whole
+
+    def _contact_masses(self) -> tuple[wp.array, wp.array]:
+        """Return the inverse masses and inertias that a contact acts on."""
+        whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
+        if self._splits is None:
+            return whole
+        launch_split_masses(self._shares, whole, self._split)
+        return self._split
+
+    def _apply_body_deltas(self, model, state_in, state_out, body_deltas, dt, rigid_contact_inv_weight=None):
+        """Move whole bodies by what contacts did to their shares, however slowly; the states take turns."""
+        now, then = (state_in, state_out) if self._body_delta_counter else (state_out, state_in)
+        self._body_delta_counter = 1 - self._body_delta_counter
+        bodies = view_bodies(model, now)
+        bodies.inv_mass, bodies.inv_inertia = self._whole
+        launch_move_by(bodies, body_deltas, rigid_contact_inv_weight, dt, then.body_q, then.body_qd)
+        return then.body_q, then.body_qd
 
 
 def _single_balls(model: newton.Model) -> np.ndarray:
