@@ -9,7 +9,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from pxr import Sdf, UsdGeom
+from pxr import Sdf, UsdGeom, UsdPhysics, UsdShade
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.optimize import brentq
 
@@ -17,6 +17,7 @@ import warpmag
 from tests.test_materials import FLOAT, stage_with
 from warpmag import MagnetizationCurve, oracle
 from warpmag.engine.attributes import marked_shapes
+from warpmag.engine.scene import import_scene
 from warpmag.errors import InputError
 from warpmag.kernels.material import curves as kernel_curves
 from warpmag.kernels.shared.native import native_options
@@ -443,3 +444,58 @@ def test_curves_on_a_stage():
 def test_bad_curves_on_a_stage_are_refused_by_name(material, attributes, message):
     with pytest.raises(InputError, match=f"^/Ball: .*{message}"):
         read_magnets(stage_with(material, **attributes))
+
+
+def mass_of(tmp_path, material, edit=lambda stage: None):
+    """Mass [kg] of a ball of 5 mm of a material after ``edit``, as Newton imports it from a file."""
+    stage = stage_with(material)
+    edit(stage)
+    path = tmp_path / "scene.usda"
+    stage.Export(str(path))
+    scene = import_scene(path)
+    return scene.builder.body_mass[scene.bodies["/Ball"]]
+
+
+VOLUME = 4.0 / 3.0 * math.pi * 0.005**3
+
+
+@pytest.mark.parametrize("material", ["1010-steel", "soft-ferrite", ""])
+def test_a_magnet_weighs_what_its_material_does(tmp_path, material):
+    density = MATERIALS[material].density if material else 1000.0  # Newton's own
+    assert mass_of(tmp_path, material) == pytest.approx(density * VOLUME, rel=1e-5)
+
+
+def _mass_of_ball(stage):
+    UsdPhysics.MassAPI.Apply(stage.GetPrimAtPath("/Ball")).CreateMassAttr(0.25)
+
+
+def _density_of_ball(stage):
+    UsdPhysics.MassAPI.Apply(stage.GetPrimAtPath("/Ball")).CreateDensityAttr(0.25 / VOLUME)
+
+
+def _density_of_bound_material(stage):
+    bound = UsdShade.Material.Define(stage, "/Looks")
+    UsdPhysics.MaterialAPI.Apply(bound.GetPrim()).CreateDensityAttr(0.25 / VOLUME)
+    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/Ball")).Bind(bound)
+
+
+@pytest.mark.parametrize("edit", [_mass_of_ball, _density_of_ball, _density_of_bound_material])
+def test_what_a_stage_says_of_its_weight_counts(tmp_path, edit):
+    assert mass_of(tmp_path, "1010-steel", edit) == pytest.approx(0.25, rel=1e-5)
+
+
+def test_a_body_of_several_parts_weighs_what_each_is_made_of(tmp_path):
+    def with_lid(stage):
+        lid = UsdGeom.Cube.Define(stage, "/Ball/Lid")
+        lid.CreateSizeAttr(0.002)
+        UsdPhysics.CollisionAPI.Apply(lid.GetPrim())
+        UsdPhysics.MassAPI.Apply(lid.GetPrim()).CreateMassAttr(0.01)
+
+    density = MATERIALS["M-19"].density
+    assert mass_of(tmp_path, "M-19", with_lid) == pytest.approx(density * VOLUME + 0.01, rel=1e-5)
+
+
+def test_densities_are_those_of_matter():
+    """Of iron 7,874 kg/m³ (CRC Handbook), of alloys and oxides of it 3,000 to 9,000."""
+    assert MATERIALS["pure-iron"].density == pytest.approx(7874.0, rel=1e-3)
+    assert all(3e3 < one.density < 9e3 for one in MATERIALS.values())

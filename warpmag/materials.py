@@ -2,8 +2,8 @@
 
 Values are typical ones at room temperature; a data sheet of the very part is better. The susceptibility is the initial
 one, of small fields: that of a ball hardly matters above 100, for its own demagnetizing field limits it to 3. Some have
-a measured curve (``measured.py``) in the place of both, which has the knee right: at 8 to 50 kA/m, where the
-default curve of iron is far too low.
+a measured curve (``measured.py``) in the place of both, which has the knee right. Densities are those of Bozorth's
+table and of makers' data sheets, rounded.
 """
 
 import math

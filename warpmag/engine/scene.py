@@ -15,6 +15,7 @@ from warpmag.usd import (
     GroundedJoint,
     StageClock,
     enabled_joints,
+    give_densities,
     inspect,
     open_stage,
     prepare_joints,
@@ -73,6 +74,7 @@ def import_scene(
     clock, contents = report.clock, report.contents
     assert clock is not None, "a clock that is wrong is a reason to refuse"
     strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)
+    give_densities(stage, contents.magnets)
     builder = newton.ModelBuilder()
     register_attributes(builder)
     found = _add_stage(builder, stage, path, visuals)
