@@ -29,19 +29,19 @@ def evaluate(request, device):
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=kind))
-    def curves(curve: int, s: wp.array[kind], square: wp.array[kind], out: wp.array2d[kind]):
+    def curves(curve: int, tables: wp.array2d[kind], s: wp.array[kind], square: wp.array[kind], out: wp.array2d[kind]):
         i = wp.tid()
-        c = curve_ratio(s[i], curve)
+        c = curve_ratio(s[i], curve, tables)
         out[0, i] = c
-        out[1, i] = curve_slope(s[i], curve)
-        out[2, i] = inverse_curve_ratio(c * s[i], curve)
+        out[1, i] = curve_slope(s[i], curve, tables)
+        out[2, i] = inverse_curve_ratio(c * s[i], curve, tables)
         by_passes(i, curve, s, square, out[3], out[4])
 
     def run(name, reduced):
         padded = [np.pad(x, (0, CHUNK)) for x in (S, reduced**2)]
         s, square = (wp.array(x, dtype=kind, device=device) for x in padded)
         out = wp.zeros((5, len(S) + CHUNK), dtype=kind, device=device)
-        wp.launch(curves, dim=len(S), inputs=[CURVE_IDS[name], s, square, out], device=device)
+        wp.launch(curves, dim=len(S), inputs=[CURVE_IDS[name], None, s, square, out], device=device)
         return out.numpy()[:, : len(S)].astype(float), PRECISION[request.param]
 
     return run

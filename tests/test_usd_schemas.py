@@ -12,6 +12,7 @@ from pxr import Plug, Usd, UsdGeom, UsdPhysics
 from warpmag import magnets
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.measured import MEASURED_CURVES
 from warpmag.usd import author_magnet, author_settings, open_stage, read_magnets, schemas
 
 MAGNETS = {
@@ -85,7 +86,7 @@ def test_fallbacks_are_the_defaults_of_the_records():
         ("warpmag:saturationMagnetization", "float", None),
         ("warpmag:susceptibility", "float", None),
         ("warpmag:magnetization", "vector3f", None),
-        ("warpmag:curve", "token", magnets.CURVES),
+        ("warpmag:curve", "token", (*magnets.CURVES, *MEASURED_CURVES)),
         ("warpmag:momentSpacing", "float", None),
         ("warpmag:moment", "vector3f", None),
         ("warpmag:externalField", "vector3f", None),

@@ -330,10 +330,6 @@ REFUSED = {
         [A, B, joint("Revolute", "A", "B", RIGHT, LEFT).replace("</World/B>", "[</World/A>, </World/B>]")],
         "/World/Joint: physics:body1 names 2 prims",
     ),
-    "curves": (
-        [A, B.replace("double radius", 'uniform token warpmag:curve = "langevin"\n double radius')],
-        "/World/B: warpmag:curve is langevin, but tanh on /World/A",
-    ),
     "a spacing that is too small": (
         [physics(), ball("A", (0, 0, 1), "float warpmag:momentSpacing = 1e-5")],
         "/World/A: warpmag:momentSpacing 1e-05 m needs more than 20000 moments for one body",

@@ -17,6 +17,7 @@ _HOMES = {
     "solve_induction": "warpmag.induction",
     "InductionResult": "warpmag.induction",
     "material": "warpmag.materials",
+    "MagnetizationCurve": "warpmag.curves",
     "register_attributes": "warpmag.engine.attributes",
     "add_inducible": "warpmag.engine.attributes",
     "add_permanent": "warpmag.engine.attributes",

@@ -21,8 +21,10 @@ from warpmag.arrays import (
     real_array,
     resolve_kind,
 )
+from warpmag.curves import MagnetizationCurve
 from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.magnets import shown
+from warpmag.materials import measured
 from warpmag.system import MomentSystem
 
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
@@ -86,7 +88,7 @@ def solve_induction(
     positions,
     radii,
     *,
-    saturation,
+    saturation=None,
     susceptibility=math.inf,
     curve="tanh",
     external_field=None,
@@ -106,9 +108,11 @@ def solve_induction(
     Args:
         positions: Ball centres [m], shape [n, 3], NumPy or Warp.
         radii: Ball radii [m], scalar or [n].
-        saturation: Saturation magnetization Ms [A/m], scalar or [n].
+        saturation: Saturation magnetization Ms [A/m], scalar or [n]; must be given, unless all curves are measured.
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-        curve: Magnetization curve, one of ``magnets.CURVES``.
+        curve: Magnetization curve: one of ``magnets.CURVES``, or a measured one, which has its own saturation and
+            susceptibility, as a :class:`warpmag.MagnetizationCurve` or the name of a material that has one. A tuple or
+            list of n gives each ball its own.
         external_field: Applied field H0 [A/m], shape [3] or [n, 3].
         sources: Permanent magnets as (positions [m], moments [A·m²]), each of shape [k, 3]; point dipoles.
         dynamics: ``theta``: the exact flow of Eqs. 8 and 9, accelerated; ``theta-euler``: their explicit step;
@@ -132,9 +136,9 @@ def solve_induction(
         ConvergenceWarning: ``max_evaluations`` did not suffice; the result is the best that was found.
     """
     kind = resolve_kind(positions, dtype, device)
-    balls = _read_balls(kind, positions, radii, saturation, susceptibility, external_field, sources)
+    balls = _read_balls(kind, positions, radii, saturation, susceptibility, curve, external_field, sources)
     system = balls.make_system(
-        kind, curve=curve, dynamics=dynamics, contact_model=contact_model, rtol=rtol, max_evaluations=max_evaluations
+        kind, dynamics=dynamics, contact_model=contact_model, rtol=rtol, max_evaluations=max_evaluations
     )
     if initial is not None:
         system.start_from(kind.vectors("initial", initial, balls.count))
@@ -165,6 +169,7 @@ class _Balls:
         radii: Radii [m], shape [n].
         saturation: Saturation magnetizations [A/m], shape [n].
         susceptibility: Susceptibilities [dimensionless], shape [n].
+        curves: Magnetization curves, one for all, or n.
         external: Applied field [A/m], Warp, shape [n].
         source_positions: Places of the permanent magnets [m], Warp, shape [k].
         source_moments: Their moments [A·m²], Warp, shape [k].
@@ -174,6 +179,7 @@ class _Balls:
     radii: np.ndarray
     saturation: np.ndarray
     susceptibility: np.ndarray
+    curves: list
     external: wp.array
     source_positions: wp.array
     source_moments: wp.array
@@ -196,6 +202,7 @@ class _Balls:
             movable=np.arange(n + k) < n,
             saturation=with_sources(self.saturation, 1.0),
             susceptibility=with_sources(self.susceptibility, 1.0),
+            curve=self.curves[0] if len(self.curves) == 1 else [*self.curves, *["tanh"] * k],
             lone_torque=True,
             dtype=name_of(kind.dtype),
             device=kind.device,
@@ -209,7 +216,7 @@ class _Balls:
         return system
 
 
-def _read_balls(kind: Kind, positions, radii, saturation, susceptibility, external_field, sources) -> _Balls:
+def _read_balls(kind: Kind, positions, radii, saturation, susceptibility, curve, external_field, sources) -> _Balls:
     """Return the arguments of :func:`solve_induction` as arrays; raises ``InputError`` for those that cannot be."""
     size = host_radii("radii", radii, kind.dtype)
     farthest = farthest_place(kind.dtype, 2.0 * float(size.max(initial=0.0)))
@@ -220,15 +227,42 @@ def _read_balls(kind: Kind, positions, radii, saturation, susceptibility, extern
         raise InputError(f"radii: must be positive, got {size.min():g}")
     external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
     source_positions, source_moments = _sources(kind, sources, farthest)
+    curves = _curves(curve, n)
+    saturation, susceptibility = _materials(curves, saturation, susceptibility)
     return _Balls(
         positions=x,
         radii=size,
         saturation=host_positive("saturation", saturation, n, kind.dtype),
         susceptibility=host_positive("susceptibility", susceptibility, n, kind.dtype, infinite=True),
+        curves=curves,
         external=external,
         source_positions=source_positions,
         source_moments=source_moments,
     )
+
+
+def _curves(curve, count: int) -> list:
+    """Return the curve of all balls, or those of each of ``count``."""
+    each = isinstance(curve, (tuple, list)) and len(curve) == count and count > 0
+    return [measured("curve", one) for one in curve] if each else [measured("curve", curve)]
+
+
+def _materials(curves: list, saturation, susceptibility):
+    """Return saturations and susceptibilities, measured ones in the place of those that are given."""
+    tables = np.array([isinstance(one, MagnetizationCurve) for one in curves])
+    if tables.all() and (saturation is not None or not np.array_equal(susceptibility, math.inf)):
+        which = "saturation" if saturation is not None else "susceptibility"
+        raise InputError(f"{which}: a measured curve says it, give one or the other")
+    if saturation is None and not tables.all():
+        raise InputError("saturation: must be given, unless all curves are measured")
+    if not tables.any():
+        return saturation, susceptibility
+    given = [host_scalars("saturation", 1.0 if saturation is None else saturation, len(curves))]
+    given.append(host_scalars("susceptibility", susceptibility, len(curves), infinite=True))
+    own = [[getattr(one, name) if of_table else 1.0 for one, of_table in zip(curves, tables, strict=True)]
+           for name in ("saturation", "susceptibility")]  # fmt: skip
+    found = [np.where(tables, *pair) for pair in zip(own, given, strict=True)]
+    return (found[0][0], found[1][0]) if len(curves) == 1 else tuple(found)
 
 
 def _read_result(kind: Kind, system: MomentSystem, balls: _Balls, given: dict) -> InductionResult:

@@ -9,6 +9,7 @@ import numbers
 import reprlib
 from dataclasses import dataclass, field, replace
 
+from warpmag.curves import MagnetizationCurve
 from warpmag.errors import InputError
 
 KINDS = ("inducible", "permanent")
@@ -53,6 +54,15 @@ def check_token(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise :class:`InputError` unless ``value`` is one of ``allowed``."""
     if not isinstance(value, str) or value not in allowed:
         raise InputError(f"{name}: {shown(value)} is not one of {', '.join(allowed)}")
+
+
+def check_curve(name: str, value, others: tuple[str, ...] = ()) -> None:
+    """Raise :class:`InputError` unless ``value`` is a magnetization curve, one of :data:`CURVES` or a measured one.
+
+    The message names ``others``, too.
+    """
+    if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
+        check_token(name, value, (*CURVES, *others))
 
 
 def check_positive(name: str, value: float, *, infinite: bool = False) -> None:
@@ -130,7 +140,8 @@ class Magnet:
         kind: ``inducible`` (magnetized by the field it is in) or ``permanent``.
         saturation: Saturation magnetization Ms [A/m], inducible only.
         susceptibility: Susceptibility χ [dimensionless], may be infinite, inducible only.
-        curve: Magnetization curve, one of :data:`CURVES`, inducible only.
+        curve: Magnetization curve, one of :data:`CURVES` or a measured one, which then says what saturation and
+            susceptibility (its largest) are; inducible only.
         magnetization: Magnetization of a permanent magnet [A/m], in its own frame.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
     """
@@ -138,9 +149,15 @@ class Magnet:
     kind: str = "inducible"
     saturation: float = SATURATION_OF_IRON
     susceptibility: float = math.inf
-    curve: str = "tanh"
+    curve: str | MagnetizationCurve = "tanh"
     magnetization: tuple[float, float, float] = (0.0, 0.0, 0.0)
     moment_spacing: float = 0.0
+
+    def __post_init__(self):
+        """Take what a measured curve says."""
+        if isinstance(self.curve, MagnetizationCurve):
+            object.__setattr__(self, "saturation", self.curve.saturation)
+            object.__setattr__(self, "susceptibility", self.curve.susceptibility)
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or body label) if a value is out of range."""
@@ -148,7 +165,7 @@ class Magnet:
         if self.kind == "inducible":
             check_material(f"{name}: saturation magnetization", self.saturation)
             check_material(f"{name}: susceptibility", self.susceptibility, infinite=True)
-            check_token(f"{name}: curve", self.curve, CURVES)
+            check_curve(f"{name}: curve", self.curve)
         else:
             check_finite(f"{name}: magnetization", self.magnetization)
         check_not_negative(f"{name}: moment spacing", self.moment_spacing)

@@ -1,14 +1,18 @@
 """Magnetic materials by name.
 
 Values are typical ones at room temperature; a data sheet of the very part is better. The susceptibility is the initial
-one, of small fields: that of a ball hardly matters above 100, for its own demagnetizing field limits it to 3.
+one, of small fields: that of a ball hardly matters above 100, for its own demagnetizing field limits it to 3. Some have
+a measured curve (``measured.py``) in the place of both, which has the knee right. Densities are those of Bozorth's
+table and of makers' data sheets, rounded.
 """
 
 import math
 from dataclasses import dataclass
 
+from warpmag.curves import MagnetizationCurve
 from warpmag.errors import InputError
-from warpmag.magnets import shown
+from warpmag.magnets import check_curve, shown
+from warpmag.measured import MEASURED_CURVES
 from warpmag.oracle import MU0
 
 _BOZORTH = "R. M. Bozorth, Ferromagnetism, 1951, table of magnetic materials: permeability at 2 mT, saturation"
@@ -24,14 +28,19 @@ class Material:
         kind: ``inducible`` or ``permanent``.
         polarization: Saturation polarization μ0·Ms of an inducible, remanence Br of a permanent material [T].
         permeability: Initial relative permeability of an inducible material [dimensionless].
+        density: Mass density [kg/m³].
         source: Where the numbers are from.
+        curve: Measured magnetization curve of an inducible material, None where it has none. Saturation and
+            permeability are then what it leads to, and the largest.
     """
 
     name: str
     kind: str
     polarization: float
     permeability: float
+    density: float
     source: str
+    curve: MagnetizationCurve | None = None
 
     @property
     def saturation(self) -> float:
@@ -49,30 +58,41 @@ class Material:
         return self.polarization / MU0
 
 
-def _inducible(name, saturation, permeability, source):
-    return Material(name, "inducible", saturation, permeability, source)
+def _inducible(name, saturation, permeability, density, source):
+    return Material(name, "inducible", saturation, permeability, density, source)
 
 
-def _permanent(name, remanence, source):
-    return Material(name, "permanent", remanence, math.nan, source)
+def _measured(name, density):
+    source, *rows = MEASURED_CURVES[name]
+    h, b = zip(*(point for row in rows for point in row), strict=True)
+    curve = MagnetizationCurve.from_bh(h, b, name=name)
+    return Material(name, "inducible", MU0 * curve.saturation, 1.0 + curve.susceptibility, density, source, curve)
+
+
+def _permanent(name, remanence, density, source):
+    return Material(name, "permanent", remanence, math.nan, density, source)
 
 
 MATERIALS = {
     one.name: one
     for one in (
-        _inducible("iron", 2.15, 200.0, f"{_BOZORTH}; 99.91 % Fe"),
-        _inducible("mild-steel", 2.10, 180.0, f"{_BOZORTH}; cold-rolled steel, 98.5 % Fe"),
-        _inducible("silicon-steel", 1.97, 500.0, f"{_BOZORTH}; 4 % Si"),
-        _inducible("permalloy", 1.07, 8000.0, f"{_BOZORTH}; 78.5 % Ni"),
-        _inducible("mumetal", 0.65, 20000.0, f"{_BOZORTH}; 77 % Ni, 5 % Cu, 2 % Cr"),
-        _inducible("soft-ferrite", 0.47, 2300.0, "Ferroxcube, Soft Ferrites, 2013; 3C90 (MnZn) at 25 °C"),
-        _permanent("N35", 1.195, _NDFEB),
-        _permanent("N42", 1.30, _NDFEB),
-        _permanent("N52", 1.45, _NDFEB),
-        _permanent("SmCo", 1.05, "Magna Tokyo, magnet characteristics: Sm2Co17"),
-        _permanent("AlNiCo5", 1.27, "Magna Tokyo, magnet characteristics"),
-        _permanent("AlNiCo8", 0.88, "Magna Tokyo, magnet characteristics"),
-        _permanent("hard-ferrite", 0.385, "Chinese standard grade Y30 (C5), middle of the range of remanence"),
+        _inducible("iron", 2.15, 200.0, 7870.0, f"{_BOZORTH}; 99.91 % Fe"),
+        _inducible("mild-steel", 2.10, 180.0, 7870.0, f"{_BOZORTH}; cold-rolled steel, 98.5 % Fe"),
+        _inducible("silicon-steel", 1.97, 500.0, 7650.0, f"{_BOZORTH}; 4 % Si"),
+        _inducible("permalloy", 1.07, 8000.0, 8600.0, f"{_BOZORTH}; 78.5 % Ni"),
+        _inducible("mumetal", 0.65, 20000.0, 8580.0, f"{_BOZORTH}; 77 % Ni, 5 % Cu, 2 % Cr"),
+        _inducible("soft-ferrite", 0.47, 2300.0, 4800.0, "Ferroxcube, Soft Ferrites, 2013; 3C90 (MnZn) at 25 °C"),
+        _measured("pure-iron", 7870.0),
+        _measured("1010-steel", 7870.0),
+        _measured("M-19", 7650.0),
+        _measured("430-stainless", 7700.0),
+        _permanent("N35", 1.195, 7500.0, _NDFEB),
+        _permanent("N42", 1.30, 7500.0, _NDFEB),
+        _permanent("N52", 1.45, 7500.0, _NDFEB),
+        _permanent("SmCo", 1.05, 8300.0, "Magna Tokyo, magnet characteristics: Sm2Co17"),
+        _permanent("AlNiCo5", 1.27, 7300.0, "Magna Tokyo, magnet characteristics"),
+        _permanent("AlNiCo8", 0.88, 7250.0, "Magna Tokyo, magnet characteristics"),
+        _permanent("hard-ferrite", 0.385, 4900.0, "Chinese standard grade Y30 (C5), middle of the range of remanence"),
     )
 }
 """Every material by its name."""
@@ -87,8 +107,8 @@ def material(name: str) -> Material:
     return _look_up("material", name)
 
 
-def inducible(owner: str, name: str) -> dict[str, float]:
-    """Return saturation [A/m] and susceptibility of an inducible material, as arguments of a magnet.
+def inducible(owner: str, name: str) -> dict:
+    """Return saturation [A/m] and susceptibility of an inducible material, or its curve, as arguments of a magnet.
 
     Args:
         owner: Who asks, for the message.
@@ -98,7 +118,49 @@ def inducible(owner: str, name: str) -> dict[str, float]:
         InputError: There is no such material, or it is a permanent one.
     """
     found = _look_up(owner, name, "inducible")
+    if found.curve is not None:
+        return {"curve": found.curve}
     return {"saturation": found.saturation, "susceptibility": found.susceptibility}
+
+
+def inducible_from(material: str | None, curve, given: dict) -> dict:
+    """Return what a material, a curve and numbers make of an inducible magnet, as its arguments.
+
+    Args:
+        material: Name of a material, or None.
+        curve: What :func:`measured` takes, or None.
+        given: Saturation [A/m] and susceptibility, where they are given.
+
+    Raises:
+        InputError: Two say the same.
+    """
+    values = given if curve is None else {**given, "curve": measured("curve", curve)}
+    table = isinstance(values.get("curve"), MagnetizationCurve)
+    brought = {} if material is None else inducible("material", material)
+    says = ("saturation", "susceptibility", "curve") if table or "curve" in brought else tuple(brought)
+    twice = [name for name in values if name in says and (material is not None or name != "curve")]
+    if twice and (material is not None or table):
+        who = f"material: {shown(material)}" if material is not None else "curve: it"
+        raise InputError(f"{who} says what {' and '.join(twice)} are, give one or the other")
+    return {**values, **brought}
+
+
+def measured(owner: str, curve):
+    """Return a magnetization curve: one with a token as it is, a measured one, or that of a material by its name.
+
+    Raises:
+        InputError: It is none of them.
+    """
+    known = [one.name for one in MATERIALS.values() if one.curve is not None]
+    if isinstance(curve, str) and curve in known:
+        return MATERIALS[curve].curve
+    check_curve(owner, curve, tuple(known))
+    return curve
+
+
+def name_of_curve(curve: MagnetizationCurve) -> str | None:
+    """Return the material that has a curve, None if none has."""
+    return next((one.name for one in MATERIALS.values() if one.curve == curve), None)
 
 
 def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -184,8 +184,13 @@ def curve_slope(susceptibility):
 
 
 def reduced_curve(s, curve):
-    """Reduced magnetization ‖M‖/Ms of a reduced field s = k‖H‖/Ms, and its derivative, for one of the curves."""
+    """Reduced magnetization ‖M‖/Ms of a reduced field s = k‖H‖/Ms, and its derivative.
+
+    ``curve`` is one of the curves, or a function of s that returns both.
+    """
     s = np.asarray(s, float)
+    if callable(curve):
+        return curve(s)
     if curve == "tanh":  # Eq. 10
         return np.tanh(s), 1.0 / np.cosh(np.minimum(s, 300.0)) ** 2
     if curve == "clamped":  # Eq. 7

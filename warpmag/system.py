@@ -17,12 +17,13 @@ from warpmag.arrays import (
     shape_message,
     vec3_type,
 )
+from warpmag.curves import MagnetizationCurve
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.energy import launch_energy
-from warpmag.kernels.material.curves import CURVE_IDS, CurveParameters
+from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, MIXED, CurveParameters, curve_tables
 from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
@@ -86,6 +87,25 @@ def _layout(radii, worlds, permanent, bodies, movable, dtype) -> _Layout:
     return _Layout(radii, worlds, permanent, bodies, movable, ~permanent & (size[body] == 1))
 
 
+def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
+    """Number of each moment's curve for the kernels, shape [n], and the measured ones among them."""
+    each = isinstance(curve, (tuple, list)) and len(curve) == n
+    measured: dict[MagnetizationCurve, int] = {}
+    known: dict[int, int] = {}  # by identity, since moments of a body share a curve
+
+    def number(one) -> int:
+        if isinstance(one, MagnetizationCurve):
+            return measured.setdefault(one, FIRST_TABLE + len(measured))
+        check_token("curve", one, tuple(CURVE_IDS))
+        return CURVE_IDS[one]
+
+    for one in curve if each else (curve,):
+        if id(one) not in known:
+            known[id(one)] = number(one)
+    ids = [known[id(one)] for one in curve] if each else known[id(curve)]
+    return np.array(np.broadcast_to(ids, n), np.int32), list(measured)
+
+
 def _with_cells(layout: _Layout, couplings) -> _Layout:
     """The same layout, in which a body that has cells is no ball, even if it has only one."""
     cells = np.zeros(len(layout.radii), bool)
@@ -110,7 +130,8 @@ class MomentSystem:
         movable: Whether the force on a moment is wanted, shape [n]; None means all.
         saturation: Saturation magnetization Ms [A/m], scalar or [n].
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-        curve: Magnetization curve, one of ``magnets.CURVES`` for all.
+        curve: Magnetization curve, one of ``magnets.CURVES`` or a measured one, which has its own saturation and
+            susceptibility; a tuple or list gives each moment its own, of which those of permanent ones do not count.
         external_field: Applied field [A/m], shape [3] or [n, 3].
         force: ``kelvin`` or ``zeeman``.
         dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
@@ -180,7 +201,6 @@ class MomentSystem:
         """Allocate all buffers."""
         check_token("contact_model", contact_model, CONTACT_MODELS)
         check_force("force", force, contact_model)
-        check_token("curve", curve, tuple(CURVE_IDS))
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         check_rtol("rtol", rtol, dtype)
         check_count("max_evaluations", max_evaluations)
@@ -189,13 +209,13 @@ class MomentSystem:
         self._force = force
         near = contact_model == "multipole"
         self._allocate(layout, external_field)
-        saturation, susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
+        susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings)
         self._evaluate_wrench(layout, turned)
         self._energies = None
-        self._near = self._make_near_contacts(layout, turned, saturation, susceptibility, curve) if near else None
+        self._near = self._make_near_contacts(layout, turned, susceptibility) if near else None
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
         self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
 
@@ -220,23 +240,30 @@ class MomentSystem:
         self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
 
     def _make_material(self, permanent, saturation, susceptibility, curve):
-        """Make the material of all moments; return saturation and susceptibility, 1 where they are permanent."""
+        """Make the material of all moments; return the susceptibility, 1 where they are permanent."""
         n = len(permanent)
+        ids, measured = _curve_ids(curve, n)
         saturation = np.where(permanent, 1.0, host_scalars("saturation", saturation, n))
         susceptibility = np.where(permanent, 1.0, host_scalars("susceptibility", susceptibility, n, infinite=True))
+        for number, one in enumerate(measured):
+            of_table = (ids == FIRST_TABLE + number) & ~permanent
+            saturation[of_table], susceptibility[of_table] = one.saturation, one.susceptibility
         host_positive("saturation", saturation, n, self.dtype)
         host_positive("susceptibility", susceptibility, n, self.dtype, infinite=True)
 
         def put(values, dtype):
             return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=dtype, device=self.device)
 
+        found = np.unique(ids[~permanent])
         self._material = CurveParameters(
             inducible=put((~permanent).astype(np.int32), wp.int32),
             saturation=put(saturation, self.dtype),
             slope=put(3.0 / (1.0 + 3.0 / susceptibility), self.dtype),
-            curve=put(np.int32(CURVE_IDS[curve]), wp.int32),
+            curve=put(ids, wp.int32),
+            common_curve=int(found[0]) if len(found) == 1 else MIXED,
+            tables=curve_tables(measured, self.dtype, self.device),
         )
-        return saturation, susceptibility
+        return susceptibility
 
     def _evaluate_field(self, layout: _Layout, near: bool):
         """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
@@ -282,11 +309,10 @@ class MomentSystem:
             "zeeman": evaluations(Quantity.FORCE, self._effective),
         }
 
-    def _make_near_contacts(self, layout: _Layout, turned, saturation, susceptibility, curve):
+    def _make_near_contacts(self, layout: _Layout, turned, susceptibility):
         return near_pairs.allocate(
-            self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, saturation,
-            CURVE_IDS[curve], field=self._mutual, movable=layout.movable, turned=turned, forces=self.forces,
-            torques=self.torques,
+            self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, self._material,
+            field=self._mutual, movable=layout.movable, turned=turned, forces=self.forces, torques=self.torques,
         )  # fmt: skip
 
     @property

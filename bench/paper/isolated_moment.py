@@ -37,9 +37,17 @@ def exceeds_tolerance(m: wp.vec3, goal: wp.vec3, tolerance: float):
 
 
 @wp.func
-def flow_iterations(start: wp.vec3, target: wp.vec3, omega: float, accelerated: int, curve: int, tolerance: float):
+def flow_iterations(
+    start: wp.vec3,
+    target: wp.vec3,
+    omega: float,
+    accelerated: int,
+    curve: int,
+    tables: wp.array2d[float],
+    tolerance: float,
+):
     """Iterations of the θ flow from dual variable ``start`` to ``target`` = k H/Ms."""
-    goal = curve_ratio(wp.length(target), curve) * target
+    goal = curve_ratio(wp.length(target), curve, tables) * target
     s = start
     old_s = start
     old_r = wp.vec3()
@@ -54,7 +62,7 @@ def flow_iterations(start: wp.vec3, target: wp.vec3, omega: float, accelerated: 
                 s -= (wp.dot(r, dr) / size) * ((now - old_s) + omega * dr)
         old_s = now
         old_r = r
-        if not exceeds_tolerance(curve_ratio(wp.length(s), curve) * s, goal, tolerance):
+        if not exceeds_tolerance(curve_ratio(wp.length(s), curve, tables) * s, goal, tolerance):
             return n + 1
     return wp.static(MOST_ITERATIONS + 1)
 
@@ -70,14 +78,15 @@ def _pair_iterations(scaled: bool):
         kappa: float,
         precession: float,
         curve: int,
+        tables: wp.array2d[float],
         tolerance: float,
     ):
         target = wp.static(_SLOPE) * h
-        goal = curve_ratio(wp.length(target), curve) * target
+        goal = curve_ratio(wp.length(target), curve, tables) * target
         u = first
         v = second
         for n in range(wp.static(MOST_ITERATIONS)):
-            h_eff = effective_field(h, 0.5 * (u + v), float(wp.static(_SLOPE)), curve)
+            h_eff = effective_field(h, 0.5 * (u + v), float(wp.static(_SLOPE)), curve, tables)
             if wp.static(scaled):
                 u = step_submagnetization(u, h_eff, kappa, precession, 1.0, law)
                 v = step_submagnetization(v, h_eff, kappa, precession, -1.0, law)
@@ -110,6 +119,7 @@ def _sweep_kernel(flow: bool, scaled: bool):
         kappa0: float,
         precession: float,
         curve: int,
+        tables: wp.array2d[float],
         tolerance: float,
         seed: int,
         # outputs:
@@ -127,11 +137,11 @@ def _sweep_kernel(flow: bool, scaled: bool):
         count = 0
         if wp.static(flow):
             m = 0.5 * (first + second)
-            s = inverse_curve_ratio(wp.length(m), curve) * m
+            s = inverse_curve_ratio(wp.length(m), curve, tables) * m
             slope = float(wp.static(_SLOPE))
-            count = flow_iterations(s, slope * h, kappa / slope, law, curve, tolerance)
+            count = flow_iterations(s, slope * h, kappa / slope, law, curve, tables, tolerance)
         else:
-            count = pair_iterations(first, second, h, law, kappa, precession, curve, tolerance)
+            count = pair_iterations(first, second, h, law, kappa, precession, curve, tables, tolerance)
         if count > wp.static(MOST_ITERATIONS):
             count = wp.static(MOST_ITERATIONS)
             wp.atomic_add(failed_out, row, column, 1)
@@ -184,7 +194,7 @@ def launch_sweep(
     wp.launch(
         _sweep_kernel(flow, scaled),
         dim=(strengths.shape[0], multipliers.shape[0], directions),
-        inputs=[multipliers, strengths, *start, law, kappa, precession, curve, tolerance, seed],
+        inputs=[multipliers, strengths, *start, law, kappa, precession, curve, None, tolerance, seed],
         outputs=[iteration_sum, most, failed],
         device=strengths.device,
     )

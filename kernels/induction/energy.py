@@ -44,6 +44,7 @@ def _energy_kernel(dtype):
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
+        tables: wp.array2d[dtype],
         h: wp.array[vec3],
         h0: wp.array[vec3],
         h_permanent: wp.array[vec3],
@@ -54,7 +55,7 @@ def _energy_kernel(dtype):
         i = wp.tid()
         half = wp.float64(0.5)
         if inducible[i] != 0:
-            area = curve_area(slope[i] * wp.length(h[i]) / saturation[i], curve[i])
+            area = curve_area(slope[i] * wp.length(h[i]) / saturation[i], curve[i], tables)
             unit = wp.float64(saturation[i]) * wp.float64(saturation[i]) / wp.float64(slope[i])
             volume = wp.float64(ball_volume(radii[i]))
             e = half * product(moments[i], h[i] - h0[i]) - volume * unit * area
@@ -77,7 +78,7 @@ def launch_energy(radii, moments, material, h, h0, h_permanent, external_field, 
         external_field: External field [A/m], shape [n].
         energies: Out, shape [n], float64.
     """
-    inputs = [material.inducible, radii, moments, material.saturation, material.slope, material.curve]
+    inputs = [material.inducible, radii, moments, material.saturation, material.slope, material.curve, material.tables]
     wp.launch(
         _energy_kernel(radii.dtype),
         dim=len(radii),

@@ -115,6 +115,8 @@ def state_type(dtype):
         saturation: wp.array[dtype]
         slope: wp.array[dtype]
         curve: wp.array[int]
+        common_curve: int
+        curve_tables: wp.array2d[dtype]
         rtol: wp.float64
         max_evaluations: int
         row: wp.array[wp.vec4i]
@@ -224,6 +226,7 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
     state.neighbor, state.neighbor_count = packed.neighbors, packed.neighbor_counts
     state.overlap, state.overlap_count = packed.overlaps, packed.overlap_counts
     state.saturation, state.slope, state.curve = material.saturation, material.slope, material.curve
+    state.common_curve, state.curve_tables = material.common_curve, material.tables
     state.rtol, state.max_evaluations = rtol, max_evaluations
 
 

@@ -41,9 +41,9 @@ LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
 
 
 @wp.func
-def effective_field(h: Any, m: Any, slope: Any, curve: int):
+def effective_field(h: Any, m: Any, slope: Any, curve: int, tables: Any):
     """Reduced effective field H_eff/Ms (Eqs. 5 and 11) of reduced field ``h`` and reduced magnetization ``m``."""
-    return h - (inverse_curve_ratio(wp.length(m), curve) / slope) * m
+    return h - (inverse_curve_ratio(wp.length(m), curve, tables) / slope) * m
 
 
 @wp.func
@@ -206,7 +206,7 @@ def _convergence_kernel(dtype):
             i = state.row[row][0]
             limit = state.saturation[i]
             g = (state.slope[i] / limit) * state.h[i]
-            goal = (limit * curve_ratio(wp.length(g), state.curve[i])) * g
+            goal = (limit * curve_ratio(wp.length(g), state.curve[i], state.curve_tables)) * g
             # lengths, not squares: a field of 1e-20 A/m squared is no float32
             deviation = wp.float64(wp.length(goal - (dtype(0.5) * limit) * (pairs.first[i] + pairs.second[i])))
             mine += wp.vec2d(deviation * deviation, wp.float64(wp.length(goal)) * wp.float64(wp.length(goal)))
@@ -228,7 +228,8 @@ def _step_kernel(dtype):
         i = row[0]
         u = pairs.first[i]
         v = pairs.second[i]
-        h_eff = effective_field(state.h[i] / state.saturation[i], dtype(0.5) * (u + v), state.slope[i], state.curve[i])
+        reduced, mean = state.h[i] / state.saturation[i], dtype(0.5) * (u + v)
+        h_eff = effective_field(reduced, mean, state.slope[i], state.curve[i], state.curve_tables)
         u = step_submagnetization(u, h_eff, pairs.kappa, pairs.precession, dtype(1.0), pairs.law)
         v = step_submagnetization(v, h_eff, pairs.kappa, pairs.precession, dtype(-1.0), pairs.law)
         pairs.first[i] = u

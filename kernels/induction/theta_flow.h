@@ -56,11 +56,11 @@ CUDA_CALLABLE inline Vector vector_of(Four f) { return {f.x, f.y, f.z}; }
 
 struct Material {
     Number saturation, slope;
-    int curve;
+    Curves curves;
 };
 template <class State> CUDA_CALLABLE inline Material material_of(const State& state, const Place& at) {
     return {some(entries(state.saturation, at), at.held, 1), some(entries(state.slope, at), at.held, 1),
-            state.curve.data[at.i]};
+            curves_of(state.curve.data, state.common_curve, state.curve_tables.data, at.i, at.held)};
 }
 
 // Positions and radii [m].
@@ -73,7 +73,7 @@ template <class State> CUDA_CALLABLE inline Four balls_at(const State& state, co
 // Moments [A·m²] of balls of given radii [m] for dual variables s.
 CUDA_CALLABLE inline Vector moments_of(Material material, Number radius, Vector s) {
     const Number volume = Real(4.18879020478639) * radius * radius * radius;
-    return scaled(volume * material.saturation * curve_ratio(length(s), material.curve), s);
+    return scaled(volume * material.saturation * curve_ratio(length(s), material.curves), s);
 }
 
 template <class State> CUDA_CALLABLE inline void store_moments(State& state, const Place& at, Vector m) {
@@ -230,8 +230,8 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     set(state.iterate_s, at, s);
     set(state.iterate_r, at, r);
     const Number length_s = length(s), length_g = length(g);
-    const Number worth_s = material.saturation * curve_ratio(length_s, material.curve);
-    const Number worth_g = material.saturation * curve_ratio(length_g, material.curve);
+    const Number worth_s = material.saturation * curve_ratio(length_s, material.curves);
+    const Number worth_g = material.saturation * curve_ratio(length_g, material.curves);
     // lengths, not squares: a field of 1e-20 A/m squared is no float32
     const Wide goal = wide(worth_g * length_g), deviation = wide(length(less(scaled(worth_g, g), scaled(worth_s, s))));
     const Wide weight = wide(length_s > length_g ? worth_s : worth_g), square = weight * weight;

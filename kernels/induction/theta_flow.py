@@ -183,7 +183,8 @@ def _set_kernel(dtype):
     def set_state(magnetizations: wp.array[wp.types.vector(3, dtype)], state: state_struct):
         row = state.row[wp.tid()]
         reduced = magnetizations[row[0]] / state.saturation[row[0]]
-        state.s[row[0]] = inverse_curve_ratio(wp.length(reduced), state.curve[row[0]]) * reduced
+        ratio = inverse_curve_ratio(wp.length(reduced), state.curve[row[0]], state.curve_tables)
+        state.s[row[0]] = ratio * reduced
         state.warm[row[1]] = 1
 
     return set_state

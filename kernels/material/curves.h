@@ -1,12 +1,14 @@
 // Magnetization curves in reduced form (Kim and Han 2022, Eqs. 7, 10); curves.py has their table and their numbers.
 //
-// The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments.
+// The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments. Those
+// at the end take curves with a formula and measured ones (tables.h) alike.
 #pragma once
-#include "shared/lanes.h"
+#include "material/tables.h"
 
 namespace warpmag {
 
-enum Curve { TANH, LANGEVIN, CLAMPED, FROHLICH }; // as in curves.py
+enum Curve { MIXED = -1, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR }; // as in curves.py
+static_assert(LINEAR + 1 == FIRST_TABLE, "tables come after curves with a formula");
 
 // tanh(s)/s, 1 at s = 0; below the root of the smallest normal number the quotient of two denormals says nothing.
 CUDA_CALLABLE inline Real tanh_ratio(Real s) { return s < Real(1e-18) ? Real(1) : wp::tanh(s) / s; }
@@ -40,6 +42,7 @@ template <class N> CUDA_CALLABLE inline N langevin_ratio(N x) {
 template <class N> CUDA_CALLABLE inline N curve_ratio(N s, int curve) {
     if (curve == CLAMPED) return s > Real(1) ? 1 / s : N(Real(1));
     if (curve == FROHLICH) return 1 / (1 + s);
+    if (curve == LINEAR) return s * 0 + 1;
     return curve == LANGEVIN ? langevin_ratio(3 * s) : tanh_ratio(s);
 }
 
@@ -55,6 +58,7 @@ CUDA_CALLABLE inline Real curve_slope(Real s, int curve) {
     if (curve == CLAMPED) return s < 1 ? Real(1) : Real(0);
     if (curve == LANGEVIN) return langevin_slope(3 * s);
     if (curve == FROHLICH) return 1 / ((1 + s) * (1 + s));
+    if (curve == LINEAR) return 1;
     const Real cosh = wp::cosh(s < 40 ? s : Real(40));
     return 1 / (cosh * cosh);
 }
@@ -64,6 +68,7 @@ CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
     const Number zero = reduced_square * Real(0), one = zero + 1;
     Number steepness = one - reduced_square; // of tanh
     if (curve == CLAMPED) steepness = reduced_square < one ? one : zero;
+    if (curve == LINEAR) steepness = one;
     if (curve == FROHLICH) steepness = (one - root(reduced_square)) * (one - root(reduced_square));
     if (curve == LANGEVIN) {
         // Cohen's approximation, corrected by a polynomial in 2c − 1 that is good to 2e-4
@@ -83,7 +88,7 @@ CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
 // s/c of the reduced field s that makes reduced magnetization c; a saturated one gets a large finite s.
 CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve) {
     const Real bounded = c < Real(0.999999) ? c : Real(0.999999), z = bounded * bounded;
-    if (bounded < Real(1e-18) || curve == CLAMPED) return 1;
+    if (bounded < Real(1e-18) || curve == CLAMPED || curve == LINEAR) return 1;
     if (curve == FROHLICH) return 1 / (1 - bounded);
     if (curve == TANH) return Real(0.5) * wp::log((1 + bounded) / (1 - bounded)) / bounded;
     // Newton on L(3s) = c from Cohen's rational start; the curve is concave, so it converges from any start below
@@ -95,6 +100,7 @@ CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve) {
 // Area under c from 0 to s, in double: the co-energy of a curve.
 CUDA_CALLABLE inline double curve_area(double s, int curve) {
     const double z = s * s;
+    if (curve == LINEAR) return z / 2;
     if (curve == CLAMPED) return s < 1 ? z / 2 : s - 0.5;
     if (curve == FROHLICH) { // s − ln(1 + s)
         if (s > 0.02) return s - wp::log(1 + s);
@@ -111,5 +117,78 @@ CUDA_CALLABLE inline double curve_area(double s, int curve) {
     if (s > 20) return s - 0.6931471805599453; // ln cosh s
     if (s > 0.1) return wp::log(wp::cosh(s));
     return z * (0.5 - z * (1.0 / 12 - z * (1.0 / 45 - z * (17.0 / 2520 - z * 31 / 14175))));
+}
+
+// Curves of a vector of moments: the id of all, or MIXED, and of each; and all tables.
+struct Curves {
+    int common;
+    Index each;
+    const Real* tables;
+};
+
+// Curves of moments from number i on, ``held`` of them, which are not all alike if ``common`` is MIXED.
+CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* tables, int i, int held) {
+#if defined(__CUDA_ARCH__)
+    return {curve[i], curve[i], tables};
+#else
+    Index each = common;
+    if (common == MIXED)
+        for (int l = 0; l < WIDTH; ++l) each[l] = curve[i + (l < held ? l : 0)];
+    return {common, each, tables};
+#endif
+}
+
+#if !defined(__CUDA_ARCH__)
+// What moments of several curves have: by_formula(curve) and by_table(curves) of theirs.
+template <class ByFormula, class ByTable>
+__attribute__((noinline)) inline Number mixed(const Curves& curves, ByFormula by_formula, ByTable by_table) {
+    Number all = 0;
+    for (int curve = TANH; curve < FIRST_TABLE; ++curve) {
+        const Mask wanted = mask_of(curves.each == Index(curve));
+        if (any(wanted)) all = wanted ? by_formula(curve) : all;
+    }
+    const auto tabled = curves.each >= Index(FIRST_TABLE);
+    const Mask wanted = mask_of(tabled);
+    return any(wanted) ? (wanted ? by_table(tabled ? curves.each : Index(FIRST_TABLE)) : all) : all;
+}
+#endif
+
+// c(s)/s of any curve.
+CUDA_CALLABLE inline Number curve_ratio(Number s, const Curves& curves) {
+    if (curves.common >= FIRST_TABLE) return table_ratio(s, curves.each, curves.tables);
+#if !defined(__CUDA_ARCH__)
+    if (curves.common == MIXED)
+        return mixed(
+            curves, [=](int curve) { return curve_ratio(s, curve); },
+            [=](Index each) { return table_ratio(s, each, curves.tables); });
+#endif
+    return curve_ratio(s, curves.common);
+}
+
+// c'(s) of any curve where c(s) has a given square.
+CUDA_CALLABLE inline Number curve_steepness(Number square, const Curves& curves) {
+    if (curves.common >= FIRST_TABLE) return table_steepness(root(square), curves.each, curves.tables);
+#if !defined(__CUDA_ARCH__)
+    if (curves.common == MIXED)
+        return mixed(
+            curves, [=](int curve) { return curve_steepness(square, curve); },
+            [=](Index each) { return table_steepness(root(square), each, curves.tables); });
+#endif
+    return curve_steepness(square, curves.common);
+}
+
+// The same of one moment, for Warp functions.
+CUDA_CALLABLE inline Real curve_ratio(Real s, int curve, const Real* tables) {
+    return curve >= FIRST_TABLE ? table_ratio(s, curve, tables) : curve_ratio(s, curve);
+}
+CUDA_CALLABLE inline Real curve_slope(Real s, int curve, const Real* tables) {
+    return curve >= FIRST_TABLE ? table_slope(s, curve, tables) : curve_slope(s, curve);
+}
+CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve, const Real* tables) {
+    if (curve < FIRST_TABLE) return inverse_curve_ratio(c, curve);
+    return inverse_table_ratio(c < Real(0.999999) ? c : Real(0.999999), curve, tables);
+}
+CUDA_CALLABLE inline double curve_area(Real s, int curve, const Real* tables) {
+    return curve >= FIRST_TABLE ? table_area(s, curve, tables) : curve_area(double(s), curve);
 }
 }

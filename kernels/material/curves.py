@@ -1,4 +1,4 @@
-"""Magnetization curves M = f(H) in reduced form (Kim and Han 2022, Eqs. 7, 10).
+"""Magnetization curves M = f(H) in reduced form (Kim and Han 2022, Eqs. 7, 10), with a formula or measured.
 
 With the reduced field s = k‖H‖/Ms every curve reads ‖M‖ = Ms c(s), c(0) = 0, c'(0) = 1, c(∞) = 1:
 
@@ -10,17 +10,39 @@ With the reduced field s = k‖H‖/Ms every curve reads ‖M‖ = Ms c(s), c(0)
 | frohlich | s/(1 + s) | Fröhlich 1881, Kennelly 1891 |
 
 k = 3χ/(3+χ) is the initial slope of a ball of susceptibility χ. ``curves.h`` has the functions. Kernels that call them
-from here, for float32 or float64, take ``native_options("material/curves.h", dtype=dtype)``.
+from here, for float32 or float64, take ``native_options("material/curves.h", dtype=dtype)``. Besides there is c = s,
+with no token: the response of a permanent magnet.
+
+**Measured curves.** A table says how M grows with the field H' inside the material. With y = k H'/Ms and c = M/Ms, a
+ball feels s = y + (k/3) c. c is cubic in y between two knots, t in [0, 1] from one to the next,
+
+    c = c_i + t (c1 + t (c2 + t c3)),    y = y_i + t span,
+
+and beyond the last it saturates as c = 1 − a/z does, z further by a constant than y, with the same slope at the knot
+(the law of approach to saturation, R. M. Bozorth, Ferromagnetism, 1951). k belongs to the largest susceptibility of the
+table, so that no slope c' exceeds 1: the iteration converges as for other curves. ``tables.h`` solves for t. Rows are
+
+| column | 0 | 1 | 2 | 3 to 5 | 6 | 7 |
+|---|---|---|---|---|---|---|
+| of a piece | s_i | c_i | span | c1, c2, c3 | ∫c dy from 0 to y_i | k/3 |
+| of the last knot | s_n | c_n | 0 | z_n, a, 0 | ∫c dy from 0 to y_n | k/3 |
+
+padded, for a search in as many steps for all, with rows that no field reaches; the number of rows stands before them.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-TANH, LANGEVIN, CLAMPED, FROHLICH = range(4)
-"""Numbers of the curves; as in ``curves.h``."""
+MIXED, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR, FIRST_TABLE = range(-1, 6)
+"""Numbers of the curves; as in ``curves.h`` and ``tables.h``."""
 CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED, "frohlich": FROHLICH}
+"""Numbers of those with a token."""
+_COLUMNS = 8
+_BEYOND = 1e30
+"""Reduced field and magnetization that none reaches."""
 
 
 @dataclass(frozen=True)
@@ -30,47 +52,89 @@ class CurveParameters:
     Attributes:
         inducible: 1 for inducible moments, 0 for permanent ones, shape [n].
         saturation: Saturation magnetization Ms [A/m], shape [n].
-        slope: Initial slope k = 3χ/(3+χ) [dimensionless], shape [n].
-        curve: Curve id, one of ``CURVE_IDS``, shape [n].
+        slope: Slope k = 3χ/(3+χ) [dimensionless], the largest of the curve, shape [n].
+        curve: Curve id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` and up for those of ``tables``, shape [n].
+        common_curve: The id that all inducible moments have in common, or ``MIXED``.
+        tables: Measured curves, as :func:`curve_tables` makes them.
     """
 
     inducible: wp.array
     saturation: wp.array
     slope: wp.array
     curve: wp.array
+    common_curve: int
+    tables: wp.array
+
+
+def curve_tables(measured, dtype, device) -> wp.array:
+    """Return the rows of measured curves for the kernels, shape [rows, 8].
+
+    Args:
+        measured: Curves as :class:`warpmag.curves.MagnetizationCurve` has them: knots ``fields`` and
+            ``magnetizations`` [A/m], ``slopes`` dM/dH at them, ``saturation`` [A/m] and the largest ``susceptibility``.
+        dtype: Warp scalar type.
+        device: Warp device.
+    """
+    longest = max((len(one.fields) for one in measured), default=1)
+    size = 1 << (longest - 1).bit_length()
+    rows = np.zeros((1 + size * len(measured), _COLUMNS))
+    rows[0] = size
+    rows[1:, :2] = _BEYOND
+    for number, one in enumerate(measured):
+        first = 1 + size * number
+        rows[first : first + len(one.fields)] = _rows(one)
+    return wp.array(rows, dtype=dtype, device=device)
+
+
+def _rows(measured) -> np.ndarray:
+    """Return the rows of one measured curve, shape [knots, 8]."""
+    k = 3.0 / (1.0 + 3.0 / measured.susceptibility)
+    y, c = (
+        k * np.asarray(measured.fields) / measured.saturation,
+        np.asarray(measured.magnetizations) / measured.saturation,
+    )
+    slope = np.asarray(measured.slopes) / k
+    span, rise = np.diff(y), np.diff(c)
+    begin, end = span * slope[:-1], span * slope[1:]
+    c1, c2, c3 = begin, 3.0 * rise - 2.0 * begin - end, begin + end - 2.0 * rise
+    area = np.concatenate([[0.0], np.cumsum(span * (c[:-1] + c1 / 2.0 + c2 / 3.0 + c3 / 4.0))])
+    left = 1.0 - c[-1]
+    z, a = (left / slope[-1], left**2 / slope[-1]) if left > 0.0 else (1.0, 0.0)
+    pieces = [np.append(span, 0.0), np.append(c1, z), np.append(c2, a), np.append(c3, 0.0)]
+    return np.stack([y + k / 3.0 * c, c, *pieces, area, np.full(len(y), k / 3.0)], axis=1)
 
 
 for _dtype in (wp.float32, wp.float64):
 
-    @wp.func_native("return warpmag::curve_ratio(s, curve);")
-    def curve_ratio(s: _dtype, curve: int) -> _dtype:
-        """c(s)/s, which is 1 at s = 0: the factor between a reduced field vector and its reduced magnetization."""
+    @wp.func_native("return warpmag::curve_ratio(s, curve, tables.data);")
+    def curve_ratio(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
+        """c(s)/s, which is c'(0) at s = 0: the factor between a reduced field vector and its reduced magnetization."""
         ...
 
-    @wp.func_native("return warpmag::curve_slope(s, curve);")
-    def curve_slope(s: _dtype, curve: int) -> _dtype:
+    @wp.func_native("return warpmag::curve_slope(s, curve, tables.data);")
+    def curve_slope(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """Derivative c'(s) for s ≥ 0."""
         ...
 
-    @wp.func_native("return warpmag::curve_area(double(s), curve);")
-    def curve_area(s: _dtype, curve: int) -> wp.float64:
+    @wp.func_native("return warpmag::curve_area(s, curve, tables.data);")
+    def curve_area(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> wp.float64:
         """Area ∫ c ds from 0 to ``s``."""
         ...
 
-    @wp.func_native("return warpmag::inverse_curve_ratio(c, curve);")
-    def inverse_curve_ratio(c: _dtype, curve: int) -> _dtype:
+    @wp.func_native("return warpmag::inverse_curve_ratio(c, curve, tables.data);")
+    def inverse_curve_ratio(c: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """s/c of the reduced field s that makes reduced magnetization ``c``; a saturated one gets a large finite s."""
         ...
 
 
 @wp.func
-def curve_derivative_times(h: Any, v: Any, k: Any, saturation: Any, curve: int):
+def curve_derivative_times(h: Any, v: Any, k: Any, saturation: Any, curve: int, tables: Any):
     """Product f'(H) v of the curve's derivative ∂M/∂H at field ``h`` [A/m] with a vector ``v``; Eq. 4 needs it."""
     norm = wp.length(h)
     s = k * norm / saturation
-    across = k * curve_ratio(s, curve)
+    across = k * curve_ratio(s, curve, tables)
     if norm == type(norm)(0.0):
         return across * v
     unit = h / norm
-    along = k * curve_slope(s, curve)
+    along = k * curve_slope(s, curve, tables)
     return across * v + ((along - across) * wp.dot(unit, v)) * unit

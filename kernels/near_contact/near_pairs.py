@@ -22,6 +22,7 @@ kept as slots, those whose surfaces nearly touch first. ``select.h`` and ``tabul
 | tables | [kinds² (gaps + 2), LINE] | spline coefficients of A to P by gap for each pair of kinds |
 | radius, unsaturated | [balls] | radii [m] and 1/(V Ms) [1/(A·m²)] |
 | curve_slope, hardness | [balls] | slopes k of the curve, and (2χ + 5)/2χ |
+| curve, curve_tables | [balls], [rows, 8] | ids of the curves, and measured ones (``material.curves``) |
 | places | [balls, LINE] | x, y, z, radius; how far a ball takes part, kind |
 | near, near_count, contact_count | [chunks, slots, CHUNK], [balls] | near balls, how many, and how many nearly touch |
 | used | [2, balls] | slots of both kinds that hold something |
@@ -113,13 +114,13 @@ def _constants() -> dict[str, int | float]:
 # those that sweeps read stand together, at the end of the integers and at the beginning of the reals
 _INTEGERS = (
     *("group", "field_row", "kind", "candidate", "candidate_count", "moved", "used", "counterpart"),
-    *("movable", "turned", "near", "near_count", "contact_count"),
+    *("movable", "turned", "near", "near_count", "contact_count", "curve"),
 )
-_SIZES = ("balls", "moment_stride", "kinds", "curve")
+_SIZES = ("balls", "moment_stride", "kinds", "common_curve")
 _REALS = (
     *("packed", "radius", "unsaturated", "curve_slope", "hardness", "relaxation", "pairs", "conductances", "state"),
     *("last_state", "sources", "drives", "field", "kept", "pair_slopes", "conductance_slopes", "pair_forces"),
-    *("partial", "found_at", "tables", "places", "forces", "torques"),
+    *("partial", "found_at", "tables", "places", "forces", "torques", "curve_tables"),
 )
 _MEMBERS = dict.fromkeys(_INTEGERS, wp.uint64) | dict.fromkeys(_SIZES, int) | dict.fromkeys(_REALS, wp.uint64)
 _DOC = "Where arrays begin, side by side, for a GPU to read together; and sizes. As in ``state.h``."
@@ -170,7 +171,7 @@ class NearContactBuffers:
 
 
 def allocate(
-    packed, worlds, eligible, susceptibility, saturation, curve, *, field, movable, turned, forces, torques
+    packed, worlds, eligible, susceptibility, material, *, field, movable, turned, forces, torques
 ) -> NearContactBuffers:
     """Allocate the buffers.
 
@@ -179,8 +180,7 @@ def allocate(
         worlds: World of each moment, shape [n].
         eligible: Whether a moment may take part, shape [n].
         susceptibility: Susceptibility of each, shape [n], may be infinite.
-        saturation: Saturation magnetization of each [A/m], shape [n].
-        curve: Their magnetization curve, of ``curves.CURVE_IDS``.
+        material: Their ``curves.CurveParameters``.
         field: Evaluation of the field at them (``evaluate.PairEvaluation``), whose last part of the sums is written.
         movable: Whether the force on a moment is wanted, shape [n].
         turned: Whether its torque is, shape [n].
@@ -201,8 +201,8 @@ def allocate(
     radii = packed.radii.numpy()
     reach = 2.0 * float(np.max(radii, initial=0.0, where=eligible))
     lists = neighbors.allocate(n, packed.packed, group, reach=reach, ratio=_RATIO, capacity=CANDIDATES)
-    kinds, material = _material_arrays(radii, eligible, susceptibility, saturation, padded)
-    arrays = _pair_arrays(balls, dtype, device) | material
+    kinds, described = _material_arrays(radii, eligible, susceptibility, material, padded)
+    arrays = _pair_arrays(balls, dtype, device) | described
     arrays |= {
         "packed": packed.packed,
         "group": group,
@@ -222,7 +222,7 @@ def allocate(
         dtype=dtype,
         lists=lists,
         arrays=arrays,
-        given=_addresses(arrays, balls=balls, moment_stride=stride, kinds=kinds, curve=curve),
+        given=_addresses(arrays, balls=balls, moment_stride=stride, kinds=kinds, common_curve=material.common_curve),
         reach=reach,
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
@@ -240,7 +240,7 @@ def _addresses(arrays: dict[str, wp.array], **sizes: int) -> Any:
     return given
 
 
-def _material_arrays(radii, eligible, susceptibility, saturation, padded) -> tuple[int, dict[str, wp.array]]:
+def _material_arrays(radii, eligible, susceptibility, material, padded) -> tuple[int, dict[str, wp.array]]:
     """The number of kinds of material, and the arrays that describe what balls are made of."""
     hardness = contact_table.hardness(susceptibility)
     levels = np.unique(hardness[eligible]) if np.any(eligible) else np.zeros(1)
@@ -248,12 +248,14 @@ def _material_arrays(radii, eligible, susceptibility, saturation, padded) -> tup
         levels = np.quantile(levels, np.linspace(0.0, 1.0, MOST_KINDS))
     tables = np.concatenate([contact_table.gap_table(float(own), float(other)) for own in levels for other in levels])
     slope = 3.0 / (1.0 + 3.0 / np.asarray(susceptibility, float))
-    saturated = 4.0 / 3.0 * np.pi * np.where(eligible, radii, 1.0).astype(float) ** 3 * saturation
+    saturated = 4.0 / 3.0 * np.pi * np.where(eligible, radii, 1.0).astype(float) ** 3 * material.saturation.numpy()
     arrays = {
         "kind": padded(np.abs(hardness[:, None] - levels[None]).argmin(1), 0),
         "radius": padded(radii, 1.0),
         "unsaturated": padded(1.0 / saturated, 1.0),
         "curve_slope": padded(slope, 1.0),
+        "curve": padded(material.curve.numpy(), 0),
+        "curve_tables": material.tables,
         "hardness": padded(2.5 / slope + 1.0 / 6.0, 1.0),
     }
     lines = np.pad(tables, ((0, 0), (0, LINE - contact_table.FUNCTIONS)))

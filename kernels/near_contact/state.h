@@ -2,6 +2,7 @@
 //
 // near_pairs.py has the meaning of all arrays, and passes the numbers of their rows and slots.
 #pragma once
+#include "material/curves.h"
 #include "near_contact/group_rows.h"
 #include "shared/team.h"
 #include "shared/vectors.h"
@@ -11,11 +12,11 @@ namespace warpmag {
 // As ``ContactArrays`` in near_pairs.py: pointers that sweeps read stand side by side, for a GPU to read together.
 struct Arrays {
     int *group, *field_row, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *turned, *near,
-        *near_count, *contact_count;
-    int balls, moment_stride, kinds, curve;
+        *near_count, *contact_count, *curve;
+    int balls, moment_stride, kinds, common_curve;
     Real *packed, *radius, *unsaturated, *curve_slope, *hardness, *relaxation, *pairs, *conductances, *state,
         *last_state, *sources, *drives, *field, *kept, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
-        *found_at, *tables, *places, *forces, *torques;
+        *found_at, *tables, *places, *forces, *torques, *curve_tables;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "ContactArrays has the same members in the same order");
@@ -33,6 +34,7 @@ struct Arrays {
         return slot_at(conductance_slopes, CONTACT_SLOTS, CONDUCTANCE_SLOPE_ROWS, s, i);
     }
     CUDA_CALLABLE Real* pair_force(int s, int i) const { return slot_at(pair_forces, CONTACT_SLOTS, 3, s, i); }
+    CUDA_CALLABLE Curves curves(int i) const { return curves_of(curve, common_curve, curve_tables, i, WIDTH); }
     // Components of the moments m, of their three rows.
     CUDA_CALLABLE const Real* moment(int component, int i) const {
         return packed + (size_t)(4 + component) * moment_stride + i;

@@ -19,7 +19,7 @@ struct Softness {
 CUDA_CALLABLE inline Softness softness_of(const Arrays& a, int i) {
     const Number slope = numbers(a.curve_slope + i), zero = slope * Real(0);
     const Vector reduced = scaled(numbers(a.unsaturated + i), a.own_moment(i));
-    const Number steepness = curve_steepness(dot(reduced, reduced), a.curve);
+    const Number steepness = curve_steepness(dot(reduced, reduced), a.curves(i));
     const Number softer = smaller(larger(slope * steepness, zero), zero + 3);
     const Number p = softer / (Real(2.5) + softer * Real(1.0 / 6.0));
     return {p, p * numbers(a.hardness + i)};

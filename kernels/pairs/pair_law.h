@@ -6,14 +6,6 @@
 
 namespace warpmag {
 
-#if !defined(__CUDA_ARCH__)
-// of scalars, as vectors.h has it of vectors
-inline bool any(bool mask) { return mask; }
-inline bool mask_of(bool condition) { return condition; }
-inline bool mask_of(int condition) { return condition; }
-inline Real larger(Real a, Real b) { return a > b ? a : b; }
-#endif
-
 // Radial factors g1, g2 d and g3 d³, of unit directions: they stay finite down to coincident centres.
 template <class N> struct Factors {
     N g1, g2, g3;

@@ -38,6 +38,7 @@ def _zeeman_kernel(dtype):
         saturation: wp.array[dtype],
         slope: wp.array[dtype],
         curve: wp.array[int],
+        tables: wp.array2d[dtype],
         # outputs:
         effective_out: wp.array2d[dtype],
     ):
@@ -46,7 +47,7 @@ def _zeeman_kernel(dtype):
         e = m
         if inducible[i] == 1:
             v = dtype(2.0) * m + ball_volume(packed[3, i]) * h[i]
-            e += curve_derivative_times(h[i], v, slope[i], saturation[i], curve[i])
+            e += curve_derivative_times(h[i], v, slope[i], saturation[i], curve[i], tables)
         for c in range(3):
             effective_out[c, i] = e[c]
 
@@ -65,7 +66,10 @@ def launch_zeeman_moments(moments, h, material: CurveParameters, effective):
     wp.launch(
         _zeeman_kernel(effective.dtype),
         dim=moments.count,
-        inputs=[moments.packed, h, material.inducible, material.saturation, material.slope, material.curve],
+        inputs=[
+            *(moments.packed, h, material.inducible),
+            *(material.saturation, material.slope, material.curve, material.tables),
+        ],
         outputs=[effective],
         device=effective.device,
     )

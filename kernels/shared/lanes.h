@@ -105,6 +105,13 @@ template <class Places> inline Number collect(const Real* row, Places j) {
     return n;
 #endif
 }
+// of scalars, as of vectors
+inline bool any(bool mask) { return mask; }
+inline bool mask_of(bool condition) { return condition; }
+inline bool mask_of(int condition) { return condition; }
+inline Real larger(Real a, Real b) { return a > b ? a : b; }
+inline Real root(Real x) { return wp::sqrt(x); }
+
 template <class Lanes> inline auto lane_of(Lanes x, int l) { return x[l]; }
 
 template <class T, T... L> struct Sequence {};

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warpmag import materials
+from warpmag.curves import MagnetizationCurve
 from warpmag.errors import InputError
 from warpmag.magnets import CURVES, KINDS, SATURATION_OF_IRON, Magnet, check_finite, check_whole, shown
 
@@ -67,7 +68,7 @@ def add_inducible(
     material: str | None = None,
     saturation: float | None = None,
     susceptibility: float | None = None,
-    curve: str = "tanh",
+    curve: str | MagnetizationCurve | None = None,
     moment_spacing: float = 0.0,
 ) -> None:
     """Make a body, or one shape, a magnet that the field magnetizes: iron, steel, ferrite.
@@ -76,10 +77,13 @@ def add_inducible(
         builder: The builder, with :func:`register_attributes` called on it.
         body: The body; all its colliding shapes, which must exist already, become one magnet.
         shape: Instead of all shapes of the body only this one; the way to make a static shape a magnet.
-        material: Name of an inducible material of :mod:`warpmag.materials`, in place of the next two.
+        material: Name of an inducible material of :mod:`warpmag.materials`, in place of the next two, and of the curve
+            where the material has a measured one.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
-        curve: Magnetization curve, one of ``magnets.CURVES``.
+        curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured one, a
+            :class:`warpmag.MagnetizationCurve` or the name of a material that has one, in place of saturation and
+            susceptibility.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
 
     Raises:
@@ -87,12 +91,8 @@ def add_inducible(
             of range.
     """
     given = {"saturation": saturation, "susceptibility": susceptibility}
-    values = {name: value for name, value in given.items() if value is not None}
-    if material is not None:
-        if values:
-            raise InputError(f"material: {shown(material)} says what {' and '.join(values)} are, give one or the other")
-        values = materials.inducible("material", material)
-    magnet = Magnet("inducible", **values, curve=curve, moment_spacing=moment_spacing)
+    values = materials.inducible_from(material, curve, {k: v for k, v in given.items() if v is not None})
+    magnet = Magnet("inducible", **values, moment_spacing=moment_spacing)
     for index in magnet_shapes(builder, body, shape):
         mark_shape(builder, index, magnet)
 
@@ -175,12 +175,29 @@ def mark_shape(builder: newton.ModelBuilder, shape: int, magnet: Magnet) -> None
         "kind": 1 + KINDS.index(magnet.kind),
         "saturation": float(magnet.saturation),
         "susceptibility": float(magnet.susceptibility),
-        "curve": CURVES.index(magnet.curve),
+        "curve": _curve_number(magnet.curve),
         "magnetization": wp.vec3(*(float(x) for x in magnet.magnetization)),
         "moment_spacing": float(magnet.moment_spacing),
     }
     for name, value in values.items():
         builder.custom_attributes[f"{NAMESPACE}:{name}"].values[shape] = value
+
+
+_MEASURED: list[MagnetizationCurve] = []
+"""Measured curves of shapes: a model has the place in this list, after those with a token."""
+
+
+def _curve_number(curve: str | MagnetizationCurve) -> int:
+    """Number that stands for a curve in the attributes of a model."""
+    if not isinstance(curve, MagnetizationCurve):
+        return CURVES.index(curve)
+    if curve not in _MEASURED:
+        _MEASURED.append(curve)
+    return len(CURVES) + _MEASURED.index(curve)
+
+
+def _curve_of(number: int) -> str | MagnetizationCurve:
+    return CURVES[number] if number < len(CURVES) else _MEASURED[number - len(CURVES)]
 
 
 def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
@@ -200,7 +217,7 @@ def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
             kind=KINDS[kinds[shape] - 1],
             saturation=float(columns["saturation"][shape]),
             susceptibility=float(columns["susceptibility"][shape]),
-            curve=CURVES[columns["curve"][shape]],
+            curve=_curve_of(columns["curve"][shape]),
             magnetization=tuple(columns["magnetization"][shape].tolist()),
             moment_spacing=float(columns["moment_spacing"][shape]),
         )

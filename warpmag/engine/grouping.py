@@ -31,14 +31,6 @@ class BodyMagnet:
     lattice: BodyLattice
 
 
-def only_curve(magnets: list[Magnet]) -> str:
-    """Return the magnetization curve of all inducible magnets, which must be the same one."""
-    curves = {one.curve for one in magnets if one.kind == "inducible"}
-    if len(curves) > 1:
-        raise InputError(f"model: its magnets have the curves {', '.join(sorted(curves))}; give all the same")
-    return curves.pop() if curves else "tanh"
-
-
 def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
     """Group the marked shapes of ``model`` into magnets and sample them, in the order that the system wants.
 

@@ -4,9 +4,11 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag import materials
 from warpmag.arrays import Kind, farthest_place, host_array
+from warpmag.curves import MagnetizationCurve
 from warpmag.engine.attributes import NAMESPACE
-from warpmag.engine.grouping import find_magnets, only_curve
+from warpmag.engine.grouping import find_magnets
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
@@ -17,7 +19,7 @@ from warpmag.kernels.rigid.bodies import (
     set_magnetization,
     sum_moments,
 )
-from warpmag.magnets import CURVES, MagneticSettings, check_token
+from warpmag.magnets import MagneticSettings
 from warpmag.probe import FieldProbe
 from warpmag.system import MomentSystem
 
@@ -51,7 +53,7 @@ class Magnetics:
         rtol: float = 1e-3,
         external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
         max_evaluations: int = 1000,
-        curve: str | None = None,
+        curve: str | MagnetizationCurve | None = None,
     ):
         """Sample the magnets of ``model`` and allocate everything that :meth:`apply` needs.
 
@@ -65,7 +67,7 @@ class Magnetics:
             rtol: Relative magnetization error at which induction ends.
             external_field: Uniform applied field H0 [A/m], world frame.
             max_evaluations: Field evaluations after which induction gives up.
-            curve: Magnetization curve of all magnets; by default their own.
+            curve: Magnetization curve of all magnets, as :func:`warpmag.add_inducible` takes it; by default their own.
 
         Raises:
             InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would be
@@ -74,13 +76,13 @@ class Magnetics:
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         settings.check("Magnetics")
         if curve is not None:
-            check_token("Magnetics: curve", curve, CURVES)
+            curve = materials.measured("Magnetics: curve", curve)
         self.magnets, self._worlds = find_magnets(model)
         self._model = model
         self.system = self._make_system(settings, max_evaluations, curve)
         self._map_bodies()
 
-    def _make_system(self, settings: MagneticSettings, max_evaluations: int, curve: str | None) -> MomentSystem:
+    def _make_system(self, settings: MagneticSettings, max_evaluations: int, curve) -> MomentSystem:
         counts = [len(one.lattice.volumes) for one in self.magnets]
 
         def spread(values, dtype=float):
@@ -103,7 +105,9 @@ class Magnetics:
             movable=spread([one.body >= 0 and not kinematic[one.body] for one in self.magnets], bool),
             saturation=spread([one.saturation for one in magnets]),
             susceptibility=spread([one.susceptibility for one in magnets]),
-            curve=only_curve(magnets) if curve is None else curve,
+            curve=[one.curve for one, count in zip(magnets, counts, strict=True) for _ in range(count)]
+            if curve is None
+            else curve,
             external_field=settings.external_field,
             force=settings.force,
             dynamics=settings.dynamics,

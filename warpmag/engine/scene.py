@@ -17,6 +17,7 @@ from warpmag.usd import (
     StageClock,
     StageContents,
     enabled_joints,
+    give_densities,
     inspect,
     open_stage,
     prepare_joints,
@@ -58,7 +59,6 @@ def import_scene(
     visuals: bool = False,
     time_code: float | None = None,
     articulations: bool = False,
-    curve: str | None = None,
 ) -> ImportedScene:
     """Read a stage and everything magnetic on it.
 
@@ -67,18 +67,18 @@ def import_scene(
         visuals: Also import what is only seen, for a viewer.
         time_code: The moment at which bodies stand; by default the start of the stage.
         articulations: Whether joints are wanted in trees, as solvers of generalized coordinates take them.
-        curve: Magnetization curve in the place of the magnets' own.
 
     Raises:
         InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
     """
     stage = open_stage(path, time_code)
-    report = inspect(stage, path, curve=curve)
+    report = inspect(stage, path)
     if report.refusals:
         raise InputError(str(report.refusals[0]))
     clock, contents = report.clock, report.contents
     assert clock is not None, "a clock that is wrong is a reason to refuse"
     strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)
+    give_densities(stage, contents.magnets)
     builder = newton.ModelBuilder()
     register_attributes(builder)
     found = _add_stage(builder, stage, path, visuals)

@@ -89,9 +89,7 @@ class Simulation:
         for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
         self.device = resolve_device(device)
-        builder, settings, own_step = self._open(
-            scene, visuals=visuals, articulations=solver not in MAXIMAL, curve=curve
-        )
+        builder, settings, own_step = self._open(scene, visuals=visuals, articulations=solver not in MAXIMAL)
         self.step_size = _time_step(step, own_step)
         self.model = self._finalize(builder, solver, scene)
         settings = settings.replaced(

@@ -8,6 +8,7 @@ attributes right even then).
 from warpmag.usd.schemas import author_magnet, author_settings  # isort: skip  (registers the schemas first)
 from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
+from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
 from warpmag.usd.paths import usable_path
@@ -37,6 +38,7 @@ __all__ = [
     "describe",
     "enabled_joints",
     "first_camera",
+    "give_densities",
     "hold",
     "inspect",
     "open_stage",

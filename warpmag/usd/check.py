@@ -1,7 +1,6 @@
 """What a stage holds and what is wrong with it, for ``warpmag check``."""
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdValidation
@@ -64,25 +63,20 @@ def check(path: str | os.PathLike) -> StageReport:
     return inspect(open_stage(path), path)
 
 
-def inspect(stage: Usd.Stage, path: str | os.PathLike, *, curve: str | None = None) -> StageReport:
+def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
     """Do what :func:`check` does with an open stage.
 
     Args:
         stage: As :func:`open_stage` opened it.
         path: File of the stage.
-        curve: Magnetization curve in the place of the magnets' own.
     """
     with readable(str(path)):
-        return _report(stage, path, curve)
+        return _report(stage, path)
 
 
-def _report(stage: Usd.Stage, path: str | os.PathLike, curve: str | None) -> StageReport:
+def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
     contents = survey(stage)
-    findings = [
-        *contents.findings,
-        *joint_findings(stage, contents.motions),
-        *([] if curve else _curve_findings(contents)),
-    ]
+    findings = [*contents.findings, *joint_findings(stage, contents.motions)]
     try:
         clock = stage_clock(stage)
     except InputError as error:
@@ -101,15 +95,6 @@ def _report(stage: Usd.Stage, path: str | os.PathLike, curve: str | None) -> Sta
         findings=tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")),
         refusals=refusals,
     )
-
-
-def _curve_findings(contents: StageContents) -> Iterator[Finding]:
-    """Yield which magnet has another magnetization curve than the first one."""
-    curves = {path: magnet.curve for path, magnet in contents.magnets.items() if magnet.kind == "inducible"}
-    for path, curve in curves.items():
-        first = next(iter(curves))
-        if curve != curves[first]:
-            yield Finding(path, f"warpmag:curve is {curve}, but {curves[first]} on {first}: magnets have the same one")
 
 
 @quiet()

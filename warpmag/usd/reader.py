@@ -313,7 +313,7 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
         contents.findings.append(
             Finding(path, f"{MAGNET_API} on a prim that is neither an enabled rigid body nor an enabled collider")
         )
-    elif not any(is_collider(one) and is_solid(one) for one in _prims_of_magnet(prim)):
+    elif not any(is_collider(one) and is_solid(one) for one in prims_of_magnet(prim)):
         contents.findings.append(Finding(path, "a magnet without colliders that are solid: no shape to magnetize"))
     elif not body and (owner := _body_above(prim)) and has_api(owner, MAGNET_API):
         contents.findings.append(Finding(path, f"its rigid body {owner.GetPath()} is a magnet already"))
@@ -328,7 +328,7 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
     faulty = {finding.where for finding in contents.findings if finding.severity == "error"}
     sound = [
         one
-        for one in _prims_of_magnet(prim)
+        for one in prims_of_magnet(prim)
         if is_collider(one) and is_solid(one) and str(one.GetPath()) not in faulty and transforms.is_sound(one)
     ]
     contents.findings += [finding for one in sound for finding in magnet_findings(one)]
@@ -336,7 +336,8 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
         contents.findings += spacing_findings(prim, sound, contents.magnets[path].moment_spacing)
 
 
-def _prims_of_magnet(prim) -> Iterator[Usd.Prim]:
+def prims_of_magnet(prim) -> Iterator[Usd.Prim]:
+    """Yield the prims that a magnet on ``prim`` may cover: all that move with a body, or a collider alone."""
     return _prims_of_body(prim) if is_body(prim) else iter((prim,))
 
 

@@ -11,9 +11,10 @@ import newton_usd_schemas  # noqa: F401  (registers Newton's own schemas, which 
 from pxr import Gf, Plug, Sdf, Usd
 
 from warpmag import materials
+from warpmag.curves import MagnetizationCurve
 from warpmag.errors import InputError
 from warpmag.keyed import Keys
-from warpmag.magnets import CURVES, Magnet, MagneticSettings, check_finite, check_material, check_token
+from warpmag.magnets import Magnet, MagneticSettings, check_curve, check_finite, check_material
 from warpmag.usd.keyed import KeyReader
 from warpmag.usd.values import instance_finding, number, text, vector
 
@@ -23,6 +24,8 @@ MAGNET_API = "WarpmagMagnetAPI"
 SCENE_API = "WarpmagSceneAPI"
 MOMENT = "warpmag:moment"
 MATERIAL = "warpmag:material"
+CURVE_POINTS = "warpmag:curve:h", "warpmag:curve:b"
+"""Points of a measured curve: H [A/m] inside the material, and B [T]."""
 
 _TYPES = {str: Sdf.ValueTypeNames.Token, float: Sdf.ValueTypeNames.Float, tuple: Sdf.ValueTypeNames.Vector3f}
 
@@ -36,6 +39,8 @@ _MAGNET_ATTRIBUTES = {
     "magnetization": "warpmag:magnetization",
     "moment_spacing": "warpmag:momentSpacing",
 }
+_OF_CURVE = ("saturation", "susceptibility", "curve")
+"""What a measured curve says."""
 _SETTINGS_ATTRIBUTES = {
     "external_field": "warpmag:externalField",
     "force": "warpmag:force",
@@ -48,7 +53,12 @@ _SETTINGS_ATTRIBUTES = {
 def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
     """Make ``prim`` a magnet, with every attribute authored (Newton sees authored values only, no fallbacks)."""
     magnet.check(str(prim.GetPath()))
-    _author(prim, MAGNET_API, _MAGNET_ATTRIBUTES, magnet)
+    if isinstance(magnet.curve, MagnetizationCurve):
+        said = {name: _MAGNET_ATTRIBUTES[name] for name in _MAGNET_ATTRIBUTES if name not in _OF_CURVE}
+        _author(prim, MAGNET_API, said, magnet)
+        _author_curve(prim, magnet.curve)
+    else:
+        _author(prim, MAGNET_API, _MAGNET_ATTRIBUTES, magnet)
 
 
 def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
@@ -59,13 +69,13 @@ def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
 
 def magnet_of(prim: Usd.Prim) -> Magnet:
     """Read and check the magnet that ``prim`` carries; raises :class:`InputError` naming the prim."""
-    magnet = _read(prim, _MAGNET_ATTRIBUTES, Magnet())
+    magnet = _with_curve(prim, _read(prim, _MAGNET_ATTRIBUTES, Magnet()))
     material = prim.GetAttribute(MATERIAL).Get()
     if material is not None and text(f"{prim.GetPath()}: {MATERIAL}", material):
         magnet = dataclasses.replace(magnet, **_of_material(prim, material, magnet))
     path = str(prim.GetPath())
     magnet.check(path)
-    check_token(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve, CURVES)  # what its kind has no use for, too
+    check_curve(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve)  # what its kind has no use for, too
     check_finite(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
     for field, infinite in (("saturation", False), ("susceptibility", True)):
         check_material(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
@@ -89,10 +99,42 @@ def _of_material(prim: Usd.Prim, material: str, magnet: Magnet) -> dict:
     if magnet.kind == "permanent":
         return {"magnetization": materials.permanent(owner, material, magnet.magnetization)}
     values = materials.inducible(owner, material)
-    for field in values:
+    if isinstance(magnet.curve, MagnetizationCurve):
+        raise InputError(f"{owner}: {material} says what the magnet is made of, and a measured curve does, author one")
+    for field in _OF_CURVE if _OF_CURVE[2] in values else values:
         if prim.GetAttribute(_MAGNET_ATTRIBUTES[field]).HasAuthoredValue():
             raise InputError(f"{owner}: {material} says what {_MAGNET_ATTRIBUTES[field]} is, author one or the other")
     return values
+
+
+def _with_curve(prim: Usd.Prim, magnet: Magnet) -> Magnet:
+    """Return a magnet with the measured curve that the prim has by name or by points, which says Ms and χ, too."""
+    name, points = _MAGNET_ATTRIBUTES["curve"], [prim.GetAttribute(one).Get() for one in CURVE_POINTS]
+    if any(points):
+        given = prim.GetAttribute(name)
+        if given and given.HasAuthoredValue():
+            raise InputError(f"{prim.GetPath()}: {name}: there are points of a curve, too, author one or the other")
+        owner = f"{prim.GetPath()}: {' and '.join(CURVE_POINTS)}"
+        curve = MagnetizationCurve.from_bh(*(one or () for one in points), name=owner)
+    else:
+        curve = materials.measured(f"{prim.GetPath()}: curve", magnet.curve)
+    if isinstance(curve, MagnetizationCurve):
+        for one in _OF_CURVE[:2]:
+            if prim.GetAttribute(_MAGNET_ATTRIBUTES[one]).HasAuthoredValue():
+                raise InputError(f"{prim.GetPath()}: {_MAGNET_ATTRIBUTES[one]}: a measured curve says it, author one")
+    return dataclasses.replace(magnet, curve=curve)
+
+
+def _author_curve(prim: Usd.Prim, curve: MagnetizationCurve) -> None:
+    """Write a measured curve, by its name where a material has it."""
+    if name := materials.name_of_curve(curve):
+        attribute = prim.CreateAttribute(
+            _MAGNET_ATTRIBUTES["curve"], Sdf.ValueTypeNames.Token, custom=False, variability=Sdf.VariabilityUniform
+        )
+        attribute.Set(name)
+        return
+    for one, values in zip(CURVE_POINTS, (curve.fields, curve.flux_densities), strict=True):
+        prim.CreateAttribute(one, Sdf.ValueTypeNames.DoubleArray, custom=False).Set(values)
 
 
 def settings_of(prim: Usd.Prim) -> MagneticSettings:

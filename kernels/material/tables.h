@@ -1,0 +1,131 @@
+// Measured magnetization curves: tables of cubic pieces and what is beyond; curves.py has their rows and equations.
+//
+// The functions are templates of the number type, as those of curves.h, and of that of the curves' ids.
+#pragma once
+#include "shared/lanes.h"
+
+namespace warpmag {
+
+constexpr int FIRST_TABLE = 5; // id of the first table's curve; as in curves.py
+// Numbers of a row, as in curves.py. The last row of a curve has no span; its KNOT_C1 and KNOT_C2 are z and a.
+enum TableColumn { KNOT_S, KNOT_C, KNOT_SPAN, KNOT_C1, KNOT_C2, KNOT_C3, KNOT_AREA, KNOT_SHEAR, TABLE_COLUMNS };
+
+#if defined(__CUDA_ARCH__)
+// as a call it leaves registers to curves that have a formula
+#define WARPMAG_CALLED __device__ __noinline__
+#else
+#define WARPMAG_CALLED __attribute__((noinline))
+inline Index rows_where(Mask mask, int rows) { return -rows * __builtin_convertvector(mask, Index); }
+inline Number table_entry(const Real* tables, Index row, int column) {
+    return collect(tables, Index((int)TABLE_COLUMNS) * row + Index(column));
+}
+#endif
+CUDA_CALLABLE inline int rows_where(bool mask, int rows) { return mask ? rows : 0; }
+CUDA_CALLABLE inline Real table_entry(const Real* tables, int row, int column) {
+    return tables[TABLE_COLUMNS * row + column];
+}
+
+// Where in [0, 1] the cubic t (a + t (b + t c)), which rises there, has a value, by Newton between bounds.
+template <class N> CUDA_CALLABLE inline N place_on_cubic(N value, N a, N b, N c) {
+    constexpr Real small = sizeof(Real) == 4 ? 1e-5 : 1e-9; // a step after which Newton has all digits
+    const N zero = value * 0, one = zero + 1, whole = a + b + c;
+    N low = zero, high = one, t = value < whole ? value / whole : one;
+    t = t > zero ? t : zero;
+    for (int step = 0; step < 60; ++step) {
+        const N excess = t * (a + t * (b + t * c)) - value, slope = a + t * (2 * b + 3 * t * c);
+        high = excess > zero ? t : high;
+        low = excess > zero ? low : t;
+        N next = t - excess / slope;
+        next = next >= low ? next : Real(0.5) * (low + high);
+        next = next <= high ? next : Real(0.5) * (low + high);
+        const N change = next > t ? next - t : t - next;
+        t = next;
+        if (!any(change > small * t)) break;
+    }
+    return t;
+}
+
+// One row of a table: c over the reduced internal field y from a knot on, which s = y + shear c follows.
+template <class N> struct Piece {
+    N s, c, span, c1, c2, c3, area, shear;
+
+    // Place t from this knot to the next of a reduced field, of a reduced magnetization.
+    CUDA_CALLABLE N at_field(N field) const {
+        return place_on_cubic(field - s, span + shear * c1, shear * c2, shear * c3);
+    }
+    CUDA_CALLABLE N at_magnetization(N reduced) const { return place_on_cubic(reduced - c, c1, c2, c3); }
+    // (c(t) − c(0))/t and dc/dt
+    CUDA_CALLABLE N rise(N t) const { return c1 + t * (c2 + t * c3); }
+    CUDA_CALLABLE N slope(N t) const { return c1 + t * (2 * c2 + 3 * t * c3); }
+    // Beyond the last knot z, y further by a constant, of a reduced field: c = 1 − a/z.
+    CUDA_CALLABLE N beyond(N field) const {
+        const N z = c1, a = shear * c2, w = field - s + z - a / z, size = root(w * w + 4 * a);
+        return w > s * 0 ? Real(0.5) * (w + size) : 2 * a / (size - w);
+    }
+};
+
+// The row in which a curve has a value of a column that grows.
+template <class N, class I> CUDA_CALLABLE inline Piece<N> piece_of(const Real* tables, I curve, N value, int column) {
+    const int rows = (int)tables[0]; // of each curve, a power of two, after a row that says so
+    I row = 1 + rows * (curve - FIRST_TABLE);
+    for (int step = rows / 2; step > 0; step /= 2)
+        row += rows_where(value >= table_entry(tables, row + step, column), step);
+    Piece<N> piece;
+    N* const numbers[TABLE_COLUMNS] = {&piece.s,  &piece.c,  &piece.span, &piece.c1,
+                                       &piece.c2, &piece.c3, &piece.area, &piece.shear};
+#pragma unroll
+    for (int k = 0; k < TABLE_COLUMNS; ++k) *numbers[k] = table_entry(tables, row, k);
+    return piece;
+}
+
+// c(s)/s.
+template <class N, class I> WARPMAG_CALLED inline N table_ratio(N s, I curve, const Real* tables) {
+    const Piece<N> piece = piece_of(tables, curve, s, KNOT_S);
+    const N zero = s * 0, t = piece.at_field(s), rise = piece.rise(t);
+    const N inside = piece.s > zero ? (piece.c + t * rise) / s : rise / (piece.span + piece.shear * rise);
+    return piece.span > zero ? inside : (1 - piece.c2 / piece.beyond(s)) / s;
+}
+
+// c'(s) of a piece in which c grows by ``rise`` where y grows by ``span``.
+template <class N> CUDA_CALLABLE inline N sheared_slope(const Piece<N>& piece, N rise, N span) {
+    return rise / (span + piece.shear * rise);
+}
+
+// c'(s).
+template <class N, class I> WARPMAG_CALLED inline N table_slope(N s, I curve, const Real* tables) {
+    const Piece<N> piece = piece_of(tables, curve, s, KNOT_S);
+    const N one = s * 0 + 1, z = piece.beyond(s);
+    const N inside = sheared_slope(piece, piece.slope(piece.at_field(s)), piece.span);
+    return piece.span > s * 0 ? inside : sheared_slope(piece, piece.c2 / (z * z), one);
+}
+
+// c'(s) where c(s) is ``reduced``.
+template <class N, class I> WARPMAG_CALLED inline N table_steepness(N reduced, I curve, const Real* tables) {
+    const N zero = reduced * 0, one = zero + 1, left = reduced < one ? 1 - reduced : zero;
+    const Piece<N> piece = piece_of(tables, curve, reduced, KNOT_C);
+    const N inside = sheared_slope(piece, piece.slope(piece.at_magnetization(reduced)), piece.span);
+    const N beyond = piece.c2 > zero ? left * left / piece.c2 : zero;
+    return piece.span > zero ? inside : sheared_slope(piece, beyond, one);
+}
+
+// s/c of the reduced field s that makes reduced magnetization c < 1.
+CUDA_CALLABLE inline Real inverse_table_ratio(Real c, int curve, const Real* tables) {
+    const Piece<Real> piece = piece_of(tables, curve, c, KNOT_C);
+    if (piece.span == 0) return (piece.s - piece.c1 + piece.c2 / (1 - c) + piece.shear * (c - piece.c)) / c;
+    const Real t = piece.at_magnetization(c);
+    if (piece.c == 0) return piece.span / piece.rise(t) + piece.shear;
+    return (piece.s + piece.span * t + piece.shear * (c - piece.c)) / c;
+}
+
+// Area under c from 0 to s: that over the internal field, and what the shear adds.
+CUDA_CALLABLE inline double table_area(Real s, int curve, const Real* tables) {
+    const Piece<Real> piece = piece_of(tables, curve, s, KNOT_S);
+    if (piece.span == 0) {
+        const double z = piece.beyond(s), a = piece.c2, c = 1 - a / z, first = piece.c1;
+        return piece.area + (z - first) - a * wp::log(z / first) + 0.5 * piece.shear * c * c;
+    }
+    const double t = piece.at_field(s), c = piece.c + t * (piece.c1 + t * (piece.c2 + t * piece.c3));
+    const double mean = piece.c + t * (piece.c1 / 2 + t * (piece.c2 / 3 + t * piece.c3 / 4));
+    return piece.area + piece.span * t * mean + 0.5 * piece.shear * c * c;
+}
+}
