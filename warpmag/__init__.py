@@ -20,6 +20,7 @@ _HOMES = {
     "register_attributes": "warpmag.engine.attributes",
     "add_inducible": "warpmag.engine.attributes",
     "add_permanent": "warpmag.engine.attributes",
+    "add_coil": "warpmag.engine.applied",
     "Magnetics": "warpmag.engine.magnetics",
     "SensorMagnetometer": "warpmag.engine.magnetometer",
     "Simulation": "warpmag.engine.simulation",
