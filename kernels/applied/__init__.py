@@ -10,7 +10,9 @@ from the same fields, so that forces are opposite and equal.
 | sources | the sources on a device, their field at targets, forces and reactions |
 | `sources.h` | the table of kinds, frames, sums over the sources of a world |
 | `field_at.h` | a field with its gradient, in double precision; what a wire is made of |
-| `loop.h` | a circular loop |
+| `loop.h`, `solenoid.h` | a circular loop, a sheet of current around a cylinder |
+| `polyline.h` | a chain of straight pieces of wire |
+| `field_map.h` | a field on a regular grid |
 
 A kind is a header with one function of a source and a place in its frame, a line in ``sources.h``, and its name in
 ``sources.SourceKind``.

@@ -7,6 +7,8 @@ namespace warpmag {
 
 typedef Vec3<double> Point;
 
+constexpr double INVERSE_PI = 0.3183098861837907;
+
 // H [A/m] and its derivatives along x, y and z [A/m²]. The gradient need not be symmetric: within a conductor, and
 // between the nodes of a table, a field has a curl.
 struct FieldAt {
@@ -18,6 +20,8 @@ struct FieldAt {
 CUDA_CALLABLE inline FieldAt operator+(const FieldAt& a, const FieldAt& b) {
     return {a.h + b.h, a.dx + b.dx, a.dy + b.dy, a.dz + b.dz};
 }
+
+CUDA_CALLABLE inline FieldAt scaled(double k, const FieldAt& f) { return {k * f.h, k * f.dx, k * f.dy, k * f.dz}; }
 
 CUDA_CALLABLE inline Point cross(const Point& a, const Point& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
@@ -44,22 +48,21 @@ CUDA_CALLABLE inline FieldAt round_field(Point x, double e, double hz, double rh
 }
 
 // A wire of radius w carries its current evenly: nearer to its axis than that, the field falls to zero in proportion to
-// the distance. Where it is evaluated instead is w away from the axis, in the direction n. ``tangent`` is the axis's,
+// the distance d. Where it is evaluated instead is w away from the axis, in the direction n. ``tangent`` is the axis's,
 // zero about the end of a straight piece; to move along the axis by some length there moves by ``stretch`` times that.
 struct InWire {
     Point n, tangent;
     double distance, radius, stretch;
 
+    // d times how the place moves where the field is evaluated.
     CUDA_CALLABLE Point moved(Point v) const {
-        const double out = dot(n, v), on = dot(tangent, v), turned = radius / distance;
-        return turned * (v - out * n - on * tangent) + (stretch * on) * tangent;
+        const double out = dot(n, v), on = dot(tangent, v);
+        return radius * (v - out * n - on * tangent) + (distance * stretch * on) * tangent;
     }
     CUDA_CALLABLE FieldAt inner(const FieldAt& at_surface) const {
-        const double part = distance / radius, slope = 1 / radius;
-        auto derivative = [&](Point v) {
-            return part * at_surface.along(moved(v)) + (slope * dot(n, v)) * at_surface.h;
-        };
-        return {part * at_surface.h, derivative({1, 0, 0}), derivative({0, 1, 0}), derivative({0, 0, 1})};
+        const double slope = 1 / radius;
+        auto derivative = [&](Point v) { return slope * (at_surface.along(moved(v)) + dot(n, v) * at_surface.h); };
+        return {(slope * distance) * at_surface.h, derivative({1, 0, 0}), derivative({0, 1, 0}), derivative({0, 0, 1})};
     }
 };
 }

@@ -2,19 +2,27 @@
 //
 // ``Arrays`` is the struct of sources.py. On a GPU a thread has one target, on a CPU threads share them out.
 #pragma once
-#include "applied/field_at.h"
+#include "applied/field_map.h"
 #include "applied/loop.h"
+#include "applied/polyline.h"
+#include "applied/solenoid.h"
 #include "shared/team.h"
 
 namespace warpmag {
 
 // As in sources.SourceKind.
-enum SourceKind { LOOP };
+enum SourceKind { LOOP, SOLENOID, POLYLINE, FIELD_MAP };
 
 CUDA_CALLABLE inline FieldAt field_of(const AppliedSource& source, Point x) {
     switch (source.kind) {
     case LOOP:
         return loop_field(source, x);
+    case SOLENOID:
+        return solenoid_field(source, x);
+    case POLYLINE:
+        return polyline_field(source, x);
+    case FIELD_MAP:
+        return map_field(source, x);
     }
     return {};
 }

@@ -24,7 +24,7 @@ from warpmag.kernels.shared.passes import passes_kernel
 from warpmag.kernels.shared.reductions import group_sum
 from warpmag.kernels.shared.team import team, threads_for
 
-PARAMETERS = 8
+PARAMETERS = 9
 """Numbers that a kind may have beside its table."""
 _FIELDS_PER_THREAD = 500
 """Fields of a source at a target that make another thread of a CPU worth waking."""
@@ -37,6 +37,9 @@ class SourceKind(IntEnum):
     """What a source is; the values are those of ``sources.h``, the headers say what its numbers mean."""
 
     LOOP = 0
+    SOLENOID = 1
+    POLYLINE = 2
+    FIELD_MAP = 3
 
 
 class AppliedSource(NamedTuple):
