@@ -11,7 +11,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.coils import Coil, SourceRecord, check_current
+from warpmag.arrays import host_array
+from warpmag.coils import FARTHEST_POINT, Coil, FieldMap, SourceRecord, check_strength, checked_vectors
 from warpmag.engine.attributes import NAMESPACE, check_body, check_registered
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
@@ -28,6 +29,9 @@ def add_coil(
     *,
     shape: str = "loop",
     radius: float = 0.0,
+    length: float = 0.0,
+    points=(),
+    closed: bool = True,
     wire_radius: float = 0.0,
     ampere_turns: float = 0.0,
     xform=None,
@@ -35,16 +39,22 @@ def add_coil(
 ) -> int:
     """Add a coil to a body, which feels what the coil does to magnets, or to the world.
 
-    Its axis is the z axis of its frame; a positive current makes a field along z inside.
+    Loops and solenoids are about the z axis of their frame, and a positive current makes a field along z inside. Closer
+    to the axis of a wire than its radius the field falls to zero; elsewhere it is exact, of loops (elliptic integrals),
+    of sheets of current (Derby and Olbert 2010) and of thin straight pieces.
 
     Args:
         builder: The builder, with :func:`warpmag.register_attributes` called on it.
         body: The body; -1 for a coil fixed in the world.
-        shape: ``loop``.
-        radius: Radius of the loop [m].
-        wire_radius: Radius of the wire [m], at most half of the loop's, inside of which the field falls to zero; 0
-            means a hundredth of the loop's.
-        ampere_turns: Current times turns [A]; :meth:`warpmag.Magnetics.set_current` changes it.
+        shape: ``loop``, ``solenoid`` or ``polyline``.
+        radius: Radius of a loop or a solenoid [m].
+        length: Length of a solenoid [m], whose middle is the origin.
+        points: Corners of a polyline [m], shape [k, 3], in the direction of a positive current.
+        closed: Whether its last point is joined to the first; an open one is a part of a circuit.
+        wire_radius: Radius of the wire, of a solenoid that of the edges of its sheet [m]; 0 means a hundredth of the
+            coil's, or of the diagonal of the box around a polyline.
+        ampere_turns: Current times turns [A], of a solenoid all its turns; :meth:`warpmag.Magnetics.set_current`
+            changes it.
         xform: Frame of the coil in that of the body, or of the world.
         label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.
 
@@ -54,9 +64,52 @@ def add_coil(
     Raises:
         InputError: The attributes are not declared, the body does not exist, or a value is out of range.
     """
-    coil = Coil(shape, radius, wire_radius, ampere_turns)
+    if len(points):
+        points = checked_vectors("add_coil: points", points, FARTHEST_POINT)
+    coil = Coil(shape, radius, length, tuple(map(tuple, points)), closed, wire_radius, ampere_turns)
     coil.check("add_coil")
     return add_source(builder, body, coil.record(), ampere_turns, xform, label or f"coil_{builder.shape_count}")
+
+
+def add_field_map(
+    builder: newton.ModelBuilder,
+    origin: tuple[float, float, float],
+    spacing,
+    values,
+    *,
+    body: int = -1,
+    factor: float = 1.0,
+    xform=None,
+    label: str | None = None,
+) -> int:
+    """Add a field that is given on a regular grid, fixed in the world or on a body, which feels what it does.
+
+    Between nodes it is interpolated by cubic convolution, to third order in the spacing; forces are of the
+    interpolant's gradient, and continuous. Beyond the grid it is zero, all at once: a map should reach to where its
+    field fades.
+
+    Args:
+        builder: The builder, with :func:`warpmag.register_attributes` called on it.
+        origin: The first node [m], in the frame of the map.
+        spacing: Distance of nodes [m], one number or one along each axis.
+        values: H at the nodes [A/m], shape [nx, ny, nz, 3], at least two along each axis, NumPy.
+        body: The body; -1 for a map fixed in the world.
+        factor: Factor of the field; :meth:`warpmag.Magnetics.set_current` changes it.
+        xform: Frame of the map in that of the body, or of the world.
+        label: Label of the map.
+
+    Returns:
+        The shape that stands for it, a site.
+
+    Raises:
+        InputError: The attributes are not declared, the body does not exist, or a value is out of range.
+    """
+    name = "add_field_map"
+    steps = (spacing,) * 3 if np.ndim(spacing) == 0 else tuple(spacing)
+    nodes = host_array(f"{name}: values", values)
+    found = FieldMap(tuple(origin), steps, nodes, factor)
+    found.check(name)
+    return add_source(builder, body, found.record(), factor, xform, label or f"field_map_{builder.shape_count}")
 
 
 def add_source(
@@ -148,7 +201,7 @@ class ModelSources:
         else:
             numbers = np.atleast_1d(np.asarray(value))
             for one in numbers.flat:
-                check_current(name, one)
+                check_strength(name, one)
             if numbers.ndim != 1:
                 raise InputError(f"{name}: shape must be [] or [{len(shapes)}], got {list(numbers.shape)}")
             values = wp.array(numbers, dtype=wp.float32, device=self._model.device)
