@@ -188,6 +188,9 @@ def _check(options) -> int:
         f"bodies      {len(contents.bodies)} ({len(contents.kinematic)} kinematic), {len(contents.colliders)} colliders"
     )
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
+    if contents.sources:
+        sources = [type(one.source).__name__ for placed in contents.sources.values() for one in placed]
+        print(f"sources     {sources.count('Coil')} coils, {sources.count('FieldMap')} field maps")
     settings = contents.settings
     field = ", ".join(f"{value:g}" for value in settings.external_field)
     laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"
