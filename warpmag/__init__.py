@@ -21,6 +21,8 @@ _HOMES = {
     "register_attributes": "warpmag.engine.attributes",
     "add_inducible": "warpmag.engine.attributes",
     "add_permanent": "warpmag.engine.attributes",
+    "add_coil": "warpmag.engine.applied",
+    "add_field_map": "warpmag.engine.applied",
     "Magnetics": "warpmag.engine.magnetics",
     "SensorMagnetometer": "warpmag.engine.magnetometer",
     "Simulation": "warpmag.engine.simulation",

@@ -191,6 +191,9 @@ def _check(options) -> int:
     if contents.motions or contents.magnetization_keys or contents.field_keys:
         field = ", the external field" if contents.field_keys else ""
         print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{field}")
+    if contents.sources:
+        sources = [type(one.source).__name__ for placed in contents.sources.values() for one in placed]
+        print(f"sources     {sources.count('Coil')} coils, {sources.count('FieldMap')} field maps")
     settings = contents.settings
     field = ", ".join(f"{value:g}" for value in settings.external_field)
     laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"

@@ -7,6 +7,7 @@ import warp as wp
 
 from warpmag.arrays import shape_message, vec3_type
 from warpmag.errors import InputError
+from warpmag.kernels.applied.sources import AppliedField, Targets, launch_add_gradients
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.inside import launch_field_of_worlds, launch_flux_density, launch_store_gradients
 from warpmag.kernels.pairs.packing import PackedMoments
@@ -35,11 +36,11 @@ class FieldProbe:
 
     Attributes:
         points: The points [m], shape [p]; written by the caller before :meth:`measure`.
-        h: Field H [A/m], shape [p]: the external field, and that of all moments (Kim and Han 2022, Eq. 1); inside a
-            ball that of a uniformly magnetized one.
+        h: Field H [A/m], shape [p]: the external field, that of sources (``kernels.applied``), and that of all moments
+            (Kim and Han 2022, Eq. 1); inside a ball that of a uniformly magnetized one.
         b: Flux density B = μ0 (H + M) [T], shape [p].
-        gradient: Rows ∇H_x, ∇H_y, ∇H_z of the field's gradient [A/m²], shape [p], matrices; the external field, which
-            is uniform, has none. None if it is not wanted.
+        gradient: Rows ∇H_x, ∇H_y, ∇H_z of the field's gradient [A/m²], shape [p], matrices, that of sources included;
+            the external field, which is uniform, has none. None if it is not wanted.
     """
 
     def __init__(self, system: MomentSystem, count: int, *, worlds=None, gradients: bool = False):
@@ -63,7 +64,12 @@ class FieldProbe:
         self._sources = sources = PackedMoments(
             system.radii, largest_radius=float(system.radii.numpy().max(initial=0.0)), groups=system.worlds
         )
-        self._field = PairEvaluation(Quantity.FIELD, segments, self._targets, sources, self._base, self.h)
+        base, self._applied = self._base, None
+        if system.sources is not None:
+            points = Targets(self.points, worlds, np.full(count, _NO_BODY), self._base)
+            self._applied = AppliedField(system.sources, points)
+            base = self._applied.field
+        self._field = PairEvaluation(Quantity.FIELD, segments, self._targets, sources, base, self.h)
         self._nothing = wp.zeros(count, dtype=vec3, device=device)
         self.gradient = None
         self._gradients: list[PairEvaluation] = []
@@ -98,9 +104,13 @@ class FieldProbe:
         self._sources.pack(system.positions, system.moments)
         targets.find_overlaps(self._sources)
         launch_field_of_worlds(system.external_field, self._first, self._base)
+        if self._applied is not None:
+            self._applied.launch()
         self._field.launch()
         launch_flux_density(self.points, targets, self._sources, self.h, self.b)
         for evaluation in self._gradients:
             evaluation.launch()
         if self._gradients:
             launch_store_gradients(self._rows, self.gradient)
+            if self._applied is not None:
+                launch_add_gradients(self._applied.gradient, self.gradient)

@@ -20,6 +20,7 @@ from warpmag.arrays import (
 from warpmag.curves import MagnetizationCurve
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
+from warpmag.kernels.applied.sources import AppliedForces, Sources, Targets
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.energy import launch_energy
@@ -146,6 +147,8 @@ class MomentSystem:
             solve is from converged: in equilibrium the two are parallel.
         couplings: What the moments of a body lack among themselves as balls: of each body that has cells the first
             of its moments, and the ``demagnetization.Coupling`` of all of them.
+        applied: Sources without a response that act on the moments, ``AppliedSource`` of ``kernels.applied.sources``;
+            their bodies are numbered as those of the moments.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
 
@@ -155,6 +158,10 @@ class MomentSystem:
     Attributes:
         rotations: Rotation of each body of ``couplings``, from its frame to the world's (x, y, z, w), shape [bodies];
             written by the caller before :meth:`solve`. None without them.
+        sources: Sources of ``applied``, their frames and strengths written by the caller before :meth:`solve`. None
+            without them.
+        reactions: What the moments do to them, ``reaction_forces`` and ``reaction_torques`` by :meth:`apply_forces`;
+            None without them.
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
@@ -195,6 +202,7 @@ class MomentSystem:
         damping=None,
         lone_torque=False,
         couplings=(),
+        applied=(),
         dtype="float32",
         device=None,
     ):
@@ -209,6 +217,7 @@ class MomentSystem:
         self._force = force
         near = contact_model == "multipole"
         self._allocate(layout, external_field)
+        self._apply_sources(layout, applied)
         susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
@@ -238,6 +247,16 @@ class MomentSystem:
         self._induction = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
         self.h, self.residual, self.error = self._induction.h, self._induction.residual, self._induction.error
         self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
+
+    def _apply_sources(self, layout: _Layout, applied):
+        """Prepare the field of sources, which with the external one magnetizes moments, and acts on them."""
+        self.sources = self.reactions = None
+        self._magnetizing = self._acting = self.external_field
+        if applied:
+            self.sources = Sources(applied, len(layout.ranges()), self.dtype, self.device)
+            moments = Targets(self.positions, layout.worlds, layout.bodies, self.external_field)
+            self.reactions = AppliedForces(self.sources, moments, layout.movable)
+            self._magnetizing, self._acting = self.reactions.at.field, self.reactions.at.acting
 
     def _make_material(self, permanent, saturation, susceptibility, curve):
         """Make the material of all moments; return the susceptibility, 1 where they are permanent."""
@@ -271,9 +290,9 @@ class MomentSystem:
         ranges = self.world_ranges
         packed, state = self._packed, self._induction
         applied = [(first, middle, middle, last) for first, middle, last in ranges]
-        self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self.external_field, state.h0)
+        self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self._magnetizing, state.h0)
         if self._applied.pair_count == 0:
-            state.h0 = self.external_field
+            state.h0 = self._magnetizing
         mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
         # near contacts write one more partial sum
         self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
@@ -297,7 +316,7 @@ class MomentSystem:
             # those with a torque come last, since the others' mirrored form writes forces on all moments
             return [
                 PairEvaluation(
-                    quantity, which, self._packed, self._packed, self.external_field, self.forces, effective=effective,
+                    quantity, which, self._packed, self._packed, self._acting, self.forces, effective=effective,
                     turned=self._turned, torques=self.torques,
                 )
                 for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
@@ -355,6 +374,8 @@ class MomentSystem:
     def begin(self):
         """Launch the start of a solve. Callers of :meth:`solve` do not need it; it serves to watch the iteration."""
         packed = self._packed
+        if self.reactions is not None:
+            self.reactions.at.launch()
         packed.pack(self.positions, self.moments)
         if self._near is not None:
             near_pairs.launch_find_pairs(self._near)
@@ -419,7 +440,7 @@ class MomentSystem:
         assert self._energies is not None
         self._permanents.launch()
         energies, state = self._energies, self._induction
-        fields = state.h, state.h0, self._permanents_field, self.external_field
+        fields = state.h, state.h0, self._permanents_field, self._acting
         launch_energy(self.radii, self.moments, self._material, *fields, energies)
         each = energies.numpy()
         return np.array([each[first:last].sum() for first, _, last in self.world_ranges])
@@ -446,3 +467,5 @@ class MomentSystem:
             evaluation.launch()
         if near is not None:
             near_pairs.launch_add_forces(near)
+        if self.reactions is not None:
+            self.reactions.add(self._packed.moments if force == "kelvin" else self._effective, self.forces)

@@ -28,6 +28,10 @@ _ATTRIBUTES = {
     "magnetization": (wp.vec3, wp.vec3(0.0, 0.0, 0.0)),  # [A/m], frame of the shape
     "moment_spacing": (wp.float32, 0.0),
 }
+_OF_SOURCES = {
+    "source": (str, ""),  # what ``warpmag.coils`` writes; empty on a shape that is no source of a field
+    "strength": (wp.float32, 0.0),
+}
 _SOLID = (
     newton.GeoType.SPHERE,
     newton.GeoType.BOX,
@@ -47,7 +51,7 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
         builder: The builder; declaring twice does nothing.
     """
     _check_builder(builder)
-    for name, (dtype, default) in _ATTRIBUTES.items():
+    for name, (dtype, default) in (_ATTRIBUTES | _OF_SOURCES).items():
         builder.add_custom_attribute(
             newton.ModelBuilder.CustomAttribute(
                 name=name,
@@ -134,9 +138,7 @@ def add_permanent(
 
 def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
     """Return the shapes that a magnet on ``body``, or on ``shape`` alone, covers."""
-    _check_builder(builder)
-    if f"{NAMESPACE}:kind" not in builder.custom_attributes:
-        raise InputError("builder: call warpmag.register_attributes(builder) before magnets are added")
+    check_registered(builder)
     if shape is not None:
         _check_index("shape", shape, builder.shape_count, "shapes")
         check_whole("body", body)
@@ -146,7 +148,7 @@ def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = N
             kind = newton.GeoType(builder.shape_type[shape]).name.lower()
             raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
         return [shape]
-    _check_index("body", body, builder.body_count, "bodies")
+    check_body(builder, body)
     shapes = [
         index
         for index in builder.body_shapes[body]
@@ -155,6 +157,18 @@ def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = N
     if not shapes:
         raise InputError(f"{builder.body_label[body]}: has no colliding solid shape yet, add its shapes first")
     return shapes
+
+
+def check_registered(builder: newton.ModelBuilder) -> None:
+    """Raise :class:`InputError` unless the attributes are declared on ``builder``."""
+    _check_builder(builder)
+    if f"{NAMESPACE}:source" not in builder.custom_attributes:
+        raise InputError("builder: call warpmag.register_attributes(builder) before magnets are added")
+
+
+def check_body(builder: newton.ModelBuilder, body: int) -> None:
+    """Raise :class:`InputError` unless ``builder`` has the body."""
+    _check_index("body", body, builder.body_count, "bodies")
 
 
 def _check_builder(builder: newton.ModelBuilder) -> None:

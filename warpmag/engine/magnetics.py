@@ -7,6 +7,7 @@ import warp as wp
 from warpmag import materials
 from warpmag.arrays import Kind, farthest_place, host_array
 from warpmag.curves import MagnetizationCurve
+from warpmag.engine.applied import ModelSources
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.grouping import find_magnets
 from warpmag.errors import InputError
@@ -79,7 +80,9 @@ class Magnetics:
             curve = materials.measured("Magnetics: curve", curve)
         self.magnets, self._worlds = find_magnets(model)
         self._model = model
+        self._sources = ModelSources(model, self._worlds)
         self.system = self._make_system(settings, max_evaluations, curve)
+        self._sources.bind(self.system)
         self._map_bodies()
 
     def _make_system(self, settings: MagneticSettings, max_evaluations: int, curve) -> MomentSystem:
@@ -115,6 +118,7 @@ class Magnetics:
             rtol=settings.rtol,
             max_evaluations=max_evaluations,
             couplings=couplings,
+            applied=self._sources.applied,
             device=self._model.device,
         )
 
@@ -178,6 +182,7 @@ class Magnetics:
         gather_moments(state.body_q, self._body_moments, self.system.positions, self.system.moments)
         if self.system.rotations is not None:
             gather_rotations(state.body_q, self._celled, self.system.rotations)
+        self._sources.gather(state.body_q)
         self.system.solve()
 
     def add_forces(self, state: newton.State) -> None:
@@ -185,6 +190,7 @@ class Magnetics:
         self.system.apply_forces()
         system = self.system
         add_wrenches(self._body_moments, self._model, state, system.positions, system.forces, system.torques)
+        self._sources.add_reactions(state)
 
     def set_external_field(self, external_field) -> None:
         """Set the uniform applied field of all worlds, or of each; capturable in a graph if given as a Warp array.
@@ -198,6 +204,23 @@ class Magnetics:
         """
         field = self._vectors("external_field", external_field, (1, max(self._model.world_count, 1)))
         set_external_field(field, self._newton_world, self.system.external_field)
+
+    def set_current(self, coil: int | str, ampere_turns) -> None:
+        """Set the current of coils; after a first call capturable in a graph, if given as a Warp array.
+
+        It is the model's attribute ``model.warpmag.strength`` that is set. Who writes there has the same effect. Of a
+        field map it is the factor of its field.
+
+        Args:
+            coil: The coil, as :func:`warpmag.add_coil` returned it if the model has no other builder's, or a pattern of
+                labels as in a shell: coils of replicated worlds have one label, and are in the order of worlds.
+            ampere_turns: Current times turns [A], one number, or one for each of the coils, shape [coils]; NumPy, or a
+                Warp array of float32 on the model's device, whose values are not checked.
+
+        Raises:
+            InputError: There is no such coil, or there are other numbers than coils, or one is not finite.
+        """
+        self._sources.set_strength("set_current", coil, ampere_turns)
 
     def set_magnetization(self, magnetization, *, body: int = -1, shape: int | None = None) -> None:
         """Set what a permanent magnet is magnetized to; capturable in a graph if given as a Warp array.

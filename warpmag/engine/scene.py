@@ -8,12 +8,15 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.coils import Coil
+from warpmag.engine.applied import add_source
 from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
 from warpmag.errors import InputError
 from warpmag.keyed import Keys, SceneKeys
 from warpmag.magnets import Magnet, StageMagnets
 from warpmag.usd import (
     GroundedJoint,
+    PlacedSource,
     StageClock,
     StageContents,
     enabled_joints,
@@ -93,6 +96,9 @@ def import_scene(
     for joint in grounded:
         _place_on_ground(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
+    for prim, sources in contents.sources.items():
+        for placed in sources:
+            _add_source(builder, prim, placed, bodies)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
     return ImportedScene(
         stage=stage,
@@ -179,6 +185,17 @@ def _scene_keys(builder, stage, contents: StageContents, clock: StageClock, bodi
 def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
     """Return how the frame of a shape is turned from that of the magnet prim that it belongs to."""
     return builder.shape_transform[shape].q if prim in bodies else _axis_turn(stage, prim)
+
+
+def _add_source(builder: newton.ModelBuilder, prim: str, placed: PlacedSource, bodies: dict[str, int]) -> None:
+    """Put a coil or a field map of a stage on its body, or into the world; its label is the path of the prim."""
+    frame, body = wp.transform(placed.position, placed.rotation), -1
+    if placed.body is not None:
+        body = bodies[placed.body]
+        frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
+    source = placed.source
+    strength = source.ampere_turns if isinstance(source, Coil) else source.factor
+    add_source(builder, body, source.record(), strength, frame, prim)
 
 
 def _in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:

@@ -17,6 +17,7 @@ from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
+from warpmag.usd.coils import PlacedSource, is_source, sources_of
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
@@ -61,6 +62,7 @@ class StageContents:
         colliders: Colliders.
         magnets: Magnets whose attributes are sound.
         initial_moments: Authored moments [A·m²], world frame.
+        sources: Coils and field maps that are sound, by prim.
         settings: Magnetic settings of the first physics scene.
         motions: How keys move kinematic bodies, at time codes.
         field_keys: Keys of the external field [A/m] at time codes, None where it is constant.
@@ -73,6 +75,7 @@ class StageContents:
     colliders: list[str] = field(default_factory=list)
     magnets: dict[str, Magnet] = field(default_factory=dict)
     initial_moments: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    sources: dict[str, list[PlacedSource]] = field(default_factory=dict)
     settings: MagneticSettings = field(default_factory=MagneticSettings)
     motions: dict[str, Motion] = field(default_factory=dict)
     field_keys: Keys | None = None
@@ -206,6 +209,8 @@ def survey(stage: Usd.Stage) -> StageContents:
     for prim in prims:
         if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
             _read_magnet(prim, transforms, keys, contents)
+        if is_source(prim) and str(prim.GetPath()) not in inside:
+            _read_sources(prim, transforms, contents)
     contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))
@@ -272,7 +277,7 @@ def _instanced_prims(stage, prims, findings) -> set[str]:
         roots = [prim, *(root for root in map(stage.GetPrimAtPath, targets) if root)]
         held = {one.GetPath(): one for root in roots for one in Usd.PrimRange(root, Usd.PrimAllPrimsPredicate)}
         inside |= {str(path) for path in held}
-        if any(one.HasAPI(UsdPhysics.RigidBodyAPI) or has_api(one, MAGNET_API) for one in held.values()):
+        if any(one.HasAPI(UsdPhysics.RigidBodyAPI) or _is_magnetic(one) for one in held.values()):
             findings.append(
                 Finding(
                     str(prim.GetPath()),
@@ -285,6 +290,10 @@ def _instanced_prims(stage, prims, findings) -> set[str]:
                 Finding(str(prim.GetPath()), "Newton imports no colliders from a PointInstancer", "warning")
             )
     return inside
+
+
+def _is_magnetic(prim) -> bool:
+    return has_api(prim, MAGNET_API) or is_source(prim)
 
 
 def _read_scene(stage, prims, keys, contents) -> None:
@@ -334,6 +343,15 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
     contents.findings += [finding for one in sound for finding in magnet_findings(one)]
     if path in contents.magnets and path not in faulty:
         contents.findings += spacing_findings(prim, sound, contents.magnets[path].moment_spacing)
+
+
+def _read_sources(prim, transforms, contents) -> None:
+    """Read the coil and the field map of a prim into ``contents``, or what is wrong with them."""
+    for found in sources_of(prim, transforms):
+        if isinstance(found, Finding):
+            contents.findings.append(found)
+        else:
+            contents.sources.setdefault(str(prim.GetPath()), []).append(found)
 
 
 def prims_of_magnet(prim) -> Iterator[Usd.Prim]:

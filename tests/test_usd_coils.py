@@ -1,0 +1,175 @@
+"""Coils and field maps on stages: what is read, what a run makes of it, and one line for each that is refused."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom
+
+import warpmag
+from warpmag import cli
+from warpmag.coils import Coil, FieldMap
+from warpmag.errors import InputError
+from warpmag.usd import author_coil, author_field_map, check, coils, open_stage, survey
+
+HEAD = '#usda 1.0\n(\n    metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"\n)\n'
+BALL = """
+def Sphere "Ball" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"])
+{
+    double radius = 0.005
+}
+"""
+COILS = {
+    "/Loop": Coil(radius=0.25, wire_radius=0.125, ampere_turns=-2.5),
+    "/Solenoid": Coil("solenoid", radius=0.25, length=2.0, ampere_turns=1e3),
+    "/Polyline": Coil("polyline", points=((0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (0.0, 0.0, 2.0))),
+    "/Open": Coil("polyline", points=((0.0, 0.0, 0.0), (1.0, 0.5, 0.0)), closed=False),
+}
+VALUES = np.random.default_rng(0).normal(size=(2, 3, 4, 3)).astype(np.float32).astype(float)
+MAP = FieldMap((0.5, 0.25, -1.0), (0.5, 0.25, 1.0), VALUES, 2.0)
+
+
+def write(folder, *prims):
+    path = folder / "stage.usda"
+    path.write_text(HEAD + BALL + "\n".join(prims))
+    return path
+
+
+def prim(api, *lines, name="Thing", kind="Xform"):
+    return "\n".join([f'def {kind} "{name}" (prepend apiSchemas = ["{api}"])', "{", *lines, "}", ""])
+
+
+def coil(*lines, **where):
+    return prim("WarpmagCoilAPI", *lines, **where)
+
+
+def field_map(*lines, **where):
+    return prim("WarpmagFieldMapAPI", *lines, **where)
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_every_attribute_survives_the_round_trip(tmp_path, suffix):
+    path = tmp_path / f"coils.{suffix}"
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    for name, one in COILS.items():
+        author_coil(UsdGeom.Xform.Define(stage, name).GetPrim(), one)
+    author_field_map(UsdGeom.Xform.Define(stage, "/Map").GetPrim(), MAP)
+    stage.Save()
+    found = survey(open_stage(path)).sources
+    assert list(found) == [*COILS, "/Map"]
+    for name, one in COILS.items():
+        assert [placed.source for placed in found[name]] == [one]
+    read = found["/Map"][0].source
+    assert (read.origin, read.spacing, read.factor) == (MAP.origin, MAP.spacing, MAP.factor)
+    np.testing.assert_array_equal(read.values, VALUES)
+    authored = {one.GetName() for one in stage.GetPrimAtPath("/Loop").GetAuthoredAttributes()}
+    assert authored == {name for name, _, _ in coils._COIL.values()}
+
+
+def test_fallbacks_are_the_defaults_of_the_records():
+    stage = Usd.Stage.CreateInMemory()
+    coil, field_map = (UsdGeom.Xform.Define(stage, name).GetPrim() for name in ("/Coil", "/Map"))
+    coil.AddAppliedSchema("WarpmagCoilAPI")
+    field_map.AddAppliedSchema("WarpmagFieldMapAPI")
+    assert coils._read(coil, coils._COIL) == dataclasses.asdict(Coil())
+    assert coils._read(field_map, coils._MAP) == {"origin": (0.0, 0.0, 0.0), "factor": 1.0}
+
+
+def test_a_run_has_the_coils_of_its_stage_in_their_places(tmp_path, device):
+    """Turned, scaled, on a body and in the world; a map, too; and by its path a coil is switched."""
+    places = """
+    def Xform "Board" (prepend apiSchemas = ["PhysicsRigidBodyAPI"])
+    {
+        float3 xformOp:rotateXYZ = (90, 0, 0)
+        double3 xformOp:translate = (0.1, 0.2, 0.3)
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]
+        def Cube "Plate" (prepend apiSchemas = ["PhysicsCollisionAPI"]) { double size = 0.01
+        }
+        def Xform "Coil" (prepend apiSchemas = ["WarpmagCoilAPI"])
+        {
+            float warpmag:coil:radius = 0.02
+            float warpmag:coil:ampereTurns = 50
+            double3 xformOp:translate = (0, 0, 0.5)
+            float3 xformOp:scale = (2, 2, 2)
+            uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+        }
+    }
+    """
+    nodes = ", ".join(["(0, 7, 0)"] * 8)
+    area = field_map(
+        "point3f warpmag:fieldMap:origin = (-2, -2, -2)",
+        "vector3f warpmag:fieldMap:spacing = (4, 4, 4)",
+        "int3 warpmag:fieldMap:counts = (2, 2, 2)",
+        f"vector3f[] warpmag:fieldMap:values = [{nodes}]",
+    )
+    simulation = warpmag.Simulation(write(tmp_path, places, area), device=device)
+    magnetics = simulation.magnetics
+    middle = [[0.1, -0.3, 0.3]]  # half a metre along the board's z, which lies along -y
+    for current in (50.0, -20.0):
+        magnetics.set_current("/Board/Coil", current)
+        magnetics.induce(simulation.state)
+        expected = [0.0, 7.0 - current / (2.0 * 0.04), 0.0]
+        np.testing.assert_allclose(magnetics.h_field(middle)[0], expected, atol=1e-4 * 700.0)  # the ball adds a little
+    simulation.step()
+    assert any("100 % of its largest where the map ends" in line for line in simulation.warnings())
+
+
+def test_check_tells_what_a_stage_holds(tmp_path, capsys):
+    path = write(tmp_path, coil("float warpmag:coil:radius = 0.02"), coil(*["float warpmag:coil:radius = 1"], name="B"))
+    assert cli.main(["check", str(path)]) in (0, None)
+    assert "sources     2 coils, 0 field maps" in capsys.readouterr().out
+
+
+MAPPED = ("vector3f warpmag:fieldMap:spacing = (1, 1, 1)", "int3 warpmag:fieldMap:counts = (2, 2, 2)")
+UNEVEN = "float3 xformOp:scale = (1, 2, 1)", 'uniform token[] xformOpOrder = ["xformOp:scale"]'
+
+
+@pytest.mark.parametrize(("body", "text"), [
+    (coil(), "/Thing: radius: must be positive"),
+    (coil("float warpmag:coil:radius = -1"), "/Thing: radius: must be positive"),
+    (coil("float warpmag:coil:radius = inf"), "/Thing: radius"),
+    (coil("token warpmag:coil:radius = \"wide\""), "/Thing: warpmag:coil:radius: 'wide' is not a float"),
+    (coil('uniform token warpmag:coil:shape = "ring"'), "/Thing: shape: 'ring'"),
+    (coil('uniform token warpmag:coil:shape = "polyline"', "point3f[] warpmag:coil:points = [(0, 0, 0), (1, 0, 0)]"),
+     "/Thing: points: must be at least 3"),
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:ampereTurns = nan"), "/Thing: ampere turns"),
+    (coil("float warpmag:coil:radius = 1", "int warpmag:coil:closed = 1"), "warpmag:coil:closed: must be true"),
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:wireRadius = 1"), "/Thing: wire radius"),
+    (coil("float warpmag:coil:radius.timeSamples = { 0: 1, 1: 2, }"), "has time samples, but cannot change"),
+    (coil("float warpmag:coil:radius = 1", *UNEVEN), "must not be scaled unevenly"),
+    (coil("float warpmag:coil:radius = 1", kind="Scope"), "has no transform"),
+    (field_map(), "/Thing: warpmag:fieldMap:spacing is missing"),
+    (field_map(*MAPPED), "warpmag:fieldMap:values is missing"),
+    (field_map(*MAPPED, "vector3f[] warpmag:fieldMap:values = [(0, 0, 0)]"), "has 1 vectors"),
+    (field_map(*MAPPED, f"vector3f[] warpmag:fieldMap:values = [{', '.join(['(0, nan, 0)'] * 8)}]"), "must be finite"),
+    (field_map("vector3f warpmag:fieldMap:spacing = (1, 0, 1)", MAPPED[1],
+               f"vector3f[] warpmag:fieldMap:values = [{', '.join(['(0, 0, 0)'] * 8)}]"), "/Thing: spacing"),
+    (field_map(MAPPED[0], "int3 warpmag:fieldMap:counts = (-2, -2, 2)",
+               f"vector3f[] warpmag:fieldMap:values = [{', '.join(['(0, 0, 0)'] * 8)}]"), "2 or more each"),
+])  # fmt: skip
+def test_what_is_refused(tmp_path, body, text):
+    path = write(tmp_path, body)
+    report = check(path)
+    assert any(text in str(one) for one in report.refusals), list(map(str, report.refusals))
+    with pytest.raises(InputError, match="Thing") as error:
+        warpmag.Simulation(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_coil_that_keys_move_without_a_body_is_told(tmp_path):
+    moved = coil(
+        "float warpmag:coil:radius = 1",
+        "double3 xformOp:translate.timeSamples = { 0: (0, 0, 0), 10: (1, 0, 0), }",
+        'uniform token[] xformOpOrder = ["xformOp:translate"]',
+    )
+    report = check(write(tmp_path, moved))
+    assert not report.refusals
+    assert any("keys move it, but it is on no rigid body" in str(one) for one in report.warnings)
+
+
+def test_largest_numbers_are_refused_by_name():
+    for bad in (Coil(radius=1.0, ampere_turns=2e15), Coil(radius=1e7), Coil(radius=1.0, wire_radius=math.nan)):
+        with pytest.raises(InputError, match="here"):
+            bad.check("here")
