@@ -38,7 +38,7 @@ def check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
     held = np.flatnonzero((kinds != newton.JointType.FREE) & (kinds != newton.JointType.DISTANCE))
     if solver != "semi-implicit" or not len(held):
         return
-    spins = np.linalg.eigvalsh(model.body_inv_inertia.numpy()).max(axis=1)
+    spins = np.linalg.eigvalsh(np.asarray(model.body_inv_inertia.numpy(), dtype=float)).max(axis=1)
     gains = np.maximum(model.body_inv_mass.numpy(), spins) * SPRING_STIFFNESS * dt**2
     for joint in held:
         bodies = model.joint_parent.numpy()[joint], model.joint_child.numpy()[joint]
