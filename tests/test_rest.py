@@ -35,7 +35,7 @@ def step(simulation, seconds):
     "side, settling, seconds", [(4, 0.6, 0.4), pytest.param(10, 3.0, 10.0, marks=pytest.mark.long)]
 )
 def test_a_pile_of_balls_does_not_creep(side, settling, seconds, device):
-    """Balls that fell into a box with friction: half of them may go a tenth of a radius in 10 s, others roll."""
+    """Balls that fell into a box with friction. Now and then one of many rolls on, so that half of them are asked."""
     builder = new_builder(0.5)
     width = 2.06 * R * side + 0.1 * R
     for normal, far in (((1.0, 0, 0), 0.0), ((-1.0, 0, 0), -width), ((0, 1.0, 0), 0.0), ((0, -1.0, 0), -width)):
@@ -50,7 +50,7 @@ def test_a_pile_of_balls_does_not_creep(side, settling, seconds, device):
     simulation = warpmag.Simulation(builder, device=device)
     before = step(simulation, settling)
     crept = np.linalg.norm(step(simulation, seconds) - before, axis=1)
-    assert np.median(crept) < 0.1 * R * seconds / 10.0
+    assert np.median(crept) < 0.01 * R * seconds / 10.0
 
 
 def test_a_chain_of_magnets_lies_still(device):
