@@ -77,6 +77,10 @@ class PileXPBD(newton.solvers.SolverXPBD):
         with self._splitting():
             super().step(state_in, state_out, control, contacts, dt, observables=observables)
 
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays that one substep hands on to the next one, by name."""
+        return {} if self._solve is None else self._solve.carried()
+
     def _step_bodies(self, state_in, state_out, contacts, dt) -> None:
         assert self._solve is not None
         before, after = self._view_bodies(state_in), self._view_bodies(state_out)

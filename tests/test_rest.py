@@ -1,0 +1,85 @@
+"""What comes to rest stays where it is, and what was put into each other comes apart slowly and keeps its momentum."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+import warpmag
+from warpmag.kernels.rigid.contact_solve import PUSH_OUT
+
+R = 0.005  # m
+
+
+def material(mu):
+    return newton.ModelBuilder.ShapeConfig(density=7874.0, mu=mu, mu_torsional=1e-3 * mu, mu_rolling=1e-3 * mu)
+
+
+def new_builder(mu, ground=True):
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    if ground:
+        builder.add_ground_plane(cfg=material(mu))
+    else:
+        builder.gravity = wp.vec3(0.0, 0.0, 0.0)
+    return builder
+
+
+def step(simulation, seconds):
+    for _ in range(round(seconds / simulation.step_size)):
+        simulation.step()
+    return simulation.state.body_q.numpy()[:, :3].astype(float)
+
+
+@pytest.mark.parametrize(
+    "side, settling, seconds", [(4, 0.6, 0.4), pytest.param(10, 3.0, 10.0, marks=pytest.mark.long)]
+)
+def test_a_pile_of_balls_does_not_creep(side, settling, seconds, device):
+    """Balls that fell into a box with friction. Now and then one of many rolls on, so that half of them are asked."""
+    builder = new_builder(0.5)
+    width = 2.06 * R * side + 0.1 * R
+    for normal, far in (((1.0, 0, 0), 0.0), ((-1.0, 0, 0), -width), ((0, 1.0, 0), 0.0), ((0, -1.0, 0), -width)):
+        builder.add_shape_plane(plane=(*normal, -far), width=0.0, length=0.0, cfg=material(0.5))
+    random = np.random.default_rng(0)
+    for place in np.ndindex(side, side, side):
+        at = 2.05 * R * np.array(place[::-1]) + R + random.uniform(0.0, 0.1 * R, 3)
+        body = builder.add_body(xform=wp.transform(wp.vec3(*at)))
+        builder.add_shape_sphere(body, radius=R, cfg=material(0.5))
+    far = builder.add_shape_sphere(-1, xform=wp.transform((5.0, 0.0, 0.0)), radius=R)
+    warpmag.add_permanent(builder, shape=far, magnetization=(0.0, 0.0, 1.0))
+    simulation = warpmag.Simulation(builder, device=device)
+    before = step(simulation, settling)
+    crept = np.linalg.norm(step(simulation, seconds) - before, axis=1)
+    assert np.median(crept) < 0.01 * R * seconds / 10.0
+
+
+def test_a_chain_of_magnets_lies_still(device):
+    """Five permanent balls that hold on to each other press each other far harder than their weight does."""
+    builder = new_builder(0.5)
+    for k in range(5):
+        body = builder.add_body(xform=wp.transform((2.0 * R * k, 0.0, R)))
+        builder.add_shape_sphere(body, radius=R, cfg=material(0.5))
+        warpmag.add_permanent(builder, body, magnetization=(8e5, 0.0, 1e5))
+    simulation = warpmag.Simulation(builder, device=device)
+    before = step(simulation, 0.2)
+    assert np.abs(step(simulation, 0.5) - before).max() < 1e-3 * R
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.5])
+def test_bodies_that_were_put_into_each_other_come_apart_slowly(mu, device):
+    """Two boxes, one of them heavier, that share half of their space: no faster than they are pushed out."""
+    builder = new_builder(mu, ground=False)
+    for x, half in ((0.0, R), (1.2 * R, 1.3 * R)):
+        body = builder.add_body(xform=wp.transform((x, 0.1 * R, 0.2 * R)))
+        builder.add_shape_box(body, hx=half, hy=half, hz=half, cfg=material(mu))
+    warpmag.add_inducible(builder, 0)
+    simulation = warpmag.Simulation(builder, device=device)
+    masses = simulation.model.body_mass.numpy().astype(float)
+    simulation.step()
+    simulation.step()
+    fastest = np.abs(simulation.state.body_qd.numpy()[:, :3]).max()
+    step(simulation, 0.03)
+    qd = simulation.state.body_qd.numpy()[:, :3].astype(float)
+    apart = simulation.state.body_q.numpy()[1, 0] - simulation.state.body_q.numpy()[0, 0]
+    assert apart > 2.3 * R and fastest < 1.01 * PUSH_OUT
+    assert np.abs(masses @ qd).max() < 1e-5 * np.abs(masses[:, None] * qd).max()
