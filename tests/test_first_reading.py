@@ -27,6 +27,15 @@ def crate(path):
     return path
 
 
+def numbers(path):
+    """A binary stage with 1,000 numbers, which USD packs."""
+    layer = Sdf.Layer.FindOrOpen(str(crate(path)))
+    attribute = Sdf.AttributeSpec(layer.GetPrimAtPath("/World"), "numbers", Sdf.ValueTypeNames.IntArray)
+    attribute.default = range(0, 3000, 3)
+    layer.Save()
+    return path
+
+
 @pytest.mark.parametrize("case", NESTED)
 def test_what_overflows_the_stack_of_usd_is_refused(tmp_path, case):
     path = tmp_path / "deep.usda"
@@ -105,6 +114,24 @@ def test_a_table_of_contents_beyond_the_end_is_damage(tmp_path, capfd):
     with pytest.raises(InputError, match=r"stage.usdc: damaged: its table of contents names bytes beyond its end"):
         open_stage(path)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["stage.usdc", "stage.usd"])
+def test_values_that_the_file_does_not_hold_are_damage(tmp_path, name):
+    """Of 1,000 numbers the block that holds them unpacks to the first bytes; USD takes the others from its memory."""
+    path, content = tmp_path / name, bytearray(numbers(tmp_path / "whole.usdc").read_bytes())
+    place = content.index((1000).to_bytes(8, "little")) + 8  # where the block's length stands
+    block = bytes([0, 0x40]) + (3).to_bytes(4, "little")  # one piece; four bytes as they are
+    content[place : place + 8 + len(block)] = len(block).to_bytes(8, "little") + block
+    path.write_bytes(content)
+    for _ in range(2):
+        with pytest.raises(InputError, match=f"{name}: damaged: USD takes some of its values from memory"):
+            open_stage(path)
+
+
+def test_packed_values_are_read(tmp_path):
+    stage = open_stage(numbers(tmp_path / "stage.usdc"))
+    assert list(stage.GetAttributeAtPath("/World.numbers").Get()) == list(range(0, 3000, 3))
 
 
 def test_a_reader_that_computes_without_end(tmp_path, monkeypatch):
