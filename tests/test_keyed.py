@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf, Ts, Usd, UsdGeom
 
 from warpmag import InputError, Simulation
 from warpmag.usd import check
@@ -222,6 +222,47 @@ def test_a_piston_pushes_what_it_meets(tmp_path, device):
     assert face == pytest.approx(-0.09, abs=1e-5)
     assert -1e-5 < ball - 0.005 - face < 1e-3
     assert simulation.state.body_qd.numpy()[body_of(simulation, "Ball")][0] == pytest.approx(5.0, rel=0.01)
+
+
+QUAD = """point3f[] points = [(-0.1, -0.1, 0), (0.1, -0.1, 0), (0.1, 0.1, 0), (-0.1, 0.1, 0)]
+int[] faceVertexCounts = [4]
+int[] faceVertexIndices = [0, 1, 2, 3]"""
+
+
+@pytest.mark.parametrize(("kind", "lines"), [("Plane", ('uniform token axis = "Z"',)), ("Mesh", (QUAD,))])
+def test_what_has_no_mass_lifts_as_well(tmp_path, device, kind, lines):
+    """Planes and open meshes are no rigid bodies otherwise."""
+    lift = prim(kind, "Lift", (COLLIDER,), *lines, operations(translate={0: (0, 0, -0.0052), 24: (0, 0, 0.0448)}))
+    simulation = Simulation(write(tmp_path, lift, held_ball(0.0), gravity=G), device=device)
+    for _ in range(400):
+        simulation.step()
+    height = simulation.state.body_q.numpy()[body_of(simulation, "Ball"), 2]
+    assert height == pytest.approx(0.05 * simulation.time - 0.0002, abs=1e-5)
+
+
+def test_a_collider_in_an_instance_that_keys_move_is_refused(tmp_path):
+    keys = operations(translate={0: (0, 0, 0), 24: (0, 0, 1)})
+    copy = 'def Xform "Copy" (instanceable = true\nreferences = </World/Original>)\n{\n}'
+    original = 'def Xform "Original"\n{\n' + prim("Cube", "Part", (COLLIDER,), "double size = 0.01") + "}"
+    path = write(tmp_path, f'def Xform "Rig"\n{{\n{keys}\n{copy}\n}}', original, held_ball(1))
+    message = r"^/World/Rig/Copy/Part: moves by keys inside an instance: set instanceable = false on /World/Rig/Copy$"
+    with pytest.raises(InputError, match=message):
+        check(path)
+
+
+def test_a_spline_is_refused_where_a_run_would_follow_it(tmp_path):
+    lines = "double size = 0.01", operations(translateX=0.0)
+    path = write(tmp_path, prim("Cube", "Part", (COLLIDER,), *lines), held_ball(1))
+    spline = Ts.Spline("double")
+    for time, value in ((0.0, 0.0), (24.0, 1.0)):
+        knot = Ts.Knot("double", time=time, value=value)
+        spline.SetKnot(knot)
+    stage = Usd.Stage.Open(str(path))
+    stage.GetAttributeAtPath("/World/Part.xformOp:translateX").SetSpline(spline)
+    stage.Save()
+    assert [str(one) for one in check(path).refusals] == [
+        "/World/Part: xformOp:translateX is a spline, of which a run reads no keys: bake it into time samples"
+    ]
 
 
 def test_a_joint_to_a_keyed_body_follows_it(tmp_path, device):

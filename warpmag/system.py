@@ -354,6 +354,27 @@ class MomentSystem:
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
         self.dynamics.start_from(magnetizations)
 
+    def set_material(self, which, saturation, susceptibility):
+        """Change what inducible moments are made of; curves stay. Waits for the device.
+
+        Args:
+            which: The moments.
+            saturation: Their saturation magnetization Ms [A/m].
+            susceptibility: Their susceptibility [dimensionless], may be infinite.
+
+        Raises:
+            InputError: The contact model has tables of what moments are made of, or a value is out of range.
+        """
+        if len(which) and self._near is not None:
+            raise InputError(f"contact_model: {self.contact_model} has tables of materials, which cannot be changed")
+        host_positive("saturation", saturation, len(which), self.dtype)
+        host_positive("susceptibility", susceptibility, len(which), self.dtype, infinite=True)
+        slope = 3.0 / (1.0 + 3.0 / susceptibility)
+        for array, values in ((self._material.saturation, saturation), (self._material.slope, slope)):
+            whole = array.numpy().copy()
+            whole[which] = values
+            array.assign(whole)
+
     def carried(self) -> dict[str, wp.array]:
         """Return the arrays that one solve hands on to the next one, by name: with them in place it goes on alike."""
         parts = {"induction": solve_state.carried_arrays(self._induction), "pairs": self._packed.carried()}

@@ -51,14 +51,50 @@ class BodyMoments:
     kinematic_flag: int
 
 
+@wp.struct
+class ShapeMagnets:
+    """What the shapes of a model say about magnets, arrays of the model or copies of them, shape [shapes].
+
+    Attributes:
+        kind: 0 for a shape that is no magnet.
+        saturation, susceptibility, curve, moment_spacing: As in ``warpmag.engine.attributes``.
+    """
+
+    kind: wp.array[wp.int32]
+    saturation: wp.array[float]
+    susceptibility: wp.array[float]
+    curve: wp.array[wp.int32]
+    moment_spacing: wp.array[float]
+
+
+@wp.func
+def _alike(now: ShapeMagnets, then: ShapeMagnets, shape: int) -> bool:
+    if now.kind[shape] != then.kind[shape]:
+        return False
+    if now.kind[shape] == 0:
+        return True
+    same = now.saturation[shape] == then.saturation[shape] and now.susceptibility[shape] == then.susceptibility[shape]
+    return same and now.curve[shape] == then.curve[shape] and now.moment_spacing[shape] == then.moment_spacing[shape]
+
+
 @wp.kernel
 def _gather_moments(
+    # inputs:
     body_q_in: wp.array[wp.transform],
     magnets: BodyMoments,
+    now: ShapeMagnets,
+    then: ShapeMagnets,
+    # outputs:
     positions_out: wp.array[wp.vec3],
     moments_out: wp.array[wp.vec3],
+    changed_out: wp.array[wp.int32],
 ):
     i = wp.tid()
+    if i < now.kind.shape[0]:
+        if not _alike(now, then, i):
+            wp.atomic_max(changed_out, 0, i + 1)
+    if i >= positions_out.shape[0]:
+        return
     frame = wp.transform_identity()
     body = magnets.body[i]
     if body >= 0:
@@ -70,10 +106,14 @@ def _gather_moments(
         moments_out[i] = wp.transform_vector(frame, wp.transform_vector(magnets.shape_frames[shape], moment))
 
 
-def gather_moments(body_q, magnets: BodyMoments, positions, moments):
-    """Write the world positions of all moments, and the world moments of the permanent ones."""
-    outputs = [positions, moments]
-    wp.launch(_gather_moments, len(positions), inputs=[body_q, magnets], outputs=outputs, device=positions.device)
+def gather_moments(body_q, magnets: BodyMoments, now: ShapeMagnets, then: ShapeMagnets, positions, moments, changed):
+    """Write the world positions of all moments, and the world moments of the permanent ones.
+
+    ``changed`` [1] becomes a shape, plus one, of which the model says something else now than then, if there is any.
+    """
+    outputs = [positions, moments, changed]
+    dim = max(len(positions), len(now.kind))
+    wp.launch(_gather_moments, dim, inputs=[body_q, magnets, now, then], outputs=outputs, device=positions.device)
 
 
 @wp.kernel

@@ -55,6 +55,20 @@ class Reading:
             prim = prim.GetParent()
         return prim or None
 
+    def driven(self) -> list:
+        """Colliders of no body that time samples move, and that are in none of them: they become kinematic bodies."""
+        found = []
+        for prim in self.colliders:
+            lineage = [prim, *(one for one in self.prims if prim.GetPath().HasPrefix(one.GetPath()))]
+            if self.above(prim) or not set(lineage).isdisjoint(found):
+                continue
+            placed = [UsdGeom.Xformable(one) for one in lineage if one.IsA(UsdGeom.Xformable)]
+            times = {time for one in placed for time in one.GetTimeSamples()}
+            poses = [np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)) for time in times]
+            if any((pose != poses[0]).any() for pose in poses):
+                found.append(prim)
+        return found
+
     def volume(self, prim) -> float | None:
         """Volume of a collider [m³], None where its approximation decides."""
         matrix = self.world(prim)[:3, :3]
@@ -168,8 +182,9 @@ def _poses(reading, result):
 def _masses(reading, simulation):
     model, numbers = simulation.model, simulation._scene.bodies
     masses, inverses = model.body_mass.numpy(), model.body_inv_mass.numpy()
-    if set(numbers) != {str(prim.GetPath()) for prim in reading.bodies}:
-        yield f"bodies: {len(numbers)} in the model, {len(reading.bodies)} on the stage"
+    bodies = {str(prim.GetPath()) for prim in (*reading.bodies, *reading.driven())}
+    if set(numbers) != bodies:
+        yield f"bodies: {len(numbers)} in the model, {len(bodies)} on the stage"
         return
     for prim in reading.bodies:
         wanted, found = reading.mass(prim), masses[numbers[str(prim.GetPath())]]
@@ -233,6 +248,8 @@ def _moments(reading, result):
             continue
         written = np.array(written, dtype=float)  # squares of floats overflow
         if reading.get(prim, "warpmag:kind", "inducible") != "permanent" or reading.get(prim, "warpmag:material"):
+            continue
+        if prim.GetAttribute("warpmag:magnetization").GetNumTimeSamples() > 1:  # switched meanwhile
             continue
         if not (whole := prim in reading.bodies) and _shares(reading, prim):
             continue

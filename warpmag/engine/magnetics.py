@@ -1,5 +1,7 @@
 """Magnetic forces on the bodies of a Newton model."""
 
+from dataclasses import replace
+
 import newton
 import numpy as np
 import warp as wp
@@ -9,7 +11,8 @@ from warpmag.arrays import Kind, farthest_place, host_array
 from warpmag.curves import MagnetizationCurve
 from warpmag.engine.applied import ModelSources
 from warpmag.engine.attributes import NAMESPACE
-from warpmag.engine.grouping import find_magnets
+from warpmag.engine.grouping import BodyMagnet, find_magnets
+from warpmag.engine.model_values import ModelValues
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
@@ -79,7 +82,7 @@ class Magnetics:
         if curve is not None:
             curve = materials.measured("Magnetics: curve", curve)
         self.magnets, self._worlds = find_magnets(model)
-        self._model = model
+        self._model, self._values = model, ModelValues(model)
         self._sources = ModelSources(model, self._worlds)
         self.system = self._make_system(settings, max_evaluations, curve)
         self._sources.bind(self.system)
@@ -173,13 +176,21 @@ class Magnetics:
 
         Args:
             state: State with poses ``body_q``; its ``body_f`` is added to, not cleared.
+
+        Raises:
+            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; on a GPU some steps later.
         """
         self.induce(state)
         self.add_forces(state)
 
     def induce(self, state: newton.State) -> None:
         """Bring the inducible magnets to equilibrium at the poses of ``state``, starting from where they were."""
-        gather_moments(state.body_q, self._body_moments, self.system.positions, self.system.moments)
+        values, system = self._values, self.system
+        gather_moments(
+            *(state.body_q, self._body_moments, values.now, values.then, system.positions, system.moments),
+            values.changed,
+        )
+        values.check(wait=False)
         if self.system.rotations is not None:
             gather_rotations(state.body_q, self._celled, self.system.rotations)
         self._sources.gather(state.body_q)
@@ -191,6 +202,38 @@ class Magnetics:
         system = self.system
         add_wrenches(self._body_moments, self._model, state, system.positions, system.forces, system.torques)
         self._sources.add_reactions(state)
+
+    def notify_model_changed(self, flags: newton.ModelFlags | int = newton.ModelFlags.SHAPE_PROPERTIES) -> None:
+        """Take over what was changed in ``model.warpmag``, as Newton's solvers do for what they keep.
+
+        Saturations and susceptibilities can be changed so; graphs that were captured stay right. A change of which
+        nobody tells is refused at the next step. Magnetizations count in any case.
+
+        Args:
+            flags: What was changed: nothing happens without ``SHAPE_PROPERTIES``.
+
+        Raises:
+            InputError: A material is out of range, the contact model has tables of it, or what cannot be changed was:
+                which shapes are magnets, of which kind, with which curve, or how far their moments are apart.
+        """
+        if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
+            return
+        changed = self._values.changed_materials()
+        moment_shapes = self._body_moments.shape.numpy()
+        moments = np.flatnonzero(np.isin(moment_shapes, changed) & ~self._body_moments.permanent.numpy())
+        self.system.set_material(moments, *self._values.material(moment_shapes[moments]))
+        self.magnets = [self._with_material(one) for one in self.magnets]
+        self._values.take()
+
+    def _with_material(self, one: BodyMagnet) -> BodyMagnet:
+        """The same magnet, of the material that its first shape has now."""
+        (saturation,), (susceptibility,) = self._values.material(list(one.shapes[:1]))
+        magnet = replace(one.magnet, saturation=float(saturation), susceptibility=float(susceptibility))
+        return replace(one, magnet=magnet)
+
+    def check_model(self) -> None:
+        """Raise :class:`InputError` if ``model.warpmag`` has changed meanwhile; waits for the device."""
+        self._values.check(wait=True)
 
     def set_external_field(self, external_field) -> None:
         """Set the uniform applied field of all worlds, or of each; capturable in a graph if given as a Warp array.
@@ -308,6 +351,7 @@ class Magnetics:
 
     def _measured(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
         probe = self.probe(points, worlds=worlds, gradients=gradients)
+        self.check_model()
         probe.measure()
         return probe
 
@@ -316,6 +360,7 @@ class Magnetics:
 
         See :meth:`MomentSystem.energy`: its gradient by positions is minus Kelvin's force.
         """
+        self.check_model()
         energies = np.zeros(max(self._model.world_count, 1))
         energies[np.maximum(self._worlds, 0)] = self.system.energy()
         return energies
@@ -325,6 +370,7 @@ class Magnetics:
 
         Where shapes of one body overlap, the common volume belongs to the first of them.
         """
+        self.check_model()
         sum_moments(self._part_start, self.system.moments, self._totals)
         return self._totals.numpy()
 

@@ -269,6 +269,7 @@ class Simulation:
             self._look()
 
     def _look(self) -> None:
+        self._magnetics.check_model()
         try:
             for report in self._stepper.look():
                 self._statistics.add_step(report)

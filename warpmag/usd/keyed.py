@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
 from warpmag.keyed import Keys, Motion, Operation
@@ -76,8 +76,6 @@ class KeyReader:
         attribute = self.plain.GetPrimAtPath(prim.GetPath()).GetAttribute(name)
         times = attribute.GetTimeSamples() if attribute else ()
         where = f"{prim.GetPath()}: {name}"
-        if attribute and attribute.HasSpline():
-            raise InputError(f"{where} is a spline, of which a run reads no keys: bake it into time samples")
         if len(times) < 2:
             return None
         return _keys(times, [read(f"{where} at time code {time:g}", _sample(attribute, time)) for time in times], where)
@@ -126,12 +124,21 @@ def make_kinematic(stage: Usd.Stage, animated: Iterable[Sdf.Path]) -> None:
                 found.append(prim.GetPath())
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         for path in found:
-            prim = stage.GetPrimAtPath(path)
+            prim = instance = stage.GetPrimAtPath(path)
+            while not instance.IsPseudoRoot() and not instance.IsInstance():
+                instance = instance.GetParent()
             if prim.IsInstanceProxy():
-                raise InputError(f"{path}: moves by keys, and lies inside an instance: set instanceable = false there")
+                where = instance.GetPath()
+                raise InputError(f"{path}: moves by keys inside an instance: set instanceable = false on {where}")
             body = UsdPhysics.RigidBodyAPI.Apply(prim)
             body.CreateRigidBodyEnabledAttr(True)
             body.CreateKinematicEnabledAttr(True)
+            # which nothing depends on, but planes and open meshes have none, and Newton leaves bodies without out
+            mass = UsdPhysics.MassAPI.Apply(prim)
+            mass.CreateMassAttr(1.0)
+            mass.CreateDiagonalInertiaAttr(Gf.Vec3f(1.0))
+            mass.CreatePrincipalAxesAttr(Gf.Quatf(1.0))
+            mass.CreateCenterOfMassAttr(Gf.Vec3f(0.0))
 
 
 def _belongs(prim: Usd.Prim, found: list[Sdf.Path]) -> bool:

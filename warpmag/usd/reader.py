@@ -140,7 +140,7 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
         attribute
         for prim in stage.Traverse()
         for attribute in prim.GetAuthoredAttributes()
-        if attribute.GetNumTimeSamples() or session.GetAttributeAtPath(attribute.GetPath())
+        if attribute.GetNumTimeSamples() or attribute.HasSpline() or session.GetAttributeAtPath(attribute.GetPath())
     ]
     for attribute in sampled:  # what an earlier call held would hide the samples
         if spec := session.GetAttributeAtPath(attribute.GetPath()):
@@ -150,7 +150,9 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
         for attribute, value in values:
             if value is not None:
                 attribute.Set(value)
-            elif attribute.GetNumTimeSamples():  # blocked at that time: as if it had never been authored
+            elif (
+                attribute.GetNumTimeSamples() or attribute.HasSpline()
+            ):  # blocked at that time: as if it had never been authored
                 attribute.Block()
     cut_off(stage)
     make_kinematic(stage, {one.GetPrim().GetPath() for one in sampled if one.GetName().startswith("xformOp:")})

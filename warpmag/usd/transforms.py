@@ -23,12 +23,13 @@ def is_collider(prim: Usd.Prim) -> bool:
 
 
 def is_animated(prim: Usd.Prim) -> bool:
-    """Whether a layer gives time samples for the prim's own transform, held or not."""
+    """Whether a layer gives time samples or a spline for the prim's own transform, held or not."""
     if not prim.IsA(UsdGeom.Xformable):
         return False
     order = UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() or ()
     operations = (prim.GetAttribute(name.removeprefix(_INVERSE)) for name in order if "xformOp:" in name)
-    return any(spec.HasInfo("timeSamples") for one in operations if one for spec in one.GetPropertyStack())
+    specs = [spec for one in operations if one for spec in one.GetPropertyStack()]
+    return any(spec.HasInfo("timeSamples") or spec.HasInfo("spline") for spec in specs)
 
 
 class TransformCheck:
