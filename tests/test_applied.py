@@ -160,25 +160,27 @@ def test_gradients_of_turned_coils(device):
     assert_gradients(LOOP, device, points_around(20) + frame[:3], frame=frame)
 
 
-def map_of(spacing, device, *, half=1.2 * A):
-    """A map of the field of a loop about half of its axis, without the wire, and the map's record."""
-    nodes = round(2.0 * half / spacing) + 1
-    origin = (-half, -half, 0.5 * A)
-    axes = [o + spacing * np.arange(nodes) for o in origin]
+DIPOLE = np.zeros((1, 3)), np.array([[0.02, -0.05, 0.1]])  # m, A·m²
+CORNER, SIDE = np.array([-0.02, -0.02, 0.03]), 0.04  # m, of a map beside it
+
+
+def map_of_a_dipole(cells):
+    """A map of a dipole's field, of so many cells along each side."""
+    axes = [start + SIDE / cells * np.arange(cells + 1) for start in CORNER]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    values = field_of(LOOP, places.reshape(-1, 3), device, strength=1.0)[0].reshape(places.shape)
-    return source_of(FieldMap(origin, (spacing,) * 3, values).record())
+    values = oracle.h_field(*DIPOLE, places.reshape(-1, 3)).reshape(places.shape)
+    return source_of(FieldMap(tuple(CORNER), (SIDE / cells,) * 3, values).record())
 
 
 def test_a_map_converges_to_the_field_that_it_is_of(device):
     """The field as the third power of the spacing, its gradient as the second, up to the border."""
-    points = np.array([-1.2 * A, -1.2 * A, 0.5 * A]) + 2.4 * A * np.random.default_rng(2).uniform(size=(1000, 3))
-    exact, errors = field_of(LOOP, points, device), []
-    for spacing in (0.1 * A, 0.05 * A, 0.025 * A):
-        found = field_of(map_of(spacing, device), points, device)
+    points = CORNER + SIDE * np.random.default_rng(2).uniform(size=(1000, 3))
+    exact, errors = (oracle.h_field(*DIPOLE, points), oracle.gradient_at(*DIPOLE, points)), []
+    for cells in (20, 40, 80):
+        found = field_of(map_of_a_dipole(cells), points, device, strength=1.0)
         errors.append([np.linalg.norm(one - of) / np.linalg.norm(of) for one, of in zip(found, exact, strict=True)])
     errors = np.array(errors)
-    assert errors[-1, 0] < 2e-5
+    assert errors[-1, 0] < 5e-6
     assert (errors[1:, 0] < errors[:-1, 0] / 7.0).all()  # 8 in the limit
     assert (errors[1:, 1] < errors[:-1, 1] / 3.8).all()  # 4
 
