@@ -5,6 +5,9 @@ import math
 import numpy as np
 import pytest
 import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from test_arguments_wild import STRANGE, chosen, refusals
 
 from warpmag import oracle
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
@@ -157,25 +160,27 @@ def test_gradients_of_turned_coils(device):
     assert_gradients(LOOP, device, points_around(20) + frame[:3], frame=frame)
 
 
-def map_of(spacing, device, *, half=1.2 * A):
-    """A map of the field of a loop about half of its axis, without the wire, and the map's record."""
-    nodes = round(2.0 * half / spacing) + 1
-    origin = (-half, -half, 0.5 * A)
-    axes = [o + spacing * np.arange(nodes) for o in origin]
+DIPOLE = np.zeros((1, 3)), np.array([[0.02, -0.05, 0.1]])  # m, A·m²
+CORNER, SIDE = np.array([-0.02, -0.02, 0.03]), 0.04  # m, of a map beside it
+
+
+def map_of_a_dipole(cells):
+    """A map of a dipole's field, of so many cells along each side."""
+    axes = [start + SIDE / cells * np.arange(cells + 1) for start in CORNER]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    values = field_of(LOOP, places.reshape(-1, 3), device, strength=1.0)[0].reshape(places.shape)
-    return source_of(FieldMap(origin, (spacing,) * 3, values).record())
+    values = oracle.h_field(*DIPOLE, places.reshape(-1, 3)).reshape(places.shape)
+    return source_of(FieldMap(tuple(CORNER), (SIDE / cells,) * 3, values).record())
 
 
 def test_a_map_converges_to_the_field_that_it_is_of(device):
     """The field as the third power of the spacing, its gradient as the second, up to the border."""
-    points = np.array([-1.2 * A, -1.2 * A, 0.5 * A]) + 2.4 * A * np.random.default_rng(2).uniform(size=(1000, 3))
-    exact, errors = field_of(LOOP, points, device), []
-    for spacing in (0.1 * A, 0.05 * A, 0.025 * A):
-        found = field_of(map_of(spacing, device), points, device)
+    points = CORNER + SIDE * np.random.default_rng(2).uniform(size=(1000, 3))
+    exact, errors = (oracle.h_field(*DIPOLE, points), oracle.gradient_at(*DIPOLE, points)), []
+    for cells in (20, 40, 80):
+        found = field_of(map_of_a_dipole(cells), points, device, strength=1.0)
         errors.append([np.linalg.norm(one - of) / np.linalg.norm(of) for one, of in zip(found, exact, strict=True)])
     errors = np.array(errors)
-    assert errors[-1, 0] < 2e-5
+    assert errors[-1, 0] < 5e-6
     assert (errors[1:, 0] < errors[:-1, 0] / 7.0).all()  # 8 in the limit
     assert (errors[1:, 1] < errors[:-1, 1] / 3.8).all()  # 4
 
@@ -400,10 +405,10 @@ def test_64_worlds_with_64_currents(device):
     magnetics, state = warpmag.Magnetics(model, rtol=1e-5), model.state()
     currents = np.random.default_rng(0).normal(size=64)
     on_axis = np.array([A**2 / (2.0 * (A**2 * (k + 0.25)) ** 1.5) * k for k in (1.0, 4.0)])
-    for given in (currents, wp.array(-currents, dtype=wp.float32, device=device), 0.5):
-        magnetics.set_current("lift", given)
+    for set_to in (currents, wp.array(-currents, dtype=wp.float32, device=device), 0.5):
+        magnetics.set_current("lift", set_to)
         magnetics.induce(state)
-        field = on_axis[0] * (given.numpy() if isinstance(given, wp.array) else np.asarray(given)) + 5.0 * on_axis[1]
+        field = on_axis[0] * (set_to.numpy() if isinstance(set_to, wp.array) else np.asarray(set_to)) + 5.0 * on_axis[1]
         expected = np.broadcast_to(3.0 * VOLUME * field, 64)
         np.testing.assert_allclose(
             magnetics.shape_moments()[:, 2], expected, atol=1e-4 * 3.0 * VOLUME * np.abs(field).max()
@@ -541,7 +546,7 @@ def test_what_ends_at_its_border():
     ({"shape": "ring", "radius": A}, "shape: 'ring' is not one of loop, solenoid, polyline"),
     ({"shape": "solenoid", "radius": A}, "length: must be positive"),
     ({"radius": A, "points": [[0, 0, 0]]}, "points are given, but a loop has none"),
-    ({"shape": "polyline"}, "points: must be vectors"),
+    ({"shape": "polyline"}, "points: must be at least 3"),
     ({"shape": "polyline", "points": [[0, 0, 0], [1, 0, 0]]}, "points: must be at least 3, got 2"),
     ({"shape": "polyline", "points": [[0, 0, 0], [1, 0, 0], [1, 0, 0]]}, "number 1 is not"),
     ({"shape": "polyline", "points": [[0, 0, 0], [1, 0, math.inf], [1, 0, 0]]}, "points: must be finite"),
@@ -551,7 +556,9 @@ def test_what_ends_at_its_border():
     ({"radius": A, "ampere_turns": "many"}, "ampere turns: must be one real number"),
     ({"radius": A, "wire_radius": A}, "wire radius must be from 0 to 0.01"),
     ({"radius": A, "body": 7}, "body: 7 is out of range"),
-    ({"radius": A, "xform": wp.transform((math.nan, 0.0, 0.0), wp.quat_identity())}, "xform must be finite"),
+    ({"radius": A, "xform": wp.transform((math.nan, 0.0, 0.0), wp.quat_identity())}, "xform: must be finite"),
+    ({"radius": A, "xform": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0))}, "xform: must be a place and a quaternion"),
+    ({"radius": A, "label": 3}, "label: must be text"),
 ])  # fmt: skip
 def test_coils_that_cannot_be(arguments, text):
     with pytest.raises(warpmag.InputError, match=text) as error:
@@ -574,6 +581,42 @@ def test_maps_that_cannot_be(arguments, text):
     given = {"origin": (0.0, 0.0, 0.0), "spacing": 1.0, "values": np.zeros((2, 2, 2, 3))} | arguments
     with pytest.raises(warpmag.InputError, match=text):
         warpmag.add_field_map(new_builder(), **given)
+
+
+WILD = {
+    "add_coil": "body shape radius length points closed wire_radius ampere_turns xform label",
+    "add_field_map": "origin spacing values body factor xform label",
+}
+
+
+@pytest.mark.parametrize("name", WILD)
+@given(st.data())
+def test_any_source(name, data):
+    """What is taken makes a record of finite numbers."""
+    builder, right = new_builder(), {"radius": A} if name == "add_coil" else {
+        "origin": (0.0, 0.0, 0.0), "spacing": 1.0, "values": np.ones((2, 2, 2, 3))
+    }  # fmt: skip
+    with refusals():
+        site = getattr(warpmag, name)(builder, **(right | chosen(data, WILD[name])))
+        record = SourceRecord.from_text(builder.custom_attributes["warpmag:source"].values[site])
+        assert np.isfinite(record.parameters).all()
+        assert np.isfinite(record.table).all()
+        assert np.isfinite(builder.custom_attributes["warpmag:strength"].values[site])
+
+
+@given(st.data())
+def test_any_current(wild_magnetics, data):
+    with refusals():
+        wild_magnetics.set_current(data.draw(st.one_of(STRANGE, st.just("*"))), data.draw(STRANGE))
+        assert np.isfinite(wild_magnetics._model.warpmag.strength.numpy()).all()
+
+
+@pytest.fixture(scope="module")
+def wild_magnetics(device):
+    builder = new_builder()
+    add_ball(builder, (0.0, 0.0, 0.0))
+    warpmag.add_coil(builder, radius=A)
+    return warpmag.Magnetics(builder.finalize(device=device))
 
 
 def test_sources_that_no_world_or_every_world_would_have(device):

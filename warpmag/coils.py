@@ -94,14 +94,15 @@ class Coil:
         elif len(self.points):
             raise InputError(f"{name}: points are given, but a {self.shape} has none")
         most = self._thickest()
-        if not 0.0 <= real(f"{name}: wire radius", self.wire_radius) <= most:
-            raise InputError(f"{name}: wire radius must be from 0 to {most:g}, got {self.wire_radius:g}")
+        wire = real(f"{name}: wire radius", self.wire_radius)
+        if not 0.0 <= wire <= most:
+            raise InputError(f"{name}: wire radius must be from 0 to {most:g}, got {wire:g}")
 
     def _check_points(self, name: str) -> None:
-        points = checked_vectors(name, self.points, FARTHEST_POINT)
         least = 3 if self.closed else 2
-        if len(points) < least:
-            raise InputError(f"{name}: must be at least {least}, got {len(points)}")
+        if len(self.points) < least:
+            raise InputError(f"{name}: must be at least {least}, got {len(self.points)}")
+        checked_vectors(name, self.points, FARTHEST_POINT)
         lengths = np.linalg.norm(np.diff(self._chain(), axis=0), axis=1)
         if not lengths.min() >= SIZES[0]:
             raise InputError(f"{name}: must be {SIZES[0]:g} m apart or more, number {int(lengths.argmin())} is not")

@@ -17,9 +17,11 @@ from warpmag.engine.attributes import NAMESPACE, check_body, check_registered
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.rigid.sources import SourceShapes, add_reactions, gather_sources, set_strengths
-from warpmag.magnets import shown
+from warpmag.magnets import check_whole, shown
 from warpmag.system import MomentSystem
 
+_STRAIGHT = 1e-3
+"""How much the length of a quaternion may differ from 1."""
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 
@@ -30,7 +32,7 @@ def add_coil(
     shape: str = "loop",
     radius: float = 0.0,
     length: float = 0.0,
-    points=(),
+    points=None,
     closed: bool = True,
     wire_radius: float = 0.0,
     ampere_turns: float = 0.0,
@@ -64,11 +66,12 @@ def add_coil(
     Raises:
         InputError: The attributes are not declared, the body does not exist, or a value is out of range.
     """
-    if len(points):
-        points = checked_vectors("add_coil: points", points, FARTHEST_POINT)
-    coil = Coil(shape, radius, length, tuple(map(tuple, points)), closed, wire_radius, ampere_turns)
+    corners = ()
+    if points is not None:
+        corners = checked_vectors("add_coil: points", host_array("add_coil: points", points), FARTHEST_POINT)
+    coil = Coil(shape, radius, length, tuple(map(tuple, corners)), closed, wire_radius, ampere_turns)
     coil.check("add_coil")
-    return add_source(builder, body, coil.record(), ampere_turns, xform, label or f"coil_{builder.shape_count}")
+    return add_source(builder, body, coil.record(), ampere_turns, xform, _label(builder, "coil", label))
 
 
 def add_field_map(
@@ -105,11 +108,19 @@ def add_field_map(
         InputError: The attributes are not declared, the body does not exist, or a value is out of range.
     """
     name = "add_field_map"
-    steps = (spacing,) * 3 if np.ndim(spacing) == 0 else tuple(spacing)
-    nodes = host_array(f"{name}: values", values)
-    found = FieldMap(tuple(origin), steps, nodes, factor)
+    nodes, steps = host_array(f"{name}: values", values), host_array(f"{name}: spacing", spacing)
+    first = host_array(f"{name}: origin", origin)
+    found = FieldMap(
+        tuple(np.atleast_1d(first)), tuple(np.resize(steps, 3) if steps.ndim == 0 else steps), nodes, factor
+    )
     found.check(name)
-    return add_source(builder, body, found.record(), factor, xform, label or f"field_map_{builder.shape_count}")
+    return add_source(builder, body, found.record(), factor, xform, _label(builder, "field_map", label))
+
+
+def _label(builder: newton.ModelBuilder, kind: str, given: str | None) -> str:
+    """Return the label of a source that is to be added."""
+    check_registered(builder)
+    return f"{kind}_{builder.shape_count}" if given is None else given
 
 
 def add_source(
@@ -117,13 +128,27 @@ def add_source(
 ) -> int:
     """Add a source to a body, or to the world; return the site that stands for it."""
     check_registered(builder)
+    check_whole("body", body)
     if body != -1:
         check_body(builder, body)
-    xform = wp.transform() if xform is None else xform
-    if not np.isfinite(np.array(xform, dtype=float)).all():
-        raise InputError(f"{label}: xform must be finite, got {shown(xform)}")
+    if not isinstance(label, str):
+        raise InputError(f"label: must be text, got {shown(label)}")
+    frame = wp.transform() if xform is None else _checked_frame("xform", xform)
     values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
-    return builder.add_site(body, xform=xform, label=label, custom_attributes=values)
+    return builder.add_site(body, xform=frame, label=label, custom_attributes=values)
+
+
+def _checked_frame(name: str, xform) -> wp.transform:
+    """Return a transform, or a place and a rotation, with a rotation of length 1."""
+    try:
+        parts = list(xform)
+    except TypeError:
+        parts = []
+    numbers = np.concatenate([np.zeros(0), *(host_array(name, part).ravel() for part in parts)])
+    length = float(np.linalg.norm(numbers[3:]))
+    if len(numbers) != 7 or not abs(length - 1.0) < _STRAIGHT or np.abs(numbers).max() > FARTHEST_POINT:
+        raise InputError(f"{name}: must be a place and a quaternion x y z w of length 1, got {shown(xform)}")
+    return wp.transform(numbers[:3], numbers[3:] / length)
 
 
 class ModelSources:
@@ -191,6 +216,8 @@ class ModelSources:
 
     def set_strength(self, name: str, which: int | str, value) -> None:
         """Set the strength of those sources that ``which`` tells, a shape or a pattern of labels, in their order."""
+        if not isinstance(which, str):
+            check_whole(name, which)
         if which not in self._found:
             self._found[which] = self._find(name, which)
         shapes = self._found[which]
@@ -199,7 +226,7 @@ class ModelSources:
                 raise InputError(f"{name}: must be a Warp array of float32 on {self._model.device}")
             values = value
         else:
-            numbers = np.atleast_1d(np.asarray(value))
+            numbers = np.atleast_1d(host_array(name, value))
             for one in numbers.flat:
                 check_strength(name, one)
             if numbers.ndim != 1:
