@@ -170,14 +170,12 @@ def matrices(model, state, contacts):
 CONTACT = "shape0 shape1 point0 point1 offset0 offset1 normal margin0 margin1".split()
 
 
-OFF = pytest.mark.xfail(strict=True, reason="ends 1.4 % of the correction away, for a reason that is not known")
-
-
-@pytest.mark.parametrize(
-    "kind", ["ball", "capsule", "dumbbell", "plate", pytest.param("mesh", marks=[pytest.mark.long, OFF])]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_substep_pushes_as_little_as_it_has_to(kind, device):
-    """Without friction contacts ask for a convex problem, the least impulses that leave no overlap; here in float64."""
+    """Without friction contacts ask for a convex problem, the least impulses that leave no overlap; here in float64.
+
+    Bodies with many contacts take many iterations: meshes are 15 % of the correction off after 300 and 1.4 after 3,000.
+    """
     model, state, contacts = heap(kind, device, ground=False)
     for material in (model.shape_material_mu, model.shape_material_mu_torsional, model.shape_material_mu_rolling):
         material.zero_()
@@ -198,13 +196,13 @@ def test_a_substep_pushes_as_little_as_it_has_to(kind, device):
         onward = 0.0 if (ahead - impulse) @ (impulse - last) > 0.0 else iteration / (iteration + 3)
         ahead = impulse + onward * (impulse - last)
     change = np.einsum("cbi,c->bi", moved, impulse)
-    assert (system @ impulse + start).min() > -1e-3 * np.abs(change[:, :3]).max()  # the oracle has arrived
-    _, qd = substep(PileXPBD, model, state, contacts, 3000)
+    assert (system @ impulse + start).min() > -1e-5 * np.abs(change[:, :3]).max()  # the oracle has arrived
+    _, qd = substep(PileXPBD, model, state, contacts, 30_000)
     # a turn by ω dt changes the angular velocity of a body that keeps its angular momentum
     turn = DT * np.abs(before[:, 3:] + change[:, 3:]).max()
     size, rounding = np.abs(change[:, :3]).max(), 3.0 * 6e-8 / DT * np.abs(state.body_q.numpy()[:, :3]).max()
-    np.testing.assert_allclose(qd[:, :3], (before + change)[:, :3], rtol=0, atol=1e-3 * size + rounding)
-    tolerance = (1e-3 + turn) * np.abs(change[:, 3:]).max() + (1e-5 * size + rounding) / R
+    np.testing.assert_allclose(qd[:, :3], (before + change)[:, :3], rtol=0, atol=1e-4 * size + rounding)
+    tolerance = (1e-4 + turn) * np.abs(change[:, 3:]).max() + (1e-5 * size + rounding) / R
     np.testing.assert_allclose(qd[:, 3:], (before + change)[:, 3:], rtol=0, atol=tolerance)
 
 
