@@ -1,0 +1,131 @@
+"""A substep's contacts meet Coulomb's law: its conditions in float64, from the impulses that the solve kept.
+
+With friction they have no unique solution, so that two solvers may end apart and both be right.
+"""
+
+from typing import NamedTuple
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.test_engine_xpbd import CAPACITY, CONTACT, DT, heap
+from warpmag.engine.xpbd import PileXPBD
+from warpmag.kernels.rigid.contact_solve import PUSH_OUT
+
+G = 9.81  # m/s²
+
+
+class Ends(NamedTuple):
+    """A contact in the world's frame: bodies, arms to where it acts, whether they give way, normal, gap, impulse."""
+
+    bodies: list
+    arms: list
+    gives: list
+    normal: np.ndarray
+    gap: float
+    impulse: np.ndarray
+
+
+def contact_ends(model, state, contacts, kept, device):
+    """The contacts, with the impulses [N·s] on their second bodies that the solve kept."""
+    count = contacts.rigid_contact_count.numpy()[0]
+    value = {name: getattr(contacts, f"rigid_contact_{name}").numpy()[:count].astype(float) for name in CONTACT}
+    order = range(count)
+    if wp.get_device(device).is_cuda:  # there contacts of the same shapes are sorted by where they are
+        order = np.lexsort(np.hstack([value[name] for name in ("point0", "point1", "normal")]).T[::-1])
+    shape_body, body_q, com = model.shape_body.numpy(), state.body_q.numpy(), model.body_com.numpy()
+    mass = masses(model)
+    seen, found = {}, []
+    for c in order:
+        shapes = int(value["shape0"][c]), int(value["shape1"][c])
+        bodies = [shape_body[shape] for shape in shapes]
+        inverse = [1.0 / mass[body] if body >= 0 else 0.0 for body in bodies]
+        if sum(inverse) == 0.0:
+            continue
+        frames = [wp.transform(*body_q[body]) if body >= 0 else wp.transform_identity() for body in bodies]
+
+        def world(end, point, frames=frames):
+            return np.array(wp.transform_point(frames[end], wp.vec3(*point)), float)
+
+        points = [world(end, value[f"point{end}"][c]) for end in (0, 1)]
+        surfaces = [world(end, value[f"point{end}"][c] + value[f"offset{end}"][c]) for end in (0, 1)]
+        at = (inverse[0] * surfaces[0] + inverse[1] * surfaces[1]) / sum(inverse)
+        normal = value["normal"][c]
+        gap = normal @ (points[1] - points[0]) - value["margin0"][c] - value["margin1"][c]
+        end, key = int(inverse[1] > 0.0), shapes[0] << 32 | shapes[1]
+        first, last = kept["kept_range"][bodies[end]]
+        place = first + np.flatnonzero(kept["kept_key"][first:last] == key)[seen.get(key, 0)]
+        seen[key] = seen.get(key, 0) + 1
+        impulse = DT * kept["kept"][place, :3].astype(float) * (1.0 if end else -1.0)
+        arms = [at - world(end, com[body]) if body >= 0 else at for end, body in enumerate(bodies)]
+        found.append(Ends(bodies, arms, [one > 0.0 for one in inverse], normal, gap, impulse))
+    return found
+
+
+def masses(model):
+    kinematic = (model.body_flags.numpy() & newton.BodyFlags.KINEMATIC) != 0
+    return np.where(kinematic, np.inf, model.body_mass.numpy().astype(float))
+
+
+def velocities(model, state, ends, gravity):
+    """Velocities that gravity and the impulses of contacts give the bodies, before they turn, shape [bodies, 6]."""
+    mass, qd = masses(model), state.body_qd.numpy().astype(float)
+    gains = np.zeros_like(qd)
+    for one in ends:
+        for body, arm, sign in zip(one.bodies, one.arms, (-1.0, 1.0), strict=True):
+            if body >= 0:
+                gains[body] += sign * np.concatenate([one.impulse, np.cross(arm, one.impulse)])
+    for body in np.flatnonzero(np.isfinite(mass)):
+        turn = np.array(wp.quat_to_matrix(wp.quat(*state.body_q.numpy()[body, 3:].tolist())), float).reshape(3, 3)
+        qd[body, :3] += gains[body, :3] / mass[body] - (0.0, 0.0, gravity * DT)
+        qd[body, 3:] += turn @ model.body_inv_inertia.numpy()[body] @ turn.T @ gains[body, 3:]
+    return qd
+
+
+def surface_velocities(one, qd):
+    ends = zip(one.bodies, one.arms, strict=True)
+    return [qd[body, :3] + np.cross(qd[body, 3:], arm) if body >= 0 else np.zeros(3) for body, arm in ends]
+
+
+@pytest.mark.parametrize(
+    "kind, mu, ground", [("ball", 0.5, True), ("capsule", 0.5, True), ("box", 0.5, True), ("mesh", 0.1, False)]
+)
+def test_contacts_meet_coulombs_law(kind, mu, ground, device):
+    """They open, or push, not both; what sticks does not slip; what slips is rubbed against, by μ times the push.
+
+    Tetrahedra that overlap and wedge each other with more friction have no solution near: impulses grow without end.
+    """
+    model, state, contacts = heap(kind, device, ground=ground)
+    model.shape_material_mu.fill_(mu)
+    for material in (model.shape_material_mu_torsional, model.shape_material_mu_rolling):
+        material.zero_()
+    settings = {"rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
+    solver, begin, end = PileXPBD(model, CAPACITY, iterations=30_000, **settings), model.state(), model.state()
+    begin.assign(state)
+    solver.step(begin, end, None, contacts, DT)
+    kept = {name: array.numpy() for name, array in solver._solve.carried().items()}
+    ends = contact_ends(model, state, contacts, kept, device)
+    qd = velocities(model, state, ends, G if ground else 0.0)
+    size = np.abs(qd - state.body_qd.numpy())[:, :3].max()
+    np.testing.assert_allclose(end.body_qd.numpy()[:, :3], qd[:, :3], atol=1e-4 * size)
+    most = max(one.impulse @ one.normal for one in ends)
+    kinds = set()
+    for one in ends:
+        v = surface_velocities(one, qd)
+        slip = v[1] - v[0]
+        slip -= (slip @ one.normal) * one.normal
+        # surfaces that are moved do not close gaps
+        opening = (one.gives[1] * v[1] - one.gives[0] * v[0]) @ one.normal + max(one.gap / DT, -PUSH_OUT)
+        push = one.impulse @ one.normal
+        rub = one.impulse - push * one.normal
+        assert opening > -1e-4 * size and push >= -1e-6 * most and np.linalg.norm(rub) <= mu * push + 1e-6 * most
+        if push < 1e-4 * most:  # as good as none
+            continue
+        sticks = np.linalg.norm(rub) < (1.0 - 1e-4) * mu * push
+        kinds.add("sticks" if sticks else "slips")
+        assert opening < 1e-4 * size
+        along = np.zeros(3) if sticks else -rub / np.linalg.norm(rub)
+        assert np.linalg.norm(slip - max(0.0, slip @ along) * along) < 1e-4 * size
+    assert ("sticks" if mu == 0.5 else "slips") in kinds
