@@ -41,25 +41,26 @@ def _count_contacts(
 
 
 @wp.kernel
-def _find_shares(shares_io: wp.array[float]):
+def _find_shares(counts_io: wp.array[float], shares_out: wp.array[float]):
     body = wp.tid()
-    shares_io[body] = wp.max(1.0, shares_io[body] / float(_UNSPLIT))
+    shares_out[body] = wp.max(1.0, counts_io[body] / float(_UNSPLIT))
+    counts_io[body] = 0.0
 
 
-def launch_count_shares(contacts: ContactView, body_q, splits, shares):
+def launch_count_shares(contacts: ContactView, body_q, splits, counts, shares):
     """Write into how many shares each body is split.
 
     Args:
         contacts: The contacts.
         body_q: Poses that they were found at, shape [body_count].
         splits: 1 for bodies whose mass may be split, shape [body_count].
+        counts: Zeros, which they are again afterwards, shape [body_count].
         shares: Out, number of shares, a quarter of the contacts that touch or nearly do, 1 at least, shape
             [body_count].
     """
-    shares.zero_()
     inputs = [contacts, body_q, splits]  # whole numbers: in any order they add up to the same
-    wp.launch(_count_contacts, dim=contacts.shape0.shape[0], inputs=inputs, outputs=[shares], device=shares.device)
-    wp.launch(_find_shares, dim=len(shares), outputs=[shares], device=shares.device)
+    wp.launch(_count_contacts, dim=contacts.shape0.shape[0], inputs=inputs, outputs=[counts], device=shares.device)
+    wp.launch(_find_shares, dim=len(shares), outputs=[counts, shares], device=shares.device)
 
 
 @wp.kernel

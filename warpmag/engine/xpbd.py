@@ -48,7 +48,8 @@ class PileXPBD(newton.solvers.SolverXPBD):
         splits = ~_single_balls(model)
         self._splits = wp.array(splits.astype(np.int32), dtype=wp.int32, device=model.device) if splits.any() else None
         self._contact_iterations = contact_iterations or self.iterations
-        self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
+        self._counts = wp.zeros(model.body_count, dtype=float, device=model.device)
+        self._shares = wp.ones_like(self._counts)
         self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         others = model.particle_count, model.tendon_segment_count, self.enable_restitution
         self._solve = self._joints = None
@@ -67,7 +68,8 @@ class PileXPBD(newton.solvers.SolverXPBD):
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; as Newton's."""
         if self._splits is not None:
-            launch_count_shares(view_contacts(self.model, contacts), state_in.body_q, self._splits, self._shares)
+            view = view_contacts(self.model, contacts)
+            launch_count_shares(view, state_in.body_q, self._splits, self._counts, self._shares)
         if self._solve is not None and contacts.rigid_contact_surface_velocity is None:
             self._step_bodies(state_in, state_out, contacts, dt)
             return
