@@ -6,9 +6,11 @@ therefore split among their contacts (``kernels.rigid.mass_splitting``).
 Newton's solver launches every iteration over all contacts that its buffers may hold, and adds them up with atomics, in
 another order in every run. Rigid bodies are moved by ``kernels.rigid.contact_solve`` instead, which solves the same
 conditions and gives the same bits in every run. It keeps momentum and angular momentum, which Newton's lever arms and
-its damping of spins do not, and needs half the iterations (``kernels/rigid/contact_law.h``). Its end is Newton's own
-where no push overshoots. In heaps Newton's pushes do, stay, and make its end depend on its relaxation: these are the
-least that leave no overlap.
+its damping of spins do not, and needs half the iterations (``kernels/rigid/contact_law.h``). What sticks stays where it
+is, however many bodies lie on it: contacts with friction begin where they ended in the last substep. Bodies that were
+put into each other are pushed apart at 2 m/s at most. Its end is Newton's own where no push overshoots. In heaps
+Newton's pushes do, stay, and make its end depend on its relaxation: without friction these are the least that leave no
+overlap, with friction they meet Coulomb's law.
 """
 
 import contextlib
