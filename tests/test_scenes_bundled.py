@@ -36,6 +36,7 @@ def test_every_scene_is_bundled():
 
 def test_scenes_hold_what_the_paper_names(report):
     name, found = report
+    assert [str(finding) for finding in found.findings] == []
     contents = found.contents
     counts = len(contents.bodies), len(contents.kinematic), *(len(found.magnets(k)) for k in ("inducible", "permanent"))
     assert counts == CONTENTS[name]
