@@ -245,7 +245,7 @@ class Simulation:
 
     def warnings(self) -> list[str]:
         """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
-        known = *(self._scene.warnings if self._scene else ()), *solver_warnings(self._options["solver"])
+        known = *(self._scene.warnings if self._scene else ()), *solver_warnings(self.model, self._options["solver"])
         return [*known, *self.statistics.warnings()]
 
     @property
