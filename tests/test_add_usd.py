@@ -34,12 +34,11 @@ def compare(found, expected):
         np.testing.assert_allclose(other.magnetization, magnet.magnetization, rtol=0, atol=1e-6 * size)
 
 
-SLOW = ("sakura_tree", "falling_magnet")  # thousands of bodies
+QUICK = ("balls_up", "crystal_balls")
+SCENES = [pytest.param(one, marks=() if one in QUICK else pytest.mark.long) for one in bundled()]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(one, marks=pytest.mark.long if one in SLOW else ()) for one in bundled()]
-)
+@pytest.mark.parametrize("name", SCENES)
 def test_bundled_scenes_have_the_same_magnets(name):
     builder = import_scene(bundled()[name]).builder
     model = builder.finalize(device="cpu")
