@@ -17,12 +17,8 @@ from warpmag.errors import InputError
 G, MU0 = 9.81, 4e-7 * math.pi  # m/s², H/m
 STEP = 1e-3  # s
 EXTENT = np.array((0.01, 0.002, 0.001))  # half of it, of a bar or a needle [m]
-SOLVERS = (
-    "xpbd",
-    "featherstone",
-    "steel",
-    *(pytest.param(name, marks=pytest.mark.long) for name in ("mujoco", "kamino")),
-)
+SLOW = [pytest.param(name, marks=pytest.mark.long) for name in ("mujoco", "kamino")]  # to compile
+SOLVERS = ["xpbd", "featherstone", "steel", *SLOW]
 
 
 def scene(gravity=0.0):
@@ -113,6 +109,8 @@ def test_a_compass_needle_swings_about_north(solver, device):
 
 
 def test_a_drive_is_a_spring_of_its_gain(solver, device):
+    if solver == "kamino":
+        pytest.skip("its drives are stiffer than their gains, as it says")
     builder, wide, rate, steps = scene(), 0.5, 25.0, 330
     axis = np.array((0.6, 0.8, 0.0))
     bar, inertia = hinge(builder, wide, arm=EXTENT[0], axis=tuple(axis))
@@ -137,7 +135,59 @@ def servo(angle=0.0, rate=200.0):
 def test_an_arm_holds_what_its_drive_holds(solver, device):
     builder, bar, sag = servo()
     path = angles(Simulation(builder, solver=solver, device=device, step=STEP), bar, np.array((0.0, 1.0, 0.0)), 80)
-    assert path[-1] == pytest.approx(sag, rel=0.01)
+    if solver == "kamino":  # stiffer than its gain, as it says
+        assert 0.0 < path[-1] < sag
+    else:
+        assert path[-1] == pytest.approx(sag, rel=0.01)
+
+
+ARM = """#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Xform "World" {
+def PhysicsScene "Scene" {
+    vector3f physics:gravityDirection = (0, 0, -1)
+    float physics:gravityMagnitude = 9.81
+}
+def Xform "Robot" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {
+def Capsule "Arm" (
+    prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"]
+) {
+    uniform token axis = "X"
+    double radius = 0.002
+    double height = 0.02
+    float physics:mass = 0.01
+}
+def PhysicsRevoluteJoint "Shoulder" (prepend apiSchemas = ["PhysicsDriveAPI:angular"]) {
+    rel physics:body1 = </World/Robot/Arm>
+    uniform token physics:axis = "Y"
+    point3f physics:localPos0 = (-0.01, 0, 0)
+    point3f physics:localPos1 = (-0.01, 0, 0)
+    float drive:angular:physics:stiffness = 0.002
+    float drive:angular:physics:damping = 0.00002
+    float drive:angular:physics:targetPosition = 10
+}
+}
+}
+"""
+
+
+@pytest.mark.parametrize("solver", ["xpbd", "featherstone", *SLOW])
+def test_a_stages_drive_holds_its_target(solver, device, tmp_path):
+    if solver == "mujoco":
+        pytest.importorskip("mujoco_warp")
+    (tmp_path / "arm.usda").write_text(ARM)
+    simulation = Simulation(tmp_path / "arm.usda", solver=solver, device=device, step=STEP)
+    angle = angles(simulation, 0, np.array((0.0, 1.0, 0.0)), 150)[-1]
+    stiffness, target = math.degrees(0.002), math.radians(10.0)  # N·m/rad
+    sag = 0.01 * G * 0.01 * math.cos(target) / stiffness
+    if solver == "kamino":
+        assert target < angle < target + sag
+    else:
+        assert angle - target == pytest.approx(sag, rel=0.02)
 
 
 def test_targets_may_change_between_steps(device):
@@ -232,7 +282,7 @@ def test_a_solver_that_is_not_installed_names_what_installs_it(device, monkeypat
             "semi-implicit",
             "^joint_1: a joint of a body that is too light for the solver semi-implicit, whose joints are",
         ),
-        ("kamino", "^solver kamino: .*DISTANCE"),
+        pytest.param("kamino", "^solver kamino: .*DISTANCE", marks=pytest.mark.long),
         ("vbd", "^solver vbd: .*DISTANCE"),
     ],
 )

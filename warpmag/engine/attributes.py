@@ -5,6 +5,7 @@ Shapes carry the magnet, not bodies, so that a static shape can be one and so th
 """
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import newton
@@ -47,10 +48,18 @@ _SOLID = (
 def register_attributes(builder: newton.ModelBuilder) -> None:
     """Declare the attributes that magnets are stored in; call it before :func:`add_inducible` and friends.
 
+    Newton's ``builder.add_usd(stage)`` then brings the magnets of a stage in, too: what colliders or their rigid bodies
+    with ``WarpmagMagnetAPI`` say, or the defaults of what they do not say.
+
     Args:
         builder: The builder; declaring twice does nothing.
     """
     _check_builder(builder)
+    declare_attributes(builder, usd_attribute_name="*", usd_value_transformer=_of_prim)
+
+
+def declare_attributes(builder: newton.ModelBuilder, **source) -> None:
+    """Declare the attributes, of which Newton reads those of magnets from ``source``."""
     for name, (dtype, default) in (_ATTRIBUTES | _OF_SOURCES).items():
         builder.add_custom_attribute(
             newton.ModelBuilder.CustomAttribute(
@@ -60,8 +69,39 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
                 frequency=newton.Model.AttributeFrequency.SHAPE,
                 assignment=newton.Model.AttributeAssignment.MODEL,
                 namespace=NAMESPACE,
+                **(source if name in _ATTRIBUTES else {}),
             )
         )
+
+
+def _of_prim(_, context: dict[str, Any]):
+    """Return the value of one attribute for the shape that Newton makes of a prim, None where that is no magnet."""
+    from warpmag.usd import magnet_of, magnet_prim_of  # noqa: PLC0415 - a builder can do without USD
+
+    prim = context["prim"]
+    owner = magnet_prim_of(prim)
+    if owner is None:
+        return None
+    turn = axis_turn(prim)
+    if owner != prim:
+        within = [newton.usd.get_transform(one, local=False).q for one in (owner, prim)]
+        turn = wp.quat_inverse(within[0]) * within[1] * turn
+    return _values(in_shape_frame(magnet_of(owner), turn))[context["attr"].name]
+
+
+def in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:
+    """Return ``magnet`` with its magnetization in the frame of a shape that is turned by ``turn`` from the prim's."""
+    if not np.any(magnet.magnetization):
+        return magnet
+    turned = wp.quat_rotate_inv(turn, wp.vec3(*magnet.magnetization))
+    return replace(magnet, magnetization=tuple(turned))
+
+
+def axis_turn(prim):
+    """Return how Newton turns the frame of a capsule, cylinder or cone prim, whose axis it puts along z."""
+    axis = prim.GetAttribute("axis")
+    value = axis.Get() if axis else None
+    return newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.from_any(value)) if value else wp.quat_identity()
 
 
 def add_inducible(
@@ -185,7 +225,13 @@ def _check_index(name: str, index: int, count: int, kind: str) -> None:
 def mark_shape(builder: newton.ModelBuilder, shape: int, magnet: Magnet) -> None:
     """Store ``magnet``, its magnetization in the frame of the shape, on one shape."""
     magnet.check(builder.shape_label[shape])
-    values = {
+    for name, value in _values(magnet).items():
+        builder.custom_attributes[f"{NAMESPACE}:{name}"].values[shape] = value
+
+
+def _values(magnet: Magnet) -> dict[str, Any]:
+    """Return the values of the attributes of a shape, in whose frame ``magnet`` is."""
+    return {
         "kind": 1 + KINDS.index(magnet.kind),
         "saturation": float(magnet.saturation),
         "susceptibility": float(magnet.susceptibility),
@@ -193,8 +239,6 @@ def mark_shape(builder: newton.ModelBuilder, shape: int, magnet: Magnet) -> None
         "magnetization": wp.vec3(*(float(x) for x in magnet.magnetization)),
         "moment_spacing": float(magnet.moment_spacing),
     }
-    for name, value in values.items():
-        builder.custom_attributes[f"{NAMESPACE}:{name}"].values[shape] = value
 
 
 _MEASURED: list[MagnetizationCurve] = []

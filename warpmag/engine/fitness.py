@@ -11,25 +11,32 @@ from warpmag.magnets import shown
 SPRING_STIFFNESS = 1e4
 """Stiffness of the semi-implicit solver's joints as Newton sets it [N/m and N·m/rad]."""
 _WEAKNESSES = {
-    "vbd": "solver vbd: bodies that magnets press together sink into each other and may be thrown out, and joints take "
-    "some 5 % of a swing; xpbd does neither",
+    "kamino": "solver kamino: hundreds of bodies that touch take it seconds a step, and drives of joints hold far "
+    "stiffer than their gains; not so with xpbd",
+    "vbd": "solver vbd: bodies that magnets press together sink into each other and may be thrown out, and hinged "
+    "bodies lose several per cent of a swing; not so with xpbd",
 }
 
 
-def check_articulations(builder: newton.ModelBuilder, solver: str) -> None:
-    """Refuse joints outside articulations to solvers that know bodies by their articulations alone."""
+def articulate(builder: newton.ModelBuilder, solver: str) -> None:
+    """Make an articulation of each joint by which a body hangs from the world alone, where the solver knows no others.
+
+    Such bodies would stay where they are, and those that hang from other bodies outside all articulations are refused.
+    """
     if solver in MAXIMAL:
         return
-    joints = list(
-        zip(builder.joint_label, builder.joint_articulation, builder.joint_parent, builder.joint_child, strict=True)
-    )
-    inside = {body for _, articulation, *bodies in joints if articulation >= 0 for body in bodies}
-    for label, articulation, parent, child in joints:
-        if articulation < 0 and parent >= 0 and child not in inside:
+    joints = list(zip(builder.joint_articulation, builder.joint_parent, builder.joint_child, strict=True))
+    inside = {body for articulation, *bodies in joints if articulation >= 0 for body in bodies}
+    for joint, (articulation, parent, child) in enumerate(joints):
+        if articulation >= 0 or child in inside:
+            continue
+        if parent >= 0 or builder.joint_world[joint] != builder.current_world:
             raise InputError(
-                f"{label}: a joint outside all articulations, which the solver {solver} cannot take, but "
-                f"{', '.join(MAXIMAL[:-1])} and {MAXIMAL[-1]} can; or apply PhysicsArticulationRootAPI above it"
+                f"{builder.joint_label[joint]}: a joint outside all articulations, which the solver {solver} cannot "
+                f"take, but {', '.join(MAXIMAL)} can; or apply PhysicsArticulationRootAPI above it"
             )
+        builder.add_articulation([joint])
+        inside.add(child)
 
 
 def check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
@@ -52,6 +59,15 @@ def check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
 def solver_warnings(solver: str) -> list[str]:
     """Return what a user of the solver should know, a line each."""
     return [_WEAKNESSES[solver]] if solver in _WEAKNESSES else []
+
+
+def check_start(model: newton.Model) -> None:
+    """Refuse bodies that start at no place or with no velocity."""
+    for name in ("body_q", "body_qd"):
+        bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
+        if bad.any():
+            what = "position or orientation" if name == "body_q" else "velocity"
+            raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {what} is not finite")
 
 
 def check_control(control: newton.Control, model: newton.Model) -> None:

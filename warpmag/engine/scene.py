@@ -10,7 +10,7 @@ import warp as wp
 
 from warpmag.coils import Coil
 from warpmag.engine.applied import add_source
-from warpmag.engine.attributes import magnet_shapes, mark_shape, register_attributes
+from warpmag.engine.attributes import axis_turn, declare_attributes, in_shape_frame, magnet_shapes, mark_shape
 from warpmag.errors import InputError
 from warpmag.keyed import Keys, SceneKeys
 from warpmag.magnets import Magnet, StageMagnets
@@ -83,7 +83,7 @@ def import_scene(
     strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)
     give_densities(stage, contents.magnets)
     builder = newton.ModelBuilder()
-    register_attributes(builder)
+    declare_attributes(builder)
     found = _add_stage(builder, stage, path, visuals)
     _let_frictionless_roll(builder)
     bodies, shapes, joints = found["path_body_map"], found["path_shape_map"], found["path_joint_map"]
@@ -159,7 +159,7 @@ def _mark_magnets(
             raise InputError(f"{prim}: a magnet of which Newton imported neither body nor shape")
         for shape in covered[prim]:
             turn = _shape_turn(builder, stage, prim, shape, bodies)
-            mark_shape(builder, shape, _in_shape_frame(magnet, turn))
+            mark_shape(builder, shape, in_shape_frame(magnet, turn))
     return covered
 
 
@@ -169,13 +169,13 @@ def _scene_keys(builder, stage, contents: StageContents, clock: StageClock, bodi
     def in_seconds(keys):
         return keys.in_seconds(clock.start, clock.time_codes_per_second)
 
-    def in_shape_frame(keys: Keys, prim: str, shape: int) -> Keys:
+    def turned_back(keys: Keys, prim: str, shape: int) -> Keys:
         turn = np.array(wp.quat_to_matrix(_shape_turn(builder, stage, prim, shape, bodies))).reshape(3, 3)
-        return replace(keys, values=keys.values @ turn)  # each turned back
+        return replace(keys, values=keys.values @ turn)
 
     motions = {bodies[prim]: in_seconds(motion) for prim, motion in contents.motions.items()}
     magnetizations = {
-        shape: in_shape_frame(in_seconds(keys), prim, shape)
+        shape: turned_back(in_seconds(keys), prim, shape)
         for prim, keys in contents.magnetization_keys.items()
         for shape in covered[prim]
     }
@@ -184,7 +184,7 @@ def _scene_keys(builder, stage, contents: StageContents, clock: StageClock, bodi
 
 def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
     """Return how the frame of a shape is turned from that of the magnet prim that it belongs to."""
-    return builder.shape_transform[shape].q if prim in bodies else _axis_turn(stage, prim)
+    return builder.shape_transform[shape].q if prim in bodies else axis_turn(stage.GetPrimAtPath(prim))
 
 
 def _add_source(builder: newton.ModelBuilder, prim: str, placed: PlacedSource, bodies: dict[str, int]) -> None:
@@ -196,21 +196,6 @@ def _add_source(builder: newton.ModelBuilder, prim: str, placed: PlacedSource, b
     source = placed.source
     strength = source.ampere_turns if isinstance(source, Coil) else source.factor
     add_source(builder, body, source.record(), strength, frame, prim)
-
-
-def _in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:
-    """Return ``magnet`` with its magnetization in the frame of a shape that is turned by ``turn`` from the prim's."""
-    if not np.any(magnet.magnetization):
-        return magnet
-    turned = wp.quat_rotate_inv(turn, wp.vec3(*magnet.magnetization))
-    return Magnet(magnet.kind, magnetization=tuple(turned), moment_spacing=magnet.moment_spacing)
-
-
-def _axis_turn(stage, prim: str):
-    """Return how Newton turns the frame of a capsule, cylinder or cone prim, whose axis it puts along z."""
-    axis = stage.GetPrimAtPath(prim).GetAttribute("axis")
-    value = axis.Get() if axis else None
-    return newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.from_any(value)) if value else wp.quat_identity()
 
 
 def _let_frictionless_roll(builder: newton.ModelBuilder) -> None:

@@ -15,7 +15,7 @@ import warp as wp
 from warpmag.arrays import resolve_device
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
-from warpmag.engine.fitness import check_articulations, check_control, check_joint_springs, solver_warnings
+from warpmag.engine.fitness import articulate, check_control, check_joint_springs, check_start, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -124,7 +124,7 @@ class Simulation:
 
     def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
         """Make the model."""
-        check_articulations(builder, solver)
+        articulate(builder, solver)
         if not builder.body_count:  # Newton allocates nothing for bodies then; one without shapes changes nothing
             whole = newton.ModelBuilder()
             whole.add_builder(builder)
@@ -135,11 +135,7 @@ class Simulation:
         with wp.ScopedDevice(self.device), self._refusals(scene):
             model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
         check_joint_springs(model, solver, LONGEST_SUBSTEP)
-        for name in ("body_q", "body_qd"):
-            bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
-            if bad.any():
-                what = "position or orientation" if name == "body_q" else "velocity"
-                raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {what} is not finite")
+        check_start(model)
         return model
 
     def _drive(self, solver: str, own_field: bool) -> Drive | None:

@@ -5,7 +5,7 @@ before the first stage is opened in a process, for USD takes no new schemas afte
 attributes right even then).
 """
 
-from warpmag.usd.schemas import author_magnet, author_settings  # isort: skip  (registers the schemas first)
+from warpmag.usd.schemas import author_magnet, author_settings, magnet_of, magnet_prim_of  # isort: skip  (registers the schemas first)
 from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
 from warpmag.usd.coils import PlacedSource, author_coil, author_field_map
@@ -45,6 +45,8 @@ __all__ = [
     "give_densities",
     "hold",
     "inspect",
+    "magnet_of",
+    "magnet_prim_of",
     "open_stage",
     "prepare_joints",
     "read_magnets",

@@ -82,6 +82,16 @@ def magnet_of(prim: Usd.Prim) -> Magnet:
     return magnet
 
 
+def magnet_prim_of(collider: Usd.Prim) -> Usd.Prim | None:
+    """Return the prim that makes a collider a magnet: itself or its rigid body; None where neither does."""
+    if not has_api(collider, "PhysicsCollisionAPI") or collider.GetTypeName() == "Plane":
+        return None
+    prim = collider
+    while not has_api(prim, MAGNET_API) and not has_api(prim, "PhysicsRigidBodyAPI") and not prim.IsPseudoRoot():
+        prim = prim.GetParent()
+    return prim if has_api(prim, MAGNET_API) and (prim == collider or has_api(prim, "PhysicsRigidBodyAPI")) else None
+
+
 def moment_of(prim: Usd.Prim) -> tuple[float, float, float] | None:
     """Read the authored moment of a magnet [A·m²], world frame, None where it has none."""
     attribute = prim.GetAttribute(MOMENT)
