@@ -199,6 +199,16 @@ def test_a_coil_that_keys_move_without_a_body_is_told(tmp_path):
     )
 
 
+def test_attributes_for_nothing_are_told(tmp_path):
+    lone = 'def Xform "Lone" {\nfloat warpmag:fieldMap:factor = 2\n}'
+    report = check(write(tmp_path, coil("float warpmag:coil:radius = 1", "float warpmag:coil:ampereturns = 5"), lone))
+    told = [str(one) for one in report.warnings if "no effect" in str(one)]
+    assert told == [
+        "/Thing: warpmag:coil:ampereturns has no effect: no schema has it",
+        "/Lone: warpmag:fieldMap:factor has no effect: the prim has no WarpmagFieldMapAPI",
+    ]
+
+
 def test_largest_numbers_are_refused_by_name():
     for bad in (Coil(radius=1.0, ampere_turns=2e15), Coil(radius=1e7), Coil(radius=1.0, wire_radius=math.nan)):
         with pytest.raises(InputError, match="here"):

@@ -133,6 +133,18 @@ def is_source(prim: Usd.Prim) -> bool:
     return has_api(prim, COIL_API) or has_api(prim, MAP_API)
 
 
+def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
+    """Yield which attributes of coils and field maps a prim has for nothing."""
+    for api, attributes in ((COIL_API, _COIL), (MAP_API, _MAP)):
+        known = {name for name, _, _ in attributes.values()}
+        namespace = min(known).rpartition(":")[0]
+        for name in map(Usd.Property.GetName, prim.GetAuthoredPropertiesInNamespace(namespace)):
+            if name not in known:
+                yield Finding(str(prim.GetPath()), f"{name} has no effect: no schema has it", "warning")
+            elif not has_api(prim, api):
+                yield Finding(str(prim.GetPath()), f"{name} has no effect: the prim has no {api}", "warning")
+
+
 def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> Iterator[PlacedSource | Finding]:
     """Yield the coil and the field map that a prim is, or what is wrong with them."""
     path = str(prim.GetPath())

@@ -17,7 +17,7 @@ from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
-from warpmag.usd.coils import PlacedSource, is_source, sources_of
+from warpmag.usd.coils import PlacedSource, is_source, sources_of, stray_findings
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
@@ -211,6 +211,7 @@ def survey(stage: Usd.Stage) -> StageContents:
     for prim in prims:
         if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
             _read_magnet(prim, transforms, keys, contents)
+        contents.findings += stray_findings(prim)
         if is_source(prim) and str(prim.GetPath()) not in inside:
             _read_sources(prim, transforms, keys, contents)
     contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
