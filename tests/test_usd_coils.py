@@ -116,6 +116,31 @@ def test_a_run_has_the_coils_of_its_stage_in_their_places(tmp_path, device):
     assert any("100 % of its largest where the map ends" in line for line in simulation.warnings())
 
 
+def test_a_current_follows_its_time_samples(tmp_path, device):
+    """A pulse: linear between its keys, and held after them; the ball is magnetized as it says at each step."""
+    pulse = coil(
+        "float warpmag:coil:radius = 0.04",
+        "float warpmag:coil:ampereTurns.timeSamples = { 0: 100, 24: 0, 48: -50, }",
+        "double3 xformOp:translate = (0, 0, 0.03)",
+        'uniform token[] xformOpOrder = ["xformOp:translate"]',
+    )
+    path = write(tmp_path, pulse)
+    path.write_text(path.read_text().replace("metersPerUnit", "timeCodesPerSecond = 2400\n    metersPerUnit"))
+    simulation = warpmag.Simulation(path, device=device, step=1e-3, rtol=1e-5)
+    sites = np.flatnonzero([bool(text) for text in simulation.model.warpmag.source])
+    currents = []
+    for _ in range(25):
+        simulation.step()
+        currents.append(float(simulation.model.warpmag.strength.numpy()[sites[0]]))
+        z = 0.03 - float(simulation.state.body_q.numpy()[0, 2])
+    # those of the last substep, of 0.5 ms, which takes what is its own at its begin
+    times = 2400.0 * 1e-3 * (np.arange(25) + 0.5)
+    np.testing.assert_allclose(currents, np.interp(times, [0.0, 24.0, 48.0], [100.0, 0.0, -50.0]), atol=1e-4)
+    moment = simulation.magnetics.shape_moments()[0, 2]
+    expected = 3.0 * 4.0 / 3.0 * np.pi * 0.005**3 * -50.0 * 0.04**2 / (2.0 * (0.04**2 + z**2) ** 1.5)
+    assert abs(moment / expected - 1.0) < 0.01  # the ball falls by 0.5 % of that in a substep
+
+
 def test_check_tells_what_a_stage_holds(tmp_path, capsys):
     path = write(tmp_path, coil("float warpmag:coil:radius = 0.02"), coil(*["float warpmag:coil:radius = 1"], name="B"))
     assert cli.main(["check", str(path)]) in (0, None)
@@ -138,6 +163,8 @@ UNEVEN = "float3 xformOp:scale = (1, 2, 1)", 'uniform token[] xformOpOrder = ["x
     (coil("float warpmag:coil:radius = 1", "int warpmag:coil:closed = 1"), "warpmag:coil:closed: must be true"),
     (coil("float warpmag:coil:radius = 1", "float warpmag:coil:wireRadius = 1"), "/Thing: wire radius"),
     (coil("float warpmag:coil:radius.timeSamples = { 0: 1, 1: 2, }"), "has time samples, but cannot change"),
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:ampereTurns.timeSamples = { 0: 1, 1: nan, }"),
+     "warpmag:coil:ampereTurns at time code 1: must be finite"),
     (coil("float warpmag:coil:radius = 1", *UNEVEN), "must not be scaled unevenly"),
     (coil("float warpmag:coil:radius = 1", kind="Scope"), "has no transform"),
     (field_map(), "/Thing: warpmag:fieldMap:spacing is missing"),
@@ -166,7 +193,20 @@ def test_a_coil_that_keys_move_without_a_body_is_told(tmp_path):
     )
     report = check(write(tmp_path, moved))
     assert not report.refusals
-    assert any("keys move it, but it is on no rigid body" in str(one) for one in report.warnings)
+    assert any(
+        "keys move it, but it is on no rigid body, a kinematic one say: a run holds it still" in str(one)
+        for one in report.warnings
+    )
+
+
+def test_attributes_for_nothing_are_told(tmp_path):
+    lone = 'def Xform "Lone" {\nfloat warpmag:fieldMap:factor = 2\n}'
+    report = check(write(tmp_path, coil("float warpmag:coil:radius = 1", "float warpmag:coil:ampereturns = 5"), lone))
+    told = [str(one) for one in report.warnings if "no effect" in str(one)]
+    assert told == [
+        "/Thing: warpmag:coil:ampereturns has no effect: no schema has it",
+        "/Lone: warpmag:fieldMap:factor has no effect: the prim has no WarpmagFieldMapAPI",
+    ]
 
 
 def test_largest_numbers_are_refused_by_name():

@@ -188,12 +188,15 @@ def _check(options) -> int:
         f"bodies      {len(contents.bodies)} ({len(contents.kinematic)} kinematic), {len(contents.colliders)} colliders"
     )
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
-    if contents.motions or contents.magnetization_keys or contents.field_keys:
-        field = ", the external field" if contents.field_keys else ""
-        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{field}")
-    if contents.sources:
-        sources = [type(one.source).__name__ for placed in contents.sources.values() for one in placed]
-        print(f"sources     {sources.count('Coil')} coils, {sources.count('FieldMap')} field maps")
+    sources = [one for placed in contents.sources.values() for one in placed]
+    currents = sum(one.currents is not None for one in sources)
+    if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
+        more = f", {currents} currents" if currents else ""
+        more += ", the external field" if contents.field_keys else ""
+        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{more}")
+    if sources:
+        kinds = [type(one.source).__name__ for one in sources]
+        print(f"sources     {kinds.count('Coil')} coils, {kinds.count('FieldMap')} field maps")
     settings = contents.settings
     field = ", ".join(f"{value:g}" for value in settings.external_field)
     laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"

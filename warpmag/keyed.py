@@ -70,9 +70,11 @@ class SceneKeys:
     Attributes:
         motions: Motion of kinematic bodies, by body.
         magnetizations: Magnetizations of permanent shapes [A/m], in the frames of the shapes, by shape.
+        currents: Ampere-turns of coils [A], by shape.
         field: External field [A/m], None where it is constant.
     """
 
     motions: dict[int, Motion]
     magnetizations: dict[int, Keys]
+    currents: dict[int, Keys]
     field: Keys | None = None

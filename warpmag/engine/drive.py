@@ -1,4 +1,5 @@
-"""Lets a model follow keys while it is stepped: poses of kinematic bodies, magnetizations, the external field.
+"""Lets a model follow keys while it is stepped: poses of kinematic bodies, magnetizations, currents,
+the external field.
 
 Keys lie on the device and are looked up at its time, which repeated and shortened substeps move as they must.
 """
@@ -40,6 +41,9 @@ class Drive:
         for shape, curve in keys.magnetizations.items():
             curves.append(curve)
             targets.append(getattr(model, NAMESPACE).magnetization[shape : shape + 1])
+        for shape, curve in keys.currents.items():
+            curves.append(curve)
+            targets.append(getattr(model, NAMESPACE).strength[shape : shape + 1])
         self._field = None
         if keys.field is not None:
             self._field = wp.zeros(1, dtype=wp.vec3, device=model.device)
@@ -48,7 +52,7 @@ class Drive:
         self._followers = follow(curves, targets, self.time) if curves else None
 
     def set_values(self, offset: float, *, shared: wp.array | None = None, substep: float = 0.0) -> None:
-        """Set magnetizations and the field to what they are some seconds after :attr:`time`.
+        """Set magnetizations, currents and the field to what they are some seconds after :attr:`time`.
 
         Args:
             offset: The seconds.

@@ -16,7 +16,6 @@ from warpmag.keyed import Keys, SceneKeys
 from warpmag.magnets import Magnet, StageMagnets
 from warpmag.usd import (
     GroundedJoint,
-    PlacedSource,
     StageClock,
     StageContents,
     enabled_joints,
@@ -96,9 +95,7 @@ def import_scene(
     for joint in grounded:
         _place_on_ground(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
-    for prim, sources in contents.sources.items():
-        for placed in sources:
-            _add_source(builder, prim, placed, bodies)
+    currents = _add_sources(builder, contents.sources, bodies)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
     return ImportedScene(
         stage=stage,
@@ -107,7 +104,7 @@ def import_scene(
         magnets=magnets,
         bodies=bodies,
         magnet_shapes=covered,
-        keys=_scene_keys(builder, stage, contents, clock, bodies, covered),
+        keys=_scene_keys(builder, stage, contents, clock, bodies, covered, currents),
         strained=strained,
         warnings=tuple(map(str, report.warnings)),
     )
@@ -163,7 +160,9 @@ def _mark_magnets(
     return covered
 
 
-def _scene_keys(builder, stage, contents: StageContents, clock: StageClock, bodies, covered) -> SceneKeys:
+def _scene_keys(
+    builder, stage, contents: StageContents, clock: StageClock, bodies, covered, currents: dict[int, Keys]
+) -> SceneKeys:
     """Return what follows time samples, in seconds and in Newton's words."""
 
     def in_seconds(keys):
@@ -179,7 +178,8 @@ def _scene_keys(builder, stage, contents: StageContents, clock: StageClock, bodi
         for prim, keys in contents.magnetization_keys.items()
         for shape in covered[prim]
     }
-    return SceneKeys(motions, magnetizations, contents.field_keys and in_seconds(contents.field_keys))
+    currents = {shape: in_seconds(keys) for shape, keys in currents.items()}
+    return SceneKeys(motions, magnetizations, currents, contents.field_keys and in_seconds(contents.field_keys))
 
 
 def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
@@ -187,15 +187,23 @@ def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -
     return builder.shape_transform[shape].q if prim in bodies else axis_turn(stage.GetPrimAtPath(prim))
 
 
-def _add_source(builder: newton.ModelBuilder, prim: str, placed: PlacedSource, bodies: dict[str, int]) -> None:
-    """Put a coil or a field map of a stage on its body, or into the world; its label is the path of the prim."""
-    frame, body = wp.transform(placed.position, placed.rotation), -1
-    if placed.body is not None:
-        body = bodies[placed.body]
-        frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
-    source = placed.source
-    strength = source.ampere_turns if isinstance(source, Coil) else source.factor
-    add_source(builder, body, source.record(), strength, frame, prim)
+def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> dict[int, Keys]:
+    """Put coils and field maps of a stage on their bodies, or into the world, labelled with the paths of their prims.
+
+    Returns:
+        Keys of the currents of those coils that have some, by the shape that stands for the coil.
+    """
+    currents = {}
+    for prim, one in ((prim, one) for prim, placed in sources.items() for one in placed):
+        frame, body = wp.transform(one.position, one.rotation), -1
+        if one.body is not None:
+            body = bodies[one.body]
+            frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
+        strength = one.source.ampere_turns if isinstance(one.source, Coil) else one.source.factor
+        shape = add_source(builder, body, one.source.record(), strength, frame, prim)
+        if one.currents is not None:
+            currents[shape] = one.currents
+    return currents
 
 
 def _let_frictionless_roll(builder: newton.ModelBuilder) -> None:

@@ -143,7 +143,7 @@ class Simulation:
         if self._scene is None:
             return None
         keys = self._scene.keys if own_field else replace(self._scene.keys, field=None)
-        if not (keys.motions or keys.magnetizations or keys.field):
+        if not any(vars(keys).values()):
             return None
         return Drive(self.model, self._magnetics, keys, ahead=solver in AHEAD)
 

@@ -10,10 +10,12 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from warpmag.coils import Coil, FieldMap
+from warpmag.coils import Coil, FieldMap, check_strength
 from warpmag.errors import InputError
+from warpmag.keyed import Keys
+from warpmag.usd.keyed import KeyReader
 from warpmag.usd.schemas import has_api
-from warpmag.usd.transforms import TransformCheck, is_animated, is_body
+from warpmag.usd.transforms import TransformCheck, is_body
 from warpmag.usd.values import Finding, finding_of, instance_finding, number, text, vector
 
 COIL_API = "WarpmagCoilAPI"
@@ -35,12 +37,20 @@ class PlacedSource:
         body: Rigid-body prim that it moves with, None where it is fixed in the world.
         position: Origin of its frame in the world [m].
         rotation: Rotation of its frame (x, y, z, w).
+        currents: Keys of a coil's ampere-turns [A] at time codes, None where they are constant.
     """
 
     source: Coil | FieldMap
     body: str | None
     position: tuple[float, float, float]
     rotation: tuple[float, float, float, float]
+    currents: Keys | None = None
+
+
+def _current(name: str, value) -> tuple[float]:
+    found = number(name, value)
+    check_strength(name, found)
+    return (found,)
 
 
 def _array(name: str, value, kinds: tuple) -> np.ndarray:
@@ -123,7 +133,19 @@ def is_source(prim: Usd.Prim) -> bool:
     return has_api(prim, COIL_API) or has_api(prim, MAP_API)
 
 
-def sources_of(prim: Usd.Prim, transforms: TransformCheck) -> Iterator[PlacedSource | Finding]:
+def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
+    """Yield which attributes of coils and field maps a prim has for nothing."""
+    for api, attributes in ((COIL_API, _COIL), (MAP_API, _MAP)):
+        known = {name for name, _, _ in attributes.values()}
+        namespace = min(known).rpartition(":")[0]
+        for name in map(Usd.Property.GetName, prim.GetAuthoredPropertiesInNamespace(namespace)):
+            if name not in known:
+                yield Finding(str(prim.GetPath()), f"{name} has no effect: no schema has it", "warning")
+            elif not has_api(prim, api):
+                yield Finding(str(prim.GetPath()), f"{name} has no effect: the prim has no {api}", "warning")
+
+
+def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> Iterator[PlacedSource | Finding]:
     """Yield the coil and the field map that a prim is, or what is wrong with them."""
     path = str(prim.GetPath())
     if not prim.IsA(UsdGeom.Xformable):
@@ -135,11 +157,14 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck) -> Iterator[PlacedSou
         return
     try:
         position, rotation, scale = _frame(prim)
-        body = _owner(prim)
-        if body is None and any(map(is_animated, _lineage(prim))):
-            yield Finding(path, "keys move it, but it is on no rigid body: a run holds it still", "warning")
+        owner = _owner(prim)
+        body = owner and str(owner.GetPath())
+        if keys.moves(prim, owner):
+            where = f"within its rigid body {body}" if body else "but it is on no rigid body, a kinematic one say"
+            yield Finding(path, f"keys move it, {where}: a run holds it still there", "warning")
         if has_api(prim, COIL_API):
-            yield PlacedSource(_scaled_coil(coil_of(prim), scale), body, position, rotation)
+            currents = keys.keys(prim, AMPERE_TURNS, _current)
+            yield PlacedSource(_scaled_coil(coil_of(prim), scale), body, position, rotation, currents)
         if has_api(prim, MAP_API):
             found = field_map_of(prim)
             if (rest := found.border()) > _FADED:
@@ -219,11 +244,10 @@ def _frame(prim):
     return tuple(np.array(matrix)[3, :3].tolist()), rotation, float(scales.mean())
 
 
-def _lineage(prim) -> Iterator[Usd.Prim]:
+def _owner(prim) -> Usd.Prim | None:
+    """Return the nearest rigid body at or above a prim."""
     while prim and not prim.IsPseudoRoot():
-        yield prim
+        if is_body(prim):
+            return prim
         prim = prim.GetParent()
-
-
-def _owner(prim) -> str | None:
-    return next((str(one.GetPath()) for one in _lineage(prim) if is_body(one)), None)
+    return None

@@ -17,7 +17,7 @@ from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
-from warpmag.usd.coils import PlacedSource, is_source, sources_of
+from warpmag.usd.coils import PlacedSource, is_source, sources_of, stray_findings
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
@@ -211,8 +211,9 @@ def survey(stage: Usd.Stage) -> StageContents:
     for prim in prims:
         if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
             _read_magnet(prim, transforms, keys, contents)
+        contents.findings += stray_findings(prim)
         if is_source(prim) and str(prim.GetPath()) not in inside:
-            _read_sources(prim, transforms, contents)
+            _read_sources(prim, transforms, keys, contents)
     contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))
@@ -347,9 +348,9 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
         contents.findings += spacing_findings(prim, sound, contents.magnets[path].moment_spacing)
 
 
-def _read_sources(prim, transforms, contents) -> None:
+def _read_sources(prim, transforms, keys, contents) -> None:
     """Read the coil and the field map of a prim into ``contents``, or what is wrong with them."""
-    for found in sources_of(prim, transforms):
+    for found in sources_of(prim, transforms, keys):
         if isinstance(found, Finding):
             contents.findings.append(found)
         else:
