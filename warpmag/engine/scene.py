@@ -203,7 +203,7 @@ def _in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:
     if not np.any(magnet.magnetization):
         return magnet
     turned = wp.quat_rotate_inv(turn, wp.vec3(*magnet.magnetization))
-    return Magnet(magnet.kind, magnetization=tuple(turned), moment_spacing=magnet.moment_spacing)
+    return replace(magnet, magnetization=tuple(turned))
 
 
 def _axis_turn(stage, prim: str):
