@@ -182,3 +182,10 @@ def test_models_keep_it(device):
     magnetics, _ = solved(device, 0.01, 1.05)
     (magnet,) = marked_shapes(magnetics._model).values()
     assert magnet.recoil_permeability == pytest.approx(1.05, rel=1e-7)
+
+
+def test_a_changed_permeability_is_refused(device):
+    magnetics, _ = solved(device, 0.01, 1.05)
+    magnetics._model.warpmag.recoil_permeability.assign([1.1])
+    with pytest.raises(InputError, match="recoil_permeability was changed"):
+        magnetics.notify_model_changed()
