@@ -175,7 +175,7 @@ def two_shapes():
 MAGNETS = {
     "register_attributes": "builder",
     "add_inducible": "builder body shape material saturation susceptibility curve moment_spacing",
-    "add_permanent": "builder body shape material magnetization moment_spacing",
+    "add_permanent": "builder body shape material magnetization recoil_permeability moment_spacing",
 }
 
 
@@ -192,7 +192,10 @@ def test_any_magnet(name, data):
         getattr(warpmag, name)(**arguments)
         values = {key: one.values for key, one in arguments["builder"].custom_attributes.items()}
         for key, wanted in given.items():
-            if key in ("saturation", "susceptibility", "moment_spacing", "magnetization") and wanted is not None:
+            if (
+                key in ("saturation", "susceptibility", "moment_spacing", "magnetization", "recoil_permeability")
+                and wanted is not None
+            ):
                 (found,) = values[f"warpmag:{key}"].values()
                 assert np.array_equal(np.ravel(found), np.ravel(wanted))
 

@@ -499,3 +499,14 @@ def test_densities_are_those_of_matter():
     """Of iron 7,874 kg/m³ (CRC Handbook), of alloys and oxides of it 3,000 to 9,000."""
     assert MATERIALS["pure-iron"].density == pytest.approx(7874.0, rel=1e-3)
     assert all(3e3 < one.density < 9e3 for one in MATERIALS.values())
+
+
+def test_a_changed_number_does_not_bend_a_measured_curve(device):
+    """What a model says beside a table is no material; a named error, not a table with the wrong saturation."""
+    model = builder_with(material="M-19").finalize(device=device)
+    magnetics = warpmag.Magnetics(model, external_field=(0.0, 0.0, 4e5))
+    saturation = model.warpmag.saturation.numpy()
+    saturation[1] *= 0.5
+    model.warpmag.saturation.assign(saturation)
+    with pytest.raises(InputError, match="saturation was changed, and a measured curve says what it is"):
+        magnetics.notify_model_changed()

@@ -13,6 +13,8 @@ from warpmag.curves import MagnetizationCurve
 from warpmag.errors import InputError
 
 KINDS = ("inducible", "permanent")
+LINEAR_CURVE = "linear"
+"""Curve of permanent magnets that respond; no token, since nothing inducible is without saturation."""
 CURVES = ("tanh", "langevin", "clamped", "frohlich")
 """Magnetization curves, see ``kernels.material.curves``; a model has the place in this list."""
 FORCES = ("kelvin", "zeeman")
@@ -24,6 +26,9 @@ ACCURACY = {"float32": 2e-6, "float64": 1e-13}
 
 MATERIAL_RANGE = {"float32": (1e-12, 1e15), "float64": (1e-100, 1e100)}
 """Least and largest saturation [A/m] and finite susceptibility, by the precision of a solve."""
+
+_RECOIL = (1.001, 10.0)
+"""Least recoil permeability above 1 that single precision resolves, and more than any magnet's: AlNiCo has up to 5."""
 
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
@@ -78,6 +83,13 @@ def check_material(name: str, value: float, *, infinite: bool = False) -> None:
     least, most = MATERIAL_RANGE["float32"]
     if not (least <= value <= most or math.isinf(value)):
         raise InputError(f"{name}: must be {least:g} to {most:g}, got {float(value):g}")
+
+
+def check_recoil(name: str, value: float) -> None:
+    """Raise :class:`InputError` unless ``value`` is a recoil permeability: 1, or from 1.001 to 10."""
+    number = real(name, value)
+    if number != 1.0 and not _RECOIL[0] <= number <= _RECOIL[1]:
+        raise InputError(f"{name}: must be 1, or {_RECOIL[0]:g} to {_RECOIL[1]:g}, got {number:g}")
 
 
 def check_not_negative(name: str, value: float) -> None:
@@ -142,7 +154,9 @@ class Magnet:
         susceptibility: Susceptibility χ [dimensionless], may be infinite, inducible only.
         curve: Magnetization curve, one of :data:`CURVES` or a measured one, which then says what saturation and
             susceptibility (its largest) are; inducible only.
-        magnetization: Magnetization of a permanent magnet [A/m], in its own frame.
+        magnetization: Magnetization of a permanent magnet [A/m], in its own frame; with a recoil permeability above 1
+            the remanent one, of no field inside.
+        recoil_permeability: μ of a permanent magnet [dimensionless], M = M_r + (μ − 1) H with the field H inside.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
     """
 
@@ -151,6 +165,7 @@ class Magnet:
     susceptibility: float = math.inf
     curve: str | MagnetizationCurve = "tanh"
     magnetization: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    recoil_permeability: float = 1.0
     moment_spacing: float = 0.0
 
     def __post_init__(self):
@@ -158,6 +173,16 @@ class Magnet:
         if isinstance(self.curve, MagnetizationCurve):
             object.__setattr__(self, "saturation", self.curve.saturation)
             object.__setattr__(self, "susceptibility", self.curve.susceptibility)
+
+    @property
+    def recoils(self) -> bool:
+        """Whether it is permanent and the field changes its magnetization."""
+        return self.kind == "permanent" and self.recoil_permeability > 1.0
+
+    @property
+    def fixed(self) -> bool:
+        """Whether no field changes its magnetization."""
+        return self.kind == "permanent" and not self.recoils
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or body label) if a value is out of range."""
@@ -168,6 +193,7 @@ class Magnet:
             check_curve(f"{name}: curve", self.curve)
         else:
             check_finite(f"{name}: magnetization", self.magnetization)
+            check_recoil(f"{name}: recoil permeability", self.recoil_permeability)
         check_not_negative(f"{name}: moment spacing", self.moment_spacing)
 
 

@@ -23,14 +23,15 @@ from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedForces, Sources, Targets
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.induction import solve_state
+from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.energy import launch_energy
-from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, MIXED, CurveParameters, curve_tables
+from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, LINEAR, MIXED, CurveParameters, curve_tables
 from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.pairs.wrench import launch_zeeman_moments
-from warpmag.magnets import CONTACT_MODELS, check_count, check_force, check_rtol, check_token
+from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
+from warpmag.magnets import CONTACT_MODELS, LINEAR_CURVE, check_count, check_force, check_rtol, check_token
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,8 @@ def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
     def number(one) -> int:
         if isinstance(one, MagnetizationCurve):
             return measured.setdefault(one, FIRST_TABLE + len(measured))
+        if one == LINEAR_CURVE:
+            return LINEAR
         check_token("curve", one, tuple(CURVE_IDS))
         return CURVE_IDS[one]
 
@@ -133,6 +136,7 @@ class MomentSystem:
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
         curve: Magnetization curve, one of ``magnets.CURVES`` or a measured one, which has its own saturation and
             susceptibility; a tuple or list gives each moment its own, of which those of permanent ones do not count.
+            ``magnets.LINEAR_CURVE`` is the response of a permanent magnet by its recoil permeability, 1 + χ.
         external_field: Applied field [A/m], shape [3] or [n, 3].
         force: ``kelvin`` or ``zeeman``.
         dynamics: ``theta``: the exact flow, accelerated; or one of its rivals, explicit steps of pairs of
@@ -165,11 +169,13 @@ class MomentSystem:
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
+        bias: M_r/χ [A/m] of permanent moments that respond, M_r the remanence, shape [n]; written by the caller before
+            :meth:`solve`. None without them.
         dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
         worlds: World of each moment, NumPy, shape [n].
         world_ranges: For each world its first moment, its first permanent one, and the end.
         h: Field at inducible moments [A/m], external and all other moments', of which the dynamics ``theta`` makes M =
-            f(H) when it ends, shape [n].
+            f(H) when it ends, shape [n]; with the bias where there is one.
         forces: Forces [N] on those that may move, shape [n], by :meth:`apply_forces`.
         torques: Torques e × H about each moment's position [N·m], e being m with Kelvin's law (see
             ``kernels.pairs.wrench``), shape [n]; zero for an inducible ball of one moment.
@@ -219,6 +225,7 @@ class MomentSystem:
         self._allocate(layout, external_field)
         self._apply_sources(layout, applied)
         susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
+        layout = self._make_bias(layout, dynamics)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings)
@@ -284,6 +291,16 @@ class MomentSystem:
         )
         return susceptibility
 
+    def _make_bias(self, layout: _Layout, dynamics: str) -> _Layout:
+        """Make room for the bias of permanent moments that respond; return the layout, in which they are no balls."""
+        linear = (self._material.curve.numpy() == LINEAR) & ~layout.permanent
+        self.bias, self._biased = None, wp.array(np.flatnonzero(linear), dtype=wp.int32, device=self.device)
+        if linear.any():
+            if dynamics != "theta":
+                raise InputError(f"dynamics: {dynamics!r} knows no recoil permeability, only 'theta' does")
+            self.bias = wp.zeros_like(self.moments)
+        return replace(layout, lone=layout.lone & ~linear)
+
     def _evaluate_field(self, layout: _Layout, near: bool):
         """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
         self.worlds, self.world_ranges = layout.worlds, layout.ranges()
@@ -291,7 +308,7 @@ class MomentSystem:
         packed, state = self._packed, self._induction
         applied = [(first, middle, middle, last) for first, middle, last in ranges]
         self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self._magnetizing, state.h0)
-        if self._applied.pair_count == 0:
+        if self._applied.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing
         mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
         # near contacts write one more partial sum
@@ -407,6 +424,10 @@ class MomentSystem:
             self._cells.start()
         if self._applied.pair_count:
             self._applied.launch()
+        elif self.bias is not None:
+            wp.copy(self._induction.h0, self._magnetizing)
+        if self.bias is not None:
+            launch_add_bias(self.bias, self._biased, self._induction.h0)
         self.dynamics.start()
         if self._near is not None:
             near_pairs.wait(self._near)
@@ -464,6 +485,10 @@ class MomentSystem:
         fields = state.h, state.h0, self._permanents_field, self._acting
         launch_energy(self.radii, self.moments, self._material, *fields, energies)
         each = energies.numpy()
+        if self.bias is not None:  # counted from where nothing but the remanence is
+            bias = np.linalg.norm(self.bias.numpy().astype(float), axis=1)
+            volumes = 4.0 / 3.0 * np.pi * self.radii.numpy().astype(float) ** 3
+            each += 0.5 * MU0 * volumes * self._material.slope.numpy() * bias**2
         return np.array([each[first:last].sum() for first, _, last in self.world_ranges])
 
     def _make_energy(self):

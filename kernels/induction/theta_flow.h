@@ -58,6 +58,14 @@ struct Material {
     Number saturation, slope;
     Curves curves;
 };
+// Part of a magnetization that an error is relative to: of a permanent moment that responds what could be induced.
+CUDA_CALLABLE inline Number induced_share(const Material& material) {
+    const Number all = material.slope * 0 + 1;
+#if !defined(__CUDA_ARCH__)
+    if (material.curves.common == MIXED) return mask_of(material.curves.each == Index(LINEAR)) ? material.slope : all;
+#endif
+    return material.curves.common == LINEAR ? material.slope : all;
+}
 template <class State> CUDA_CALLABLE inline Material material_of(const State& state, const Place& at) {
     return {some(entries(state.saturation, at), at.held, 1), some(entries(state.slope, at), at.held, 1),
             curves_of(state.curve.data, state.common_curve, state.curve_tables.data, at.i, at.held)};
@@ -233,7 +241,8 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Number worth_s = material.saturation * curve_ratio(length_s, material.curves);
     const Number worth_g = material.saturation * curve_ratio(length_g, material.curves);
     // lengths, not squares: a field of 1e-20 A/m squared is no float32
-    const Wide goal = wide(worth_g * length_g), deviation = wide(length(less(scaled(worth_g, g), scaled(worth_s, s))));
+    const Wide goal = wide(induced_share(material) * worth_g * length_g),
+               deviation = wide(length(less(scaled(worth_g, g), scaled(worth_s, s))));
     const Wide weight = wide(length_s > length_g ? worth_s : worth_g), square = weight * weight;
     const Wide merit = weight * wide(length(r));
     put(DEVIATION, deviation * deviation);

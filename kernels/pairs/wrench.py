@@ -17,7 +17,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.material.curves import CurveParameters, curve_derivative_times
+from warpmag.kernels.material.curves import LINEAR, CurveParameters, curve_derivative_times
 from warpmag.kernels.pairs.packing import ball_volume
 from warpmag.kernels.shared.native import native_options
 
@@ -45,7 +45,7 @@ def _zeeman_kernel(dtype):
         i = wp.tid()
         m = vec3(packed[4, i], packed[5, i], packed[6, i])
         e = m
-        if inducible[i] == 1:
+        if inducible[i] == 1 and curve[i] != wp.static(LINEAR):  # permanent ones respond little
             v = dtype(2.0) * m + ball_volume(packed[3, i]) * h[i]
             e += curve_derivative_times(h[i], v, slope[i], saturation[i], curve[i], tables)
         for c in range(3):

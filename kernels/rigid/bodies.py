@@ -57,13 +57,14 @@ class ShapeMagnets:
 
     Attributes:
         kind: 0 for a shape that is no magnet.
-        saturation, susceptibility, curve, moment_spacing: As in ``warpmag.engine.attributes``.
+        saturation, susceptibility, curve, recoil_permeability, moment_spacing: As in ``warpmag.engine.attributes``.
     """
 
     kind: wp.array[wp.int32]
     saturation: wp.array[float]
     susceptibility: wp.array[float]
     curve: wp.array[wp.int32]
+    recoil_permeability: wp.array[float]
     moment_spacing: wp.array[float]
 
 
@@ -74,6 +75,7 @@ def _alike(now: ShapeMagnets, then: ShapeMagnets, shape: int) -> bool:
     if now.kind[shape] == 0:
         return True
     same = now.saturation[shape] == then.saturation[shape] and now.susceptibility[shape] == then.susceptibility[shape]
+    same = same and now.recoil_permeability[shape] == then.recoil_permeability[shape]
     return same and now.curve[shape] == then.curve[shape] and now.moment_spacing[shape] == then.moment_spacing[shape]
 
 
@@ -114,6 +116,31 @@ def gather_moments(body_q, magnets: BodyMoments, now: ShapeMagnets, then: ShapeM
     outputs = [positions, moments, changed]
     dim = max(len(positions), len(now.kind))
     wp.launch(_gather_moments, dim, inputs=[body_q, magnets, now, then], outputs=outputs, device=positions.device)
+
+
+@wp.kernel
+def _gather_bias(
+    body_q_in: wp.array[wp.transform],
+    magnets: BodyMoments,
+    moments_in: wp.array[wp.int32],
+    factors_in: wp.array[float],
+    bias_out: wp.array[wp.vec3],
+):
+    k = wp.tid()
+    i = moments_in[k]
+    frame = wp.transform_identity()
+    body = magnets.body[i]
+    if body >= 0:
+        frame = body_q_in[body]
+    shape = magnets.shape[i]
+    bias = factors_in[k] * magnets.magnetizations[shape]
+    bias_out[i] = wp.transform_vector(frame, wp.transform_vector(magnets.shape_frames[shape], bias))
+
+
+def gather_bias(body_q, magnets: BodyMoments, moments, factors, bias):
+    """Write the field that stands for the remanence of some ``moments``, ``factors`` times it [A/m], world frame."""
+    inputs = [body_q, magnets, moments, factors]
+    wp.launch(_gather_bias, len(moments), inputs=inputs, outputs=[bias], device=bias.device)
 
 
 @wp.kernel

@@ -91,6 +91,9 @@ AUTHORED = {
     "warpmag:rtol": "float",
     "warpmag:curve": "token",
     "warpmag:material": "token",
+    "warpmag:recoilPermeability": "float",
+    "warpmag:curve:h": "double[]",
+    "warpmag:curve:b": "double[]",
 }
 SCHEMAS = (
     *("PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "PhysicsMaterialAPI", "WarpmagMagnetAPI"),

@@ -27,6 +27,7 @@ _ATTRIBUTES = {
     "susceptibility": (wp.float32, math.inf),
     "curve": (wp.int32, 0),
     "magnetization": (wp.vec3, wp.vec3(0.0, 0.0, 0.0)),  # [A/m], frame of the shape
+    "recoil_permeability": (wp.float32, 1.0),
     "moment_spacing": (wp.float32, 0.0),
 }
 _OF_SOURCES = {
@@ -148,6 +149,7 @@ def add_permanent(
     shape: int | None = None,
     material: str | None = None,
     magnetization: tuple[float, float, float],
+    recoil_permeability: float = 1.0,
     moment_spacing: float = 0.0,
 ) -> None:
     """Make a body, or one shape, a permanent magnet.
@@ -159,6 +161,9 @@ def add_permanent(
         material: Name of a permanent material of :mod:`warpmag.materials`, which says how strong the magnet is.
         magnetization: Magnetization M [A/m] in the frame of the body, of the shape if that is static; with
             ``material`` only its direction counts.
+        recoil_permeability: μ of M = M_r + (μ − 1) H, H the field inside and M_r the ``magnetization``: 1.05 or so of
+            NdFeB, 1.1 of ferrite [dimensionless]. By default, 1, no field changes M; above, the magnet is one more
+            body that induction solves for.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
 
     Raises:
@@ -173,7 +178,13 @@ def add_permanent(
         if builder.shape_body[index] >= 0:
             place: Any = builder.shape_transform[index]  # Newton declares a tuple where it holds a transform
             in_shape = wp.quat_rotate_inv(place.q, wp.vec3(*magnetization))
-        mark_shape(builder, index, Magnet("permanent", magnetization=tuple(in_shape), moment_spacing=moment_spacing))
+        magnet = Magnet(
+            "permanent",
+            magnetization=tuple(in_shape),
+            recoil_permeability=recoil_permeability,
+            moment_spacing=moment_spacing,
+        )
+        mark_shape(builder, index, magnet)
 
 
 def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
@@ -237,6 +248,7 @@ def _values(magnet: Magnet) -> dict[str, Any]:
         "susceptibility": float(magnet.susceptibility),
         "curve": _curve_number(magnet.curve),
         "magnetization": wp.vec3(*(float(x) for x in magnet.magnetization)),
+        "recoil_permeability": float(magnet.recoil_permeability),
         "moment_spacing": float(magnet.moment_spacing),
     }
 
@@ -277,6 +289,7 @@ def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
             susceptibility=float(columns["susceptibility"][shape]),
             curve=_curve_of(columns["curve"][shape]),
             magnetization=tuple(columns["magnetization"][shape].tolist()),
+            recoil_permeability=float(columns["recoil_permeability"][shape]),
             moment_spacing=float(columns["moment_spacing"][shape]),
         )
         for shape in marked

@@ -58,11 +58,11 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
             body,
             tuple(shapes),
             world,
-            sampler.sample(shapes, magnet.moment_spacing, magnet.kind == "permanent"),
+            sampler.sample(shapes, magnet.moment_spacing, magnet.fixed),
         )
         for (magnet, body, shapes), world in zip(groups, worlds, strict=True)
     ]
-    return sorted(magnets, key=lambda one: (one.world, one.magnet.kind == "permanent", one.body, one.shapes)), held
+    return sorted(magnets, key=lambda one: (one.world, one.magnet.fixed, one.body, one.shapes)), held
 
 
 def _alike(a: Magnet, b: Magnet) -> bool:

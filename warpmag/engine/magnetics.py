@@ -17,13 +17,14 @@ from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
+    gather_bias,
     gather_moments,
     gather_rotations,
     set_external_field,
     set_magnetization,
     sum_moments,
 )
-from warpmag.magnets import MagneticSettings
+from warpmag.magnets import LINEAR_CURVE, MagneticSettings
 from warpmag.probe import FieldProbe
 from warpmag.system import MomentSystem
 
@@ -105,15 +106,19 @@ class Magnetics:
         bodies = [one.body if one.body >= 0 else own for one, own in zip(self.magnets, fixed, strict=True)]
         return MomentSystem(
             worlds=spread([one.world for one in self.magnets], int),
-            permanent=spread([one.kind == "permanent" for one in magnets], bool),
+            permanent=spread([one.fixed for one in magnets], bool),
             radii=np.concatenate([one.lattice.radii for one in self.magnets]),
             bodies=spread(bodies, int),
             movable=spread([one.body >= 0 and not kinematic[one.body] for one in self.magnets], bool),
             saturation=spread([one.saturation for one in magnets]),
-            susceptibility=spread([one.susceptibility for one in magnets]),
-            curve=[one.curve for one, count in zip(magnets, counts, strict=True) for _ in range(count)]
-            if curve is None
-            else curve,
+            susceptibility=spread(
+                [one.recoil_permeability - 1.0 if one.recoils else one.susceptibility for one in magnets]
+            ),
+            curve=[
+                LINEAR_CURVE if one.recoils else curve or one.curve
+                for one, count in zip(magnets, counts, strict=True)
+                for _ in range(count)
+            ],
             external_field=settings.external_field,
             force=settings.force,
             dynamics=settings.dynamics,
@@ -131,7 +136,7 @@ class Magnetics:
         lattices = [one.lattice for one in self.magnets]
         counts = [len(one.volumes) for one in lattices]
         body = np.repeat([one.body for one in self.magnets], counts)
-        permanent = np.repeat([one.magnet.kind == "permanent" for one in self.magnets], counts)
+        permanent = np.repeat([one.magnet.fixed for one in self.magnets], counts)
         self._volumes = np.concatenate([one.volumes for one in lattices])
         self.shapes = np.concatenate([one.shapes for one in self.magnets])
         of_shape = np.concatenate([one.counts for one in lattices])
@@ -151,6 +156,9 @@ class Magnetics:
         moments.volumes, moments.shape = put(self._volumes, float), put(np.repeat(self.shapes, of_shape), wp.int32)
         moments.shape_frames = self._model.shape_transform
         moments.magnetizations = getattr(self._model, NAMESPACE).magnetization
+        recoil = np.repeat([one.magnet.recoil_permeability - 1.0 for one in self.magnets], counts)
+        recoils = np.flatnonzero(np.repeat([one.magnet.recoils for one in self.magnets], counts))
+        self._recoiling, self._coercivity = put(recoils, wp.int32), put(1.0 / recoil[recoils], float)
         moments.body_list = put(bodies[dynamic], wp.int32)
         moments.body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
         moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
@@ -194,6 +202,8 @@ class Magnetics:
         if self.system.rotations is not None:
             gather_rotations(state.body_q, self._celled, self.system.rotations)
         self._sources.gather(state.body_q)
+        if len(self._recoiling):
+            gather_bias(state.body_q, self._body_moments, self._recoiling, self._coercivity, self.system.bias)
         self.system.solve()
 
     def add_forces(self, state: newton.State) -> None:
@@ -220,7 +230,9 @@ class Magnetics:
             return
         changed = self._values.changed_materials()
         moment_shapes = self._body_moments.shape.numpy()
-        moments = np.flatnonzero(np.isin(moment_shapes, changed) & ~self._body_moments.permanent.numpy())
+        made = np.isin(moment_shapes, changed) & ~self._body_moments.permanent.numpy()
+        made[self._recoiling.numpy()] = False
+        moments = np.flatnonzero(made)
         self.system.set_material(moments, *self._values.material(moment_shapes[moments]))
         self.magnets = [self._with_material(one) for one in self.magnets]
         self._values.take()

@@ -14,11 +14,11 @@ import warp as wp
 from warpmag.engine.attributes import NAMESPACE, NO_MAGNET
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import ShapeMagnets
-from warpmag.magnets import check_material
+from warpmag.magnets import CURVES, check_material
 
 _MATERIAL = ("saturation", "susceptibility")
 """What can be taken over; the others decide which moments there are, and what they are computed by."""
-_NAMES = ("kind", *_MATERIAL, "curve", "moment_spacing")
+_NAMES = ("kind", *_MATERIAL, "curve", "recoil_permeability", "moment_spacing")
 
 
 class ModelValues:
@@ -87,6 +87,8 @@ class ModelValues:
                     raise InputError(
                         f"{where} was changed, and this Magnetics keeps what it was made with: make another"
                     )
+                if self.now.curve.numpy()[shape] >= len(CURVES):
+                    raise InputError(f"{where} was changed, and a measured curve says what it is")
                 value = float(getattr(self.now, name).numpy()[shape])
                 check_material(where, value, infinite=name == "susceptibility")
         return np.unique(np.concatenate([self._differing(name) for name in _MATERIAL]))

@@ -14,7 +14,7 @@ from warpmag import materials
 from warpmag.curves import MagnetizationCurve
 from warpmag.errors import InputError
 from warpmag.keyed import Keys
-from warpmag.magnets import Magnet, MagneticSettings, check_curve, check_finite, check_material
+from warpmag.magnets import Magnet, MagneticSettings, check_curve, check_finite, check_material, check_recoil
 from warpmag.usd.keyed import KeyReader
 from warpmag.usd.values import instance_finding, number, text, vector
 
@@ -37,6 +37,7 @@ _MAGNET_ATTRIBUTES = {
     "susceptibility": "warpmag:susceptibility",
     "curve": "warpmag:curve",
     "magnetization": "warpmag:magnetization",
+    "recoil_permeability": "warpmag:recoilPermeability",
     "moment_spacing": "warpmag:momentSpacing",
 }
 _OF_CURVE = ("saturation", "susceptibility", "curve")
@@ -77,6 +78,7 @@ def magnet_of(prim: Usd.Prim) -> Magnet:
     magnet.check(path)
     check_curve(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve)  # what its kind has no use for, too
     check_finite(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
+    check_recoil(f"{path}: {_MAGNET_ATTRIBUTES['recoil_permeability']}", magnet.recoil_permeability)
     for field, infinite in (("saturation", False), ("susceptibility", True)):
         check_material(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
     return magnet
