@@ -10,7 +10,7 @@ import warp as wp
 from arrangements import relative
 
 from warpmag import contact_oracle
-from warpmag.kernels.near_contact import contact_table
+from warpmag.kernels.near_contact import contact_table, near_pairs
 from warpmag.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
@@ -215,6 +215,20 @@ def test_force_is_continuous(device):
     )[0]  # fmt: skip
     far = wrench(magnets, [np.zeros(3), [0.0, 0.0, end * R]], [np.zeros(3), [0.0, 0.0, 0.2]])[0]
     np.testing.assert_array_equal(far, dipole)
+
+
+def test_threads_give_the_same_bits(device, monkeypatch):
+    """However many threads of a CPU share the balls."""
+    found = []
+    for count in (1, 2, 5):
+        monkeypatch.setattr(near_pairs, "threads_for", lambda *_, count=count: count)
+        magnets = system(
+            np.tile(RADII, 80), device, dtype="float32", worlds=np.repeat(np.arange(80), 5),
+            permanent=np.arange(400) % 5 >= 2,
+        )  # fmt: skip
+        found.append(wrench(magnets, np.tile(PLACES, (80, 1)), np.tile(MOMENTS, (80, 1))))
+    for one in found[1:]:
+        np.testing.assert_array_equal(one, found[0])
 
 
 def test_graph_gives_the_same_bits(device):

@@ -87,6 +87,8 @@ _WARM = ("state", "last_state", "sources")
 """Arrays that sweeps go on from."""
 _BALLS_PER_THREAD = 500
 """Balls that make another thread of a CPU worth its start."""
+_PAIRS_PER_THREAD = 20000
+"""Pairs of a ball and a permanent moment that do: 0.1 ms."""
 _LEAST, _MOST = 0.4, 4.0
 """Between these lie the eigenvalues of what sweeps solve for, in piles of any permeability, touching or overlapping."""
 
@@ -139,8 +141,8 @@ class NearContactBuffers:
         given: Where these are, their sizes and what else passes are given: kinds, the number of kinds of material, and
             the magnetization curve.
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
-        uneven: Whether permanent moments may act on the balls.
         threads: Threads of a CPU.
+        uneven: Those for what permanent moments add; 0 if none may act on balls.
         stream: Stream of a GPU for what is done beside the pair loops.
         events: There, when it starts, when the field is summed, and when all is done.
         commands: Launches as they were recorded, which spares packing the arrays each time.
@@ -151,8 +153,8 @@ class NearContactBuffers:
     arrays: dict[str, wp.array]
     given: Any
     reach: float
-    uneven: bool
     threads: int
+    uneven: int
     stream: wp.Stream | None
     events: tuple[wp.Event, ...]
     commands: dict
@@ -203,7 +205,7 @@ def allocate(
     reach = 2.0 * float(np.max(radii, initial=0.0, where=eligible))
     lists = neighbors.allocate(n, packed.packed, group, reach=reach, ratio=_RATIO, capacity=CANDIDATES)
     kinds, described = _material_arrays(radii, eligible, susceptibility, material, padded)
-    is_uneven, others = uneven.allocate(balls, ranges, eligible, lone, movable, dtype, device)
+    pairs, others = uneven.allocate(balls, ranges, eligible, lone, movable, dtype, device)
     arrays = _pair_arrays(balls, dtype, device) | described | others
     arrays |= {
         "packed": packed.packed,
@@ -224,7 +226,7 @@ def allocate(
         arrays=arrays,
         given=_addresses(arrays, balls=balls, moment_stride=stride, kinds=kinds, common_curve=material.common_curve),
         reach=reach,
-        uneven=is_uneven,
+        uneven=threads_for(pairs, _PAIRS_PER_THREAD) if pairs else 0,
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
@@ -324,7 +326,7 @@ def _launch(b: NearContactBuffers, passes: str, first: int, last: int):
             b.commands[key] = wp.launch(
                 kernel(b.dtype, passes),
                 dim=1 if cpu else GROUP * b.given.balls,
-                inputs=[begin, end, b.threads, team() if cpu else None, b.given],
+                inputs=[begin, end, b.uneven if passes == "Uneven" else b.threads, team() if cpu else None, b.given],
                 device=b.device,
                 block_dim=128,
                 record_cmd=True,

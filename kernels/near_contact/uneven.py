@@ -55,8 +55,8 @@ def constants() -> dict[str, int | float]:
     return {"RESPONSE_ROWS": RESPONSE_ROWS, "BOUND_ROWS": BOUND_ROWS} | sizes | ends
 
 
-def allocate(balls: int, ranges, eligible, lone, movable, dtype, device) -> tuple[bool, dict[str, wp.array]]:
-    """Whether permanent moments are there that may act on balls, and the arrays of the table.
+def allocate(balls: int, ranges, eligible, lone, movable, dtype, device) -> tuple[int, dict[str, wp.array]]:
+    """Number of pairs of a ball and a permanent moment that may act on it, and the arrays of the table.
 
     Args:
         balls: Moments, padded to ``CHUNK``.
@@ -91,4 +91,4 @@ def allocate(balls: int, ranges, eligible, lone, movable, dtype, device) -> tupl
         "bounds": wp.zeros((balls // CHUNK, BOUND_ROWS), dtype=dtype, device=device),
         "response": wp.zeros((balls // CHUNK, RESPONSE_ROWS, CHUNK), dtype=dtype, device=device),
     }
-    return bool(np.any(end)), arrays
+    return int(np.sum((end - begin)[:n], where=eligible)), arrays
