@@ -45,6 +45,7 @@ class _Layout:
         bodies: Its body.
         movable: Whether the force on it is wanted.
         lone: Whether it is an inducible ball, its body's only moment, which is parallel to the field that turns it.
+        alone: Whether it is its body's only moment.
     """
 
     radii: np.ndarray
@@ -53,6 +54,7 @@ class _Layout:
     bodies: np.ndarray
     movable: np.ndarray
     lone: np.ndarray
+    alone: np.ndarray
 
     def ranges(self) -> list[tuple[int, int, int]]:
         """For each world its first moment, its first permanent one, and the end."""
@@ -86,7 +88,8 @@ def _layout(radii, worlds, permanent, bodies, movable, dtype) -> _Layout:
             "worlds, permanent: moments must be ordered by world, from 0 on, the inducible ones of each first"
         )
     _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
-    return _Layout(radii, worlds, permanent, bodies, movable, ~permanent & (size[body] == 1))
+    alone = size[body] == 1
+    return _Layout(radii, worlds, permanent, bodies, movable, ~permanent & alone, alone)
 
 
 def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
@@ -348,7 +351,8 @@ class MomentSystem:
     def _make_near_contacts(self, layout: _Layout, turned, susceptibility):
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, self._material,
-            field=self._mutual, movable=layout.movable, turned=turned, forces=self.forces, torques=self.torques,
+            ranges=self.world_ranges, lone=layout.alone, field=self._mutual, movable=layout.movable, turned=turned,
+            forces=self.forces, torques=self.torques,
         )  # fmt: skip
 
     @property

@@ -66,8 +66,8 @@ CUDA_CALLABLE inline Real curve_slope(Real s, int curve) {
 // Derivative c'(s) where the reduced magnetization c(s) has a given square.
 CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
     const Number zero = reduced_square * Real(0), one = zero + 1;
-    Number steepness = one - reduced_square; // of tanh
-    if (curve == CLAMPED) steepness = reduced_square < one ? one : zero;
+    Number steepness = one - reduced_square;                                       // of tanh
+    if (curve == CLAMPED) steepness = reduced_square < Real(0.99999) ? one : zero; // but for rounding it is Ms
     if (curve == LINEAR) steepness = one;
     if (curve == FROHLICH) steepness = (one - root(reduced_square)) * (one - root(reduced_square));
     if (curve == LANGEVIN) {

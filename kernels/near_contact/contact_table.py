@@ -27,6 +27,17 @@ MOST_SHARED = (0.1, 0.3)
 LEAST_RATIO = (0.5, 0.8)
 """Ratio of radii over which the pair's part sets in: the table is that of equal balls."""
 
+MAGNET_REACH = (8.0, 10.0)
+"""Distance [radii of a ball] over which permanent moments that act on its multipoles fade."""
+MAGNET_OVERLAP = (0.1, 0.3)
+"""Overlap [radii of the permanent ball] over which they fade, too."""
+LEAST_MAGNET = 0.1
+"""Radius [radii of the ball] that smaller permanent balls count as: on a surface a dipole pulls without bounds."""
+CELL_SIZE = (0.6, 0.8)
+"""Radius of a cell's ball [radii of the ball] over which it fades: nearer than that cells do not stand for a body."""
+CELL_DEPTH = 0.7
+"""Distance of the outermost cells from the surface of their body, in radii of their balls; 0.81 in a cubic lattice."""
+
 LOG_GAPS = (float(np.log(4.9e-4)), float(np.log(0.8)), 26)
 """Natural logarithm of gap/R: first node, last node, number of nodes."""
 HARDNESSES = (0.0, 1.0, 11)

@@ -1,7 +1,5 @@
 // Forces between near balls, in units of μ0/4π: of the short-range parts, of quadrupoles and of contacts; and torques.
 // Products of sources leave float32's range where balls are small or large, so that lengths are in radii of the ball.
-//
-// From Python: UNIT, μ0/4π [T·m/A].
 #pragma once
 #include "near_contact/sweeps.h"
 
@@ -132,17 +130,6 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& so
         total = sum(total, less(theirs, own_vector(a.pair_force(s, i))));
     }
     return {group_total(total.x), group_total(total.y), group_total(total.z)};
-}
-
-// Adds UNIT times vectors to those of the balls in an array that are ``wanted``.
-CUDA_CALLABLE inline void add_to(Real* array, int i, Vector v, const int* wanted) {
-    for (int l = 0; l < WIDTH; ++l) {
-        if (wanted[i + l] == 0) continue;
-        Real* const own = array + 3 * (size_t)(i + l);
-        own[0] += UNIT * lane_of(v.x, l);
-        own[1] += UNIT * lane_of(v.y, l);
-        own[2] += UNIT * lane_of(v.z, l);
-    }
 }
 
 // Adds forces, and torques m × 4π H_near, to those of the moments that move and turn.

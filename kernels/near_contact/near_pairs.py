@@ -14,7 +14,7 @@ and the same for Θ̃, with s the inverse diagonal of 1 + ΔC M, run along with 
 Only eligible balls take part, in pairs with one another: single inducible moments with no more near balls than there
 are slots, and no more volume shared than the model allows. Near balls are found as ``neighbors`` finds overlaps, and
 kept as slots, those whose surfaces nearly touch first. ``select.h`` and ``tabulate.h`` have the passes that find them,
-``sweeps.h`` the sweeps, ``forces.h`` the forces.
+``sweeps.h`` the sweeps, ``forces.h`` the forces. ``uneven.py`` has what permanent moments add, and its arrays.
 
 | array | shape | meaning |
 |---|---|---|
@@ -54,7 +54,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.near_contact import contact_table
+from warpmag.kernels.near_contact import contact_table, uneven
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
@@ -87,6 +87,8 @@ _WARM = ("state", "last_state", "sources")
 """Arrays that sweeps go on from."""
 _BALLS_PER_THREAD = 500
 """Balls that make another thread of a CPU worth its start."""
+_PAIRS_PER_THREAD = 20000
+"""Pairs of a ball and a permanent moment that do: 0.1 ms."""
 _LEAST, _MOST = 0.4, 4.0
 """Between these lie the eigenvalues of what sweeps solve for, in piles of any permeability, touching or overlapping."""
 
@@ -97,7 +99,7 @@ def _constants() -> dict[str, int | float]:
     fades = {name: getattr(contact_table, name) for name in ("MOST_SHARED", "LEAST_RATIO", "CONTACT_GAP", "DEEPEST")}
     fades["QUADRUPOLE_GAP"] = [distance - 2.0 for distance in contact_table.QUADRUPOLE_REACH]
     fades["QUADRUPOLE_OVERLAP"] = contact_table.QUADRUPOLE_OVERLAP
-    return _ROWS | dict(
+    return _ROWS | uneven.constants() | dict(
         GROUP=GROUP, CANDIDATES=CANDIDATES, NEAR_SLOTS=NEAR_SLOTS, CONTACT_SLOTS=CONTACT_SLOTS, SWEEPS=SWEEPS,
         MARGIN=MARGIN, HALF_RANGE=0.5 * contact_table.RANGE, HALF_REACH=0.5 * contact_table.REACH,
         SMALLEST_GAP=contact_table.SMALLEST_GAP, SOFTNESS=contact_table.SOFTNESS, NODES=nodes, FIRST_NODE=first,
@@ -114,13 +116,13 @@ def _constants() -> dict[str, int | float]:
 # those that sweeps read stand together, at the end of the integers and at the beginning of the reals
 _INTEGERS = (
     *("group", "field_row", "kind", "candidate", "candidate_count", "moved", "used", "counterpart"),
-    *("movable", "turned", "near", "near_count", "contact_count", "curve"),
+    *("movable", "turned", "near", "near_count", "contact_count", "curve", "other_begin", "other_end", "pushed"),
 )
 _SIZES = ("balls", "moment_stride", "kinds", "common_curve")
 _REALS = (
     *("packed", "radius", "unsaturated", "curve_slope", "hardness", "relaxation", "pairs", "conductances", "state"),
     *("last_state", "sources", "drives", "field", "kept", "pair_slopes", "conductance_slopes", "pair_forces"),
-    *("partial", "found_at", "tables", "places", "forces", "torques", "curve_tables"),
+    *("partial", "found_at", "tables", "places", "forces", "torques", "curve_tables", "alone", "response", "bounds"),
 )
 _MEMBERS = dict.fromkeys(_INTEGERS, wp.uint64) | dict.fromkeys(_SIZES, int) | dict.fromkeys(_REALS, wp.uint64)
 _DOC = "Where arrays begin, side by side, for a GPU to read together; and sizes. As in ``state.h``."
@@ -140,6 +142,7 @@ class NearContactBuffers:
             the magnetization curve.
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
         threads: Threads of a CPU.
+        uneven: Those for what permanent moments add; 0 if none may act on balls.
         stream: Stream of a GPU for what is done beside the pair loops.
         events: There, when it starts, when the field is summed, and when all is done.
         commands: Launches as they were recorded, which spares packing the arrays each time.
@@ -151,6 +154,7 @@ class NearContactBuffers:
     given: Any
     reach: float
     threads: int
+    uneven: int
     stream: wp.Stream | None
     events: tuple[wp.Event, ...]
     commands: dict
@@ -171,26 +175,25 @@ class NearContactBuffers:
 
 
 def allocate(
-    packed, worlds, eligible, susceptibility, material, *, field, movable, turned, forces, torques
+    packed, worlds, eligible, susceptibility, material, *, ranges, lone, field, movable, turned, forces, torques
 ) -> NearContactBuffers:
     """Allocate the buffers.
 
     Args:
         packed: The moments (``packing.PackedMoments``).
-        worlds: World of each moment, shape [n].
+        worlds: World of each, shape [n].
         eligible: Whether a moment may take part, shape [n].
         susceptibility: Susceptibility of each, shape [n], may be infinite.
         material: Their ``curves.CurveParameters``.
+        ranges: For each world its first moment, its first permanent one, and the end.
+        lone: Whether a moment is its body's only one, shape [n].
         field: Evaluation of the field at them (``evaluate.PairEvaluation``), whose last part of the sums is written.
         movable: Whether the force on a moment is wanted, shape [n].
         turned: Whether its torque is, shape [n].
-        forces: What forces are added to [N], Warp array, shape [n].
-        torques: What torques are added to [N·m], Warp array, shape [n].
+        forces, torques: What is added to [N, N·m], Warp arrays, shape [n].
     """
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
-    field_row = np.full(n, -1)
-    field_row[field.target.numpy()] = np.arange(field.count)
 
     def padded(values, other):
         """Values of balls that take part, and another of the rest."""
@@ -202,15 +205,14 @@ def allocate(
     reach = 2.0 * float(np.max(radii, initial=0.0, where=eligible))
     lists = neighbors.allocate(n, packed.packed, group, reach=reach, ratio=_RATIO, capacity=CANDIDATES)
     kinds, described = _material_arrays(radii, eligible, susceptibility, material, padded)
-    arrays = _pair_arrays(balls, dtype, device) | described
+    pairs, others = uneven.allocate(balls, ranges, eligible, lone, movable, dtype, device)
+    arrays = _pair_arrays(balls, dtype, device) | described | others
     arrays |= {
         "packed": packed.packed,
         "group": group,
-        "candidate": lists.neighbor,
-        "candidate_count": lists.count,
-        "found_at": lists.found_at,
-        "moved": lists.moved,
-        "field_row": padded(field_row, -1),
+        **{"candidate": lists.neighbor, "candidate_count": lists.count},
+        **{"found_at": lists.found_at, "moved": lists.moved},
+        "field_row": padded(_field_rows(field, n), -1),
         "partial": field.partial[-1],
         "movable": padded(movable, 0),
         "turned": padded(movable & turned, 0),
@@ -224,11 +226,19 @@ def allocate(
         arrays=arrays,
         given=_addresses(arrays, balls=balls, moment_stride=stride, kinds=kinds, common_curve=material.common_curve),
         reach=reach,
+        uneven=threads_for(pairs, _PAIRS_PER_THREAD) if pairs else 0,
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
         commands={},
     )
+
+
+def _field_rows(field, n: int) -> np.ndarray:
+    """Row of each moment in the sums of ``field``, −1 if it has none."""
+    rows = np.full(n, -1)
+    rows[field.target.numpy()] = np.arange(field.count)
+    return rows
 
 
 def _addresses(arrays: dict[str, wp.array], **sizes: int) -> Any:
@@ -300,9 +310,9 @@ def _pair_arrays(balls: int, dtype, device) -> dict[str, wp.array]:
 
 @cache
 def kernel(dtype, passes: str):
-    """Kernel that makes passes ``Places``, ``Pairs``, ``Sweeps`` or ``Forces``."""
-    header = {"Places": "select", "Pairs": "tabulate", "Sweeps": "sweeps", "Forces": "forces"}[passes]
-    options = native_options(f"near_contact/{header}.h", dtype=dtype, **_constants())
+    """Kernel that makes passes ``Places``, ``Pairs``, ``Sweeps``, ``Forces`` or ``Uneven``."""
+    headers = {"Places": "select", "Pairs": "tabulate", "Sweeps": "sweeps", "Forces": "forces", "Uneven": "uneven"}
+    options = native_options(f"near_contact/{headers[passes]}.h", dtype=dtype, **_constants())
     call = f"warpmag::make_passes<warpmag::{passes}>(thread, first, last, threads, team.data, arrays);"
     return passes_kernel(call, ContactArrays, options)
 
@@ -316,7 +326,7 @@ def _launch(b: NearContactBuffers, passes: str, first: int, last: int):
             b.commands[key] = wp.launch(
                 kernel(b.dtype, passes),
                 dim=1 if cpu else GROUP * b.given.balls,
-                inputs=[begin, end, b.threads, team() if cpu else None, b.given],
+                inputs=[begin, end, b.uneven if passes == "Uneven" else b.threads, team() if cpu else None, b.given],
                 device=b.device,
                 block_dim=128,
                 record_cmd=True,
@@ -379,11 +389,16 @@ def launch_begin_forces(b: NearContactBuffers):
 
 
 def launch_add_forces(b: NearContactBuffers):
-    """Add the forces [N] of near pairs, and the torques [N·m] where they are wanted, to those of the moments."""
+    """Add the forces [N] of near pairs, and the torques [N·m] where they are wanted, to those of the moments.
+
+    And those of permanent moments on balls that feel an uneven field, and back.
+    """
     if b.reach == 0.0:
         return
     wait(b)
     _launch(b, "Forces", 0 if b.stream is None else _LAST + 1, _LAST + 2)
+    if b.uneven:
+        _launch(b, "Uneven", 0, 4)
 
 
 def wait(b: NearContactBuffers):

@@ -1,6 +1,6 @@
 // What passes over near pairs work on: the arrays, and what balls publish for others to read, a cache line each.
 //
-// near_pairs.py has the meaning of all arrays, and passes the numbers of their rows and slots.
+// near_pairs.py has the meaning of all arrays, and passes the numbers of their rows and slots, and UNIT, μ0/4π [T·m/A].
 #pragma once
 #include "material/curves.h"
 #include "near_contact/group_rows.h"
@@ -12,11 +12,11 @@ namespace warpmag {
 // As ``ContactArrays`` in near_pairs.py: pointers that sweeps read stand side by side, for a GPU to read together.
 struct Arrays {
     int *group, *field_row, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *turned, *near,
-        *near_count, *contact_count, *curve;
+        *near_count, *contact_count, *curve, *other_begin, *other_end, *pushed;
     int balls, moment_stride, kinds, common_curve;
     Real *packed, *radius, *unsaturated, *curve_slope, *hardness, *relaxation, *pairs, *conductances, *state,
         *last_state, *sources, *drives, *field, *kept, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
-        *found_at, *tables, *places, *forces, *torques, *curve_tables;
+        *found_at, *tables, *places, *forces, *torques, *curve_tables, *alone, *response, *bounds;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "ContactArrays has the same members in the same order");
@@ -78,6 +78,17 @@ struct Own {
         for (int l = 0; l < WIDTH; ++l) at[l] = i + l;
     }
 };
+
+// Adds UNIT times vectors to those of the moments in an array that are ``wanted``.
+CUDA_CALLABLE inline void add_to(Real* array, int i, Vector v, const int* wanted) {
+    for (int l = 0; l < WIDTH; ++l) {
+        if (wanted[i + l] == 0) continue;
+        Real* const own = array + 3 * (size_t)(i + l);
+        own[0] += UNIT * lane_of(v.x, l);
+        own[1] += UNIT * lane_of(v.y, l);
+        own[2] += UNIT * lane_of(v.z, l);
+    }
+}
 
 // Publishes numbers 0 to 7 and 13 of a ball, and more that goes with them.
 CUDA_CALLABLE inline void publish(Real* lines, int i, const Number* part, Vector more) {

@@ -3,8 +3,7 @@
 // The numbers of a ball's state, and of sums over its slots, are: 0 to 4 xx, yy, xy, yz, zx of a quadrupole, 5 to 7 a
 // dipole, 13 a source. From Python: PACE and MOMENTUM of a step, OWN_SOURCE and OWN_DIPOLE of M, SWEEPS.
 #pragma once
-#include "material/curves.h"
-#include "near_contact/state.h"
+#include "near_contact/softness.h"
 
 namespace warpmag {
 
@@ -14,14 +13,9 @@ struct Softness {
     Number p, weight;
 };
 
-// Polarizability p = 2χ_d/(2χ_d + 5) of a ball's higher multipoles, 1/χ_d = 1/k_d − 1/3, and p over that of a small
-// field.
+// Polarizability p of a ball's quadrupole, and p over that of a small field.
 CUDA_CALLABLE inline Softness softness_of(const Arrays& a, int i) {
-    const Number slope = numbers(a.curve_slope + i), zero = slope * Real(0);
-    const Vector reduced = scaled(numbers(a.unsaturated + i), a.own_moment(i));
-    const Number steepness = curve_steepness(dot(reduced, reduced), a.curves(i));
-    const Number softer = smaller(larger(slope * steepness, zero), zero + 3);
-    const Number p = softer / (Real(2.5) + softer * Real(1.0 / 6.0));
+    const Number p = polarizability(differential_slope(a, i), 2);
     return {p, p * numbers(a.hardness + i)};
 }
 

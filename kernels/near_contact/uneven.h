@@ -1,0 +1,355 @@
+// Forces of permanent moments on a ball whose field is uneven: what its multipoles of degree 2 and more add; uneven.py
+// has the equations.
+//
+// Lengths are in radii R of the ball, moments over R³. Symmetric traceless tensors of degrees 2 to 4 have the 21 rows
+// xx, yy, xy, yz, zx; xxx, yyy, xxy, xxz, yyx, yyz, xyz; xxxx, yyyy, xxyy, xxxy, xxxz, yyyx, yyyz, xxyz, yyzx, and one
+// more row the polarizability of the rest. From Python: RESPONSE_ROWS, and the windows of contact_table.py.
+#pragma once
+#include "near_contact/select.h"
+#include "near_contact/softness.h"
+#include "shared/inverse_root.h"
+
+namespace warpmag {
+
+// A permanent moment seen from a ball: direction, 1/d and how far it takes part, with the derivative.
+struct Sight {
+    Vector u;
+    Number inverse, weight, slope;
+    Mask live;
+};
+
+// At r from the centre of a ball of radius 1/``metre``, a moment of a ball of radius b, alone on its body or a cell of
+// it.
+CUDA_CALLABLE inline Sight sight_of(Vector r, Number metre, Number b, Number alone, Mask taken) {
+    const Number zero = metre * Real(0), one = zero + 1;
+    const Vector s = scaled(metre, r);
+    const Number d2 = dot(s, s), its = metre * b, lone = alone > Real(0) ? one : zero;
+    const Number depth = larger(its * (CELL_DEPTH + (1 - CELL_DEPTH) * lone), zero + LEAST_MAGNET);
+    const Number deepest = 1 + (1 - MAGNET_OVERLAP_HIGH) * depth, shallow = 1 + (1 - MAGNET_OVERLAP_LOW) * depth;
+    const Mask live = taken & (d2 < MAGNET_REACH_HIGH * MAGNET_REACH_HIGH) & (d2 > deepest * deepest);
+    if (!any(live)) return {{zero, zero, zero}, one, zero, zero, live};
+    const Number inverse = Real(0.5) * twice_inverse_root(live ? d2 : one), d = d2 * inverse;
+    Number weight = live ? one : zero, slope = zero;
+    if (any(live & (its > CELL_SIZE_LOW) & (lone < one))) {
+        const Number coarse = smoothstep((its - CELL_SIZE_LOW) * (1 / (CELL_SIZE_HIGH - CELL_SIZE_LOW))).value;
+        weight = weight * (1 - coarse * (1 - lone));
+    }
+    if (any(live & (d > MAGNET_REACH_LOW))) {
+        const Fade outer = smoothstep((MAGNET_REACH_HIGH - d) * (1 / (MAGNET_REACH_HIGH - MAGNET_REACH_LOW)));
+        slope = -weight * outer.slope * (1 / (MAGNET_REACH_HIGH - MAGNET_REACH_LOW));
+        weight = weight * outer.value;
+    }
+    if (any(live & (d < shallow))) { // nowhere near the other end, if the magnet is not far larger than the ball
+        const Number width = 1 / (shallow - deepest);
+        const Fade inner = smoothstep((d - deepest) * width);
+        slope = slope * inner.value + weight * inner.slope * width;
+        weight = weight * inner.value;
+    }
+    return {scaled(live ? inverse : zero, s), inverse, weight, slope, live & (weight > zero)};
+}
+
+// Symmetric tensors: of degree 2 xx, yy, zz, xy, yz, zx; of degree 3 xxx, yyy, zzz, xxy, xxz, yyx, yyz, zzx, zzy, xyz;
+// of degree 4 xxxx, yyyy, zzzz, xxxy, xxxz, yyyx, yyyz, zzzx, zzzy, xxyy, yyzz, zzxx, xxyz, yyzx, zzxy.
+constexpr int FULL = 31;
+
+// Adds derivatives of a moment's potential: of degree l, w/d^(l+2) times what is symmetric of y u..u,
+// y = l m − (2l + 1) (u·m) u.
+CUDA_CALLABLE inline void add_derivatives(Number (&sum)[FULL], const Sight& s, Vector m) {
+    const Vector u = s.u;
+    const Number a = dot(u, m), x = u.x * u.x, y = u.y * u.y, z = u.z * u.z;
+    const Number xy = u.x * u.y, yz = u.y * u.z, zx = u.z * u.x;
+    const Number k2 = s.weight * s.inverse * s.inverse * s.inverse * s.inverse;
+    const Number k3 = k2 * s.inverse * Real(1.0 / 3.0), k4 = k2 * s.inverse * s.inverse * Real(0.25);
+    const Vector p = scaled(k2, less(m, scaled(Real(2.5) * a, u)));
+    sum[0] += 2 * p.x * u.x;
+    sum[1] += 2 * p.y * u.y;
+    sum[2] += 2 * p.z * u.z;
+    sum[3] += p.x * u.y + p.y * u.x;
+    sum[4] += p.y * u.z + p.z * u.y;
+    sum[5] += p.z * u.x + p.x * u.z;
+    const Vector q = scaled(k3, less(scaled(Number(Real(3)), m), scaled(7 * a, u)));
+    sum[6] += 3 * q.x * x;
+    sum[7] += 3 * q.y * y;
+    sum[8] += 3 * q.z * z;
+    sum[9] += 2 * q.x * xy + q.y * x;
+    sum[10] += 2 * q.x * zx + q.z * x;
+    sum[11] += 2 * q.y * xy + q.x * y;
+    sum[12] += 2 * q.y * yz + q.z * y;
+    sum[13] += 2 * q.z * zx + q.x * z;
+    sum[14] += 2 * q.z * yz + q.y * z;
+    sum[15] += q.x * yz + q.y * zx + q.z * xy;
+    const Vector r = scaled(k4, less(scaled(Number(Real(4)), m), scaled(9 * a, u)));
+    const Vector by_x = scaled(x, r), by_y = scaled(y, r), by_z = scaled(z, r);
+    sum[16] += 4 * by_x.x * u.x;
+    sum[17] += 4 * by_y.y * u.y;
+    sum[18] += 4 * by_z.z * u.z;
+    sum[19] += 3 * by_x.x * u.y + by_x.y * u.x;
+    sum[20] += 3 * by_x.x * u.z + by_x.z * u.x;
+    sum[21] += 3 * by_y.y * u.x + by_y.x * u.y;
+    sum[22] += 3 * by_y.y * u.z + by_y.z * u.y;
+    sum[23] += 3 * by_z.z * u.x + by_z.x * u.z;
+    sum[24] += 3 * by_z.z * u.y + by_z.y * u.z;
+    sum[25] += 2 * (by_y.x * u.x + by_x.y * u.y);
+    sum[26] += 2 * (by_z.y * u.y + by_y.z * u.z);
+    sum[27] += 2 * (by_x.z * u.z + by_z.x * u.x);
+    sum[28] += 2 * xy * u.z * r.x + by_x.y * u.z + by_x.z * u.y;
+    sum[29] += 2 * xy * u.z * r.y + by_y.z * u.x + by_y.x * u.z;
+    sum[30] += 2 * xy * u.z * r.z + by_z.x * u.y + by_z.y * u.x;
+}
+
+// Writes the response: the sums without their traces, times (2l − 1)!!/l! and the polarizability of a degree.
+CUDA_CALLABLE inline void put_response(Real* rows, const Number (&s)[FULL], Number slope) {
+    const Number k2 = Real(1.5) * polarizability(slope, 2), k3 = Real(2.5) * polarizability(slope, 3);
+    const Number k4 = Real(4.375) * polarizability(slope, 4), third = (s[0] + s[1] + s[2]) * Real(1.0 / 3.0);
+    auto keep = [=](int row, Number n) { put(rows + row * CHUNK, n); };
+    keep(0, k2 * (s[0] - third));
+    keep(1, k2 * (s[1] - third));
+    keep(2, k2 * s[3]);
+    keep(3, k2 * s[4]);
+    keep(4, k2 * s[5]);
+    const Number fifth = Real(0.2), x = fifth * (s[6] + s[11] + s[13]), y = fifth * (s[7] + s[9] + s[14]);
+    const Number z = fifth * (s[8] + s[10] + s[12]);
+    keep(5, k3 * (s[6] - 3 * x));
+    keep(6, k3 * (s[7] - 3 * y));
+    keep(7, k3 * (s[9] - y));
+    keep(8, k3 * (s[10] - z));
+    keep(9, k3 * (s[11] - x));
+    keep(10, k3 * (s[12] - z));
+    keep(11, k3 * s[15]);
+    const Number xx = s[16] + s[25] + s[27], yy = s[17] + s[25] + s[26], zz = s[18] + s[26] + s[27];
+    const Number xy = s[19] + s[21] + s[30], yz = s[22] + s[24] + s[28], zx = s[20] + s[23] + s[29];
+    const Number all = (xx + yy + zz) * Real(1.0 / 35.0), k = Number(Real(1.0 / 7.0));
+    keep(12, k4 * (s[16] - 6 * k * xx + 3 * all));
+    keep(13, k4 * (s[17] - 6 * k * yy + 3 * all));
+    keep(14, k4 * (s[25] - k * (xx + yy) + all));
+    keep(15, k4 * (s[19] - 3 * k * xy));
+    keep(16, k4 * (s[20] - 3 * k * zx));
+    keep(17, k4 * (s[21] - 3 * k * xy));
+    keep(18, k4 * (s[22] - 3 * k * yz));
+    keep(19, k4 * (s[28] - k * yz));
+    keep(20, k4 * (s[29] - k * zx));
+    keep(21, polarizability(slope, 6)); // of the rest, which begins with degree 5
+}
+
+// The tensor of degree 3 or 4 from row ``first`` on, contracted with u to degree 2.
+template <class Get> CUDA_CALLABLE inline Tensor contracted_3(const Get& b, int first, Vector u) {
+    auto along = [=](Number x, Number y, Number z) { return x * u.x + y * u.y + z * u.z; };
+    const Number xxx = b(first), yyy = b(first + 1), xxy = b(first + 2), xxz = b(first + 3), yyx = b(first + 4);
+    const Number yyz = b(first + 5), xyz = b(first + 6);
+    return {along(xxx, xxy, xxz), along(yyx, yyy, yyz), along(xxy, yyx, xyz), along(xyz, yyz, -(xxy + yyy)),
+            along(xxz, xyz, -(xxx + yyx))};
+}
+template <class Get> CUDA_CALLABLE inline Tensor contracted_4(const Get& b, int first, Vector u) {
+    const Number z = u.z * u.z, x = u.x * u.x - z, y = u.y * u.y - z;
+    const Number xy = 2 * u.x * u.y, yz = 2 * u.y * u.z, zx = 2 * u.z * u.x;
+    auto along = [=](Number a, Number c, Number d, Number e, Number f) {
+        return a * x + c * y + d * xy + e * yz + f * zx;
+    };
+    const Number xxxx = b(first), yyyy = b(first + 1), xxyy = b(first + 2), xxxy = b(first + 3), xxxz = b(first + 4);
+    const Number yyyx = b(first + 5), yyyz = b(first + 6), xxyz = b(first + 7), yyzx = b(first + 8);
+    const Number yyzz = -(xxyy + yyyy), zzxx = -(xxxx + xxyy), zzxy = -(xxxy + yyyx);
+    return {along(xxxx, xxyy, xxxy, xxyz, xxxz), along(xxyy, yyyy, yyyx, yyyz, yyzx),
+            along(xxxy, yyyx, xxyy, yyzx, xxyz), along(xxyz, yyyz, yyzx, yyzz, zzxy),
+            along(xxxz, yyzx, xxyz, zzxy, zzxx)};
+}
+
+// Force on a permanent moment, over μ0/4π R², and the field that turns it.
+struct Push {
+    Vector force, field;
+};
+CUDA_CALLABLE inline void add(Tensor& to, Number k, Tensor t) {
+    to.xx += k * t.xx, to.yy += k * t.yy, to.xy += k * t.xy, to.yz += k * t.yz, to.zx += k * t.zx;
+}
+
+// By the ball's response b of degrees 2 to 4.
+template <class Get> CUDA_CALLABLE inline Push push_of(const Get& b, const Sight& s, Vector m) {
+    const Vector u = s.u;
+    const Number a = dot(u, m), k2 = s.inverse * s.inverse * s.inverse * s.inverse, zero = a * Real(0);
+    const Tensor of[3] = {{b(0), b(1), b(2), b(3), b(4)}, contracted_3(b, 5, u), contracted_4(b, 12, u)};
+    Tensor twice = {zero, zero, zero, zero, zero};
+    Vector first = {zero, zero, zero}, second = first;
+    Number on_m = zero, on_u = zero, k = k2;
+    for (int n = 0; n < 3; ++n, k = k * s.inverse) {
+        const Real l = Real(n + 2), odd = 2 * l + 1;
+        const Vector v = times(of[n], u);
+        const Number f = k * odd * dot(v, u);
+        add(twice, k * (l * (l - 1)), of[n]);
+        first = sum(first, scaled(k * l, v));
+        second = sum(second, scaled(k * (l * odd), v));
+        on_m += f;
+        on_u += f * (odd + 2);
+    }
+    const Vector gradient = less(first, scaled(on_m, u)); // of the response's potential
+    const Vector across = less(times(twice, m), sum(scaled(a, second), scaled(on_m, m)));
+    const Vector change = sum(across, scaled(on_u * a - dot(m, second), u));
+    return {sum(scaled(s.weight * s.inverse, change), scaled(s.slope * dot(m, gradient), u)),
+            scaled(s.weight, gradient)};
+}
+
+// By the response of all higher degrees to this moment alone, in closed form: of energy −½ p w² (Q m² + D (u·m)²).
+CUDA_CALLABLE inline Push push_of_rest(Number p, const Sight& s, Vector m) {
+    const Number x = s.live ? s.inverse * s.inverse : p * Real(0), open = 1 / (1 - x), x3 = x * x * x;
+    const Number k = s.weight * p * x3 * x3 * open * open * open, a = dot(s.u, m), steep = 3 * x * open;
+    const Number q = 15 - (24 - 10 * x) * x, both = 36 - (59 - 25 * x) * x, d = both - q;
+    const Number q_slope = (7 + steep) * q - (24 - 20 * x) * x, d_slope = (7 + steep) * d - (35 - 30 * x) * x;
+    const Number square = dot(m, m), along = a * a;
+    const Number radial = s.slope * x * (q * square + d * along)
+                          - s.weight * x * s.inverse * (q_slope * square + d_slope * along)
+                          - s.weight * s.inverse * x * d * along;
+    const Number across = s.weight * s.inverse * x * d * a;
+    return {scaled(k, sum(scaled(radial, s.u), scaled(across, m))),
+            scaled(k * s.weight * x, sum(scaled(q, m), scaled(d * a, s.u)))};
+}
+
+// Both, of a moment that is ``alone`` on its body; of a cell only the first.
+template <class Get> CUDA_CALLABLE inline Push whole_push(const Get& b, const Sight& s, Vector m, Number alone) {
+    const Push push = push_of(b, s, m);
+    const Mask lone = s.live & (alone > Real(0));
+    if (!any(lone)) return push;
+    const Number zero = alone * Real(0);
+    const Push rest = push_of_rest(lone ? b(21) : zero, s, m);
+    return {sum(push.force, rest.force), sum(push.field, rest.field)};
+}
+
+// What a pass reads of a moment: place, radius, moment and whether it is alone, of several or the same in all lanes.
+struct Magnet {
+    Vector at, m;
+    Number size, alone;
+};
+CUDA_CALLABLE inline Number spread(Real n) { return Number(n); }
+CUDA_CALLABLE inline Magnet magnets(const Arrays& a, int i) {
+    const size_t stride = a.moment_stride;
+    const Real* row = a.packed + i;
+    return {{numbers(row), numbers(row + stride), numbers(row + 2 * stride)},
+            a.own_moment(i),
+            numbers(row + 3 * stride),
+            numbers(a.alone + i)};
+}
+CUDA_CALLABLE inline Magnet magnet(const Arrays& a, int j) {
+    const size_t stride = a.moment_stride;
+    const Real* row = a.packed + j;
+    auto at = [=](int n) -> Number { return spread(row[n * stride]); };
+    return {{at(0), at(1), at(2)}, {at(4), at(5), at(6)}, at(3), spread(a.alone[j])};
+}
+
+// Pass 0: the ball around the places of CHUNK moments that take part, and the largest radius of them.
+CUDA_CALLABLE inline void find_bounds(const Arrays& a, int i) {
+    if (i % CHUNK != 0 || share() > 0) return;
+    const size_t stride = a.moment_stride;
+    Real low[3] = {0, 0, 0}, high[3] = {0, 0, 0}, largest = -1;
+    for (int j = i; j < i + CHUNK; ++j) {
+        if (a.alone[j] < 0) continue;
+        const Real* row = a.packed + j;
+        for (int c = 0; c < 3; ++c) {
+            const Real x = row[c * stride];
+            low[c] = largest < 0 || x < low[c] ? x : low[c];
+            high[c] = largest < 0 || x > high[c] ? x : high[c];
+        }
+        largest = row[3 * stride] > largest ? row[3 * stride] : largest;
+    }
+    Real* const bounds = a.bounds + BOUND_ROWS * (i / CHUNK);
+    Real square = 0;
+    for (int c = 0; c < 3; ++c) {
+        bounds[c] = Real(0.5) * (low[c] + high[c]);
+        square += (high[c] - low[c]) * (high[c] - low[c]);
+    }
+    bounds[3] = Real(0.5) * wp::sqrt(square);
+    bounds[4] = largest;
+}
+
+// Calls visit(j, taken) for the moments j that may act on balls among moments i at x, whose radii are ``size``, or that
+// may feel them where these are ``permanent``; ``taken`` says which of them.
+template <class Visit>
+CUDA_CALLABLE inline void visit_others(const Arrays& a, int i, Vector x, Number size, bool permanent, Visit visit) {
+    int begin[WIDTH], end[WIDTH], first = a.balls, last = 0;
+    for (int l = 0; l < WIDTH; ++l) {
+        const bool wanted = (a.group[i + l] < 0) == permanent;
+        begin[l] = wanted ? a.other_begin[i + l] : 0;
+        end[l] = wanted ? a.other_end[i + l] : 0;
+        if (begin[l] == end[l]) continue;
+        first = begin[l] < first ? begin[l] : first;
+        last = end[l] > last ? end[l] : last;
+    }
+    const Number low = number_of(indices(begin)), high = number_of(indices(end));
+    for (int start = first / CHUNK * CHUNK; start < last; start += CHUNK) {
+        const Real* const bounds = a.bounds + BOUND_ROWS * (start / CHUNK);
+        const Vector r = less({spread(bounds[0]), spread(bounds[1]), spread(bounds[2])}, x);
+        const Number reach = MAGNET_REACH_HIGH * (permanent ? spread(bounds[4]) : size) + bounds[3];
+        if (!any((high > low) & (dot(r, r) < reach * reach))) continue;
+        const int stop = start + CHUNK < last ? start + CHUNK : last;
+        for (int j = (start > first ? start : first) + share(); j < stop; j += SHARES)
+            visit(j, (low <= Real(j)) & (high > Real(j)));
+    }
+}
+
+// Moments over the cube of a ball's radius 1/``metre``, in steps that stay in float32's range.
+CUDA_CALLABLE inline Vector over_cube(Vector m, Number metre) { return scaled(metre, scaled(metre, scaled(metre, m))); }
+
+// Pass 1: the response of balls.
+CUDA_CALLABLE inline void find_response(const Arrays& a, int i) {
+    const Magnet own = magnets(a, i);
+    const Number zero = own.size * Real(0), size = own.size > zero ? own.size : zero + 1;
+    const Number metre = 1 / size;
+    Number sums[FULL];
+    for (int c = 0; c < FULL; ++c) sums[c] = zero;
+    visit_others(a, i, own.at, size, false, [&](int j, Mask taken) {
+        const Magnet o = magnet(a, j);
+        const Sight s = sight_of(less(o.at, own.at), metre, o.size, o.alone, taken);
+        if (any(s.live)) add_derivatives(sums, s, over_cube(o.m, metre));
+    });
+    for (int c = 0; c < FULL; ++c) sums[c] = group_sum(sums[c]);
+    if (share() == 0) put_response(rows_at(a.response, RESPONSE_ROWS, i), sums, differential_slope(a, i));
+}
+
+// Pass 2: forces on balls, minus those that they push permanent moments with.
+CUDA_CALLABLE inline void pull_balls(const Arrays& a, int i) {
+    const Magnet own = magnets(a, i);
+    const Number zero = own.size * Real(0), size = own.size > zero ? own.size : zero + 1;
+    const Number metre = 1 / size;
+    const Real* rows = rows_at(a.response, RESPONSE_ROWS, i);
+    Vector total = {zero, zero, zero};
+    visit_others(a, i, own.at, size, false, [&](int j, Mask taken) {
+        const Magnet o = magnet(a, j);
+        const Sight s = sight_of(less(o.at, own.at), metre, o.size, o.alone, taken);
+        if (!any(s.live)) return;
+        auto response = [=](int row) -> Number { return numbers(rows + row * CHUNK); };
+        total = less(total, whole_push(response, s, over_cube(o.m, metre), o.alone).force);
+    });
+    total = group_sums(scaled(size * size, total));
+    if (share() == 0) add_to(a.forces, i, total, a.movable);
+}
+
+// Pass 3: forces and torques on permanent moments.
+CUDA_CALLABLE inline void push_magnets(const Arrays& a, int i) {
+    const Magnet own = magnets(a, i);
+    const Number zero = own.size * Real(0);
+    Vector force = {zero, zero, zero}, torque = force;
+    visit_others(a, i, own.at, zero, true, [&](int j, Mask taken) {
+        if (a.group[j] < 0) return;
+        const Magnet ball = magnet(a, j);
+        const Number size = ball.size, metre = 1 / size;
+        const Sight s = sight_of(less(own.at, ball.at), metre, own.size, own.alone, taken);
+        if (!any(s.live)) return;
+        const Real* rows = rows_at(a.response, RESPONSE_ROWS, j);
+        auto response = [=](int row) -> Number { return spread(rows[row * CHUNK]); };
+        const Push push = whole_push(response, s, over_cube(own.m, metre), own.alone);
+        force = sum(force, scaled(size * size, push.force));
+        torque = sum(torque, cross(own.m, push.field));
+    });
+    force = group_sums(force);
+    torque = group_sums(torque);
+    if (share() > 0) return;
+    add_to(a.forces, i, force, a.pushed);
+    add_to(a.torques, i, torque, a.pushed);
+}
+
+struct Uneven {
+    const Arrays a;
+    CUDA_CALLABLE void operator()(int pass, int i) const {
+        if (pass == 0) find_bounds(a, i);
+        if (pass == 1) find_response(a, i);
+        if (pass == 2) pull_balls(a, i);
+        if (pass == 3) push_magnets(a, i);
+    }
+};
+}
