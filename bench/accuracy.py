@@ -45,7 +45,7 @@ BLOCK = 1000
 PERMEABILITIES = (2.0, 4.0, 10.0, 1000.0, np.inf)
 GAPS = (0.01, 0.03, 0.1, 0.3, 0.5, 0.9, 1.2, 3.0)
 """Gaps between two balls over their radius."""
-SIDE, BOX_GAPS, MAGNETIZATION = 0.02, (0.2, 0.5, 1.0, 2.0), 1e6
+SIDE, BOX_GAPS, MAGNETIZATION = 0.02, (0.0, 0.01, 0.05, 0.2, 0.5, 1.0, 2.0), 1e6
 """Longest edge of box magnets [m], gaps between two of them over it, and their magnetization along z [A/m]."""
 PILES = (2500, 10000)
 """Balls of the piles on which the near-contact model's price is taken."""

@@ -71,6 +71,7 @@ class FieldProbe:
             base = self._applied.field
         self._field = PairEvaluation(Quantity.FIELD, segments, self._targets, sources, base, self.h)
         self._nothing = wp.zeros(count, dtype=vec3, device=device)
+        self._add_close_up = system.close_up.at_points(self._targets, worlds) if system.close_up is not None else None
         self.gradient = None
         self._gradients: list[PairEvaluation] = []
         if gradients:
@@ -114,3 +115,5 @@ class FieldProbe:
             launch_store_gradients(self._rows, self.gradient)
             if self._applied is not None:
                 launch_add_gradients(self._applied.gradient, self.gradient)
+        if self._add_close_up is not None:
+            self._add_close_up(self.h, self.b, self.gradient)

@@ -22,6 +22,7 @@ from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedForces, Sources, Targets
 from warpmag.kernels.cells.couplings import CellCouplings
+from warpmag.kernels.close_up.bodies import CloseUp
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.energy import launch_energy
@@ -156,6 +157,8 @@ class MomentSystem:
             of its moments, and the ``demagnetization.Coupling`` of all of them.
         applied: Sources without a response that act on the moments, ``AppliedSource`` of ``kernels.applied.sources``;
             their bodies are numbered as those of the moments.
+        solids: Permanent bodies whose fields are closed forms close up (``kernels.close_up.bodies.SolidMagnet``),
+            ordered by world.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
 
@@ -169,6 +172,9 @@ class MomentSystem:
             without them.
         reactions: What the moments do to them, ``reaction_forces`` and ``reaction_torques`` by :meth:`apply_forces`;
             None without them.
+        frames: Where each of ``solids`` is, transforms, shape [solids]; written by the caller before :meth:`solve`.
+            None without them.
+        close_up: What closed forms add to the sums (``kernels.close_up.bodies.CloseUp``); None without ``solids``.
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
@@ -212,6 +218,7 @@ class MomentSystem:
         lone_torque=False,
         couplings=(),
         applied=(),
+        solids=(),
         dtype="float32",
         device=None,
     ):
@@ -232,6 +239,7 @@ class MomentSystem:
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings)
+        self._make_close_up(layout, solids)
         self._evaluate_wrench(layout, turned)
         self._energies = None
         self._near = self._make_near_contacts(layout, turned, susceptibility) if near else None
@@ -321,6 +329,15 @@ class MomentSystem:
         worlds = [(first, middle) for first, middle, _ in layout.ranges()]
         self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h) if couplings else None
         self.rotations = self._cells.rotations if self._cells is not None else None
+
+    def _make_close_up(self, layout: _Layout, solids):
+        self.close_up = self.frames = None
+        if solids:
+            self.close_up = CloseUp(
+                solids, self._packed, inducible=~layout.permanent, movable=layout.movable, worlds=layout.worlds,
+                h0=self._induction.h0,
+            )  # fmt: skip
+            self.frames = self.close_up.frames
 
     def _evaluate_wrench(self, layout: _Layout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
@@ -422,16 +439,18 @@ class MomentSystem:
         if self._near is not None:
             near_pairs.launch_find_pairs(self._near)
         packed.find_overlaps()
-        if self._mutual.count == 0:
-            return
-        if self._cells is not None:
-            self._cells.start()
         if self._applied.pair_count:
             self._applied.launch()
         elif self.bias is not None:
             wp.copy(self._induction.h0, self._magnetizing)
+        if self.close_up is not None:
+            self.close_up.add_fields()
         if self.bias is not None:
             launch_add_bias(self.bias, self._biased, self._induction.h0)
+        if self._mutual.count == 0:
+            return
+        if self._cells is not None:
+            self._cells.start()
         self.dynamics.start()
         if self._near is not None:
             near_pairs.wait(self._near)
@@ -488,6 +507,8 @@ class MomentSystem:
         energies, state = self._energies, self._induction
         fields = state.h, state.h0, self._permanents_field, self._acting
         launch_energy(self.radii, self.moments, self._material, *fields, energies)
+        if self.close_up is not None:
+            self.close_up.add_energies(self.moments, energies)
         each = energies.numpy()
         if self.bias is not None:  # counted from where nothing but the remanence is
             bias = np.linalg.norm(self.bias.numpy().astype(float), axis=1)
@@ -515,6 +536,9 @@ class MomentSystem:
             near_pairs.launch_begin_forces(near)
         for evaluation in self._wrench[force]:
             evaluation.launch()
+        if self.close_up is not None:
+            effective = self._effective if force == "zeeman" else self._packed.moments
+            self.close_up.add_forces(effective, self._turned, self.forces, self.torques)
         if near is not None:
             near_pairs.launch_add_forces(near)
         if self.reactions is not None:

@@ -158,6 +158,20 @@ def gather_rotations(body_q, bodies, rotations):
 
 
 @wp.kernel
+def _gather_frames(
+    body_q_in: wp.array[wp.transform], bodies_in: wp.array[wp.int32], frames_out: wp.array[wp.transform]
+):
+    k = wp.tid()
+    if bodies_in[k] >= 0:
+        frames_out[k] = body_q_in[bodies_in[k]]
+
+
+def gather_frames(body_q, bodies, frames):
+    """Write where ``bodies`` are; that of one fixed in the world, −1, stays."""
+    wp.launch(_gather_frames, len(bodies), [body_q, bodies], [frames], device=frames.device)
+
+
+@wp.kernel
 def _set_magnetization(
     magnetization_in: wp.array[wp.vec3],
     shapes_in: wp.array[wp.int32],

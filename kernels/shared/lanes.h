@@ -25,6 +25,7 @@ CUDA_CALLABLE inline void raise_flag(int& flag) { flag = 1; }
 CUDA_CALLABLE inline bool any(Mask mask) { return mask; }
 CUDA_CALLABLE inline Number root(Number x) { return sqrt(x); }
 CUDA_CALLABLE inline Number logarithm(Number x) { return log(x); }
+CUDA_CALLABLE inline Number angle(Number y, Number x) { return atan2(y, x); }
 CUDA_CALLABLE inline Number larger(Number a, Number b) { return a > b ? a : b; }
 CUDA_CALLABLE inline Number smaller(Number a, Number b) { return a < b ? a : b; }
 CUDA_CALLABLE inline Number number_of(Index n) { return (Number)n; }
@@ -72,6 +73,23 @@ inline Number logarithm(Number x) {
     const Number s = (m - 1) / (m + 1), z = s * s;
     const Number series = 1 + z * (Real(1.0 / 3) + z * (Real(1.0 / 5) + z * (Real(1.0 / 7) + z * Real(1.0 / 9))));
     return __builtin_convertvector(n, Number) * Real(0.693147180559945) + 2 * s * series;
+}
+// Angle of the point (x, y) from the x-axis.
+inline Number angle(Number y, Number x) {
+    Number turned;
+    if constexpr (sizeof(Real) == 8) { // one by one
+        for (int l = 0; l < WIDTH; ++l) turned[l] = atan2(y[l], x[l]);
+        return turned;
+    }
+    // of the smaller part t of the larger, 2 atan(t / (1 + √(1 + t²))), of which the series is good to float32
+    const Number a = __builtin_elementwise_abs(x), b = __builtin_elementwise_abs(y);
+    const Number large = __builtin_elementwise_max(a, b), small = __builtin_elementwise_min(a, b);
+    const Number t = small / (large > 0 ? large : Number(Real(1))), s = t / (1 + root(1 + t * t)), z = s * s;
+    const Number tail = Real(0.1999821) - z * (Real(0.14239976) - z * (Real(0.10572771) - z * Real(0.0603314)));
+    turned = 2 * s * (1 - z * (Real(0.33333307) - z * tail));
+    turned = b > a ? Real(1.5707963267948966) - turned : turned;
+    turned = x < 0 ? Real(3.141592653589793) - turned : turned;
+    return y < 0 ? -turned : turned;
 }
 inline Number larger(Number a, Number b) { return __builtin_elementwise_max(a, b); }
 inline Number smaller(Number a, Number b) { return __builtin_elementwise_min(a, b); }

@@ -14,10 +14,12 @@ from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.grouping import BodyMagnet, find_magnets
 from warpmag.engine.model_values import ModelValues
 from warpmag.errors import InputError
+from warpmag.kernels.close_up.bodies import SolidMagnet
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
     gather_bias,
+    gather_frames,
     gather_moments,
     gather_rotations,
     set_external_field,
@@ -99,17 +101,20 @@ class Magnetics:
         celled = [(k, one) for k, one in zip(first, self.magnets, strict=True) if one.lattice.coupling is not None]
         couplings = [(int(k), one.lattice.coupling) for k, one in celled]
         self._celled = wp.array([one.body for _, one in celled], dtype=wp.int32, device=self._model.device)
+        solids = [(k, one) for k, one in zip(first, self.magnets, strict=True) if one.lattice.solid is not None]
+        self._solid_bodies = wp.array([one.body for _, one in solids], dtype=wp.int32, device=self._model.device)
         magnets = [one.magnet for one in self.magnets]
         flags = self._model.body_flags  # None in a model without bodies
         kinematic = [] if flags is None else (flags.numpy() & _KINEMATIC) != 0
         fixed = np.cumsum([one.body < 0 for one in self.magnets]) + self._model.body_count
         bodies = [one.body if one.body >= 0 else own for one, own in zip(self.magnets, fixed, strict=True)]
+        movable = [one.body >= 0 and not kinematic[one.body] for one in self.magnets]
         return MomentSystem(
             worlds=spread([one.world for one in self.magnets], int),
             permanent=spread([one.fixed for one in magnets], bool),
             radii=np.concatenate([one.lattice.radii for one in self.magnets]),
             bodies=spread(bodies, int),
-            movable=spread([one.body >= 0 and not kinematic[one.body] for one in self.magnets], bool),
+            movable=spread(movable, bool),
             saturation=spread([one.saturation for one in magnets]),
             susceptibility=spread(
                 [one.recoil_permeability - 1.0 if one.recoils else one.susceptibility for one in magnets]
@@ -127,6 +132,18 @@ class Magnetics:
             max_evaluations=max_evaluations,
             couplings=couplings,
             applied=self._sources.applied,
+            solids=[
+                SolidMagnet(
+                    int(k),
+                    len(one.lattice.volumes),
+                    float(one.lattice.volumes[0]),
+                    one.world,
+                    one.lattice.reach,
+                    one.lattice.solid,
+                    one.body >= 0 and not kinematic[one.body],
+                )
+                for k, one in solids
+            ],
             device=self._model.device,
         )
 
@@ -202,6 +219,8 @@ class Magnetics:
         if self.system.rotations is not None:
             gather_rotations(state.body_q, self._celled, self.system.rotations)
         self._sources.gather(state.body_q)
+        if self.system.frames is not None:
+            gather_frames(state.body_q, self._solid_bodies, self.system.frames)
         if len(self._recoiling):
             gather_bias(state.body_q, self._body_moments, self._recoiling, self._coercivity, self.system.bias)
         self.system.solve()

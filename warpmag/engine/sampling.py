@@ -6,9 +6,13 @@ from typing import Any
 import newton
 import numpy as np
 
-from warpmag import lattice
+from warpmag import lattice, polyhedra
 from warpmag.demagnetization import Coupling, coupling
 from warpmag.errors import InputError
+from warpmag.polyhedra import Polyhedron
+
+_REACH = 3.0
+"""How far the closed form of a permanent magnet reaches where its moments' spacing is given, in cells."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,8 @@ class BodyLattice:
         counts: Moments of each shape, in the order of the shapes.
         coupling: What inducible moments of one shape lack among themselves as balls; None of permanent ones, of balls,
             and of several shapes.
+        solid: What bounds a permanent magnet whose field is a closed form close up; None of others, and of balls.
+        reach: Distance up to which it is [m].
     """
 
     positions: np.ndarray
@@ -29,6 +35,8 @@ class BodyLattice:
     radii: np.ndarray
     counts: np.ndarray
     coupling: Coupling | None = None
+    solid: Polyhedron | None = None
+    reach: float = 0.0
 
 
 class ShapeSampler:
@@ -75,13 +83,34 @@ class ShapeSampler:
                 np.ones(len(shapes), dtype=int),
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
+        solid = self._polyhedron(shapes[0], solids[0]) if permanent and len(shapes) == 1 else None
+        if solid is not None and spacing == 0.0:
+            return self._close_up(shapes[0], solids[0], solid)
         filled = lattice.fill(solids, spacing, 1 if permanent or len(solids) > 1 else lattice.LEAST_ACROSS)
         counts = np.bincount(filled.owners, minlength=len(solids))
         if permanent:
-            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts)
+            reach = _REACH * float(filled.pieces[0].sides.max())
+            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solid=solid, reach=reach)
         # between shapes, which have grids of their own, there are balls; mixed with cells these may have no solution
         cells = coupling(filled, filled.radii) if len(filled.pieces) == 1 else None
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells)
+
+    def _polyhedron(self, shape: int, posed: lattice.Solid) -> Polyhedron | None:
+        """What bounds a box or a cylinder, in the frame of its body; None of other shapes."""
+        kinds, kind, scale = newton.GeoType, self._types[shape], self._scales[shape]
+        if kind not in (kinds.BOX, kinds.CYLINDER):
+            return None
+        found = polyhedra.box(scale) if kind == kinds.BOX else polyhedra.cylinder(scale[0], scale[1])
+        return found.posed(posed.position, posed.rotation)
+
+    def _close_up(self, shape: int, posed: lattice.Solid, solid: Polyhedron) -> BodyLattice:
+        """Moments of a permanent box or cylinder, which is a closed form close up."""
+        scale = self._scales[shape]
+        box = self._types[shape] == newton.GeoType.BOX
+        found = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
+        radii = np.minimum(0.5 * np.cbrt(found.volumes), found.depths)
+        counts = np.array([len(radii)])
+        return BodyLattice(posed.to_body(found.places), found.volumes, radii, counts, solid=solid, reach=found.reach)
 
     def _are_balls_apart(self, shapes: list[int]) -> bool:
         if (self._types[shapes] != newton.GeoType.SPHERE).any():

@@ -1,0 +1,342 @@
+"""Permanent boxes and cylinders close up: their fields, and their forces on each other and on balls.
+
+References: magpylib's closed forms, differentiated and meshed, for fields and for forces in any pose; Akoun and Yonnet
+(``bench/reference/cuboids.py``) and Vokoun et al. (``bench/reference/discs.py``) for parallel ones in contact.
+"""
+
+import magpylib
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+import warpmag
+from bench.reference import cuboids, discs
+from warpmag import oracle, polyhedra
+from warpmag.kernels.close_up.bodies import SolidMagnet
+from warpmag.probe import FieldProbe
+from warpmag.system import MomentSystem
+
+M = 1.05e6  # A/m, N42
+SIDE, GAP = 0.01, 5e-4  # m
+CUBE, DISC = ("box", (SIDE / 2,) * 3), ("cylinder", (SIDE / 2, SIDE / 4))
+LARGE = ("box", (0.02,) * 3)
+BALL = ("ball", (0.005,))
+ALONG, ASKEW = (0.0, 0.0, M), (0.3 * M, -0.2 * M, 0.9 * M)
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+TILTED = tuple(Rotation.from_euler("xyz", [20.0, 35.0, 10.0], degrees=True).as_quat())
+SINGLE = 3e-6  # float32: sums of some hundred terms, relative to the largest
+
+
+def add(builder, kind, size, place=(0.0, 0.0, 0.0), turn=UPRIGHT, magnetization=ALONG):
+    """Add a body of one shape, permanent unless it has no magnetization."""
+    body = builder.add_body(xform=wp.transform(wp.vec3(*place), wp.quat(*turn)))
+    if kind == "box":
+        builder.add_shape_box(body, hx=size[0], hy=size[1], hz=size[2])
+    elif kind == "cylinder":
+        builder.add_shape_cylinder(body, radius=size[0], half_height=size[1])
+    else:
+        heavy = newton.ModelBuilder.ShapeConfig(
+            density=1e6
+        )  # Newton changes the inertia of light bodies, with a warning
+        builder.add_shape_sphere(body, radius=size[0], cfg=heavy)
+    if magnetization is None:
+        warpmag.add_inducible(builder, body)
+    else:
+        warpmag.add_permanent(builder, body, magnetization=magnetization)
+    return body
+
+
+def model_of(device, *parts):
+    """Magnetics and state of bodies (kind, size, place, turn, magnetization)."""
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    for part in parts:
+        add(builder, *part)
+    model = builder.finalize(device=device)
+    return warpmag.Magnetics(model, rtol=1e-5), model.state()
+
+
+def magnets(device, *parts):
+    """Magnetics and wrenches of such bodies, shape [bodies, 6]."""
+    magnetics, state = model_of(device, *parts)
+    magnetics.apply(state)
+    return magnetics, state.body_f.numpy().astype(float)
+
+
+def force_on_second(device, *parts):
+    return magnets(device, *parts)[1][1, :3]
+
+
+def reference(kind, size, place=(0.0, 0.0, 0.0), turn=UPRIGHT, magnetization=ALONG):
+    pose = {"position": place, "orientation": Rotation.from_quat(turn), "magnetization": magnetization}
+    if kind == "box":
+        return magpylib.magnet.Cuboid(dimension=2.0 * np.array(size), **pose)
+    if kind == "cylinder":
+        return magpylib.magnet.Cylinder(dimension=(2.0 * size[0], 2.0 * size[1]), **pose)
+    return magpylib.magnet.Sphere(diameter=2.0 * size[0], **pose)
+
+
+def gradient_of(magnet, x, step=1e-6):
+    """Gradient of its field by central differences, ∂H_i/∂x_k, shape [3, 3]."""
+    columns = [(magnet.getH(x + step * axis) - magnet.getH(x - step * axis)) / (2.0 * step) for axis in np.eye(3)]
+    return np.stack(columns, axis=1)
+
+
+def near_system(half, device, dtype="float64", places=((0.0, 0.0, 0.0),), balls=(), magnetization=ASKEW):
+    """A system of equal boxes, and of permanent balls of 1 mm."""
+    body, shape = polyhedra.box_moments(half), polyhedra.box(half)
+    n = len(body.volumes)
+    solids = [SolidMagnet(k * n, n, body.volumes[0], 0, body.reach, shape, True) for k in range(len(places))]
+    count = n * len(places) + len(balls)
+    radii = np.concatenate([np.tile(body.depths, len(places)), np.full(len(balls), 1e-3)])
+    labels = np.concatenate([np.repeat(np.arange(len(places)), n), len(places) + np.arange(len(balls))])
+    system = MomentSystem(
+        radii=radii, permanent=np.ones(count, bool), bodies=labels, solids=solids, dtype=dtype, device=device
+    )
+
+    def put(places, balls):
+        positions = np.concatenate([*(body.places + p for p in places), np.reshape(balls, (-1, 3))])
+        moments = np.concatenate(
+            [*(body.volumes[:, None] * magnetization for _ in places), *([[0.1, 0.0, 0.3]],) * len(balls)]
+        )
+        system.positions.assign(positions)
+        system.moments.assign(moments)
+        frames = np.array([[*p, 0.0, 0.0, 0.0, 1.0] for p in places])
+        system.frames.assign(frames)
+        system.solve()
+
+    put(places, balls)
+    return system, put
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-10), ("float32", 2e-5)])
+def test_field_of_a_box(dtype, tolerance, device):
+    """Inside, outside, near faces and edges, and on the lines that edges lie on."""
+    half = np.array([0.01, 0.007, 0.004])
+    system, _ = near_system(half, device, dtype)
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1.3, 1.3, (300, 3)) * half
+    x[:60, :2] = half[:2] * (1.0 + 1e-3 * rng.normal(size=(60, 2)))  # near an edge and beyond it
+    x[60:80] = half
+    x[60:80, 2] *= np.linspace(1.01, 1.7, 20)  # on its line, as far as the closed form reaches
+    probe = FieldProbe(system, len(x), gradients=True)
+    probe.points.assign(x)
+    probe.measure()
+    magnet = reference("box", half, magnetization=ASKEW)
+    x = probe.points.numpy().astype(float)
+    h, b = magnet.getH(x), magnet.getB(x)
+    np.testing.assert_allclose(probe.h.numpy(), h, atol=tolerance * M)
+    np.testing.assert_allclose(probe.b.numpy(), b, atol=tolerance * oracle.MU0 * M)
+    for k in range(0, len(x), 7):
+        expected = gradient_of(magnet, x[k], 1e-8)
+        # (step/distance)² of the differences, or places in float32 over it: 1e-6 m from an edge
+        allowed = (1e-4 if dtype == "float64" else 1e-3) * max(np.abs(expected).max(), M)
+        np.testing.assert_allclose(probe.gradient.numpy()[k], expected, atol=allowed)
+
+
+def test_field_of_a_cylinder(device):
+    """The prism in its place: within 1 % of M a tenth of the radius from the rim, 1e-3 elsewhere."""
+    magnetics, _ = magnets(device, ("cylinder", (0.01, 0.008), (0.1, 0.0, 0.0), TILTED, ASKEW))
+    magnet = reference("cylinder", (0.01, 0.008), (0.1, 0.0, 0.0), TILTED, ASKEW)
+    rng = np.random.default_rng(1)
+    local = rng.uniform(-1.6, 1.6, (400, 3)) * [0.01, 0.01, 0.008]
+    r, z = np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])
+    away = np.hypot(np.where(z < 0.008, 0.0, z - 0.008), r - 0.01)
+    keep = (away > 1e-3) & ((np.abs(z - 0.008) > 1e-4) | (r > 0.011))
+    x = np.add(Rotation.from_quat(TILTED).apply(local[keep]), [0.1, 0.0, 0.0])
+    np.testing.assert_allclose(magnetics.h_field(x), magnet.getH(x), atol=3e-3 * M)
+    np.testing.assert_allclose(magnetics.b_field(x), magnet.getB(x), atol=3e-3 * oracle.MU0 * M)
+
+
+PLACES = [(0.0, 0.0, SIDE + gap) for gap in (0.0, 1e-4, 5e-4, 2e-3)]
+PLACES += [(k * SIDE / 36.0, 0.0, SIDE) for k in (1, 2, 3, 4, 11)]  # quarters of a cell of nine
+PLACES += [(SIDE, 0.0, 0.0), (SIDE, 0.0, SIDE / 36.0), (SIDE, 0.002, 0.003), (0.003, -0.004, SIDE)]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_cubes_in_contact(place, device):
+    """Gauss points leave 2e-3 at most, where an edge of one cube crosses the other's face."""
+    found = force_on_second(device, (*CUBE,), (*CUBE, place))
+    half = np.array(CUBE[1])
+    expected = cuboids.force(half, half, place, M, M)
+    np.testing.assert_allclose(found, expected, atol=2e-3 * np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-4, 5e-4, 2e-3])
+def test_discs_in_line(gap, device):
+    """The prism's rim is 0.2 % of the radius off the cylinder's, in and out."""
+    found = force_on_second(device, (*DISC,), (*DISC, (0.0, 0.0, SIDE / 2 + gap)))
+    expected = discs.force(DISC[1][0], SIDE / 2, SIDE / 2, gap, M, M)
+    np.testing.assert_allclose(found, [0.0, 0.0, expected], atol=3e-3 * abs(expected))
+
+
+POSES = {
+    "tilted cubes": ((*CUBE,), (*CUBE, (0.001, 0.002, 0.0135), TILTED, ASKEW)),
+    "cube and plate": ((*CUBE,), ("box", (0.005, 0.005, 0.001), (0.001, 0.002, 0.006 + GAP), UPRIGHT, ASKEW)),
+    "discs, slid": ((*DISC,), (*DISC, (0.001, 0.0, SIDE / 2 + GAP))),
+    "discs, tilted": ((*DISC,), (*DISC, (0.001, 0.002, 0.009), TILTED, ASKEW)),
+    "rods side by side": (
+        ("cylinder", (0.005, 0.005), (0.0, 0.0, 0.0), UPRIGHT, (M, 0.0, 0.0)),
+        ("cylinder", (0.005, 0.005), (0.01 + GAP, 0.002, 0.001), UPRIGHT, (M, 0.0, 0.0)),
+    ),
+    "disc and tilted cube": ((*DISC,), (*CUBE, (0.001, 0.002, 0.012), TILTED, ASKEW)),
+    "ball at a face": ((*LARGE,), (*BALL, (0.004, 0.003, 0.025), UPRIGHT, ASKEW)),
+    "ball at an edge": ((*LARGE,), (*BALL, (0.0236, 0.003, 0.0236), UPRIGHT, ASKEW)),
+    "ball at a corner": ((*LARGE,), (*BALL, (0.0229, 0.0229, 0.0229), UPRIGHT, ASKEW)),
+    "ball at a disc": (("cylinder", (0.02, 0.005)), (*BALL, (0.0236, 0.001, 0.0086), UPRIGHT, ASKEW)),
+}
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_force_and_torque_in_any_pose(name, device):
+    """Against magpylib's, of magnets cut into 2,000 cells (1e-3); what both feel is opposite and equal."""
+    one, other = POSES[name]
+    _, wrenches = magnets(device, one, other)
+    force, torque = magpylib.getFT(reference(*one), reference(*other), meshing=2000, eps=1e-7)
+    size = np.linalg.norm(force)
+    np.testing.assert_allclose(wrenches[1, :3], force, atol=2e-3 * size)
+    np.testing.assert_allclose(wrenches[1, 3:], torque, atol=2e-3 * size * 0.005)
+    np.testing.assert_allclose(wrenches[0, :3], -wrenches[1, :3], atol=SINGLE * size)
+    turn = wrenches[:, 3:].sum(axis=0) + np.cross(other[2], wrenches[1, :3])
+    np.testing.assert_allclose(turn, 0.0, atol=SINGLE * size * 0.02)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.025), (0.02 + 0.0036, 0.0, 0.0236), (0.0229, 0.0229, 0.0229)])
+def test_iron_ball_at_a_large_cube(place, device):
+    """Its force is that of its moment in the exact field's gradient, and pushes the cube back."""
+    magnetics, wrenches = magnets(device, (*LARGE,), (*BALL, place, UPRIGHT, None))
+    magnet, moment = reference(*LARGE), magnetics.shape_moments()[list(magnetics.shapes).index(1)]
+    applied = magnet.getH(place)
+    expected = oracle.MU0 * gradient_of(magnet, np.array(place)) @ moment
+    size = np.linalg.norm(expected)
+    np.testing.assert_allclose(wrenches[1, :3], expected, atol=1e-5 * size)
+    np.testing.assert_allclose(wrenches[0, :3], -expected, atol=1e-5 * size)
+    volume = 4.0 / 3.0 * np.pi * 0.005**3
+    curve = np.tanh(3.0 * np.linalg.norm(applied) / 1.7e6) * 1.7e6 / np.linalg.norm(applied)
+    np.testing.assert_allclose(moment, volume * curve * applied, atol=3e-5 * volume * 1.7e6)
+
+
+SWITCHES = {
+    "ball over a face": ((*CUBE,), BALL, (0.001, 0.002, 1.0), SIDE / 2),
+    "ball off a corner": ((*CUBE,), BALL, (1.0, 1.0, 1.0), SIDE / 2),
+    "ball off a rim": ((*DISC,), ("ball", (0.001,)), (1.0, 0.0, 0.5), SIDE / 2),
+    "ball over a disc": (("cylinder", (0.01, 0.0015)), ("ball", (0.001,)), (0.0, 0.0, 1.0), 0.0025),
+    "cubes": ((*CUBE,), CUBE, (0.0, 0.0, 1.0), SIDE),
+    "cubes off their edges": ((*CUBE,), CUBE, (1.0, 1.0, 0.0), SIDE),
+    "plates": (("box", (0.01, 0.01, 0.001)), ("box", (0.01, 0.01, 0.001)), (0.0, 0.3, 1.0), 0.002),
+    "discs": ((*DISC,), DISC, (0.5, 0.0, 1.0), SIDE / 2),
+}
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+def test_lattice_takes_over_without_a_jump(name, device):
+    """Where the closed form ends, it changes the force by less than 1e-3."""
+    one, (kind, size), way, start = SWITCHES[name]
+    way = np.array(way) / np.abs(way).max()
+
+    def forces(distance):
+        magnetics, state = model_of(device, one, (kind, size, tuple(distance * way), UPRIGHT, ASKEW))
+        found = []
+        for _ in range(2):
+            state.clear_forces()
+            magnetics.apply(state)
+            found.append(state.body_f.numpy()[1, :3].astype(float))
+            magnetics.system.close_up = None
+        return found
+
+    inside, outside = start, 10.0 * SIDE
+    for _ in range(9):
+        middle = 0.5 * (inside + outside)
+        near, far = forces(middle)
+        inside, outside = (middle, outside) if (near != far).any() else (inside, middle)
+    near, far = forces(inside)
+    assert (near != far).any()
+    np.testing.assert_allclose(far, near, atol=1e-3 * np.linalg.norm(near))
+
+
+@pytest.mark.parametrize("across", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)])
+def test_boxes_that_sink_into_each_other(across, device):
+    """As contact solvers let them: the force goes on as it grew before, by 1 % for 10 µm."""
+    found = [
+        force_on_second(device, (*CUBE,), (*CUBE, tuple((SIDE + gap) * np.array(across)))) @ across
+        for gap in (2e-5, 1e-5, 0.0, -1e-5, -2e-5)
+    ]
+    assert np.isfinite(found).all()
+    steps = np.diff(found) / found[2]
+    assert (steps > 0.0).all()
+    np.testing.assert_allclose(steps, steps[1], rtol=0.3)
+
+
+def test_gradient_of_the_energy_is_the_force(device):
+    """Of two boxes and a ball, all near each other, in float64; the boxes' energy takes a gap of some points' width."""
+    places, balls = np.array([[0.0, 0.0, 0.0], [0.004, 0.002, 0.013]]), np.array([[0.0075, 0.0005, -0.001]])
+    system, put = near_system((0.005, 0.005, 0.005), device, places=places, balls=balls)
+    system.apply_forces()
+    found = system.forces.numpy()
+    n = (len(found) - 1) // 2
+    forces = np.array([found[:n].sum(axis=0), found[n : 2 * n].sum(axis=0), found[-1]])
+    step = 1e-6
+    for axis in range(3):
+        for k, (box, ball) in enumerate(((0, None), (1, None), (None, 0))):
+            energies = []
+            for sign in (1.0, -1.0):
+                there, around = places.copy(), balls.copy()
+                if ball is None:
+                    there[box, axis] += sign * step
+                else:
+                    around[ball, axis] += sign * step
+                put(there, around)
+                energies.append(system.energy()[0])
+            slope = (energies[0] - energies[1]) / (2.0 * step)
+            # Gauss points on the faces, whose energy this is, leave 1e-3
+            assert abs(slope + forces[k, axis]) < 3e-3 * np.abs(forces).max()
+
+
+def test_what_has_no_closed_form_launches_nothing(device):
+    assert magnets(device, BALL, (*BALL, (0.02, 0.0, 0.0)))[0].system.close_up is None
+
+
+def test_magnets_of_one_body_and_of_other_worlds_do_not_feel_each_other(device):
+    """Two boxes of one body, magnetized apart, and a disc over them; alone, and in two worlds."""
+
+    def fill(builder, parts=2):
+        body = builder.add_body()
+        for z, strength in ((0.0, M), (SIDE, -0.5 * M)):
+            frame = wp.transform((0.0, 0.0, z), wp.quat_identity())
+            shape = builder.add_shape_box(body, xform=frame, hx=0.005, hy=0.005, hz=0.005)
+            warpmag.add_permanent(builder, shape=shape, magnetization=(strength, 0.0, strength))
+        if parts == 2:
+            add(builder, *DISC, (0.001, 0.0, 0.019), UPRIGHT, ASKEW)
+
+    found = []
+    for worlds, parts in ((1, 1), (1, 2), (2, 2)):
+        world, builder = newton.ModelBuilder(), newton.ModelBuilder()
+        warpmag.register_attributes(world)
+        warpmag.register_attributes(builder)
+        fill(world, parts)
+        builder.replicate(world, worlds)
+        model = builder.finalize(device=device)
+        magnetics, state = warpmag.Magnetics(model), model.state()
+        magnetics.apply(state)
+        found.append(state.body_f.numpy())
+    np.testing.assert_array_equal(found[0], 0.0)
+    assert np.abs(found[1]).max() > 1.0
+    np.testing.assert_allclose(found[2], np.tile(found[1], (2, 1)), rtol=1e-5, atol=1e-5)
+
+
+def test_a_magnet_that_is_switched_is_switched_close_up(device):
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    add(builder, *CUBE)
+    add(builder, *CUBE, (0.0, 0.0, SIDE + GAP))
+    model = builder.finalize(device=device)
+    magnetics, state = warpmag.Magnetics(model), model.state()
+    forces = []
+    for strength in (M, 0.0, -0.5 * M):
+        magnetics.set_magnetization((0.0, 0.0, strength), body=0)
+        state.clear_forces()
+        magnetics.apply(state)
+        forces.append(state.body_f.numpy()[1, 2])
+    np.testing.assert_allclose(forces, forces[0] * np.array([1.0, 0.0, -0.5]), atol=SINGLE * abs(forces[0]))
