@@ -143,11 +143,12 @@ CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pos
     c.arm = less(rub, scaled(quotient(other_body.inv_mass, total), apart_there));
     c.other_arm = sum(other_rub, scaled(quotient(body.inv_mass, total), apart_there));
     const Vector points = less(turned(own.q, t.point), turned(other.q, t.other_point));
-    c.gap_speed = larger((dot(n, sum(apart, points)) - t.margin) / dt, n.x * Real(0) - PUSH_OUT);
-    // kinematic bodies lend their surfaces a velocity, of which gaps do not tell
+    // kinematic bodies stand where they do at the end already, and lend their surfaces a velocity besides; without it
+    // the gap is the one that they and others were found with
     const Vector drift = sum(body.v, cross(body.spin, c.arm)), its = cross(other_body.spin, c.other_arm);
     const Vector other_drift = sum(other_body.v, its);
-    c.gap_speed -= t.kinematic * dot(n, drift) - t.other_kinematic * dot(n, other_drift);
+    const Number lent = t.kinematic * dot(n, drift) - t.other_kinematic * dot(n, other_drift);
+    c.gap_speed = larger((dot(n, sum(apart, points)) - t.margin) / dt - lent, n.x * Real(0) - PUSH_OUT);
     auto both = [&](Vector a, Vector b) {
         return ease(body, inertia, c.arm, a, b) + ease(other_body, other_inertia, c.other_arm, a, b);
     };
