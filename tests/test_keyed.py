@@ -10,7 +10,7 @@ import pytest
 from pxr import Gf, Ts, Usd, UsdGeom
 
 from warpmag import InputError, Simulation
-from warpmag.usd import check
+from warpmag.usd import check, hold, open_stage, survey
 
 MU0 = 4e-7 * math.pi
 G = 9.81
@@ -249,6 +249,19 @@ def test_a_collider_in_an_instance_that_keys_move_is_refused(tmp_path):
     message = r"^/World/Rig/Copy/Part: moves by keys inside an instance: set instanceable = false on /World/Rig/Copy$"
     with pytest.raises(InputError, match=message):
         check(path)
+
+
+def test_a_stage_is_held_at_another_moment_as_well(tmp_path):
+    """What a collider that is no body became, it stays."""
+    keys = operations(translate={0: (0, 0, 0), 24: (0, 0, 1)})
+    path = write(tmp_path, prim("Cube", "Part", (COLLIDER,), "double size = 0.01", keys), held_ball(1))
+    stage = open_stage(path)
+    for time in (12.0, 24.0):
+        hold(stage, time)
+        assert UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/World/Part"))[3][2] == time / 24.0
+        contents = survey(stage)
+        assert contents.kinematic == ["/World/Part"]
+        assert contents.motions["/World/Part"].operations[0].keys.times.tolist() == [0.0, 24.0]
 
 
 def test_a_spline_is_refused_where_a_run_would_follow_it(tmp_path):

@@ -136,26 +136,35 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
             move cannot become a body.
     """
     session = stage.GetSessionLayer()
-    sampled = [
+    candidates = [
         attribute
         for prim in stage.Traverse()
         for attribute in prim.GetAuthoredAttributes()
         if attribute.GetNumTimeSamples() or attribute.HasSpline() or session.GetAttributeAtPath(attribute.GetPath())
     ]
-    for attribute in sampled:  # what an earlier call held would hide the samples
-        if spec := session.GetAttributeAtPath(attribute.GetPath()):
-            spec.ClearDefaultValue()
+    sampled = [attribute for attribute in candidates if _uncover(attribute, session)]
     values = [(attribute, _at(attribute, time_code)) for attribute in sampled if attribute.GetName() != _ORDER]
     with Usd.EditContext(stage, session):
         for attribute, value in values:
             if value is not None:
                 attribute.Set(value)
-            elif (
-                attribute.GetNumTimeSamples() or attribute.HasSpline()
-            ):  # blocked at that time: as if it had never been authored
+            else:  # blocked at that time: as if it had never been authored
                 attribute.Block()
     cut_off(stage)
     make_kinematic(stage, {one.GetPrim().GetPath() for one in sampled if one.GetName().startswith("xformOp:")})
+
+
+def _uncover(attribute: Usd.Attribute, session: Sdf.Layer) -> bool:
+    """Take away what an earlier call held, which would hide samples; return whether there are any, or a spline."""
+    spec = session.GetAttributeAtPath(attribute.GetPath())
+    held = spec.default if spec else None
+    if spec:
+        spec.ClearDefaultValue()
+    if attribute.GetNumTimeSamples() or attribute.HasSpline():
+        return True
+    if held is not None:  # written for another reason
+        spec.default = held
+    return False
 
 
 def _at(attribute, time_code):
