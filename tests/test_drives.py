@@ -19,6 +19,7 @@ STEP = 1e-3  # s
 EXTENT = np.array((0.01, 0.002, 0.001))  # half of it, of a bar or a needle [m]
 SLOW = [pytest.param(name, marks=pytest.mark.long) for name in ("mujoco", "kamino")]  # to compile
 SOLVERS = ["xpbd", "featherstone", "steel", *SLOW]
+DRIVEN = ["xpbd", *(pytest.param(name, marks=pytest.mark.long) for name in ("featherstone", "steel")), *SLOW]
 
 
 def scene(gravity=0.0):
@@ -68,7 +69,7 @@ def period(path):
     """Twice the mean time between two passages of zero [s]."""
     before = np.flatnonzero(np.diff(np.sign(path)))
     times = STEP * (before + path[before] / (path[before] - path[before + 1]))
-    assert len(times) >= 3
+    assert len(times) >= 2
     return 2.0 * np.diff(times).mean()
 
 
@@ -92,7 +93,7 @@ def test_a_bar_hinged_at_its_end_swings_as_a_pendulum(solver, device):
     builder, center, wide = scene(G), math.pi / 2, math.radians(60)
     axis = np.array((0.0, 1.0, 0.0))
     bar, inertia = hinge(builder, center - wide, arm=EXTENT[0])
-    rate, steps = math.sqrt(builder.body_mass[bar] * G * EXTENT[0] / inertia), 330
+    rate, steps = math.sqrt(builder.body_mass[bar] * G * EXTENT[0] / inertia), 220
     simulation = Simulation(builder, solver=solver, device=device, step=STEP)
     compare(angles(simulation, bar, axis, steps), swing(rate, center - wide, center, steps), center, wide)
 
@@ -104,14 +105,15 @@ def test_a_compass_needle_swings_about_north(solver, device):
     warpmag.add_permanent(builder, needle, magnetization=(4e5, 0.0, 0.0))
     moment = 4e5 * 8.0 * EXTENT.prod()
     simulation = Simulation(builder, solver=solver, device=device, step=STEP, external_field=(field, 0.0, 0.0))
-    rate, steps = math.sqrt(MU0 * moment * field / inertia), 350
+    rate, steps = math.sqrt(MU0 * moment * field / inertia), 220
     compare(angles(simulation, needle, axis, steps), swing(rate, wide, 0.0, steps), 0.0, wide)
 
 
+@pytest.mark.parametrize("solver", DRIVEN, indirect=True)
 def test_a_drive_is_a_spring_of_its_gain(solver, device):
     if solver == "kamino":
         pytest.skip("its drives are stiffer than their gains, as it says")
-    builder, wide, rate, steps = scene(), 0.5, 25.0, 330
+    builder, wide, rate, steps = scene(), 0.5, 25.0, 220
     axis = np.array((0.6, 0.8, 0.0))
     bar, inertia = hinge(builder, wide, arm=EXTENT[0], axis=tuple(axis))
     builder.joint_target_ke[-1], builder.joint_target_kd[-1] = inertia * rate**2, 0.0
@@ -132,6 +134,7 @@ def servo(angle=0.0, rate=200.0):
     return builder, bar, builder.body_mass[bar] * G * EXTENT[0] / (inertia * rate**2)
 
 
+@pytest.mark.parametrize("solver", DRIVEN, indirect=True)
 def test_an_arm_holds_what_its_drive_holds(solver, device):
     builder, bar, sag = servo()
     path = angles(Simulation(builder, solver=solver, device=device, step=STEP), bar, np.array((0.0, 1.0, 0.0)), 80)
@@ -219,7 +222,7 @@ def test_what_is_no_control_of_the_model_is_refused(device):
 
 def test_a_drive_along_a_slanted_axis(device):
     """A ball on a rail, hung on a spring: it swings about where that carries it."""
-    builder, rate, steps, axis = scene(G), 25.0, 260, np.array((0.0, 0.6, 0.8))
+    builder, rate, steps, axis = scene(G), 25.0, 200, np.array((0.0, 0.6, 0.8))
     ball = builder.add_link()
     builder.add_shape_sphere(ball, radius=5e-3)
     builder.add_articulation([builder.add_joint_prismatic(-1, ball, axis=tuple(axis))])
@@ -250,10 +253,10 @@ def weakly_pulled(other):
 def test_a_weak_pull_moves_a_body_from_rest(other, device):
     builder, ball = weakly_pulled(other)
     simulation = Simulation(builder, device=device, step=STEP)
-    for _ in range(300):
+    for _ in range(150):
         simulation.step()
     fallen = -simulation.state.body_q.numpy()[ball, 2]
-    assert fallen == pytest.approx(0.5 * 0.15 * 0.3**2, rel=0.01)
+    assert fallen == pytest.approx(0.5 * 0.15 * 0.15**2, rel=0.01)
 
 
 def test_a_weak_pull_moves_a_body_that_rebounds(device):

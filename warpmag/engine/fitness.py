@@ -39,7 +39,17 @@ def articulate(builder: newton.ModelBuilder, solver: str) -> None:
         inside.add(child)
 
 
-def check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
+def check_model(model: newton.Model, solver: str, dt: float) -> None:
+    """Refuse what the solver cannot move in substeps of ``dt`` [s], and bodies whose start is not finite."""
+    _check_joint_springs(model, solver, dt)
+    for name in ("body_q", "body_qd"):
+        bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
+        if bad.any():
+            what = "position or orientation" if name == "body_q" else "velocity"
+            raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {what} is not finite")
+
+
+def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
     """Refuse joints of bodies that the springs which the solver makes of them would blow up in substeps of ``dt``."""
     kinds = model.joint_type.numpy() if model.joint_count else np.zeros(0, int)
     held = np.flatnonzero((kinds != newton.JointType.FREE) & (kinds != newton.JointType.DISTANCE))
@@ -59,15 +69,6 @@ def check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
 def solver_warnings(solver: str) -> list[str]:
     """Return what a user of the solver should know, a line each."""
     return [_WEAKNESSES[solver]] if solver in _WEAKNESSES else []
-
-
-def check_start(model: newton.Model) -> None:
-    """Refuse bodies that start at no place or with no velocity."""
-    for name in ("body_q", "body_qd"):
-        bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
-        if bad.any():
-            what = "position or orientation" if name == "body_q" else "velocity"
-            raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {what} is not finite")
 
 
 def check_control(control: newton.Control, model: newton.Model) -> None:

@@ -15,7 +15,7 @@ import warp as wp
 from warpmag.arrays import resolve_device
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
-from warpmag.engine.fitness import articulate, check_control, check_joint_springs, check_start, solver_warnings
+from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -134,8 +134,7 @@ class Simulation:
             builder.color()  # VBD moves bodies that touch nothing in common at once
         with wp.ScopedDevice(self.device), self._refusals(scene):
             model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
-        check_joint_springs(model, solver, LONGEST_SUBSTEP)
-        check_start(model)
+        check_model(model, solver, LONGEST_SUBSTEP)
         return model
 
     def _drive(self, solver: str, own_field: bool) -> Drive | None:
