@@ -52,14 +52,17 @@ _SETTINGS_ATTRIBUTES = {
 
 
 def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
-    """Make ``prim`` a magnet, with every attribute authored (Newton sees authored values only, no fallbacks)."""
+    """Make ``prim`` a magnet, with every attribute authored (Newton sees authored values only, no fallbacks).
+
+    But for what has no meaning for this one: a recoil permeability of 1, and what a measured curve says.
+    """
     magnet.check(str(prim.GetPath()))
+    left_out = [] if magnet.recoils else ["recoil_permeability"]
     if isinstance(magnet.curve, MagnetizationCurve):
-        said = {name: _MAGNET_ATTRIBUTES[name] for name in _MAGNET_ATTRIBUTES if name not in _OF_CURVE}
-        _author(prim, MAGNET_API, said, magnet)
+        left_out += _OF_CURVE
         _author_curve(prim, magnet.curve)
-    else:
-        _author(prim, MAGNET_API, _MAGNET_ATTRIBUTES, magnet)
+    said = {field: name for field, name in _MAGNET_ATTRIBUTES.items() if field not in left_out}
+    _author(prim, MAGNET_API, said, magnet)
 
 
 def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
