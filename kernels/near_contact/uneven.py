@@ -24,8 +24,8 @@ force on the ball minus their sum: all are derivatives of E, and momentum and an
 * **Saturation.** χ is the differential susceptibility at the ball's magnetization: a saturated ball is a dipole.
 
 Magnets with a recoil permeability act by the moments that they have. Inducible moments do not drive these multipoles,
-nor feel them: what balls do to each other is ``near_pairs``. So the induction stays as it is, and all this is done once a
-force. Reference: Jackson, Classical Electrodynamics, 3rd ed., ch. 4.
+nor feel them: what balls do to each other is ``near_pairs``. So the induction stays as it is, and all this is done once
+a force. Reference: Jackson, Classical Electrodynamics, 3rd ed., ch. 4.
 
 | array | shape | meaning |
 |---|---|---|
