@@ -161,6 +161,30 @@ def test_only_what_may_move_is_pushed(device):
         assert not other[[1, 2, 4]].any()
 
 
+def test_magnets_of_a_recoil_permeability(device):
+    """They act by the moments that they have when the induction is solved, wherever they stand among the moments."""
+    order = [2, 0, 3, 1, 4]
+    x, radii = PLACES[order], RADII[order]
+    linear = np.array([magnet in (2, 3) for magnet in order])
+    found, moments = [], np.zeros((5, 3))
+    for model in ("multipole", "dipole"):
+        magnets = system(
+            radii, device, balls=4, contact_model=model,
+            curve=["linear" if one else "tanh" for one in linear], susceptibility=np.where(linear, 0.05, np.inf),
+        )  # fmt: skip
+        remanence = MOMENTS[order] / (4.0 / 3.0 * np.pi * radii[:, None] ** 3)
+        magnets.bias.assign(np.where(linear[:, None], remanence / 0.05, 0.0))
+        found.append(wrench(magnets, x, np.where(linear[:, None], 0.0, MOMENTS[order])))
+        moments = magnets.moments.numpy()
+    fixed = [
+        wrench(system(RADII, device, balls=2, contact_model=model), PLACES, moments[np.argsort(order)])
+        for model in ("multipole", "dipole")
+    ]
+    for part in (0, 1):
+        added, expected = found[0][part] - found[1][part], fixed[0][part] - fixed[1][part]
+        np.testing.assert_allclose(added[np.argsort(order)], expected, atol=1e-6 * np.abs(expected).max())
+
+
 def test_worlds_are_apart(device):
     """Forty worlds at once are each what it is alone, though they share vectors of balls."""
     rng, alone = np.random.default_rng(3), []

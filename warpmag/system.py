@@ -366,10 +366,11 @@ class MomentSystem:
         }
 
     def _make_near_contacts(self, layout: _Layout, turned, susceptibility):
+        magnets = layout.permanent | (self._material.curve.numpy() == LINEAR)
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, self._material,
-            ranges=self.world_ranges, lone=layout.alone, field=self._mutual, movable=layout.movable, turned=turned,
-            forces=self.forces, torques=self.torques,
+            ranges=self.world_ranges, magnets=magnets, lone=layout.alone, field=self._mutual, movable=layout.movable,
+            turned=turned, forces=self.forces, torques=self.torques,
         )  # fmt: skip
 
     @property

@@ -175,8 +175,9 @@ class NearContactBuffers:
 
 
 def allocate(
-    packed, worlds, eligible, susceptibility, material, *, ranges, lone, field, movable, turned, forces, torques
-) -> NearContactBuffers:
+    packed, worlds, eligible, susceptibility, material, *, ranges, magnets, lone, field, movable, turned,
+    forces, torques,
+) -> NearContactBuffers:  # fmt: skip
     """Allocate the buffers.
 
     Args:
@@ -186,7 +187,8 @@ def allocate(
         susceptibility: Susceptibility of each, shape [n], may be infinite.
         material: Their ``curves.CurveParameters``.
         ranges: For each world its first moment, its first permanent one, and the end.
-        lone: Whether a moment is its body's only one, shape [n].
+        magnets: Whether a moment is that of a permanent magnet, shape [n].
+        lone: Whether it is its body's only one, shape [n].
         field: Evaluation of the field at them (``evaluate.PairEvaluation``), whose last part of the sums is written.
         movable: Whether the force on a moment is wanted, shape [n].
         turned: Whether its torque is, shape [n].
@@ -205,7 +207,7 @@ def allocate(
     reach = 2.0 * float(np.max(radii, initial=0.0, where=eligible))
     lists = neighbors.allocate(n, packed.packed, group, reach=reach, ratio=_RATIO, capacity=CANDIDATES)
     kinds, described = _material_arrays(radii, eligible, susceptibility, material, padded)
-    pairs, others = uneven.allocate(balls, ranges, eligible, lone, movable, dtype, device)
+    pairs, others = uneven.allocate(balls, ranges, eligible, magnets, lone, movable, dtype, device)
     arrays = _pair_arrays(balls, dtype, device) | described | others
     arrays |= {
         "packed": packed.packed,

@@ -293,6 +293,7 @@ CUDA_CALLABLE inline void find_response(const Arrays& a, int i) {
     Number sums[FULL];
     for (int c = 0; c < FULL; ++c) sums[c] = zero;
     visit_others(a, i, own.at, size, false, [&](int j, Mask taken) {
+        if (a.group[j] >= 0 || a.alone[j] < 0) return; // no magnet
         const Magnet o = magnet(a, j);
         const Sight s = sight_of(less(o.at, own.at), metre, o.size, o.alone, taken);
         if (any(s.live)) add_derivatives(sums, s, over_cube(o.m, metre));
@@ -309,6 +310,7 @@ CUDA_CALLABLE inline void pull_balls(const Arrays& a, int i) {
     const Real* rows = rows_at(a.response, RESPONSE_ROWS, i);
     Vector total = {zero, zero, zero};
     visit_others(a, i, own.at, size, false, [&](int j, Mask taken) {
+        if (a.group[j] >= 0 || a.alone[j] < 0) return; // no magnet
         const Magnet o = magnet(a, j);
         const Sight s = sight_of(less(o.at, own.at), metre, o.size, o.alone, taken);
         if (!any(s.live)) return;

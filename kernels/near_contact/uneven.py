@@ -23,12 +23,13 @@ force on the ball minus their sum: all are derivatives of E, and momentum and an
   they do not stand for their body.
 * **Saturation.** χ is the differential susceptibility at the ball's magnetization: a saturated ball is a dipole.
 
-Inducible moments do not drive these multipoles, nor feel them: what balls do to each other is ``near_pairs``. So the
-induction stays as it is, and all this is done once a force. Reference: Jackson, Classical Electrodynamics, ch. 4.
+Magnets with a recoil permeability act by the moments that they have. Inducible moments do not drive these multipoles,
+nor feel them: what balls do to each other is ``near_pairs``. So the induction stays as it is, and all this is done once
+a force. Reference: Jackson, Classical Electrodynamics, 3rd ed., ch. 4.
 
 | array | shape | meaning |
 |---|---|---|
-| other_begin, other_end | [balls] | of a ball, its world's permanent moments; of these, if they may move, its balls |
+| other_begin, other_end | [balls] | of a ball, where its world's magnets are; of these, if they may move, its balls |
 | pushed | [balls] | whether the force on a permanent moment is wanted |
 | alone | [balls] | 1 for a permanent moment that is alone on its body, 0 for a cell and a ball, −1 for others |
 | bounds | [chunks, 8] | centre and radius of the ball around the places of a chunk's moments, largest of their radii |
@@ -55,13 +56,14 @@ def constants() -> dict[str, int | float]:
     return {"RESPONSE_ROWS": RESPONSE_ROWS, "BOUND_ROWS": BOUND_ROWS} | sizes | ends
 
 
-def allocate(balls: int, ranges, eligible, lone, movable, dtype, device) -> tuple[int, dict[str, wp.array]]:
+def allocate(balls: int, ranges, eligible, magnets, lone, movable, dtype, device) -> tuple[int, dict[str, wp.array]]:
     """Number of pairs of a ball and a permanent moment that may act on it, and the arrays of the table.
 
     Args:
         balls: Moments, padded to ``CHUNK``.
         ranges: For each world its first moment, its first permanent one, and the end.
         eligible: Whether a moment is an inducible ball that takes part, shape [n].
+        magnets: Whether it is that of a permanent magnet, fixed or with a recoil permeability, shape [n].
         lone: Whether a moment is its body's only one, shape [n].
         movable: Whether the force on a moment is wanted, shape [n].
         dtype: Warp scalar type.
@@ -71,17 +73,14 @@ def allocate(balls: int, ranges, eligible, lone, movable, dtype, device) -> tupl
     begin, end, pushed = (np.zeros(balls, np.int32) for _ in range(3))
     alone = np.full(balls, -1.0)
     alone[:n][eligible] = 0.0
-    for first, middle, last in ranges:
-        if not np.any(eligible[first:middle]) or middle == last:
+    for first, _, last in ranges:
+        own, others = (first + np.flatnonzero(chosen[first:last]) for chosen in (eligible, magnets))
+        if own.size == 0 or others.size == 0:
             continue
-        alone[middle:last] = lone[middle:last]
-        pushed[middle:last] = movable[middle:last]
-        at_balls, at_moved = (
-            first + np.flatnonzero(eligible[first:middle]),
-            middle + np.flatnonzero(pushed[middle:last]),
-        )
-        begin[at_balls], end[at_balls] = middle, last
-        begin[at_moved], end[at_moved] = first, middle
+        alone[others], pushed[others] = lone[others], movable[others]
+        begin[own], end[own] = others[0], others[-1] + 1
+        moved = others[pushed[others] > 0]
+        begin[moved], end[moved] = own[0], own[-1] + 1
     arrays = {
         **{
             name: wp.array(values, dtype=wp.int32, device=device)
