@@ -326,6 +326,30 @@ def test_magnets_of_one_body_and_of_other_worlds_do_not_feel_each_other(device):
     np.testing.assert_allclose(found[2], np.tile(found[1], (2, 1)), rtol=1e-5, atol=1e-5)
 
 
+def test_a_magnet_of_several_boxes(device):
+    """Two legs of one magnet, apart and touching, under a cube; where they share volume they are a lattice."""
+    for place, solids in ((0.006, 2), (0.005, 2), (0.003, 0)):
+        builder = newton.ModelBuilder()
+        warpmag.register_attributes(builder)
+        legs = builder.add_body()
+        for x in (-place, place):
+            frame = wp.transform((x, 0.0, 0.0), wp.quat_identity())
+            builder.add_shape_box(legs, xform=frame, hx=0.005, hy=0.005, hz=0.01)
+        warpmag.add_permanent(builder, legs, magnetization=ASKEW)
+        cube = (*CUBE, (0.001, 0.002, 0.0155))
+        add(builder, *cube)
+        model = builder.finalize(device=device)
+        magnetics, state = warpmag.Magnetics(model), model.state()
+        assert len(magnetics.magnets[0].lattice.solids) == solids
+        magnetics.apply(state)
+        if solids:
+            apart = [reference("box", (0.005, 0.005, 0.01), (x, 0.0, 0.0), UPRIGHT, ASKEW) for x in (-place, place)]
+            force = magpylib.getFT(apart, reference(*cube), meshing=2000, eps=1e-7)[0].sum(axis=0)
+            found = state.body_f.numpy()
+            np.testing.assert_allclose(found[1, :3], force, atol=2e-3 * np.linalg.norm(force))
+            np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=SINGLE * np.linalg.norm(force))
+
+
 def test_a_magnet_that_is_switched_is_switched_close_up(device):
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
