@@ -139,8 +139,9 @@ class ShapeSampler:
             parts.append(ClosedForm(first, len(found.volumes), bound, found.reach))
             first += len(found.volumes)
         counts = np.array([part.count for part in parts])
-        joined = [np.concatenate(one) for one in (places, volumes, radii)]
-        return BodyLattice(*joined, counts, solids=tuple(parts))
+        return BodyLattice(
+            np.concatenate(places), np.concatenate(volumes), np.concatenate(radii), counts, solids=tuple(parts)
+        )
 
     def _are_balls_apart(self, shapes: list[int]) -> bool:
         if (self._types[shapes] != newton.GeoType.SPHERE).any():
