@@ -12,7 +12,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpmag
-from bench.reference import cuboids, discs
+from bench.reference import cuboids, discs, uneven
 from warpmag import oracle, polyhedra
 from warpmag.kernels.close_up.bodies import SolidMagnet
 from warpmag.probe import FieldProbe
@@ -216,6 +216,25 @@ def test_iron_ball_at_a_large_cube(place, device):
     volume = 4.0 / 3.0 * np.pi * 0.005**3
     curve = np.tanh(3.0 * np.linalg.norm(applied) / 1.7e6) * 1.7e6 / np.linalg.norm(applied)
     np.testing.assert_allclose(moment, volume * curve * applied, atol=3e-5 * volume * 1.7e6)
+
+
+@pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
+def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
+    """The whole force, at face, edge and corner: the exact field's dipole, and multipoles from cells (see there)."""
+    half, radius, weak = LARGE[1][0], BALL[1][0], 0.1 * M  # far from saturation: tanh leaves 3e-3
+    outward = np.array(touched)
+    place = half * outward + 1.00001 * radius * outward / np.linalg.norm(outward)
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    add(builder, *LARGE, magnetization=(0.0, 0.0, weak))
+    add(builder, *BALL, tuple(place), UPRIGHT, None)
+    model = builder.finalize(device=device)
+    magnetics, state = warpmag.Magnetics(model, contact_model="multipole"), model.state()
+    magnetics.apply(state)
+    whole = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), weak), place, radius, order=20)
+    found = state.body_f.numpy()
+    np.testing.assert_allclose(found[1, :3], whole, atol=0.055 * np.linalg.norm(whole))
+    np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=1e-4 * np.linalg.norm(whole))
 
 
 SWITCHES = {

@@ -84,7 +84,7 @@ class Magnetics:
         settings.check("Magnetics")
         if curve is not None:
             curve = materials.measured("Magnetics: curve", curve)
-        self.magnets, self._worlds = find_magnets(model)
+        self.magnets, self._worlds = find_magnets(model, cells=contact_model == "multipole")
         self._model, self._values = model, ModelValues(model)
         self._sources = ModelSources(model, self._worlds)
         self.system = self._make_system(settings, max_evaluations, curve)

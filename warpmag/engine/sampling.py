@@ -12,7 +12,7 @@ from warpmag.errors import InputError
 from warpmag.polyhedra import Polyhedron
 
 _REACH = 3.0
-"""How far the closed form of a permanent magnet reaches where its moments' spacing is given, in cells."""
+"""How far the closed form of a permanent magnet reaches where it is a lattice from afar, in cells."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,15 @@ class BodyLattice:
 class ShapeSampler:
     """Samples shapes of one model; shapes that are alike, in many worlds say, are sampled once."""
 
-    def __init__(self, model: newton.Model):
-        """Read the geometry of ``model``."""
+    def __init__(self, model: newton.Model, *, cells: bool = False):
+        """Read the geometry of ``model``.
+
+        Args:
+            model: The model.
+            cells: Whether permanent bodies are cells of a lattice, as what acts on the multipoles of balls takes them
+                (``kernels/near_contact/uneven.py``), and not points of Gauss.
+        """
+        self._cells = cells
         self._labels, self._sources = model.shape_label, model.shape_source
         self._bodies = model.shape_body.numpy()
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
@@ -98,7 +105,7 @@ class ShapeSampler:
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
         closed = self._polyhedra(shapes, solids) if permanent else []
-        if closed and spacing == 0.0:
+        if closed and spacing == 0.0 and not self._cells:
             return self._close_up(shapes, solids, closed)
         filled = lattice.fill(solids, spacing, 1 if permanent or len(solids) > 1 else lattice.LEAST_ACROSS)
         counts = np.bincount(filled.owners, minlength=len(solids))
