@@ -12,7 +12,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpmag
-from bench.reference import cuboids, discs
+from bench.reference import cuboids, discs, uneven
 from warpmag import oracle, polyhedra
 from warpmag.kernels.close_up.bodies import SolidMagnet
 from warpmag.probe import FieldProbe
@@ -218,6 +218,25 @@ def test_iron_ball_at_a_large_cube(place, device):
     np.testing.assert_allclose(moment, volume * curve * applied, atol=3e-5 * volume * 1.7e6)
 
 
+@pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
+def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
+    """The whole force, at face, edge and corner: the exact field's dipole, and multipoles from cells (see there)."""
+    half, radius, weak = LARGE[1][0], BALL[1][0], 0.1 * M  # far from saturation: tanh leaves 3e-3
+    outward = np.array(touched)
+    place = half * outward + 1.00001 * radius * outward / np.linalg.norm(outward)
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    add(builder, *LARGE, magnetization=(0.0, 0.0, weak))
+    add(builder, *BALL, tuple(place), UPRIGHT, None)
+    model = builder.finalize(device=device)
+    magnetics, state = warpmag.Magnetics(model, contact_model="multipole"), model.state()
+    magnetics.apply(state)
+    whole = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), weak), place, radius, order=20)
+    found = state.body_f.numpy()
+    np.testing.assert_allclose(found[1, :3], whole, atol=0.055 * np.linalg.norm(whole))
+    np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=1e-4 * np.linalg.norm(whole))
+
+
 SWITCHES = {
     "ball over a face": ((*CUBE,), BALL, (0.001, 0.002, 1.0), SIDE / 2),
     "ball off a corner": ((*CUBE,), BALL, (1.0, 1.0, 1.0), SIDE / 2),
@@ -324,6 +343,30 @@ def test_magnets_of_one_body_and_of_other_worlds_do_not_feel_each_other(device):
     np.testing.assert_array_equal(found[0], 0.0)
     assert np.abs(found[1]).max() > 1.0
     np.testing.assert_allclose(found[2], np.tile(found[1], (2, 1)), rtol=1e-5, atol=1e-5)
+
+
+def test_a_magnet_of_several_boxes(device):
+    """Two legs of one magnet, apart and touching, under a cube; where they share volume they are a lattice."""
+    for place, solids in ((0.006, 2), (0.005, 2), (0.003, 0)):
+        builder = newton.ModelBuilder()
+        warpmag.register_attributes(builder)
+        legs = builder.add_body()
+        for x in (-place, place):
+            frame = wp.transform((x, 0.0, 0.0), wp.quat_identity())
+            builder.add_shape_box(legs, xform=frame, hx=0.005, hy=0.005, hz=0.01)
+        warpmag.add_permanent(builder, legs, magnetization=ASKEW)
+        cube = (*CUBE, (0.001, 0.002, 0.0155))
+        add(builder, *cube)
+        model = builder.finalize(device=device)
+        magnetics, state = warpmag.Magnetics(model), model.state()
+        assert len(magnetics.magnets[0].lattice.solids) == solids
+        magnetics.apply(state)
+        if solids:
+            apart = [reference("box", (0.005, 0.005, 0.01), (x, 0.0, 0.0), UPRIGHT, ASKEW) for x in (-place, place)]
+            force = magpylib.getFT(apart, reference(*cube), meshing=2000, eps=1e-7)[0].sum(axis=0)
+            found = state.body_f.numpy()
+            np.testing.assert_allclose(found[1, :3], force, atol=2e-3 * np.linalg.norm(force))
+            np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=SINGLE * np.linalg.norm(force))
 
 
 def test_a_magnet_that_is_switched_is_switched_close_up(device):

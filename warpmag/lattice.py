@@ -308,7 +308,7 @@ def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float, across: in
     splits = np.maximum(np.ceil(_FINE_POINTS / counts).astype(int), 3)
     splits = np.where(splits > 8, -(-splits // 8) * 8, splits)  # which demagnetizing tensors join to 8
     offsets = ((grid(splits) + 0.5) / splits - 0.5) * (sides / counts)
-    others = [other for other in earlier if _boxes_meet(part, other)]
+    others = [other for other in earlier if boxes_meet(part, other)]
 
     hits, sums, whole = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
     step = max(1, _CHUNK // len(offsets))
@@ -362,11 +362,11 @@ def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     return moments / weights[:, None], weights, tuple(np.concatenate(one) for one in zip(*joined, strict=True))
 
 
-def _boxes_meet(a: Solid, b: Solid) -> bool:
-    """Whether the axis-aligned bounding boxes of two posed shapes meet in the body's frame."""
+def boxes_meet(a: Solid, b: Solid) -> bool:
+    """Whether the axis-aligned bounding boxes of two posed shapes share volume in the body's frame, rounding apart."""
     reach = sum(np.abs(s.rotation) @ (0.5 * (s.upper - s.lower)) for s in (a, b))
     middle_a, middle_b = (s.to_body(0.5 * (s.lower + s.upper)) for s in (a, b))
-    return bool((np.abs(middle_a - middle_b) < reach).all())
+    return bool((np.abs(middle_a - middle_b) < reach * (1.0 - 1e-6)).all())
 
 
 def grid(counts: np.ndarray) -> np.ndarray:

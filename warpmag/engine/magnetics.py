@@ -84,7 +84,7 @@ class Magnetics:
         settings.check("Magnetics")
         if curve is not None:
             curve = materials.measured("Magnetics: curve", curve)
-        self.magnets, self._worlds = find_magnets(model)
+        self.magnets, self._worlds = find_magnets(model, cells=contact_model == "multipole")
         self._model, self._values = model, ModelValues(model)
         self._sources = ModelSources(model, self._worlds)
         self.system = self._make_system(settings, max_evaluations, curve)
@@ -101,14 +101,30 @@ class Magnetics:
         celled = [(k, one) for k, one in zip(first, self.magnets, strict=True) if one.lattice.coupling is not None]
         couplings = [(int(k), one.lattice.coupling) for k, one in celled]
         self._celled = wp.array([one.body for _, one in celled], dtype=wp.int32, device=self._model.device)
-        solids = [(k, one) for k, one in zip(first, self.magnets, strict=True) if one.lattice.solid is not None]
-        self._solid_bodies = wp.array([one.body for _, one in solids], dtype=wp.int32, device=self._model.device)
         magnets = [one.magnet for one in self.magnets]
         flags = self._model.body_flags  # None in a model without bodies
         kinematic = [] if flags is None else (flags.numpy() & _KINEMATIC) != 0
         fixed = np.cumsum([one.body < 0 for one in self.magnets]) + self._model.body_count
         bodies = [one.body if one.body >= 0 else own for one, own in zip(self.magnets, fixed, strict=True)]
         movable = [one.body >= 0 and not kinematic[one.body] for one in self.magnets]
+        parts = [
+            (int(k), one, move, part)
+            for k, one, move in zip(first, self.magnets, movable, strict=True)
+            for part in one.lattice.solids
+        ]
+        self._solid_bodies = wp.array([one.body for _, one, *_ in parts], dtype=wp.int32, device=self._model.device)
+        solids = [
+            SolidMagnet(
+                k + part.first,
+                part.count,
+                float(one.lattice.volumes[part.first]),
+                one.world,
+                part.reach,
+                part.shape,
+                move,
+            )
+            for k, one, move, part in parts
+        ]
         return MomentSystem(
             worlds=spread([one.world for one in self.magnets], int),
             permanent=spread([one.fixed for one in magnets], bool),
@@ -132,18 +148,7 @@ class Magnetics:
             max_evaluations=max_evaluations,
             couplings=couplings,
             applied=self._sources.applied,
-            solids=[
-                SolidMagnet(
-                    int(k),
-                    len(one.lattice.volumes),
-                    float(one.lattice.volumes[0]),
-                    one.world,
-                    one.lattice.reach,
-                    one.lattice.solid,
-                    one.body >= 0 and not kinematic[one.body],
-                )
-                for k, one in solids
-            ],
+            solids=solids,
             device=self._model.device,
         )
 

@@ -12,7 +12,23 @@ from warpmag.errors import InputError
 from warpmag.polyhedra import Polyhedron
 
 _REACH = 3.0
-"""How far the closed form of a permanent magnet reaches where its moments' spacing is given, in cells."""
+"""How far the closed form of a permanent magnet reaches where it is a lattice from afar, in cells."""
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """One shape of a permanent magnet whose field is a closed form close up.
+
+    Attributes:
+        first, count: Its moments among those of the magnet.
+        shape: What bounds it, in the frame of the body.
+        reach: Distance up to which the closed form counts [m].
+    """
+
+    first: int
+    count: int
+    shape: Polyhedron
+    reach: float
 
 
 @dataclass(frozen=True)
@@ -26,8 +42,7 @@ class BodyLattice:
         counts: Moments of each shape, in the order of the shapes.
         coupling: What inducible moments of one shape lack among themselves as balls; None of permanent ones, of balls,
             and of several shapes.
-        solid: What bounds a permanent magnet whose field is a closed form close up; None of others, and of balls.
-        reach: Distance up to which it is [m].
+        solids: The parts of a permanent magnet whose fields are closed forms close up; none of others, and of balls.
     """
 
     positions: np.ndarray
@@ -35,15 +50,21 @@ class BodyLattice:
     radii: np.ndarray
     counts: np.ndarray
     coupling: Coupling | None = None
-    solid: Polyhedron | None = None
-    reach: float = 0.0
+    solids: tuple[ClosedForm, ...] = ()
 
 
 class ShapeSampler:
     """Samples shapes of one model; shapes that are alike, in many worlds say, are sampled once."""
 
-    def __init__(self, model: newton.Model):
-        """Read the geometry of ``model``."""
+    def __init__(self, model: newton.Model, *, cells: bool = False):
+        """Read the geometry of ``model``.
+
+        Args:
+            model: The model.
+            cells: Whether permanent bodies are cells of a lattice, as what acts on the multipoles of balls takes them
+                (``kernels/near_contact/uneven.py``), and not points of Gauss.
+        """
+        self._cells = cells
         self._labels, self._sources = model.shape_label, model.shape_source
         self._bodies = model.shape_body.numpy()
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
@@ -83,34 +104,51 @@ class ShapeSampler:
                 np.ones(len(shapes), dtype=int),
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
-        solid = self._polyhedron(shapes[0], solids[0]) if permanent and len(shapes) == 1 else None
-        if solid is not None and spacing == 0.0:
-            return self._close_up(shapes[0], solids[0], solid)
+        closed = self._polyhedra(shapes, solids) if permanent else []
+        if closed and spacing == 0.0 and not self._cells:
+            return self._close_up(shapes, solids, closed)
         filled = lattice.fill(solids, spacing, 1 if permanent or len(solids) > 1 else lattice.LEAST_ACROSS)
         counts = np.bincount(filled.owners, minlength=len(solids))
         if permanent:
-            reach = _REACH * float(filled.pieces[0].sides.max())
-            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solid=solid, reach=reach)
+            ends = np.cumsum(counts)
+            parts = [
+                ClosedForm(int(end - count), int(count), shape, _REACH * float(one.sides.max()))
+                for end, count, shape, one in zip(ends, counts, closed, filled.pieces, strict=bool(closed))
+            ]
+            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
         # between shapes, which have grids of their own, there are balls; mixed with cells these may have no solution
         cells = coupling(filled, filled.radii) if len(filled.pieces) == 1 else None
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells)
 
-    def _polyhedron(self, shape: int, posed: lattice.Solid) -> Polyhedron | None:
-        """What bounds a box or a cylinder, in the frame of its body; None of other shapes."""
-        kinds, kind, scale = newton.GeoType, self._types[shape], self._scales[shape]
-        if kind not in (kinds.BOX, kinds.CYLINDER):
-            return None
-        found = polyhedra.box(scale) if kind == kinds.BOX else polyhedra.cylinder(scale[0], scale[1])
-        return found.posed(posed.position, posed.rotation)
+    def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:
+        """What bounds boxes and cylinders apart from each other, in the frame of their body; nothing for others."""
+        kinds, found = newton.GeoType, []
+        for shape, solid in zip(shapes, solids, strict=True):
+            kind, scale = self._types[shape], self._scales[shape]
+            if kind not in (kinds.BOX, kinds.CYLINDER) or any(
+                lattice.boxes_meet(solid, one) for one in solids[: len(found)]
+            ):
+                return []
+            own = polyhedra.box(scale) if kind == kinds.BOX else polyhedra.cylinder(scale[0], scale[1])
+            found.append(own.posed(solid.position, solid.rotation))
+        return found
 
-    def _close_up(self, shape: int, posed: lattice.Solid, solid: Polyhedron) -> BodyLattice:
-        """Moments of a permanent box or cylinder, which is a closed form close up."""
-        scale = self._scales[shape]
-        box = self._types[shape] == newton.GeoType.BOX
-        found = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
-        radii = np.minimum(0.5 * np.cbrt(found.volumes), found.depths)
-        counts = np.array([len(radii)])
-        return BodyLattice(posed.to_body(found.places), found.volumes, radii, counts, solid=solid, reach=found.reach)
+    def _close_up(self, shapes: list[int], solids: list[lattice.Solid], closed: list[Polyhedron]) -> BodyLattice:
+        """Moments of permanent boxes and cylinders, which are closed forms close up."""
+        places, volumes, radii, parts, first = [], [], [], [], 0
+        for shape, solid, bound in zip(shapes, solids, closed, strict=True):
+            scale = self._scales[shape]
+            box = self._types[shape] == newton.GeoType.BOX
+            found = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
+            places.append(solid.to_body(found.places))
+            volumes.append(found.volumes)
+            radii.append(np.minimum(0.5 * np.cbrt(found.volumes), found.depths))
+            parts.append(ClosedForm(first, len(found.volumes), bound, found.reach))
+            first += len(found.volumes)
+        counts = np.array([part.count for part in parts])
+        return BodyLattice(
+            np.concatenate(places), np.concatenate(volumes), np.concatenate(radii), counts, solids=tuple(parts)
+        )
 
     def _are_balls_apart(self, shapes: list[int]) -> bool:
         if (self._types[shapes] != newton.GeoType.SPHERE).any():
