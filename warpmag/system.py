@@ -1,8 +1,7 @@
 """All magnetic moments of a simulation on one device: induction and forces, every buffer allocated once."""
 
 import math
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -10,14 +9,11 @@ import warp as wp
 from warpmag.arrays import (
     host_array,
     host_positive,
-    host_radii,
-    host_scalars,
     resolve_device,
     resolve_dtype,
     shape_message,
     vec3_type,
 )
-from warpmag.curves import MagnetizationCurve
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedForces, Sources, Targets
@@ -26,100 +22,14 @@ from warpmag.kernels.close_up.bodies import CloseUp
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.energy import launch_energy
-from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, LINEAR, MIXED, CurveParameters, curve_tables
+from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
-from warpmag.magnets import CONTACT_MODELS, LINEAR_CURVE, check_count, check_force, check_rtol, check_token
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """What each moment is, NumPy arrays of shape [n].
-
-    Attributes:
-        radii: Radius of its ball [m].
-        worlds: Its world.
-        permanent: Whether it is permanent.
-        bodies: Its body.
-        movable: Whether the force on it is wanted.
-        lone: Whether it is an inducible ball, its body's only moment, which is parallel to the field that turns it.
-        alone: Whether it is its body's only moment.
-    """
-
-    radii: np.ndarray
-    worlds: np.ndarray
-    permanent: np.ndarray
-    bodies: np.ndarray
-    movable: np.ndarray
-    lone: np.ndarray
-    alone: np.ndarray
-
-    def ranges(self) -> list[tuple[int, int, int]]:
-        """For each world its first moment, its first permanent one, and the end."""
-        edges = np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))
-        return [
-            (int(first), int(last - np.count_nonzero(self.permanent[first:last])), int(last))
-            for first, last in pairwise(edges)
-        ]
-
-
-def _layout(radii, worlds, permanent, bodies, movable, dtype) -> _Layout:
-    """Layout of moments, of which all but the radii may be None; see :class:`MomentSystem`."""
-    radii = host_radii("radii", radii, dtype)
-    if radii.ndim != 1:
-        raise InputError(shape_message("radii", "[n]", radii))
-    n = len(radii)
-
-    def labels(name, values, default, kinds):
-        array = np.asarray(default if values is None else values)
-        if array.shape != (n,):
-            raise InputError(shape_message(name, f"[{n}]", array))
-        if array.size and array.dtype.kind not in kinds:
-            raise InputError(f"{name}: must be {'flags' if 'b' in kinds else 'whole numbers'}, got {array.dtype}")
-        return array.astype(default.dtype)
-
-    worlds, bodies = labels("worlds", worlds, np.zeros(n, int), "iu"), labels("bodies", bodies, np.arange(n), "iu")
-    permanent = labels("permanent", permanent, np.zeros(n, bool), "biu")
-    movable = labels("movable", movable, np.ones(n, bool), "biu")
-    if (worlds < 0).any() or (np.diff(2 * worlds + permanent) < 0).any():
-        raise InputError(
-            "worlds, permanent: moments must be ordered by world, from 0 on, the inducible ones of each first"
-        )
-    _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
-    alone = size[body] == 1
-    return _Layout(radii, worlds, permanent, bodies, movable, ~permanent & alone, alone)
-
-
-def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
-    """Number of each moment's curve for the kernels, shape [n], and the measured ones among them."""
-    each = isinstance(curve, (tuple, list)) and len(curve) == n
-    measured: dict[MagnetizationCurve, int] = {}
-    known: dict[int, int] = {}  # by identity, since moments of a body share a curve
-
-    def number(one) -> int:
-        if isinstance(one, MagnetizationCurve):
-            return measured.setdefault(one, FIRST_TABLE + len(measured))
-        if one == LINEAR_CURVE:
-            return LINEAR
-        check_token("curve", one, tuple(CURVE_IDS))
-        return CURVE_IDS[one]
-
-    for one in curve if each else (curve,):
-        if id(one) not in known:
-            known[id(one)] = number(one)
-    ids = [known[id(one)] for one in curve] if each else known[id(curve)]
-    return np.array(np.broadcast_to(ids, n), np.int32), list(measured)
-
-
-def _with_cells(layout: _Layout, couplings) -> _Layout:
-    """The same layout, in which a body that has cells is no ball, even if it has only one."""
-    cells = np.zeros(len(layout.radii), bool)
-    for first, coupling in couplings:
-        cells[first : first + len(coupling.start) - 1] = True
-    return replace(layout, lone=layout.lone & ~cells)
+from warpmag.layout import MomentLayout, make_layout, make_material, with_cells
+from warpmag.magnets import CONTACT_MODELS, check_count, check_force, check_rtol, check_token
 
 
 class MomentSystem:
@@ -228,13 +138,14 @@ class MomentSystem:
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         check_rtol("rtol", rtol, dtype)
         check_count("max_evaluations", max_evaluations)
-        layout = _with_cells(_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
+        layout = with_cells(make_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
         self.rtol, self.max_evaluations, self.contact_model = float(rtol), int(max_evaluations), contact_model
         self._force = force
         near = contact_model == "multipole"
         self._allocate(layout, external_field)
         self._apply_sources(layout, applied)
-        susceptibility = self._make_material(layout.permanent, saturation, susceptibility, curve)
+        made_of = saturation, susceptibility, curve
+        self._material, susceptibility = make_material(layout.permanent, *made_of, self.dtype, self.device)
         layout = self._make_bias(layout, dynamics)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
@@ -246,7 +157,7 @@ class MomentSystem:
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
         self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
 
-    def _allocate(self, layout: _Layout, external_field):
+    def _allocate(self, layout: MomentLayout, external_field):
         n, vec3 = len(layout.radii), vec3_type(self.dtype)
         self.positions, self.moments, self.forces, self.torques = (
             wp.zeros(n, dtype=vec3, device=self.device) for _ in range(4)
@@ -266,7 +177,7 @@ class MomentSystem:
         self.h, self.residual, self.error = self._induction.h, self._induction.residual, self._induction.error
         self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
 
-    def _apply_sources(self, layout: _Layout, applied):
+    def _apply_sources(self, layout: MomentLayout, applied):
         """Prepare the field of sources, which with the external one magnetizes moments, and acts on them."""
         self.sources = self.reactions = None
         self._magnetizing = self._acting = self.external_field
@@ -276,33 +187,7 @@ class MomentSystem:
             self.reactions = AppliedForces(self.sources, moments, layout.movable)
             self._magnetizing, self._acting = self.reactions.at.field, self.reactions.at.acting
 
-    def _make_material(self, permanent, saturation, susceptibility, curve):
-        """Make the material of all moments; return the susceptibility, 1 where they are permanent."""
-        n = len(permanent)
-        ids, measured = _curve_ids(curve, n)
-        saturation = np.where(permanent, 1.0, host_scalars("saturation", saturation, n))
-        susceptibility = np.where(permanent, 1.0, host_scalars("susceptibility", susceptibility, n, infinite=True))
-        for number, one in enumerate(measured):
-            of_table = (ids == FIRST_TABLE + number) & ~permanent
-            saturation[of_table], susceptibility[of_table] = one.saturation, one.susceptibility
-        host_positive("saturation", saturation, n, self.dtype)
-        host_positive("susceptibility", susceptibility, n, self.dtype, infinite=True)
-
-        def put(values, dtype):
-            return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=dtype, device=self.device)
-
-        found = np.unique(ids[~permanent])
-        self._material = CurveParameters(
-            inducible=put((~permanent).astype(np.int32), wp.int32),
-            saturation=put(saturation, self.dtype),
-            slope=put(3.0 / (1.0 + 3.0 / susceptibility), self.dtype),
-            curve=put(ids, wp.int32),
-            common_curve=int(found[0]) if len(found) == 1 else MIXED,
-            tables=curve_tables(measured, self.dtype, self.device),
-        )
-        return susceptibility
-
-    def _make_bias(self, layout: _Layout, dynamics: str) -> _Layout:
+    def _make_bias(self, layout: MomentLayout, dynamics: str) -> MomentLayout:
         """Make room for the bias of permanent moments that respond; return the layout, in which they are no balls."""
         linear = (self._material.curve.numpy() == LINEAR) & ~layout.permanent
         self.bias, self._biased = None, wp.array(np.flatnonzero(linear), dtype=wp.int32, device=self.device)
@@ -312,7 +197,7 @@ class MomentSystem:
             self.bias = wp.zeros_like(self.moments)
         return replace(layout, lone=layout.lone & ~linear)
 
-    def _evaluate_field(self, layout: _Layout, near: bool):
+    def _evaluate_field(self, layout: MomentLayout, near: bool):
         """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
         self.worlds, self.world_ranges = layout.worlds, layout.ranges()
         ranges = self.world_ranges
@@ -325,12 +210,12 @@ class MomentSystem:
         # near contacts write one more partial sum
         self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
 
-    def _make_cells(self, layout: _Layout, couplings):
+    def _make_cells(self, layout: MomentLayout, couplings):
         worlds = [(first, middle) for first, middle, _ in layout.ranges()]
         self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h) if couplings else None
         self.rotations = self._cells.rotations if self._cells is not None else None
 
-    def _make_close_up(self, layout: _Layout, solids):
+    def _make_close_up(self, layout: MomentLayout, solids):
         self.close_up = self.frames = None
         if solids:
             self.close_up = CloseUp(
@@ -339,7 +224,7 @@ class MomentSystem:
             )  # fmt: skip
             self.frames = self.close_up.frames
 
-    def _evaluate_wrench(self, layout: _Layout, turned):
+    def _evaluate_wrench(self, layout: MomentLayout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
         self._turned = wp.array(turned.astype(np.int32), dtype=wp.int32, device=self.device)
         segments = [], []
@@ -365,7 +250,7 @@ class MomentSystem:
             "zeeman": evaluations(Quantity.FORCE, self._effective),
         }
 
-    def _make_near_contacts(self, layout: _Layout, turned, susceptibility):
+    def _make_near_contacts(self, layout: MomentLayout, turned, susceptibility):
         magnets = layout.permanent | (self._material.curve.numpy() == LINEAR)
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, self._material,
