@@ -4,11 +4,13 @@ import itertools
 import sys
 from pathlib import Path
 
+import newton
 import numpy as np
 import pytest
 import warp as wp
 from arrangements import relative
 
+import warpmag
 from warpmag import contact_oracle
 from warpmag.kernels.near_contact import contact_table, near_pairs
 from warpmag.system import MomentSystem
@@ -77,9 +79,10 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
     The iron balls are too far from each other to be near contacts.
     """
     bodies = np.array([0, 1, 2, 2, 2]) if cells else np.arange(5)
+    radii = RADII * np.where(cells & (np.arange(5) > 1), 0.55, 1.0)  # larger cells would not act
     found = [
         wrench(
-            system(RADII, device, balls=2, contact_model=model, bodies=bodies, susceptibility=SUSCEPTIBILITY),
+            system(radii, device, balls=2, contact_model=model, bodies=bodies, susceptibility=SUSCEPTIBILITY),
             PLACES, MOMENTS,
         )
         for model in ("multipole", "dipole")
@@ -89,7 +92,7 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
     def energy(x, m):
         return sum(
             contact_oracle.uneven_energy(
-                x[i], RADII[i], SUSCEPTIBILITY[i], x[2:], RADII[2:], m[2:], np.full(3, not cells)
+                x[i], radii[i], SUSCEPTIBILITY[i], x[2:], radii[2:], m[2:], np.full(3, not cells)
             )
             for i in (0, 1)
         )
@@ -125,7 +128,7 @@ def test_a_ball_at_a_cube_of_cells(touched, device):
     place = half * np.array(touched) + 1.00001 * R * outward / np.linalg.norm(outward)
     moments = np.zeros((n + 1, 3))
     moments[1:, 2] = 1e6 * (2.0 * half) ** 3 / n
-    radii = np.append(R, np.full(n, (0.75 / np.pi) ** (1.0 / 3.0) * 2.0 * half / count))
+    radii = np.append(R, np.full(n, half / count))
     found = [
         wrench(
             system(radii, device, dtype="float32", bodies=np.append(0, np.ones(n, int)), contact_model=model),
@@ -140,6 +143,27 @@ def test_a_ball_at_a_cube_of_cells(touched, device):
 
     whole = exact(20)
     assert np.linalg.norm(added + exact(1) - whole) < 0.055 * np.linalg.norm(whole)
+
+
+@pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
+def test_a_ball_at_a_cube_magnet(touched, device):
+    """In a Newton model within 5 % of the exact force; a dipole lacks 24 % of it at an edge, 23 % at a corner."""
+    half, outward = 0.02, np.array(touched) / np.linalg.norm(touched)
+    place = half * np.array(touched) + 1.0001 * R * outward
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    ball, cube = builder.add_body(xform=wp.transform(tuple(place), wp.quat_identity())), builder.add_body()
+    builder.add_shape_sphere(ball, radius=R)
+    builder.add_shape_box(cube, hx=half, hy=half, hz=half)
+    warpmag.add_inducible(builder, ball)
+    warpmag.add_permanent(builder, cube, magnetization=(0.0, 0.0, 1e4))
+    model = builder.finalize(device=device)
+    magnetics, state = warpmag.Magnetics(model, contact_model="multipole", rtol=1e-5), model.state()
+    magnetics.apply(state)
+    forces = state.body_f.numpy()[:, :3]
+    exact = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), 1e4), place, R, order=20)
+    assert np.linalg.norm(forces[ball] - exact) < 0.05 * np.linalg.norm(exact)
+    assert np.abs(forces.sum(0)).max() < 1e-5 * np.abs(forces).max()
 
 
 @pytest.mark.parametrize("dtype, error", [("float64", 1e-12), ("float32", 1e-5)])

@@ -33,10 +33,10 @@ MAGNET_OVERLAP = (0.1, 0.3)
 """Overlap [radii of the permanent ball] over which they fade, too."""
 LEAST_MAGNET = 0.1
 """Radius [radii of the ball] that smaller permanent balls count as: on a surface a dipole pulls without bounds."""
-CELL_SIZE = (0.6, 0.8)
+CELL_SIZE = (0.48, 0.64)
 """Radius of a cell's ball [radii of the ball] over which it fades: nearer than that cells do not stand for a body."""
-CELL_DEPTH = 0.7
-"""Distance of the outermost cells from the surface of their body, in radii of their balls; 0.81 in a cubic lattice."""
+CELL_DEPTH = 0.87
+"""Least distance of cells from the surface of their body, in radii of their balls; 1 in a cubic lattice."""
 
 LOG_GAPS = (float(np.log(4.9e-4)), float(np.log(0.8)), 26)
 """Natural logarithm of gap/R: first node, last node, number of nodes."""
