@@ -192,14 +192,24 @@ struct Given {
 // Nesterov's momentum: the part of its last change that an impulse goes on by. It is bounded, so that nothing has to
 // tell when to begin anew, and the last iteration leaves impulses that contacts admit.
 CUDA_CALLABLE inline Real momentum_at(int iteration, int iterations) {
-    const Real part = Real(iteration - 1) / (iteration + 2);
+    const Real part = Real(iteration) / (iteration + 3);
     return iteration == iterations - 1 ? 0 : part < Real(0.8) ? part : Real(0.8);
 }
-// One iteration of a contact: returns the impulse that it adds. The first gives its bodies what it starts from.
+// One iteration of a contact: returns the impulse that it adds. The first gives its bodies what it starts from, if that
+// is anything.
 CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body& other, Given& given, int iteration,
                                    int iterations) {
-    if (iteration == 0) return given.last;
     const Real momentum = momentum_at(iteration, iterations);
+    if (iteration == 0) {
+        const Impulse first = relaxed(c, own, other, {}), kept = given.last;
+        const auto begun = dot(kept.linear, kept.linear) > 0;
+        auto chosen = [&](Vector a, Vector b) {
+            return Vector{begun ? a.x : b.x, begun ? a.y : b.y, begun ? a.z : b.z};
+        };
+        const Impulse start = {chosen(kept.linear, first.linear), chosen(kept.turn, first.turn)};
+        given = {start, start};
+        return start;
+    }
     const Impulse now = relaxed(c, own, other, given.ahead), gain = change(given.last, now);
     const Impulse ahead = {sum(now.linear, scaled(momentum, gain.linear)), sum(now.turn, scaled(momentum, gain.turn))};
     const Impulse added = change(given.ahead, ahead);
