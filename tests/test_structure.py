@@ -31,7 +31,7 @@ OWNERS = {
         "warpmag/cli.py",
         *(
             f"warpmag/{name}.py"
-            for name in ("arrays", "dynamics", "fields", "induction", "probe", "snapshot", "system")
+            for name in ("arrays", "dynamics", "fields", "induction", "layout", "probe", "snapshot", "system")
         ),
     ),
 }
