@@ -108,6 +108,7 @@ REFUSED = {
         ball('string xformOpOrder = "xformOp:translate"'),
         "/Ball: xformOpOrder must be a TokenArray",
     ),
+    "order that is a number": (ball("bool xformOpOrder = 1"), "/Ball: xformOpOrder must be a TokenArray"),
     "far away": (
         posed(["xformOp:translate"], "double3 xformOp:translate = (1e25, 0, 0)"),
         "/Ball: transform reaches 1e+25",

@@ -11,6 +11,7 @@ import warpmag
 from warpmag import cli
 from warpmag.engine.simulation import Simulation
 from warpmag.errors import SimulationError
+from warpmag.kernels.rigid.contact_solve import PUSH_OUT
 from warpmag.usd import check
 
 G = 9.81  # m/s²
@@ -456,13 +457,14 @@ def letter(name):
 """
 
 
-def test_two_letters_at_one_place_fly_apart_and_a_line_says_why(device, tmp_path):
+def test_two_letters_at_one_place_come_apart_and_a_line_says_why(device, tmp_path):
     simulation = Simulation(write(tmp_path, physics(0.0), letter("A"), letter("B")), device=device)
     assert any("overlap at the start" in line for line in simulation.warnings())
-    advance(simulation, 0.2)
+    advance(simulation, 0.1)
     velocities = simulation.state.body_qd.numpy()[:, :3]
-    assert np.linalg.norm(velocities[0]) > 0.1
-    np.testing.assert_allclose(velocities[0], -velocities[1], atol=1e-4 * np.abs(velocities).max())  # equal masses
+    assert np.isfinite(velocities).all()
+    np.testing.assert_allclose(velocities.sum(axis=0), 0.0, atol=1e-4 * np.abs(velocities).max())  # equal masses
+    assert np.abs(velocities).max() < 2.0 * PUSH_OUT  # of points; centres may go faster than these
 
 
 def test_what_leaves_all_finite_numbers_is_told_with_what_was_wrong_before(device, tmp_path):

@@ -128,7 +128,11 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
     if (team < tasks) {
         const int2 sides = room.tasks[team].sides;
         const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
-        if (taken && sides.x + first < sides.y) kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at);
+        if (taken && sides.x + first < sides.y) {
+            kept_at = sides.x + first;
+            kept = side_of(a, plan, room, kept_at);
+            kept_given = given_at(a, kept_at);
+        }
     }
     for (int iteration = 0; iteration < iterations; ++iteration) {
         const int odd = iteration % 2;
