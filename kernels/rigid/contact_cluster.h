@@ -119,7 +119,7 @@ template <class Plan> __device__ inline KeptSide side_of(const Arrays& a, const 
 // All iterations over a block's tasks; lines are in the first half of what the block keeps of them then, or else in the
 // second.
 template <class Plan>
-__device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room, int tasks, int iterations, Real dt) {
+__device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room, int tasks, int iterations) {
     const int teams = plan.is_wide() ? 1 : BLOCK / GROUP, members = BLOCK / teams;
     const int team = threadIdx.x / members, first = threadIdx.x % members;
     int kept_at = -1;
@@ -128,11 +128,7 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
     if (team < tasks) {
         const int2 sides = room.tasks[team].sides;
         const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
-        if (taken && sides.x + first < sides.y) {
-            kept_at = sides.x + first;
-            kept = side_of(a, plan, room, kept_at);
-            kept_given = given_at(a, kept_at);
-        }
+        if (taken && sides.x + first < sides.y) kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at);
     }
     for (int iteration = 0; iteration < iterations; ++iteration) {
         const int odd = iteration % 2;
@@ -154,30 +150,24 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
             const Task task = room.tasks[t];
             Four* const line = plan.is_wide() ? plan.line(a, room, task.slot) : room.lines + QUARTERS * t;
             move({line + 2 * odd, line + 4}, line + 2 * (1 - odd), task.sides, true, first, members, side_at, press_at,
-                 totals, Pass{iteration, iterations});
+                 totals, momentum_at(iteration, iterations));
         }
         meet();
-    }
-    for (int t = team; t < tasks; t += teams) {
-        const int2 sides = room.tasks[t].sides;
-        if (!plan.is_wide() && sides.y - sides.x > WIDE) continue;
-        keep_sides(a, sides.x + first, sides.y, members, dt,
-                   [&](int k) { return k == kept_at ? kept_given : given_at(a, k); });
     }
 }
 
 // Takes bodies into shared memory, moves them, and writes what they are then.
 template <class Plan>
-__device__ inline void solve_tasks(const Arrays& a, const Plan& plan, Room& room, int iterations, Real dt) {
+__device__ inline void solve_tasks(const Arrays& a, const Plan& plan, Room& room, int iterations) {
     const int tasks = plan.take_tasks(a, room), own_lines = plan.is_wide() ? 0 : tasks;
     if (CLUSTER == 1 && tasks == 0) return;
     __syncthreads();
     for (int k = threadIdx.x; k < 4 * own_lines; k += BLOCK)
         room.lines[QUARTERS * (k / 4) + k % 4 + k % 4 / 2 * 2] = own_four(a.motion, k % 4, room.tasks[k / 4].slot);
     meet();
-    iterate_all(a, plan, room, tasks, iterations, dt);
+    iterate_all(a, plan, room, tasks, iterations);
     for (int t = threadIdx.x / GROUP; t < own_lines; t += BLOCK / GROUP)
-        finish_body(a, room.tasks[t].slot, room.tasks[t].sides, room.lines + QUARTERS * t + iterations % 2 * 2);
+        finish_body(a, room.tasks[t].slot, room.lines + QUARTERS * t + iterations % 2 * 2);
 }
 
 // The whole solve, or if there are more than ``most`` sides or more bodies than fit, no more than the lists: then
@@ -188,13 +178,13 @@ __device__ inline void solve_in_cluster(const Arrays& a, int iterations, int mos
     const ClusterPlan plan(a);
     const bool fits = plan.fits() && a.totals[SIDES] <= most;
     if (!fits && threadIdx.x == 0 && plan.block == 0) a.totals[LEFT] = plan.bodies;
-    if (fits && plan.bodies > 0) solve_tasks(a, plan, room, iterations, dt);
+    if (fits && plan.bodies > 0) solve_tasks(a, plan, room, iterations);
 }
 
 // All iterations in the block's world.
-__device__ inline void solve_world(const Arrays& a, int iterations, Real dt) {
+__device__ inline void solve_world(const Arrays& a, int iterations) {
     __shared__ Room room;
-    solve_tasks(a, WorldPlan(a), room, iterations, dt);
+    solve_tasks(a, WorldPlan(a), room, iterations);
 }
 }
 #endif

@@ -62,10 +62,7 @@ inline void write_contacts(const Arrays& a, const Lists& lists) {
         ends_of(a, a.entry[k], ends);
         for (int end = 0; end < 2; ++end) {
             other[end * CHUNK] = a.line_of(ends[end]);
-            if (!a.movable(ends[end])) continue;
-            const int place = a.range[2 * a.slot[ends[end]] + 1]++;
-            other[(2 + end) * CHUNK] = place;
-            a.key[place] = a.key_of(a.entry[k]);
+            if (a.movable(ends[end])) other[(2 + end) * CHUNK] = a.range[2 * a.slot[ends[end]] + 1]++;
         }
     }
 }
@@ -116,8 +113,7 @@ inline auto put_rows(Real* rows) {
     };
 }
 
-// Prepares contacts of a vector, and lets them start from the impulses that they had in the last substep.
-inline void prepare_contacts(const Arrays& a, int k, int contacts, Real relaxation, Real dt) {
+inline void prepare_contacts(const Arrays& a, int k, Real relaxation, Real dt) {
     const Pair p = pair_at(a, k);
     Real* const rows = rows_at(a.side, TOUCH, k);
     auto inertia = [&](const int* line) { return read_inertia(fours_at(a.motion, line)); };
@@ -125,22 +121,14 @@ inline void prepare_contacts(const Arrays& a, int k, int contacts, Real relaxati
     put_contact(prepared(read_touch(rows_of(rows)), pose(p.own_line), pose(p.other_line), p.own, p.other,
                          inertia(p.own_line), inertia(p.other_line), relaxation, dt),
                 put_rows(rows));
-    Real* const given = rows_at(a.given, GIVEN, k);
-    for (int l = 0; l < WIDTH && k + l < contacts; ++l) {
-        int ends[2];
-        ends_of(a, a.entry[k + l], ends);
-        const int from = a.movable(ends[1]);
-        const Real *const kept = kept_of(a, a.entry[k + l], ends[from]), part = from ? dt : -dt;
-        for (int r = 0; r < GIVEN && kept; ++r) given[r * CHUNK + l] = part * kept[r % KEPT];
-    }
 }
 
-inline void press_contacts(const Arrays& a, int k, int iteration, int iterations) {
+inline void press_contacts(const Arrays& a, int k, Real momentum) {
     const Pair p = pair_at(a, k);
     const Contact c = read_contact(rows_of(rows_at(a.side, TOUCH, k)));
     Real* const rows = rows_at(a.given, GIVEN, k);
     Given given = read_given(rows_of(rows));
-    const Impulse added = press(c, p.own, p.other, given, iteration, iterations);
+    const Impulse added = press(c, p.own, p.other, given, momentum);
     // what was written in an iteration that added nothing still holds
     int& quiet = a.wide[k / WIDTH];
     const bool adds = any(dot(added.linear, added.linear) + dot(added.turn, added.turn) != 0);
@@ -170,50 +158,28 @@ inline void move_bodies(const Arrays& a, int i) {
     put_body(a.motion, i, body);
 }
 
-// Keeps the impulses of a vector of contacts for the next substep.
-inline void keep_contacts(const Arrays& a, int k, int contacts, Real dt) {
-    const Real* const given = rows_at(a.given, GIVEN, k);
-    for (int l = 0; l < WIDTH && k + l < contacts; ++l)
-        for (int end = 0; end < 2; ++end) {
-            const int place = list_at(a.other, 4, 2 + end, k)[l];
-            if (place >= 2 * a.contact_max) continue;
-            Real forces[KEPT];
-            for (int r = 0; r < KEPT; ++r) forces[r] = (end == 1 ? given[r * CHUNK + l] : -given[r * CHUNK + l]) / dt;
-            keep(a, place, a.entry[k + l], forces);
-        }
-}
-inline void keep_ranges(const Arrays& a) {
-    for (int b = 0; b < a.bodies; ++b) {
-        const bool some = a.side_count[b] > 0;
-        const int* const range = a.range + (some ? 2 * a.slot[b] : 0);
-        keep_range(a, b, some ? range[0] : 0, some ? range[1] : 0);
-    }
-}
-
 inline void solve_contacts(const Arrays& a, int iterations, Real relaxation, Real dt, int threads, Word* team) {
     const Lists lists = list_contacts(a);
-    if (lists.contacts == 0) return keep_ranges(a);
+    if (lists.contacts == 0) return;
     write_contacts(a, lists);
     for (int i = 0; i < lists.lines; i += WIDTH) begin_lines(a, i);
     begin_lines(a, a.lines - WIDTH);
     const int helpful = lists.contacts / CONTACTS_PER_THREAD;
     threads = helpful < 1 ? 1 : helpful < threads ? helpful : threads;
     const int passes = 2 * iterations;
-    for (int first = 0; first <= passes; first += MOST_PASSES) {
-        const int last = passes + 1 - first < MOST_PASSES ? passes + 1 - first : MOST_PASSES;
+    for (int first = 0; first < passes; first += MOST_PASSES) {
+        const int last = passes - first < MOST_PASSES ? passes - first : MOST_PASSES;
         auto items = [&](int pass) { return pass % 2 == 0 ? lists.contacts : lists.bodies; };
         run_passes(team, threads, 0, last, items, WIDTH, [&](int pass, int i) {
-            if (first + pass == 0) prepare_contacts(a, i, lists.contacts, relaxation, dt);
+            if (first + pass == 0) prepare_contacts(a, i, relaxation, dt);
             if (pass % 2 == 1) move_bodies(a, i);
-            else if (first + pass == passes) keep_contacts(a, i, lists.contacts, dt);
-            else press_contacts(a, i, (first + pass) / 2, iterations);
+            else press_contacts(a, i, momentum_at((first + pass) / 2, iterations));
         });
     }
     for (int i = 0; i < lists.bodies; i += WIDTH) {
         const Body body = read_body([&](int quarter) { return own_four(a.motion, quarter, i); });
         end_lines(a, body, i, lists.bodies - i);
     }
-    keep_ranges(a);
 }
 }
 #endif

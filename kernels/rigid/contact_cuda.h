@@ -34,12 +34,10 @@ __device__ inline int reserve(int* counter, int count) {
 }
 
 // For body b: a line, and room for its sides; all threads of a warp take part. The body after the last is the world.
-// Nothing is kept of bodies without sides.
 __device__ inline void place_body(int b, const Arrays& a) {
     const int sides = b < a.bodies ? a.side_count[b] : 0;
     const int slot = reserve(a.totals + BODIES, sides > 0), start = reserve(a.totals + SIDES, sides);
     if (b > a.bodies) return;
-    if (b < a.bodies && sides == 0) keep_range(a, b, 0, 0);
     int line = slot;
     if (sides > 0) {
         a.range[2 * slot] = start;
@@ -61,7 +59,7 @@ __device__ inline void list_sides(int c, const Arrays& a) {
         if (!a.movable(ends[end])) continue;
         const int place = a.range[2 * a.slot[ends[end]]] + atomicAdd(a.filled + ends[end], 1);
         a.entry[place] = 2 * c + end;
-        a.key[place] = a.key_of(c);
+        a.key[place] = (unsigned long long)a.shape0[c] << 32 | (unsigned)a.shape1[c];
     }
 }
 
@@ -81,11 +79,7 @@ __device__ inline void put_given_of(const Arrays& a, int k, const Given& given) 
     put_given(given, [&](int quarter, Four f) { ((Four*)a.given)[GIVEN / 4 * (size_t)k + quarter] = f; });
 }
 
-// The contact that a side is of, in the half of ``other`` that sides leave.
-__device__ inline int& contact_of(const Arrays& a, int k) { return a.other[2 * (size_t)a.contact_max + k]; }
-
-// For entry k of the lists: writes the side to where it comes among those of its body, with the impulses that its
-// contact had in the last substep.
+// For entry k of the lists: writes the side to where it comes among those of its body.
 __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real dt) {
     if (k >= a.totals[SIDES]) return;
     const int c = a.entry[k] / 2, end = a.entry[k] % 2;
@@ -105,7 +99,6 @@ __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real 
     put_touch(a, c, end, touch, 1);
     const int other = a.line_of(ends[1 - end]);
     a.other[place] = other;
-    contact_of(a, place) = c;
     auto fours = [](const Real* lines, int i) { return [=](int quarter) { return own_four(lines, quarter, i); }; };
     const auto own_motion = fours(a.motion, slot), other_motion = fours(a.motion, other);
     put_contact(prepared(read_touch([&](int q) {
@@ -114,12 +107,7 @@ __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real 
                          read_pose(fours(a.pose, slot)), read_pose(fours(a.pose, other)), read_body(own_motion),
                          read_body(other_motion), read_inertia(own_motion), read_inertia(other_motion), relaxation, dt),
                 [&](int quarter, Four f) { put_four(a.side, quarter, place, f); });
-    Given given = {};
-    if (const Real* const kept = kept_of(a, c, ends[end])) {
-        const Real k[6] = {dt * kept[0], dt * kept[1], dt * kept[2], dt * kept[3], dt * kept[4], dt * kept[5]};
-        given.last = given.ahead = {{k[0], k[1], k[2]}, {k[3], k[4], k[5]}};
-    }
-    put_given_of(a, place, given);
+    put_given_of(a, place, {});
 }
 
 // Sums of impulses on a body, over the threads that share it.
@@ -143,22 +131,17 @@ __device__ inline Contact contact_at(const Arrays& a, int k) {
     return read_contact([&](int quarter) { return own_four(a.side, quarter, k); });
 }
 
-// An iteration, and how many there are.
-struct Pass {
-    int number, count;
-};
-
 // What each ``threads``-th contact of a body does, from k to last. ``side_at`` gives contacts, and ``press_at`` lets a
 // function change what they have given.
 template <class Sides, class Presses>
 __device__ inline Pressure press_all(Sides side_at, Presses press_at, int k, int last, int threads, const Body& own,
-                                     Pass pass) {
+                                     Real momentum) {
     Pressure total = {{0, 0, 0}, {0, 0, 0}};
     for (; k < last; k += threads) {
         const Side side = side_at(k);
         const Body other = read_body([&](int quarter) { return side.other.motion[quarter]; });
         const Impulse added =
-            press_at(k, [&](Given& given) { return press(side.contact, own, other, given, pass.number, pass.count); });
+            press_at(k, [&](Given& given) { return press(side.contact, own, other, given, momentum); });
         total.linear = sum(total.linear, added.linear);
         total.angular = sum(total.angular, on_own(side.contact, added));
     }
@@ -184,13 +167,13 @@ __device__ inline Pressure block_sums(Pressure mine, int sides) {
 // contacts, unless they are ``WIDE`` where these are not.
 template <class Sides, class Presses, class Totals>
 __device__ inline void move(const Line& line, Four* to, int2 sides, bool taken, int first, int threads, Sides side_at,
-                            Presses press_at, Totals totals, Pass pass) {
+                            Presses press_at, Totals totals, Real momentum) {
     Body own = read_body([&](int quarter) { return line.motion[quarter]; });
     const Inertia inertia = read_inertia([&](int quarter) { return line.inertia[quarter - 2]; });
     // all of that is read at once, whether it is needed or not
     if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
     const Pressure p =
-        totals(sides.y - sides.x, press_all(side_at, press_at, sides.x + first, sides.y, threads, own, pass));
+        totals(sides.y - sides.x, press_all(side_at, press_at, sides.x + first, sides.y, threads, own, momentum));
     apply(own, inertia, p.linear, p.angular);
     if (first == 0) put_body((Real*)to, 0, own);
 }
@@ -210,7 +193,7 @@ __device__ inline void iterate(int thread, const Arrays& a, int iteration, int i
     };
     auto move_slot = [&](int slot, bool taken, int first, int threads, auto totals) {
         move(line_at(a, from, slot), to + 4 * (size_t)slot, ((const int2*)a.range)[slot], taken, first, threads,
-             side_at, press_at, totals, Pass{iteration, iterations});
+             side_at, press_at, totals, momentum_at(iteration, iterations));
     };
     const int block = thread / BLOCK;
     if (block < WIDE_BLOCKS) {
@@ -222,29 +205,13 @@ __device__ inline void iterate(int thread, const Arrays& a, int iteration, int i
     move_slot(slot, slot < a.totals[BODIES], share(), GROUP, [](int, Pressure p) { return p; });
 }
 
-// Keeps each ``threads``-th side of a body, from k to last, for the next substep.
-template <class Givens>
-__device__ inline void keep_sides(const Arrays& a, int k, int last, int threads, Real dt, Givens given_at) {
-    for (; k < last; k += threads) {
-        const Impulse p = given_at(k).last;
-        const Real per = 1 / dt;
-        keep(a, k, contact_of(a, k),
-             {per * p.linear.x, per * p.linear.y, per * p.linear.z, per * p.turn.x, per * p.turn.y, per * p.turn.z});
-    }
+// Ends the solve for the body of a line that a group of threads shares: writes its velocities.
+__device__ inline void finish_body(const Arrays& a, int slot, const Four* motion) {
+    if (share() == 0) end_lines(a, read_body([&](int quarter) { return motion[quarter]; }), slot, 1);
 }
-// Ends the solve for the body of a line that a group of threads shares: writes its velocities, and which sides are
-// kept.
-__device__ inline void finish_body(const Arrays& a, int slot, int2 sides, const Four* motion) {
-    if (share() != 0) return;
-    end_lines(a, read_body([&](int quarter) { return motion[quarter]; }), slot, 1);
-    keep_range(a, a.body[slot], sides.x, sides.y);
-}
-__device__ inline void finish(int thread, const Arrays& a, int odd, Real dt) {
+__device__ inline void finish(int thread, const Arrays& a, int odd) {
     const int slot = thread / GROUP;
-    if (slot >= a.totals[BODIES]) return;
-    const int2 sides = ((const int2*)a.range)[slot];
-    keep_sides(a, sides.x + share(), sides.y, GROUP, dt, [&](int k) { return given_at(a, k); });
-    finish_body(a, slot, sides, line_at(a, odd ? a.next_motion : a.motion, slot).motion);
+    if (slot < a.totals[BODIES]) finish_body(a, slot, line_at(a, odd ? a.next_motion : a.motion, slot).motion);
 }
 }
 #endif

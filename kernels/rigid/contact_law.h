@@ -11,13 +11,6 @@
 // Accelerate Multibody Dynamics with Friction and Contact"). Pushes that are never taken back, as in Newton's kernels,
 // end somewhere without overlap; these end at the least impulses that do it.
 //
-// With friction, contacts of two shapes at one point start from the friction of the last substep, and from half of its
-// push. What sticks then comes to rest within some substeps, however many bodies lie on each other. From nothing,
-// thirty iterations leave it to slip a little, in each substep the same way: heaps creep. With the whole push, which
-// undoes overlap besides, what iterations have not solved adds up, and throws a chain of 1,000 balls apart. Without
-// friction nothing holds what creeps, and heaps of magnets come to rest because iterations from nothing leave out a
-// part of the push: there they begin so.
-//
 // What overlaps is moved apart at no more than PUSH_OUT (from Python), so that bodies that were put into each other do
 // not fly off.
 //
@@ -197,26 +190,8 @@ CUDA_CALLABLE inline Real momentum_at(int iteration, int iterations) {
     const Real part = Real(iteration) / (iteration + 3);
     return iteration == iterations - 1 ? 0 : part < Real(0.8) ? part : Real(0.8);
 }
-// One iteration of a contact: returns the impulse that it adds. The first gives its bodies what it starts from, if that
-// is anything.
-constexpr Real KEPT_PUSH = 0.5; // part of the last substep's push that the next one starts from
-CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body& other, Given& given, int iteration,
-                                   int iterations) {
-    const Real momentum = momentum_at(iteration, iterations);
-    if (iteration == 0) {
-        const Impulse first = relaxed(c, own, other, {}), kept = given.last;
-        const Vector n = c.normal;
-        const Number push = larger(dot(first.linear, n), KEPT_PUSH * dot(kept.linear, n));
-        const auto begun = dot(kept.linear, kept.linear) > 0;
-        auto chosen = [&](Vector a, Vector b) {
-            return Vector{begun ? a.x : b.x, begun ? a.y : b.y, begun ? a.z : b.z};
-        };
-        const Vector tangential = chosen(kept.linear, first.linear);
-        const Vector rub = less(tangential, scaled(dot(tangential, n), n));
-        const Impulse start = {sum(scaled(push, n), rub), chosen(kept.turn, first.turn)};
-        given = {start, start};
-        return start;
-    }
+// One iteration of a contact: returns the impulse that it adds.
+CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body& other, Given& given, Real momentum) {
     const Impulse now = relaxed(c, own, other, given.ahead), gain = change(given.last, now);
     const Impulse ahead = {sum(now.linear, scaled(momentum, gain.linear)), sum(now.turn, scaled(momentum, gain.turn))};
     const Impulse added = change(given.ahead, ahead);

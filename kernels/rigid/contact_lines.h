@@ -19,9 +19,9 @@ struct Arrays {
     Real* qd;
     // own
     const Real* shares;
-    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide, *world_first, *kept_range;
-    unsigned long long *key, *kept_key;
-    Real *motion, *next_motion, *pose, *side, *given, *record, *kept;
+    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide, *world_first;
+    unsigned long long* key;
+    Real *motion, *next_motion, *pose, *side, *given, *record;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "SolveArrays has the same members in the same order");
@@ -32,13 +32,9 @@ struct Arrays {
     CUDA_CALLABLE bool movable(int b) const { return b >= 0 && inv_mass[b] > 0; }
     CUDA_CALLABLE bool kinematic(int b) const { return b >= 0 && (flags[b] & kinematic_flag) != 0; }
     CUDA_CALLABLE int line_of(int b) const { return b < 0 ? lines - 1 : slot[b]; }
-    CUDA_CALLABLE unsigned long long key_of(int c) const {
-        return (unsigned long long)shape0[c] << 32 | (unsigned)shape1[c];
-    }
 };
 
-// Numbers of a contact as found, of its impulses, of a record, and of what is kept of a side.
-constexpr int TOUCH = 20, GIVEN = 12, RECORD = 8, KEPT = 6;
+constexpr int TOUCH = 20, GIVEN = 12, RECORD = 8; // numbers of a contact as found, of its impulses, and of a record
 
 // Reads by four numbers, which ``fours`` gives for a quarter of a line, and writes so.
 template <class Fours> CUDA_CALLABLE inline Body read_body(Fours motion) {
@@ -174,36 +170,5 @@ CUDA_CALLABLE inline void put_touch(const Arrays& a, int c, int end, Real* place
     place[11 * stride] = mean(a.mu_torsional);
     place[15 * stride] = mean(a.mu_rolling);
     place[19 * stride] = a.kinematic(a.body_of(shapes[end])) + 2 * a.kinematic(a.body_of(shapes[1 - end]));
-}
-
-// The only place from first to last where a key stands, -1 if there is none, or if there are more.
-CUDA_CALLABLE inline int only_place(const unsigned long long* keys, unsigned long long key, int first, int last) {
-    int only = -1, count = 0;
-    for (int place = first; place < last; ++place)
-        if (keys[place] == key) only = place, ++count;
-    return count == 1 ? only : -1;
-}
-// The impulses of contact c on body b in the last substep, over its length; null without friction, if its shapes touch
-// at several points then or now, as it is not known which is which, or if they are not finite.
-CUDA_CALLABLE inline const Real* kept_of(const Arrays& a, int c, int b) {
-    if (a.mu[a.shape0[c]] + a.mu[a.shape1[c]] == 0) return nullptr;
-    const int *const now = a.range + 2 * (size_t)a.slot[b], *const last = a.kept_range + 2 * (size_t)b;
-    if (only_place(a.key, a.key_of(c), now[0], now[1]) < 0) return nullptr;
-    const int place = only_place(a.kept_key, a.key_of(c), last[0], last[1]);
-    if (place < 0) return nullptr;
-    const Real* const kept = a.kept + KEPT * (size_t)place;
-    Real size = 0;
-    for (int k = 0; k < KEPT; ++k) size += kept[k] < 0 ? -kept[k] : kept[k];
-    return size < Real(1e30) ? kept : nullptr;
-}
-// Keeps a side of contact c for the next substep, with the impulses on its body over dt.
-CUDA_CALLABLE inline void keep(const Arrays& a, int place, int c, const Real (&forces)[KEPT]) {
-    for (int k = 0; k < KEPT; ++k) a.kept[KEPT * (size_t)place + k] = forces[k];
-    a.kept_key[place] = a.key_of(c);
-}
-// Which sides are kept of body b.
-CUDA_CALLABLE inline void keep_range(const Arrays& a, int b, int first, int last) {
-    a.kept_range[2 * (size_t)b] = first;
-    a.kept_range[2 * (size_t)b + 1] = last;
 }
 }

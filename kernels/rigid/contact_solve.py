@@ -34,8 +34,8 @@ PUSH_OUT = 2.0
 0.5 ms, it undoes an overlap of 1 mm, and what 5 mm balls may newly overlap in a step in the shortest, 31 µs."""
 _ROUND = 1e-6
 """Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
-_TOUCH, _GIVEN, _RECORD, _KEPT = 20, 12, 8, 6
-"""Numbers of a contact as found, of its impulses, of a record, and of what is kept; as in ``contact_lines.h``."""
+_TOUCH, _GIVEN, _RECORD = 20, 12, 8
+"""Numbers of a contact as found, of its impulses, and of a record; as in ``contact_lines.h``."""
 _TOTALS, _LEFT = 5, 4
 """Number of totals, and which is that of bodies left to launches; as in ``contact_cuda.h``."""
 
@@ -46,8 +46,8 @@ _OF_CONTACTS = (
 )
 _OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "q", "qd")
 _OWN = (
-    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "world_first", "kept_range"),
-    *("key", "kept_key", "motion", "next_motion", "pose", "side", "given", "record", "kept"),
+    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "world_first", "key"),
+    *("motion", "next_motion", "pose", "side", "given", "record"),
 )
 _ADDRESSES = (*_OF_CONTACTS, *_OF_BODIES, "shares", *_OWN)
 _DOC = "Sizes, and where arrays begin; as ``Arrays`` in ``contact_lines.h``."
@@ -70,7 +70,7 @@ class SolveBuffers:
                     contacts, and of bodies that a cluster leaves to launches, shape [5].
                 side_count, filled: Sides of each body, and how many of them are listed, shape [b].
                 entry, key: Side, twice its contact plus its end, and shapes of it, by bodies, shape [2c].
-                other: Line of the body at the other end, and then the contact of each side, shape [2, 2c].
+                other: Line of the body at the other end, shape [2c].
                 side: Contacts as each end sees them, see ``contact_law.h``, shape [2c, LINE].
                 given: Impulses that each end has been given, shape [2c, 12].
                 wide: Lines of bodies with many contacts, shape [b].
@@ -78,7 +78,6 @@ class SolveBuffers:
             and on a CPU, where vectors of contacts are seen from their second bodies,
                 side_count: Sides of each body, shape [b].
                 entry: Contacts that take part, shape [c].
-                key: Shapes of each side, by bodies, shape [2c].
                 other: Lines of the first and second body and their records, shape [c padded / CHUNK, 4, CHUNK].
                 side: The contacts, as found and then as prepared, shape [c padded / CHUNK, 20, CHUNK].
                 given: Impulses that they have given, shape [c padded / CHUNK, 12, CHUNK].
@@ -92,10 +91,6 @@ class SolveBuffers:
                 motion, next_motion: Lines of velocities, before and on a GPU after an iteration, and of inverse
                     masses and inertias, shape [lines, LINE].
                 pose: Lines of where bodies are before the substep, shape [lines, LINE].
-                kept_range: First of the sides of each body in the last substep, and the one after the last, shape
-                    [b, 2].
-                kept_key, kept: Shapes of these sides, and impulses on the body over the length of the substep
-                    [N, N·m], shapes [2c] and [2c, 6].
         given: Their sizes and addresses, and what else the kernels are given.
         round: Whether every body has the same inertia about all axes.
         group: Threads of a GPU that share a body, 0 on a CPU.
@@ -113,10 +108,6 @@ class SolveBuffers:
     most: int
     worlds: int
     world_lines: int
-
-    def carried(self) -> dict[str, wp.array]:
-        """Return the arrays that one substep hands on to the next one, by name."""
-        return {name: self.arrays[name] for name in ("kept_range", "kept_key", "kept")}
 
 
 def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> SolveBuffers:
@@ -149,10 +140,7 @@ def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> Solv
     arrays["side"] = zeros(sides, _TOUCH if device.is_cpu else LINE, dtype=wp.float32)
     arrays["given"] = zeros(sides, _GIVEN, dtype=wp.float32)
     arrays["record"] = zeros((2 * padded + padded // CHUNK) if device.is_cpu else 0, _RECORD, dtype=wp.float32)
-    arrays |= {"kept_range": zeros(max(bodies, 1), 2)} | {
-        name: zeros(2 * padded, dtype=wp.uint64) for name in ("key", "kept_key")
-    }
-    arrays["kept"] = zeros(2 * padded, _KEPT, dtype=wp.float32)
+    arrays["key"] = zeros(0 if device.is_cpu else 2 * padded, dtype=wp.uint64)
     arrays["world_first"] = wp.array(world_first, dtype=wp.int32, device=device)
     given = SolveArrays()
     for name in _OWN:
@@ -249,8 +237,8 @@ LIST = "list_sides(thread, warpmag::Arrays(given))"
 WRITE = "write_side(thread, warpmag::Arrays(given), relaxation, dt)"
 ITERATE = "iterate(thread, warpmag::Arrays(given), number, most)"
 SOLVE = "solve_in_cluster(warpmag::Arrays(given), number, most, relaxation, dt)"
-SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number, dt)"
-FINISH = "finish(thread, warpmag::Arrays(given), number, dt)"
+SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number)"
+FINISH = "finish(thread, warpmag::Arrays(given), number)"
 
 
 def launch_solve_contacts(

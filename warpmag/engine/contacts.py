@@ -283,8 +283,7 @@ class RigidSolver:
 
     def carried(self) -> dict[str, wp.array]:
         """Return the arrays that one substep hands on to the next one, by name."""
-        solver = self._solver.carried() if isinstance(self._solver, PileXPBD) else {}
-        return self._broad_phase.carried() | solver
+        return self._broad_phase.carried()
 
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""
