@@ -10,7 +10,7 @@ import warp as wp
 from scipy.integrate import quad
 
 import warpmag
-from bench.reference import boxes
+from bench.reference import boxes, cylinders
 from warpmag import demagnetization, lattice, oracle
 from warpmag.system import MomentSystem
 
@@ -144,6 +144,17 @@ def test_rods_and_sheets_take_the_moment_of_a_surface_integral_equation(device, 
     body = lattice.fill(lattice.box(0.5 * np.array(sides)), across=lattice.LEAST_ACROSS)
     error = polarizability(body, math.inf, device) / boxes.moments(sides, 8)[[0, 2]] - 1.0
     assert (error < 0.0).all() and (error > -0.05).all()
+
+
+@pytest.mark.parametrize("length", cylinders.LENGTHS)
+def test_cylinders_take_the_moment_of_a_surface_integral_equation(device, length):
+    """5.5 %: at 5 cells across, of which the corners join others, dipoles beyond the reach miss 1.6 % of 5.2.
+
+    The reference with 16 rings on half a side is good to 0.1 %.
+    """
+    body = lattice.fill(lattice.cylinder(0.5, 0.5 * length), across=lattice.LEAST_ACROSS)
+    error = polarizability(body, math.inf, device)[::-1] / cylinders.moments(length, 16) - 1.0
+    assert (np.abs(error) < 0.055).all()
 
 
 def test_cubes_approach_the_published_value(device):
