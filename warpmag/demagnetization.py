@@ -120,7 +120,7 @@ def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) ->
     """What the pair sums lack between the moments of one body.
 
     Args:
-        lattice: Its moments with their cells. Moments of different shapes are left to the pair sums.
+        lattice: Its moments with their cells. Moments in cells of different grids are left to the pair sums.
         radii: Radii of the balls that the pair sums take them for [m], shape [n].
         reach: Distance up to which pairs are exact, in longest sides of the cells.
     """
@@ -146,7 +146,7 @@ def _pair_law(r, a, b, same):
 
 
 def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (i, j) of near moments of one shape, shape [2, pairs], and N_ij √(V_i V_j) over V in six numbers."""
+    """Pairs (i, j) of near moments of one grid, shape [2, pairs], and N_ij √(V_i V_j) over V in six numbers."""
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     i, j = _near_pairs(local, reach * float(part.sides.max()))

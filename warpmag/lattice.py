@@ -35,12 +35,14 @@ The moments of an inducible body act on each other as what they are, parts of ce
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from warpmag.cell_grid import CellGrid, Filled, cells_over
 from warpmag.closed_mesh import check_closed, welded, winding_number
 from warpmag.errors import InputError
+from warpmag.solid import Solid, Values, grid
 
 AUTOMATIC_COUNT = 729
 """Moments of one body at automatic spacing, at most (see the table above): 9³, a cube's."""
@@ -57,15 +59,15 @@ _FINE_POINTS = 32
 """Test points across a shape, along each axis, at least."""
 
 _CHUNK = 1 << 18
-"""Test points evaluated at a time (some tens of MB)."""
+"""Pairs of cells evaluated at a time (some tens of MB)."""
 
-
-Values = Sequence[float] | np.ndarray
+_NOTHING = np.empty((0, 3)), np.empty(0), (np.empty(0, int), np.empty(0, int), np.empty(0))
+"""Moments of a shape that lies within others."""
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """What one shape fills of the cells of its grid, and the moments that stand for it.
+    """What shapes fill of the cells of a grid, a piece for each cell of each, and the moments that stand for it.
 
     Attributes:
         sides: Sides of a cell [m], shape [3].
@@ -93,7 +95,7 @@ class Lattice:
         positions: Positions of the moments [m], body frame, shape [n, 3].
         volumes: Volumes of the moments [m³], shape [n]; their sum is the volume of the body.
         owners: Index of the shape that each moment belongs to, non-decreasing, shape [n].
-        pieces: The parts of cells that they stand for, of each shape that has moments; none of a ball.
+        pieces: The parts of cells that they stand for, of each grid; none of a ball.
     """
 
     positions: np.ndarray
@@ -110,54 +112,6 @@ class Lattice:
     def inner_radii(self) -> np.ndarray:
         """Radii of the balls inscribed in cubes of the same volumes, V^⅓/2 [m], shape [n]; for permanent moments."""
         return 0.5 * np.cbrt(self.volumes)
-
-
-@dataclass(frozen=True)
-class Solid:
-    """A shape with a volume, posed in the frame of its body.
-
-    Attributes:
-        name: What error messages call it.
-        lower: Lower corner of the bounding box [m], frame of the shape, shape [3].
-        upper: Upper corner of the bounding box [m], frame of the shape, shape [3].
-        volume: Volume [m³].
-        centroid: Centroid [m], frame of the shape, shape [3].
-        inside: Tells which of the points [m], frame of the shape, shape [n, 3], lie inside.
-        position: Origin of the shape in the body's frame [m], shape [3].
-        rotation: Rotation from the frame of the shape to the body's, shape [3, 3].
-    """
-
-    name: str
-    lower: np.ndarray
-    upper: np.ndarray
-    volume: float
-    centroid: np.ndarray
-    inside: Callable[[np.ndarray], np.ndarray]
-    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-
-    def posed(self, position: Values, quaternion: Values = (0.0, 0.0, 0.0, 1.0)) -> "Solid":
-        """The same shape at ``position`` [m], turned by ``quaternion`` (x, y, z, w), both in the body's frame."""
-        at, q = np.asarray(position, float), np.asarray(quaternion, float)
-        if at.shape != (3,) or not np.isfinite(at).all():
-            raise InputError(f"{self.name}: position must be three finite lengths, got {position}")
-        if q.shape != (4,) or not (np.isfinite(q).all() and q.any()):
-            raise InputError(f"{self.name}: quaternion must be four finite numbers, not all zero, got {quaternion}")
-        x, y, z, w = q / np.linalg.norm(q)
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return replace(self, position=at, rotation=np.eye(3) + 2.0 * (w * cross + cross @ cross))
-
-    def to_body(self, points: np.ndarray) -> np.ndarray:
-        """Points [m], shape [n, 3], from the frame of the shape to the body's."""
-        return points @ self.rotation.T + self.position
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which of the points [m], body frame, shape [n, 3], lie inside."""
-        own = (points - self.position) @ self.rotation
-        near = np.flatnonzero(((own >= self.lower) & (own <= self.upper)).all(axis=1))
-        result = np.zeros(len(points), bool)
-        result[near] = self.inside(own[near])
-        return result
 
 
 def box(half_extents: Values) -> Solid:
@@ -256,7 +210,7 @@ def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
         return not sum(np.prod(box / spacing) for box in boxes) > 4.0 * LARGEST_COUNT
 
 
-def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1) -> Lattice:
+def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1, *, together: bool = False) -> Lattice:
     """Fill a body with moments.
 
     Args:
@@ -264,6 +218,8 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1)
         spacing: Distance between moments [m]; 0 chooses one that needs about, and at most,
             :data:`AUTOMATIC_COUNT` moments. A spacing larger than a shape gives that shape one moment.
         across: Cells across a shape at automatic spacing, at least; they are as much flatter where that is more.
+        together: Whether all shapes share the cells of one grid, in the frame of the largest, as tensors between them
+            need. A cell that several shapes reach into is then a moment of each.
 
     Returns:
         The lattice. Its volume is exact if no two shapes overlap, else known to the fine test grid, about 1 %.
@@ -276,73 +232,69 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1)
     if spacing > 0.0:
         if not fits([p.upper - p.lower for p in parts], spacing):
             raise InputError(f"spacing: {spacing} m needs more than {LARGEST_COUNT} moments for one body")
-        return _fill(parts, spacing, 1)
+        return _fill(parts, spacing, 1, together)
     spacing = (sum(p.volume for p in parts) / AUTOMATIC_COUNT) ** (1.0 / 3.0)
-    lattice = _fill(parts, spacing, across)
-    while len(lattice.volumes) > AUTOMATIC_COUNT:
+    lattice = _fill(parts, spacing, across, together)
+    most = max(AUTOMATIC_COUNT, across**3 * len(parts))
+    while len(lattice.volumes) > most:
         spacing *= max(1.02, (len(lattice.volumes) / AUTOMATIC_COUNT) ** (1.0 / 3.0))
-        lattice = _fill(parts, spacing, across)
+        lattice = _fill(parts, spacing, across, together)
     return lattice
 
 
-def _fill(parts: Sequence[Solid], spacing: float, across: int) -> Lattice:
-    filled = [_fill_part(part, parts[:k], spacing, across) for k, part in enumerate(parts)]
-    counts = [len(one.volumes) for one in filled]
-    pieces, first = [], 0
-    for one, count in zip(filled, counts, strict=True):
-        pieces += [replace(part, moment=part.moment + first) for part in one.pieces]
-        first += count
+def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -> Lattice:
+    grids = _grids(parts, spacing, across, together)
+    filled = [_fill_part(one, k) for one in grids for k in range(one.earlier, len(one.solids))]
+    counts = [len(volumes) for _, volumes, _ in filled]
+    firsts = np.cumsum(counts) - counts
+    moved = [replace(one, moment=one.moment + first) for (_, _, one), first in zip(filled, firsts, strict=True)]
+    pieces = [_side_by_side(moved)] if together else [one for one in moved if len(one.index)]
     return Lattice(
-        np.concatenate([one.positions for one in filled]),
-        np.concatenate([one.volumes for one in filled]),
+        np.concatenate([positions for positions, _, _ in filled]),
+        np.concatenate([volumes for _, volumes, _ in filled]),
         np.repeat(np.arange(len(parts)), counts),
         tuple(pieces),
     )
 
 
-def _fill_part(part: Solid, earlier: Sequence[Solid], spacing: float, across: int) -> Lattice:
-    """Moments, in the body's frame, of what ``part`` adds to the ``earlier`` ones."""
-    sides = part.upper - part.lower
-    counts = np.maximum(np.rint(sides / spacing).astype(int), across)
-    cells = part.lower + (grid(counts) + 0.5) * (sides / counts)
-    splits = np.maximum(np.ceil(_FINE_POINTS / counts).astype(int), 3)
-    splits = np.where(splits > 8, -(-splits // 8) * 8, splits)  # which demagnetizing tensors join to 8
-    offsets = ((grid(splits) + 0.5) / splits - 0.5) * (sides / counts)
-    others = [other for other in earlier if boxes_meet(part, other)]
+def _grids(parts: Sequence[Solid], spacing: float, across: int, together: bool) -> list[CellGrid]:
+    """The one grid of all shapes, or that of each."""
+    if together:
+        return [cells_over(parts, [], spacing, across)]
+    return [cells_over([part], parts[:k], spacing, across) for k, part in enumerate(parts)]
 
-    hits, sums, whole = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
-    step = max(1, _CHUNK // len(offsets))
-    for start in range(0, len(cells), step):
-        chunk = cells[start : start + step]
-        points = (chunk[:, None, :] + offsets).reshape(-1, 3)
-        free = part.inside(points)
-        whole += free.sum()
-        for other in others:
-            free[free] = ~other.contains(part.to_body(points[free]))
-        free = hits[start : start + step] = free.reshape(len(chunk), -1)
-        sums[start : start + step] = free.sum(axis=1)[:, None] * chunk + free @ offsets
-    if whole == 0.0:
+
+def _side_by_side(pieces: list[Pieces]) -> Pieces:
+    """Pieces of several shapes in the cells of one grid, as of one shape."""
+    before = np.cumsum([0, *(len(one.index) for one in pieces)])
+    return replace(
+        pieces[0],
+        index=np.concatenate([one.index for one in pieces]),
+        filled=np.concatenate([one.filled for one in pieces]),
+        piece=np.concatenate([one.piece + first for one, first in zip(pieces, before, strict=False)]),
+        moment=np.concatenate([one.moment for one in pieces]),
+        share=np.concatenate([one.share for one in pieces]),
+    )
+
+
+def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]:
+    """Positions, in the body's frame, and volumes of the moments of what shape ``k`` adds to those before it."""
+    part, found = cells.solids[k], cells.filled(k)
+    if found.whole == 0.0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
-    held = hits.any(axis=1)
-    if not held.any():
-        return Lattice(np.empty((0, 3)), np.empty(0), np.empty(0, int))
-
-    hits, counted = hits[held], hits[held].sum(axis=1).astype(float)
-    positions, weights, shares = _joined(counted, sums[held])
-    if counted.sum() == whole:  # nothing taken away: the exact centroid is known
-        positions += part.centroid - weights @ positions / weights.sum()
-    filled = hits.reshape(-1, *splits).astype(float)
-    piece, moment, share = shares
-    pieces = Pieces(sides / counts, grid(counts)[held], filled, piece, moment, share, part.position, part.rotation)
-    volumes = weights * (part.volume / whole)
-    return Lattice(part.to_body(positions), volumes, np.zeros(len(volumes), int), (pieces,))
+    positions, weights, (piece, moment, share) = _joined(found) if len(found.index) else _NOTHING
+    if found.weights.sum() == found.whole:  # nothing taken away: the exact centroid is known
+        positions = positions + part.to_body(part.centroid[None]) - weights @ positions / weights.sum()
+    pieces = Pieces(cells.sides, found.index, found.shares, piece, moment, share, cells.position, cells.rotation)
+    return positions @ cells.rotation.T + cells.position, weights * (part.volume / found.whole), pieces
 
 
-def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """Centroids and hit counts of the cells, those filled by less than half joined with their nearest neighbours.
+def _joined(found: Filled) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """Centroids and weights of the cells, those filled by less than half joined with their nearest neighbours.
 
     Also returned are which cell is joined with which, and the share of it.
     """
+    hits, sums = found.weights, found.sums
     centroids = sums / hits[:, None]
     full = hits >= 0.5 * hits.max()
     weights, moments = hits[full], sums[full]
@@ -360,18 +312,6 @@ def _joined(hits: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray,
         given, taker = np.nonzero(shares)
         joined.append((rows[given], taker, shares[given, taker]))
     return moments / weights[:, None], weights, tuple(np.concatenate(one) for one in zip(*joined, strict=True))
-
-
-def boxes_meet(a: Solid, b: Solid) -> bool:
-    """Whether the axis-aligned bounding boxes of two posed shapes share volume in the body's frame, rounding apart."""
-    reach = sum(np.abs(s.rotation) @ (0.5 * (s.upper - s.lower)) for s in (a, b))
-    middle_a, middle_b = (s.to_body(0.5 * (s.lower + s.upper)) for s in (a, b))
-    return bool((np.abs(middle_a - middle_b) < reach * (1.0 - 1e-6)).all())
-
-
-def grid(counts: np.ndarray) -> np.ndarray:
-    """Index triples of a grid, shape [product of counts, 3]."""
-    return np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _lengths(name: str, values: Values, count: int) -> np.ndarray:

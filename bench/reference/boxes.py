@@ -29,6 +29,37 @@ def moments(sides, rectangles: int = 12) -> np.ndarray:
     return np.array(found)
 
 
+def moments_within(faces, volume: float, rectangles: int = 12) -> np.ndarray:
+    """Moment over V H0 of a body bounded by rectangles, whatever its symmetry, shape [3, 3].
+
+    Args:
+        faces: Lower and upper corner of each, equal along the axis that it is across, shape [n, 2, 3].
+        volume: Volume of the body.
+        rectangles: Into how many rectangles to divide each along each of its axes.
+    """
+    parts = [_divided(face, rectangles) for face in np.asarray(faces, float)]
+    lower, upper, axis = (np.concatenate(one) for one in zip(*parts, strict=True))
+    centre, size = 0.5 * (lower + upper), upper - lower
+    area = np.prod(np.where(np.arange(3) == axis[:, None], 1.0, size), axis=1)
+    matrix = np.ones((len(axis) + 1, len(axis) + 1))  # the potential of the body is free, its charge is zero
+    matrix[:-1, :-1] = _potentials(centre, lower, upper, axis)
+    matrix[-1] = np.append(area, 0.0)
+    charge = np.linalg.solve(matrix, np.append(centre, np.zeros((1, 3)), axis=0))[:-1]
+    return (charge * area[:, None]).T @ centre / volume
+
+
+def _divided(face, count: int):
+    """Corners of rectangles that shrink towards the edges of one, and the axis that they are across."""
+    axis = int(np.ptp(face, axis=0).argmin())
+    at = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, count + 1))
+    edges = face[0] + np.outer(at, face[1] - face[0])
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    i, j = (one.reshape(-1) for one in np.meshgrid(np.arange(count), np.arange(count)))
+    corners = np.tile(face[0], (2, count * count, 1))
+    corners[:, :, a], corners[:, :, b] = [edges[i, a], edges[i + 1, a]], [edges[j, b], edges[j + 1, b]]
+    return corners[0], corners[1], np.full(count * count, axis)
+
+
 def _faces(half, count: int):
     """Corners of the rectangles of an eighth of the surface, shapes [n, 3], and the axis that each is across."""
     lower, upper, axes = [], [], []

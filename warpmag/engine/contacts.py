@@ -266,7 +266,9 @@ class RigidSolver:
 
         Those of other shapes are, in some order, which the solver makes up for.
         """
-        meshes = np.isin(self._model.shape_type.numpy(), (newton.GeoType.MESH, newton.GeoType.HFIELD)).any()
+        colliding = (self._model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
+        kinds = self._model.shape_type.numpy()[colliding]
+        meshes = np.isin(kinds, (newton.GeoType.MESH, newton.GeoType.HFIELD)).any()
         on_gpu = wp.get_device(self._model.device).is_cuda
         return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _NUMBERED)
 

@@ -10,6 +10,7 @@ from warpmag import lattice, polyhedra
 from warpmag.demagnetization import Coupling, coupling
 from warpmag.errors import InputError
 from warpmag.polyhedra import Polyhedron
+from warpmag.solid import boxes_meet
 
 _REACH = 3.0
 """How far the closed form of a permanent magnet reaches where it is a lattice from afar, in cells."""
@@ -40,8 +41,7 @@ class BodyLattice:
         volumes: Volumes [m³], shape [n].
         radii: Radii of the balls that the moments are averaged over [m], shape [n].
         counts: Moments of each shape, in the order of the shapes.
-        coupling: What inducible moments of one shape lack among themselves as balls; None of permanent ones, of balls,
-            and of several shapes.
+        coupling: What inducible moments lack among themselves as balls; None of permanent ones, and of balls apart.
         solids: The parts of a permanent magnet whose fields are closed forms close up; none of others, and of balls.
     """
 
@@ -107,7 +107,8 @@ class ShapeSampler:
         closed = self._polyhedra(shapes, solids) if permanent else []
         if closed and spacing == 0.0 and not self._cells:
             return self._close_up(shapes, solids, closed)
-        filled = lattice.fill(solids, spacing, 1 if permanent or len(solids) > 1 else lattice.LEAST_ACROSS)
+        across = 1 if permanent else lattice.LEAST_ACROSS
+        filled = lattice.fill(solids, spacing, across, together=not permanent)
         counts = np.bincount(filled.owners, minlength=len(solids))
         if permanent:
             ends = np.cumsum(counts)
@@ -116,8 +117,7 @@ class ShapeSampler:
                 for end, count, shape, one in zip(ends, counts, closed, filled.pieces, strict=bool(closed))
             ]
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
-        # between shapes, which have grids of their own, there are balls; mixed with cells these may have no solution
-        cells = coupling(filled, filled.radii) if len(filled.pieces) == 1 else None
+        cells = coupling(filled, filled.radii)
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells)
 
     def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:
@@ -125,9 +125,7 @@ class ShapeSampler:
         kinds, found = newton.GeoType, []
         for shape, solid in zip(shapes, solids, strict=True):
             kind, scale = self._types[shape], self._scales[shape]
-            if kind not in (kinds.BOX, kinds.CYLINDER) or any(
-                lattice.boxes_meet(solid, one) for one in solids[: len(found)]
-            ):
+            if kind not in (kinds.BOX, kinds.CYLINDER) or any(boxes_meet(solid, one) for one in solids[: len(found)]):
                 return []
             own = polyhedra.box(scale) if kind == kinds.BOX else polyhedra.cylinder(scale[0], scale[1])
             found.append(own.posed(solid.position, solid.rotation))

@@ -11,6 +11,7 @@ import warp as wp
 from warpmag.coils import Coil
 from warpmag.engine.applied import add_source
 from warpmag.engine.attributes import axis_turn, declare_attributes, in_shape_frame, magnet_shapes, mark_shape
+from warpmag.engine.drawn import StageBuilder
 from warpmag.errors import InputError
 from warpmag.keyed import Keys, SceneKeys
 from warpmag.magnets import Magnet, StageMagnets
@@ -81,7 +82,7 @@ def import_scene(
     assert clock is not None, "a clock that is wrong is a reason to refuse"
     strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)
     give_densities(stage, contents.magnets)
-    builder = newton.ModelBuilder()
+    builder = StageBuilder()
     declare_attributes(builder)
     found = _add_stage(builder, stage, path, visuals)
     _let_frictionless_roll(builder)
@@ -143,7 +144,7 @@ def _place_on_ground(
 
 
 def _mark_magnets(
-    builder: newton.ModelBuilder, stage, magnets: dict[str, Magnet], bodies: dict[str, int], shapes: dict[str, int]
+    builder: StageBuilder, stage, magnets: dict[str, Magnet], bodies: dict[str, int], shapes: dict[str, int]
 ) -> dict[str, list[int]]:
     """Let the shapes of the magnet prims carry the magnets; return the shapes of each prim."""
     covered = {}
@@ -154,6 +155,7 @@ def _mark_magnets(
             covered[prim] = magnet_shapes(builder, -1, shapes[prim])
         else:
             raise InputError(f"{prim}: a magnet of which Newton imported neither body nor shape")
+        covered[prim] = builder.as_drawn(covered[prim])
         for shape in covered[prim]:
             turn = _shape_turn(builder, stage, prim, shape, bodies)
             mark_shape(builder, shape, in_shape_frame(magnet, turn))

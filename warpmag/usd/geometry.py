@@ -17,7 +17,7 @@ _SOLIDS = (
 _LARGEST_MAGNET = 2e4
 """Limit of a magnet's sizes [m], so that its moment and its square stay in single precision."""
 _AS_DRAWN = ("none", "meshSimplification", "sdf", None)
-"""Approximations of a mesh that keep its surface; all others close it."""
+"""Approximations of a mesh that keep its surface; all others close it, and magnetize in its place if it is open."""
 
 
 def is_solid(prim: Usd.Prim) -> bool:
@@ -37,12 +37,17 @@ def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
     """Yield why a collider that is sound as such cannot be magnetized."""
     if not prim.IsA(UsdGeom.Mesh):
         yield from _size_findings(prim, _LARGEST_MAGNET)
-    elif prim.GetAttribute("physics:approximation").Get() in _AS_DRAWN:
-        points, counts, indices = (np.asarray(value) for value in _topology(prim))
-        try:
-            lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
-        except InputError as error:
+        return
+    points, counts, indices = (np.asarray(value) for value in _topology(prim))
+    try:
+        lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
+    except InputError as error:
+        collided = prim.GetAttribute("physics:approximation").Get()
+        if collided in _AS_DRAWN:
             yield Finding(str(prim.GetPath()), str(error))
+        else:
+            message = f"{error}: the {collided} that it collides as is magnetized in its place"
+            yield Finding(str(prim.GetPath()), message, "warning")
 
 
 def spacing_findings(magnet: Usd.Prim, colliders: list[Usd.Prim], spacing: float) -> Iterator[Finding]:
