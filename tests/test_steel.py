@@ -143,7 +143,9 @@ def test_balls_of_several_materials(dtype, device):
             exact = ball_in(laws[one], field)[1]
         else:
             exact = oracle.magnetization(np.array([[field, 0.0, 0.0]]), 1.7e6, 300.0, one)[0][0, 0]
-        assert m == pytest.approx(exact, rel={"float32": 3e-6, "float64": 1e-12}[dtype])
+        # Langevin's coth x - 1/x loses a digit just above where its series ends
+        rounding = {"float32": 6e-6 if one == "langevin" else 3e-6, "float64": 1e-12}[dtype]
+        assert m == pytest.approx(exact, rel=rounding)
 
 
 @pytest.mark.parametrize("contact_model", ["dipole", "multipole"])
