@@ -364,15 +364,26 @@ def test_ends_of_a_prismatic_joint_may_be_apart_along_its_axis(tmp_path, place, 
     assert found == [f"/Joint: its ends are {apart:g} m apart at the start, and a run begins by pulling"] * (apart > 0)
 
 
-def test_a_run_that_ends_names_a_field_beyond_all_measure(device, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("external field", (0.0, 1e9, 0.0), r"an applied field of 1e\+09 A/m"),
+        ("magnetization", (0.0, 0.0, 1e38), r"a magnetization of 1e\+38 A/m"),
+        ("strength", 1e28, r"a coil's current \[A\] or a field map's factor of 1e\+28"),
+    ],
+)
+def test_a_run_that_ends_names_a_strength_beyond_all_measure(device, tmp_path, monkeypatch, name, value, told):
     simulation = Simulation(write(tmp_path, ball()), device=device)
-    simulation.magnetics.set_external_field((0.0, 1e9, 0.0))
+    if name == "external field":
+        simulation.magnetics.set_external_field(value)
+    else:
+        getattr(simulation.model.warpmag, name).fill_(value)
 
     def end():
         raise SimulationError("step 1: /Ball has left")
 
     monkeypatch.setattr(simulation._stepper, "look", end)
-    with pytest.raises(SimulationError, match=r"/Ball has left; an applied field of 1e\+09 A/m turns magnets too fast"):
+    with pytest.raises(SimulationError, match=rf"/Ball has left; {told} moves magnets too fast"):
         simulation.step()
 
 

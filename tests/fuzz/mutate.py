@@ -94,10 +94,23 @@ AUTHORED = {
     "warpmag:recoilPermeability": "float",
     "warpmag:curve:h": "double[]",
     "warpmag:curve:b": "double[]",
+    "warpmag:coil:shape": "token",
+    "warpmag:coil:radius": "float",
+    "warpmag:coil:length": "float",
+    "warpmag:coil:points": "point3f[]",
+    "warpmag:coil:closed": "bool",
+    "warpmag:coil:wireRadius": "float",
+    "warpmag:coil:ampereTurns": "float",
+    "warpmag:fieldMap:origin": "point3f",
+    "warpmag:fieldMap:spacing": "vector3f",
+    "warpmag:fieldMap:counts": "int3",
+    "warpmag:fieldMap:values": "vector3f[]",
+    "warpmag:fieldMap:factor": "float",
 }
 SCHEMAS = (
     *("PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "PhysicsMaterialAPI", "WarpmagMagnetAPI"),
     *("PhysicsArticulationRootAPI", "WarpmagSceneAPI", "NewtonCollisionAPI", "PhysicsMeshCollisionAPI"),
+    *("WarpmagCoilAPI", "WarpmagFieldMapAPI"),
 )
 KINDS = ("Sphere", "Cube", "Capsule", "Cylinder", "Cone", "Plane", "Mesh", "Xform", "Scope", "PointInstancer")
 JOINTS = ("PhysicsFixedJoint", "PhysicsRevoluteJoint", "PhysicsPrismaticJoint", "PhysicsSphericalJoint", "PhysicsJoint")
@@ -317,6 +330,8 @@ def _filled(example, chance):
         value = Gf.Matrix4d(1.0)
         value[chance.randrange(4), chance.randrange(4)] = odd
         return value
+    if isinstance(example, Gf.Vec3i):
+        return Gf.Vec3i(*(_value("int", chance) for _ in range(3)))
     try:
         value = type(example)(*(chance.choice((0.0, 1.0, odd)) for _ in range(len(example))))
     except (TypeError, OverflowError, ValueError):

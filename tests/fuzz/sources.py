@@ -1,11 +1,11 @@
-"""The stages that are spoiled: the bundled scenes, small, and one as somebody else would author it."""
+"""The stages that are spoiled: the bundled scenes, small, and two as somebody else would author them."""
 
 import shutil
 from pathlib import Path
 
 from warpmag.scenes_usd import balls_up, crystal_balls, falling_magnet, sakura_tree
 
-WORKSHOP = Path(__file__).with_name("workshop.usda")
+STRANGE = [Path(__file__).with_name(name) for name in ("workshop.usda", "laboratory.usda")]
 
 
 def author(folder: Path) -> list[Path]:
@@ -21,6 +21,4 @@ def author(folder: Path) -> list[Path]:
     for scene, options in small.items():
         paths.append(folder / f"{scene.__name__.rpartition('.')[2]}.usda")
         scene.author(paths[-1], **options)
-    paths.append(folder / WORKSHOP.name)
-    shutil.copyfile(WORKSHOP, paths[-1])
-    return paths
+    return [*paths, *(Path(shutil.copyfile(stage, folder / stage.name)) for stage in STRANGE)]

@@ -22,6 +22,7 @@ def differences(path: Path, output: Path, simulation) -> list[str]:
     found = [*not_finite(result), *_poses(reading, result), *_moments(reading, result)]
     if simulation is not None:
         found += [*_masses(reading, simulation), *_shapes(reading, simulation), *_gravity(reading, simulation)]
+        found += _sources(reading, simulation)
     return found
 
 
@@ -233,6 +234,41 @@ def _gravity(reading, simulation):
         yield f"gravity {found} for {wanted}"
 
 
+def _sources(reading, simulation):
+    """Compare where coils and field maps start, and how strong they are."""
+    model = simulation.model
+    sites = {label: index for index, label in enumerate(model.shape_label)}
+    bodies, frames, strengths = (
+        array.numpy() for array in (model.shape_body, model.shape_transform, model.warpmag.strength)
+    )
+    poses = [np.eye(4), *map(_matrix, model.body_q.numpy())]
+    for prim in reading.prims:
+        kind = {"WarpmagCoilAPI", "WarpmagFieldMapAPI"}.intersection(prim.GetAppliedSchemas())
+        if not kind:
+            continue
+        index = sites.get(str(prim.GetPath()))
+        if index is None:
+            yield f"source {prim.GetPath()} is not in the model"
+            continue
+        wanted, found = reading.world(prim)[3, :3], (_matrix(frames[index]) @ poses[bodies[index] + 1])[3, :3]
+        if not np.allclose(wanted, found, rtol=1e-4, atol=1e-4 * np.abs(wanted).max() + 1e-9):
+            yield f"place of {prim.GetPath()}: {found} for {wanted}"
+        name, usual = {
+            "WarpmagCoilAPI": ("warpmag:coil:ampereTurns", 0.0),
+            "WarpmagFieldMapAPI": ("warpmag:fieldMap:factor", 1.0),
+        }[kind.pop()]
+        if prim.GetAttribute(name).GetNumTimeSamples() > 1:  # switched meanwhile
+            continue
+        if not math.isclose(reading.get(prim, name, usual), strengths[index], rel_tol=1e-5, abs_tol=1e-30):
+            yield f"{name} of {prim.GetPath()}: {strengths[index]:g} for {reading.get(prim, name, usual):g}"
+
+
+def _matrix(transform) -> np.ndarray:
+    """The matrix of a transform (x, y, z, quaternion), for rows, as USD has it."""
+    turn = Gf.Matrix3d(Gf.Rotation(Gf.Quatd(float(transform[6]), Gf.Vec3d(*map(float, transform[3:6])))))
+    return np.array(Gf.Matrix4d(turn, Gf.Vec3d(*map(float, transform[:3]))))
+
+
 def _moments(reading, result):
     """Compare the moments of permanent magnets at the end with how they stand then, and who is a magnet at all."""
     end = Usd.TimeCode(result.GetEndTimeCode())
@@ -250,6 +286,8 @@ def _moments(reading, result):
         if reading.get(prim, "warpmag:kind", "inducible") != "permanent" or reading.get(prim, "warpmag:material"):
             continue
         if prim.GetAttribute("warpmag:magnetization").GetNumTimeSamples() > 1:  # switched meanwhile
+            continue
+        if reading.get(prim, "warpmag:recoilPermeability", 1.0) > 1.0:  # yields to the field that it is in
             continue
         if not (whole := prim in reading.bodies) and _shares(reading, prim):
             continue

@@ -31,11 +31,11 @@ _OVERLAP = 1e-4
 _TOUCHING = 0.05
 """Bodies closer than this part of their thickness touch, for the count of held ones."""
 _FRAME_RATE = 60.0
+"""Output frames per second [Hz] of a scene that is no stage."""
 _AHEAD = 4
 """Steps that a GPU is given before the host writes the frame before them."""
 _STRONGEST_FIELD = 1e8
-"""Applied field above which it is named where a run ends [A/m]; the strongest of laboratories are ten times less."""
-"""Output frames per second [Hz] of a scene that is no stage."""
+"""Field, magnetization [A/m] or current [A] that is named where a run ends; the strongest are ten times less."""
 
 
 class Simulation:
@@ -281,9 +281,16 @@ class Simulation:
             return f"the ends of the joint {self._scene.strained[0]} were apart at the start, and it pulls at them"
         if self._statistics.capped:
             return "bodies were moving too fast for the shortest substep before"
-        field = float(np.abs(self._magnetics.system.external_field.numpy()).max(initial=0.0))
-        if field > _STRONGEST_FIELD:
-            return f"an applied field of {field:.3g} A/m turns magnets too fast for the shortest substep"
+        given = self.model.warpmag
+        strengths = {
+            "an applied field of {:.3g} A/m": self._magnetics.system.external_field.numpy(),
+            "a magnetization of {:.3g} A/m": given.magnetization.numpy(),
+            "a coil's current [A] or a field map's factor of {:.3g}": given.strength.numpy(),
+        }
+        for name, values in strengths.items():
+            strongest = float(np.abs(values).max(initial=0.0))
+            if strongest > _STRONGEST_FIELD:
+                return f"{name.format(strongest)} moves magnets too fast for the shortest substep"
         return ""
 
     def _positions(self) -> np.ndarray:
