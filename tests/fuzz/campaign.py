@@ -238,10 +238,10 @@ class Campaign:
 
     def verdicts(self, numbers: list[int]) -> Iterator[Verdict]:
         """Yield what became of each of the mutants, in the order in which they end."""
-        left, running = list(numbers), selectors.DefaultSelector()
+        left, running, shares = list(numbers), selectors.DefaultSelector(), self._shares()
         while left or running.get_map():
-            while left and len(running.get_map()) < self.workers:
-                worker = _Worker(self, left[: self.batch])
+            while left and shares:
+                worker = _Worker(self, left[: self.batch], shares.pop())
                 running.register(worker.results, selectors.EVENT_READ, worker)
                 del left[: self.batch]
             ready = [key.data for key, _ in running.select(timeout=1.0)]
@@ -251,13 +251,20 @@ class Campaign:
                     running.unregister(worker.results)
                     verdicts += worker.end()
                     left[:0] = worker.left
+                    shares.append(worker.share)
                 for verdict in verdicts:
                     if not (verdict.problems or self.keep):
                         shutil.rmtree(self.folder / f"{verdict.number:05}")
                     yield verdict
 
-    def work(self, numbers: list[int], outward: int) -> None:
-        """Be a worker that writes its verdicts to a pipe, and never return."""
+    def _shares(self) -> list[list[int]]:
+        """Cores of each worker: threads that wait for each other on all cores would use up each other's time."""
+        cores = sorted(os.sched_getaffinity(0))
+        return [cores[k :: self.workers] or [cores[k % len(cores)]] for k in range(self.workers)]
+
+    def work(self, numbers: list[int], share: list[int], outward: int) -> None:
+        """Be a worker on its share of the cores that writes its verdicts to a pipe, and never return."""
+        os.sched_setaffinity(0, share)
         if not self.fresh:  # CUDA's driver takes more addresses than that when it starts
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -279,15 +286,16 @@ class _Worker:
     Attributes:
         results: The pipe of its verdicts.
         left: Mutants that it has not done yet.
+        share: Cores that it runs on.
     """
 
-    def __init__(self, campaign: Campaign, numbers: list[int]):
-        self._folder, self.left = campaign.folder, list(numbers)
+    def __init__(self, campaign: Campaign, numbers: list[int], share: list[int]):
+        self._folder, self.left, self.share = campaign.folder, list(numbers), share
         self.results, outward = os.pipe()
         self._process = os.fork()
         if not self._process:
             os.close(self.results)
-            campaign.work(numbers, outward)
+            campaign.work(numbers, share, outward)
         os.close(outward)
         self._begun, self._heard, self._hung = b"", time.monotonic(), False
 
