@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 from pxr import Usd
 
 from warpmag import cli
@@ -27,7 +28,7 @@ def stage(tmp_path_factory):
 
 def drawn(stage, path, device, **arguments):
     """Draw and return the pixels, shape [height, width, 3]."""
-    render(stage, path, device=device, width=192, height=108, **arguments)
+    render(stage, path, device=device, size=(192, 108), **arguments)
     return imread(path)[..., :3].astype(float)
 
 
@@ -50,18 +51,64 @@ def test_bodies_stand_where_the_camera_sees_them(stage, device, tmp_path):
     assert last == pytest.approx(0.5 + 0.5 * front * 0.005 / half, abs=0.02)
 
 
-def test_a_frame_of_a_run(stage, device, tmp_path):
-    """The first frame is the scene; in the last, which is the default, the ball has left the ground."""
-    out = tmp_path / "run" / "out.usda"
+@pytest.fixture(scope="module")
+def run(stage, device, tmp_path_factory):
+    """A run of twelve frames, by the end of which the ball has left the ground."""
+    out = tmp_path_factory.mktemp("run") / "out.usda"
     assert cli.main(["run", str(stage), "-o", str(out), "--frames", "12", "--device", device]) == 0
+    return out
+
+
+def test_a_frame_of_a_run(stage, run, device, tmp_path):
+    """The first frame is the scene; in the last, which is the default, the ball has left the ground."""
     scene = drawn(stage, tmp_path / "scene.png", device)
-    first, last = (drawn(out, tmp_path / f"{frame}.png", device, frame=frame) for frame in (0, 12))
+    first, last = (drawn(run, tmp_path / f"{frame}.png", device, frame=frame) for frame in (0, 12))
     np.testing.assert_array_equal(first, scene)
-    np.testing.assert_array_equal(drawn(out, tmp_path / "end.png", device), last)
+    np.testing.assert_array_equal(drawn(run, tmp_path / "end.png", device), last)
     ground = slice(60, None)  # rows below the magnet: the ball, then its shadow alone
     assert np.abs(last - first)[ground].max() > 0.05
     with pytest.raises(InputError, match="has frames 0 to 12, got 13"):
-        drawn(out, tmp_path / "no.png", device, frame=13)
+        drawn(run, tmp_path / "no.png", device, frame=13)
+
+
+def test_frames_of_several_pictures_are_those_of_single_ones(run, device, tmp_path):
+    paths = render(run, tmp_path / "film.png", frames=(10, 12), size=(96, 54), device=device)
+    assert [path.name for path in paths] == ["film.0010.png", "film.0011.png", "film.0012.png"]
+    render(run, tmp_path / "one.png", frame=11, size=(96, 54), device=device)
+    np.testing.assert_array_equal(imread(paths[1]), imread(tmp_path / "one.png"))
+    assert (imread(paths[0]) != imread(paths[2])).any()
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_films_last_as_long_as_their_frames(run, device, tmp_path, suffix):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg") if suffix == ".mp4" else None
+    film, size = tmp_path / f"film{suffix}", (64, 36)
+    command = ["render", str(run), "-o", str(film), "--size", "64x36", "--device", device]
+    assert cli.main(command) == 0
+    if ffmpeg:
+        frames, seconds = ffmpeg.count_frames_and_secs(str(film))
+        assert frames == 13 and seconds == pytest.approx(13 / 60.0, abs=0.02)
+    else:
+        with Image.open(film) as opened:
+            lasting = sum(opened.info["duration"] for _ in map(opened.seek, range(opened.n_frames)))
+            assert opened.size == size and lasting == 5 * 50  # frames 0, 3, ... 12 of 60 a second
+
+
+def test_arrows_stand_on_magnets(run, device, tmp_path):
+    """The cube's moment points up: the cone on top of it is above the row where the cube ends."""
+    plain, shown = (drawn(run, tmp_path / f"{m}.png", device, moments=m) for m in (False, True))
+    (top, _), other = rows_of(plain, red), np.abs(shown - plain).max(axis=2) > 0.05
+    assert other[: int(top * len(plain))].any()
+
+
+def test_edges_of_bodies_are_between_what_is_beside_them(stage, device, tmp_path):
+    """Colours are mixed as light: the magnet's upper edge is no darker than what is beside it."""
+    pixels = drawn(stage, tmp_path / "edge.png", device)
+    first, _ = rows_of(pixels, red)
+    row, column = int(first * len(pixels)), pixels.shape[1] // 2
+    above, edge, below = pixels[row - 2, column], pixels[row - 1 : row + 1, column], pixels[row + 2, column]
+    assert (edge >= np.minimum(above, below) - 2.0 / 255.0).all()
+    assert (edge <= np.maximum(above, below) + 2.0 / 255.0).all()
 
 
 def test_without_a_camera_all_bodies_are_in_the_picture(stage, device, tmp_path):
@@ -81,11 +128,17 @@ def test_bad_input_is_one_line(stage, tmp_path, capsys):
     (tmp_path / "file").touch()
     for arguments, text in (
         (["-o", str(tmp_path / "file" / "a.png")], "a.png: cannot be written ("),
-        (["-o", "picture.jpg"], "picture.jpg: a picture is written as .png"),
+        (["-o", "picture.jpg"], "picture.jpg: a picture is written as .png, a film as .mp4 or .gif"),
         (["-o", str(tmp_path / "a.png"), "--frame", "-1"], "has frames 0 to"),
+        (["-o", str(tmp_path / "a.png"), "--frames", "3:2"], "got 3 to 2"),
+        (["-o", str(tmp_path / "a.png"), "--frames", "all"], "frames: must be two whole numbers such as 10:20"),
+        (["-o", str(tmp_path / "a.png"), "--size", "1280"], "size: must be two whole numbers such as 10x20"),
     ):
         assert cli.main(["render", str(stage), *arguments]) == cli.BAD_INPUT
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert line.startswith("warpmag: ") and text in line
-    with pytest.raises(InputError, match="size: must be positive, got 0 x 540"):
-        render(stage, tmp_path / "a.png", width=0)
+    with pytest.raises(InputError, match="size: must be 1 to 16384, got 0 x 540"):
+        render(stage, tmp_path / "a.png", size=(0, 540))
+    with pytest.raises(InputError, match="holds no moments to show"):
+        render(stage, tmp_path / "a.png", moments=True)
+    assert not list(tmp_path.glob("*.png"))

@@ -138,10 +138,14 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     check.set_defaults(command=_check)
 
-    render = commands.add_parser("render", help="draw a frame of a stage, of a finished run for example")
+    render = commands.add_parser("render", help="draw frames of a stage, of a finished run for example")
     render.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
-    render.add_argument("-o", "--output", metavar="PNG", required=True, help="picture to write")
-    render.add_argument("--frame", type=int, metavar="N", help="frame after the start (default: the last)")
+    render.add_argument("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
+    several = render.add_mutually_exclusive_group()
+    several.add_argument("--frame", type=int, metavar="N", help="frame after the start (default: the last)")
+    several.add_argument("--frames", metavar="A:B", help="frames from A to B (default of a film: all)")
+    render.add_argument("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
+    render.add_argument("--moments", action="store_true", help="show the moments of a finished run as arrows")
     render.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     render.set_defaults(command=_render)
     return parser
@@ -228,9 +232,25 @@ def _render(options) -> int:
     _quiet_warp()
     from warpmag.engine.render import render  # noqa: PLC0415
 
-    render(path, options.output, frame=options.frame, device=options.device)
-    print(f"written {options.output}")
+    written = render(
+        path,
+        options.output,
+        frame=options.frame,
+        frames=_two("frames", options.frames, ":") if options.frames is not None else None,
+        size=_two("size", options.size, "x"),
+        moments=options.moments,
+        device=options.device,
+    )
+    print(f"written {written[0]}{f' to {written[-1].name}' if len(written) > 1 else ''}")
     return 0
+
+
+def _two(name: str, text: str, between: str) -> tuple[int, int]:
+    """Return the two numbers of an argument."""
+    parts = text.lower().split(between)
+    if len(parts) != 2 or not all(part.isdecimal() and len(part) < 10 for part in parts):
+        raise InputError(f"{name}: must be two whole numbers such as 10{between}20, got {text!r:.40}")
+    return int(parts[0]), int(parts[1])
 
 
 def _run(options) -> int:

@@ -13,6 +13,7 @@ from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
 from warpmag.usd.paths import usable_path
+from warpmag.usd.playback import Playback, metalness
 from warpmag.usd.reader import (
     StageContents,
     describe,
@@ -30,6 +31,7 @@ __all__ = [
     "Earlier",
     "Finding",
     "GroundedJoint",
+    "Playback",
     "StageClock",
     "StageContents",
     "StageReport",
@@ -46,6 +48,7 @@ __all__ = [
     "inspect",
     "magnet_of",
     "magnet_prim_of",
+    "metalness",
     "open_stage",
     "prepare_joints",
     "read_magnets",

@@ -1,0 +1,98 @@
+"""Writes pictures one by one, or as a film."""
+
+import contextlib
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from warpmag.errors import InputError
+
+FILMS = (".mp4", ".gif")
+SUFFIXES = (".png", *FILMS)
+_GIF_RATE = 25.0
+"""Most pictures per second of a GIF [Hz]: players slow down faster ones."""
+
+
+def check_name(output: Path) -> None:
+    """Raise :class:`InputError` unless the name says a format, and what writes it is installed."""
+    if output.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{output}: a picture is written as .png, a film as .mp4 or .gif")
+    if output.suffix.lower() == ".mp4":
+        _ffmpeg()
+
+
+def write(output: Path, pictures: Iterable[np.ndarray], frames: list[int], rate: float) -> list[Path]:
+    """Write pictures, one file for a film, and one for each frame otherwise, which its number tells apart.
+
+    Args:
+        output: ``.png``, ``.mp4`` or ``.gif``.
+        pictures: 8-bit sRGB, each of shape [height, width, 3], made as they are asked for.
+        frames: Their numbers.
+        rate: Pictures per second [Hz] of a film.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: A file cannot be written.
+    """
+    with _named(output):
+        output.parent.mkdir(parents=True, exist_ok=True)
+        kind = output.suffix.lower()
+        if kind == ".mp4":
+            _write_mp4(output, pictures, rate)
+        elif kind == ".gif":
+            _write_gif(output, pictures, rate)
+        else:
+            return list(_write_each(output, pictures, frames))
+    return [output]
+
+
+def _write_each(output: Path, pictures: Iterable[np.ndarray], frames: list[int]) -> Iterator[Path]:
+    for frame, picture in zip(frames, pictures, strict=True):
+        path = output if len(frames) == 1 else output.with_stem(f"{output.stem}.{frame:04}")
+        Image.fromarray(picture).save(path, optimize=True)
+        yield path
+
+
+def _write_gif(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
+    each = math.ceil(rate / _GIF_RATE)
+    images = (Image.fromarray(picture) for picture in itertools.islice(pictures, None, None, each))
+    lasts = 10 * round(100.0 * each / rate)  # ms; the format counts in hundredths of a second
+    next(images).save(output, save_all=True, append_images=images, duration=lasts, loop=0)
+
+
+def _write_mp4(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
+    writer = None
+    for picture in pictures:
+        height, width = (2 * (size // 2) for size in picture.shape[:2])  # what yuv420p needs
+        if writer is None:
+            writer = _ffmpeg().write_frames(
+                str(output), (width, height), fps=rate, codec="libx264", quality=8, macro_block_size=2
+            )
+            writer.send(None)
+        writer.send(np.ascontiguousarray(picture[:height, :width]))
+    if writer is not None:
+        writer.close()
+
+
+def _ffmpeg():
+    try:
+        import imageio_ffmpeg  # noqa: PLC0415 - an extra
+    except ImportError:
+        raise InputError(
+            "a film as .mp4 needs imageio-ffmpeg: pip install 'warpmag[video]'; .gif needs nothing"
+        ) from None
+    return imageio_ffmpeg
+
+
+@contextlib.contextmanager
+def _named(output: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror or error})") from None
