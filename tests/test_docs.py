@@ -38,7 +38,7 @@ def pages_with_programs():
 def test_snippets_run(page, device, tmp_path, monkeypatch):
     """One after the other, as a reader would type them; they assert what they claim."""
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / f"{page.stem}.py"
+    path = tmp_path / f"page_{page.stem}.py"
     path.write_text(program(page), encoding="utf-8")
     with wp.ScopedDevice(device), np.errstate(over="ignore"):
         runpy.run_path(str(path))
