@@ -30,7 +30,8 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
+autodoc_typehints = "none"  # docstrings say shapes and units, which types do not
+maximum_signature_line_length = 90
 autodoc_preserve_defaults = True
 napoleon_use_ivar = True
 napoleon_custom_sections = ["Warns"]
@@ -50,7 +51,7 @@ def _schema(prim) -> str:
     for one in prim.properties:
         kind = f"{'uniform ' * (one.variability == Sdf.VariabilityUniform)}{one.typeName}"
         tokens = f" One of {', '.join(f'`{token}`' for token in one.allowedTokens)}." if one.allowedTokens else ""
-        default = "" if one.default is None else f"`{one.default}`"
+        default = "" if one.default in (None, "") else f"`{one.default}`"
         lines.append(f"| `{one.name}` | {kind} | {default} | {_plain(one.documentation)}{tokens} |")
     return "\n".join([*lines, ""])
 
@@ -62,7 +63,7 @@ def _plain(text: str) -> str:
 
 def _commands() -> str:
     """Help of the command and of each of its commands."""
-    os.environ["COLUMNS"] = "100"
+    os.environ["COLUMNS"] = "84"
     parser = cli._parser()
     (commands,) = (one.choices for one in parser._subparsers._group_actions)
     texts = {"warpmag": parser, **{f"warpmag {name}": one for name, one in commands.items()}}
