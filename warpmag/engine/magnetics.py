@@ -88,6 +88,7 @@ class Magnetics:
         self.magnets, self._worlds = find_magnets(model, cells=contact_model == "multipole")
         self._model, self._values = model, ModelValues(model)
         self._sources = ModelSources(model, self._worlds)
+        self._induced = False
         self.system = self._make_system(settings, max_evaluations, curve)
         self._sources.bind(self.system)
         self._map_bodies()
@@ -217,6 +218,7 @@ class Magnetics:
     def induce(self, state: newton.State) -> None:
         """Bring the inducible magnets to equilibrium at the poses of ``state``, starting from where they were."""
         values, system = self._values, self.system
+        self._induced = True
         gather_moments(
             *(state.body_q, self._body_moments, values.now, values.then, system.positions, system.moments),
             values.changed,
@@ -387,6 +389,8 @@ class Magnetics:
         return gradient.numpy()
 
     def _measured(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
+        if not self._induced:
+            raise InputError("Magnetics: nothing is to be measured yet, call apply(state) or induce(state) first")
         probe = self.probe(points, worlds=worlds, gradients=gradients)
         self.check_model()
         probe.measure()
