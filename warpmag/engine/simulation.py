@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.arrays import resolve_device
+from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
 from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings
@@ -281,7 +282,7 @@ class Simulation:
             return f"the ends of the joint {self._scene.strained[0]} were apart at the start, and it pulls at them"
         if self._statistics.capped:
             return "bodies were moving too fast for the shortest substep before"
-        given = self.model.warpmag
+        given = getattr(self.model, NAMESPACE)
         strengths = {
             "an applied field of {:.3g} A/m": self._magnetics.system.external_field.numpy(),
             "a magnetization of {:.3g} A/m": given.magnetization.numpy(),
