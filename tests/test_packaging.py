@@ -167,6 +167,7 @@ def test_every_public_name_is_there():
     assert warpmag.register_attributes is warpmag.register_custom_attributes
 
 
+@pytest.mark.long
 def test_a_checker_of_types_sees_through_lazy_imports(environment, tmp_path):
     """From the wheel, as a user's does: ``tests/typed_use.py`` has the types, the second file mistakes."""
     pytest.importorskip("pyright")
