@@ -620,7 +620,7 @@ def wild_magnetics(device):
 
 
 def test_sources_that_no_world_or_every_world_would_have(device):
-    with pytest.raises(warpmag.InputError, match="register_attributes"):
+    with pytest.raises(warpmag.InputError, match="register_custom_attributes"):
         warpmag.add_coil(newton.ModelBuilder(), radius=A)
     world = new_builder()
     add_ball(world, (0.0, 0.0, 0.0))

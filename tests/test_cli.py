@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
@@ -44,6 +45,13 @@ def test_run_writes_a_stage_and_a_summary(scene, device, tmp_path, capfd):
     stage = Usd.Stage.Open(str(out))
     assert stage.GetEndTimeCode() == pytest.approx(3.0)
     assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").GetNumTimeSamples() == 4
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"warpmag {metadata.version('warpmag')}\n"
 
 
 @pytest.mark.parametrize("method", ["warpmag", "paper", "kim2018"])

@@ -96,7 +96,7 @@ def test_bad_magnetizations_are_refused(builder):
 def test_attributes_must_be_registered_and_magnets_must_exist(device):
     builder = newton.ModelBuilder()
     body = add_ball(builder)
-    with pytest.raises(warpmag.InputError, match="call warpmag.register_attributes"):
+    with pytest.raises(warpmag.InputError, match="call warpmag.register_custom_attributes"):
         warpmag.add_inducible(builder, body)
     with pytest.raises(warpmag.InputError, match="has no magnets"):
         warpmag.Magnetics(builder.finalize(device=device))

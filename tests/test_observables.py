@@ -143,8 +143,10 @@ def test_each_point_sees_the_magnets_of_its_world(device):
     model = builder.finalize(device=device)
     magnetics = warpmag.Magnetics(model)
     magnetics.set_magnetization((0.0, 0.0, -2.0 * M), body=1)
-    magnetics.induce(model.state())
     points = [[0.0, 0.0, 0.02]] * 4
+    with pytest.raises(warpmag.InputError, match=r"nothing is to be measured yet, call apply\(state\)"):
+        magnetics.h_field(points, worlds=0)
+    magnetics.induce(model.state())
     field = magnetics.h_field(points, worlds=[2, 1, 0, 1])[:, 2]
     one = 2.0 * M * VOLUME / (4.0 * math.pi * 0.02**3)
     np.testing.assert_allclose(field, [one, -2.0 * one, one, -2.0 * one], rtol=SINGLE)

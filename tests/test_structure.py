@@ -194,7 +194,13 @@ def test_only_their_owners_import_libraries():
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("page", ["ARCHITECTURE.md", "README.md", "bench/README.md"])
+PAGES = ["ARCHITECTURE.md", "CONTRIBUTING.md", "README.md", "bench/README.md"]
+PAGES += [
+    path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md")) if path.parent.name != "paper"
+]
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_pages_name_files_that_exist(page):
     names = set(re.findall(r"`((?:[\w.]+/)+[\w.]*)`", (ROOT / page).read_text(encoding="utf-8")))
     folders = ROOT, ROOT / "warpmag", KERNELS

@@ -6,28 +6,23 @@ CUDA, after Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation
 Importing this package imports neither Warp nor Newton nor USD; the names below load what they need when first used.
 """
 
+import ast
 from importlib import import_module
+from pathlib import Path
 
-_HOMES = {
-    "InputError": "warpmag.errors",
-    "SimulationError": "warpmag.errors",
-    "ConvergenceWarning": "warpmag.errors",
-    "h_field": "warpmag.fields",
-    "wrench": "warpmag.fields",
-    "solve_induction": "warpmag.induction",
-    "InductionResult": "warpmag.induction",
-    "material": "warpmag.materials",
-    "MagnetizationCurve": "warpmag.curves",
-    "register_attributes": "warpmag.engine.attributes",
-    "add_inducible": "warpmag.engine.attributes",
-    "add_permanent": "warpmag.engine.attributes",
-    "add_coil": "warpmag.engine.applied",
-    "add_field_map": "warpmag.engine.applied",
-    "Magnetics": "warpmag.engine.magnetics",
-    "SensorMagnetometer": "warpmag.engine.magnetometer",
-    "Simulation": "warpmag.engine.simulation",
-}
+__version__ = "0.1.0"
 
+
+def _homes() -> dict[str, str]:
+    """Module of each public name, by the stub beside this file, which type checkers read."""
+    stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    found = [
+        (one.module or "", alias.name) for one in stub.body if isinstance(one, ast.ImportFrom) for alias in one.names
+    ]
+    return {name: module for module, name in found}
+
+
+_HOMES = _homes()
 __all__ = sorted(_HOMES)
 
 
@@ -38,4 +33,4 @@ def __getattr__(name):
 
 
 def __dir__():
-    return __all__
+    return [*__all__, "__version__"]

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warpmag.errors import InputError
 from warpmag.magnets import MATERIAL_RANGE, check_token, shown
 
+Numbers = npt.ArrayLike | wp.array
+"""What arguments take: numbers, lists of them and NumPy arrays, or a Warp array."""
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
 RADIUS_RANGE = {wp.float32: (5e-8, 2e4), wp.float64: (1e-30, 1e30)}
 """Smallest and largest radius [m] of a ball by Warp scalar type: neither r⁻⁵ nor products of moments may overflow."""

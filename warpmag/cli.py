@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+from warpmag import __version__
 from warpmag.errors import InputError, SimulationError
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, check_rtol
 
@@ -108,6 +109,7 @@ def _silence(descriptor: int) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="warpmag", description="Magnets for the Newton physics engine.")
+    parser.add_argument("--version", action="version", version=f"warpmag {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")

@@ -12,8 +12,10 @@ import math
 import os
 import re
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from warpmag.errors import InputError
 
@@ -50,7 +52,14 @@ class MagnetizationCurve:
     name: str = field(default="curve", compare=False)
 
     @classmethod
-    def from_bh(cls, fields, flux_densities, *, saturation: float | None = None, name: str = "curve"):
+    def from_bh(
+        cls,
+        fields: npt.ArrayLike,
+        flux_densities: npt.ArrayLike,
+        *,
+        saturation: float | None = None,
+        name: str = "curve",
+    ) -> Self:
         """Return the curve of flux densities B [T] at fields H [A/m], each of shape [points].
 
         Args:
@@ -67,14 +76,21 @@ class MagnetizationCurve:
         return cls._made(name, h, b / _MU0 - h, saturation)
 
     @classmethod
-    def from_mh(cls, fields, magnetizations, *, saturation: float | None = None, name: str = "curve"):
+    def from_mh(
+        cls,
+        fields: npt.ArrayLike,
+        magnetizations: npt.ArrayLike,
+        *,
+        saturation: float | None = None,
+        name: str = "curve",
+    ) -> Self:
         """Return the curve of magnetizations M [A/m] at fields H [A/m]; see :meth:`from_bh`."""
         h, m = _numbers(name, "fields", fields), _numbers(name, "magnetizations", magnetizations)
         _check_count(name, h, m)
         return cls._made(name, h, m, saturation)
 
     @classmethod
-    def from_csv(cls, path: str | os.PathLike, *, saturation: float | None = None):
+    def from_csv(cls, path: str | os.PathLike, *, saturation: float | None = None) -> Self:
         """Return the curve of a file with two columns, the first line of which says what they are.
 
         Such as ``H [A/m], B [T]``. The second may be the flux density B, the polarization J or the magnetization M.
@@ -124,7 +140,7 @@ class MagnetizationCurve:
         vertex = np.clip(np.divide(-b, 3.0 * c, out=np.zeros_like(b), where=c < 0.0), 0.0, 1.0)
         return float(max(slope.max(), (slope[:-1] + vertex * (2.0 * b + 3.0 * vertex * c)).max()))
 
-    def magnetization(self, fields):
+    def magnetization(self, fields: npt.ArrayLike) -> np.ndarray:
         """Return the magnetization M [A/m] at fields H ≥ 0 inside the material [A/m], NumPy, any shape."""
         h, m, d = np.array(self.fields), np.array(self.magnetizations), np.array(self.slopes)
         x = np.asarray(fields, float)

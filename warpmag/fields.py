@@ -1,5 +1,7 @@
 """Field of moments, and forces and torques between them: one-shot calls on arrays."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -7,6 +9,7 @@ from warpmag.arrays import (
     LEAST_OF_FORCE,
     REFERENCE_RADIUS_RANGE,
     Kind,
+    Numbers,
     farthest_place,
     first_not_finite,
     hint,
@@ -27,18 +30,18 @@ _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
 
 
 def h_field(
-    positions,
-    moments,
-    targets=None,
+    positions: Numbers,
+    moments: Numbers,
+    targets: Numbers | None = None,
     *,
-    radii=None,
-    target_radii=None,
-    smoothing=0.0,
-    method="auto",
-    rtol=None,
-    dtype="float32",
-    device=None,
-):
+    radii: Numbers | None = None,
+    target_radii: Numbers | None = None,
+    smoothing: float = 0.0,
+    method: str = "auto",
+    rtol: float | None = None,
+    dtype: str = "float32",
+    device: wp.DeviceLike = None,
+) -> Any:
     """Field H of magnetic moments (Kim and Han 2022, Eq. 1).
 
     Moments with a radius are uniformly magnetized balls; where a ball overlaps the target's ball the field is the one
@@ -88,17 +91,17 @@ def h_field(
 
 
 def wrench(
-    positions,
-    moments,
+    positions: Numbers,
+    moments: Numbers,
     *,
-    radii=None,
-    external_field=None,
-    smoothing=0.0,
-    method="auto",
-    rtol=None,
-    dtype="float32",
-    device=None,
-):
+    radii: Numbers | None = None,
+    external_field: Numbers | None = None,
+    smoothing: float = 0.0,
+    method: str = "auto",
+    rtol: float | None = None,
+    dtype: str = "float32",
+    device: wp.DeviceLike = None,
+) -> tuple[Any, Any]:
     """Kelvin force and torque on each of a set of magnetic moments, mutual and from an external field.
 
     F = μ0 (m·∇)H (Kim and Han 2022, Eqs. 13 and 14) and τ = μ0 m × H. Mutual forces obey Newton's third law, and with

@@ -2,7 +2,9 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,6 +12,7 @@ import warp as wp
 from warpmag.arrays import (
     LEAST_OF_FORCE,
     Kind,
+    Numbers,
     farthest_place,
     first_not_finite,
     hint,
@@ -48,8 +51,8 @@ class InductionResult:
         converged: Whether ``error`` is at most ``rtol``.
     """
 
-    magnetizations: object
-    h_field: object
+    magnetizations: Any
+    h_field: Any
     error: float
     evaluations: int
     converged: bool
@@ -58,7 +61,7 @@ class InductionResult:
     _given: dict
     _count: int
 
-    def wrench(self, force="kelvin"):
+    def wrench(self, force: str = "kelvin") -> tuple[Any, Any]:
         """Force and torque on each ball from the other balls, the sources and the external field.
 
         Args:
@@ -85,22 +88,22 @@ class InductionResult:
 
 
 def solve_induction(
-    positions,
-    radii,
+    positions: Numbers,
+    radii: Numbers,
     *,
-    saturation=None,
-    susceptibility=math.inf,
-    curve="tanh",
-    external_field=None,
-    sources=None,
-    dynamics="theta",
-    contact_model="dipole",
-    rtol=1e-3,
-    max_evaluations=1000,
-    initial=None,
-    dtype="float32",
-    device=None,
-):
+    saturation: Numbers | None = None,
+    susceptibility: Numbers = math.inf,
+    curve: str | MagnetizationCurve | Sequence[str | MagnetizationCurve] = "tanh",
+    external_field: Numbers | None = None,
+    sources: tuple[Numbers, Numbers] | None = None,
+    dynamics: str = "theta",
+    contact_model: str = "dipole",
+    rtol: float = 1e-3,
+    max_evaluations: int = 1000,
+    initial: Numbers | None = None,
+    dtype: str = "float32",
+    device: wp.DeviceLike = None,
+) -> InductionResult:
     """Bring inducible balls to magnetic equilibrium, M = f(H), with one another and an applied field.
 
     Balls may overlap at will: the solution is unique for any arrangement, and the iteration safeguarded.

@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warpmag.arrays import shape_message, vec3_type
@@ -43,7 +44,9 @@ class FieldProbe:
             the external field, which is uniform, has none. None if it is not wanted.
     """
 
-    def __init__(self, system: MomentSystem, count: int, *, worlds=None, gradients: bool = False):
+    def __init__(
+        self, system: MomentSystem, count: int, *, worlds: npt.ArrayLike | None = None, gradients: bool = False
+    ):
         """Allocate all buffers."""
         self._system = system
         ranges = system.world_ranges

@@ -9,6 +9,7 @@ import re
 
 import newton
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warpmag.arrays import host_array
@@ -32,11 +33,11 @@ def add_coil(
     shape: str = "loop",
     radius: float = 0.0,
     length: float = 0.0,
-    points=None,
+    points: npt.ArrayLike | None = None,
     closed: bool = True,
     wire_radius: float = 0.0,
     ampere_turns: float = 0.0,
-    xform=None,
+    xform: wp.transform | tuple | None = None,
     label: str | None = None,
 ) -> int:
     """Add a coil to a body, which feels what the coil does to magnets, or to the world.
@@ -46,7 +47,7 @@ def add_coil(
     of sheets of current (Derby and Olbert 2010) and of thin straight pieces.
 
     Args:
-        builder: The builder, with :func:`warpmag.register_attributes` called on it.
+        builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
         body: The body; -1 for a coil fixed in the world.
         shape: ``loop``, ``solenoid`` or ``polyline``.
         radius: Radius of a loop or a solenoid [m].
@@ -77,12 +78,12 @@ def add_coil(
 def add_field_map(
     builder: newton.ModelBuilder,
     origin: tuple[float, float, float],
-    spacing,
-    values,
+    spacing: npt.ArrayLike,
+    values: npt.ArrayLike,
     *,
     body: int = -1,
     factor: float = 1.0,
-    xform=None,
+    xform: wp.transform | tuple | None = None,
     label: str | None = None,
 ) -> int:
     """Add a field that is given on a regular grid, fixed in the world or on a body, which feels what it does.
@@ -92,7 +93,7 @@ def add_field_map(
     field fades.
 
     Args:
-        builder: The builder, with :func:`warpmag.register_attributes` called on it.
+        builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
         origin: The first node [m], in the frame of the map.
         spacing: Distance of nodes [m], one number or one along each axis.
         values: H at the nodes [A/m], shape [nx, ny, nz, 3], at least two along each axis, NumPy.

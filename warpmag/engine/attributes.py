@@ -46,8 +46,10 @@ _SOLID = (
 )
 
 
-def register_attributes(builder: newton.ModelBuilder) -> None:
+def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     """Declare the attributes that magnets are stored in; call it before :func:`add_inducible` and friends.
+
+    Newton's solvers have class methods of this name; ``register_attributes`` is the same function.
 
     Newton's ``builder.add_usd(stage)`` then brings the magnets of a stage in, too: what colliders or their rigid bodies
     with ``WarpmagMagnetAPI`` say, or the defaults of what they do not say.
@@ -57,6 +59,9 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     """
     _check_builder(builder)
     declare_attributes(builder, usd_attribute_name="*", usd_value_transformer=_of_prim)
+
+
+register_attributes = register_custom_attributes
 
 
 def declare_attributes(builder: newton.ModelBuilder, **source) -> None:
@@ -119,7 +124,7 @@ def add_inducible(
     """Make a body, or one shape, a magnet that the field magnetizes: iron, steel, ferrite.
 
     Args:
-        builder: The builder, with :func:`register_attributes` called on it.
+        builder: The builder, with :func:`register_custom_attributes` called on it.
         body: The body; all its colliding shapes, which must exist already, become one magnet.
         shape: Instead of all shapes of the body only this one; the way to make a static shape a magnet.
         material: Name of an inducible material of :mod:`warpmag.materials`, in place of the next two, and of the curve
@@ -155,7 +160,7 @@ def add_permanent(
     """Make a body, or one shape, a permanent magnet.
 
     Args:
-        builder: The builder, with :func:`register_attributes` called on it.
+        builder: The builder, with :func:`register_custom_attributes` called on it.
         body: The body; all its colliding shapes, which must exist already, become one magnet.
         shape: Instead of all shapes of the body only this one; the way to make a static shape a magnet.
         material: Name of a permanent material of :mod:`warpmag.materials`, which says how strong the magnet is.
@@ -214,7 +219,7 @@ def check_registered(builder: newton.ModelBuilder) -> None:
     """Raise :class:`InputError` unless the attributes are declared on ``builder``."""
     _check_builder(builder)
     if f"{NAMESPACE}:source" not in builder.custom_attributes:
-        raise InputError("builder: call warpmag.register_attributes(builder) before magnets are added")
+        raise InputError("builder: call warpmag.register_custom_attributes(builder) before magnets are added")
 
 
 def check_body(builder: newton.ModelBuilder, body: int) -> None:

@@ -243,7 +243,7 @@ class RigidSolver:
             try:
                 self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
             except ImportError as error:
-                reason = f"needs what `pip install 'warpmag[solvers]'` installs ({error.__cause__ or error})"
+                reason = f"needs what `pip install 'warpmag[sim]'` installs ({error.__cause__ or error})"
                 raise InputError(f"solver {self._name}: {reason}") from None
             except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
                 raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import newton
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warpmag import materials
-from warpmag.arrays import Kind, farthest_place, host_array
+from warpmag.arrays import Kind, Numbers, farthest_place, host_array
 from warpmag.curves import MagnetizationCurve
 from warpmag.engine.applied import ModelSources
 from warpmag.engine.attributes import NAMESPACE
@@ -87,6 +88,7 @@ class Magnetics:
         self.magnets, self._worlds = find_magnets(model, cells=contact_model == "multipole")
         self._model, self._values = model, ModelValues(model)
         self._sources = ModelSources(model, self._worlds)
+        self._induced = False
         self.system = self._make_system(settings, max_evaluations, curve)
         self._sources.bind(self.system)
         self._map_bodies()
@@ -216,6 +218,7 @@ class Magnetics:
     def induce(self, state: newton.State) -> None:
         """Bring the inducible magnets to equilibrium at the poses of ``state``, starting from where they were."""
         values, system = self._values, self.system
+        self._induced = True
         gather_moments(
             *(state.body_q, self._body_moments, values.now, values.then, system.positions, system.moments),
             values.changed,
@@ -271,7 +274,7 @@ class Magnetics:
         """Raise :class:`InputError` if ``model.warpmag`` has changed meanwhile; waits for the device."""
         self._values.check(wait=True)
 
-    def set_external_field(self, external_field) -> None:
+    def set_external_field(self, external_field: Numbers) -> None:
         """Set the uniform applied field of all worlds, or of each; capturable in a graph if given as a Warp array.
 
         Args:
@@ -284,7 +287,7 @@ class Magnetics:
         field = self._vectors("external_field", external_field, (1, max(self._model.world_count, 1)))
         set_external_field(field, self._newton_world, self.system.external_field)
 
-    def set_current(self, coil: int | str, ampere_turns) -> None:
+    def set_current(self, coil: int | str, ampere_turns: Numbers) -> None:
         """Set the current of coils; after a first call capturable in a graph, if given as a Warp array.
 
         It is the model's attribute ``model.warpmag.strength`` that is set. Who writes there has the same effect. Of a
@@ -301,7 +304,7 @@ class Magnetics:
         """
         self._sources.set_strength("set_current", coil, ampere_turns)
 
-    def set_magnetization(self, magnetization, *, body: int = -1, shape: int | None = None) -> None:
+    def set_magnetization(self, magnetization: Numbers, *, body: int = -1, shape: int | None = None) -> None:
         """Set what a permanent magnet is magnetized to; capturable in a graph if given as a Warp array.
 
         It is the model's attribute ``model.warpmag.magnetization`` that is set, in the frame of each shape. Who writes
@@ -337,7 +340,7 @@ class Magnetics:
             raise InputError(f"{name}: shape must be [3] or {wanted}, got {list(np.shape(value))}")
         return found
 
-    def probe(self, points, *, worlds=None, gradients: bool = False) -> FieldProbe:
+    def probe(self, points: Numbers, *, worlds: npt.ArrayLike | None = None, gradients: bool = False) -> FieldProbe:
         """Return what measures the field at points; :meth:`FieldProbe.measure` is capturable in a graph.
 
         Args:
@@ -371,21 +374,23 @@ class Magnetics:
             raise InputError(f"worlds: world {strangers.flat[0]} holds no magnets")
         return np.broadcast_to(np.searchsorted(self._worlds, worlds), count)
 
-    def h_field(self, points, *, worlds=None) -> np.ndarray:
+    def h_field(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
         """Return the field H [A/m] at points, shape [p, 3], as :meth:`probe` measures it."""
         return self._measured(points, worlds).h.numpy()
 
-    def b_field(self, points, *, worlds=None) -> np.ndarray:
+    def b_field(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
         """Return the flux density B [T] at points, inside bodies too, shape [p, 3], as :meth:`probe` measures it."""
         return self._measured(points, worlds).b.numpy()
 
-    def field_gradient(self, points, *, worlds=None) -> np.ndarray:
+    def field_gradient(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
         """Return the gradient ∂H_i/∂x_k [A/m²] at points, shape [p, 3, 3], as :meth:`probe` measures it."""
         gradient = self._measured(points, worlds, gradients=True).gradient
         assert gradient is not None
         return gradient.numpy()
 
     def _measured(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
+        if not self._induced:
+            raise InputError("Magnetics: nothing is to be measured yet, call apply(state) or induce(state) first")
         probe = self.probe(points, worlds=worlds, gradients=gradients)
         self.check_model()
         probe.measure()

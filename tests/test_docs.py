@@ -1,0 +1,83 @@
+"""The documents: their Python runs, what they say of schemas and commands is so, and every public name is described."""
+
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+from pxr import Sdf
+
+import warpmag
+from warpmag import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(page for page in DOCS.rglob("*.md") if "paper" not in page.parts)]
+SNIPPET = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
+"""A block of Python; in a comment it is what a page leaves to its reader, such as the model that it speaks of."""
+STAGE = re.compile(r"^```\n(#usda 1\.0\n# (\S+)\n.*?)^```$", re.MULTILINE | re.DOTALL)
+"""A whole stage and the file to save it as."""
+COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
+SLOW = {"howto/mujoco.md": "MuJoCo's kernels take minutes to compile"}
+
+
+def program(page: Path) -> str:
+    """The Python of a page, each line where it is on the page."""
+    text, lines = page.read_text(encoding="utf-8"), []
+    for snippet in SNIPPET.finditer(text):
+        lines += [""] * (text.count("\n", 0, snippet.start(1)) - len(lines))
+        lines += snippet[1].splitlines()
+    return "\n".join(lines)
+
+
+def pages_with_programs():
+    found = []
+    for page in PAGES:
+        if program(page):
+            name = page.relative_to(DOCS if page.is_relative_to(DOCS) else ROOT).as_posix()
+            found.append(pytest.param(page, id=name, marks=[pytest.mark.long] if name in SLOW else []))
+    return found
+
+
+@pytest.mark.parametrize("page", pages_with_programs())
+def test_snippets_run(page, device, tmp_path, monkeypatch):
+    """One after the other, as a reader would type them; they assert what they claim."""
+    monkeypatch.chdir(tmp_path)
+    for stage in STAGE.finditer(page.read_text(encoding="utf-8")):
+        (tmp_path / stage[2]).write_text(stage[1], encoding="utf-8")
+    path = tmp_path / f"page_{page.stem}.py"
+    path.write_text(program(page), encoding="utf-8")
+    with wp.ScopedDevice(device), np.errstate(over="ignore"):
+        runpy.run_path(str(path))
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if COMMAND.search(page.read_text(encoding="utf-8"))], ids=str)
+def test_commands_are_understood(page):
+    for command in COMMAND.finditer(page.read_text(encoding="utf-8")):
+        cli._parser().parse_args(shlex.split(command[1])[1:])
+
+
+def test_every_public_name_is_described():
+    described = re.findall(
+        r"^\.\. auto\w+:: warpmag\.(\w+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert {*described, "register_attributes"} >= set(warpmag.__all__)
+
+
+@pytest.mark.long
+def test_pages_build_without_a_warning(tmp_path):
+    """Schemas, commands and docstrings are read anew, so that pages cannot go stale."""
+    pytest.importorskip("sphinx", reason="the pages need the extra docs")
+    build = [sys.executable, "-m", "sphinx", "-q", "-n", "-W", "--keep-going", DOCS, tmp_path]
+    built = subprocess.run(build, capture_output=True, text=True, timeout=600)
+    assert built.returncode == 0, built.stderr
+    told = (tmp_path / "usd.html").read_text(encoding="utf-8")
+    layer = Sdf.Layer.FindOrOpen(str(ROOT / "warpmag" / "usd" / "schema" / "generatedSchema.usda"))
+    attributes = {one.name for prim in layer.rootPrims for one in prim.properties}
+    assert "warpmag:kind" in attributes
+    assert {name for name in attributes if name not in told} == set()
