@@ -3,13 +3,15 @@
 import os
 from dataclasses import dataclass
 
-from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdValidation
+from pxr import Tf, Usd, UsdGeom, UsdValidation
 
 from warpmag.errors import InputError
 from warpmag.usd.clock import StageClock, stage_clock, stage_name
 from warpmag.usd.guard import readable
 from warpmag.usd.joints import joint_findings
 from warpmag.usd.reader import StageContents, open_stage, survey
+from warpmag.usd.session import file_of
+from warpmag.usd.units import units_of
 from warpmag.usd.values import Finding, quiet
 
 _SEVERITIES = {"Error": "error", "Warn": "warning"}
@@ -84,11 +86,12 @@ def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
         where, _, message = str(error).rpartition(": ")
         findings.append(Finding(where, message))
     refusals = tuple(dict.fromkeys(finding for finding in findings if finding.severity == "error"))
-    findings += validate(stage)
+    findings += validate(file_of(stage))
+    units = units_of(stage)
     return StageReport(
         path=str(path),
-        metres_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
-        kilograms_per_unit=UsdPhysics.GetStageKilogramsPerUnit(stage),
+        metres_per_unit=units.metres,
+        kilograms_per_unit=units.kilograms,
         up_axis=UsdGeom.GetStageUpAxis(stage),
         clock=clock,
         contents=contents,
