@@ -232,14 +232,13 @@ def _all_below(prim: Usd.Prim) -> Iterator[Usd.Prim]:
 def _prototype(root: Usd.Prim) -> _Prototype:
     places, below = UsdGeom.XformCache(), list(_all_below(root))
     order = UsdGeom.Xformable(root).GetXformOpOrderAttr().Get() if root.IsA(UsdGeom.Xformable) else None
-    resets = order is not None and _RESET in order
     outside = places.GetParentToWorldTransform(root).GetInverse()
     bodies = tuple(
         (one.GetPath().MakeRelativePath(root.GetPath()), places.GetLocalToWorldTransform(one) * outside)
         for one in below
         if is_body(one)
     )
-    kept = [one for one in order if one != _RESET] if resets else None
+    kept = [one for one in order if one != _RESET] if order and _RESET in order else None
     return _Prototype(root.GetPath(), root.GetName(), kept, bodies, len(below))
 
 

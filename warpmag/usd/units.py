@@ -35,7 +35,7 @@ _POWERS = {
     **dict.fromkeys(("positions", "velocities", "accelerations"), _LENGTH),
     **dict.fromkeys((f"physics:{name}" for name in ("velocity", "centerOfMass", "gravityMagnitude")), _LENGTH),
     **dict.fromkeys((f"physics:{name}" for name in ("localPos0", "localPos1", "minDistance", "maxDistance")), _LENGTH),
-    "physics:mass": (0, 1),
+    **dict.fromkeys(("physics:mass", "physics:masses"), (0, 1)),
     "physics:density": (-3, 1),
     "physics:diagonalInertia": (2, 1),
     "physics:breakForce": _FORCE,
