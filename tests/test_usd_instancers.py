@@ -215,7 +215,7 @@ def test_refused_with_one_line_that_names_the_prim(tmp_path, case):
     path = write(tmp_path, instancer(*arguments, inner=BALL).replace("'", ""))
     with pytest.raises(InputError, match=r"^/World/Many[^\n]*$") as caught:
         report = check(path)
-        raise InputError(str(report.refusals[0]))
+        raise InputError(str(report.errors[0]))
     assert message in str(caught.value)
 
 

@@ -18,7 +18,7 @@ from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
-from warpmag.usd.coils import PlacedSource, is_source, sources_of, stray_findings
+from warpmag.usd.coils import PlacedSource, is_source, sources_of
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
@@ -36,6 +36,7 @@ from warpmag.usd.schemas import (
     moment_of,
     settings_of,
 )
+from warpmag.usd.slips import kind_findings, stray_findings
 from warpmag.usd.transforms import TransformCheck, is_body, is_collider
 from warpmag.usd.units import convert_units
 from warpmag.usd.values import (
@@ -315,9 +316,10 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
     elif not body and (owner := _body_above(prim)) and has_api(owner, MAGNET_API):
         contents.findings.append(Finding(path, f"its rigid body {owner.GetPath()} is a magnet already"))
     try:
-        contents.magnets[path] = magnet_of(prim)
-        if curve := magnetization_keys(prim, contents.magnets[path], keys):
+        contents.magnets[path] = magnet = magnet_of(prim)
+        if curve := magnetization_keys(prim, magnet, keys):
             contents.magnetization_keys[path] = curve
+        contents.findings += kind_findings(prim, magnet, keyed=curve is not None)
         if moment := moment_of(prim):
             contents.initial_moments[path] = moment
     except InputError as error:
