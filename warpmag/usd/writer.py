@@ -401,7 +401,8 @@ def _over(layer, stage, path) -> None:
 
 def _author_default(layer, path, name, kind, value, variability=Sdf.VariabilityVarying) -> Sdf.Path:
     place = Sdf.Path(f"{path}.{name}")
-    Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, variability, False)
+    if not layer.GetAttributeAtPath(place):  # an instance may have it
+        Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, variability, False)
     layer.GetAttributeAtPath(place).default = value
     return place
 
