@@ -129,7 +129,7 @@ def test_velocities_of_instances_are_those_of_their_bodies(device, tmp_path):
     """
     path = write(tmp_path, instancer(["Ball"], [0], [(0, 0, 1)], arrays, placed(BALL, (0, 0, 0.01))))
     simulation = Simulation(path, device=device)
-    [speeds] = simulation.state.body_qd.numpy()
+    [speeds] = simulation.state.body_qd.numpy().copy()
     simulation.run(1, output=tmp_path / "out.usda")
     cos, sin = np.cos(np.pi / 6.0), np.sin(np.pi / 6.0)
     across = 0.5 * np.pi * 0.01  # the ball is 1 cm above the point about which its instance turns
