@@ -138,7 +138,7 @@ def test_bodies_go_where_usd_composes_them(tmp_path, device, motion, kinematic):
     rig = f'def Xform "Rig"\n{{\n{above}\n{prim("Cube", "Part", apis, *lines)}\n}}'
     path = write(tmp_path, rig, start=5)
     report = check(path)
-    assert not report.refusals
+    assert not report.errors
     assert list(report.contents.motions) == report.contents.kinematic == ["/World/Rig/Part"]
     simulation, stage = Simulation(path, device=device), Usd.Stage.Open(str(path))
     body, dt = body_of(simulation, "Rig/Part"), 5e-4
@@ -274,7 +274,7 @@ def test_a_spline_is_refused_where_a_run_would_follow_it(tmp_path):
     stage = Usd.Stage.Open(str(path))
     stage.GetAttributeAtPath("/World/Part.xformOp:translateX").SetSpline(spline)
     stage.Save()
-    assert [str(one) for one in check(path).refusals] == [
+    assert [str(one) for one in check(path).errors] == [
         "/World/Part: xformOp:translateX is a spline, of which a run reads no keys: bake it into time samples"
     ]
 
@@ -415,19 +415,19 @@ def test_substeps_that_are_shortened_follow_the_same_keys(tmp_path, device):
 def test_what_no_body_can_follow_is_refused(tmp_path, lines, message):
     lines = lines.replace("'", "").replace("None", "None")
     path = write(tmp_path, prim("Cube", "Part", (BODY, COLLIDER), "double size = 0.01", KINEMATIC, lines), held_ball(1))
-    refusals = [str(one) for one in check(path).refusals]
+    refusals = [str(one) for one in check(path).errors]
     assert refusals and refusals[0].startswith(message), refusals
 
 
 def test_samples_of_fields_that_are_not_finite_are_refused(tmp_path):
     bad = text({0: "(0, 0, 0)", 5: "(0, nan, 0)"})
     path = write(tmp_path, held_ball(0), scene=f"vector3f warpmag:externalField.timeSamples = {bad}")
-    assert [str(one) for one in check(path).refusals] == [
+    assert [str(one) for one in check(path).errors] == [
         "/World/Scene: warpmag:externalField at time code 5: must be finite, got (0.0, nan, 0.0)"
     ]
     lines = 'uniform token warpmag:kind = "permanent"', f"vector3f warpmag:magnetization.timeSamples = {bad}"
     path = write(tmp_path, prim("Sphere", "Part", (COLLIDER, MAGNET), "double radius = 0.01", *lines), held_ball(1))
-    assert [str(one) for one in check(path).refusals] == [
+    assert [str(one) for one in check(path).errors] == [
         "/World/Part: warpmag:magnetization at time code 5: must be finite, got (0.0, nan, 0.0)"
     ]
 

@@ -344,13 +344,13 @@ def hinged(operation, value):
 )
 def test_a_joint_to_a_frame_that_is_nowhere(tmp_path, operation, value, message):
     report = check(write(tmp_path, hinged(operation, value)))
-    assert [one.where for one in report.refusals if message in one.message] == ["/Frame"]
+    assert [one.where for one in report.errors if message in one.message] == ["/Frame"]
 
 
 @pytest.mark.parametrize(("apart", "warned"), [(1e-5, False), (3e-4, True), (0.5, True)])
 def test_ends_of_a_joint_that_are_apart(tmp_path, apart, warned):
     report = check(write(tmp_path, hinged("double3 xformOp:translate", f"({apart}, 0, 0)")))
-    assert not report.refusals
+    assert not report.errors
     found = [str(one) for one in report.warnings if one.where == "/Joint"]
     assert found == [f"/Joint: its ends are {apart:g} m apart at the start, and a run begins by pulling"] * warned
 
@@ -401,7 +401,7 @@ def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
 def test_a_point_instancer_as_a_collider_of_a_magnet(tmp_path):
     body = ball('def PointInstancer "Shape" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}', kind="Xform")
     report = check(write(tmp_path, body.replace('"PhysicsCollisionAPI", ', "", 1)))
-    assert [str(one) for one in report.refusals] == [
+    assert [str(one) for one in report.errors] == [
         "/Ball: a magnet without colliders that are solid: no shape to magnetize"
     ]
 
@@ -434,10 +434,10 @@ def test_metadata_that_cannot_be_read(tmp_path):
     layer.Export(str(path))
     path.write_bytes(path.read_bytes().replace(b"a note that", b"a n\x80te that"))
     report = check(path)
-    assert [str(one) for one in report.refusals] == [f"{path}: documentation cannot be read (text that is not UTF-8)"]
+    assert [str(one) for one in report.errors] == [f"{path}: documentation cannot be read (text that is not UTF-8)"]
 
 
 def test_offsets_of_sublayers_are_no_metadata_to_copy(tmp_path):
     write(tmp_path, ball()).rename(tmp_path / "below.usda")
     path = write(tmp_path, "", f"{METRES}\nsubLayers = [@./below.usda@ (offset = 2; scale = 2)]")
-    assert check(path).refusals == ()
+    assert check(path).errors == ()

@@ -1,4 +1,4 @@
-"""Scenes that are unusual and valid run with sane physics; what cannot run is told alike by ``check`` and ``run``."""
+"""Scenes that are unusual and valid run with sane physics."""
 
 import math
 
@@ -6,74 +6,12 @@ import newton
 import numpy as np
 import pytest
 from pxr import Usd
+from small_stages import CHAIN, FIELD, IRON, LEFT, PERMANENT, RIGHT, A, B, C, G, R, ball, joint, physics, told, write
 
 import warpmag
-from warpmag import cli
 from warpmag.engine.simulation import Simulation
 from warpmag.errors import SimulationError
 from warpmag.kernels.rigid.contact_solve import PUSH_OUT
-from warpmag.usd import check
-
-G = 9.81  # m/s²
-R = 0.005  # m
-IRON = 7870.0  # kg/m³
-HEAD = """#usda 1.0
-(
-    defaultPrim = "World"
-    metersPerUnit = 1
-    kilogramsPerUnit = 1
-    upAxis = "Z"
-    timeCodesPerSecond = 60
-    startTimeCode = 0
-    endTimeCode = 60
-)
-"""
-PERMANENT = 'uniform token warpmag:kind = "permanent"\n vector3f warpmag:magnetization = (0, 0, 1e6)\n'
-FIELD = (0.0, 0.0, 1000.0)  # A/m: far from saturation
-
-
-def physics(gravity=G, field=(0.0, 0.0, 0.0), name="Scene"):
-    return f"""def PhysicsScene "{name}" (prepend apiSchemas = ["WarpmagSceneAPI"]) {{
-    vector3f physics:gravityDirection = (0, 0, -1)
-    float physics:gravityMagnitude = {gravity}
-    vector3f warpmag:externalField = {field}
-}}
-"""
-
-
-def ball(name, place, lines="", radius=R, magnet=True, body=True, kinematic=False):
-    schemas = ["PhysicsCollisionAPI", "PhysicsMassAPI"]
-    schemas += ["PhysicsRigidBodyAPI"] * body + ["WarpmagMagnetAPI"] * magnet
-    return f"""def Sphere "{name}" (prepend apiSchemas = {str(schemas).replace("'", '"')}) {{
-    double radius = {radius}
-    float physics:density = {IRON}
-    double3 xformOp:translate = {place}
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-    {"bool physics:kinematicEnabled = 1" if kinematic else ""}
-    {lines}
-}}
-"""
-
-
-def joint(kind, one, other, place_of_one, place_of_other, lines="", name="Joint"):
-    """A joint about the y axis between prims of the world, or None for the world itself."""
-    bodies = [f"rel physics:body{k} = </World/{prim}>" for k, prim in enumerate((one, other)) if prim]
-    axis = 'uniform token physics:axis = "Y"' if kind in ("Revolute", "Prismatic") else ""
-    return f"""def Physics{kind}Joint "{name}" {{
-    {chr(10).join([*bodies, axis])}
-    point3f physics:localPos0 = {place_of_one}
-    point3f physics:localPos1 = {place_of_other}
-    quatf physics:localRot0 = (1, 0, 0, 0)
-    quatf physics:localRot1 = (1, 0, 0, 0)
-    {lines}
-}}
-"""
-
-
-def write(folder, *parts):
-    path = folder / "scene.usda"
-    path.write_text(HEAD + 'def Xform "World" {\n' + "".join(parts) + "}\n")
-    return path
 
 
 def advance(simulation, seconds):
@@ -82,27 +20,6 @@ def advance(simulation, seconds):
     return simulation.state.body_q.numpy(), simulation.state.body_qd.numpy()
 
 
-def told(path, folder, device, capsys, frames=2):
-    """Errors and warnings of ``check`` and ``run``; both commands end alike."""
-    capsys.readouterr()
-    code = cli.main(["check", str(path)])
-    lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
-    checked = {kind: [rest for name, rest in lines if name == kind] for kind in ("error", "warning")}
-    command = ["run", str(path), "-o", str(folder / "out.usda"), "--frames", str(frames), "--device", device]
-    assert cli.main(command) == code
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warpmag: ")]
-    ran = [line.removeprefix("warpmag: warning: ") for line in lines if line.startswith("warpmag: warning: ")]
-    refused = [line.removeprefix("warpmag: ") for line in lines if not line.startswith("warpmag: warning: ")]
-    assert code == (cli.BAD_INPUT if checked["error"] else 0)
-    assert refused == checked["error"][:1]
-    if not refused:
-        assert ran == checked["warning"]
-    return checked["error"], checked["warning"]
-
-
-A, B, C = (ball(name, (0.05 * k, 0.0, 1.0)) for k, name in enumerate("ABC"))
-RIGHT, LEFT = (0.025, 0.0, 0.0), (-0.025, 0.0, 0.0)
-CHAIN = [joint("Spherical", one, other, RIGHT, LEFT, name=one + other) for one, other in ("AB", "BC")]
 COMPOUND = f"""def Xform "Body" (prepend apiSchemas = ["PhysicsRigidBodyAPI"]) {{
     double3 xformOp:translate = (0, 0, 1)
     uniform token[] xformOpOrder = ["xformOp:translate"]
@@ -316,91 +233,6 @@ def test_an_articulation_whose_bodies_pass_through_each_other_stays_one(kept, de
     model = Simulation(path, device=device).model
     inside = model.joint_articulation.numpy()[model.joint_label.index("/World/R/AB")] >= 0
     assert inside == kept
-
-
-REFUSED = {
-    "no magnets": ([physics(), ball("A", (0, 0, 1), magnet=False)], "no magnets: no prim has WarpmagMagnetAPI"),
-    "nothing at all": ([], "no magnets: no prim has WarpmagMagnetAPI"),
-    "two scenes": ([physics(), physics(name="Other"), A], "/World/Other: one PhysicsScene of several"),
-    "a joint to nowhere": (
-        [A, joint("Revolute", "A", "Nowhere", RIGHT, LEFT)],
-        "/World/Joint: physics:body1 names /World/Nowhere, which is not there",
-    ),
-    "a joint of one body": ([A, joint("Revolute", "A", "A", RIGHT, LEFT)], "/World/Joint: both of its ends are on the"),
-    "a joint to two": (
-        [A, B, joint("Revolute", "A", "B", RIGHT, LEFT).replace("</World/B>", "[</World/A>, </World/B>]")],
-        "/World/Joint: physics:body1 names 2 prims",
-    ),
-    "a spacing that is too small": (
-        [physics(), ball("A", (0, 0, 1), "float warpmag:momentSpacing = 1e-5")],
-        "/World/A: warpmag:momentSpacing 1e-05 m needs more than 20000 moments for one body",
-    ),
-    "a saturation beyond single precision": (
-        [physics(), ball("A", (0, 0, 1), "float warpmag:saturationMagnetization = 1e30")],
-        "/World/A: saturation magnetization: must be 1e-12 to 1e+15, got 1e+30",
-    ),
-    **{
-        f"a physics material that is {state}": (
-            [
-                physics(),
-                ball("A", (0, 0, 1), "rel material:binding:physics = </World/Rubber>").replace(
-                    '"PhysicsMassAPI"', '"PhysicsMassAPI", "MaterialBindingAPI"'
-                ),
-                f'{kind} Material "Rubber" ({active} prepend apiSchemas = ["PhysicsMaterialAPI"]) {{}}\n',
-            ],
-            f"/World/A: its physics material /World/Rubber is {state}",
-        )
-        for state, kind, active in (
-            ("inactive", "def", "active = false\n"),
-            ("abstract", "class", ""),
-            ("not defined", "over", ""),
-        )
-    },
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_run_is_told_by_both(case, device, tmp_path, capsys):
-    parts, message = REFUSED[case]
-    path = write(tmp_path, *parts)
-    [error], _ = told(path, tmp_path, device, capsys)
-    assert message in error
-    assert error in map(str, check(path).refusals)  # without Newton
-
-
-WARNED = {
-    "a joint of nothing": ([A, joint("Revolute", None, None, RIGHT, LEFT)], "/World/Joint: joins things that do not"),
-    "a joint of kinematic bodies": (
-        [A, ball("K", (1, 0, 0), kinematic=True, magnet=False), joint("Fixed", "K", None, RIGHT, LEFT)],
-        "/World/Joint: joins things that do not move",
-    ),
-    "an overlap": ([A, ball("B", (1.9 * R, 0, 1))], "1 pair of bodies overlaps at the start"),
-}
-
-
-@pytest.mark.parametrize("case", WARNED)
-def test_warnings_of_both_are_the_same(case, device, tmp_path, capsys):
-    parts, message = WARNED[case]
-    errors, warnings = told(write(tmp_path, *parts), tmp_path, device, capsys)
-    assert errors == []
-    assert any(message in warning for warning in warnings)
-
-
-def test_a_body_that_is_marked_as_a_collider_itself(device, tmp_path, capsys):
-    """An Xform has no shape to collide with, or to fill with moments: those of its children count."""
-    inner = ball("Shape", (0, 0, 0), body=False, magnet=False)
-    schemas = '"PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"'
-    body = f'def Xform "A" (prepend apiSchemas = [{schemas}]) {{\nfloat warpmag:momentSpacing = 0.01\n{inner}}}\n'
-    assert told(write(tmp_path, physics(field=FIELD), body), tmp_path, device, capsys)[0] == []
-
-
-def test_a_broken_rule_of_usd_is_a_warning(device, tmp_path, capsys):
-    path = write(tmp_path, A)
-    path.write_text(path.read_text().replace('defaultPrim = "World"', ""))
-    assert [finding.severity for finding in check(path).errors] == ["error"]
-    errors, [warning] = told(path, tmp_path, device, capsys)
-    assert errors == []
-    assert "missing defaultPrim" in warning
 
 
 def test_a_builder_of_one_static_magnet(device):

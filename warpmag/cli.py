@@ -207,7 +207,7 @@ def _check(options) -> int:
     field = ", ".join(f"{value:g}" for value in settings.external_field)
     laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"
     print(f"magnetics   {laws}, rtol {settings.rtol:g}, external field ({field}) A/m")
-    errors, warnings = list(map(str, report.refusals)), list(map(str, report.warnings))
+    errors, warnings = list(map(str, report.errors)), list(map(str, report.warnings))
     if not errors:
         try:
             warnings = _load(Path(report.path)).warnings()

@@ -1,11 +1,11 @@
-"""The stages that are spoiled: the bundled scenes, small, and two as somebody else would author them."""
+"""The stages that are spoiled: the bundled scenes, small, and three as somebody else would author them."""
 
 import shutil
 from pathlib import Path
 
 from warpmag.scenes_usd import balls_up, crystal_balls, falling_magnet, sakura_tree
 
-STRANGE = [Path(__file__).with_name(name) for name in ("workshop.usda", "laboratory.usda")]
+STRANGE = [Path(__file__).with_name(name) for name in ("workshop.usda", "laboratory.usda", "studio.usda")]
 
 
 def author(folder: Path) -> list[Path]:

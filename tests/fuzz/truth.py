@@ -18,21 +18,33 @@ def differences(path: Path, output: Path, simulation) -> list[str]:
     """Return where a run says other things than its stage; without the simulation, where its cache does."""
     stage, result = Usd.Stage.Open(str(path)), Usd.Stage.Open(str(output))
     reading = Reading(stage)
-    reading = Reading(stage)
-    found = [*not_finite(result), *_poses(reading, result), *_moments(reading, result)]
+    found = [*not_finite(result), *_poses(reading, result), *_instances(reading, result), *_moments(reading, result)]
     if simulation is not None:
         found += [*_masses(reading, simulation), *_shapes(reading, simulation), *_gravity(reading, simulation)]
         found += _sources(reading, simulation)
     return found
 
 
+def _prims_of(stage) -> tuple[list, list]:
+    """Prims that are no prototypes of instancers, and the instancers."""
+    prims, instancers = [], []
+    found = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+    for prim in found:
+        prims.append(prim)
+        if prim.IsA(UsdGeom.PointInstancer):
+            instancers.append(UsdGeom.PointInstancer(prim))
+            found.PruneChildren()
+    return prims, instancers
+
+
 class Reading:
-    """A stage at its start, as plain USD reads it."""
+    """A stage at its start, as plain USD reads it, in its own units."""
 
     def __init__(self, stage):
         self.stage, self.time = stage, Usd.TimeCode(stage.GetStartTimeCode())
         self.transforms = UsdGeom.XformCache(self.time)
-        self.prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+        self.metres, self.kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+        self.prims, self.instancers = _prims_of(stage)
         self.bodies = self.enabled("physics:rigidBodyEnabled", "PhysicsRigidBodyAPI")
         self.colliders = self.enabled("physics:collisionEnabled", "PhysicsCollisionAPI")
 
@@ -71,7 +83,7 @@ class Reading:
         return found
 
     def volume(self, prim) -> float | None:
-        """Volume of a collider [m³], None where its approximation decides."""
+        """Volume of a collider, None where its approximation decides."""
         matrix = self.world(prim)[:3, :3]
         kind, scales = prim.GetTypeName(), np.linalg.norm(matrix, axis=1)
         if kind in ("Capsule", "Cone", "Cylinder", "Sphere") and np.ptp(scales) > 1e-4 * scales.max():
@@ -116,7 +128,7 @@ class Reading:
         return bool(bound and relationship) and self.material(prim) is None
 
     def density(self, prim) -> float:
-        """Density of a collider [kg/m³]: its own, that of what it is part of, its material's, water's."""
+        """Density of a collider: its own, that of what it is part of, its material's, water's."""
         one = prim
         while one and not one.IsPseudoRoot():
             if "PhysicsMassAPI" in one.GetAppliedSchemas() and (own := self.get(one, "physics:density", 0.0)) > 0.0:
@@ -126,14 +138,15 @@ class Reading:
             one = one.GetParent()
         material = self.material(prim)
         given = material and "PhysicsMaterialAPI" in material.GetAppliedSchemas()
-        return (given and self.get(material, "physics:density", 0.0)) or DENSITY
+        own = given and self.get(material, "physics:density", 0.0)
+        return own or DENSITY * self.metres**3 / self.kilograms
 
     def own_mass(self, prim) -> float:
-        """Mass that a prim gives itself [kg], 0 where it does not."""
+        """Mass that a prim gives itself, 0 where it does not."""
         return self.get(prim, "physics:mass", 0.0) if "PhysicsMassAPI" in prim.GetAppliedSchemas() else 0.0
 
     def mass(self, body) -> float | None:
-        """Mass of a body [kg], None where shapes decide that are not known here."""
+        """Mass of a body, None where shapes decide that are not known here."""
         if own := self.own_mass(body):
             return own
         total = 0.0
@@ -180,15 +193,38 @@ def _poses(reading, result):
                 yield f"{name} of {prim.GetPath()}: {found} for {wanted}"
 
 
+def _instances(reading, result):
+    """Compare the places at which bodies of instances start with where USD puts them."""
+    start, kinds = Usd.TimeCode(result.GetStartTimeCode()), UsdGeom.PointInstancer
+    cache = UsdGeom.XformCache(start)
+    for instancer in reading.instancers:
+        kind = instancer.GetProtoIndicesAttr().Get(start) or ()
+        targets = instancer.GetPrototypesRel().GetForwardedTargets()
+        if result.GetPrimAtPath(instancer.GetPath()).IsA(UsdGeom.PointInstancer):
+            continue  # only seen
+        placed = instancer.ComputeInstanceTransformsAtTime(start, start, kinds.IncludeProtoXform, kinds.IgnoreMask)
+        above = reading.transforms.GetLocalToWorldTransform(instancer.GetPrim())
+        for row, matrix in enumerate(placed):
+            root = reading.stage.GetPrimAtPath(targets[kind[row]])
+            prim = result.GetPrimAtPath(f"{instancer.GetPath()}/instance{row}/{root.GetName()}")
+            if not prim or root.IsA(UsdGeom.PointInstancer):  # inactive
+                continue
+            given, found = np.array(matrix * above), np.array(cache.GetLocalToWorldTransform(prim))
+            size = np.abs(given[3, :3]).max() + np.linalg.norm(given[:3, :3], axis=1).max()
+            if not np.abs(given - found).max() <= 2e-3 * size:  # half-precision quaternions
+                yield f"pose of {prim.GetPath()}: {np.abs(given - found).max():g} off"
+
+
 def _masses(reading, simulation):
     model, numbers = simulation.model, simulation._scene.bodies
     masses, inverses = model.body_mass.numpy(), model.body_inv_mass.numpy()
     bodies = {str(prim.GetPath()) for prim in (*reading.bodies, *reading.driven())}
-    if set(numbers) != bodies:
+    if set(numbers) != bodies and not (reading.instancers and set(numbers) > bodies):
         yield f"bodies: {len(numbers)} in the model, {len(bodies)} on the stage"
         return
     for prim in reading.bodies:
         wanted, found = reading.mass(prim), masses[numbers[str(prim.GetPath())]]
+        wanted = None if wanted is None else reading.kilograms * wanted
         if wanted is not None and not math.isclose(wanted, found, rel_tol=1e-3):
             yield f"mass of {prim.GetPath()}: {found:g} for {wanted:g}"
         if not (math.isfinite(found) and np.isfinite(inverses).all()):
@@ -208,7 +244,7 @@ def _shapes(reading, simulation):
                 yield f"collider {prim.GetPath()} is not in the model"
             continue
         if prim.IsA(UsdGeom.Sphere):
-            wanted = reading.get(prim, "radius") * np.linalg.norm(reading.world(prim)[0, :3])
+            wanted = reading.metres * reading.get(prim, "radius") * np.linalg.norm(reading.world(prim)[0, :3])
             if not math.isclose(wanted, scales[index][0], rel_tol=1e-4):
                 yield f"radius of {prim.GetPath()}: {scales[index][0]:g} for {wanted:g}"
         material = reading.material(prim)
@@ -228,7 +264,7 @@ def _gravity(reading, simulation):
     strength = reading.get(scenes[0], "physics:gravityMagnitude", -math.inf)
     direction = np.array(reading.get(scenes[0], "physics:gravityDirection", (0.0, 0.0, 0.0)), dtype=float)
     direction = direction / np.linalg.norm(direction) if direction.any() else -np.array(up)
-    wanted = direction * (9.81 if strength < 0.0 else strength)
+    wanted = direction * (9.81 if strength < 0.0 else reading.metres * strength)
     found = simulation.model.gravity.numpy()[0]
     if not np.allclose(wanted, found, rtol=1e-3, atol=1e-6):
         yield f"gravity {found} for {wanted}"
@@ -250,7 +286,10 @@ def _sources(reading, simulation):
         if index is None:
             yield f"source {prim.GetPath()} is not in the model"
             continue
-        wanted, found = reading.world(prim)[3, :3], (_matrix(frames[index]) @ poses[bodies[index] + 1])[3, :3]
+        wanted, found = (
+            reading.metres * reading.world(prim)[3, :3],
+            (_matrix(frames[index]) @ poses[bodies[index] + 1])[3, :3],
+        )
         if not np.allclose(wanted, found, rtol=1e-4, atol=1e-4 * np.abs(wanted).max() + 1e-9):
             yield f"place of {prim.GetPath()}: {found} for {wanted}"
         name, usual = {
@@ -296,7 +335,8 @@ def _moments(reading, result):
         if len(volumes) != 1 or None in volumes:  # several may overlap
             continue
         before, after = (_turn(one, result.GetPrimAtPath(prim.GetPath())) for one in caches)
-        given = np.array(reading.get(prim, "warpmag:magnetization", (0.0, 0.0, 0.0)), dtype=float) * volumes[0]
+        given = np.array(reading.get(prim, "warpmag:magnetization", (0.0, 0.0, 0.0)), dtype=float)
+        given *= volumes[0] * reading.metres**3
         size = np.linalg.norm(given)
         spin = reading.above(prim) and result.GetPrimAtPath(reading.above(prim).GetPath()).GetAttribute(WRITTEN[1]).Get(
             end

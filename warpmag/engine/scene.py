@@ -76,8 +76,8 @@ def import_scene(
     """
     stage = open_stage(path, time_code)
     report = inspect(stage, path)
-    if report.refusals:
-        raise InputError(str(report.refusals[0]))
+    if report.errors:
+        raise InputError(str(report.errors[0]))
     clock, contents = report.clock, report.contents
     assert clock is not None, "a clock that is wrong is a reason to refuse"
     strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)

@@ -1,15 +1,17 @@
 """What a stage holds and what is wrong with it, for ``warpmag check``."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdValidation
+from pxr import Tf, Usd, UsdGeom, UsdValidation
 
 from warpmag.errors import InputError
 from warpmag.usd.clock import StageClock, stage_clock, stage_name
 from warpmag.usd.guard import readable
 from warpmag.usd.joints import joint_findings
 from warpmag.usd.reader import StageContents, open_stage, survey
+from warpmag.usd.session import file_of
+from warpmag.usd.units import units_of
 from warpmag.usd.values import Finding, quiet
 
 _SEVERITIES = {"Error": "error", "Warn": "warning"}
@@ -27,7 +29,7 @@ class StageReport:
         clock: How time runs, None where that is wrong.
         contents: Bodies, colliders, magnets and settings.
         findings: All that is wrong, the findings of ``UsdValidation`` included; errors before warnings.
-        refusals: The findings for which a run refuses the stage.
+        broken_rules: What ``UsdValidation`` calls an error. A stage that breaks a rule of USD runs: it is a warning.
     """
 
     path: str
@@ -37,17 +39,17 @@ class StageReport:
     clock: StageClock | None
     contents: StageContents
     findings: tuple[Finding, ...]
-    refusals: tuple[Finding, ...]
+    broken_rules: tuple[Finding, ...]
 
     @property
     def errors(self) -> tuple[Finding, ...]:
-        """The findings for which a run would refuse the stage, or that break a rule of USD."""
+        """The findings for which a run refuses the stage."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
         """The findings with which a stage still runs, broken rules of USD among them."""
-        return tuple(finding for finding in self.findings if finding not in self.refusals)
+        return tuple(finding for finding in self.findings if finding.severity != "error")
 
     def magnets(self, kind: str) -> list[str]:
         """Paths of the magnets of one kind, ``inducible`` or ``permanent``."""
@@ -83,17 +85,17 @@ def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
         clock = None
         where, _, message = str(error).rpartition(": ")
         findings.append(Finding(where, message))
-    refusals = tuple(dict.fromkeys(finding for finding in findings if finding.severity == "error"))
-    findings += validate(stage)
+    rules, units = validate(file_of(stage)), units_of(stage)
+    findings += [replace(one, severity="warning") for one in rules]
     return StageReport(
         path=str(path),
-        metres_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
-        kilograms_per_unit=UsdPhysics.GetStageKilogramsPerUnit(stage),
+        metres_per_unit=units.metres,
+        kilograms_per_unit=units.kilograms,
         up_axis=UsdGeom.GetStageUpAxis(stage),
         clock=clock,
         contents=contents,
         findings=tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")),
-        refusals=refusals,
+        broken_rules=tuple(one for one in rules if one.severity == "error"),
     )
 
 

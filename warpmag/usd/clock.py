@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pxr import Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
+from warpmag.usd.units import units_of
 from warpmag.usd.values import Finding, value_of
 
 _RATES = (1e-3, 1e6)
@@ -68,30 +69,16 @@ def scenes(stage: Usd.Stage) -> list[Usd.Prim]:
 
 
 def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
-    """Yield what the units of a stage get refused for: Newton's importer does not convert any."""
-    metres = UsdGeom.GetStageMetersPerUnit(stage)
-    kilograms = UsdPhysics.GetStageKilogramsPerUnit(stage)
-    name = stage_name(stage)
-    for what, unit in (("metersPerUnit", metres), ("kilogramsPerUnit", kilograms)):
+    """Yield what is wrong with the units of a stage, and which length it has only by USD's default."""
+    units, name = units_of(stage), stage_name(stage)
+    for what, unit in (("metersPerUnit", units.metres), ("kilogramsPerUnit", units.kilograms)):
         if not 1e-50 < unit < 1e50:
             yield Finding(name, f"{what} must be positive and finite, got {unit:g}")
     if (up := UsdGeom.GetStageUpAxis(stage)) not in ("Y", "Z"):
         yield Finding(name, f"upAxis must be Y or Z, got {up!r}")
-    if not math.isclose(metres, 1.0) and 1e-50 < metres < 1e50:
-        given = f"metersPerUnit is {metres:g}"
-        if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-            given = f"metersPerUnit is not set, which in USD means {metres:g}"
-        yield Finding(
-            name,
-            f"{given}, only metres are read; to convert, multiply lengths, velocities and gravity by {metres:g}, "
-            f"densities by {metres**-3:g} and inertias by {metres**2:g}, and set metersPerUnit = 1",
-        )
-    if not math.isclose(kilograms, 1.0) and 1e-50 < kilograms < 1e50:
-        yield Finding(
-            name,
-            f"kilogramsPerUnit is {kilograms:g}, only kilograms are read; to convert, multiply masses, densities and "
-            f"inertias by {kilograms:g} and set kilogramsPerUnit = 1",
-        )
+    if not stage.GetRootLayer().pseudoRoot.HasInfo("metersPerUnit"):
+        message = f"metersPerUnit is not set, which in USD means {units.metres:g}: lengths are taken for so many metres"
+        yield Finding(name, message, "warning")
 
 
 def _step(stage) -> float | None:

@@ -97,6 +97,7 @@ _MAP = {
     "factor": ("warpmag:fieldMap:factor", number, _NAMES.Float),
 }
 _VARYING = ("ampere_turns",)
+COIL_NAMES, MAP_NAMES = (tuple(name for name, _, _ in one.values()) for one in (_COIL, _MAP))
 
 
 def author_coil(prim: Usd.Prim, coil: Coil) -> None:
@@ -131,18 +132,6 @@ def _author(prim, api, attributes, values) -> None:
 def is_source(prim: Usd.Prim) -> bool:
     """Whether a prim is a coil or a field map."""
     return has_api(prim, COIL_API) or has_api(prim, MAP_API)
-
-
-def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield which attributes of coils and field maps a prim has for nothing."""
-    for api, attributes in ((COIL_API, _COIL), (MAP_API, _MAP)):
-        known = {name for name, _, _ in attributes.values()}
-        namespace = min(known).rpartition(":")[0]
-        for name in map(Usd.Property.GetName, prim.GetAuthoredPropertiesInNamespace(namespace)):
-            if name not in known:
-                yield Finding(str(prim.GetPath()), f"{name} has no effect: no schema has it", "warning")
-            elif not has_api(prim, api):
-                yield Finding(str(prim.GetPath()), f"{name} has no effect: the prim has no {api}", "warning")
 
 
 def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> Iterator[PlacedSource | Finding]:

@@ -1,6 +1,6 @@
 """Reads what a stage gives time samples for and a run follows: transforms of kinematic bodies, fields, magnetizations.
 
-Samples are read from the stage without its session layer, whose held values would hide them. What moves by keys and is
+Samples are read from the stage without what its session holds, which would hide them. What moves by keys and is
 no rigid body, as artists leave it, becomes a kinematic one there.
 """
 
@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
 from warpmag.keyed import Keys, Motion, Operation
+from warpmag.usd.session import without_held
 from warpmag.usd.transforms import is_animated, is_body, is_collider
 from warpmag.usd.values import LARGEST_COORDINATE, Finding
 
@@ -29,8 +30,8 @@ class KeyReader:
 
     @cached_property
     def plain(self) -> Usd.Stage:
-        """The stage without its session layer."""
-        return Usd.Stage.Open(self._stage.GetRootLayer(), None)
+        """The stage without the values that are held."""
+        return without_held(self._stage)
 
     def moves(self, prim: Usd.Prim, within: Usd.Prim | None = None) -> bool:
         """Whether keys move a prim, or what is above it, in the world or within another prim above it."""
@@ -142,9 +143,9 @@ def make_kinematic(stage: Usd.Stage, animated: Iterable[Sdf.Path]) -> None:
 
 
 def _belongs(prim: Usd.Prim, found: list[Sdf.Path]) -> bool:
-    """Whether a prim is a rigid body, to be one, or part of one, or of a point instancer, which Newton leaves out."""
+    """Whether a prim is a rigid body, to be one, or part of one."""
     while prim and not prim.IsPseudoRoot():
-        if is_body(prim) or prim.GetPath() in found or prim.IsA(UsdGeom.PointInstancer):
+        if is_body(prim) or prim.GetPath() in found:
             return True
         prim = prim.GetParent()
     return False

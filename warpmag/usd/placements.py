@@ -14,9 +14,9 @@ class Placed:
     """What the prims of bodies get, rows in their order.
 
     Attributes:
-        positions: Translations in the parents [m], float64, shape [n, 3].
+        positions: Translations in the parents [units of the stage], float64, shape [n, 3].
         turns: Orientations in the parents, quaternions x y z w, float32, shape [n, 4].
-        linear: Velocities in the bodies' frames [m/s], float32, shape [n, 3].
+        linear: Velocities in the bodies' frames [units of the stage/s], float32, shape [n, 3].
         angular: Angular velocities there [degrees/s], float32, shape [n, 3].
     """
 
@@ -35,9 +35,9 @@ class Placements:
         free: Whether each must leave its parent's transform behind, shape [n].
     """
 
-    def __init__(self, stage: Usd.Stage, paths: Sequence[str]):
-        """Look at the prims ``paths`` and what is above them."""
-        self.paths = list(paths)
+    def __init__(self, stage: Usd.Stage, paths: Sequence[str], unit: float = 1.0):
+        """Look at the prims ``paths`` and what is above them, which get lengths in a ``unit`` [m]."""
+        self.paths, self._unit = list(paths), unit
         self._transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
         moving, count = set(self.paths), len(self.paths)
         self.scales, self.free = np.ones((count, 3)), np.zeros(count, dtype=bool)
@@ -94,7 +94,9 @@ class Placements:
             turns[below] = _product(self._turn_into, turns[below])
         if last_turns is not None:
             turns *= np.where(_dot(turns, last_turns) < 0.0, -1.0, 1.0)
-        return Placed(positions, *(values.astype(np.float32) for values in (turns, linear, angular)))
+        return Placed(
+            positions / self._unit, *(values.astype(np.float32) for values in (turns, linear / self._unit, angular))
+        )
 
 
 def _scale(matrix) -> float:

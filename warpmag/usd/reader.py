@@ -2,7 +2,8 @@
 
 Everything that Newton's importer would read wrong without a word is found here and refused before Newton sees any of
 it: values by ``values.py``, transforms by ``transforms.py``, sizes and meshes by ``geometry.py``, units and time by
-``clock.py``; here are bodies inside a PointInstancer and magnets that are none.
+``clock.py``; here are magnets that are none. Point instancers become prims (``instancers.py``), and other units than
+metres and kilograms are converted (``units.py``), in layers of the session (``session.py``).
 """
 
 import os
@@ -17,10 +18,11 @@ from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
-from warpmag.usd.coils import PlacedSource, is_source, sources_of, stray_findings
+from warpmag.usd.coils import PlacedSource, is_source, sources_of
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
+from warpmag.usd.instancers import expand_instancers
 from warpmag.usd.keyed import KeyReader, make_kinematic
 from warpmag.usd.materials import material_findings
 from warpmag.usd.paths import full_path, usable_path
@@ -34,7 +36,9 @@ from warpmag.usd.schemas import (
     moment_of,
     settings_of,
 )
+from warpmag.usd.slips import kind_findings, stray_findings
 from warpmag.usd.transforms import TransformCheck, is_body, is_collider
+from warpmag.usd.units import convert_units
 from warpmag.usd.values import (
     Finding,
     attribute_findings,
@@ -91,7 +95,8 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
         time_code: The moment at which bodies stand; by default the start of the stage.
 
     Returns:
-        The stage. Its layers are untouched; only the session layer holds the values of that moment.
+        The stage in metres and kilograms, with a prim for each instance of a body. Its layers are untouched; all that
+        is in its session, which holds the values of that moment, too.
 
     Raises:
         InputError: The file is missing, is not USD or does not compose.
@@ -111,7 +116,10 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     if broken:
         raise InputError(f"{path}: {' '.join(_SESSION.sub('', broken[0]).split())}")
     with readable(str(path)):
-        hold(stage, start_of(stage) if time_code is None else time_code)
+        time_code = start_of(stage) if time_code is None else time_code
+        expand_instancers(stage, time_code)
+        convert_units(stage)
+        hold(stage, time_code)
     return stage
 
 
@@ -211,17 +219,15 @@ def survey(stage: Usd.Stage) -> StageContents:
     contents = StageContents()
     contents.findings += [*_metadata_findings(stage), *unit_findings(stage)]
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
-    inside = _instanced_prims(stage, prims, contents.findings)
     transforms, keys = TransformCheck(), KeyReader(stage)
     for prim in prims:
-        if str(prim.GetPath()) not in inside:
-            _read_prim(prim, transforms, keys, contents)
+        _read_prim(prim, transforms, keys, contents)
     _read_scene(stage, prims, keys, contents)
     for prim in prims:
-        if has_api(prim, MAGNET_API) and str(prim.GetPath()) not in inside:
+        if has_api(prim, MAGNET_API):
             _read_magnet(prim, transforms, keys, contents)
         contents.findings += stray_findings(prim)
-        if is_source(prim) and str(prim.GetPath()) not in inside:
+        if is_source(prim):
             _read_sources(prim, transforms, keys, contents)
     contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
@@ -279,35 +285,6 @@ def _read_motion(prim, keys, contents) -> Iterator[Finding]:
         yield finding_of(path, error)
 
 
-def _instanced_prims(stage, prims, findings) -> set[str]:
-    """Refuse bodies and magnets in point instancers; return the paths of all prims that belong to an instancer."""
-    inside = set()
-    for prim in prims:
-        if not prim.IsA(UsdGeom.PointInstancer):
-            continue
-        targets = UsdGeom.PointInstancer(prim).GetPrototypesRel().GetForwardedTargets()
-        roots = [prim, *(root for root in map(stage.GetPrimAtPath, targets) if root)]
-        held = {one.GetPath(): one for root in roots for one in Usd.PrimRange(root, Usd.PrimAllPrimsPredicate)}
-        inside |= {str(path) for path in held}
-        if any(one.HasAPI(UsdPhysics.RigidBodyAPI) or _is_magnetic(one) for one in held.values()):
-            findings.append(
-                Finding(
-                    str(prim.GetPath()),
-                    "a PointInstancer of rigid bodies or magnets: Newton imports no bodies from an instancer; "
-                    "give each body a prim of its own",
-                )
-            )
-        elif any(one.HasAPI(UsdPhysics.CollisionAPI) for one in held.values()):
-            findings.append(
-                Finding(str(prim.GetPath()), "Newton imports no colliders from a PointInstancer", "warning")
-            )
-    return inside
-
-
-def _is_magnetic(prim) -> bool:
-    return has_api(prim, MAGNET_API) or is_source(prim)
-
-
 def _read_scene(stage, prims, keys, contents) -> None:
     """Read the magnetic settings of the first physics scene, the one that Newton takes."""
     found = scenes(stage)
@@ -339,9 +316,10 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
     elif not body and (owner := _body_above(prim)) and has_api(owner, MAGNET_API):
         contents.findings.append(Finding(path, f"its rigid body {owner.GetPath()} is a magnet already"))
     try:
-        contents.magnets[path] = magnet_of(prim)
-        if curve := magnetization_keys(prim, contents.magnets[path], keys):
+        contents.magnets[path] = magnet = magnet_of(prim)
+        if curve := magnetization_keys(prim, magnet, keys):
             contents.magnetization_keys[path] = curve
+        contents.findings += kind_findings(prim, magnet, keyed=curve is not None)
         if moment := moment_of(prim):
             contents.initial_moments[path] = moment
     except InputError as error:

@@ -49,6 +49,8 @@ _SETTINGS_ATTRIBUTES = {
     "contact_model": "warpmag:contactModel",
     "rtol": "warpmag:rtol",
 }
+MAGNET_NAMES = (*_MAGNET_ATTRIBUTES.values(), MATERIAL, *CURVE_POINTS, MOMENT)
+SCENE_NAMES = tuple(_SETTINGS_ATTRIBUTES.values())
 
 
 def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:

@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from warpmag.errors import InputError
 from warpmag.usd.clock import stage_clock
@@ -28,6 +28,8 @@ from warpmag.usd.reader import copied_metadata
 from warpmag.usd.samples import END_MARK, SampleFile, time_mark
 from warpmag.usd.scene_copy import copy_scene
 from warpmag.usd.schemas import MOMENT
+from warpmag.usd.session import INSTANCES, added_layer, as_written
+from warpmag.usd.units import units_of
 
 _TRANSLATE, _ORIENT, _SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
 _TYPES = Sdf.ValueTypeNames
@@ -103,13 +105,13 @@ class CacheWriter:
         Raises:
             InputError: The path has another suffix, cannot be written or would overwrite a layer of the scene.
         """
-        self._stage = stage
+        self._stage, self._units = stage, units_of(stage)
         self._clock = stage_clock(stage)
         self._copy_scene = copy_scene or stage.GetRootLayer().anonymous
         scene = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
         self._output = Output(path, scene, copy_scene=self._copy_scene)
         self._magnet_paths = list(magnet_paths)
-        self._bodies = Placements(stage, body_paths)
+        self._bodies = Placements(stage, body_paths, self._units.metres)
         self._counts = [len(self._bodies.paths)] * len(_BODY) + [len(self._magnet_paths)]
         self._frames, self._options = frames, options or {}
         self._samples: SampleFile | None = None
@@ -337,8 +339,8 @@ class CacheWriter:
 
     def _set_metadata(self, layer, end: float) -> None:
         """Repeat on ``layer`` what says how the numbers of the scene are meant."""
-        layer.pseudoRoot.SetInfo("metersPerUnit", UsdGeom.GetStageMetersPerUnit(self._stage))
-        layer.pseudoRoot.SetInfo("kilogramsPerUnit", UsdPhysics.GetStageKilogramsPerUnit(self._stage))
+        layer.pseudoRoot.SetInfo("metersPerUnit", self._units.metres)
+        layer.pseudoRoot.SetInfo("kilogramsPerUnit", self._units.kilograms)
         layer.pseudoRoot.SetInfo("upAxis", UsdGeom.GetStageUpAxis(self._stage))
         layer.timeCodesPerSecond = self._clock.time_codes_per_second  # equal in all layers: USD rescales otherwise
         layer.framesPerSecond = self._clock.frames_per_second
@@ -357,12 +359,15 @@ class CacheWriter:
     def _cache_layer(self, values: list[np.ndarray]) -> Sdf.Layer:
         """Return the layer with the first frame, with room for samples."""
         cache = Sdf.Layer.CreateAnonymous()
+        if instances := added_layer(self._stage, INSTANCES):
+            cache.TransferContent(instances)
         self._set_metadata(cache, END_MARK)
         cache.customLayerData = {"warpmag": self._about}
         bodies, paths = self._bodies, [*[self._bodies.paths] * len(_BODY), self._magnet_paths]
+        scene = as_written(self._stage)
         with Sdf.ChangeBlock():
             for path in (*bodies.paths, *self._magnet_paths):
-                _over(cache, self._stage, path)
+                _over(cache, scene, path)
             number = itertools.count()
             for kind, prims, first in zip(_KINDS, paths, values, strict=True):
                 for path, value in zip(prims, kind.array.FromNumpy(np.ascontiguousarray(first)), strict=True):
@@ -396,7 +401,8 @@ def _over(layer, stage, path) -> None:
 
 def _author_default(layer, path, name, kind, value, variability=Sdf.VariabilityVarying) -> Sdf.Path:
     place = Sdf.Path(f"{path}.{name}")
-    Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, variability, False)
+    if not layer.GetAttributeAtPath(place):  # an instance may have it
+        Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, variability, False)
     layer.GetAttributeAtPath(place).default = value
     return place
 

@@ -1,0 +1,156 @@
+"""What cannot run, and what a user should know of a stage, is told alike by ``check`` and ``run``."""
+
+import pytest
+from pxr import Usd, UsdGeom, UsdPhysics
+from small_stages import FIELD, LEFT, RIGHT, A, B, R, ball, joint, physics, told, write
+
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.usd import author_magnet, author_settings, check
+
+OPEN = """def Mesh "Open" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI",
+    "PhysicsMeshCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"]) {{
+    float physics:mass = 0.1
+    uniform token physics:approximation = "{approximation}"
+    point3f[] points = [(0, 0, 1), (0.01, 0, 1), (0, 0.01, 1), (0, 0, 1.01)]
+    int[] faceVertexCounts = [3, 3, 3]
+    int[] faceVertexIndices = [0, 2, 1, 0, 1, 3, 1, 2, 3]
+}}
+"""
+REFUSED = {
+    "no magnets": ([physics(), ball("A", (0, 0, 1), magnet=False)], "no magnets: no prim has WarpmagMagnetAPI"),
+    "nothing at all": ([], "no magnets: no prim has WarpmagMagnetAPI"),
+    "two scenes": ([physics(), physics(name="Other"), A], "/World/Other: one PhysicsScene of several"),
+    "a joint to nowhere": (
+        [A, joint("Revolute", "A", "Nowhere", RIGHT, LEFT)],
+        "/World/Joint: physics:body1 names /World/Nowhere, which is not there",
+    ),
+    "a joint of one body": ([A, joint("Revolute", "A", "A", RIGHT, LEFT)], "/World/Joint: both of its ends are on the"),
+    "a joint to two": (
+        [A, B, joint("Revolute", "A", "B", RIGHT, LEFT).replace("</World/B>", "[</World/A>, </World/B>]")],
+        "/World/Joint: physics:body1 names 2 prims",
+    ),
+    "a spacing that is too small": (
+        [physics(), ball("A", (0, 0, 1), "float warpmag:momentSpacing = 1e-5")],
+        "/World/A: warpmag:momentSpacing 1e-05 m needs more than 20000 moments for one body",
+    ),
+    "an open mesh": (
+        [physics(), OPEN.format(approximation="none")],
+        "/World/Open: mesh: not closed and consistently oriented",
+    ),
+    "a saturation beyond single precision": (
+        [physics(), ball("A", (0, 0, 1), "float warpmag:saturationMagnetization = 1e30")],
+        "/World/A: saturation magnetization: must be 1e-12 to 1e+15, got 1e+30",
+    ),
+    **{
+        f"a physics material that is {state}": (
+            [
+                physics(),
+                ball("A", (0, 0, 1), "rel material:binding:physics = </World/Rubber>").replace(
+                    '"PhysicsMassAPI"', '"PhysicsMassAPI", "MaterialBindingAPI"'
+                ),
+                f'{kind} Material "Rubber" ({active} prepend apiSchemas = ["PhysicsMaterialAPI"]) {{}}\n',
+            ],
+            f"/World/A: its physics material /World/Rubber is {state}",
+        )
+        for state, kind, active in (
+            ("inactive", "def", "active = false\n"),
+            ("abstract", "class", ""),
+            ("not defined", "over", ""),
+        )
+    },
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_run_is_told_by_both(case, device, tmp_path, capsys):
+    parts, message = REFUSED[case]
+    path = write(tmp_path, *parts)
+    [error], _ = told(path, tmp_path, device, capsys)
+    assert message in error
+    assert error in map(str, check(path).errors)  # without Newton
+
+
+WARNED = {
+    "a joint of nothing": ([A, joint("Revolute", None, None, RIGHT, LEFT)], "/World/Joint: joins things that do not"),
+    "a joint of kinematic bodies": (
+        [A, ball("K", (1, 0, 0), kinematic=True, magnet=False), joint("Fixed", "K", None, RIGHT, LEFT)],
+        "/World/Joint: joins things that do not move",
+    ),
+    "an overlap": ([A, ball("B", (1.9 * R, 0, 1))], "1 pair of bodies overlaps at the start"),
+}
+
+
+@pytest.mark.parametrize("case", WARNED)
+def test_warnings_of_both_are_the_same(case, device, tmp_path, capsys):
+    parts, message = WARNED[case]
+    errors, warnings = told(write(tmp_path, *parts), tmp_path, device, capsys)
+    assert errors == []
+    assert any(message in warning for warning in warnings)
+
+
+SLIPS = {
+    "/World/Spelt": (
+        'uniform token warpmag:kind = "permanent"\nvector3f warpmag:magnetisation = (0, 0, 1e6)',
+        "warpmag:magnetisation has no effect: no schema has it, the nearest is warpmag:magnetization",
+        "a permanent magnet without magnetization: warpmag:magnetization says it, or warpmag:material its strength",
+    ),
+    "/World/Soft": (
+        "vector3f warpmag:magnetization = (0, 0, 1e6)\nfloat warpmag:recoilPermeability = 1.05",
+        "warpmag:magnetization has no effect on an inducible magnet: warpmag:kind says what it is",
+        "warpmag:recoilPermeability has no effect on an inducible magnet: warpmag:kind says what it is",
+    ),
+    "/World/Bare": (
+        "float warpmag:saturationMagnetization = 1e6\nfloat warpmag:rtol = 1e-2",
+        "warpmag:saturationMagnetization has no effect: the prim has no WarpmagMagnetAPI",
+        "warpmag:rtol has no effect: the prim has no WarpmagSceneAPI",
+        "WarpMagMagnetAPI has no effect: there is no such schema, the nearest is WarpmagMagnetAPI",
+    ),
+}
+
+
+def test_slips_are_warnings_of_both(device, tmp_path, capsys):
+    parts = [
+        ball(path.rpartition("/")[2], (0.1 * number, 0, 1), lines, magnet="Bare" not in path)
+        for number, (path, (lines, *_)) in enumerate(SLIPS.items())
+    ]
+    parts[-1] = parts[-1].replace('"PhysicsMassAPI"', '"PhysicsMassAPI", "WarpMagMagnetAPI"')
+    parts.append(OPEN.format(approximation="convexHull"))
+    errors, warnings = told(write(tmp_path, physics(), *parts), tmp_path, device, capsys)
+    assert errors == []
+    expected = {f"{path}: {message}" for path, (_, *messages) in SLIPS.items() for message in messages}
+    assert expected <= set(warnings)
+    [mesh] = [one for one in warnings if one.startswith("/World/Open: mesh: not closed")]
+    assert "the convexHull that it collides as is magnetized in its place" in mesh
+
+
+def test_what_goes_together_is_no_slip(device, tmp_path, capsys):
+    """All attributes authored, as ``author_magnet`` does, and magnets that are switched on later."""
+    stage = Usd.Stage.CreateInMemory()
+    for name, magnet in (("A", Magnet()), ("B", Magnet("permanent", magnetization=(0.0, 0.0, 1e5)))):
+        prim = stage.DefinePrim(f"/{name}", "Sphere")
+        for api in (UsdPhysics.RigidBodyAPI, UsdPhysics.CollisionAPI):
+            api.Apply(prim)
+        author_magnet(prim, magnet)
+    stage.GetPrimAtPath("/B").GetAttribute("warpmag:magnetization").Set((0, 0, 0), 0.0)
+    stage.GetPrimAtPath("/B").GetAttribute("warpmag:magnetization").Set((0, 0, 1e5), 10.0)
+    author_settings(UsdPhysics.Scene.Define(stage, "/Scene").GetPrim(), MagneticSettings())
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.GetRootLayer().Export(str(tmp_path / "scene.usda"))
+    assert check(tmp_path / "scene.usda").contents.findings == []
+
+
+def test_a_body_that_is_marked_as_a_collider_itself(device, tmp_path, capsys):
+    """An Xform has no shape to collide with, or to fill with moments: those of its children count."""
+    inner = ball("Shape", (0, 0, 0), body=False, magnet=False)
+    schemas = '"PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"'
+    body = f'def Xform "A" (prepend apiSchemas = [{schemas}]) {{\nfloat warpmag:momentSpacing = 0.01\n{inner}}}\n'
+    assert told(write(tmp_path, physics(field=FIELD), body), tmp_path, device, capsys)[0] == []
+
+
+def test_a_broken_rule_of_usd_is_a_warning(device, tmp_path, capsys):
+    path = write(tmp_path, A)
+    path.write_text(path.read_text().replace('defaultPrim = "World"', ""))
+    assert check(path).errors == () and len(check(path).broken_rules) == 1
+    errors, [warning] = told(path, tmp_path, device, capsys)
+    assert errors == []
+    assert "missing defaultPrim" in warning

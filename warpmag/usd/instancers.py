@@ -1,0 +1,298 @@
+"""Point instancers of bodies: Newton imports nothing from them, so each instance becomes prims of its own.
+
+They lie in a layer of the session, below the instancer, which is an Xform there: ``/Balls/instance12/Ball`` with a
+reference to the prototype. A run copies that layer into its cache, in which the instances then move one by one.
+Instances with an inactive id are left out, invisible ones are not. What instancers of colliders, bodies or magnets need
+not be made of stays as it is.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+
+from warpmag.errors import InputError
+from warpmag.usd.first_reading import MOST_PRIMS
+from warpmag.usd.session import INSTANCES, add_layer, new_layer
+from warpmag.usd.transforms import is_body, is_collider
+
+_TYPES = Sdf.ValueTypeNames
+_NAME = "instance"
+_OPERATIONS = (
+    ("xformOp:translate", "positions", _TYPES.Double3),
+    ("xformOp:orient", "orientations", _TYPES.Quatf),
+    ("xformOp:scale", "scales", _TYPES.Float3),
+)
+"""What moves an instance, in the order of operations, the array of the instancer and the type of a value."""
+_RESET = "!resetXformStack!"
+
+
+def expand_instancers(stage: Usd.Stage, time_code: float) -> None:
+    """Let a stage have a prim for each instance of what is physical, by a layer of its session.
+
+    Args:
+        stage: The stage.
+        time_code: The moment at which instances stand, those left out whose transforms are followed over time.
+
+    Raises:
+        InputError: An instancer is not what USD says one must be, or stands for too many prims.
+    """
+    expansion = _Expansion(stage, time_code)
+    prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    found = [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]
+    for path in found:
+        expansion.expand(path)
+
+
+def _is_physical(prim: Usd.Prim) -> bool:
+    schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+    return any(one.startswith(("PhysicsRigidBody", "PhysicsCollision", "Warpmag")) for one in schemas)
+
+
+@dataclass(frozen=True)
+class _Prototype:
+    """What instances are made of.
+
+    Attributes:
+        path: Its root.
+        name: Name of its root.
+        order: Its operations where it would leave the transform of its instance behind, else None.
+        bodies: Rigid bodies in it, by their path below the root, and their transforms there.
+        prims: How many prims it has.
+    """
+
+    path: Sdf.Path
+    name: str
+    order: list[str] | None
+    bodies: tuple[tuple[Sdf.Path, Gf.Matrix4d], ...]
+    prims: int
+
+
+class _Expansion:
+    """Expands the instancers of one stage, those first that are in prototypes of others."""
+
+    def __init__(self, stage: Usd.Stage, time_code: float):
+        self._stage, self._time = stage, time_code
+        self._layer: Sdf.Layer | None = None
+        self._done: set[Sdf.Path] = set()
+        self._prims = 0
+
+    def expand(self, path: Sdf.Path, within: tuple[Sdf.Path, ...] = ()) -> None:
+        """Expand an instancer, in prototypes of those ``within``, unless it is only seen."""
+        if path in within:
+            raise InputError(f"{path}: a PointInstancer that is part of its own prototypes")
+        if path in self._done:
+            return
+        instancer = UsdGeom.PointInstancer(self._editable(path))
+        targets = instancer.GetPrototypesRel().GetForwardedTargets()
+        roots = [self._prototype_prim(path, target) for target in targets]
+        held = [one for root in (instancer.GetPrim(), *roots) for one in _all_below(root)]
+        if not any(map(_is_physical, held)):
+            return
+        inner = [one.GetPath() for root in roots for one in _all_below(root) if one.IsA(UsdGeom.PointInstancer)]
+        for one in inner:
+            self.expand(one, (*within, path))
+        self._write(UsdGeom.PointInstancer.Get(self._stage, path), targets)
+        self._done.add(path)
+
+    def _layer_of_prims(self) -> Sdf.Layer:
+        """Return the layer, part of the stage from the first time on."""
+        if self._layer is None:
+            self._layer = new_layer(INSTANCES)
+            add_layer(self._stage, self._layer)
+        return self._layer
+
+    def _editable(self, path: Sdf.Path) -> Usd.Prim:
+        """Return the prim at a path, no longer in an instance."""
+        while (prim := self._stage.GetPrimAtPath(path)) and prim.IsInstanceProxy():
+            if not any(_is_physical(one) for one in _all_below(prim)):
+                break  # only seen, or what it has is elsewhere, which must not be in an instance
+            while not prim.IsInstance():
+                prim = prim.GetParent()
+            Sdf.CreatePrimInLayer(self._layer_of_prims(), prim.GetPath()).instanceable = False
+        return prim
+
+    def _prototype_prim(self, instancer: Sdf.Path, target: Sdf.Path) -> Usd.Prim:
+        if not target.IsPrimPath() or not (prim := self._editable(target)):
+            raise InputError(f"{instancer}: prototypes names {target}, which is not there")
+        return prim
+
+    def _write(self, instancer: UsdGeom.PointInstancer, targets) -> None:
+        """Write the prims of all instances of an instancer."""
+        path, layer = instancer.GetPath(), self._layer_of_prims()
+        instances = _Instances(instancer, len(targets), self._time)
+        prototypes = [_prototype(self._stage.GetPrimAtPath(target)) for target in targets]
+        self._prims += sum(1 + prototypes[instances.prototypes[row]].prims for row in instances.rows)
+        if self._prims > MOST_PRIMS:
+            raise InputError(f"{path}: instances of bodies that stand for more than {MOST_PRIMS} prims")
+        followed = instances.samples() if any(map(self._follows_keys, targets)) else ()
+        prefix = _NAME
+        while any(name.startswith(prefix) for name in instancer.GetPrim().GetAllChildrenNames()):
+            prefix += "_"
+        with Sdf.ChangeBlock():
+            own = Sdf.CreatePrimInLayer(layer, path)
+            own.typeName = "Xform"
+            for target in targets:
+                if target.HasPrefix(path):
+                    Sdf.CreatePrimInLayer(layer, target).active = False
+            for row in instances.rows:
+                prim = Sdf.PrimSpec(own, f"{prefix}{row}", Sdf.SpecifierDef, "Xform")
+                prototype = prototypes[instances.prototypes[row]]
+                _write_transform(prim, instances, row, followed)
+                _write_prototype(prim, prototype)
+                _write_velocities(prim, prototype, instances, row)
+
+    def _follows_keys(self, target: Sdf.Path) -> bool:
+        """Whether something of a prototype moves as its instance does over time: what is no dynamic body."""
+        dynamic = False
+        for prim in _all_below(self._stage.GetPrimAtPath(target)):
+            if is_body(prim):
+                dynamic = not UsdPhysics.RigidBodyAPI(prim).GetKinematicEnabledAttr().Get()
+                if not dynamic:
+                    return True
+            elif is_collider(prim) and not dynamic:
+                return True
+        return False
+
+
+class _Instances:
+    """The arrays of an instancer at one moment.
+
+    Attributes:
+        rows: Indices of the instances that are active.
+        prototypes: Number of the prototype of each, shape [n].
+    """
+
+    def __init__(self, instancer: UsdGeom.PointInstancer, prototypes: int, time_code: float):
+        """Read them; raises :class:`InputError` where they do not fit each other."""
+        self._prim, self._path = instancer.GetPrim(), instancer.GetPath()
+        time = Usd.TimeCode(time_code)
+        self.prototypes = self._array("protoIndices", time, None)
+        self._count = len(self.prototypes)
+        wrong = self.prototypes[(self.prototypes < 0) | (self.prototypes >= prototypes)]
+        if len(wrong):
+            raise InputError(f"{self._path}: protoIndices names prototype {wrong[0]}, but there are {prototypes}")
+        self._values = {name: self._array(name, time, 3) for name in ("positions", "scales")}
+        self._values["orientations"] = self._turns(time)
+        if not len(self._values["positions"]) and self._count:
+            raise InputError(f"{self._path}: positions is missing, of {self._count} instances")
+        self.velocities, self.spins = (self._array(name, time, 3) for name in ("velocities", "angularVelocities"))
+        ids = self._array("ids", time, None)
+        inactive = self._prim.GetMetadata("inactiveIds")
+        off = set(inactive.GetAppliedItems() if inactive else ())
+        self.rows = [row for row in range(self._count) if (int(ids[row]) if len(ids) else row) not in off]
+
+    def value(self, name: str, row: int):
+        """Return what an array says of an instance, None where it is empty."""
+        values = self._values[name]
+        return _typed(name, values[row]) if len(values) else None
+
+    def samples(self) -> tuple[tuple[float, dict[str, np.ndarray]], ...]:
+        """Return the arrays that move instances at all their times, nothing where they have but one."""
+        names = ("positions", "orientations", "orientationsf", "scales", "protoIndices")
+        times = {name: self._prim.GetAttribute(name).GetTimeSamples() for name in names}
+        if len(times["protoIndices"]) > 1:
+            raise InputError(f"{self._path}: protoIndices has time samples, and bodies in it follow their instances")
+        every = sorted({time for one in times.values() for time in one})
+        return tuple((time, self._at(Usd.TimeCode(time))) for time in every) if len(every) > 1 else ()
+
+    def _at(self, time) -> dict[str, np.ndarray]:
+        found = {name: self._array(name, time, 3) for name in ("positions", "scales")}
+        return found | {"orientations": self._turns(time)}
+
+    def _array(self, name: str, time, width: int | None) -> np.ndarray:
+        """Return an array of as many values as there are instances, or none."""
+        attribute = self._prim.GetAttribute(name)
+        value = attribute.Get(time) if attribute else None
+        found = np.zeros(0) if value is None else np.asarray(value)
+        if value is not None and len(found) and (found.dtype.kind not in "if" or found.ndim != (2 if width else 1)):
+            raise InputError(f"{self._path}: {name} is no array of {'vectors' if width else 'whole numbers'}")
+        if name != "protoIndices" and len(found) not in (0, self._count):
+            raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
+        return found if width else found.astype(np.int64)
+
+    def _turns(self, time) -> np.ndarray:
+        """Return the orientations, the precise ones if there are any, quaternions x y z w of length 1."""
+        name = "orientationsf" if len(self._prim.GetAttribute("orientationsf").Get(time) or ()) else "orientations"
+        value = self._prim.GetAttribute(name).Get(time) or ()
+        found = np.array([(*one.GetImaginary(), one.GetReal()) for one in value], dtype=float).reshape(-1, 4)
+        if len(found) not in (0, self._count):
+            raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
+        lengths = np.linalg.norm(found, axis=1)
+        if not (lengths > 0.0).all():
+            raise InputError(f"{self._path}: {name} has a quaternion of zeros or what is no number")
+        return found / lengths[:, None]
+
+
+def _all_below(prim: Usd.Prim) -> Iterator[Usd.Prim]:
+    return iter(Usd.PrimRange(prim, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)))
+
+
+def _prototype(root: Usd.Prim) -> _Prototype:
+    places, below = UsdGeom.XformCache(), list(_all_below(root))
+    order = UsdGeom.Xformable(root).GetXformOpOrderAttr().Get() if root.IsA(UsdGeom.Xformable) else None
+    outside = places.GetParentToWorldTransform(root).GetInverse()
+    bodies = tuple(
+        (one.GetPath().MakeRelativePath(root.GetPath()), places.GetLocalToWorldTransform(one) * outside)
+        for one in below
+        if is_body(one)
+    )
+    kept = [one for one in order if one != _RESET] if order and _RESET in order else None
+    return _Prototype(root.GetPath(), root.GetName(), kept, bodies, len(below))
+
+
+def _typed(name: str, value) -> object:
+    numbers = [float(one) for one in value]
+    if name == "orientations":
+        return Gf.Quatf(numbers[3], *numbers[:3])
+    return Gf.Vec3d(*numbers) if name == "positions" else Gf.Vec3f(*numbers)
+
+
+def _write_transform(prim: Sdf.PrimSpec, instances: _Instances, row: int, samples) -> None:
+    order = []
+    for operation, name, kind in _OPERATIONS:
+        value = instances.value(name, row)
+        if value is None:
+            continue
+        attribute = Sdf.AttributeSpec(prim, operation, kind)
+        attribute.default = value
+        for time, arrays in samples:
+            prim.layer.SetTimeSample(attribute.path, time, _typed(name, arrays[name][row]))
+        order.append(operation)
+    _write_order(prim, order)
+
+
+def _write_order(prim: Sdf.PrimSpec, order: list[str]) -> None:
+    Sdf.AttributeSpec(prim, "xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform).default = order
+
+
+def _write_prototype(instance: Sdf.PrimSpec, prototype: _Prototype) -> None:
+    prim = Sdf.PrimSpec(instance, prototype.name, Sdf.SpecifierDef)
+    prim.active, prim.instanceable = True, False
+    prim.referenceList.Prepend(Sdf.Reference("", prototype.path))
+    if prototype.order is not None:
+        _write_order(prim, prototype.order)
+
+
+def _write_velocities(prim: Sdf.PrimSpec, prototype: _Prototype, instances: _Instances, row: int) -> None:
+    """Give the bodies of an instance its velocities, which are in the frame of the instancer, in their own frames."""
+    given = [values[row] if len(values) else None for values in (instances.velocities, instances.spins)]
+    if all(one is None for one in given):
+        return
+    velocity, spin = (Gf.Vec3d(0.0) if one is None else Gf.Vec3d(*map(float, one)) for one in given)
+    turn = instances.value("orientations", row) or Gf.Quatf(1.0)
+    scale = instances.value("scales", row) or Gf.Vec3f(1.0)
+    rotation = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Quatd(turn)))
+    for below, matrix in prototype.bodies:
+        placed = matrix * Gf.Matrix4d().SetScale(Gf.Vec3d(scale)) * rotation
+        own = Gf.Transform(placed).GetRotation().GetInverse()
+        across = Gf.Cross(spin, placed.ExtractTranslation()) * np.pi / 180.0
+        path = prim.path.AppendChild(prototype.name).AppendPath(below)
+        body = Sdf.CreatePrimInLayer(prim.layer, path)
+        for name, value, said in (
+            ("physics:velocity", own.TransformDir(velocity + across), given[0]),
+            ("physics:angularVelocity", own.TransformDir(spin), given[1]),
+        ):
+            if said is not None:
+                Sdf.AttributeSpec(body, name, _TYPES.Vector3f).default = Gf.Vec3f(value)
