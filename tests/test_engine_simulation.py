@@ -449,7 +449,8 @@ def test_the_first_frame_has_the_moments_of_the_start(stage_run):
     stage = Usd.Stage.Open(str(folder / "out.usda"))
     balls = [f"/World/Balls/Ball_{number:04d}" for number in range(4)]
     moments = {
-        path: np.array(stage.GetAttributeAtPath(f"{path}.warpmag:moment").Get(0.0)) for path in ("/World/Magnet", *balls)
+        path: np.array(stage.GetAttributeAtPath(f"{path}.warpmag:moment").Get(0.0))
+        for path in ("/World/Magnet", *balls)
     }
     np.testing.assert_allclose(moments["/World/Magnet"], (0.0, 0.0, 1e6 * 0.04**3), rtol=1e-6)
     places = np.array([stage.GetAttributeAtPath(f"{path}.xformOp:translate").Get() for path in balls])
