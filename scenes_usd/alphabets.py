@@ -93,7 +93,6 @@ def author(
     _add_center(stage, moment, core)
     reach = 0.5 * float(np.linalg.norm(pitch * (columns, layers, rows)))
     authoring.add_camera(stage, (1.5 * reach, -3.8 * reach, 0.9 * reach), (0.0, 0.0, 0.0))
-    authoring.add_lights(stage)
     authoring.save(stage, path)
 
 
@@ -120,6 +119,9 @@ def _define_letter(
     shell.CreateFaceVertexCountsAttr(Vt.IntArray([len(face) for face in faces]))
     shell.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
     shell.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    normals = lettering.corner_normals(points, faces) @ upright
+    shell.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
+    shell.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     shell.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(shell, Usd.TimeCode.Default()))
     for number, box in enumerate(lettering.boxes(curves)):
         cube = UsdGeom.Cube.Define(stage, root.AppendChild(f"Box_{number:02d}"))

@@ -12,6 +12,7 @@ from warpmag.usd.coils import author_coil, author_field_map
 from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
+from warpmag.usd.looks import author_surface
 from warpmag.usd.paths import usable_path
 from warpmag.usd.reader import (
     StageContents,
@@ -37,6 +38,7 @@ __all__ = [
     "author_field_map",
     "author_magnet",
     "author_settings",
+    "author_surface",
     "check",
     "describe",
     "enabled_joints",

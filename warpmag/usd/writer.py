@@ -350,7 +350,9 @@ class CacheWriter:
         root = Sdf.Layer.CreateAnonymous()
         for key in copied_metadata(scene):
             root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
-        self._set_metadata(root, self._code(self._last_time))
+        # Players stop at whole frames: the last one, which stands at the step nearest to it, is not to be cut off.
+        whole = round(self._last_time * self._clock.frames_per_second) / self._clock.frames_per_second
+        self._set_metadata(root, self._code(max(whole, self._last_time)))
         root.subLayerPaths[:] = [f"./{self._output.cache.name}", self._below]
         return root
 
