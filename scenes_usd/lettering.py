@@ -24,8 +24,6 @@ _COVERED, _WORTH = 0.96, 0.025
 """Boxes are added until they cover this part of the letter, or until the next would add less than that part."""
 _THINNEST = 0.16
 """No side of a box is shorter: strokes are 0.19 wide, and a thin box would ask for short time steps."""
-_CREASE = 0.82
-"""Cosine of the angle beyond which an edge is sharp."""
 _OUT = 0.015
 """Boxes may stick out of a letter by this much, and by half a cell: curved strokes need fewer then."""
 
@@ -138,35 +136,6 @@ def extruded(curves: list[np.ndarray], depth: float, bevel: float) -> tuple[np.n
         low, high = (upper + 1) * count, upper * count
         faces += list(np.stack([here + low, following + low, following + high, here + high], axis=1))
     return points, faces
-
-
-def corner_normals(points: np.ndarray, faces: list[np.ndarray]) -> np.ndarray:
-    """Return unit normals at the corners of flat faces: smooth where faces meet at less than :data:`_CREASE`.
-
-    Args:
-        points: Points of the mesh, shape [n, 3].
-        faces: Indices of the corners of each face, counterclockwise seen from outside.
-
-    Returns:
-        A normal for each corner of each face, one face after the other, shape [corners, 3].
-    """
-    areas = np.array(
-        [
-            sum(np.cross(points[f[k]] - points[f[0]], points[f[k + 1]] - points[f[0]]) for k in range(1, len(f) - 1))
-            for f in faces
-        ]
-    )
-    flat = areas / np.linalg.norm(areas, axis=1, keepdims=True)
-    around: dict[int, list[int]] = {}
-    for number, face in enumerate(faces):
-        for point in face.tolist():
-            around.setdefault(point, []).append(number)
-    sums = []
-    for number, face in enumerate(faces):
-        for point in face.tolist():
-            near = [other for other in around[point] if flat[other] @ flat[number] > _CREASE]
-            sums.append(areas[near].sum(axis=0))
-    return np.array(sums) / np.linalg.norm(sums, axis=1, keepdims=True)
 
 
 def boxes(curves: list[np.ndarray]) -> list[Box]:

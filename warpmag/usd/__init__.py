@@ -13,6 +13,8 @@ from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
 from warpmag.usd.looks import author_surface
+from warpmag.usd.meshes import author_mesh
+from warpmag.usd.motion import Recording, read_recording
 from warpmag.usd.paths import usable_path
 from warpmag.usd.reader import (
     StageContents,
@@ -23,6 +25,7 @@ from warpmag.usd.reader import (
     read_magnets,
     survey,
 )
+from warpmag.usd.render_layer import RenderLayer
 from warpmag.usd.values import Finding
 from warpmag.usd.writer import CacheWriter, Earlier
 
@@ -31,12 +34,15 @@ __all__ = [
     "Earlier",
     "Finding",
     "GroundedJoint",
+    "Recording",
+    "RenderLayer",
     "StageClock",
     "StageContents",
     "StageReport",
     "author_coil",
     "author_field_map",
     "author_magnet",
+    "author_mesh",
     "author_settings",
     "author_surface",
     "check",
@@ -51,6 +57,7 @@ __all__ = [
     "open_stage",
     "prepare_joints",
     "read_magnets",
+    "read_recording",
     "refusals",
     "stage_clock",
     "strained_joints",

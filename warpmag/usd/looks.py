@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
 
 _MATERIALX = "ND_standard_surface_surfaceshader"
@@ -12,6 +13,9 @@ _NAMES = {
     "clearcoat": "coat",
 }
 """Inputs of UsdPreviewSurface that are authored here, and what MaterialX's standard surface calls them."""
+
+_PLASMA = ((13, 8, 135), (92, 1, 166), (156, 23, 158), (204, 71, 120), (237, 121, 83), (253, 180, 47), (240, 249, 33))
+"""Colours of the scale, evenly spaced, 8-bit sRGB (Matplotlib's plasma, by N. Smith and S. van der Walt, CC0)."""
 
 
 def author_surface(
@@ -48,6 +52,13 @@ def author_materialx(stage: Usd.Stage) -> None:
                 given = {own: shader.GetInput(name) for name, own in _NAMES.items()}
                 values = {own: one.Get() for own, one in given.items() if one and one.Get() is not None}
                 _connect(material, "MaterialX", _MATERIALX, values, material.CreateSurfaceOutput("mtlx"), "out")
+
+
+def color_scale(count: int) -> np.ndarray:
+    """Return a scale of colours, linear RGB, shape [count, 3]."""
+    anchors = (np.array(_PLASMA) / 255.0) ** 2.2
+    at = np.linspace(0.0, len(anchors) - 1.0, count)
+    return np.stack([np.interp(at, np.arange(len(anchors)), anchors[:, k]) for k in range(3)], axis=1)
 
 
 def _connect(material, name, identifier, values, output, own_output) -> None:

@@ -29,7 +29,8 @@ from warpmag.usd.samples import END_MARK, SampleFile, time_mark
 from warpmag.usd.scene_copy import copy_scene
 from warpmag.usd.schemas import MOMENT
 
-_TRANSLATE, _ORIENT, _SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
+TRANSLATE, ORIENT, SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
+"""What moves a body, in this order."""
 _TYPES = Sdf.ValueTypeNames
 _CHECKPOINT_SECONDS = 1.0
 _CHECKPOINT_SHARE = 0.01
@@ -48,8 +49,8 @@ class _Kind:
 
 
 _BODY = (
-    _Kind(_TRANSLATE, _TYPES.Double3, Vt.Vec3dArray, np.float64, 3),
-    _Kind(_ORIENT, _TYPES.Quatf, Vt.QuatfArray, np.float32, 4),
+    _Kind(TRANSLATE, _TYPES.Double3, Vt.Vec3dArray, np.float64, 3),
+    _Kind(ORIENT, _TYPES.Quatf, Vt.QuatfArray, np.float32, 4),
     _Kind("physics:velocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
     _Kind("physics:angularVelocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
 )
@@ -371,10 +372,10 @@ class CacheWriter:
                     place = _author_default(cache, path, kind.name, kind.usd_type, value)
                     cache.SetTimeSample(place, time_mark(next(number)), value)
             for path, scale, free in zip(bodies.paths, bodies.scales, bodies.free, strict=True):
-                order = ["!resetXformStack!"] * bool(free) + [_TRANSLATE, _ORIENT]
+                order = ["!resetXformStack!"] * bool(free) + [TRANSLATE, ORIENT]
                 if not np.allclose(scale, 1.0, rtol=0.0, atol=1e-6):
-                    _author_default(cache, path, _SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
-                    order.append(_SCALE)
+                    _author_default(cache, path, SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
+                    order.append(SCALE)
                 kind, value = _TYPES.TokenArray, Vt.TokenArray(order)
                 _author_default(cache, path, "xformOpOrder", kind, value, Sdf.VariabilityUniform)
         return cache
