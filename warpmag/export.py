@@ -13,7 +13,7 @@ from warpmag.errors import InputError
 from warpmag.field_lines import trace
 from warpmag.fields import h_field, wrench
 from warpmag.magnets import check_positive, check_token, shown
-from warpmag.usd import Recording, RenderLayer, open_stage, read_recording, usable_path
+from warpmag.usd import Recording, RenderLayer, open_motion, read_recording, usable_path
 from warpmag.usd.meshes import BALL
 from warpmag.usd.placements import rotate
 
@@ -270,9 +270,7 @@ def _triangles(faces: Sequence[np.ndarray]) -> np.ndarray:
 
 def _write_numbers(stage: str | os.PathLike, path: Path) -> None:
     """Write what a stage shows as arrays, SI units, world frame."""
-    opened = open_stage(stage)
-    opened.GetSessionLayer().Clear()
-    record = read_recording(opened)
+    record = read_recording(open_motion(stage))
     columns = {
         "positions": record.positions * record.metres_per_unit,
         "orientations": record.turns,

@@ -21,7 +21,7 @@ from warpmag.usd.meshes import ARROW, BALL, Shape, author_mesh, shape_of
 from warpmag.usd.motion import read_recording
 from warpmag.usd.paths import usable_path
 from warpmag.usd.placements import rigid
-from warpmag.usd.reader import copied_metadata, open_stage
+from warpmag.usd.reader import copied_metadata, open_motion
 from warpmag.usd.transforms import is_body
 from warpmag.usd.values import quiet
 
@@ -89,8 +89,7 @@ class RenderLayer:
         Raises:
             InputError: It is no stage.
         """
-        source = open_stage(path)
-        source.GetSessionLayer().Clear()  # which holds the start
+        source = open_motion(path)
         self._files = {Path(layer.realPath).resolve() for layer in source.GetUsedLayers() if layer.realPath}
         self.recording = read_recording(source)
         self._codes = self.recording.codes * (rate / source.GetTimeCodesPerSecond())
