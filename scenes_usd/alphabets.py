@@ -9,11 +9,11 @@ import os
 import string
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, lettering
-from warpmag.usd import author_magnet
+from warpmag.usd import author_magnet, author_mesh
 
 PAINTS = {
     "Coral": (0.86, 0.19, 0.13),
@@ -93,7 +93,6 @@ def author(
     _add_center(stage, moment, core)
     reach = 0.5 * float(np.linalg.norm(pitch * (columns, layers, rows)))
     authoring.add_camera(stage, (1.5 * reach, -3.8 * reach, 0.9 * reach), (0.0, 0.0, 0.0))
-    authoring.add_lights(stage)
     authoring.save(stage, path)
 
 
@@ -116,11 +115,7 @@ def _define_letter(
     upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the letter's y is up, its face at -y
     points, faces = lettering.extruded(curves, thickness / size, _BEVEL)
     shell = UsdGeom.Mesh.Define(stage, root.AppendChild("Shell"))
-    shell.CreatePointsAttr(Vt.Vec3fArray.FromNumpy((size * points @ upright).astype(np.float32)))
-    shell.CreateFaceVertexCountsAttr(Vt.IntArray([len(face) for face in faces]))
-    shell.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
-    shell.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    shell.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(shell, Usd.TimeCode.Default()))
+    author_mesh(shell, size * points @ upright, faces)
     for number, box in enumerate(lettering.boxes(curves)):
         cube = UsdGeom.Cube.Define(stage, root.AppendChild(f"Box_{number:02d}"))
         cube.CreateSizeAttr(1.0)

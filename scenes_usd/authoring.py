@@ -14,7 +14,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
-from warpmag.usd import author_magnet, author_settings
+from warpmag.usd import author_magnet, author_settings, author_surface
 
 GRAVITY = 9.81
 """Acceleration of free fall [m/s²]."""
@@ -33,6 +33,14 @@ BALL_SPACING = 2.002
 
 DYNAMIC, KINEMATIC, STATIC = "dynamic", "kinematic", "static"
 """How a shape moves: as a body of its own, as one that is held in place, or with whatever it belongs to."""
+
+_FILM, _F_STOP = 0.036, 8.0
+"""Width of the camera's film [m], and the focal length over the aperture."""
+_SOFT_BOXES = (
+    ("Key", (-0.75, -0.4, 1.0), 0.8, 9.0, (1.0, 0.96, 0.9)),
+    ("Rim", (0.9, 0.9, 0.6), 0.6, 8.0, (0.9, 0.95, 1.0)),
+)
+"""Name, place and side over the distance of the camera, radiance, and linear RGB."""
 
 _METRICS = {"metersPerUnit": 1.0, "kilogramsPerUnit": 1.0, "upAxis": "Z"}
 
@@ -86,6 +94,7 @@ def add_material(
     color: Sequence[float],
     metallic: float = 0.0,
     roughness: float = 0.5,
+    coat: float = 0.0,
     density: float | None = None,
     friction: float = 0.0,
     restitution: float = 0.0,
@@ -98,6 +107,7 @@ def add_material(
         color: Linear RGB.
         metallic: Metalness, 0 to 1.
         roughness: Roughness, 0 to 1.
+        coat: Clear lacquer over it, 0 to 1.
         density: Mass density [kg/m³] of the bodies that it is bound to.
         friction: Coefficient of static and dynamic friction; if there is any, rolling and spinning meet some too.
         restitution: Coefficient of restitution.
@@ -114,12 +124,7 @@ def add_material(
     for name in ("newton:rollingFriction", "newton:torsionalFriction"):
         attribute = material.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False)
         attribute.Set(CONTACT_PATCH if friction else 0.0)
-    shader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*color))
-    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(metallic)
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(roughness)
-    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    author_surface(material, color=color, metallic=metallic, roughness=roughness, coat=coat)
     return material
 
 
@@ -201,27 +206,48 @@ def add_capsule(
 
 
 def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], *, field_of_view: float = 35.0) -> None:
-    """Author a camera at ``eye`` [m] that looks at ``target`` [m], ``field_of_view`` [degrees] wide."""
+    """Author a camera at ``eye`` [m] that looks at ``target`` [m], ``field_of_view`` [degrees] wide, and the lights.
+
+    Its film is 36 mm wide, whatever the unit of the stage: UsdGeom counts film and focal length in tenths of that unit.
+    """
     camera = UsdGeom.Camera.Define(stage, "/World/Camera")
-    view = Gf.Matrix4d().SetLookAt(Gf.Vec3d(*eye), Gf.Vec3d(*target), Gf.Vec3d(0.0, 0.0, 1.0))
-    camera.AddTransformOp().Set(view.GetInverse())
-    aperture = camera.GetHorizontalApertureAttr().Get()
-    camera.CreateHorizontalApertureAttr(aperture)
-    camera.CreateVerticalApertureAttr(aperture * 9.0 / 16.0)
-    camera.CreateFocalLengthAttr(0.5 * aperture / math.tan(math.radians(0.5 * field_of_view)))
+    camera.AddTransformOp().Set(_looking(eye, target))
+    tenth = 10.0 / UsdGeom.GetStageMetersPerUnit(stage)
+    camera.CreateHorizontalApertureAttr(tenth * _FILM)
+    camera.CreateVerticalApertureAttr(tenth * _FILM * 9.0 / 16.0)
+    camera.CreateFocalLengthAttr(tenth * 0.5 * _FILM / math.tan(math.radians(0.5 * field_of_view)))
+    camera.CreateFStopAttr(_F_STOP)
     distance = math.dist(eye, target)
     camera.CreateClippingRangeAttr(Gf.Vec2f(0.01 * distance, 100.0 * distance))
     camera.CreateFocusDistanceAttr(distance)
+    _add_lights(stage, target, distance)
 
 
-def add_lights(stage: Usd.Stage) -> None:
-    """Author a sun from the upper left and a sky that fills the shadows."""
+def _add_lights(stage: Usd.Stage, target: Sequence[float], distance: float) -> None:
+    """Author a sky, and two soft boxes around ``target`` [m] that are as far as the camera, ``distance`` [m].
+
+    Intensities are radiances where ``inputs:normalize`` is false: they light a small scene as they do a large one. A
+    white wall that faces the key has a radiance of about 1 from all of them.
+    """
+    UsdGeom.Scope.Define(stage, "/World/Lights")
     sky = UsdLux.DomeLight.Define(stage, "/World/Lights/Sky")
-    sky.CreateIntensityAttr(0.4)
-    sun = UsdLux.DistantLight.Define(stage, "/World/Lights/Sun")
-    sun.CreateIntensityAttr(2.0)
-    sun.CreateAngleAttr(2.0)
-    sun.AddRotateXYZOp().Set(Gf.Vec3f(40.0, -25.0, 0.0))
+    sky.CreateIntensityAttr(0.35)
+    sky.CreateColorAttr(Gf.Vec3f(0.86, 0.93, 1.0))
+    for name, place, side, intensity, color in _SOFT_BOXES:
+        box = UsdLux.RectLight.Define(stage, f"/World/Lights/{name}")
+        box.CreateWidthAttr(side * distance)
+        box.CreateHeightAttr(side * distance)
+        box.CreateIntensityAttr(intensity)
+        box.CreateNormalizeAttr(False)
+        box.CreateColorAttr(Gf.Vec3f(*color))
+        box.MakeMatrixXform().Set(_looking(np.add(target, np.multiply(distance, place)), target))
+        box.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(box, Usd.TimeCode.Default()))
+
+
+def _looking(eye: Sequence[float], target: Sequence[float]) -> Gf.Matrix4d:
+    """Return the transform of what looks along its -z from ``eye`` to ``target``, z up."""
+    up = Gf.Vec3d(0.0, 0.0, 1.0)
+    return Gf.Matrix4d().SetLookAt(Gf.Vec3d(*map(float, eye)), Gf.Vec3d(*map(float, target)), up).GetInverse()
 
 
 def run(author: Callable) -> None:

@@ -51,7 +51,9 @@ def author(
     iron = authoring.add_material(
         stage, "Iron", color=authoring.STEEL_COLOR, metallic=1.0, roughness=0.3, density=authoring.IRON_DENSITY
     )
-    magnet = authoring.add_material(stage, "Magnet", color=authoring.MAGNET_COLOR, density=7500.0)
+    magnet = authoring.add_material(
+        stage, "Magnet", color=authoring.MAGNET_COLOR, roughness=0.3, coat=1.0, density=7500.0
+    )
     ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8)
     authoring.add_ground(stage, ground, size=1.0)
     authoring.add_box(
@@ -70,7 +72,6 @@ def author(
         position = ((x - 0.5 * (columns - 1)) * pitch, (y - 0.5 * (rows - 1)) * pitch, radius + z * pitch)
         authoring.add_ball(stage, f"/World/Balls/Ball_{number:04d}", position, radius, iron, magnet=ball_magnet)
     authoring.add_camera(stage, (0.28, -0.36, 0.2), (0.0, 0.0, 0.5 * height))
-    authoring.add_lights(stage)
     authoring.save(stage, path)
 
 

@@ -53,7 +53,9 @@ def author(
     )
     authoring.add_scene(stage, MagneticSettings(), gravity=0.0)
     crystal = authoring.add_material(stage, "Crystal", color=CRYSTAL_COLOR, roughness=0.1, density=2650.0)
-    magnet = authoring.add_material(stage, "Magnet", color=authoring.MAGNET_COLOR, density=7500.0)
+    magnet = authoring.add_material(
+        stage, "Magnet", color=authoring.MAGNET_COLOR, roughness=0.3, coat=1.0, density=7500.0
+    )
     gap = spacing - 2.0 * radius
     sizes = (bar * spacing - gap, bar_rows * spacing - gap, bar_rows * spacing - gap)
     prim = authoring.add_box(stage, "/World/Magnet", (0.0, 0.0, 0.0), sizes, magnet, motion=authoring.KINEMATIC)
@@ -75,7 +77,6 @@ def author(
         )
     reach = spacing * max(columns, 1.78 * rows)
     authoring.add_camera(stage, (0.35 * reach, -1.75 * reach, 0.3 * reach), (0.0, 0.0, 0.0))
-    authoring.add_lights(stage)
     authoring.save(stage, path)
 
 

@@ -61,7 +61,13 @@ def author(
         friction=friction,
     )
     magnet = authoring.add_material(
-        stage, "Magnet", color=authoring.MAGNET_COLOR, density=magnet_density, friction=friction
+        stage,
+        "Magnet",
+        color=authoring.MAGNET_COLOR,
+        roughness=0.3,
+        coat=1.0,
+        density=magnet_density,
+        friction=friction,
     )
     ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8, friction=friction)
     authoring.add_ground(stage, ground, size=2.0)
@@ -82,7 +88,6 @@ def author(
     )
     reach = max(float(np.ptp(positions[:, 0])), top + drop + 2.0 * magnet_radius)
     authoring.add_camera(stage, (1.2 * reach, -3.2 * reach, 1.2 * reach), (0.0, 0.0, 0.46 * reach))
-    authoring.add_lights(stage)
     authoring.save(stage, path)
 
 

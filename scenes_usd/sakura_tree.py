@@ -118,7 +118,6 @@ def author(
     for number, position in enumerate(rain(balls, radius, spacing, height, np.random.default_rng(seed))):
         authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
     authoring.add_camera(stage, (1.3 * height, -4.6 * height, 1.2 * height), (0.0, 0.0, 0.8 * height))
-    authoring.add_lights(stage)
     authoring.save(stage, path)
 
 

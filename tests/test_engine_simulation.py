@@ -4,6 +4,7 @@ import math
 import re
 import time
 
+import magpylib
 import newton
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import warp as wp
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 import warpmag
+from warpmag import oracle
 from warpmag.engine.contacts import RigidSolver, body_sizes
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.statistics import find_held
@@ -439,6 +441,31 @@ def test_moments_of_the_stage_are_those_of_the_run(stage_run):
     np.testing.assert_allclose(moments["/World/Magnet"], (0.0, 0.0, 1e6 * 0.04**3), rtol=1e-6)
     total = sum(moments.values())
     np.testing.assert_allclose(total, simulation.magnetics.shape_moments().sum(axis=0), atol=1e-6 * 64.0)
+
+
+def test_the_first_frame_has_the_moments_of_the_start(stage_run):
+    """Before any step: what the float64 reference finds in the cube's closed-form field, to the solve's 1e-3."""
+    _, folder, _ = stage_run
+    stage = Usd.Stage.Open(str(folder / "out.usda"))
+    balls = [f"/World/Balls/Ball_{number:04d}" for number in range(4)]
+    moments = {
+        path: np.array(stage.GetAttributeAtPath(f"{path}.warpmag:moment").Get(0.0))
+        for path in ("/World/Magnet", *balls)
+    }
+    np.testing.assert_allclose(moments["/World/Magnet"], (0.0, 0.0, 1e6 * 0.04**3), rtol=1e-6)
+    places = np.array([stage.GetAttributeAtPath(f"{path}.xformOp:translate").Get() for path in balls])
+    cube = magpylib.magnet.Cuboid(dimension=(0.04,) * 3, magnetization=(0.0, 0.0, 1e6), position=(0.0, 0.0, 0.05))
+    balance = oracle.equilibrium(places, R, cube.getH(places), saturation=1.7e6)
+    expected = balance.magnetizations * 4.0 / 3.0 * math.pi * R**3
+    np.testing.assert_allclose([moments[path] for path in balls], expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_to_be_recorded_changes_no_bit_of_a_run(stage_run, device):
+    """The moments of the first frame are solved for beside the run, which still starts from none."""
+    simulation, folder, _ = stage_run
+    alone = Simulation(folder / "scene.usda", device=device)
+    np.testing.assert_array_equal(run(alone, 100), simulation.state.body_q.numpy())
+    np.testing.assert_array_equal(alone.magnetics.shape_moments(), simulation.magnetics.shape_moments())
 
 
 def test_magnetization_of_a_collider_prim_is_in_its_own_frame(device, tmp_path):

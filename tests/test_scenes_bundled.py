@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from warpmag.errors import InputError
 from warpmag.magnets import MagneticSettings
@@ -64,16 +64,29 @@ def test_every_magnet_says_all_of_itself(report):
 def test_scenes_can_be_looked_at(report):
     stage = open_stage(bundled()[report[0]])
     camera = UsdGeom.Camera.Get(stage, "/World/Camera").GetCamera(0.0)
-    assert stage.GetPrimAtPath("/World/Lights/Sun")
     boxes = UsdGeom.BBoxCache(0.0, [UsdGeom.Tokens.default_])
-    center = boxes.ComputeWorldBound(stage.GetPrimAtPath("/World")).ComputeCentroid()
     ground = stage.GetPrimAtPath("/World/Ground")
-    if not ground:
-        assert camera.frustum.Intersects(center)
     for prim in stage.Traverse():
         if prim.IsA(UsdGeom.Gprim) and UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.default_:
             middle = boxes.ComputeWorldBound(prim).ComputeCentroid()
             assert prim == ground or camera.frustum.Intersects(middle), prim.GetPath()
+
+
+def test_scenes_are_lit_typed_and_filmed_in_their_units(report):
+    """A film of 36 mm in tenths of the stage's metres, focused on what it looks at; a sky, and lamps of set sizes."""
+    stage = open_stage(bundled()[report[0]])
+    assert [prim.GetPath() for prim in stage.Traverse() if not prim.GetTypeName()] == []
+    camera = UsdGeom.Camera.Get(stage, "/World/Camera")
+    assert camera.GetHorizontalApertureAttr().Get() == pytest.approx(0.36)
+    assert 0.2 < camera.GetFocalLengthAttr().Get() < 2.0 and camera.GetFStopAttr().Get() > 0.0
+    assert camera.GetClippingRangeAttr().Get()[0] < camera.GetFocusDistanceAttr().Get()
+    lights = [prim for prim in stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)]
+    assert sorted(prim.GetTypeName() for prim in lights) == ["DomeLight", "RectLight", "RectLight"]
+    for light in map(UsdLux.LightAPI, lights):
+        assert 0.0 < light.GetIntensityAttr().Get() < 20.0
+        assert light.GetPrim().IsA(UsdLux.DomeLight) or light.GetNormalizeAttr().HasAuthoredValue()
+    codes = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    assert codes == tuple(map(round, codes)) and stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond()
 
 
 def _specs(layer):

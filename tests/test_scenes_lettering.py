@@ -9,6 +9,7 @@ import pytest
 from warpmag import lattice
 from warpmag.errors import InputError
 from warpmag.scenes_usd import lettering
+from warpmag.usd.meshes import corner_normals
 
 pytest.importorskip("matplotlib")
 
@@ -60,6 +61,13 @@ def test_extruded_letters_are_closed_and_have_their_volume(letter):
     # The bevel takes a triangular prism off both edges, more along holes, less where corners are sharp.
     assert 0.6 * edge * bevel**2 < missing < 1.05 * edge * bevel**2
     assert np.ptp(points[:, 2]) == pytest.approx(depth)
+    normals = corner_normals(points, faces)
+    flat = [np.cross(points[face[1]] - points[face[0]], points[face[2]] - points[face[0]]) for face in faces]
+    flat = np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), [len(face) for face in faces], axis=0)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+    # within the crease, 35°, and 10° more where the bevel of a sharp corner is twisted
+    assert (np.einsum("ni,ni->n", normals, flat) > 0.7).all()
+    np.testing.assert_allclose(normals[np.abs(flat[:, 2]) > 0.99], flat[np.abs(flat[:, 2]) > 0.99], atol=1e-9)
 
 
 @pytest.mark.parametrize("letter", string.ascii_uppercase)

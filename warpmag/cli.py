@@ -131,6 +131,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--viewer", choices=("none", *_VIEWERS), default="none", help="watch the run (default: %(default)s)"
     )
+    run.add_argument(
+        "--for",
+        dest="purpose",
+        choices=("render",),
+        help="also write a stage for renderers beside the output, as 'warpmag export' does",
+    )
     run.set_defaults(command=_run)
 
     scenes = commands.add_parser("scenes", help="list the bundled scenes")
@@ -150,7 +156,25 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--moments", action="store_true", help="show the moments of a finished run as arrows")
     render.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     render.set_defaults(command=_render)
+    _add_export(commands)
     return parser
+
+
+def _add_export(commands) -> None:
+    export = commands.add_parser("export", help="write a stage for renderers, or numbers, of a scene or a finished run")
+    export.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
+    export.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help=".usda, .usdc, .usdz; .npz or .csv for numbers"
+    )
+    export.add_argument(
+        "--rate", type=float, default=24.0, metavar="HZ", help="frames a second (default: %(default)g, as in Blender)"
+    )
+    export.add_argument("--color", metavar="WHAT", help="colour bodies by magnetization, speed or force")
+    export.add_argument("--arrows", action="store_true", help="draw moments as arrows")
+    export.add_argument("--field-lines", type=int, default=0, metavar="N", help="draw field lines of permanent magnets")
+    export.add_argument("--materialx", action="store_true", help="describe materials in MaterialX, too")
+    export.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
+    export.set_defaults(command=_export)
 
 
 def _scenes(options) -> int:
@@ -255,6 +279,18 @@ def _two(name: str, text: str, between: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
+def _export(options) -> int:
+    path, _ = _find_scene(options.stage)
+    _quiet_warp()
+    from warpmag.export import export  # noqa: PLC0415
+
+    names = ("rate", "color", "arrows", "field_lines", "materialx", "device")
+    for line in export(path, options.output, **{name: getattr(options, name) for name in names}):
+        print(line)
+    print(f"written {options.output}")
+    return 0
+
+
 def _run(options) -> int:
     if options.frames is not None and options.frames < 1:
         raise InputError(f"frames: must be positive, got {options.frames}")
@@ -299,6 +335,11 @@ def _run(options) -> int:
     for line in statistics.summary():
         print(line)
     print(f"written        {output}")
+    if options.purpose:
+        from warpmag.export import export  # noqa: PLC0415
+
+        export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
+        print(f"to render      {rendered}")
     _warn([line for line in simulation.warnings() if line not in known])
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])

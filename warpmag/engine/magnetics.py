@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warpmag import materials
+from warpmag import materials, snapshot
 from warpmag.arrays import Kind, Numbers, farthest_place, host_array
 from warpmag.curves import MagnetizationCurve
 from warpmag.engine.applied import ModelSources
@@ -414,6 +414,22 @@ class Magnetics:
         self.check_model()
         sum_moments(self._part_start, self.system.moments, self._totals)
         return self._totals.numpy()
+
+    def moments_at(self, state: newton.State) -> np.ndarray:
+        """Return what :meth:`shape_moments` is once :meth:`induce` has been called; nothing goes on differently for it.
+
+        Args:
+            state: State with poses ``body_q``.
+
+        Returns:
+            Total moment of each magnetic shape in equilibrium at these poses [A·m²], world frame, shape [n, 3].
+        """
+        carried = self.system.carried()
+        before = snapshot.save(carried)
+        self.induce(state)
+        moments = self.shape_moments().copy()
+        snapshot.load(carried, before)
+        return moments
 
     def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:
         """Let induction start from given magnetizations.

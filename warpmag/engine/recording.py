@@ -60,12 +60,14 @@ class Recorder:
     def add_frame(self, time: float, state, save: Callable[[], dict[str, np.ndarray]] | None) -> None:
         """Take a frame, and write it; on a GPU :meth:`write` does that, while the next steps run.
 
+        Moments are those of the last substep. Before the first step there are none: they are solved for, and forgotten.
+
         Args:
             time: Time since the start [s].
             state: Newton's state.
             save: Returns all that the run needs to go on from here; None if it cannot be resumed.
         """
-        moments = self._magnetics.shape_moments()[self._shapes]
+        moments = (self._magnetics.shape_moments() if time > 0.0 else self._magnetics.moments_at(state))[self._shapes]
         totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
         body_q, body_qd = state.body_q.numpy()[self._bodies], state.body_qd.numpy()[self._bodies]
         self.write()

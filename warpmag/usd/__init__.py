@@ -12,6 +12,9 @@ from warpmag.usd.coils import author_coil, author_field_map
 from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
+from warpmag.usd.looks import author_surface
+from warpmag.usd.meshes import author_mesh
+from warpmag.usd.motion import Recording, read_recording
 from warpmag.usd.paths import usable_path
 from warpmag.usd.playback import Playback, metalness
 from warpmag.usd.reader import (
@@ -19,10 +22,12 @@ from warpmag.usd.reader import (
     describe,
     first_camera,
     hold,
+    open_motion,
     open_stage,
     read_magnets,
     survey,
 )
+from warpmag.usd.render_layer import RenderLayer
 from warpmag.usd.values import Finding
 from warpmag.usd.writer import CacheWriter, Earlier
 
@@ -32,13 +37,17 @@ __all__ = [
     "Finding",
     "GroundedJoint",
     "Playback",
+    "Recording",
+    "RenderLayer",
     "StageClock",
     "StageContents",
     "StageReport",
     "author_coil",
     "author_field_map",
     "author_magnet",
+    "author_mesh",
     "author_settings",
+    "author_surface",
     "check",
     "describe",
     "enabled_joints",
@@ -49,9 +58,11 @@ __all__ = [
     "magnet_of",
     "magnet_prim_of",
     "metalness",
+    "open_motion",
     "open_stage",
     "prepare_joints",
     "read_magnets",
+    "read_recording",
     "refusals",
     "stage_clock",
     "strained_joints",

@@ -45,7 +45,7 @@ class Placements:
         for index, path in enumerate(self.paths):
             prim = stage.GetPrimAtPath(path)
             world = np.array(self._transforms.GetLocalToWorldTransform(prim))
-            self.scales[index] = np.diag(world[:3, :3] @ _rigid(world)[:3, :3].T)
+            self.scales[index] = np.diag(world[:3, :3] @ rigid(world)[:3, :3].T)
             parent = self._parent(prim, moving)
             self.free[index] = parent is None
             if parent is not None:
@@ -55,7 +55,7 @@ class Placements:
         self._below = np.array(list(below), dtype=int)
         parents = list(below.values())
         self._into = np.reshape([np.linalg.inv(parent) for parent in parents], (-1, 4, 4))
-        self._turn_into = np.reshape([_conjugate_rotation(parent) for parent in parents], (-1, 4))
+        self._turn_into = np.reshape([turn_of(parent) * (-1.0, -1.0, -1.0, 1.0) for parent in parents], (-1, 4))
 
     def _parent(self, prim, moving) -> np.ndarray | None:
         """Return the parent's world transform, None where the prim must leave it behind.
@@ -71,7 +71,7 @@ class Placements:
         matrix = np.array(self._transforms.GetLocalToWorldTransform(parent))
         scale = _scale(matrix)
         # Scales are often authored in single precision.
-        similar = np.allclose(matrix[:3, :3], scale * _rigid(matrix)[:3, :3], rtol=0.0, atol=1e-6 * abs(scale))
+        similar = np.allclose(matrix[:3, :3], scale * rigid(matrix)[:3, :3], rtol=0.0, atol=1e-6 * abs(scale))
         return matrix if similar else None
 
     def place(self, body_q: np.ndarray, body_qd: np.ndarray, last_turns: np.ndarray | None) -> Placed:
@@ -83,17 +83,17 @@ class Placements:
             last_turns: Orientations of the frame before, next to which those of this one are to be; None in the first.
         """
         positions, turns = body_q[:, :3].astype(np.float64), body_q[:, 3:].astype(np.float64)
-        turns /= np.sqrt(_dot(turns, turns))
+        turns /= np.sqrt(dot(turns, turns))
         in_body = turns * (-1.0, -1.0, -1.0, 1.0)
-        linear = _rotate(in_body, body_qd[:, :3])
-        angular = _rotate(in_body, np.degrees(body_qd[:, 3:].astype(np.float64)))
+        linear = rotate(in_body, body_qd[:, :3])
+        angular = rotate(in_body, np.degrees(body_qd[:, 3:].astype(np.float64)))
         below = self._below
         if len(below):
             local = np.c_[positions[below], np.ones(len(below))]
             positions[below] = np.einsum("ni,nij->nj", local, self._into)[:, :3]
-            turns[below] = _product(self._turn_into, turns[below])
+            turns[below] = product(self._turn_into, turns[below])
         if last_turns is not None:
-            turns *= np.where(_dot(turns, last_turns) < 0.0, -1.0, 1.0)
+            turns *= np.where(dot(turns, last_turns) < 0.0, -1.0, 1.0)
         return Placed(
             positions / self._unit, *(values.astype(np.float32) for values in (turns, linear / self._unit, angular))
         )
@@ -104,7 +104,7 @@ def _scale(matrix) -> float:
     return float(np.cbrt(np.linalg.det(matrix[:3, :3])))
 
 
-def _rigid(matrix) -> np.ndarray:
+def rigid(matrix) -> np.ndarray:
     """Return position and rotation of a transform, as USD's physics and Newton take them: the body's frame."""
     transform = Gf.Transform(Gf.Matrix4d(matrix.tolist()))
     rigid = Gf.Matrix4d().SetRotate(transform.GetRotation())
@@ -112,30 +112,31 @@ def _rigid(matrix) -> np.ndarray:
     return np.array(rigid)
 
 
-def _conjugate_rotation(matrix) -> np.ndarray:
+def turn_of(matrix) -> np.ndarray:
+    """Return the rotation of a transform as a quaternion x y z w."""
     turn = Gf.Transform(Gf.Matrix4d(matrix.tolist())).GetRotation().GetQuat()
-    return np.array([*(-turn.GetImaginary()), turn.GetReal()])
+    return np.array([*turn.GetImaginary(), turn.GetReal()])
 
 
-def _product(a, b) -> np.ndarray:
+def product(a, b) -> np.ndarray:
     """Return the product of quaternions x y z w, shape [n, 4]: first ``b``, then ``a``."""
     va, vb, wa, wb = a[:, :3], b[:, :3], a[:, 3:], b[:, 3:]
-    return np.concatenate([wa * vb + wb * va + _cross(va, vb), wa * wb - _dot(va, vb)], axis=1)
+    return np.concatenate([wa * vb + wb * va + cross(va, vb), wa * wb - dot(va, vb)], axis=1)
 
 
-def _rotate(turns, vectors) -> np.ndarray:
+def rotate(turns, vectors) -> np.ndarray:
     """Rotate ``vectors`` [n, 3] by quaternions ``turns`` [n, 4]."""
     axis, w = turns[:, :3], turns[:, 3:]
-    across = 2.0 * _cross(axis, vectors)
-    return vectors + w * across + _cross(axis, across)
+    across = 2.0 * cross(axis, vectors)
+    return vectors + w * across + cross(axis, across)
 
 
-def _cross(a, b) -> np.ndarray:
+def cross(a, b) -> np.ndarray:
     """Return cross products of rows; ``numpy.cross`` takes three times as long."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
-def _dot(a, b) -> np.ndarray:
+def dot(a, b) -> np.ndarray:
     """Return dot products of rows, shape [n, 1]."""
     return np.einsum("ni,ni->n", a, b)[:, None]

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
@@ -106,6 +107,32 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
         raise InputError(f"{path}: no such file")
     if reason := first_reading(full_path(file)):
         raise InputError(f"{path}: {reason}")
+    stage = _open(file, path)
+    with readable(str(path)):
+        time_code = start_of(stage) if time_code is None else time_code
+        expand_instancers(stage, time_code)
+        convert_units(stage)
+        hold(stage, time_code)
+    return stage
+
+
+def open_motion(path: str | os.PathLike) -> Usd.Stage:
+    """Open a stage as it moves, held at no moment.
+
+    It is read in this process at once: to read a long run's samples in a process of their own first would take longer
+    than to export them.
+
+    Raises:
+        InputError: The file is missing, is not USD or does not compose.
+    """
+    file = usable_path(path)
+    if not os.path.isfile(file):
+        raise InputError(f"{path}: no such file")
+    return _open(file, path)
+
+
+def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
+    """Open a file that is there; ``path`` is what messages call it."""
     try:
         with quiet():  # what USD has to say goes into the error
             stage = Usd.Stage.Open(str(full_path(file)))
@@ -115,11 +142,6 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
         raise InputError(f"{path}: not a USD file ({failure(error)})") from None
     if broken:
         raise InputError(f"{path}: {' '.join(_SESSION.sub('', broken[0]).split())}")
-    with readable(str(path)):
-        time_code = start_of(stage) if time_code is None else time_code
-        expand_instancers(stage, time_code)
-        convert_units(stage)
-        hold(stage, time_code)
     return stage
 
 

@@ -31,7 +31,8 @@ from warpmag.usd.schemas import MOMENT
 from warpmag.usd.session import INSTANCES, added_layer, as_written
 from warpmag.usd.units import units_of
 
-_TRANSLATE, _ORIENT, _SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
+TRANSLATE, ORIENT, SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
+"""What moves a body, in this order."""
 _TYPES = Sdf.ValueTypeNames
 _CHECKPOINT_SECONDS = 1.0
 _CHECKPOINT_SHARE = 0.01
@@ -50,8 +51,8 @@ class _Kind:
 
 
 _BODY = (
-    _Kind(_TRANSLATE, _TYPES.Double3, Vt.Vec3dArray, np.float64, 3),
-    _Kind(_ORIENT, _TYPES.Quatf, Vt.QuatfArray, np.float32, 4),
+    _Kind(TRANSLATE, _TYPES.Double3, Vt.Vec3dArray, np.float64, 3),
+    _Kind(ORIENT, _TYPES.Quatf, Vt.QuatfArray, np.float32, 4),
     _Kind("physics:velocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
     _Kind("physics:angularVelocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
 )
@@ -352,7 +353,9 @@ class CacheWriter:
         root = Sdf.Layer.CreateAnonymous()
         for key in copied_metadata(scene):
             root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
-        self._set_metadata(root, self._code(self._last_time))
+        # Players stop at whole frames: the last one, which stands at the step nearest to it, is not to be cut off.
+        whole = round(self._last_time * self._clock.frames_per_second) / self._clock.frames_per_second
+        self._set_metadata(root, self._code(max(whole, self._last_time)))
         root.subLayerPaths[:] = [f"./{self._output.cache.name}", self._below]
         return root
 
@@ -374,10 +377,10 @@ class CacheWriter:
                     place = _author_default(cache, path, kind.name, kind.usd_type, value)
                     cache.SetTimeSample(place, time_mark(next(number)), value)
             for path, scale, free in zip(bodies.paths, bodies.scales, bodies.free, strict=True):
-                order = ["!resetXformStack!"] * bool(free) + [_TRANSLATE, _ORIENT]
+                order = ["!resetXformStack!"] * bool(free) + [TRANSLATE, ORIENT]
                 if not np.allclose(scale, 1.0, rtol=0.0, atol=1e-6):
-                    _author_default(cache, path, _SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
-                    order.append(_SCALE)
+                    _author_default(cache, path, SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
+                    order.append(SCALE)
                 kind, value = _TYPES.TokenArray, Vt.TokenArray(order)
                 _author_default(cache, path, "xformOpOrder", kind, value, Sdf.VariabilityUniform)
         return cache

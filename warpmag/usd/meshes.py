@@ -1,0 +1,167 @@
+"""Meshes of what USD has other prims for: importers drop the materials of spheres and cubes, Blender's among them."""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from pxr import Gf, Usd, UsdGeom, Vt
+
+_AROUND = 48
+"""Corners of a ball's equator, and of other round shapes."""
+_CREASE = 0.82
+"""Cosine of the angle beyond which an edge is sharp."""
+
+Shape = tuple[np.ndarray, list[np.ndarray]]
+"""Points, shape [n, 3], and the corners of each face, counterclockwise seen from outside."""
+
+
+def shape_of(prim: Usd.Prim) -> Shape | None:
+    """Return the surface of a mesh, of one of UsdGeom's solids, or of a plane, in its own frame; None for others.
+
+    What is along another axis than z is turned there as UsdGeom says.
+    """
+    if prim.IsA(UsdGeom.Mesh):
+        points, counts, indices = (
+            np.array(prim.GetAttribute(name).Get(0.0)) for name in ("points", "faceVertexCounts", "faceVertexIndices")
+        )
+        if not (points.ndim and counts.ndim and indices.ndim and len(points) and len(counts)):
+            return None
+        return points.astype(float), np.split(indices, np.cumsum(counts)[:-1])
+    for kind, (make, *sizes) in _MAKERS.items():
+        if prim.IsA(kind):
+            points, faces = make(*(prim.GetAttribute(name).Get() for name in sizes))
+            axis = prim.GetAttribute("axis").Get() if prim.HasAttribute("axis") else "Z"
+            return np.roll(points, {"X": 1, "Y": 2, "Z": 0}[axis], axis=1), faces  # (x, y, z) → (z, x, y)
+    return None
+
+
+def author_mesh(mesh: UsdGeom.Mesh, points: np.ndarray, faces: Sequence[np.ndarray]) -> None:
+    """Author flat faces with normals that are smooth but for sharp edges."""
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, dtype=np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray([len(face) for face in faces]))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    corners, normals = np.concatenate(faces), corner_normals(points, faces)
+    at_points = np.zeros((len(points), 3))
+    at_points[corners] = normals
+    smooth = np.allclose(at_points[corners], normals, rtol=0.0, atol=1e-6)
+    chosen = at_points if smooth else normals
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(chosen, dtype=np.float32)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex if smooth else UsdGeom.Tokens.faceVarying)
+    low, high = points.min(axis=0), points.max(axis=0)
+    mesh.CreateExtentAttr([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())])
+
+
+def corner_normals(points: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarray:
+    """Return unit normals at the corners of faces: smooth where faces meet at less than 35°.
+
+    Args:
+        points: Points of the mesh, shape [n, 3].
+        faces: Indices of the corners of each face, counterclockwise seen from outside.
+
+    Returns:
+        A normal for each corner of each face, one face after the other, shape [corners, 3].
+    """
+    sizes = np.array([len(face) for face in faces])
+    corners, owners = np.concatenate(faces), np.repeat(np.arange(len(faces)), sizes)
+    start = np.repeat(np.cumsum(sizes) - sizes, sizes)
+    place = np.arange(len(corners)) - start
+    following = corners[start + (place + 1) % np.repeat(sizes, sizes)]
+    middle = points[corners[start]]
+    areas = np.zeros((len(faces), 3))
+    np.add.at(areas, owners, np.cross(points[corners] - middle, points[following] - middle))
+    flat = areas / np.linalg.norm(areas, axis=1, keepdims=True)
+    # all pairs of corners that share a point: those of a point stand side by side
+    order = np.argsort(corners, kind="stable")
+    shared = np.bincount(corners, minlength=len(points))
+    first = (np.cumsum(shared) - shared)[corners]
+    count = shared[corners]
+    mine = np.repeat(np.arange(len(corners)), count)
+    turn = np.arange(len(mine)) - np.repeat(np.cumsum(count) - count, count)
+    other = owners[order[first[mine] + turn]]
+    near = np.einsum("ni,ni->n", flat[owners[mine]], flat[other]) > _CREASE
+    sums = np.zeros((len(corners), 3))
+    np.add.at(sums, mine[near], areas[other[near]])
+    return sums / np.linalg.norm(sums, axis=1, keepdims=True)
+
+
+def turned(profile: np.ndarray, around: int = _AROUND) -> Shape:
+    """Return the surface that a line turned about z sweeps.
+
+    Args:
+        profile: Points (r, z) of the line from the lower pole to the upper one, r 0 at both alone, shape [k, 2].
+        around: Corners around.
+    """
+    angle = 2.0 * np.pi * np.arange(around) / around
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rings = [np.c_[r * circle, np.full(around, z)] for r, z in profile[1:-1].tolist()]
+    poles = np.array([[0.0, 0.0, profile[0, 1]], [0.0, 0.0, profile[-1, 1]]])
+    points = np.concatenate([*rings, poles])
+    here = np.arange(around)
+    after = np.roll(here, -1)
+    last, low, high = (len(rings) - 1) * around, len(points) - 2, len(points) - 1
+    faces = list(np.stack([np.full(around, low), after, here], axis=1))
+    for ring in range(len(rings) - 1):
+        a, b = ring * around, (ring + 1) * around
+        faces += list(np.stack([here + a, after + a, after + b, here + b], axis=1))
+    return points, faces + list(np.stack([here + last, after + last, np.full(around, high)], axis=1))
+
+
+def _arc(radius: float, middle: float, begin: float, end: float, count: int) -> np.ndarray:
+    """Return points (r, z) of an arc about (0, middle), angles from the equator in parts of π."""
+    angle = np.pi * np.linspace(begin, end, count)
+    return np.stack([radius * np.cos(angle), middle + radius * np.sin(angle)], axis=1)
+
+
+@functools.cache  # thousands of balls are alike
+def _sphere(radius: float) -> Shape:
+    profile = _arc(radius, 0.0, -0.5, 0.5, _AROUND // 2 + 1)
+    profile[[0, -1], 0] = 0.0
+    return turned(profile)
+
+
+def _box(side: float) -> Shape:
+    corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return side * corners, [np.array(face) for face in faces]
+
+
+def _plane(width: float, length: float) -> Shape:
+    corners = np.array([(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)])
+    return corners * (width, length, 1.0), [np.arange(4)]
+
+
+def _cylinder(low: float, high: float, height: float) -> Shape:
+    h = 0.5 * height
+    return turned(np.array([(0.0, -h), (low, -h), (high, h), (0.0, h)]))
+
+
+def _capsule(low: float, high: float, height: float) -> Shape:
+    h = 0.5 * height
+    lower, upper = _arc(low, -h, -0.5, 0.0, 5), _arc(high, h, 0.0, 0.5, 5)
+    profile = np.concatenate([lower, upper])
+    profile[[0, -1], 0] = 0.0
+    return turned(profile, _AROUND // 3)
+
+
+def _cone(radius: float, height: float) -> Shape:
+    h = 0.5 * height
+    return turned(np.array([(0.0, -h), (radius, -h), (0.0, h)]))
+
+
+_MAKERS: dict[type, tuple] = {
+    UsdGeom.Sphere: (_sphere, "radius"),
+    UsdGeom.Cube: (_box, "size"),
+    UsdGeom.Cylinder: (_cylinder, "radius", "radius", "height"),
+    UsdGeom.Cylinder_1: (_cylinder, "radiusBottom", "radiusTop", "height"),
+    UsdGeom.Capsule: (_capsule, "radius", "radius", "height"),
+    UsdGeom.Capsule_1: (_capsule, "radiusBottom", "radiusTop", "height"),
+    UsdGeom.Cone: (_cone, "radius", "height"),
+    UsdGeom.Plane: (_plane, "width", "length"),
+}
+"""What makes a mesh of a kind of prim, and the attributes that it takes."""
+
+BALL = _sphere(1.0)
+"""A ball of radius 1."""
+ARROW = turned(np.array([(0.0, -0.5), (0.05, -0.5), (0.05, 0.15), (0.14, 0.15), (0.0, 0.5)]), 16)
+"""An arrow along z from -1/2 to 1/2."""
