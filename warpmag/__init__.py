@@ -23,6 +23,7 @@ _HOMES = {
     "add_permanent": "warpmag.engine.attributes",
     "add_coil": "warpmag.engine.applied",
     "add_field_map": "warpmag.engine.applied",
+    "Display": "warpmag.engine.display",
     "Magnetics": "warpmag.engine.magnetics",
     "SensorMagnetometer": "warpmag.engine.magnetometer",
     "Simulation": "warpmag.engine.simulation",
