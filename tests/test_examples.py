@@ -15,7 +15,7 @@ SMALL = {
     "arm": "--num-frames 150",
     "balls_up": "--columns 3 --layers 2 --num-frames 15",
     "chain": "--balls 4 --num-frames 40",
-    "compass_swarm": "--columns 2 --rows 4 --num-frames 75",
+    "compass_swarm": "--columns 2 --rows 2 --num-frames 62",
     "connectors": "--num-frames 40",
     "sorter": "--coils 2 --num-frames 24",
     "worlds": "--world-count 32 --num-frames 15",

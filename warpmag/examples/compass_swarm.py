@@ -16,9 +16,9 @@ import warpmag.examples
 
 MU0 = 4e-7 * math.pi  # T·m/A
 EXTENT = (0.01, 0.0015, 0.001)  # m, half of it
-MAGNETIZATION = 4e5  # A/m
+MAGNETIZATION = 8e5  # A/m
 PITCH = 0.3  # m, far enough for needles to feel the field alone
-SPEED = 8.0 * math.pi  # rad/s
+SPEED = 16.0 * math.pi  # rad/s
 MOMENT = MAGNETIZATION * 8.0 * math.prod(EXTENT)  # A·m²
 
 
@@ -44,7 +44,7 @@ class Example:
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         builder.replicate(row, args.rows)
 
-        self.simulation = warpmag.Simulation(builder, step=1e-3)
+        self.simulation = warpmag.Simulation(builder, step=5e-4)
         self.magnetics = self.simulation.magnetics
         self.display = warpmag.Display(viewer, self.simulation.model, self.magnetics)
         self.viewer = viewer
@@ -63,7 +63,7 @@ class Example:
         return SPEED * self.simulation.time
 
     def step(self):
-        """Advance by a frame of 10 ms."""
+        """Advance by a frame of 5 ms."""
         for _ in range(10):
             turned = self.field_angle()
             along = np.array((math.cos(turned), math.sin(turned), 0.0))
