@@ -47,6 +47,11 @@ CASES = {
             {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768)},
         ),
         Case(
+            "worlds",
+            "a warm solve and forces in 1,024 worlds (32 on a CPU) of so many balls that move",
+            {"cpu": (64,), "cuda": (8, 27, 64, 125, 216)},
+        ),
+        Case(
             "scene",
             "steps of Balls Up while it runs: induction, forces, rigid bodies, host",
             {"cpu": (243, 2500), "cuda": (243, 2500, 10000)},

@@ -1,4 +1,4 @@
-"""Check, then time: ``python -m bench.run field|force|induction|scene [--device cuda:0] [--sizes 243 2560]``.
+"""Check, then time: ``python -m bench.run field|force|induction|worlds|scene [--device cuda:0] [--sizes 243 2560]``.
 
 Each size is compared with the float64 oracle on some targets before it is timed; induction and scenes give the error
 of the solve itself. One JSON line a measurement, with machine, commit, error and the time of the first call, which
@@ -19,6 +19,7 @@ from bench.timing import measure
 from warpmag import oracle
 from warpmag.system import MomentSystem
 
+_WORLDS = {"cpu": 32, "cuda": 1024}
 _CHECKED = 64
 """Targets compared with the oracle."""
 
@@ -85,6 +86,55 @@ def run_induction(system, device) -> dict:
     }
 
 
+def make_worlds(worlds: int, count: int, device) -> tuple[MomentSystem, list[wp.array]]:
+    """As many piles of ``make_system`` in a world each, and their positions before and after a little motion [m]."""
+    system = MomentSystem(
+        radii=np.full(worlds * count, RADIUS), worlds=np.repeat(np.arange(worlds), count), saturation=SATURATION,
+        external_field=[0.0, 0.0, 0.5 * SATURATION], device=device,
+    )  # fmt: skip
+    start = np.concatenate([touching_pile(count, seed) for seed in range(worlds)])
+    motion = 1e-3 * RADIUS * np.random.default_rng(1).normal(size=start.shape)
+    kind = system.positions.dtype
+    return system, [wp.array(one, dtype=kind, device=device) for one in (start, start + motion)]
+
+
+def run_worlds(count: int, device) -> dict:
+    """Time the magnetics of a step of many worlds, whose balls move by 1e-3 radii, its parts, and check one world."""
+    worlds = _WORLDS["cpu" if device.is_cpu else "cuda"]
+    began = time.perf_counter()
+    system, places = make_worlds(worlds, count, device)
+
+    def there_and_back():
+        for place in places:
+            wp.copy(system.positions, place)
+            system.solve()
+            system.apply_forces()
+
+    there_and_back()
+    wp.synchronize_device(device)
+    first = time.perf_counter() - began
+    seconds = 0.5 * measure(there_and_back, device)
+    field, force = measure(system.evaluate, device), measure(system.apply_forces, device)
+    own = slice((worlds - 1) * count, worlds * count)
+    x, m = (a.numpy()[own].astype(float) for a in (system.positions, system.moments))
+    gradients = [
+        oracle.gradient_at(np.delete(x, i, 0), np.delete(m, i, 0), x[i : i + 1], radii=RADIUS, target_radii=RADIUS)
+        for i in range(count)
+    ]
+    expected = np.concatenate([oracle.kelvin_force(m[i : i + 1], one) for i, one in enumerate(gradients)])
+    return {
+        "worlds": worlds,
+        "seconds": seconds,
+        "world_steps_per_second": worlds / seconds,
+        "field_seconds": field,
+        "force_seconds": force,
+        "evaluations": float(system.evaluations.numpy().mean()),
+        "error": _relative(system.forces.numpy()[own], expected),
+        "converged": bool(system.converged.numpy().all()),
+        "first_call_seconds": first,
+    }
+
+
 RUNNERS = {"field": run_field, "force": run_force, "induction": run_induction}
 
 
@@ -108,7 +158,10 @@ def run_case(case: Case, device, sizes) -> None:
     machine = describe(device)
     for dtype in case.dtypes:
         for count in sizes or case.sizes["cpu" if device.is_cpu else "cuda"]:
-            result = run_system(case, count, dtype, device) if case.name in RUNNERS else run_scene(count, device)
+            if case.name in RUNNERS:
+                result = run_system(case, count, dtype, device)
+            else:
+                result = (run_worlds if case.name == "worlds" else run_scene)(count, device)
             print(json.dumps({"case": case.name, "dtype": dtype, "count": count, **result, **machine}), flush=True)
 
 

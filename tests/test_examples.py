@@ -1,0 +1,89 @@
+"""The examples, small: each checks its physics itself, in ``test_final``."""
+
+import importlib
+import re
+from pathlib import Path
+
+import newton
+import pytest
+import warp as wp
+
+from warpmag import examples
+
+FOLDER = Path(examples.__file__).parent
+SMALL = {
+    "arm": "--num-frames 150",
+    "balls_up": "--columns 3 --layers 2 --num-frames 15",
+    "chain": "--balls 4 --num-frames 40",
+    "compass_swarm": "--columns 2 --rows 2 --num-frames 62",
+    "connectors": "--num-frames 40",
+    "sorter": "--coils 2 --num-frames 24",
+    "worlds": "--world-count 32 --num-frames 15",
+}
+
+
+def make(name, device, options):
+    """An example that draws nothing, and its options."""
+    with wp.ScopedDevice(device):
+        module = importlib.import_module(f"warpmag.examples.{name}")
+        options = module.Example.create_parser().parse_args([*options.split(), "--test"])
+        return module.Example(newton.viewer.ViewerNull(num_frames=options.num_frames), options), options
+
+
+def run(name, device, options, capsys):
+    example, options = make(name, device, options)
+    with wp.ScopedDevice(device):
+        examples.run(example, options)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line == example.summary()
+
+
+@pytest.mark.parametrize("name", examples.get_examples())
+def test_small(name, device, capsys):
+    if name == "arm":
+        pytest.importorskip("mujoco_warp")
+    run(name, device, SMALL[name], capsys)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", examples.get_examples())
+def test_as_it_is(name, device, capsys):
+    if name == "arm":
+        pytest.importorskip("mujoco_warp")
+    run(name, device, "", capsys)
+
+
+def test_before_its_time_an_example_fails(device):
+    """What ``test_final`` asks for is not there from the start."""
+    example, _ = make("worlds", device, SMALL["worlds"])
+    with pytest.raises(AssertionError):
+        example.test_final()
+
+
+def test_readme_lists_all():
+    text = (FOLDER / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `(\w+)`", text, re.MULTILINE) == list(examples.get_examples())
+
+
+def test_command(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["examples"])
+    assert examples.main() == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in SMALL)
+    monkeypatch.setattr("sys.argv", ["examples", "ball_up"])
+    assert examples.main() == 2
+    assert capsys.readouterr().err.startswith("warpmag: ball_up: no such example, there are arm, balls_up, ")
+
+
+def test_a_viewer_that_cannot_open_is_one_line(monkeypatch, capsys):
+    def fail(**_):
+        raise RuntimeError("no display\nhere")
+
+    monkeypatch.setattr(newton.viewer, "ViewerGL", fail)
+    monkeypatch.setattr("sys.argv", ["examples", "worlds"])
+    assert examples.main() == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == (
+        "warpmag: viewer: gl cannot open (no display); it needs `pip install 'warpmag[viewers]'` and a display, "
+        "--headless needs neither"
+    )

@@ -1,0 +1,102 @@
+"""Examples after the pattern of Newton's: ``python -m warpmag.examples NAME``.
+
+Each is a module with a class ``Example``: its constructor builds the scene, ``step`` advances one frame, ``render``
+shows it, ``test_final`` compares what came out with physics. ``--test`` does that at the end, ``--headless`` draws
+nothing.
+"""
+
+import argparse
+import ast
+import importlib
+import sys
+from pathlib import Path
+
+import newton.examples
+import warp as wp
+
+from warpmag.errors import InputError
+
+__all__ = ["create_parser", "get_examples", "init", "main", "run"]
+
+
+def create_parser(frames: int) -> argparse.ArgumentParser:
+    """Return Newton's parser of the options that all examples take.
+
+    Args:
+        frames: Frames that the example runs, unless ``--num-frames`` says otherwise.
+    """
+    parser = newton.examples.create_parser()
+    parser.set_defaults(num_frames=frames)
+    for action in parser._actions:
+        if action.dest == "headless":
+            action.help = "Draw nothing, as --viewer null."
+    return parser
+
+
+def init(parser: argparse.ArgumentParser):
+    """Read the options and open the viewer they ask for.
+
+    Returns:
+        The viewer and the options.
+
+    Raises:
+        InputError: The viewer cannot open.
+    """
+    options = parser.parse_args()
+    if options.headless:
+        sys.argv += ["--viewer", "null"]
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.config.enable_backward = False  # nothing here is differentiated, and it doubles the time to compile
+    try:
+        return newton.examples.init(parser)
+    except Exception as error:  # each viewer fails in its own way without its package or without a display
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise InputError(
+            f"viewer: {options.viewer} cannot open ({reason}); it needs `pip install 'warpmag[viewers]'`"
+            f"{' and a display' if options.viewer == 'gl' else ''}, --headless needs neither"
+        ) from None
+
+
+def run(example, options) -> None:
+    """Run an example to its end and print what it found.
+
+    Raises:
+        AssertionError: With ``--test``, what came out is not what physics says.
+    """
+    newton.examples.run(example, options)
+    print(example.summary())
+
+
+def get_examples() -> dict[str, str]:
+    """Return the first line of what each example is about, by its name."""
+    lines = {}
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        if not path.stem.startswith("_"):
+            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            lines[path.stem] = text.partition("\n")[0]
+    return lines
+
+
+def main() -> int:
+    """Run the example that the command line names, or list them; return the exit code."""
+    examples = get_examples()
+    name = sys.argv[1] if len(sys.argv) > 1 else None
+    if name in examples:
+        sys.argv = [f"warpmag.examples.{name}", *sys.argv[2:]]
+        try:
+            example = importlib.import_module(sys.argv[0]).Example
+            viewer, options = init(example.create_parser())
+            run(example(viewer, options), options)
+        except InputError as error:
+            print(f"warpmag: {error}", file=sys.stderr)
+            return 2
+        return 0
+    known = name in (None, "-h", "--help", "--list")
+    if not known:
+        print(f"warpmag: {name}: no such example, there are {', '.join(examples)}", file=sys.stderr)
+        return 2
+    print("python -m warpmag.examples NAME [--headless] [--test] [--viewer gl|viser|rerun|usd|null] [--device cuda:0]")
+    width = max(map(len, examples))
+    for example, line in examples.items():
+        print(f"  {example:{width}}  {line}")
+    return 0

@@ -1,0 +1,91 @@
+"""Two floating connectors with permanent magnets in them find each other and mate.
+
+Each has a north and a south pole in its face, so that they mate in one way only: the one that starts twisted turns. As
+nothing else acts on the two, neither their momentum nor their angular momentum changes.
+"""
+
+import math
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+import warpmag
+import warpmag.examples
+
+HALF = (0.006, 0.012, 0.008)  # m, of a housing
+POLE = 0.003  # m, half the edge of a magnet
+GAP = 0.02  # m, between the faces at the start
+
+
+class Example:
+    """Two connectors, the second one shifted, tilted and twisted."""
+
+    def __init__(self, viewer, args):
+        """Build the scene."""
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        warpmag.register_attributes(builder)
+        twist = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), math.radians(args.twist))
+        yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), math.radians(15.0))
+        self.add_connector(builder, wp.transform_identity(), face=1.0)
+        self.add_connector(builder, wp.transform((2 * HALF[0] + GAP, 0.003, 0.002), wp.mul(yaw, twist)), face=-1.0)
+
+        self.simulation = warpmag.Simulation(builder, step=1e-3)
+        self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
+        self.viewer = viewer
+
+    @staticmethod
+    def add_connector(builder, place, face):
+        """Add a housing with two magnets of opposite direction in its face."""
+        body = builder.add_body(xform=place)
+        plastic = newton.ModelBuilder.ShapeConfig(density=1200.0, mu=0.02, mu_torsional=0.0)
+        builder.add_shape_box(body, hx=HALF[0], hy=HALF[1], hz=HALF[2], cfg=plastic)
+        for side in (1.0, -1.0):
+            pole = wp.transform((face * (HALF[0] - POLE), side * 0.007, 0.0), wp.quat_identity())
+            # the plastic weighs its part there, too
+            heavy = newton.ModelBuilder.ShapeConfig(density=6300.0, mu=0.02, mu_torsional=0.0)
+            shape = builder.add_shape_box(body, xform=pole, hx=POLE, hy=POLE, hz=POLE, cfg=heavy)
+            warpmag.add_permanent(builder, shape=shape, material="N42", magnetization=(side, 0.0, 0.0))
+
+    @staticmethod
+    def create_parser():
+        """Return the parser of its options."""
+        parser = warpmag.examples.create_parser(frames=60)
+        parser.add_argument("--twist", type=float, default=40.0, help="Twist of the second one about its axis [°].")
+        return parser
+
+    def step(self):
+        """Advance by a frame of 10 ms."""
+        for _ in range(10):
+            self.simulation.step()
+
+    def render(self):
+        """Show the connectors."""
+        self.display.show(self.simulation.time, self.simulation.state)
+
+    def mating(self) -> tuple[np.ndarray, float]:
+        """Where the second one is in the frame of the first [m], and by how much it is turned [rad]."""
+        first, second = (wp.transform(*pose) for pose in self.simulation.state.body_q.numpy())
+        relative: Any = wp.transform_multiply(wp.transform_inverse(first), second)
+        return np.array(relative.p), 2.0 * math.acos(min(1.0, abs(relative.q[3])))
+
+    def test_final(self):
+        """They sit face to face as they are made to, and both together have the momentum of the start, none."""
+        place, angle = self.mating()
+        np.testing.assert_allclose(place, (2 * HALF[0], 0.0, 0.0), atol=1e-4)
+        assert angle < math.radians(1.0)
+        masses, speeds = self.simulation.model.body_mass.numpy(), self.simulation.state.body_qd.numpy()
+        fastest = math.sqrt(2.0 * 1e-2 / masses.min())  # of the energy that the magnets give, some 10 mJ
+        assert np.linalg.norm(masses @ speeds[:, :3]) < 1e-4 * masses.sum() * fastest
+
+    def summary(self) -> str:
+        """What it shows."""
+        place, angle = self.mating()
+        off = 1e3 * np.linalg.norm(place - np.array((2 * HALF[0], 0.0, 0.0)))
+        return f"mated within {off:.2g} mm and {math.degrees(angle):.2g} degrees"
+
+
+if __name__ == "__main__":
+    viewer, args = warpmag.examples.init(Example.create_parser())
+    warpmag.examples.run(Example(viewer, args), args)
