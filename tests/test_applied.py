@@ -244,7 +244,7 @@ def test_gradient_of_the_energy_is_the_force(kind, device):
 
     energy(places)
     system.apply_forces()
-    forces, reaction = system.forces.numpy(), system.reactions.reaction_forces.numpy()[0]
+    forces, reaction = system.forces.numpy(), system.applied.wrenches.numpy()[0, :3]
     step = 1e-6  # m: the third derivative's part is (step/R)² of the force
     for ball, axis in ((0, 0), (3, 1), (7, 2), (8, 0), (11, 2)):
         moved = np.zeros((12, 3))
@@ -290,10 +290,10 @@ def test_reaction_is_opposite_and_equal(force, device):
     forces = oracle.kelvin_force(effective, gradient)
     torques = oracle.torque(effective, coil) + np.cross(places - frame[:3], forces)
     for found, expected in (
-        (system.reactions.reaction_forces, forces),
-        (system.reactions.reaction_torques, torques),
+        (system.applied.wrenches.numpy()[0, :3], forces),
+        (system.applied.wrenches.numpy()[0, 3:6], torques),
     ):
-        np.testing.assert_allclose(found.numpy()[0], -expected.sum(axis=0), atol=1e-13 * np.abs(expected).sum())
+        np.testing.assert_allclose(found, -expected.sum(axis=0), atol=1e-13 * np.abs(expected).sum())
 
 
 def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
@@ -312,7 +312,7 @@ def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
         np.testing.assert_allclose(system.moments.numpy(), oracle.magnetization(h, 1.0)[0] * VOLUME)
         expected = oracle.kelvin_force(system.moments.numpy(), gradient) * body
         np.testing.assert_allclose(system.forces.numpy(), expected, rtol=1e-12)
-        np.testing.assert_allclose(system.reactions.reaction_forces.numpy(), -expected, rtol=1e-12)
+        np.testing.assert_allclose(system.applied.wrenches.numpy()[:, :3], -expected, rtol=1e-12)
 
 
 def test_each_world_has_its_sources(device):
@@ -334,7 +334,7 @@ def test_each_world_has_its_sources(device):
     found = system.forces.numpy()
     np.testing.assert_allclose(found[0], oracle.kelvin_force(m, strengths[:, None, None] * gradient)[0], atol=1e-15)
     push = -oracle.kelvin_force(m[1:], -40.0 * gradient[1:]).sum(axis=0)
-    np.testing.assert_allclose(system.reactions.reaction_forces.numpy(), [[0, 0, 0], push], atol=1e-18)
+    np.testing.assert_allclose(system.applied.wrenches.numpy()[:, :3], [[0, 0, 0], push], atol=1e-18)
     probe = FieldProbe(system, 2, worlds=[1, 0])
     probe.points.assign([[0.0, 0.0, 1.0]] * 2)
     probe.measure()

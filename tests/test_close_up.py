@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import warpmag
 from bench.reference import cuboids, discs, uneven
 from warpmag import oracle, polyhedra
-from warpmag.kernels.close_up.bodies import SolidMagnet
+from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.probe import FieldProbe
 from warpmag.system import MomentSystem
 
@@ -104,7 +104,7 @@ def near_system(half, device, dtype="float64", places=((0.0, 0.0, 0.0),), balls=
         system.positions.assign(positions)
         system.moments.assign(moments)
         frames = np.array([[*p, 0.0, 0.0, 0.0, 1.0] for p in places])
-        system.frames.assign(frames)
+        system.sources.solid_frames.assign(frames)
         system.solve()
 
     put(places, balls)
@@ -262,7 +262,10 @@ def test_lattice_takes_over_without_a_jump(name, device):
             state.clear_forces()
             magnetics.apply(state)
             found.append(state.body_f.numpy()[1, :3].astype(float))
-            magnetics.system.close_up = None
+            sizes = magnetics.system.sources.arrays["size"]
+            reachless = sizes.numpy()
+            reachless[:, 1] = np.nan  # nothing is nearer than that
+            sizes.assign(reachless)
         return found
 
     inside, outside = start, 10.0 * SIDE
@@ -314,7 +317,7 @@ def test_gradient_of_the_energy_is_the_force(device):
 
 
 def test_what_has_no_closed_form_launches_nothing(device):
-    assert magnets(device, BALL, (*BALL, (0.02, 0.0, 0.0)))[0].system.close_up is None
+    assert magnets(device, BALL, (*BALL, (0.02, 0.0, 0.0)))[0].system.sources is None
 
 
 def test_magnets_of_one_body_and_of_other_worlds_do_not_feel_each_other(device):

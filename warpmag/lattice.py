@@ -22,7 +22,7 @@ n     n³     field, d=0.2 L  field, d=L/8  force, d=0.2 L  force, d=L/8
 
 729 is thus the smallest cube number that keeps the force at contact within 2 %. A cylinder as wide as high, 621
 moments then, has 2e-3 in the field at 0.2 L and 5e-3 at L/8. The error falls off as exp(−2πd/a) with the cell side a.
-Permanent boxes and cylinders, whose fields are closed forms close up (``kernels/close_up``), have points of Gauss
+Permanent boxes and cylinders, whose fields are closed forms close up (``kernels/applied``), have points of Gauss
 instead (``polyhedra.py``), which are fewer.
 
 Which radius a moment's ball gets matters where another ball touches the body. Balls of the moments' own volumes

@@ -35,6 +35,11 @@ class MomentLayout:
     lone: np.ndarray
     alone: np.ndarray
 
+    @property
+    def balls(self) -> np.ndarray:
+        """Whether it is an inducible ball of some size, its body's only moment."""
+        return self.lone & (self.radii > 0.0)
+
     def ranges(self) -> list[tuple[int, int, int]]:
         """For each world its first moment, its first permanent one, and the end."""
         edges = np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))

@@ -1,6 +1,6 @@
 """Convex polyhedra that bound uniformly magnetized bodies, and the points at which forces between two are summed.
 
-The field of such a body is a sum over its edges and faces in closed form (``kernels/close_up/polyhedron.h``). A box is
+The field of such a body is a sum over its edges and faces in closed form (``kernels/applied/polyhedron.h``). A box is
 exact. A cylinder is a prism of :data:`CYLINDER_SIDES` sides with the cylinder's volume, whose field differs by 1 % of M
 at a twentieth of the radius from the rim's corners and by 1e-3 at a tenth (``tests/test_close_up.py``).
 

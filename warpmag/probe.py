@@ -8,7 +8,7 @@ import warp as wp
 
 from warpmag.arrays import shape_message, vec3_type
 from warpmag.errors import InputError
-from warpmag.kernels.applied.sources import AppliedField, Targets, launch_add_gradients
+from warpmag.kernels.applied.fields import AppliedField
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.inside import launch_field_of_worlds, launch_flux_density, launch_store_gradients
 from warpmag.kernels.pairs.packing import PackedMoments
@@ -69,12 +69,10 @@ class FieldProbe:
         )
         base, self._applied = self._base, None
         if system.sources is not None:
-            points = Targets(self.points, worlds, np.full(count, _NO_BODY), self._base)
-            self._applied = AppliedField(system.sources, points)
+            self._applied = AppliedField(system.sources, self._targets, worlds, self._base, points=True)
             base = self._applied.field
         self._field = PairEvaluation(Quantity.FIELD, segments, self._targets, sources, base, self.h)
         self._nothing = wp.zeros(count, dtype=vec3, device=device)
-        self._add_close_up = system.close_up.at_points(self._targets, worlds) if system.close_up is not None else None
         self.gradient = None
         self._gradients: list[PairEvaluation] = []
         if gradients:
@@ -116,7 +114,5 @@ class FieldProbe:
             evaluation.launch()
         if self._gradients:
             launch_store_gradients(self._rows, self.gradient)
-            if self._applied is not None:
-                launch_add_gradients(self._applied.gradient, self.gradient)
-        if self._add_close_up is not None:
-            self._add_close_up(self.h, self.b, self.gradient)
+        if self._applied is not None:
+            self._applied.add_to_probe(self.b, self.gradient)

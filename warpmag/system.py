@@ -16,14 +16,14 @@ from warpmag.arrays import (
 )
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
-from warpmag.kernels.applied.sources import AppliedForces, Sources, Targets
+from warpmag.kernels.applied.fields import AppliedForces
+from warpmag.kernels.applied.sources import Sources
 from warpmag.kernels.cells.couplings import CellCouplings
-from warpmag.kernels.close_up.bodies import CloseUp
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.material.curves import LINEAR
-from warpmag.kernels.near_contact import near_pairs
+from warpmag.kernels.near_contact import near_pairs, uneven
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
@@ -67,7 +67,7 @@ class MomentSystem:
             of its moments, and the ``demagnetization.Coupling`` of all of them.
         applied: Sources without a response that act on the moments, ``AppliedSource`` of ``kernels.applied.sources``;
             their bodies are numbered as those of the moments.
-        solids: Permanent bodies whose fields are closed forms close up (``kernels.close_up.bodies.SolidMagnet``),
+        solids: Permanent bodies whose fields are closed forms close up (``kernels.applied.solids.SolidMagnet``),
             ordered by world.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
@@ -78,13 +78,10 @@ class MomentSystem:
     Attributes:
         rotations: Rotation of each body of ``couplings``, from its frame to the world's (x, y, z, w), shape [bodies];
             written by the caller before :meth:`solve`. None without them.
-        sources: Sources of ``applied``, their frames and strengths written by the caller before :meth:`solve`. None
-            without them.
-        reactions: What the moments do to them, ``reaction_forces`` and ``reaction_torques`` by :meth:`apply_forces`;
-            None without them.
-        frames: Where each of ``solids`` is, transforms, shape [solids]; written by the caller before :meth:`solve`.
-            None without them.
-        close_up: What closed forms add to the sums (``kernels.close_up.bodies.CloseUp``); None without ``solids``.
+        sources: ``applied`` and ``solids`` on the device, where they are and how strong written by the caller before
+            :meth:`solve`. None without them.
+        applied: Their field at the moments, and by :meth:`apply_forces` what the moments do to them
+            (``kernels.applied.fields.AppliedForces``); None without sources.
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
@@ -143,14 +140,13 @@ class MomentSystem:
         self._force = force
         near = contact_model == "multipole"
         self._allocate(layout, external_field)
-        self._apply_sources(layout, applied)
         made_of = saturation, susceptibility, curve
         self._material, susceptibility = make_material(layout.permanent, *made_of, self.dtype, self.device)
         layout = self._make_bias(layout, dynamics)
+        self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings)
-        self._make_close_up(layout, solids)
         self._evaluate_wrench(layout, turned)
         self._energies = None
         self._near = self._make_near_contacts(layout, turned, susceptibility) if near else None
@@ -172,20 +168,23 @@ class MomentSystem:
             labels=layout.bodies,
             groups=layout.worlds,
         )
-        self._effective = wp.zeros((3, n), dtype=self.dtype, device=self.device)
+        self._effective = self._packed.vectors()
         self._induction = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
         self.h, self.residual, self.error = self._induction.h, self._induction.residual, self._induction.error
         self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
 
-    def _apply_sources(self, layout: MomentLayout, applied):
+    def _apply_sources(self, layout: MomentLayout, applied, solids):
         """Prepare the field of sources, which with the external one magnetizes moments, and acts on them."""
-        self.sources = self.reactions = None
+        self.sources = self.applied = None
         self._magnetizing = self._acting = self.external_field
-        if applied:
-            self.sources = Sources(applied, len(layout.ranges()), self.dtype, self.device)
-            moments = Targets(self.positions, layout.worlds, layout.bodies, self.external_field)
-            self.reactions = AppliedForces(self.sources, moments, layout.movable)
-            self._magnetizing, self._acting = self.reactions.at.field, self.reactions.at.acting
+        if applied or solids:
+            self.sources = Sources(applied, solids, self._packed, len(layout.ranges()))
+            self.applied = AppliedForces(
+                self.sources, layout.worlds, self.external_field, layout.movable,
+                balls=layout.balls if self.contact_model == "multipole" else None,
+                constants=uneven.expansion_constants(),
+            )  # fmt: skip
+            self._magnetizing, self._acting = self.applied.field, self.applied.acting
 
     def _make_bias(self, layout: MomentLayout, dynamics: str) -> MomentLayout:
         """Make room for the bias of permanent moments that respond; return the layout, in which they are no balls."""
@@ -215,15 +214,6 @@ class MomentSystem:
         self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h) if couplings else None
         self.rotations = self._cells.rotations if self._cells is not None else None
 
-    def _make_close_up(self, layout: MomentLayout, solids):
-        self.close_up = self.frames = None
-        if solids:
-            self.close_up = CloseUp(
-                solids, self._packed, inducible=~layout.permanent, movable=layout.movable, worlds=layout.worlds,
-                h0=self._induction.h0,
-            )  # fmt: skip
-            self.frames = self.close_up.frames
-
     def _evaluate_wrench(self, layout: MomentLayout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
         self._turned = wp.array(turned.astype(np.int32), dtype=wp.int32, device=self.device)
@@ -252,10 +242,13 @@ class MomentSystem:
 
     def _make_near_contacts(self, layout: MomentLayout, turned, susceptibility):
         magnets = layout.permanent | (self._material.curve.numpy() == LINEAR)
+        for one in () if self.sources is None else self.sources.solids:  # of closed forms, not of their moments
+            magnets[one.first : one.first + one.count] = False
         return near_pairs.allocate(
-            self._packed, layout.worlds, layout.lone & (layout.radii > 0.0), susceptibility, self._material,
+            self._packed, layout.worlds, layout.balls, susceptibility, self._material,
             ranges=self.world_ranges, magnets=magnets, lone=layout.alone, field=self._mutual, movable=layout.movable,
             turned=turned, forces=self.forces, torques=self.torques,
+            expansion=None if self.applied is None else self.applied.expansion,
         )  # fmt: skip
 
     @property
@@ -319,9 +312,9 @@ class MomentSystem:
     def begin(self):
         """Launch the start of a solve. Callers of :meth:`solve` do not need it; it serves to watch the iteration."""
         packed = self._packed
-        if self.reactions is not None:
-            self.reactions.at.launch()
         packed.pack(self.positions, self.moments)
+        if self.applied is not None:
+            self.applied.launch()
         if self._near is not None:
             near_pairs.launch_find_pairs(self._near)
         packed.find_overlaps()
@@ -329,8 +322,6 @@ class MomentSystem:
             self._applied.launch()
         elif self.bias is not None:
             wp.copy(self._induction.h0, self._magnetizing)
-        if self.close_up is not None:
-            self.close_up.add_fields()
         if self.bias is not None:
             launch_add_bias(self.bias, self._biased, self._induction.h0)
         if self._mutual.count == 0:
@@ -393,9 +384,9 @@ class MomentSystem:
         energies, state = self._energies, self._induction
         fields = state.h, state.h0, self._permanents_field, self._acting
         launch_energy(self.radii, self.moments, self._material, *fields, energies)
-        if self.close_up is not None:
-            self.close_up.add_energies(self.moments, energies)
         each = energies.numpy()
+        if self.applied is not None:
+            each += self.applied.energies()
         if self.bias is not None:  # counted from where nothing but the remanence is
             bias = np.linalg.norm(self.bias.numpy().astype(float), axis=1)
             volumes = 4.0 / 3.0 * np.pi * self.radii.numpy().astype(float) ** 3
@@ -422,10 +413,11 @@ class MomentSystem:
             near_pairs.launch_begin_forces(near)
         for evaluation in self._wrench[force]:
             evaluation.launch()
-        if self.close_up is not None:
-            effective = self._effective if force == "zeeman" else self._packed.moments
-            self.close_up.add_forces(effective, self._turned, self.forces, self.torques)
+        expanded = self.applied is not None and self.applied.expansion is not None
+        if expanded:
+            self.applied.expand()
         if near is not None:
             near_pairs.launch_add_forces(near)
-        if self.reactions is not None:
-            self.reactions.add(self._packed.moments if force == "kelvin" else self._effective, self.forces)
+        if self.applied is not None:
+            effective = self._effective if force == "zeeman" else self._packed.moments
+            self.applied.add(effective, self.forces, self.torques, near.arrays["response"] if expanded else None)

@@ -1,12 +1,9 @@
-// The field of all sources of a world at a target: the table of kinds, frames and sums.
-//
-// ``Arrays`` is the struct of sources.py. On a GPU a thread has one target, on a CPU threads share them out.
+// Sources that are a field everywhere: the table of kinds, and where they are. ``All`` is the struct of sources.py.
 #pragma once
 #include "applied/field_map.h"
 #include "applied/loop.h"
 #include "applied/polyline.h"
 #include "applied/solenoid.h"
-#include "shared/team.h"
 
 namespace warpmag {
 
@@ -42,15 +39,6 @@ struct SourceFrame {
 CUDA_CALLABLE inline Point point_at(const Real* vectors, int i) {
     return {vectors[3 * (size_t)i], vectors[3 * (size_t)i + 1], vectors[3 * (size_t)i + 2]};
 }
-CUDA_CALLABLE inline void put_point(Real* vectors, size_t i, Point v) {
-    vectors[3 * i] = Real(v.x), vectors[3 * i + 1] = Real(v.y), vectors[3 * i + 2] = Real(v.z);
-}
-// A gradient as a matrix ∂H_i/∂x_k.
-CUDA_CALLABLE inline void put_gradient(Real* matrices, size_t i, const FieldAt& f) {
-    put_point(matrices, 3 * i, {f.dx.x, f.dy.x, f.dz.x});
-    put_point(matrices, 3 * i + 1, {f.dx.y, f.dy.y, f.dz.y});
-    put_point(matrices, 3 * i + 2, {f.dx.z, f.dy.z, f.dz.z});
-}
 
 // From a transform: a place and a quaternion (x, y, z, w), of length 1 up to the rounding of Real.
 CUDA_CALLABLE inline SourceFrame frame_from(const Real* t) {
@@ -61,48 +49,13 @@ CUDA_CALLABLE inline SourceFrame frame_from(const Real* t) {
             {n * (x * z + w * y), n * (y * z - w * x), 1 - n * (x * x + y * y)}};
 }
 
-// Field of source s at target i, in the world.
-template <class Arrays> CUDA_CALLABLE inline FieldAt field_at(const Arrays& arrays, int s, int i) {
-    const SourceFrame frame = frame_from((const Real*)arrays.frame.data + 7 * (size_t)s);
-    const int begin = arrays.table_begin.data[s], end = arrays.table_end.data[s];
-    const AppliedSource source = {arrays.kind.data[s], point_at((const Real*)arrays.strength.data, s),
-                                  arrays.parameters.data + (size_t)s * arrays.parameters.shape[1],
-                                  (const Point*)arrays.table.data + begin, end - begin};
-    const Point x = point_at((const Real*)arrays.position.data, i);
+// Field of source s at x, in the world.
+template <class All> CUDA_CALLABLE inline FieldAt field_at(const All& all, int s, Point x) {
+    const SourceFrame frame = frame_from((const Real*)all.frame.data + 7 * (size_t)s);
+    const int begin = all.table_begin.data[s], end = all.table_end.data[s];
+    const AppliedSource source = {all.kind.data[s], point_at((const Real*)all.strength.data, s),
+                                  all.parameters.data + (size_t)s * all.parameters.shape[1],
+                                  (const Point*)all.table.data + begin, end - begin};
     return frame.to_world(field_of(source, frame.to_local(x - frame.origin)));
-}
-
-// Adds to the field at target i what the sources of its world apply, all of them to the one that magnetizes, those of
-// other bodies to the one that acts; and keeps apart what comes from those that are pushed back.
-template <class Arrays> CUDA_CALLABLE inline void apply_sources_at(const Arrays& arrays, int i) {
-    const int world = arrays.world.data[i];
-    const Point base = point_at((const Real*)arrays.base.data, i);
-    FieldAt acting = {base};
-    Point field = base;
-    for (int k = arrays.list_begin.data[world]; k < arrays.list_begin.data[world + 1]; ++k) {
-        const int s = arrays.list.data[k];
-        const bool own = arrays.source_body.data[s] == arrays.target_body.data[i];
-        FieldAt at = field_at(arrays, s, i);
-        field += at.h;
-        if (own) at = {};
-        acting = acting + at;
-        if (arrays.pair_begin.data[s] >= 0) {
-            const size_t pair = (size_t)arrays.pair_begin.data[s] + i - arrays.first.data[world];
-            put_point((Real*)arrays.pair_field.data, pair, at.h);
-            put_gradient((Real*)arrays.pair_gradient.data, pair, at);
-        }
-    }
-    put_point((Real*)arrays.field.data, i, field);
-    put_point((Real*)arrays.acting.data, i, acting.h);
-    put_gradient((Real*)arrays.gradient.data, i, acting);
-}
-
-template <class Word, class Arrays>
-CUDA_CALLABLE inline void apply_sources(int thread, int threads, Word* team, const Arrays& arrays) {
-#if defined(__CUDA_ARCH__)
-    apply_sources_at(arrays, thread);
-#else
-    run_passes(team, threads, 0, 1, arrays.position.shape[0], 1, [&](int, int i) { apply_sources_at(arrays, i); });
-#endif
 }
 }

@@ -1,16 +1,44 @@
-"""The sources on a device, their field at targets, and the forces and reactions that follow.
+"""What sources are, and where they and their targets stand on a device.
 
-A source of strength s applies to a moment m at x the field H(x) [A/m], and with Kelvin's law (Kim and Han 2022, Eqs. 13
-and 14) the force and torque
+Sources are numbered from coils and maps on, permanent bodies last:
 
-    F = μ0 ∇(m·H),   F_k = μ0 m_i ∂H_i/∂x_k,      τ = μ0 m × H,
+| array | shape | meaning |
+|---|---|---|
+| kind, frame, strength | [coils] | of a coil or a map: its kind, where it is, how strong |
+| parameters, table, table_begin, table_end | [coils, PARAMETERS], flat, [coils] | its numbers and vectors |
+| label, extent | [coils], [coils, 6] | label of its body as packed rows have it; middle and half sides of a box [m] |
+| list, list_begin | flat, [worlds + 1] | coils and maps of each world, and where its list begins |
+| shape, edge, face, corner, begin, edge_point, face_point, body, size | | ``solids`` has them |
+| solid_frame, world | [bodies] | where a permanent body is; the first body of its world, and the end of them |
+| packed, effective | | all moments, packed, and those that forces act on, shape [3, n] |
+| row | [rows] | source, first target and the end of those that push it back, and whether they are balls |
+| row_begin, partial | [sources + 1], [rows, 6] | first row of each source; force and torque of each row |
+| wrench | [sources, 7] | force [N], torque [N·m] about its origin or its first moment, and half an energy, see below |
 
-with Eq. 4 those on the effective moment (``pairs.wrench``). ∇(m·H) is (m·∇)H where H has no curl, and everywhere the
-gradient of the co-energy. The body of the source feels −ΣF and, about the source, −Σ(τ + (x − o) × F), of all moments
-that are not of its own body: momentum and angular momentum are kept by construction.
+The last number of a wrench is half the energy [J] that a permanent body has with others beyond what the sums over pairs
+give its moments. Targets are moments, or points:
+
+| array | shape | meaning |
+|---|---|---|
+| target | [8, t] | packed targets |
+| wanted | [t] | 0 of moments of permanent bodies of a closed form, 1 of others |
+| chunk, lists | [chunks] | first target, how many, and the bodies of their world; the part of ``list`` |
+| base | [t] | what fields are added to [A/m] |
+| field | [t] | what magnetizes: ``base`` and the field of all sources [A/m] |
+| acting | [t] | what turns: ``base`` and the field of the sources of other bodies [A/m] |
+| along_x, along_y, along_z | [t] | derivatives of the field of the sources of other bodies [A/m²] |
+| inside | [t] | of points, magnetization of the bodies there beyond that of their lattices' balls [A/m] |
+
+And balls that feel multipoles of theirs:
+
+| array | shape | meaning |
+|---|---|---|
+| ball | [balls] | moment, world, and the permanent bodies of that |
+| points, tables | | ``expansion`` has them |
+| expansion | [chunks, EXPANSION_ROWS, CHUNK] | what ``balls.h`` makes of the field about each moment |
+| response | [chunks, rows, CHUNK] | what ``near_contact/uneven.h`` makes of that |
 """
 
-from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache
 from typing import NamedTuple
@@ -18,19 +46,10 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import passes_kernel
-from warpmag.kernels.shared.reductions import group_sum
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.applied.solids import INTEGER_TABLES, tables_of
 
 PARAMETERS = 9
 """Numbers that a kind may have beside its table."""
-_FIELDS_PER_THREAD = 500
-"""Fields of a source at a target that make another thread of a CPU worth waking."""
-_SHARES = 32
-"""Threads of a GPU that sum the reaction on a source: a warp."""
-_sum_group = group_sum(wp.spatial_vectord)
 
 
 class SourceKind(IntEnum):
@@ -43,7 +62,7 @@ class SourceKind(IntEnum):
 
 
 class AppliedSource(NamedTuple):
-    """One source.
+    """One coil, or map.
 
     Attributes:
         kind: What it is.
@@ -61,293 +80,113 @@ class AppliedSource(NamedTuple):
     body: int = -1
     pushed: bool = False
 
-
-@dataclass(frozen=True)
-class Targets:
-    """Where fields are wanted.
-
-    Attributes:
-        positions: The places [m], Warp array of vectors, shape [n]; read at each launch.
-        worlds: World of each, shape [n].
-        bodies: Body of each, shape [n]; on moments of its own body a source does not act, though it magnetizes them.
-        base: What fields are added to [A/m], Warp array, shape [n].
-    """
-
-    positions: wp.array
-    worlds: np.ndarray
-    bodies: np.ndarray
-    base: wp.array = field(repr=False)
+    def extent(self) -> np.ndarray:
+        """Return middle and half sides of the box around its wires, or its nodes [m], shape [6]."""
+        first, p = np.zeros(3), self.parameters
+        if self.kind == SourceKind.POLYLINE:
+            first, last = self.table.min(axis=0), self.table.max(axis=0)
+        elif self.kind == SourceKind.FIELD_MAP:
+            first = np.array(p[:3])
+            last = first + np.multiply(p[3:6], np.subtract(p[6:9], 1.0))
+        else:
+            last = np.array([p[0], p[0], p[1] if self.kind == SourceKind.SOLENOID else 0.0])
+            first = -last
+        return np.concatenate([0.5 * (first + last), 0.5 * (last - first)])
 
 
 @cache
-def _arrays_type(dtype):
-    """Sources, targets and results; the module says what they are.
-
-    list_begin, list: Sources of each world, in order, and where its list begins, shape [worlds + 1].
-    first: First target of each world, shape [worlds]; where reactions are wanted, it has them in a row.
-    field: What magnetizes: ``base`` and the field of all sources, shape [n].
-    acting: What turns: ``base`` and the field of the sources of other bodies, shape [n].
-    gradient: Gradient ∂H_i/∂x_k of the field of the sources of other bodies [A/m²], shape [n].
-    pair_begin: Of each source where its pairs with the targets of its world begin, -1 if it is not pushed.
-    pair_field, pair_gradient: Field and gradient of one source at one target, shape [pairs].
-    """
-    vec3, mat33 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
-
-    @wp.struct
-    class SourceArrays:
-        kind: wp.array[int]
-        frame: wp.array[wp.types.transformation(dtype)]
-        strength: wp.array[vec3]
-        parameters: wp.array2d[wp.float64]
-        table: wp.array[wp.vec3d]
-        table_begin: wp.array[int]
-        table_end: wp.array[int]
-        source_body: wp.array[int]
-        list_begin: wp.array[int]
-        list: wp.array[int]
-        position: wp.array[vec3]
-        world: wp.array[int]
-        target_body: wp.array[int]
-        first: wp.array[int]
-        base: wp.array[vec3]
-        field: wp.array[vec3]
-        acting: wp.array[vec3]
-        gradient: wp.array[mat33]
-        pair_begin: wp.array[int]
-        pair_field: wp.array[vec3]
-        pair_gradient: wp.array[mat33]
-
-    return SourceArrays
-
-
-@cache
-def _field_kernel(dtype):
-    call = "(void)first, (void)last, warpmag::apply_sources(thread, threads, team.data, arrays);"
-    return passes_kernel(call, _arrays_type(dtype), native_options("applied/sources.h", dtype=dtype))
+def source_arrays_type(dtype):
+    """Type of the sources and targets; the module says what its arrays are."""
+    vec3, transform = wp.types.vector(3, dtype), wp.types.transformation(dtype)
+    kinds = (
+        (wp.array[int], "kind table_begin table_end list list_begin begin wanted row_begin"),
+        (wp.array[transform], "frame solid_frame"),
+        (wp.array[vec3], "strength base field acting along_x along_y along_z inside"),
+        (wp.array2d[wp.float64], "parameters"),
+        (wp.array[wp.vec3d], "table"),
+        (wp.array[dtype], "label edge face corner edge_point face_point points tables"),
+        (wp.array3d[dtype], "expansion response"),
+        (wp.array2d[dtype], "extent size packed effective partial wrench target"),
+        (wp.array2d[int], "shape body"),
+        (wp.array[wp.vec2i], "world lists"),
+        (wp.array[wp.vec4i], "chunk row ball"),
+    )
+    members = {name: kind for kind, names in kinds for name in names.split()}
+    doc = "Arrays of sources and targets."
+    return wp.struct(type("SourceArrays", (), {"__doc__": doc, "__annotations__": members}))
 
 
 class Sources:
     """Sources on a device.
 
     Args:
-        sources: The sources, ``AppliedSource``.
+        applied: Coils and maps, ``AppliedSource``.
+        solids: Permanent bodies, ``SolidMagnet``, ordered by world.
+        packed: All moments, packed (``packing.PackedMoments``).
         world_count: Number of worlds.
-        dtype: Warp scalar type of frames, strengths and fields.
-        device: Warp device.
 
     Attributes:
-        frames: Frame of each in the world, shape [s], transforms; written by the caller before fields are evaluated.
-        strengths: Strength of each, as its kind understands it, vectors, shape [s]; written by the caller.
-        sources: The sources.
+        applied, solids: The sources.
+        frames: Frame of each coil and map in the world, shape [coils], transforms; written by the caller before fields
+            are evaluated.
+        strengths: Strength of each of them, as its kind understands it, vectors, shape [coils]; written by the caller.
+        solid_frames: Where the permanent bodies are, transforms, shape [bodies]; written by the caller.
+        solid_worlds: Their worlds, NumPy.
+        lists: First of each world's coils and maps in their list, and the end, NumPy.
     """
 
-    def __init__(self, sources, world_count: int, dtype, device):
+    def __init__(self, applied, solids, packed, world_count: int):
         """Put the sources on the device."""
-        self.sources, self.dtype, self.device = tuple(sources), dtype, device
-        self.world_count = world_count
-        self._arrays = a = _arrays_type(dtype)()
-        worlds = [[k for k, one in enumerate(self.sources) if one.world in (-1, world)] for world in range(world_count)]
-        tables: dict[int, tuple[int, np.ndarray]] = {}
-        rows = 0
-        for one in self.sources:
+        self.applied, self.solids, self.packed = tuple(applied), tuple(solids), packed
+        self.dtype, self.device, self.world_count = packed.dtype, packed.device, world_count
+        self.arrays: dict[str, wp.array] = {"packed": packed.packed}
+        self._lay_out_applied()
+        if solids:
+            for name, values in tables_of(solids).items():
+                self.put(**{name: (values, wp.int32 if name in INTEGER_TABLES else self.dtype)})
+        self.solid_worlds = np.array([one.world for one in solids], int)
+        self.put(world=(self.bodies_of(self.solid_worlds), wp.vec2i))
+        transform, identity = wp.types.transformation(self.dtype), [0.0] * 6 + [1.0]
+        for name, count in (("frame", len(applied)), ("solid_frame", len(solids))):
+            self.put(**{name: (np.broadcast_to(identity, (count, 7)), transform)})
+        self.frames, self.solid_frames = self.arrays["frame"], self.arrays["solid_frame"]
+        self.strengths = self.zeros("strength", len(applied), wp.types.vector(3, self.dtype))
+
+    def _lay_out_applied(self):
+        """Put the numbers and vectors of coils and maps side by side."""
+        applied, tables, rows = self.applied, {}, 0
+        for one in applied:
             if id(one.table) not in tables:
                 tables[id(one.table)] = rows, one.table
                 rows += len(one.table)
-        begins = np.array([tables[id(one.table)][0] for one in self.sources], np.int32)
-        numbers = np.zeros((len(self.sources), PARAMETERS))
-        for row, one in zip(numbers, self.sources, strict=True):
-            row[: len(one.parameters)] = one.parameters
-        a.kind = self._integers([one.kind for one in self.sources])
-        a.parameters = wp.array(numbers, dtype=wp.float64, device=device)
-        table = np.concatenate([np.zeros((0, 3)), *(part for _, part in tables.values())])
-        a.table = wp.array(table, dtype=wp.vec3d, device=device)
-        a.table_begin = self._integers(begins)
-        a.table_end = self._integers(begins + [len(one.table) for one in self.sources])
-        a.source_body = self._integers([one.body for one in self.sources])
-        a.list_begin = self._integers(np.cumsum([0, *map(len, worlds)]))
-        a.list = self._integers([k for world in worlds for k in world])
-        identity = np.broadcast_to([0.0] * 6 + [1.0], (len(self.sources), 7))
-        a.frame = self.frames = wp.array(identity, dtype=wp.types.transformation(dtype), device=device)
-        a.strength = self.strengths = wp.zeros(len(self.sources), dtype=wp.types.vector(3, dtype), device=device)
-
-    def _integers(self, values) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=self.device)
-
-    def longest_list(self) -> int:
-        """Sources of the world that has most."""
-        return int(np.diff(self._arrays.list_begin.numpy()).max(initial=0))
-
-
-class AppliedField:
-    """Field of sources at targets, again and again in the same arrays.
-
-    Args:
-        sources: The sources.
-        targets: The targets.
-        reactions: Whether what pushes sources back is kept, for which the targets of a world must be in a row.
-
-    Attributes:
-        field: What magnetizes the targets: their base and the field of all sources [A/m], shape [n].
-        acting: What turns them: their base and the field of the sources of other bodies [A/m], shape [n].
-        gradient: Gradient ∂H_i/∂x_k of the field of the sources of other bodies [A/m²], shape [n], matrices.
-    """
-
-    def __init__(self, sources: Sources, targets: Targets, *, reactions: bool = False):
-        """Allocate the results and record the launch."""
-        dtype, device, count = sources.dtype, sources.device, len(targets.positions)
-        vec3, mat33 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
-        self.count = count
-        self._arrays = a = _arrays_type(dtype)()
-        for name in ("kind", "frame", "strength", "parameters", "table", "table_begin", "table_end", "source_body"):
-            setattr(a, name, getattr(sources._arrays, name))
-        a.list_begin, a.list = sources._arrays.list_begin, sources._arrays.list
-        a.position, a.base = targets.positions, targets.base
-        a.world, a.target_body = sources._integers(targets.worlds), sources._integers(targets.bodies)
-        edges = np.searchsorted(targets.worlds, np.arange(sources.world_count + 1))
-        a.first = sources._integers(edges[:-1])
-        a.field, a.acting = (wp.zeros(count, dtype=vec3, device=device) for _ in range(2))
-        a.gradient = wp.zeros(count, dtype=mat33, device=device)
-        self.field, self.acting, self.gradient = a.field, a.acting, a.gradient
-        begins, pairs = [], 0
-        for one in sources.sources:
-            begins.append(pairs if one.pushed and reactions else -1)
-            pairs += int(edges[one.world + 1] - edges[one.world]) if begins[-1] >= 0 else 0
-        a.pair_begin = sources._integers(begins)
-        a.pair_field = wp.zeros(pairs, dtype=vec3, device=device)
-        a.pair_gradient = wp.zeros(pairs, dtype=mat33, device=device)
-        threads = threads_for(count * sources.longest_list(), _FIELDS_PER_THREAD)
-        self._launch = wp.launch(
-            _field_kernel(dtype),
-            dim=count if device.is_cuda else 1,
-            inputs=[0, 1, threads, None if device.is_cuda else team(), a],
-            device=device,
-            record_cmd=True,
+        begins = np.array([tables[id(one.table)][0] for one in applied], np.int32)
+        numbers = np.array([np.pad(one.parameters, (0, PARAMETERS - len(one.parameters))) for one in applied])
+        worlds = [[k for k, one in enumerate(applied) if one.world in (-1, w)] for w in range(self.world_count)]
+        self.lists = np.cumsum([0, *map(len, worlds)])
+        self.put(
+            kind=([one.kind for one in applied], wp.int32),
+            parameters=(numbers.reshape(-1, PARAMETERS), wp.float64),
+            table=(np.concatenate([np.zeros((0, 3)), *(part for _, part in tables.values())]), wp.vec3d),
+            table_begin=(begins, wp.int32),
+            table_end=(begins + [len(one.table) for one in applied], wp.int32),
+            label=([one.body for one in applied], self.dtype),
+            extent=(np.array([one.extent() for one in applied]).reshape(-1, 6), self.dtype),
+            list_begin=(self.lists, wp.int32),
+            list=([k for world in worlds for k in world], wp.int32),
         )
 
-    def launch(self):
-        """Evaluate the field at the targets, where sources and targets are now."""
-        if self.count:
-            self._launch.launch()
+    def bodies_of(self, worlds) -> np.ndarray:
+        """Return the first permanent body of each of some worlds, and the end of them, shape [..., 2]."""
+        return np.stack([np.searchsorted(self.solid_worlds, worlds, side) for side in ("left", "right")], axis=-1)
 
+    def put(self, **arrays):
+        """Put arrays (values, type) on the device, whole numbers as such."""
+        for name, (values, kind) in arrays.items():
+            whole = kind in (wp.int32, wp.vec2i, wp.vec4i)
+            values = np.ascontiguousarray(values, np.int32 if whole else float)
+            self.arrays[name] = wp.array(values, dtype=kind, device=self.device)
 
-@cache
-def _sum_kernel(mat33):
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_gradients(more: wp.array[mat33], gradients_out: wp.array[mat33]):
-        i = wp.tid()
-        gradients_out[i] += more[i]
-
-    return add_gradients
-
-
-def launch_add_gradients(more, gradients):
-    """Add gradients [A/m²], matrices of shape [n], to others."""
-    kernel = _sum_kernel(gradients.dtype)
-    wp.launch(kernel, dim=len(gradients), inputs=[more], outputs=[gradients], device=gradients.device)
-
-
-@cache
-def _force_kernel(dtype):
-    vec3, mat33 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_applied_forces(
-        # inputs:
-        movable: wp.array[int],
-        effective: wp.array2d[dtype],
-        gradient: wp.array[mat33],
-        # outputs:
-        forces_out: wp.array[vec3],
-    ):
-        i = wp.tid()
-        if movable[i] != 0:
-            e = vec3(effective[0, i], effective[1, i], effective[2, i])
-            forces_out[i] += dtype(wp.static(MU0)) * (wp.transpose(gradient[i]) * e)
-
-    return add_applied_forces
-
-
-@cache
-def _reaction_kernel(dtype):
-    vec3, arrays_type = wp.types.vector(3, dtype), _arrays_type(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def sum_reactions(
-        # inputs:
-        arrays: arrays_type,
-        pushed: wp.array[int],
-        worlds: wp.array[int],
-        ends: wp.array[int],
-        effective: wp.array2d[dtype],
-        shares: int,
-        # outputs:
-        forces_out: wp.array[vec3],
-        torques_out: wp.array[vec3],
-    ):
-        k = wp.tid() // shares
-        share = wp.tid() % shares
-        s = pushed[k]
-        first = arrays.first[worlds[k]]
-        origin = wp.transform_get_translation(arrays.frame[s])
-        mine = wp.spatial_vectord()
-        for i in range(first + share, ends[k], shares):
-            pair = arrays.pair_begin[s] + i - first
-            e = vec3(effective[0, i], effective[1, i], effective[2, i])
-            force = wp.transpose(arrays.pair_gradient[pair]) * e
-            torque = wp.cross(e, arrays.pair_field[pair]) + wp.cross(arrays.position[i] - origin, force)
-            for c in range(3):
-                mine[c] += wp.float64(force[c])
-                mine[c + 3] += wp.float64(torque[c])
-        total = wp.float64(-wp.static(MU0)) * _sum_group(mine, shares)
-        if share == 0:
-            forces_out[s] = vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
-            torques_out[s] = vec3(dtype(total[3]), dtype(total[4]), dtype(total[5]))
-
-    return sum_reactions
-
-
-class AppliedForces:
-    """What sources do to moments, and these to them.
-
-    Args:
-        sources: The sources.
-        moments: The moments that they act on, as targets.
-        movable: Whether the force on a moment is wanted, shape [n].
-
-    Attributes:
-        at: The field at the moments.
-        reaction_forces: Force [N] on each source that is pushed, shape [s].
-        reaction_torques: Torque [N·m] on it about the origin of its frame, shape [s].
-    """
-
-    def __init__(self, sources: Sources, moments: Targets, movable: np.ndarray):
-        """Allocate the results."""
-        self.at = AppliedField(sources, moments, reactions=True)
-        self._movable = sources._integers(movable)
-        pushed = [k for k, one in enumerate(sources.sources) if one.pushed]
-        worlds = np.array([sources.sources[k].world for k in pushed], int)
-        self._pushed, self._worlds = sources._integers(pushed), sources._integers(worlds)
-        self._ends = sources._integers(np.searchsorted(moments.worlds, worlds + 1))
-        vec3 = wp.types.vector(3, sources.dtype)
-        self.reaction_forces, self.reaction_torques = (
-            wp.zeros(len(sources.sources), dtype=vec3, device=sources.device) for _ in range(2)
-        )
-
-    def add(self, effective, forces):
-        """Add the forces on the moments, and sum the reactions.
-
-        Args:
-            effective: Effective moments (``pairs.wrench``) [A·m²], shape [3, n].
-            forces: Forces [N] that are added to, shape [n].
-        """
-        dtype, device, arrays = forces.dtype._wp_scalar_type_, forces.device, self.at._arrays
-        inputs = [self._movable, effective, self.at.gradient]
-        wp.launch(_force_kernel(dtype), dim=self.at.count, inputs=inputs, outputs=[forces], device=device)
-        shares = _SHARES if device.is_cuda else 1
-        wp.launch(
-            _reaction_kernel(dtype),
-            dim=shares * len(self._pushed),
-            inputs=[arrays, self._pushed, self._worlds, self._ends, effective, shares],
-            outputs=[self.reaction_forces, self.reaction_torques],
-            device=device,
-        )
+    def zeros(self, name: str, shape, kind) -> wp.array:
+        """Put an array of zeros on the device."""
+        self.arrays[name] = wp.zeros(shape, dtype=kind, device=self.device)
+        return self.arrays[name]

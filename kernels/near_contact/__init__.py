@@ -1,7 +1,7 @@
 """Near contacts: what two balls add to their dipoles when they almost touch.
 
-May import ``shared``, ``material`` and ``pairs``. ``contact_table`` has the constants and the table of two balls,
-``near_pairs`` the buffers and launches, headers the passes over the near pairs.
+May import ``shared``, ``material``, ``pairs`` and ``applied``. ``contact_table`` has the constants and the table of two
+balls, ``near_pairs`` the buffers and launches, headers the passes over the near pairs.
 
 Close to contact the flux between two permeable balls crowds into the gap, and dipoles miss most of the force. As
 Bonnecaze and Brady did for suspensions, the far field stays many-body and what it lacks is added pair by pair, from the

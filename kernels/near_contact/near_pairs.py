@@ -123,6 +123,7 @@ _REALS = (
     *("packed", "radius", "unsaturated", "curve_slope", "hardness", "relaxation", "pairs", "conductances", "state"),
     *("last_state", "sources", "drives", "field", "kept", "pair_slopes", "conductance_slopes", "pair_forces"),
     *("partial", "found_at", "tables", "places", "forces", "torques", "curve_tables", "alone", "response", "bounds"),
+    "expansion",
 )
 _MEMBERS = dict.fromkeys(_INTEGERS, wp.uint64) | dict.fromkeys(_SIZES, int) | dict.fromkeys(_REALS, wp.uint64)
 _DOC = "Where arrays begin, side by side, for a GPU to read together; and sizes. As in ``state.h``."
@@ -142,7 +143,7 @@ class NearContactBuffers:
             the magnetization curve.
         reach: Distance of the farthest contact [m]; 0 if no moment may take part.
         threads: Threads of a CPU.
-        uneven: Those for what permanent moments add; 0 if none may act on balls.
+        uneven: Those for what uneven fields add; 0 if there are none.
         stream: Stream of a GPU for what is done beside the pair loops.
         events: There, when it starts, when the field is summed, and when all is done.
         commands: Launches as they were recorded, which spares packing the arrays each time.
@@ -176,7 +177,7 @@ class NearContactBuffers:
 
 def allocate(
     packed, worlds, eligible, susceptibility, material, *, ranges, magnets, lone, field, movable, turned,
-    forces, torques,
+    forces, torques, expansion=None,
 ) -> NearContactBuffers:  # fmt: skip
     """Allocate the buffers.
 
@@ -193,6 +194,7 @@ def allocate(
         movable: Whether the force on a moment is wanted, shape [n].
         turned: Whether its torque is, shape [n].
         forces, torques: What is added to [N, N·m], Warp arrays, shape [n].
+        expansion: Fields of sources about the moments (``applied/balls.h``); None without such.
     """
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
@@ -218,8 +220,7 @@ def allocate(
         "partial": field.partial[-1],
         "movable": padded(movable, 0),
         "turned": padded(movable & turned, 0),
-        "forces": forces,
-        "torques": torques,
+        **{"forces": forces, "torques": torques, "expansion": expansion},
     }
     stride = packed.packed.strides[0] // wp.types.type_size_in_bytes(dtype)
     return NearContactBuffers(
@@ -228,7 +229,7 @@ def allocate(
         arrays=arrays,
         given=_addresses(arrays, balls=balls, moment_stride=stride, kinds=kinds, common_curve=material.common_curve),
         reach=reach,
-        uneven=threads_for(pairs, _PAIRS_PER_THREAD) if pairs else 0,
+        uneven=threads_for(pairs, _PAIRS_PER_THREAD) if pairs or expansion is not None else 0,
         threads=threads_for(n, _BALLS_PER_THREAD),
         stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
         events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
@@ -246,7 +247,7 @@ def _field_rows(field, n: int) -> np.ndarray:
 def _addresses(arrays: dict[str, wp.array], **sizes: int) -> Any:
     given = ContactArrays()
     for name in (*_INTEGERS, *_REALS):
-        setattr(given, name, arrays[name].ptr or 0)
+        setattr(given, name, (arrays[name].ptr if arrays[name] is not None else None) or 0)
     for name, size in sizes.items():
         setattr(given, name, size)
     return given

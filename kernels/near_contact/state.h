@@ -16,7 +16,7 @@ struct Arrays {
     int balls, moment_stride, kinds, common_curve;
     Real *packed, *radius, *unsaturated, *curve_slope, *hardness, *relaxation, *pairs, *conductances, *state,
         *last_state, *sources, *drives, *field, *kept, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
-        *found_at, *tables, *places, *forces, *torques, *curve_tables, *alone, *response, *bounds;
+        *found_at, *tables, *places, *forces, *torques, *curve_tables, *alone, *response, *bounds, *expansion;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "ContactArrays has the same members in the same order");

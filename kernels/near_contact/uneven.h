@@ -97,38 +97,41 @@ CUDA_CALLABLE inline void add_derivatives(Number (&sum)[FULL], const Sight& s, V
     sum[30] += 2 * xy * u.z * r.z + by_z.x * u.y + by_z.y * u.x;
 }
 
-// Writes the response: the sums without their traces, times (2l − 1)!!/l! and the polarizability of a degree.
-CUDA_CALLABLE inline void put_response(Real* rows, const Number (&s)[FULL], Number slope) {
+// Writes the response: the sums without their traces, and what the field of sources has, times (2l − 1)!!/l! and the
+// polarizability of a degree.
+CUDA_CALLABLE inline void put_response(Real* rows, const Real* sources, const Number (&s)[FULL], Number slope) {
     const Number k2 = Real(1.5) * polarizability(slope, 2), k3 = Real(2.5) * polarizability(slope, 3);
     const Number k4 = Real(4.375) * polarizability(slope, 4), third = (s[0] + s[1] + s[2]) * Real(1.0 / 3.0);
-    auto keep = [=](int row, Number n) { put(rows + row * CHUNK, n); };
-    keep(0, k2 * (s[0] - third));
-    keep(1, k2 * (s[1] - third));
-    keep(2, k2 * s[3]);
-    keep(3, k2 * s[4]);
-    keep(4, k2 * s[5]);
+    auto keep = [=](int row, Number k, Number n) {
+        put(rows + row * CHUNK, k * (sources ? n + numbers(sources + row * CHUNK) : n));
+    };
+    keep(0, k2, s[0] - third);
+    keep(1, k2, s[1] - third);
+    keep(2, k2, s[3]);
+    keep(3, k2, s[4]);
+    keep(4, k2, s[5]);
     const Number fifth = Real(0.2), x = fifth * (s[6] + s[11] + s[13]), y = fifth * (s[7] + s[9] + s[14]);
     const Number z = fifth * (s[8] + s[10] + s[12]);
-    keep(5, k3 * (s[6] - 3 * x));
-    keep(6, k3 * (s[7] - 3 * y));
-    keep(7, k3 * (s[9] - y));
-    keep(8, k3 * (s[10] - z));
-    keep(9, k3 * (s[11] - x));
-    keep(10, k3 * (s[12] - z));
-    keep(11, k3 * s[15]);
+    keep(5, k3, s[6] - 3 * x);
+    keep(6, k3, s[7] - 3 * y);
+    keep(7, k3, s[9] - y);
+    keep(8, k3, s[10] - z);
+    keep(9, k3, s[11] - x);
+    keep(10, k3, s[12] - z);
+    keep(11, k3, s[15]);
     const Number xx = s[16] + s[25] + s[27], yy = s[17] + s[25] + s[26], zz = s[18] + s[26] + s[27];
     const Number xy = s[19] + s[21] + s[30], yz = s[22] + s[24] + s[28], zx = s[20] + s[23] + s[29];
     const Number all = (xx + yy + zz) * Real(1.0 / 35.0), k = Number(Real(1.0 / 7.0));
-    keep(12, k4 * (s[16] - 6 * k * xx + 3 * all));
-    keep(13, k4 * (s[17] - 6 * k * yy + 3 * all));
-    keep(14, k4 * (s[25] - k * (xx + yy) + all));
-    keep(15, k4 * (s[19] - 3 * k * xy));
-    keep(16, k4 * (s[20] - 3 * k * zx));
-    keep(17, k4 * (s[21] - 3 * k * xy));
-    keep(18, k4 * (s[22] - 3 * k * yz));
-    keep(19, k4 * (s[28] - k * yz));
-    keep(20, k4 * (s[29] - k * zx));
-    keep(21, polarizability(slope, 6)); // of the rest, which begins with degree 5
+    keep(12, k4, s[16] - 6 * k * xx + 3 * all);
+    keep(13, k4, s[17] - 6 * k * yy + 3 * all);
+    keep(14, k4, s[25] - k * (xx + yy) + all);
+    keep(15, k4, s[19] - 3 * k * xy);
+    keep(16, k4, s[20] - 3 * k * zx);
+    keep(17, k4, s[21] - 3 * k * xy);
+    keep(18, k4, s[22] - 3 * k * yz);
+    keep(19, k4, s[28] - k * yz);
+    keep(20, k4, s[29] - k * zx);
+    put(rows + TENSOR_ROWS * CHUNK, polarizability(slope, 6)); // of the rest, which begins with degree 5
 }
 
 // The tensor of degree 3 or 4 from row ``first`` on, contracted with u to degree 2.
@@ -299,7 +302,20 @@ CUDA_CALLABLE inline void find_response(const Arrays& a, int i) {
         if (any(s.live)) add_derivatives(sums, s, over_cube(o.m, metre));
     });
     for (int c = 0; c < FULL; ++c) sums[c] = group_sum(sums[c]);
-    if (share() == 0) put_response(rows_at(a.response, RESPONSE_ROWS, i), sums, differential_slope(a, i));
+    if (share() > 0) return;
+    const Real* const sources = a.expansion ? rows_at(a.expansion, EXPANSION_ROWS, i) : nullptr;
+    put_response(rows_at(a.response, RESPONSE_ROWS, i), sources, sums, differential_slope(a, i));
+}
+
+// What the field of sources pulls the response of balls with, over μ0/4π R³.
+CUDA_CALLABLE inline Vector pull_of_sources(const Arrays& a, int i) {
+    const Real* const response = rows_at(a.response, RESPONSE_ROWS, i);
+    const Real* const slopes = rows_at(a.expansion, EXPANSION_ROWS, i) + TENSOR_ROWS * CHUNK;
+    const Number zero = Number(Real(0));
+    Vector total = {zero, zero, zero};
+    for (int row = 0; row < TENSOR_ROWS; ++row)
+        total = sum(total, scaled(numbers(response + row * CHUNK), own_vector(slopes + 3 * row * CHUNK)));
+    return total;
 }
 
 // Pass 2: forces on balls, minus those that they push permanent moments with.
@@ -318,7 +334,9 @@ CUDA_CALLABLE inline void pull_balls(const Arrays& a, int i) {
         total = less(total, whole_push(response, s, over_cube(o.m, metre), o.alone).force);
     });
     total = group_sums(scaled(size * size, total));
-    if (share() == 0) add_to(a.forces, i, total, a.movable);
+    if (share() > 0) return;
+    if (a.expansion) total = sum(total, scaled(size * size * size, pull_of_sources(a, i)));
+    add_to(a.forces, i, total, a.movable);
 }
 
 // Pass 3: forces and torques on permanent moments.

@@ -39,6 +39,7 @@ a force. Reference: Jackson, Classical Electrodynamics, 3rd ed., ch. 4.
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.applied.expansion import EXPANSION_ROWS, TENSOR_ROWS
 from warpmag.kernels.near_contact import contact_table
 from warpmag.kernels.shared.passes import CHUNK
 
@@ -53,7 +54,13 @@ def constants() -> dict[str, int | float]:
     fades = {name: getattr(contact_table, name) for name in ("MAGNET_REACH", "MAGNET_OVERLAP", "CELL_SIZE")}
     ends = {f"{name}_{end}": x for name, fade in fades.items() for end, x in zip(("LOW", "HIGH"), fade, strict=True)}
     sizes = {name: getattr(contact_table, name) for name in ("CELL_DEPTH", "LEAST_MAGNET")}
-    return {"RESPONSE_ROWS": RESPONSE_ROWS, "BOUND_ROWS": BOUND_ROWS} | sizes | ends
+    rows = {"TENSOR_ROWS": TENSOR_ROWS, "EXPANSION_ROWS": EXPANSION_ROWS}
+    return rows | {"RESPONSE_ROWS": RESPONSE_ROWS, "BOUND_ROWS": BOUND_ROWS} | sizes | ends
+
+
+def expansion_constants() -> tuple[float, float, int]:
+    """What ``applied/balls.h`` takes: the range over which sources of fields fade, and the rows of a response."""
+    return (*map(float, contact_table.MAGNET_REACH), RESPONSE_ROWS)
 
 
 def allocate(balls: int, ranges, eligible, magnets, lone, movable, dtype, device) -> tuple[int, dict[str, wp.array]]:

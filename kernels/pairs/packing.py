@@ -104,7 +104,7 @@ class PackedMoments:
 
         self.labels = integers(np.arange(n, dtype=np.int32) if labels is None else labels)
         self.groups = wp.zeros(n, dtype=wp.int32, device=device) if groups is None else integers(groups)
-        pitched = wp.zeros((PACKED_ROWS, (1 + -(-n // PITCH)) * PITCH), dtype=dtype, device=device)
+        pitched = self._pitched(PACKED_ROWS)
         pitched[3].fill_(largest_radius)
         pitched[7].fill_(-1.0)
         self.packed: wp.array = pitched[:, :n] if n else pitched
@@ -114,6 +114,14 @@ class PackedMoments:
         self._lists = lists
         self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
         self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
+
+    def _pitched(self, rows: int) -> wp.array:
+        """Rows of zeros, with room after the last moment."""
+        return wp.zeros((rows, (1 + -(-self.count // PITCH)) * PITCH), dtype=self.dtype, device=self.device)
+
+    def vectors(self) -> wp.array:
+        """Return an array for more vectors of the moments, laid out as :attr:`moments`, shape [3, n]."""
+        return self._pitched(3)[:, : self.count] if self.count else self._pitched(3)
 
     def carried(self) -> dict:
         """Return the arrays that outlive an arrangement, by name."""

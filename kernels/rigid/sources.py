@@ -61,8 +61,7 @@ def _add_reactions(
     sources: SourceShapes,
     bodies: BodyView,
     frames_in: wp.array[wp.transform],
-    forces_in: wp.array[wp.vec3],
-    torques_in: wp.array[wp.vec3],
+    wrenches_in: wp.array2d[float],
     # outputs:
     body_f_out: wp.array[wp.spatial_vector],
 ):
@@ -75,14 +74,16 @@ def _add_reactions(
     torque = wp.vec3()
     for place in range(sources.run_start[k], sources.run_start[k + 1]):
         s = sources.order[place]
-        force += forces_in[s]
-        torque += torques_in[s] + wp.cross(wp.transform_get_translation(frames_in[s]) - center, forces_in[s])
+        pull = wp.vec3(wrenches_in[s, 0], wrenches_in[s, 1], wrenches_in[s, 2])
+        turn = wp.vec3(wrenches_in[s, 3], wrenches_in[s, 4], wrenches_in[s, 5])
+        force += pull
+        torque += turn + wp.cross(wp.transform_get_translation(frames_in[s]) - center, pull)
     body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
 
 
-def add_reactions(sources: SourceShapes, model, state, frames, forces, torques):
+def add_reactions(sources: SourceShapes, model, state, frames, wrenches):
     """Add force and torque about its frame of every source to the wrench of its body, unless that is kinematic."""
-    inputs = [sources, view_bodies(model, state), frames, forces, torques]
+    inputs = [sources, view_bodies(model, state), frames, wrenches]
     outputs = [state.body_f]
     wp.launch(_add_reactions, len(sources.body_list), inputs=inputs, outputs=outputs, device=frames.device)
 

@@ -211,9 +211,8 @@ class ModelSources:
     def add_reactions(self, state: newton.State) -> None:
         """Add what the moments do to the sources to the forces on their bodies."""
         if self.applied:
-            reactions, frames = self._system.reactions, self._system.sources.frames
-            forces, torques = reactions.reaction_forces, reactions.reaction_torques
-            add_reactions(self._shapes, self._model, state, frames, forces, torques)
+            frames, wrenches = self._system.sources.frames, self._system.applied.wrenches
+            add_reactions(self._shapes, self._model, state, frames, wrenches)
 
     def set_strength(self, name: str, which: int | str, value) -> None:
         """Set the strength of those sources that ``which`` tells, a shape or a pattern of labels, in their order."""

@@ -31,12 +31,11 @@ class BodyMagnet:
     lattice: BodyLattice
 
 
-def find_magnets(model: newton.Model, *, cells: bool = False) -> tuple[list[BodyMagnet], np.ndarray]:
+def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
     """Group the marked shapes of ``model`` into magnets and sample them, in the order that the system wants.
 
     Args:
         model: The model.
-        cells: Whether permanent bodies are cells of a lattice from afar, see :class:`ShapeSampler`.
 
     Returns:
         The magnets, and the Newton worlds that hold them, -1 where there are none.
@@ -55,7 +54,7 @@ def find_magnets(model: newton.Model, *, cells: bool = False) -> tuple[list[Body
             groups.append((magnet, body, [shape]))
             of_body.setdefault(body, []).append(groups[-1])
     worlds, held = _number_worlds(model, [shapes[0] for _, _, shapes in groups])
-    sampler = ShapeSampler(model, cells=cells)
+    sampler = ShapeSampler(model)
     magnets = [
         BodyMagnet(
             magnet,

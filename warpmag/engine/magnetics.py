@@ -15,7 +15,7 @@ from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.grouping import BodyMagnet, find_magnets
 from warpmag.engine.model_values import ModelValues
 from warpmag.errors import InputError
-from warpmag.kernels.close_up.bodies import SolidMagnet
+from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
@@ -85,7 +85,7 @@ class Magnetics:
         settings.check("Magnetics")
         if curve is not None:
             curve = materials.measured("Magnetics: curve", curve)
-        self.magnets, self._worlds = find_magnets(model, cells=contact_model == "multipole")
+        self.magnets, self._worlds = find_magnets(model)
         self._model, self._values = model, ModelValues(model)
         self._sources = ModelSources(model, self._worlds)
         self._induced = False
@@ -227,8 +227,8 @@ class Magnetics:
         if self.system.rotations is not None:
             gather_rotations(state.body_q, self._celled, self.system.rotations)
         self._sources.gather(state.body_q)
-        if self.system.frames is not None:
-            gather_frames(state.body_q, self._solid_bodies, self.system.frames)
+        if len(self._solid_bodies):
+            gather_frames(state.body_q, self._solid_bodies, self.system.sources.solid_frames)
         if len(self._recoiling):
             gather_bias(state.body_q, self._body_moments, self._recoiling, self._coercivity, self.system.bias)
         self.system.solve()

@@ -56,15 +56,8 @@ class BodyLattice:
 class ShapeSampler:
     """Samples shapes of one model; shapes that are alike, in many worlds say, are sampled once."""
 
-    def __init__(self, model: newton.Model, *, cells: bool = False):
-        """Read the geometry of ``model``.
-
-        Args:
-            model: The model.
-            cells: Whether permanent bodies are cells of a lattice, as what acts on the multipoles of balls takes them
-                (``kernels/near_contact/uneven.py``), and not points of Gauss.
-        """
-        self._cells = cells
+    def __init__(self, model: newton.Model):
+        """Read the geometry of ``model``."""
         self._labels, self._sources = model.shape_label, model.shape_source
         self._bodies = model.shape_body.numpy()
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
@@ -105,7 +98,7 @@ class ShapeSampler:
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
         closed = self._polyhedra(shapes, solids) if permanent else []
-        if closed and spacing == 0.0 and not self._cells:
+        if closed and spacing == 0.0:
             return self._close_up(shapes, solids, closed)
         across = 1 if permanent else lattice.LEAST_ACROSS
         filled = lattice.fill(solids, spacing, across, together=not permanent)

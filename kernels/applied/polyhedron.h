@@ -18,7 +18,7 @@
 
 namespace warpmag {
 
-constexpr int EDGE_ROW = 19, FACE_ROW = 3; // as in bodies.py
+constexpr int EDGE_ROW = 19, FACE_ROW = 3; // as in solids.py
 
 // Tables of a shape: rows of edges (corner, direction, length, ν and n of both faces), of faces (n), and the corners of
 // each face from corner[begin] to corner[end].
@@ -35,6 +35,9 @@ CUDA_CALLABLE inline Three three(const Real* at) { return {at[0], at[1], at[2]};
 CUDA_CALLABLE inline Real dot(Three a, Three b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 CUDA_CALLABLE inline Three mixed(Real p, Three a, Real q, Three b) {
     return {p * a.x + q * b.x, p * a.y + q * b.y, p * a.z + q * b.z};
+}
+CUDA_CALLABLE inline Three crossed(Three a, Three b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 CUDA_CALLABLE inline Vector spread(Three a) {
     const Number zero = Number(Real(0));
@@ -58,6 +61,12 @@ struct Near {
 CUDA_CALLABLE inline Near no_field() {
     const Number zero = Number(Real(0));
     return {{zero, zero, zero}, {zero, zero, zero, zero, zero, zero}};
+}
+CUDA_CALLABLE inline Near mixed(Real p, const Near& a, Real q, const Near& b) {
+    auto mix = [=](Number x, Number y) { return p * x + q * y; };
+    return {{mix(a.h.x, b.h.x), mix(a.h.y, b.h.y), mix(a.h.z, b.h.z)},
+            {mix(a.t.xx, b.t.xx), mix(a.t.yy, b.t.yy), mix(a.t.zz, b.t.zz), mix(a.t.xy, b.t.xy), mix(a.t.yz, b.t.yz),
+             mix(a.t.zx, b.t.zx)}};
 }
 CUDA_CALLABLE inline void add_where(Mask wanted, Gradient& to, const Gradient& t) {
     to.xx += wanted ? t.xx : 0, to.yy += wanted ? t.yy : 0, to.zz += wanted ? t.zz : 0;
