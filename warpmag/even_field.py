@@ -26,6 +26,9 @@ from warpmag.solid import Solid
 FACETS = 600
 """Facets of a body, about; from these and a quarter as many its moment is extrapolated, to 0.3 % for a cube."""
 
+_FACETS_OF_PART = 150
+"""The same of each shape, at least: a quarter as many are then the fewest that ``facets.py`` gives."""
+
 MOST_FACETS = 1500
 """A mesh of more triangles is left as its cells are."""
 
@@ -49,7 +52,8 @@ def corrected(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> 
     """
     if len(lattice.volumes) > MOST_MOMENTS or not _hangs_together(coupling):
         return coupling
-    coarse, fine = (facets.of_body(solids, count) for count in (FACETS // 4, FACETS))
+    most = max(FACETS, _FACETS_OF_PART * len(solids))
+    coarse, fine = (facets.of_body(solids, count) for count in (most // 4, most))
     if len(fine) > MOST_FACETS:
         return coupling
     of_surface, of_cells = extrapolated_moments(coarse, fine), cell_moments(coupling, lattice)
