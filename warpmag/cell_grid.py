@@ -10,7 +10,7 @@ from warpmag.solid import Solid, boxes_meet, grid
 _FINE_POINTS = 32
 """Test points across a shape, along each axis, at least, as far as ``_MOST_SPLITS`` lets them."""
 
-_MOST_SPLITS = 6
+_MOST_SPLITS = 8
 """Test points across a cell, along each axis, at most, where several shapes share a grid."""
 
 _FLATTEST = 4.0
@@ -145,8 +145,8 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     sides = thin / np.where(fit < 1.0, fit, np.rint(fit))
     before = np.ceil((face - lower) / sides - 1e-6)
     counts = (before + np.ceil((upper - face) / sides - 1e-6)).astype(int)
-    splits = np.maximum(np.ceil(_FINE_POINTS * sides / thin - 1e-6).astype(int), 3)
-    splits = np.where(splits > 8, -(-splits // 8) * 8, splits)  # which demagnetizing tensors join to 8
+    splits = np.maximum(np.ceil(_FINE_POINTS * sides / thin - 1e-6).astype(int), 1)
+    splits = np.where(splits > 4, -(-splits // 8) * 8, 4)  # which demagnetizing tensors join to 8 and 4
     splits = splits if len(parts) == 1 else np.minimum(splits, _MOST_SPLITS)
     lower = face - before * sides
     return CellGrid(solids, len(earlier), lower, sides, counts, splits, home.position, home.rotation)

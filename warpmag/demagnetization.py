@@ -28,7 +28,16 @@ EXACT_REACH = 3.0
 _SUBCELLS = 8
 """Subcells that resolve a cell which the surface cuts, along each axis, at most."""
 
-_PLACES = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+_FAR_SUBCELLS = 4
+"""The same for cells that do not touch."""
+
+_FAR = 4.0
+"""Distance up to which moments lack more than a dipole, in :data:`EXACT_REACH`."""
+
+_WIDEST = 0.15
+"""Norm of a moment's second moments that counts, at most, in squares of a cell's longest side; two cells have 0.2."""
+
+PLACES = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 """Rows and columns of the six numbers of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
 
 _BATCH = 1 << 22
@@ -43,11 +52,13 @@ class Coupling:
         start: First entry of each moment, and the end, shape [n + 1].
         other: Moment j of each entry, ascending, shape [entries].
         tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
+        even: The same between all moments, whichever (``even_field.py``), shape [6].
     """
 
     start: np.ndarray
     other: np.ndarray
     tensor: np.ndarray
+    even: np.ndarray
 
 
 def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
@@ -134,14 +145,14 @@ def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) ->
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
-    return Coupling(start, j[order], tensor[order])
+    return Coupling(start, j[order], tensor[order], np.zeros(6))
 
 
 def _pair_law(r, a, b, same):
     """H = T m of the pair sums, in six numbers [1/m³]; of a moment itself −M/3, which the curve of a ball contains."""
     g1, g2, _ = radial_factors(np.linalg.norm(r, axis=1), a, b)
     g1, g2 = np.where(same, -1.0 / a**3, g1), np.where(same, 0.0, g2)
-    products = r[:, _PLACES[0]] * r[:, _PLACES[1]]
+    products = r[:, PLACES[0]] * r[:, PLACES[1]]
     return (g1[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) + g2[:, None] * products) / (4.0 * np.pi)
 
 
@@ -149,7 +160,8 @@ def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndar
     """Pairs (i, j) of near moments of one grid, shape [2, pairs], and N_ij √(V_i V_j) over V in six numbers."""
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
-    i, j = _near_pairs(local, reach * float(part.sides.max()))
+    reach = reach * float(part.sides.max())
+    i, j = _near_pairs(local, reach)
     volume = np.bincount(part.moment - first, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece], count)
     order = np.argsort(part.moment, kind="stable")
     piece, share = part.piece[order], part.share[order]
@@ -166,9 +178,59 @@ def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndar
     weight = share[a] * share[b]
     sums = np.stack([np.bincount(pair, weight * values[:, c], len(i)) for c in range(6)], axis=1)
     sums /= np.sqrt(volume[i] * volume[j])[:, None]
+    sums[i == j] += _lack_from_afar(local, part.sides.prod() * volume, _spreads(part, first, volume), reach)[i[i == j]]
     both = i != j
     pairs = np.concatenate([np.stack([i, j]), np.stack([j[both], i[both]])], axis=1) + first
     return pairs, _turned(np.concatenate([sums, sums[both]]), part.rotation)
+
+
+def _spreads(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
+    """Second moments of each moment's pieces about their centroid, over volume, less their trace, shape [n, 3, 3]."""
+    split = np.array(part.filled.shape[1:])
+    points, weights = (grid(split) + 0.5) / split * part.sides, part.filled.reshape(len(part.filled), -1) / split.prod()
+    corner, held = part.index * part.sides, weights.sum(axis=1)[:, None]
+    ones = weights @ points
+    twos = np.stack([weights @ (points[:, [k]] * points) for k in range(3)], axis=1)
+    twos += held[..., None] * np.diag((part.sides / split) ** 2 / 12.0)
+    twos += ones[:, :, None] * corner[:, None] + corner[:, :, None] * (ones + held * corner)[:, None]
+    ones += held * corner
+    sums = np.concatenate([ones, twos.reshape(-1, 9)], axis=1)[part.piece] * part.share[:, None]
+    sums = np.stack([np.bincount(part.moment - first, x, len(volume)) for x in sums.T], axis=1) / volume[:, None]
+    centre = sums[:, :3]
+    spread = sums[:, 3:].reshape(-1, 3, 3) - centre[:, :, None] * centre[:, None]
+    spread -= np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3.0
+    size, most = np.linalg.norm(spread, axis=(1, 2)), _WIDEST * part.sides.max() ** 2
+    return spread * np.minimum(1.0, most / np.maximum(size, np.finfo(float).tiny))[:, None, None]
+
+
+def _lack_from_afar(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray, reach: float) -> np.ndarray:
+    """What moments beyond the reach lack as dipoles, if they are magnetized as the one that they act on, shape [n, 6].
+
+    It falls off with the fifth power of the distance, and is taken up to ``_FAR`` times the reach.
+    """
+    total = np.zeros((6, len(points)))
+    if np.abs(spreads).max() < 1e-9 * reach * reach:  # of cubes
+        return total.T
+    pairs = np.stack(_near_pairs(points, _FAR * reach))
+    step = _BATCH // 64
+    for start in range(0, pairs.shape[1], step):
+        i, j = pairs[:, start : start + step]
+        r = points[i] - points[j]
+        square = (r * r).sum(axis=1)
+        far = square > reach * reach * (1.0 + 1e-9)
+        i, j, r, d = i[far], j[far], r[far], np.sqrt(square[far])[:, None]
+        spread = spreads[i] + spreads[j]
+        turned = np.einsum("nkl,nl->nk", spread, r)
+        along = (turned * r).sum(axis=1)[:, None]
+        rows, columns = PLACES
+        mixed = r[:, rows] * turned[:, columns] + turned[:, rows] * r[:, columns]
+        one = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+        found = 105.0 * along * r[:, rows] * r[:, columns] / d**9 - 15.0 * (along * one + 2.0 * mixed) / d**7
+        found = (found + 6.0 * spread[:, rows, columns] / d**5) / (-8.0 * np.pi)
+        for k in range(6):
+            total[k] += np.bincount(i, volumes[j] * found[:, k], len(points))
+            total[k] += np.bincount(j, volumes[i] * found[:, k], len(points))
+    return total.T
 
 
 def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -196,36 +258,8 @@ def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         filled = _sharp(_coarser(part.filled, _SUBCELLS))
         result[near] = _cut_tensors(part.sides, filled, p[near], q[near], apart[near])
     if len(far):
-        result[far] = _expanded_tensors(part, p[far], q[far])
+        result[far] = _cut_tensors(part.sides, _coarser(part.filled, _FAR_SUBCELLS), p[far], q[far], apart[far])
     return result
-
-
-def _expanded_tensors(part: Pieces, p, q) -> np.ndarray:
-    """The same for pieces that do not touch: dipoles at the centroids, and what their second moments add."""
-    split = np.array(part.filled.shape[1:])
-    points, size = (grid(split) + 0.5) / split * part.sides, part.sides / split
-    weights = part.filled.reshape(len(part.filled), -1) / split.prod()
-    volume = weights.sum(axis=1)
-    centre = weights @ points / volume[:, None]
-    spread = np.einsum("pa,ak,al->pkl", weights, points, points) / volume[:, None, None]
-    spread += np.diag(size**2 / 12.0) - centre[:, :, None] * centre[:, None, :]
-    r = (part.index[p] - part.index[q]) * part.sides + centre[p] - centre[q]
-    s, one = spread[p] + spread[q], np.eye(3)
-    d = np.linalg.norm(r, axis=1)[:, None, None]
-    turned = np.einsum("nkl,nl->nk", s, r)
-    along, trace = np.einsum("nk,nk->n", turned, r)[:, None, None], np.trace(s, axis1=1, axis2=2)[:, None, None]
-    rr, rs = r[:, :, None] * r[:, None, :], r[:, :, None] * turned[:, None, :]
-    tensor = (
-        one / d**3
-        - 3.0 * rr / d**5
-        - 0.5
-        * (
-            105.0 * along * rr / d**9
-            - 15.0 * (along * one + trace * rr + 2.0 * (rs + np.swapaxes(rs, 1, 2))) / d**7
-            + 3.0 * (trace * one + 2.0 * s) / d**5
-        )
-    )
-    return (tensor * (volume[p] * volume[q])[:, None, None] * part.sides.prod() / (4.0 * np.pi))[:, *_PLACES]
 
 
 def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarray:
@@ -265,9 +299,14 @@ def _coarser(filled: np.ndarray, most: int) -> np.ndarray:
     return filled
 
 
-def _turned(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Symmetric tensors in six numbers, turned."""
-    rows, columns = _PLACES
+def full_tensors(six: np.ndarray) -> np.ndarray:
+    """Symmetric tensors of their six numbers, shape [n, 3, 3]."""
+    rows, columns = PLACES
     full = np.empty((len(six), 3, 3))
     full[:, rows, columns] = full[:, columns, rows] = six
-    return (rotation @ full @ rotation.T)[:, rows, columns]
+    return full
+
+
+def _turned(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Symmetric tensors in six numbers, turned."""
+    return (rotation @ full_tensors(six) @ rotation.T)[:, *PLACES]

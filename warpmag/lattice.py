@@ -36,9 +36,11 @@ The moments of an inducible body act on each other as what they are, parts of ce
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from warpmag import facets
 from warpmag.cell_grid import CellGrid, Filled, cells_over
 from warpmag.closed_mesh import check_closed, welded, winding_number
 from warpmag.errors import InputError
@@ -117,7 +119,8 @@ class Lattice:
 def box(half_extents: Values) -> Solid:
     """A box of half sides ``half_extents`` [m], shape [3], centred at the origin."""
     h = _lengths("box: half_extents", half_extents, 3)
-    return Solid("box", -h, h, float(8.0 * h.prod()), np.zeros(3), lambda p: np.abs(p / h).max(axis=1) <= 1.0)
+    inside, surface = (lambda p: np.abs(p / h).max(axis=1) <= 1.0), partial(facets.box, h)
+    return Solid("box", -h, h, float(8.0 * h.prod()), np.zeros(3), inside, surface)
 
 
 def sphere(radius: float) -> Solid:
@@ -130,7 +133,8 @@ def ellipsoid(semi_axes: Values) -> Solid:
     """An ellipsoid of ``semi_axes`` [m], shape [3], centred at the origin."""
     a = _lengths("ellipsoid: semi_axes", semi_axes, 3)
     volume = 4.0 / 3.0 * np.pi * float(a.prod())
-    return Solid("ellipsoid", -a, a, volume, np.zeros(3), lambda p: ((p / a) ** 2).sum(axis=1) <= 1.0)
+    inside, surface = (lambda p: ((p / a) ** 2).sum(axis=1) <= 1.0), partial(facets.ellipsoid, a)
+    return Solid("ellipsoid", -a, a, volume, np.zeros(3), inside, surface)
 
 
 def capsule(radius: float, half_height: float) -> Solid:
@@ -141,7 +145,8 @@ def capsule(radius: float, half_height: float) -> Solid:
         return p[:, 0] ** 2 + p[:, 1] ** 2 + np.maximum(np.abs(p[:, 2]) - h, 0.0) ** 2 <= r * r
 
     upper = np.array([r, r, h + r])
-    return Solid("capsule", -upper, upper, np.pi * r * r * (2.0 * h + 4.0 / 3.0 * r), np.zeros(3), inside)
+    volume, surface = np.pi * r * r * (2.0 * h + 4.0 / 3.0 * r), partial(facets.capsule, r, h)
+    return Solid("capsule", -upper, upper, volume, np.zeros(3), inside, surface)
 
 
 def cylinder(radius: float, half_height: float) -> Solid:
@@ -152,7 +157,8 @@ def cylinder(radius: float, half_height: float) -> Solid:
         return (p[:, 0] ** 2 + p[:, 1] ** 2 <= r * r) & (np.abs(p[:, 2]) <= h)
 
     upper = np.array([r, r, h])
-    return Solid("cylinder", -upper, upper, 2.0 * np.pi * r * r * h, np.zeros(3), inside)
+    volume, surface = 2.0 * np.pi * r * r * h, partial(facets.cylinder, r, h)
+    return Solid("cylinder", -upper, upper, volume, np.zeros(3), inside, surface)
 
 
 def cone(radius: float, half_height: float) -> Solid:
@@ -164,7 +170,8 @@ def cone(radius: float, half_height: float) -> Solid:
         return (p[:, 0] ** 2 + p[:, 1] ** 2 <= width * width) & (np.abs(p[:, 2]) <= h)
 
     upper = np.array([r, r, h])
-    return Solid("cone", -upper, upper, 2.0 / 3.0 * np.pi * r * r * h, np.array([0.0, 0.0, -0.5 * h]), inside)
+    volume, surface = 2.0 / 3.0 * np.pi * r * r * h, partial(facets.cone, r, h)
+    return Solid("cone", -upper, upper, volume, np.array([0.0, 0.0, -0.5 * h]), inside, surface)
 
 
 def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
@@ -188,7 +195,8 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
         raise InputError("mesh: encloses no volume")
     centroid = middle + (parts[:, None] * local.sum(axis=1)).sum(axis=0) / (4.0 * volume)
     winding = winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
-    solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda p: winding(p) != 0)
+    surface = partial(facets.mesh, corners if volume > 0.0 else corners[:, ::-1])
+    solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda p: winding(p) != 0, surface)
     turns, samples = _turns(solid, winding)
     if np.isin(turns, (0, 1)).all():
         return solid

@@ -21,6 +21,7 @@ class Solid:
         volume: Volume [m³].
         centroid: Centroid [m], frame of the shape, shape [3].
         inside: Tells which of the points [m], frame of the shape, shape [n, 3], lie inside.
+        facets: About so many flat facets of its surface [m], frame of the shape, shape [m, 4, 3] (``facets.py``).
         position: Origin of the shape in the body's frame [m], shape [3].
         rotation: Rotation from the frame of the shape to the body's, shape [3, 3].
     """
@@ -31,6 +32,7 @@ class Solid:
     volume: float
     centroid: np.ndarray
     inside: Callable[[np.ndarray], np.ndarray]
+    facets: Callable[[int], np.ndarray]
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 

@@ -1,9 +1,10 @@
 // Adds to the field at the cells of bodies what the sums over pairs lack between cells of one body: H_i += Σ T_ij m_j
 // with tensors T_ij of the body's frame.
 //
-// Two passes: moments are turned into the frame of their body, then sums into the world; and one before, where cells of
-// two bodies overlap. On a CPU a pass works on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY,
-// GROUP and HARDENING; ``Couplings`` is the struct of couplings.py.
+// Three passes: moments are turned into the frame of their body, there they make the field that all its cells have in
+// common, and sums are turned into the world; and one before, where cells of two bodies overlap. On a CPU a pass works
+// on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY, GROUP and HARDENING; ``Couplings`` is the
+// struct of couplings.py.
 #pragma once
 #include "pairs/overlap_volume.h"
 #include "shared/team.h"
@@ -12,7 +13,7 @@ namespace warpmag {
 
 constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
 
-enum CellPass { HARDEN, TURN, ADD }; // as in couplings.py
+enum CellPass { HARDEN, TURN, SHARE, ADD }; // as in couplings.py
 
 // Rows of the rotation of a body.
 struct Rotation {
@@ -56,6 +57,30 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
     return group_sums(h);
 }
 
+// Field that all cells of a body have in common: its tensor times the moment of the body.
+template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings& c, int body) {
+    const auto& rows = c.rows.data[body]; // first row of the body, and the end of them
+    const size_t pitch = c.turned.strides[0] / sizeof(Real);
+    Vector sums = {0, 0, 0};
+    for (int row = rows[0] + WIDTH * share(); row < rows[1]; row += WIDTH * SHARES) {
+        const Real* const own = c.turned.data + row;
+        sums = sum(sums, {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)});
+    }
+    sums = group_sums(sums);
+    if (share() != 0) return;
+    Real m[3] = {0, 0, 0};
+    for (int lane = 0; lane < WIDTH; ++lane) {
+        m[0] += lane_of(sums.x, lane);
+        m[1] += lane_of(sums.y, lane);
+        m[2] += lane_of(sums.z, lane);
+    }
+    const Real* const t = c.even.data + (size_t)body * TENSOR;
+    Real* const h = c.common.data + 3 * (size_t)body;
+    h[0] = t[0] * m[0] + t[3] * m[1] + t[4] * m[2];
+    h[1] = t[3] * m[0] + t[1] * m[1] + t[5] * m[2];
+    h[2] = t[4] * m[0] + t[5] * m[1] + t[2] * m[2];
+}
+
 // What the overlap of cells with those of other bodies adds to their demagnetizing factor, over their volume [1/m³].
 template <class Couplings> CUDA_CALLABLE inline Number hardness_of(const Couplings& c, int chunk, int i, int held) {
     const Real* const packed = (const Real*)c.packed.data;
@@ -78,7 +103,12 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
         if (share() == 0) put(c.hardness.data + row, hardness);
         return;
     }
-    const Rotation rotation = rotation_of(c.rotation.data[c.body.data[row / CHUNK]]);
+    const int body = c.body.data[row / CHUNK];
+    if (pass == SHARE) {
+        if (row == c.rows.data[body][0]) share_field(c, body);
+        return;
+    }
+    const Rotation rotation = rotation_of(c.rotation.data[body]);
     Real* const own = c.turned.data + row;
     const size_t pitch = c.turned.strides[0] / sizeof(Real);
     if (pass == TURN) {
@@ -92,7 +122,9 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
     const Vector sums = sum_entries(c, c.turned.data + chunk[2], row - chunk[2] + chunk[3]);
     if (share() != 0) return;
     const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
-    const Vector h = less(sums, scaled(numbers(c.hardness.data + row), m));
+    const Real* const common = c.common.data + 3 * (size_t)body;
+    const Vector even = {Number(common[0]), Number(common[1]), Number(common[2])};
+    const Vector h = less(sum(sums, even), scaled(numbers(c.hardness.data + row), m));
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
     put_vectors(field, held, sum(vectors(field, held), turned(rotation, h)));
 }

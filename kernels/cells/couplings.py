@@ -12,6 +12,9 @@ Bodies refer to them, in as many chunks:
     chunk: First moment, how many moments, first row of the body, and first row of its table, shape [chunks].
     body: Which body it is of, shape [chunks].
     rotation: Rotation of each body, from its frame to the world's (x, y, z, w), shape [bodies].
+    rows: First row of each body, and the end of them, shape [bodies].
+    even: Tensor of the field that all cells of a body have in common, times its moment [1/m³], flat, six a body.
+    common: That field [A/m], frame of the body, flat, three numbers a body.
     moments: Moments [A·m²], shape [n]; those of a body follow each other.
     turned: Moments in the frames of their bodies, shape [3, chunks · CHUNK].
     world: First inducible moment of the chunk's world, and the end of them, shape [chunks].
@@ -38,7 +41,7 @@ from warpmag.kernels.shared.team import team, threads_for
 
 HARDENING = 0.2
 """Demagnetizing factor of a cell that wholly lies in another body's; least eigenvalues with 0.15 are down to -0.001."""
-HARDEN, TURN, ADD = range(3)
+HARDEN, TURN, SHARE, ADD = range(4)
 """The passes, in order; as in ``couplings.h``."""
 _CELLS_PER_THREAD = 500
 """Cells that make another thread of a CPU worth waking."""
@@ -57,6 +60,9 @@ def couplings_type(dtype):
         chunk: wp.array[wp.vec4i]
         body: wp.array[int]
         rotation: wp.array[quaternion]
+        rows: wp.array[wp.vec2i]
+        even: wp.array[dtype]
+        common: wp.array[dtype]
         moments: wp.array[vec3]
         turned: wp.array2d[dtype]
         world: wp.array[wp.vec2i]
@@ -97,7 +103,8 @@ class CellCouplings:
 
     Args:
         bodies: Of each body the first moment, and the coupling of its cells: ``start``, ``other`` and ``tensor``, a
-            list for each (see ``warpmag.demagnetization``). Bodies with one and the same coupling share its table.
+            list for each, and ``even`` (see ``warpmag.demagnetization``). Bodies with one and the same coupling share
+            its table.
         worlds: First inducible moment of each world, and the end of them, shape [worlds, 2].
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
@@ -125,7 +132,7 @@ class CellCouplings:
             return wp.launch(_kernel(dtype, group), dim=dim, inputs=inputs, device=device, record_cmd=True)
 
         self._start = record(HARDEN, HARDEN)
-        self._launches = [record(TURN, TURN), record(ADD, ADD)] if device.is_cuda else [record(TURN, ADD)]
+        self._launches = [record(one, one) for one in (TURN, SHARE, ADD)] if device.is_cuda else [record(TURN, ADD)]
 
     def _lay_out(self, bodies, worlds, dtype, device):
         c, found, tables, chunks, body = self._couplings, {}, [], [], []
@@ -147,6 +154,10 @@ class CellCouplings:
         c.chunk, c.body = put(np.array(chunks, np.int32), wp.vec4i), put(np.array(body, np.int32), wp.int32)
         identity = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(bodies), 4))
         c.rotation = put(identity, wp.types.quaternion(dtype))
+        ends = CHUNK * np.searchsorted(body, np.arange(len(bodies) + 1))
+        c.rows = put(np.stack([ends[:-1], ends[1:]], axis=1).astype(np.int32), wp.vec2i)
+        c.even = put(np.concatenate([coupling.even for _, coupling in bodies]), dtype)
+        c.common = wp.zeros(3 * len(bodies), dtype=dtype, device=device)
         c.turned = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
         c.hardness = wp.zeros(CHUNK * len(chunks), dtype=dtype, device=device)
         world = np.searchsorted(worlds[:, 0], [first for first, *_ in chunks], side="right") - 1

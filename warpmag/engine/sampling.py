@@ -9,6 +9,7 @@ import numpy as np
 from warpmag import lattice, polyhedra
 from warpmag.demagnetization import Coupling, coupling
 from warpmag.errors import InputError
+from warpmag.even_field import corrected
 from warpmag.polyhedra import Polyhedron
 from warpmag.solid import boxes_meet
 
@@ -110,7 +111,7 @@ class ShapeSampler:
                 for end, count, shape, one in zip(ends, counts, closed, filled.pieces, strict=bool(closed))
             ]
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
-        cells = coupling(filled, filled.radii)
+        cells = corrected(coupling(filled, filled.radii), filled, solids)
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells)
 
     def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:

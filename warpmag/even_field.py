@@ -1,0 +1,165 @@
+"""How a body answers to an even field, from its surface, and what its cells lack for that.
+
+Cells of uniform magnetization take too little moment (``demagnetization.py``): one or two across a sheet or a letter up
+to a third. What they take in an even field is known at once, by conjugate gradients; what the body takes, if it is
+ideally permeable, is known from its surface alone, which is at one potential then: (1/4π) ∫ σ/‖x − y‖ dA = H0·x, and
+the moment is ∫ σ x dA. σ is taken as constant on facets (``facets.py``), whose potentials are closed forms (Wilton et
+al., IEEE Trans. Antennas Propag. 32 (1984) 276).
+
+With polarizabilities P of the cells and Q of the surface, moments over V H0, the operator of the cells N is replaced by
+N − E C Eᵀ/n, C = P⁻¹ − Q⁻¹, E an even field: all cells feel C times their mean magnetization on top. By Woodbury's
+formula the body then takes Q in an even field; and since Q is positive the operator stays positive, which a change of
+the cells' own tensors would not leave it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from warpmag import facets
+from warpmag.demagnetization import PLACES, Coupling, full_tensors
+from warpmag.lattice import Lattice
+from warpmag.oracle import radial_factors
+from warpmag.solid import Solid
+
+FACETS = 600
+"""Facets of a body, about; from these and a quarter as many its moment is extrapolated, to 0.3 % for a cube."""
+
+_FACETS_OF_PART = 150
+"""The same of each shape, at least: a quarter as many are then the fewest that ``facets.py`` gives."""
+
+MOST_FACETS = 1500
+"""A mesh of more triangles is left as its cells are."""
+
+MOST_MOMENTS = 6200
+"""A body of more moments is left as its cells are: two arrays of their pairs take 0.6 GB."""
+
+_RATIOS = 0.9, 4.0
+"""Moments of surfaces over those of cells: others come from surfaces that nearly meet, which facets do not resolve."""
+
+_RESIDUAL = 3e-3
+"""Relative residual of the cells' magnetization; the error of the moment is its square."""
+
+_CHUNK = 1 << 18
+"""Pairs of facets evaluated at a time (some tens of MB)."""
+
+
+def corrected(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
+    """The coupling with the field that all cells have in common, which brings the body's moment to that of its surface.
+
+    Bodies in parts that are apart have none, nor those of which surface or cells are too many.
+    """
+    if len(lattice.volumes) > MOST_MOMENTS or not _hangs_together(coupling):
+        return coupling
+    most = max(FACETS, _FACETS_OF_PART * len(solids))
+    coarse, fine = (facets.of_body(solids, count) for count in (most // 4, most))
+    if len(fine) > MOST_FACETS:
+        return coupling
+    of_surface, of_cells = extrapolated_moments(coarse, fine), cell_moments(coupling, lattice)
+    ratios = np.linalg.eigvals(np.linalg.solve(of_cells, of_surface)).real
+    if not (ratios.min() > _RATIOS[0] and ratios.max() < _RATIOS[1]):
+        return coupling
+    return replace(coupling, even=(np.linalg.inv(of_cells) - np.linalg.inv(of_surface))[PLACES])
+
+
+def extrapolated_moments(coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
+    """:func:`surface_moments` for ever more facets, of which the error goes as one over their number."""
+    found = surface_moments(fine)
+    if len(fine) < 2 * len(coarse):
+        return found
+    return found + (found - surface_moments(coarse)) / (len(fine) / len(coarse) - 1.0)
+
+
+def surface_moments(surface: np.ndarray) -> np.ndarray:
+    """Moments [m³] of an ideally permeable body in unit fields along each axis, shape [3, 3].
+
+    Args:
+        surface: Its facets [m], shape [m, 4, 3].
+    """
+    middles, (normals, areas) = facets.middles(surface), facets.measures(surface)
+    at = middles - areas @ middles / areas.sum()
+    matrix = np.zeros((len(at) + 1, len(at) + 1))
+    step = max(1, _CHUNK // len(at))
+    for start in range(0, len(at), step):
+        matrix[start : min(start + step, len(at)), :-1] = potentials(middles[start : start + step], surface, normals)
+    matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # the potential of the body is free, its charge is zero
+    charges = np.linalg.solve(matrix, np.append(at, np.zeros((1, 3)), axis=0))[:-1]
+    found = (charges * areas[:, None]).T @ at
+    return 0.5 * (found + found.T)
+
+
+def potentials(points: np.ndarray, surface: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(1/4π) ∫ dA/‖x − y‖ of each facet at each point [m], shape [points, facets]."""
+    tiny = np.finfo(float).tiny
+    height = np.abs(points @ normals.T - np.einsum("ik,ik->i", normals, surface[:, 0]))
+    total = np.zeros_like(height)
+    for k in range(4):
+        a, b = surface[:, k], surface[:, (k + 1) % 4]
+        length = np.linalg.norm(b - a, axis=1)
+        along = (b - a) / np.maximum(length, tiny)[:, None]
+        outward = np.cross(along, normals)
+        begin = np.einsum("ik,ik->i", a, along) - points @ along.T
+        across = np.einsum("ik,ik->i", a, outward) - points @ outward.T
+        end, near2 = begin + length, across * across + height * height
+        first, last = np.sqrt(begin * begin + near2), np.sqrt(end * end + near2)
+        sign = np.where(begin + end > 0.0, 1.0, -1.0)  # of the form that keeps its digits
+        ratio = np.maximum(last + sign * end, tiny) / np.maximum(first + sign * begin, tiny)
+        angle = np.arctan2(across * end, near2 + height * last) - np.arctan2(across * begin, near2 + height * first)
+        total += across * sign * np.log(ratio) - height * angle
+    return total / (4.0 * np.pi)
+
+
+def cell_moments(coupling: Coupling, lattice: Lattice) -> np.ndarray:
+    """The same of the cells of a body, of which those without a coupling are dipoles to each other."""
+    apply, root = _operator(coupling, lattice), np.sqrt(lattice.volumes)[:, None, None]
+    fields = root * np.eye(3)
+    found, rest = np.zeros_like(fields), fields
+    search, size = rest, (rest**2).sum(axis=(0, 1))
+    goal = _RESIDUAL**2 * size
+    while (size > goal).any():
+        image = apply(search)
+        step = size / (search * image).sum(axis=(0, 1))
+        found, rest = found + step * search, rest - step * image
+        size, before = (rest**2).sum(axis=(0, 1)), size
+        search = rest + size / before * search
+    moments = np.einsum("nkl,nkm->lm", found, fields + rest)  # second order in the residual
+    return 0.5 * (moments + moments.T)
+
+
+def _operator(coupling: Coupling, lattice: Lattice):
+    """N of the cells, symmetrized by their volumes, as a function of magnetizations, shape [n, 3, fields].
+
+    Of r(r·m), r = x − y, each factor is a sum over y that a product of matrices makes.
+    """
+    x, root, n = lattice.positions - lattice.positions.mean(axis=0), np.sqrt(lattice.volumes), len(lattice.volumes)
+    radii, tensors = lattice.radii, full_tensors(coupling.tensor)
+    even, odd = np.empty((n, n)), np.empty((n, n))
+    step = max(1, _CHUNK // n)
+    for start in range(0, n, step):
+        rows = slice(start, start + step)
+        apart = np.linalg.norm(x[rows, None] - x, axis=2)
+        even[rows], odd[rows], _ = radial_factors(apart, radii[rows, None], radii)
+    even[np.arange(n), np.arange(n)], odd[np.arange(n), np.arange(n)] = -1.0 / radii**3, 0.0
+
+    def apply(scaled: np.ndarray) -> np.ndarray:
+        m = scaled * root[:, None, None]
+        along = np.einsum("nk,nkf->nf", x, m)
+        products = (x[:, k, None, None] * m for k in range(3))
+        parts = np.concatenate([m, along[:, None], *products, x[:, :, None] * along[:, None]], axis=1)
+        sums = (odd @ parts.reshape(n, -1)).reshape(n, 16, -1)
+        inner = np.einsum("nk,nkf->nf", x, sums[:, :3]) - sums[:, 3]
+        outer = np.einsum("nklf,nl->nkf", sums[:, 4:13].reshape(n, 3, 3, -1), x) - sums[:, 13:]
+        field = ((even @ m.reshape(n, -1)).reshape(m.shape) + x[:, :, None] * inner[:, None] - outer) / (4.0 * np.pi)
+        field += np.add.reduceat(tensors @ m[coupling.other], coupling.start[:-1], axis=0)
+        return -field * root[:, None, None]
+
+    return apply
+
+
+def _hangs_together(coupling: Coupling) -> bool:
+    """Whether each cell is coupled with each other one, over others."""
+    group, before = np.arange(len(coupling.start) - 1), None
+    while before is None or (group != before).any():
+        before, group = group, np.minimum.reduceat(group[coupling.other], coupling.start[:-1])
+    return not group.any()
