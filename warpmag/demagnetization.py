@@ -16,6 +16,7 @@ cell itself less the 1/3 that the magnetization law of a ball contains.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -53,12 +54,28 @@ class Coupling:
         other: Moment j of each entry, ascending, shape [entries].
         tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
         even: The same between all moments, whichever (``even_field.py``), shape [6].
+        positions: Where the moments are [m], shape [n, 3].
+        radii: Radii of their balls [m], shape [n].
     """
 
     start: np.ndarray
     other: np.ndarray
     tensor: np.ndarray
     even: np.ndarray
+    positions: np.ndarray
+    radii: np.ndarray
+
+    @cached_property
+    def dense(self) -> np.ndarray:
+        """Tensors between all moments [1/m³], whole ones, and those of the pair sums, shape [2, n, n, 6]."""
+        n = len(self.radii)
+        i, j = np.divmod(np.arange(n * n), n)
+        law = _pair_law(self.positions[i] - self.positions[j], self.radii[i], self.radii[j], i == j)
+        law[i == j] = 0.0  # a ball's own field is in its curve
+        whole = law.reshape(n, n, 6).copy()
+        whole[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
+        whole += self.even
+        return np.stack([whole, law.reshape(n, n, 6)])
 
 
 def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
@@ -145,7 +162,7 @@ def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) ->
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
-    return Coupling(start, j[order], tensor[order], np.zeros(6))
+    return Coupling(start, j[order], tensor[order], np.zeros(6), x, radii)
 
 
 def _pair_law(r, a, b, same):

@@ -13,6 +13,7 @@ import numpy as np
 
 from warpmag.errors import InputError
 from warpmag.kernels.induction import submagnetization, theta_flow
+from warpmag.kernels.induction.body_response import BodyResponses
 from warpmag.magnets import DYNAMICS, check_positive, check_token
 
 STEP = 0.3
@@ -25,17 +26,17 @@ DAMPING = 0.2
 class ThetaFlow:
     """The exact flow of the θ dynamics, accelerated; it chooses its own step."""
 
-    def __init__(self, state):
-        """Move the moments of ``state``."""
-        self._state = state
+    def __init__(self, state, bodies: BodyResponses | None = None):
+        """Move the moments of ``state``, of which some ``bodies`` respond as wholes."""
+        self._state, self._bodies = state, bodies
 
     def carried(self) -> dict:
         """Return the arrays of its own that one solve hands on to the next one, by name."""
-        return {}
+        return {} if self._bodies is None else self._bodies.carried()
 
     @cached_property
     def _launches(self) -> theta_flow.Launches:
-        return theta_flow.Launches(self._state)
+        return theta_flow.Launches(self._state, self._bodies)
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
@@ -97,12 +98,13 @@ class SubmagnetizationPairs:
         submagnetization.launch_iteration(self._state, self._pairs)
 
 
-def make_dynamics(name: str, state, *, step: float | None = None, damping: float | None = None):
+def make_dynamics(name: str, state, *, bodies=None, step: float | None = None, damping: float | None = None):
     """Return the dynamics of a name.
 
     Args:
         name: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``.
         state: State of the solve that it moves, bound to its moments.
+        bodies: Bodies that respond as wholes (``BodyResponses``), or None; only ``theta`` lets them.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means :data:`STEP`.
         damping: Damping α [dimensionless] of ``llg``; None means :data:`DAMPING`.
 
@@ -115,7 +117,7 @@ def make_dynamics(name: str, state, *, step: float | None = None, damping: float
     if damping is not None and name != "llg":
         raise InputError(f"damping: the dynamics {name!r} has none to choose")
     if name == "theta":
-        return ThetaFlow(state)
+        return ThetaFlow(state, bodies)
     step, damping = STEP if step is None else step, DAMPING if damping is None else damping
     check_positive("step", step)
     check_positive("damping", damping)

@@ -140,27 +140,10 @@ def solve_induction(
     """
     kind = resolve_kind(positions, dtype, device)
     balls = _read_balls(kind, positions, radii, saturation, susceptibility, curve, external_field, sources)
-    system = balls.make_system(
-        kind, dynamics=dynamics, contact_model=contact_model, rtol=rtol, max_evaluations=max_evaluations
-    )
-    if initial is not None:
-        system.start_from(kind.vectors("initial", initial, balls.count))
+    choices = {"dynamics": dynamics, "contact_model": contact_model, "rtol": rtol, "max_evaluations": max_evaluations}
+    system = balls.make_system(kind, initial, **choices)
     system.solve()
-    source_positions, source_moments = (None, None) if sources is None else sources
-    given = {
-        "positions": positions,
-        "radii": balls.radii,
-        "saturation": balls.saturation,
-        "external_field": external_field,
-        "sources: positions": source_positions,
-        "sources: moments": source_moments,
-        "initial": initial,
-    }
-    result = _read_result(kind, system, balls, given)
-    if not result.converged:
-        reached = f"error {result.error:.2g} > rtol {rtol:g} after max_evaluations = {max_evaluations}"
-        warnings.warn(f"solve_induction: did not converge, {reached}", ConvergenceWarning, stacklevel=2)
-    return result
+    return _read_result(kind, system, balls, _by_name(balls, positions, external_field, sources, initial))
 
 
 @dataclass(frozen=True)
@@ -192,8 +175,8 @@ class _Balls:
         """How many they are."""
         return self.positions.shape[0]
 
-    def make_system(self, kind: Kind, **choices) -> MomentSystem:
-        """Return them as moments, the permanent ones last, before a solve."""
+    def make_system(self, kind: Kind, initial, **choices) -> MomentSystem:
+        """Return them as moments, the permanent ones last, before a solve from ``initial`` magnetizations or None."""
         n, k = self.count, self.source_positions.shape[0]
 
         def with_sources(values, others):
@@ -216,6 +199,8 @@ class _Balls:
         if k:
             wp.copy(system.positions, self.source_positions, dest_offset=n, count=k)
             wp.copy(system.moments, self.source_moments, dest_offset=n, count=k)
+        if initial is not None:
+            system.start_from(kind.vectors("initial", initial, n))
         return system
 
 
@@ -268,8 +253,26 @@ def _materials(curves: list, saturation, susceptibility):
     return (found[0][0], found[1][0]) if len(curves) == 1 else tuple(found)
 
 
+def _by_name(balls: _Balls, positions, external_field, sources, initial) -> dict:
+    """Return the arrays that the caller has given, by the names that messages call them."""
+    source_positions, source_moments = (None, None) if sources is None else sources
+    return {
+        "positions": positions,
+        "radii": balls.radii,
+        "saturation": balls.saturation,
+        "external_field": external_field,
+        "sources: positions": source_positions,
+        "sources: moments": source_moments,
+        "initial": initial,
+    }
+
+
 def _read_result(kind: Kind, system: MomentSystem, balls: _Balls, given: dict) -> InductionResult:
-    """Return what a solve ended with; raises ``InputError`` where that is not finite or was not to be resolved."""
+    """Return what a solve ended with, and warn if it did not converge.
+
+    Raises:
+        InputError: The result is not finite, or was not to be resolved.
+    """
     n = balls.count
     m, h = (kind.finish(array, n) for array in (system.magnetizations(), system.h))
     _check_finite(kind, n, given, magnetization=m, field=h)
@@ -278,12 +281,16 @@ def _read_result(kind: Kind, system: MomentSystem, balls: _Balls, given: dict) -
         raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
     strongest = float(np.abs(h if isinstance(h, np.ndarray) else h.numpy()).max(initial=0.0))
     _check_strength(kind, strongest, balls.saturation)
+    converged = bool(system.converged.numpy().all())
+    if not converged:
+        reached = f"error {error:.2g} > rtol {system.rtol:g} after max_evaluations = {system.max_evaluations}"
+        warnings.warn(f"solve_induction: did not converge, {reached}", ConvergenceWarning, stacklevel=3)
     return InductionResult(
         magnetizations=m,
         h_field=h,
         error=error,
         evaluations=int(system.evaluations.numpy().max(initial=0)),
-        converged=bool(system.converged.numpy().all()),
+        converged=converged,
         _system=system,
         _kind=kind,
         _given=given,

@@ -21,6 +21,7 @@ from warpmag.kernels.applied.sources import Sources
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
+from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, WholeBody
 from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
@@ -98,7 +99,8 @@ class MomentSystem:
         error: Relative error of each world's magnetization, as ``theta`` estimates it (see ``kernels.induction``); of
             other dynamics the residual; shape [worlds].
         residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last field evaluation, the computable form
-            of Eq. 12, shape [worlds]; ``theta`` goes a step on from there.
+            of Eq. 12, shape [worlds]; ``theta`` goes a step on from there. Of bodies that respond as wholes (see
+            ``kernels.induction.body_response``) H is the field in which they have responded.
         evaluations: Field evaluations of the last solve, shape [worlds].
         converged: 1 where the last solve reached ``rtol``, shape [worlds].
     """
@@ -146,12 +148,13 @@ class MomentSystem:
         self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
         self._evaluate_field(layout, near)
-        self._make_cells(layout, couplings)
+        self._make_cells(layout, couplings, whole=dynamics == "theta")
         self._evaluate_wrench(layout, turned)
         self._energies = None
         self._near = self._make_near_contacts(layout, turned, susceptibility) if near else None
         solve_state.bind(self._induction, self._packed, self._material, self.moments, self.rtol, self.max_evaluations)
-        self.dynamics = make_dynamics(dynamics, self._induction, step=step, damping=damping)
+        bodies = self._make_bodies(layout, couplings) if dynamics == "theta" else None
+        self.dynamics = make_dynamics(dynamics, self._induction, bodies=bodies, step=step, damping=damping)
 
     def _allocate(self, layout: MomentLayout, external_field):
         n, vec3 = len(layout.radii), vec3_type(self.dtype)
@@ -209,10 +212,23 @@ class MomentSystem:
         # near contacts write one more partial sum
         self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
 
-    def _make_cells(self, layout: MomentLayout, couplings):
+    def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
+        """Prepare what cells lack as balls; ``whole`` tells whether small bodies respond as wholes."""
         worlds = [(first, middle) for first, middle, _ in layout.ranges()]
-        self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h) if couplings else None
-        self.rotations = self._cells.rotations if self._cells is not None else None
+        self._cells = self.rotations = None
+        if couplings:
+            which = [whole and len(one.radii) <= MOST_CELLS for _, one in couplings]
+            self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h, which)
+            self.rotations = self._cells.rotations
+
+    def _make_bodies(self, layout: MomentLayout, couplings) -> BodyResponses | None:
+        """Prepare the response of those bodies that are small enough to respond as wholes."""
+        bodies = [
+            WholeBody(first, int(layout.worlds[first]), number, int(self._cells.rows[number]), one.dense)
+            for number, (first, one) in enumerate(couplings)
+            if len(one.radii) <= MOST_CELLS
+        ]
+        return BodyResponses(self._induction, bodies, self._cells) if bodies else None
 
     def _evaluate_wrench(self, layout: MomentLayout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
@@ -336,12 +352,16 @@ class MomentSystem:
         """Launch one field evaluation among the inducible moments and the step that follows from it."""
         self.dynamics.refine()
         self._sum_field()
+        if self._cells is not None:
+            self._cells.launch_others()
         self.dynamics.iterate()
         self._end_sweeps()
 
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""
         self._sum_field()
+        if self._cells is not None:
+            self._cells.launch()
         self._end_sweeps()
 
     def _sum_field(self):
@@ -352,8 +372,6 @@ class MomentSystem:
         else:
             near_pairs.launch_sweeps(near)
             self._mutual.launch(wait=lambda: near_pairs.wait_for_field(near))
-        if self._cells is not None:
-            self._cells.launch()
 
     def _end_sweeps(self):
         """Have what is launched next wait for what near contacts do beside."""

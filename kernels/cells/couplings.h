@@ -6,6 +6,7 @@
 // on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY, GROUP and HARDENING; ``Couplings`` is the
 // struct of couplings.py.
 #pragma once
+#include "cells/rotation.h"
 #include "pairs/overlap_volume.h"
 #include "shared/team.h"
 
@@ -14,28 +15,6 @@ namespace warpmag {
 constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
 
 enum CellPass { HARDEN, TURN, SHARE, ADD }; // as in couplings.py
-
-// Rows of the rotation of a body.
-struct Rotation {
-    Real rows[3][3];
-};
-
-template <class Quaternion> CUDA_CALLABLE inline Rotation rotation_of(const Quaternion& q) {
-    const Real x = q[0], y = q[1], z = q[2], w = q[3];
-    return {{{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
-             {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
-             {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}}};
-}
-CUDA_CALLABLE inline Vector turned(const Rotation& r, Vector v) {
-    const auto& a = r.rows;
-    return {a[0][0] * v.x + a[0][1] * v.y + a[0][2] * v.z, a[1][0] * v.x + a[1][1] * v.y + a[1][2] * v.z,
-            a[2][0] * v.x + a[2][1] * v.y + a[2][2] * v.z};
-}
-CUDA_CALLABLE inline Vector turned_back(const Rotation& r, Vector v) {
-    const auto& a = r.rows;
-    return {a[0][0] * v.x + a[1][0] * v.y + a[2][0] * v.z, a[0][1] * v.x + a[1][1] * v.y + a[2][1] * v.z,
-            a[0][2] * v.x + a[1][2] * v.y + a[2][2] * v.z};
-}
 
 // Sum over the entries of cells that stand at ``row`` of the tables: lists of a chunk are as long as its longest.
 template <class Couplings>

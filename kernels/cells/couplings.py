@@ -109,41 +109,63 @@ class CellCouplings:
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
+        whole: Of each body whether :meth:`launch_others` leaves it out, shape [bodies]; None leaves out none.
 
     Attributes:
         rotations: Rotation of each body, from its frame to the world's, shape [bodies]; written by the caller.
+        hardness: What is added to the demagnetizing factor of cells, over the volume [1/m³].
+        rows: First row of each body there, shape [bodies].
         entries: Pairs of cells that one evaluation sums.
     """
 
-    def __init__(self, bodies, worlds, packed, moments, h):
+    def __init__(self, bodies, worlds, packed, moments, h, whole=None):
         """Lay out the tables on the device of the moments."""
         dtype = packed.dtype
         self._couplings = c = couplings_type(dtype)()
         c.moments, c.h, c.packed = moments, h, packed.packed
         c.overlap, c.overlap_count = packed.overlaps, packed.overlap_counts
-        self._lay_out(bodies, np.asarray(worlds), dtype, h.device)
+        left = self._lay_out(bodies, whole, np.asarray(worlds), dtype, h.device)
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
-        device, rows = h.device, c.turned.shape[1]
+        self.hardness = c.hardness
+        self._start = self._record(c, HARDEN, HARDEN)
+        self._launches, self._others = self._record_field(c), []
+        if left:
+            part = couplings_type(dtype)()
+            for name in couplings_type(dtype).vars:
+                setattr(part, name, getattr(c, name))
+            part.chunk = c.chunk[:left]
+            self._others = self._record_field(part)
+
+    def _record_field(self, couplings):
+        on_gpu = couplings.h.device.is_cuda
+        passes = [(one, one) for one in (TURN, SHARE, ADD)] if on_gpu else [(TURN, ADD)]
+        return [self._record(couplings, *one) for one in passes]
+
+    @staticmethod
+    def _record(couplings, first: int, last: int):
+        device, rows = couplings.h.device, CHUNK * couplings.chunk.shape[0]
         group, threads = group_threads(device), threads_for(rows, _CELLS_PER_THREAD)
+        inputs = [first, last + 1, threads, None if device.is_cuda else team(), couplings]
+        dim = group * rows if device.is_cuda else 1
+        kernel = _kernel(couplings.packed.dtype, group)
+        return wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
 
-        def record(first: int, last: int):
-            inputs = [first, last + 1, threads, None if device.is_cuda else team(), c]
-            dim = group * rows if device.is_cuda else 1
-            return wp.launch(_kernel(dtype, group), dim=dim, inputs=inputs, device=device, record_cmd=True)
-
-        self._start = record(HARDEN, HARDEN)
-        self._launches = [record(one, one) for one in (TURN, SHARE, ADD)] if device.is_cuda else [record(TURN, ADD)]
-
-    def _lay_out(self, bodies, worlds, dtype, device):
-        c, found, tables, chunks, body = self._couplings, {}, [], [], []
-        for number, (first, coupling) in enumerate(bodies):
+    def _lay_out(self, bodies, whole, worlds, dtype, device) -> int:
+        """Fill the arrays; return how many chunks those bodies have that are not whole, which come first."""
+        c, found, tables, chunks, body, left = self._couplings, {}, [], [], [], 0
+        self.rows = np.zeros(len(bodies), int)
+        whole = np.zeros(len(bodies), bool) if whole is None else np.asarray(whole, bool)
+        for number in np.argsort(whole, kind="stable").tolist():
+            first, coupling = bodies[number]
             if id(coupling) not in found:
                 found[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.tensor))
             count, row = len(coupling.start) - 1, CHUNK * len(chunks)
+            self.rows[number] = row
             starts = range(0, count, CHUNK)
             chunks += [(first + k, min(CHUNK, count - k), row, found[id(coupling)]) for k in starts]
             body += [number] * len(starts)
+            left += 0 if whole[number] else len(starts)
         slots, others, tensors = (np.concatenate(parts) for parts in zip(*tables, strict=True))
 
         def put(values, kind):
@@ -154,14 +176,15 @@ class CellCouplings:
         c.chunk, c.body = put(np.array(chunks, np.int32), wp.vec4i), put(np.array(body, np.int32), wp.int32)
         identity = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(bodies), 4))
         c.rotation = put(identity, wp.types.quaternion(dtype))
-        ends = CHUNK * np.searchsorted(body, np.arange(len(bodies) + 1))
-        c.rows = put(np.stack([ends[:-1], ends[1:]], axis=1).astype(np.int32), wp.vec2i)
+        ends = self.rows + CHUNK * np.bincount(body, minlength=len(bodies))
+        c.rows = put(np.stack([self.rows, ends], axis=1).astype(np.int32), wp.vec2i)
         c.even = put(np.concatenate([coupling.even for _, coupling in bodies]), dtype)
         c.common = wp.zeros(3 * len(bodies), dtype=dtype, device=device)
         c.turned = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
         c.hardness = wp.zeros(CHUNK * len(chunks), dtype=dtype, device=device)
         world = np.searchsorted(worlds[:, 0], [first for first, *_ in chunks], side="right") - 1
         c.world = put(worlds[world].astype(np.int32), wp.vec2i)
+        return left
 
     def start(self):
         """Begin a solve where the moments are now."""
@@ -170,4 +193,9 @@ class CellCouplings:
     def launch(self):
         """Add to the field what the couplings make of the moments."""
         for one in self._launches:
+            one.launch()
+
+    def launch_others(self):
+        """The same, save for whole bodies."""
+        for one in self._others:
             one.launch()

@@ -11,6 +11,7 @@ The state of n moments, m of them inducible, in w worlds and c chunks:
     saturation, slope, curve: What they are made of (``curves.CurveParameters``).
     rtol: Error at which a world ends.
     max_evaluations: Field evaluations after which a world gives up.
+    responds: Whether a moment is a cell of a body that responds as a whole (``body_response``), shape [n].
     row: Number, world, and the world's inducible moments from and to, of each inducible moment, shape [m].
     chunk: Rows from and to, and world, of each chunk, shape [c].
     chunk_begin: First chunk of each world, shape [w + 1].
@@ -117,6 +118,7 @@ def state_type(dtype):
         curve: wp.array[int]
         common_curve: int
         curve_tables: wp.array2d[dtype]
+        responds: wp.array[int]
         rtol: wp.float64
         max_evaluations: int
         row: wp.array[wp.vec4i]
@@ -196,6 +198,7 @@ def allocate(worlds, inducible, dtype, device):
         **zeros("worlds", world_count, World),
         **zeros("residual error", world_count, wp.float64),
         **zeros("arrived warm evaluations", world_count),
+        **zeros("responds", n),
         **zeros("condition", 1),
     }
     state = state_type(dtype)()

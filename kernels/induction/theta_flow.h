@@ -2,7 +2,8 @@
 // theta_flow.py has its equations, theta_step.h what a world does next.
 //
 // On a CPU a pass works on a vector of moments, which are all of one world; on a GPU a group of threads has a moment.
-// Takes CAPACITY, DEPTH, GROUP and INVERSE_4PI; ``State`` is the struct of solve_state.py.
+// Takes CAPACITY, DEPTH, GROUP and INVERSE_4PI, and RESPONDING, whether any moments belong to bodies that respond as
+// wholes; ``State`` is the struct of solve_state.py.
 #pragma once
 #include "induction/theta_step.h"
 #include "material/curves.h"
@@ -91,7 +92,25 @@ template <class State> CUDA_CALLABLE inline void store_moments(State& state, con
     put_some(entries(state.packed, at, 6), at.held, m.z);
 }
 
-// Calls visit(row, listed) for the inducible neighbours of moments; a moment whose list is full has none.
+// Whether moments are cells of a body that responds as a whole (body_response.h).
+template <class State> CUDA_CALLABLE inline Mask responding(const State& state, const Place& at) {
+    Index which = 0;
+#if defined(__CUDA_ARCH__)
+    if constexpr (RESPONDING) which = state.responds.data[at.i];
+#else
+    for (int l = 0; RESPONDING && l < at.held; ++l) which[l] = state.responds.data[at.i + l];
+#endif
+    return mask_of(which != Index(0));
+}
+// Whether moments i and j are cells of one such body.
+template <class State> CUDA_CALLABLE inline bool respond_together(const State& state, int i, int j) {
+    if (!RESPONDING || state.responds.data[i] == 0) return false;
+    const Real* const labels = (const Real*)((const char*)state.packed.data + 7 * (size_t)state.packed.strides[0]);
+    return labels[i] == labels[j];
+}
+
+// Calls visit(row, listed) for the inducible neighbours of moments, save those that respond together with them; a
+// moment whose list is full has none.
 #if defined(__CUDA_ARCH__)
 template <class State, class Visit>
 CUDA_CALLABLE inline void visit_neighbors(const State& state, const Place& at, Visit visit) {
@@ -99,7 +118,7 @@ CUDA_CALLABLE inline void visit_neighbors(const State& state, const Place& at, V
     const int count = state.neighbor_count.data[at.i];
     for (int s = share(); s < (count > CAPACITY ? 0 : count); s += SHARES) {
         const int j = list[s], row = j - at.i + at.row;
-        if (j >= at.begin && j < at.end) visit(&row, true);
+        if (j >= at.begin && j < at.end && !respond_together(state, at.i, j)) visit(&row, true);
     }
 }
 #else
@@ -120,7 +139,8 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
         const int i = at.i + l, found = state.neighbor_count.data[i];
         for (int s = 0; s < found && found <= CAPACITY; ++s) {
             const int j = state.neighbor.data[(size_t)CAPACITY * i + s];
-            if (j >= at.begin && j < at.end) lists[CHUNK * counts[l]++ + l] = j - at.i + at.row;
+            if (j >= at.begin && j < at.end && !respond_together(state, i, j))
+                lists[CHUNK * counts[l]++ + l] = j - at.i + at.row;
         }
     }
     const int longest = most(counts);
@@ -134,23 +154,38 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
 //
 // Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
 // above 1/3 − (1 + max o_i), which is −2/3 without overlap: hence a step length that converges for any arrangement.
+// Cells of a body that responds as a whole do not overlap.
 template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Place& at) {
-    auto others = [](Index i, Index j) { return mask_of(j != i); };
+    const Real* const labels = entries(state.packed, at, 7) - at.i;
+    const Mask whole = responding(state, at), each = mask_of(Index(0) == Index(0));
+    auto others = [=](Index i, Index j) {
+        return mask_of(j != i) & (whole ? mask_of(collect(labels, i) != collect(labels, j)) : each);
+    };
     return shared_volumes(state, at.i, at.held, at.begin, at.end, others);
 }
 
 // 4π times the field [A/m] of neighbours at the last solution, further by ``ahead`` of its change from the one before.
+// For cells that respond as a whole less that of the neighbours where they are now, which no sweep is to add.
 template <class State>
-CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& at, Number radius, Real ahead) {
-    const Real* const past = (const Real*)state.past.data;
+CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& at, Four ball, Real ahead) {
+    const Real *const past = (const Real*)state.past.data, *const packed = (const Real*)state.packed.data;
+    const size_t pitch = state.packed.strides[0] / sizeof(Real);
     const Vector x0 = vector_of(own_four(past, 0, at.row)), x1 = vector_of(own_four(past, 2, at.row));
+    const Mask whole = responding(state, at);
     Vector total = {0, 0, 0};
     visit_neighbors(state, at, [&](const int* j, Mask listed) {
         const Four y0 = four_at(past, 0, j), y1 = four_at(past, 2, j);
-        Vector last = {0, 0, 0}, earlier = {0, 0, 0};
-        add_pair_field(last, less(x0, vector_of(y0)), radius, y0.w, vector_of(four_at(past, 1, j)), listed);
-        add_pair_field(earlier, less(x1, vector_of(y1)), radius, y1.w, vector_of(four_at(past, 3, j)), listed);
+        const Vector m0 = vector_of(four_at(past, 1, j)), m1 = vector_of(four_at(past, 3, j));
+        Vector last = {0, 0, 0}, earlier = {0, 0, 0}, present = {0, 0, 0};
+        add_pair_field(last, less(x0, vector_of(y0)), ball.w, y0.w, m0, listed);
+        add_pair_field(earlier, less(x1, vector_of(y1)), ball.w, y1.w, m1, listed);
         total = sum(total, sum(last, scaled(ahead, less(last, earlier))));
+        if (!any(whole)) return;
+        const Index n = indices(j) + (at.i - at.row);
+        const Vector y = {collect(packed, n), collect(packed + pitch, n), collect(packed + 2 * pitch, n)};
+        const Vector m = sum(m0, scaled(ahead, less(m0, m1)));
+        add_pair_field(present, less(vector_of(ball), y), ball.w, y0.w, m, listed & whole);
+        total = less(total, present);
     });
     return group_sums(total);
 }
@@ -164,7 +199,7 @@ template <class State> CUDA_CALLABLE inline Number start(State& state, const Pla
     const Material material = material_of(state, at);
     const Number stiffness = material.slope * (total_overlap(state, at) + Real(2.0 / 3.0));
     Vector near = {0, 0, 0};
-    if (warm == STEADY) near = extrapolated_field(state, at, ball.w, ahead);
+    if (warm == STEADY) near = extrapolated_field(state, at, ball, ahead);
     if (share() != 0) return stiffness;
     const Vector h0 = get(state.h0, at);
     if (any(mask_of(length(h0) > Real(0)))) raise_flag(world.in_field);
@@ -207,7 +242,8 @@ template <class State> CUDA_CALLABLE inline void sweep(State& state, const Place
     const Vector s = get(state.s, at);
     const Vector g = sum(get(state.mixed_g, at), scaled(INVERSE_4PI * material.slope / material.saturation, h));
     const Real wanted = Real(SWEEP_STEP) * (Real)world.omega;
-    const Vector next = sum(s, scaled(wanted < 1 ? wanted : Real(1), less(g, s)));
+    const Number step = wanted < 1 ? wanted : Real(1), none = step * 0;
+    const Vector next = sum(s, scaled(responding(state, at) ? none : step, less(g, s)));
     set(state.s, at, next);
     const Vector m = moments_of(material, ball.w, next);
     if (last) {
@@ -300,7 +336,8 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
             r = less(r, scaled(alpha, get(state.history_r, at, old)));
         }
     }
-    const Vector g = sum(mixed, r), next = sum(mixed, scaled((Real)world.omega, r));
+    const Number omega = (Real)world.omega, longer = whole_step<Real>((Real)world.omega);
+    const Vector g = sum(mixed, r), next = sum(mixed, scaled(responding(state, at) ? longer : omega, r));
     const Material material = material_of(state, at);
     set(state.s, at, next);
     // what ends takes a whole step, where moments and field are the material's; s is the next solve's start

@@ -42,12 +42,16 @@ have predicted the last change from the one before it, β = ⟨φΔg, φΔg'⟩/
 motion is followed, noise is not. The changes Δs_j, Δr_j outlive a solve, since the coupling hardly changes: a slow
 mode, as of long columns of balls, costs one evaluation instead of three. All that leaves 1.2 evaluations a solve
 where 243 balls jump (Balls Up). Whatever a start is worth, the solve converges to the one solution.
+
+Bodies of few cells respond as wholes to each field that is evaluated (``body_response``). The flow takes the field in
+which they have responded for the field, and whole steps for them, as for lone balls; sweeps leave them out.
 """
 
 from functools import cache
 
 import warp as wp
 
+from warpmag.kernels.induction.body_response import BodyResponses
 from warpmag.kernels.induction.solve_state import BLOCK_CHUNK, COLUMNS, DEPTH, state_type, world_summation
 from warpmag.kernels.material.curves import inverse_curve_ratio
 from warpmag.kernels.pairs.neighbors import CAPACITY
@@ -66,21 +70,20 @@ _RESIDENT = {wp.float32: (3, 5), wp.float64: (2, 3)}
 """Blocks of 256 threads that a multiprocessor is to hold at the start and in sweeps: compilers take more registers."""
 
 
-def _options(dtype, group: int) -> dict:
-    return native_options(
-        "induction/theta_flow.h", dtype=dtype, GROUP=group, CAPACITY=CAPACITY, DEPTH=DEPTH, INVERSE_4PI=INVERSE_4PI
-    )
+def _options(dtype, group: int, responding: bool) -> dict:
+    constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH, "RESPONDING": int(responding)}
+    return native_options("induction/theta_flow.h", dtype=dtype, INVERSE_4PI=INVERSE_4PI, **constants)
 
 
 @cache
-def _passes_kernel(dtype):
+def _passes_kernel(dtype, responding: bool):
     """Kernel of passes on a CPU."""
     call = "warpmag::theta_flow(first, last, threads, team.data, arrays);"
-    return passes_kernel(call, state_type(dtype), _options(dtype, 1))
+    return passes_kernel(call, state_type(dtype), _options(dtype, 1, responding))
 
 
 @cache
-def _begin_kernel(dtype, group: int):
+def _begin_kernel(dtype, group: int, responding: bool):
     state_struct = state_type(dtype)
 
     @wp.func_native("return warpmag::start(state, warpmag::place(state, row));")
@@ -92,7 +95,7 @@ def _begin_kernel(dtype, group: int):
     @wp.kernel(
         module="unique",
         enable_backward=False,
-        module_options=_options(dtype, group),
+        module_options=_options(dtype, group, responding),
         launch_bounds=(256, _RESIDENT[dtype][0]),
     )
     def begin_flow(state: state_struct):
@@ -111,7 +114,7 @@ def _begin_kernel(dtype, group: int):
 
 
 @cache
-def _sweep_kernel(dtype, group: int):
+def _sweep_kernel(dtype, group: int, responding: bool):
     state_struct = state_type(dtype)
 
     @wp.func_native("warpmag::sweep(state, warpmag::place(state, row), last == 1);")
@@ -120,7 +123,7 @@ def _sweep_kernel(dtype, group: int):
     @wp.kernel(
         module="unique",
         enable_backward=False,
-        module_options=_options(dtype, group),
+        module_options=_options(dtype, group, responding),
         launch_bounds=(256, _RESIDENT[dtype][1]),
     )
     def sweep(last: int, state: state_struct):
@@ -130,7 +133,7 @@ def _sweep_kernel(dtype, group: int):
 
 
 @cache
-def _convergence_kernel(dtype, group: int):
+def _convergence_kernel(dtype, group: int, responding: bool):
     """Kernel whose blocks measure a chunk of a world each, the last of which chooses its world's next step."""
     state_struct = state_type(dtype)
     columns = wp.types.vector(COLUMNS, wp.float64)
@@ -142,7 +145,7 @@ def _convergence_kernel(dtype, group: int):
     @wp.func_native("warpmag::choose_step(state, w, &sums[0]);")
     def choose_step(state: state_struct, w: int, sums: columns): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group))
+    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group, responding))
     def check_convergence(state: state_struct):
         c, lane = wp.tid()
         chunk = state.chunk[c]
@@ -162,13 +165,13 @@ def _convergence_kernel(dtype, group: int):
 
 
 @cache
-def _advance_kernel(dtype, group: int):
+def _advance_kernel(dtype, group: int, responding: bool):
     state_struct = state_type(dtype)
 
     @wp.func_native("warpmag::advance(state, warpmag::place(state, row));")
     def advance_moment(state: state_struct, row: int): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group))
+    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group, responding))
     def advance(state: state_struct):
         advance_moment(state, wp.tid())
 
@@ -200,10 +203,15 @@ def launch_set_state(state, magnetizations):
 class Launches:
     """Launches of the flow on one state, recorded once, which spares packing its arrays every time."""
 
-    def __init__(self, state):
-        """Record the launches for a state that is bound to its moments (``solve_state.bind``)."""
+    def __init__(self, state, bodies: BodyResponses | None):
+        """Record the launches for a state that is bound to its moments (``solve_state.bind``).
+
+        Args:
+            state: The state.
+            bodies: Bodies among the moments that respond as wholes.
+        """
         device, dtype, count, chunks = state.h.device, state.packed.dtype, state.row.shape[0], state.chunk.shape[0]
-        group = group_threads(device)
+        group, responding = group_threads(device), bodies is not None
 
         def record(kernel, dim, *inputs, block_dim=256):
             return wp.launch(
@@ -211,17 +219,24 @@ class Launches:
             )
 
         def passes(first: int, last: int):
-            return record(_passes_kernel(dtype), 1, first, last + 1, threads_for(count, MOMENTS_PER_THREAD), team())
+            return record(
+                _passes_kernel(dtype, responding), 1, first, last + 1, threads_for(count, MOMENTS_PER_THREAD), team()
+            )
 
         if device.is_cpu:
-            self.begin = [passes(START, START)]
-            self.sweeps = [passes(FIRST_SWEEP, LAST_SWEEP)]
+            self.begin, self.sweeps = [passes(START, START)], [passes(FIRST_SWEEP, LAST_SWEEP)]
             self.iteration = [passes(MEASURE, ADVANCE)]
-            return
-        width = group * BLOCK_CHUNK // _BEGINNERS
-        self.begin = [record(_begin_kernel(dtype, group), (_BEGINNERS * chunks, width), block_dim=width)]
-        self.sweeps = [record(_sweep_kernel(dtype, group), group * count, last) for last in (0, 1)]
-        self.iteration = [
-            record(_convergence_kernel(dtype, group), (chunks, BLOCK_CHUNK), block_dim=BLOCK_CHUNK),
-            record(_advance_kernel(dtype, group), count),
-        ]
+        else:
+            width = group * BLOCK_CHUNK // _BEGINNERS
+            self.begin = [
+                record(_begin_kernel(dtype, group, responding), (_BEGINNERS * chunks, width), block_dim=width)
+            ]
+            self.sweeps = [record(_sweep_kernel(dtype, group, responding), group * count, last) for last in (0, 1)]
+            self.iteration = [
+                record(_convergence_kernel(dtype, group, responding), (chunks, BLOCK_CHUNK), block_dim=BLOCK_CHUNK),
+                record(_advance_kernel(dtype, group, responding), count),
+            ]
+        if bodies is not None:
+            self.begin.append(bodies.begin)
+            self.iteration.insert(0, bodies.respond)
+            self.sweeps = self.sweeps if bodies.cell_count < count else []

@@ -115,6 +115,8 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     }
     int next = done || world.plain_steps > 0 ? STEP : STEP_AND_SWEEP;
     if (!mixed) next = STEP_FROM_BEST;
+    // how strongly bodies that respond as wholes couple is not bounded beforehand
+    if (!mixed && RESPONDING) world.omega *= 0.5;
     if (done && !finite) next = NOTHING;
     if (fieldless && !done) next = DEMAGNETIZE;
     world.next = next;

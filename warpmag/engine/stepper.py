@@ -133,11 +133,7 @@ class Stepper:
         self._machine.keep(_arrays(self._state), _arrays(self._saved))
         self._arrays = self._machine.arrays
         self._watched = self._machine.watched(sizes.thickness, sizes.reach)
-        self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
-        if self._device.is_cuda:
-            self._mirrors = {
-                name: wp.empty_like(array, device="cpu", pinned=True) for name, array in self._mirrors.items()
-            }
+        self._mirrors = self._make_mirrors()
         self._clock = _Clock(self._device)
         self._workspace = Workspace(self._device) if self._device.is_cuda else None
         self._capture, self._graph = graphs, None
@@ -147,6 +143,13 @@ class Stepper:
         if drive:
             drive.place(self._state, 0.0, self._longest)
         self._prepare()
+
+    def _make_mirrors(self) -> dict[str, wp.array]:
+        """Return where the host reads what the device writes, by name."""
+        mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
+        if self._device.is_cuda:
+            mirrors = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in mirrors.items()}
+        return mirrors
 
     def _prepare(self) -> None:
         """Fit everything to the solver's buffers, whose number does not change."""
