@@ -84,6 +84,7 @@ FILES = {
     "CHANGELOG.md": "changes.md",
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
+    "warpmag/examples/README.md": "examples.md",
 }
 """Files beside this folder that are pages, too."""
 GENERATED = {"schemas": _schemas, "command": _commands, **{name: partial(_file, name) for name in FILES}}

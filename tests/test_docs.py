@@ -17,7 +17,7 @@ from warpmag import cli
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = [*sorted(page for page in DOCS.rglob("*.md") if "paper" not in page.parts)]
+PAGES = [ROOT / "README.md", *sorted(page for page in DOCS.rglob("*.md") if "paper" not in page.parts)]
 SNIPPET = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
 """A block of Python; in a comment it is what a page leaves to its reader, such as the model that it speaks of."""
 STAGE = re.compile(r"^```\n(#usda 1\.0\n# (\S+)\n.*?)^```$", re.MULTILINE | re.DOTALL)
