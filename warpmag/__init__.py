@@ -12,10 +12,14 @@ from pathlib import Path
 
 __version__ = "0.1.0"
 
+_FOLDER = Path(__file__).resolve().parent
+if not (_FOLDER / "kernels").exists():  # a checkout, where kernels and scenes_usd are beside this folder
+    __path__.append(str(_FOLDER.parent))
+
 
 def _homes() -> dict[str, str]:
     """Module of each public name, by the stub beside this file, which type checkers read."""
-    stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    stub = ast.parse((_FOLDER / "__init__.pyi").read_text(encoding="utf-8"))
     found = [
         (one.module or "", alias.name) for one in stub.body if isinstance(one, ast.ImportFrom) for alias in one.names
     ]
