@@ -18,7 +18,7 @@ def draw(stage: str, output: str, frame: int, samples: int, width: int, height: 
         width: Width of the picture [px].
         height: Height of the picture [px].
     """
-    import bpy  # noqa: PLC0415 - of Blender's Python alone
+    import bpy  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - Blender as a module
 
     bpy.ops.wm.read_factory_settings()
     for one in list(bpy.data.objects):
