@@ -14,7 +14,7 @@ from warpmag.usd import open_motion, stage_clock, usable_path
 
 BLENDER = "WARPMAG_BLENDER"
 """The variable that names a Python with ``bpy``, if this one has none."""
-_SAMPLES = 64
+_SAMPLES = 24
 """Paths per pixel; the rest is denoised."""
 _PICTURES = (".png", ".jpg")
 
