@@ -34,7 +34,7 @@ def _run(cli, arguments: list[str], messages: str, frames: str) -> int:
     os.dup2(os.open(messages, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
     os.dup2(2, 1)
     log = os.open(frames, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    cli._Progress._draw = lambda self, frame: os.write(log, f"{time.monotonic()} {frame}\n".encode())
+    cli.Progress._draw = lambda self, frame: os.write(log, f"{time.monotonic()} {frame}\n".encode())
     code = cli.main(arguments)
     sys.stdout.flush()
     return code

@@ -13,6 +13,7 @@ from pathlib import Path
 from warpmag import __version__
 from warpmag.errors import InputError, SimulationError
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, check_rtol
+from warpmag.progress import Progress, silence
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes; 0 where all went well, ``STOPPED`` and the signal's number where a signal ended it."""
@@ -57,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
         return STOPPED + stopped.number
     except BrokenPipeError:
         _tell("nobody reads the standard output any more")
-        _silence(1)
+        silence(1)
         return STOPPED + signal.SIGPIPE
 
 
@@ -97,14 +98,7 @@ def _tell(what) -> None:
     try:
         print(f"warpmag: {what}", file=sys.stderr, flush=True)
     except OSError:
-        _silence(2)
-
-
-def _silence(descriptor: int) -> None:
-    """Drop what goes to a standard file, also what Python writes there when it ends."""
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, descriptor)
-    os.close(nothing)
+        silence(2)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -153,6 +147,9 @@ def _parser() -> argparse.ArgumentParser:
     several.add_argument("--frame", type=int, metavar="N", help="frame after the start (default: the last)")
     several.add_argument("--frames", metavar="A:B", help="frames from A to B (default of a film: all)")
     render.add_argument("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
+    render.add_argument(
+        "--quality", choices=("draft", "final"), default="draft", help="final: by Blender's path tracer"
+    )
     render.add_argument("--moments", action="store_true", help="show the moments of a finished run as arrows")
     render.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     render.set_defaults(command=_render)
@@ -256,6 +253,15 @@ def _load(path: Path, **options):
 def _render(options) -> int:
     path, _ = _find_scene(options.stage)
     _quiet_warp()
+    if options.quality == "final":
+        from warpmag.final import render_final  # noqa: PLC0415
+
+        if options.frames or options.moments:
+            raise InputError("quality: 'final' draws one frame, without moments; 'warpmag export' has arrows")
+        print(
+            f"written {render_final(path, options.output, frame=options.frame, size=_two('size', options.size, 'x'))}"
+        )
+        return 0
     from warpmag.engine.render import render  # noqa: PLC0415
 
     written = render(
@@ -313,7 +319,7 @@ def _run(options) -> int:
     known = simulation.warnings()
     _warn(known)
     viewer = _open_viewer(options.viewer, simulation)
-    progress = _Progress(simulation.frames_of(options.frames))
+    progress = Progress(simulation.frames_of(options.frames))
 
     def show(frame: int) -> bool:
         progress.show(frame)
@@ -349,45 +355,6 @@ def _run(options) -> int:
 def _warn(lines: list[str]) -> None:
     for line in lines:
         _tell(f"warning: {line}")
-
-
-class _Progress:
-    """A progress bar that appears with the first frame, so that bad input is answered by its one line alone."""
-
-    def __init__(self, frames: int):
-        self.frames, self.done = frames, None
-        self._bar = None
-
-    def show(self, frame: int) -> None:
-        """Show that ``frame`` is done."""
-        self.done = frame
-        try:
-            self._draw(frame)
-        except OSError:  # nobody reads it any more, which is no reason to end the run
-            _silence(2)
-
-    def _draw(self, frame: int) -> None:
-        if self._bar is None:
-            from tqdm import tqdm  # noqa: PLC0415
-
-            interval = 0.2 if sys.stderr.isatty() else 10.0
-            self._bar = tqdm(
-                total=self.frames,
-                initial=frame,
-                unit="frame",
-                mininterval=interval,
-                file=sys.stderr,
-                dynamic_ncols=True,
-            )
-        self._bar.update(frame - self._bar.n)
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        try:
-            if self._bar is not None:
-                self._bar.close()
-        except OSError:
-            _silence(2)
 
 
 def _open_viewer(name: str, simulation):

@@ -1,0 +1,75 @@
+"""Draws a stage with Blender's path tracer: ``python -P blender.py STAGE OUTPUT FRAME SAMPLES WIDTH HEIGHT``.
+
+A process of its own runs this file, which imports nothing of warpmag: Blender brings a USD that cannot live beside
+another one. It prints one line where it cannot draw.
+"""
+
+import sys
+
+_FEWEST = 3
+_OUTSIDE, _MARGIN = 0.1, 1.85
+"""Part of the bodies that may lie outside on each side, and the width of the picture over that of the others."""
+
+
+def draw(stage: str, output: str, frame: int, samples: int, width: int, height: int) -> str:
+    """Draw a frame, denoised; return why that cannot be done, or nothing.
+
+    Args:
+        stage: USD file for renderers, as ``warpmag export`` writes it.
+        output: Picture to write.
+        frame: Time code.
+        samples: Paths per pixel.
+        width: Width of the picture [px].
+        height: Height of the picture [px].
+    """
+    import bpy  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - Blender as a module
+
+    bpy.ops.wm.read_factory_settings()
+    for one in list(bpy.data.objects):
+        bpy.data.objects.remove(one)
+    bpy.ops.wm.usd_import(filepath=stage)
+    scene = bpy.context.scene
+    cameras = [one for one in bpy.data.objects if one.type == "CAMERA"]
+    if not cameras:
+        return "the stage has no camera"
+    scene.camera = cameras[0]
+    scene.frame_set(frame)
+    _frame_bodies(bpy, scene.camera, width / height)
+    scene.view_settings.look = "AgX - Medium High Contrast"
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.use_denoising = samples, True
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
+    scene.render.use_motion_blur = False
+    scene.render.filepath = output
+    scene.render.image_settings.file_format = "JPEG" if output.endswith((".jpg", ".jpeg")) else "PNG"
+    bpy.ops.render.render(write_still=True)
+    return ""
+
+
+def _frame_bodies(bpy, camera, aspect: float) -> None:
+    """Zoom to what moves and shift the lens there, as an architect does; the camera stays where it is.
+
+    Of the bodies those count that lie, across and up, between the outermost tenths.
+    """
+    shown = bpy.context.evaluated_depsgraph_get().object_instances
+    places = [one.matrix_world.translation.copy() for one in shown if one.is_instance]
+    back = camera.matrix_world.inverted()
+    seen = [back @ place for place in places]
+    seen = [(place.x / -place.z, place.y / -place.z) for place in seen if place.z < 0.0]
+    if len(seen) < _FEWEST:
+        return
+    sides = []
+    for values in map(sorted, zip(*seen, strict=True)):
+        few = int(_OUTSIDE * len(values))
+        sides.append((values[few], values[-1 - few]))
+    (left, right), (low, high) = sides
+    lens = camera.data
+    width = _MARGIN * max(right - left, aspect * (high - low), 1e-6)
+    zoom = lens.sensor_width / width / lens.lens
+    lens.lens *= zoom
+    lens.dof.aperture_fstop *= zoom  # the aperture itself stays, and with it the depth of field
+    lens.shift_x, lens.shift_y = 0.5 * (left + right) / width, 0.5 * (low + high) / width
+
+
+if __name__ == "__main__":
+    sys.exit(draw(sys.argv[1], sys.argv[2], *map(int, sys.argv[3:7])) or 0)

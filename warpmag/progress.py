@@ -1,0 +1,51 @@
+"""What a command shows of a run on the standard error, which nobody may read any more."""
+
+import os
+import sys
+
+
+def silence(descriptor: int) -> None:
+    """Drop what goes to a standard file, also what Python writes there when it ends."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, descriptor)
+    os.close(nothing)
+
+
+class Progress:
+    """A progress bar that appears with the first frame, so that bad input is answered by its one line alone."""
+
+    def __init__(self, frames: int):
+        """Expect so many frames."""
+        self.frames, self.done = frames, None
+        self._bar = None
+
+    def show(self, frame: int) -> None:
+        """Show that ``frame`` is done."""
+        self.done = frame
+        try:
+            self._draw(frame)
+        except OSError:  # nobody reads it any more, which is no reason to end the run
+            silence(2)
+
+    def _draw(self, frame: int) -> None:
+        if self._bar is None:
+            from tqdm import tqdm  # noqa: PLC0415
+
+            interval = 0.2 if sys.stderr.isatty() else 10.0
+            self._bar = tqdm(
+                total=self.frames,
+                initial=frame,
+                unit="frame",
+                mininterval=interval,
+                file=sys.stderr,
+                dynamic_ncols=True,
+            )
+        self._bar.update(frame - self._bar.n)
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        try:
+            if self._bar is not None:
+                self._bar.close()
+        except OSError:
+            silence(2)
