@@ -137,6 +137,14 @@ def test_velocities_of_instances_are_those_of_their_bodies(device, tmp_path):
     np.testing.assert_allclose(speeds[3:], np.array((-sin, cos, 0.0)) * 0.5 * np.pi, atol=1e-5)
 
 
+def test_velocities_reach_bodies_in_instances(tmp_path):
+    inner = 'def Xform "Kind" {\ndef "In" (instanceable = true\nreferences = </Asset>) {\n}\n}\n'
+    scene = instancer(["Kind"], [0], [(0, 0, 1)], "vector3f[] velocities = [(0, 0, 2)]", inner)
+    stage = open_stage(write(tmp_path, scene, f'class "Asset" {{\n{BALL}}}\n'))
+    body = stage.GetPrimAtPath("/World/Many/instance0/Kind/In/Ball")
+    assert body.GetAttribute("physics:velocity").Get() == (0.0, 0.0, 2.0)
+
+
 def test_prototypes_of_several_bodies_and_instancers(tmp_path):
     """Two bodies in a prototype, colliders without a body, and an instancer within a prototype."""
     pair = f'def Xform "Pair" {{\n{placed(BALL)}{placed(BOX, (0.01, 0, 0))}{placed(STATIC, (0, 0.1, 0))}}}\n'

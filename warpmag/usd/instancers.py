@@ -14,7 +14,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
 from warpmag.usd.first_reading import MOST_PRIMS
-from warpmag.usd.session import INSTANCES, add_layer, new_layer
+from warpmag.usd.session import INSTANCES, add_layer, new_layer, release_instances
 from warpmag.usd.transforms import is_body, is_collider
 
 _TYPES = Sdf.ValueTypeNames
@@ -122,6 +122,9 @@ class _Expansion:
         """Write the prims of all instances of an instancer."""
         path, layer = instancer.GetPath(), self._layer_of_prims()
         instances = _Instances(instancer, len(targets), self._time)
+        if len(instances.velocities) or len(instances.spins):  # which bodies get, in instances, too
+            for target in targets:
+                release_instances(self._stage, layer, target)
         prototypes = [_prototype(self._stage.GetPrimAtPath(target)) for target in targets]
         self._prims += sum(1 + prototypes[instances.prototypes[row]].prims for row in instances.rows)
         if self._prims > MOST_PRIMS:

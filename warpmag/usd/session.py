@@ -30,6 +30,18 @@ def added_layer(stage: Usd.Stage, name: str) -> Sdf.Layer | None:
     return next((one for one in found if one and one.GetDisplayName() == f"{name}.usda"), None)
 
 
+def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> None:
+    """Make what instances below a prim hold editable, those in instances included, by opinions in ``layer``."""
+    while True:
+        prims = Usd.PrimRange(stage.GetPrimAtPath(within), Usd.PrimAllPrimsPredicate)
+        instances = [prim.GetPath() for prim in prims if prim.IsInstance()]
+        if not instances:
+            return
+        with Sdf.ChangeBlock():
+            for path in instances:
+                Sdf.CreatePrimInLayer(layer, path).instanceable = False
+
+
 def without_held(stage: Usd.Stage) -> Usd.Stage:
     """Return the stage without the values that are held at one moment."""
     return _opened(stage, list(stage.GetSessionLayer().subLayerPaths))

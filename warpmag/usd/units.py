@@ -16,7 +16,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 
 from warpmag.errors import InputError
-from warpmag.usd.session import UNITS, add_layer, new_layer
+from warpmag.usd.session import UNITS, add_layer, new_layer, release_instances
 
 _LENGTH, _NONE = (1, 0), (0, 0)
 _FORCE, _TORQUE = (1, 1), (2, 1)
@@ -125,7 +125,7 @@ def convert_units(stage: Usd.Stage) -> None:
         return
     layer = new_layer(UNITS)
     add_layer(stage, layer)
-    release_instances(stage, layer)
+    release_instances(stage, layer, stage.GetPseudoRoot().GetPath())
     # all is read before anything is written: what is referenced would be converted twice
     everywhere = Usd.PrimRange(stage.GetPseudoRoot(), Usd.PrimAllPrimsPredicate)
     converted = [one for prim in everywhere for one in _converted(prim, units)]
@@ -135,18 +135,6 @@ def convert_units(stage: Usd.Stage) -> None:
     session = stage.GetSessionLayer().pseudoRoot
     session.SetInfo("metersPerUnit", 1.0)
     session.SetInfo("kilogramsPerUnit", 1.0)
-
-
-def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path = Sdf.Path.absoluteRootPath) -> None:
-    """Make what instances hold editable, those in instances included, by opinions in ``layer``."""
-    while True:
-        prims = Usd.PrimRange(stage.GetPrimAtPath(within), Usd.PrimAllPrimsPredicate)
-        instances = [prim.GetPath() for prim in prims if prim.IsInstance()]
-        if not instances:
-            return
-        with Sdf.ChangeBlock():
-            for path in instances:
-                Sdf.CreatePrimInLayer(layer, path).instanceable = False
 
 
 @dataclass(frozen=True)
