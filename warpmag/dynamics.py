@@ -14,7 +14,7 @@ import numpy as np
 from warpmag.errors import InputError
 from warpmag.kernels.induction import submagnetization, theta_flow
 from warpmag.kernels.induction.body_response import BodyResponses
-from warpmag.magnets import DYNAMICS, check_positive, check_token
+from warpmag.magnets import check_positive
 
 STEP = 0.3
 """Default step κ = βΔtMs [dimensionless] of the explicit dynamics: none of the larger ones measured converges in weak
@@ -109,9 +109,8 @@ def make_dynamics(name: str, state, *, bodies=None, step: float | None = None, d
         damping: Damping α [dimensionless] of ``llg``; None means :data:`DAMPING`.
 
     Raises:
-        InputError: Unknown name, or a setting that is out of range or that this dynamics does not have.
+        InputError: A setting is out of range, or one that this dynamics does not have.
     """
-    check_token("dynamics", name, DYNAMICS)
     if step is not None and name == "theta":
         raise InputError("step: the dynamics 'theta' chooses its own step")
     if damping is not None and name != "llg":

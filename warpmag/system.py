@@ -30,7 +30,7 @@ from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
 from warpmag.layout import MomentLayout, make_layout, make_material, with_cells
-from warpmag.magnets import CONTACT_MODELS, check_count, check_force, check_rtol, check_token
+from warpmag.magnets import CONTACT_MODELS, DYNAMICS, check_count, check_force, check_rtol, check_token
 
 
 class MomentSystem:
@@ -133,6 +133,7 @@ class MomentSystem:
     ):
         """Allocate all buffers."""
         check_token("contact_model", contact_model, CONTACT_MODELS)
+        check_token("dynamics", dynamics, DYNAMICS)
         check_force("force", force, contact_model)
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         check_rtol("rtol", rtol, dtype)
