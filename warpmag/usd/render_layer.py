@@ -16,6 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from warpmag.errors import InputError
 from warpmag.usd.instance_arrays import InstanceArrays, author_curves, author_instances, turns_to
+from warpmag.usd.instancers import expand_instancers
 from warpmag.usd.looks import author_materialx, author_surface, color_scale
 from warpmag.usd.meshes import ARROW, BALL, Shape, author_mesh, shape_of
 from warpmag.usd.motion import read_recording
@@ -343,6 +344,7 @@ def _scene_of(source: Usd.Stage, rate: float) -> Sdf.Layer:
     for layer in stage.GetUsedLayers():
         if "warpmag" in layer.customLayerData:
             stage.MuteLayer(layer.identifier)
+    expand_instancers(stage, stage.GetStartTimeCode())  # as the run did that wrote their motion
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
             for prim in instances:
