@@ -71,7 +71,8 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         model, kinematic = self._model, newton.BodyFlags.KINEMATIC
         colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
         flags = np.append(model.body_flags.numpy(), kinematic)  # of what has no body
-        moving = (flags[model.shape_body.numpy()] & kinematic) == 0
+        body: np.ndarray = model.shape_body.numpy()
+        moving = (flags[body] & kinematic) == 0
         others = colliding & (kinds != PARTNERS.index("ball"))
         return bool((others & (moving | (kinds == len(PARTNERS)))).any())
 
