@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 
 from warpmag.engine.broad_phase import NeighborBroadPhase
+from warpmag.engine.contacts import RigidSolver, body_sizes
 
 FARTHEST = 0.02
 """How far ahead contacts are sought [m]: twice the radius of the balls."""
@@ -119,3 +120,49 @@ def test_nothing_collides(device):
     builder.add_body()
     model = builder.finalize(device=device)
     assert Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state()) == (set(), [])
+
+
+def heap(device, *, free_box=False, static_cylinder=False):
+    """Balls on a plane, a static box, and kinematic capsules that stand in the plane."""
+    builder, rng = newton.ModelBuilder(), np.random.default_rng(4)
+    builder.rigid_gap = 1e-3
+    for place in rng.uniform(0.0, 0.05, (60, 3)):
+        builder.add_shape_sphere(builder.add_body(xform=wp.transform(place, wp.quat_identity())), radius=0.005)
+    for x in (0.0, 0.03):
+        place = wp.transform((x, 0.02, 0.0), wp.quat_identity())
+        builder.add_shape_capsule(builder.add_body(xform=place, is_kinematic=True), radius=0.004, half_height=0.02)
+    at = wp.transform((0.02, 0.02, 0.01), wp.quat_identity())
+    builder.add_shape_box(builder.add_body(xform=at) if free_box else -1, hx=0.02, hy=0.02, hz=0.01)
+    if static_cylinder:
+        builder.add_shape_cylinder(-1, xform=at, radius=0.02, half_height=0.01)
+    builder.add_ground_plane()
+    return builder.finalize(device=device)
+
+
+@pytest.mark.parametrize("others", [{}, {"free_box": True}, {"static_cylinder": True}], ids=lambda one: "".join(one))
+def test_newtons_narrow_phase_looks_where_something_is_left_to_it(others, device, monkeypatch):
+    """And what moves by forces has all contacts that it has by comparing all pairs."""
+    model = heap(device, **others)
+    looked, narrow = [], newton.geometry.NarrowPhase.launch_custom_write
+
+    def watched(self, **arguments):
+        looked.append(1)
+        narrow(self, **arguments)
+
+    monkeypatch.setattr(newton.geometry.NarrowPhase, "launch_custom_write", watched)
+    solver, state = RigidSolver(model, body_sizes(model)), model.state()
+    solver.collide(state, SUBSTEP)
+    assert bool(looked) == bool(others)
+    count = int(solver.contacts.rigid_contact_count.numpy()[0])
+    shapes = np.stack([getattr(solver.contacts, f"rigid_contact_shape{side}").numpy()[:count] for side in (0, 1)], 1)
+    monkeypatch.undo()
+    search = Search(model)
+    search.pipeline = newton.CollisionPipeline(
+        model, broad_phase="nxn", speculative_contact_gap_max=solver._speculation, rigid_contact_max=100_000
+    )
+    search.contacts = search.pipeline.contacts()
+    held = (np.append(model.body_flags.numpy(), newton.BodyFlags.KINEMATIC) & newton.BodyFlags.KINEMATIC) != 0
+    held = held[model.shape_body.numpy()]
+    expected = [(a, b) for a, b, _ in search.find(state)[1] if not (held[a] and held[b])]
+    assert sorted(map(tuple, shapes.tolist())) == expected
+    assert len(expected) > 60

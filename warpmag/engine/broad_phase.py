@@ -17,6 +17,9 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
 
     Once told where to, by :meth:`write_contacts`, it writes the contacts of balls, and leaves out their pairs. See
     ``kernels.rigid.broad_phase`` for the method, and for the pairs of balls that it leaves out anyway.
+
+    Attributes:
+        leaves_pairs: Whether any pairs may be left for the pipeline to look at.
     """
 
     def __init__(self, model: newton.Model, farthest: float):
@@ -38,6 +41,7 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
             device=wp.get_device(model.device),
         )
         self._model = model
+        self.leaves_pairs = True
         if self._search is None:
             super().__init__(model.shape_world, shape_flags=model.shape_flags, sort_type="auto", device=model.device)
             return
@@ -58,8 +62,19 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         kinds = np.select([types == kind for kind in _TYPES], np.arange(len(PARTNERS)), len(PARTNERS))
         a = self._search.arrays
         a.kind.assign(kinds.astype(np.int32))
+        self.leaves_pairs = self._may_leave_pairs(kinds)
         a.placement, a.frame = self._model.shape_transform, pipeline.geom_transform
         a.contacts = view_contacts(self._model, contacts)
+
+    def _may_leave_pairs(self, kinds: np.ndarray) -> bool:
+        """Whether there are shapes whose contacts with balls are not found here, or that move and are no balls."""
+        model, kinematic = self._model, newton.BodyFlags.KINEMATIC
+        colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
+        flags = np.append(model.body_flags.numpy(), kinematic)  # of what has no body
+        body: np.ndarray = model.shape_body.numpy()
+        moving = (flags[body] & kinematic) == 0
+        others = colliding & (kinds != PARTNERS.index("ball"))
+        return bool((others & (moving | (kinds == len(PARTNERS)))).any())
 
     def set_motion(self, state: newton.State, dt: float) -> None:
         """Tell how bodies move, by ``state``, in the next ``dt`` [s] for which pairs are sought."""

@@ -231,6 +231,7 @@ class RigidSolver:
                 shape_pairs_max=self._limits["pair"],
                 max_triangle_pairs=self._limits["triangle"],
                 deterministic=self._reduces_in_order(),
+                include_static_kinematic_pairs=False,  # their contacts move nothing
                 verify_buffers=False,  # would only print; the counters are read instead
             )
             self.contacts = self._pipeline.contacts()
@@ -238,6 +239,8 @@ class RigidSolver:
             self._pipeline.broad_phase = self._broad_phase
             if not self._pipeline.deterministic:  # there Newton puts contacts into an order
                 self._broad_phase.write_contacts(self._pipeline, self.contacts)
+            if not self._broad_phase.leaves_pairs:
+                self._pipeline.narrow_phase.launch_custom_write = lambda **arguments: None  # spares its launches
             self._contact_view = view_contacts(self._model, self.contacts)
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:

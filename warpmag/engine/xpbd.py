@@ -47,7 +47,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             settings: Those of Newton's solver.
         """
         super().__init__(model, **settings)
-        splits = ~_single_balls(model)
+        splits = ~_single_balls(model) & (self.body_inv_mass_effective.numpy() > 0.0)
         self._splits = wp.array(splits.astype(np.int32), dtype=wp.int32, device=model.device) if splits.any() else None
         self._contact_iterations = contact_iterations or self.iterations
         self._counts = wp.zeros(model.body_count, dtype=float, device=model.device)
