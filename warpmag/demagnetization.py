@@ -263,25 +263,34 @@ def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarray:
-    """The same for pieces that are cut, from the tensors of their subcells."""
+    """The same for pieces that are cut, from the tensors of their subcells.
+
+    The sum over pairs of subcells is one of tensors times the correlation of what is filled, taken in Fourier's space.
+    """
     split = np.array(filled.shape[1:])
     table = cuboid_tensors(grid(reach := (np.abs(apart).max(axis=0) + 1) * split), sides / split).reshape(*reach, 6)
-    between = grid(split)[:, None] - grid(split)
-    flat = filled.reshape(len(filled), -1)
+    period, size = tuple(2 * split), len(filled)
+    filled = np.fft.rfftn(filled, period, axes=(1, 2, 3))
+    twice = np.where(np.arange(filled.shape[3]) % split[2] == 0, 1.0, 2.0)  # other halves of the spectrum are conjugate
+    filled, twice = filled.reshape(size, -1), np.broadcast_to(twice, filled.shape[1:]).reshape(-1)
+    between = (grid(2 * split) + split) % (2 * split) - split
+    valid = (between > -split).all(axis=1)
     result = np.empty((len(p), 6))
     offsets, which = np.unique(apart, axis=0, return_inverse=True)
     order = np.argsort(which.reshape(-1), kind="stable")
     ends = np.append(0, np.cumsum(np.bincount(which.reshape(-1))))
     for k, offset in enumerate(offsets):
-        rows = order[ends[k] : ends[k + 1]]
         steps = offset * split + between
-        tensors = table[tuple(np.abs(np.moveaxis(steps, -1, 0)))]
+        tensors = np.where(valid[:, None], table[tuple(np.minimum(np.abs(steps), reach - 1).T)], 0.0)
         signs = np.where(steps < 0, -1.0, 1.0)
-        tensors[..., 3:] *= signs[..., [0, 0, 1]] * signs[..., [1, 2, 2]]
-        left, right = flat[p[rows]], flat[q[rows]]
-        for c in range(6):
-            result[rows, c] = ((left @ tensors[..., c]) * right).sum(axis=1)
-    return result / split.prod()
+        tensors[:, 3:] *= signs[:, [0, 0, 1]] * signs[:, [1, 2, 2]]
+        tensors = np.fft.rfftn(tensors.reshape(*period, 6), axes=(0, 1, 2)).reshape(-1, 6) * twice[:, None]
+        rows = order[ends[k] : ends[k + 1]]
+        step = max(1, _BATCH // len(twice))
+        for start in range(0, len(rows), step):
+            part = rows[start : start + step]
+            result[part] = ((filled[p[part]] * filled[q[part]].conj()) @ tensors.conj()).real
+    return result / (split.prod() * np.prod(period))
 
 
 def _sharp(filled: np.ndarray) -> np.ndarray:

@@ -38,6 +38,9 @@ MOST_MOMENTS = 6200
 _RATIOS = 0.9, 4.0
 """Moments of surfaces over those of cells: others come from surfaces that nearly meet, which facets do not resolve."""
 
+_NEAR = 6.0
+"""Distance up to which the potential of a facet is that of its area, in distances from its middle to its corners."""
+
 _RESIDUAL = 3e-3
 """Relative residual of the cells' magnetization; the error of the moment is its square."""
 
@@ -77,37 +80,50 @@ def surface_moments(surface: np.ndarray) -> np.ndarray:
     Args:
         surface: Its facets [m], shape [m, 4, 3].
     """
-    middles, (normals, areas) = facets.middles(surface), facets.measures(surface)
+    middles, (_, areas) = facets.middles(surface), facets.measures(surface)
     at = middles - areas @ middles / areas.sum()
     matrix = np.zeros((len(at) + 1, len(at) + 1))
     step = max(1, _CHUNK // len(at))
     for start in range(0, len(at), step):
-        matrix[start : min(start + step, len(at)), :-1] = potentials(middles[start : start + step], surface, normals)
+        matrix[start : min(start + step, len(at)), :-1] = potentials(middles[start : start + step], surface)
     matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # the potential of the body is free, its charge is zero
     charges = np.linalg.solve(matrix, np.append(at, np.zeros((1, 3)), axis=0))[:-1]
     found = (charges * areas[:, None]).T @ at
     return 0.5 * (found + found.T)
 
 
-def potentials(points: np.ndarray, surface: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(1/4π) ∫ dA/‖x − y‖ of each facet at each point [m], shape [points, facets]."""
+def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """(1/4π) ∫ dA/‖x − y‖ of each facet at each point [m], shape [points, facets].
+
+    From afar, where that differs by less than 0.3 %, that of its area in its middle.
+    """
+    middles, (normals, areas) = facets.middles(surface), facets.measures(surface)
+    distance = np.linalg.norm(points[:, None] - middles, axis=2)
+    extent = np.linalg.norm(surface - middles[:, None], axis=2).max(axis=1)
+    i, j = np.nonzero(distance < _NEAR * extent)
+    distance[i, j] = 1.0
+    result = areas / distance
+    result[i, j] = _near_potentials(points[i], surface[j], normals[j])
+    return result / (4.0 * np.pi)
+
+
+def _near_potentials(points: np.ndarray, surface: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """∫ dA/‖x − y‖ of a facet at a point of its own, shape [n]."""
     tiny = np.finfo(float).tiny
-    height = np.abs(points @ normals.T - np.einsum("ik,ik->i", normals, surface[:, 0]))
+    height = np.abs(np.einsum("ik,ik->i", normals, points - surface[:, 0]))
     total = np.zeros_like(height)
     for k in range(4):
-        a, b = surface[:, k], surface[:, (k + 1) % 4]
+        a, b = surface[:, k] - points, surface[:, (k + 1) % 4] - points
         length = np.linalg.norm(b - a, axis=1)
         along = (b - a) / np.maximum(length, tiny)[:, None]
-        outward = np.cross(along, normals)
-        begin = np.einsum("ik,ik->i", a, along) - points @ along.T
-        across = np.einsum("ik,ik->i", a, outward) - points @ outward.T
+        begin, across = np.einsum("ik,ik->i", a, along), np.einsum("ik,ik->i", a, np.cross(along, normals))
         end, near2 = begin + length, across * across + height * height
         first, last = np.sqrt(begin * begin + near2), np.sqrt(end * end + near2)
         sign = np.where(begin + end > 0.0, 1.0, -1.0)  # of the form that keeps its digits
         ratio = np.maximum(last + sign * end, tiny) / np.maximum(first + sign * begin, tiny)
         angle = np.arctan2(across * end, near2 + height * last) - np.arctan2(across * begin, near2 + height * first)
         total += across * sign * np.log(ratio) - height * angle
-    return total / (4.0 * np.pi)
+    return total
 
 
 def cell_moments(coupling: Coupling, lattice: Lattice) -> np.ndarray:
