@@ -206,7 +206,8 @@ def _spreads(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
 def _lack_from_afar(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray, reach: float) -> np.ndarray:
     """What moments beyond the reach lack as dipoles, if they are magnetized as the one that they act on, shape [n, 6].
 
-    It falls off with the fifth power of the distance, and is taken up to ``_FAR`` times the reach.
+    It falls off with the fifth power of the distance, and is taken up to ``_FAR`` times the reach. What would make the
+    operator softer is left out, which thin plates with flat cells would not stay positive with.
     """
     total = np.zeros((6, len(points)))
     if np.abs(spreads).max() < 1e-9 * reach * reach:  # of cubes
@@ -230,7 +231,9 @@ def _lack_from_afar(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray
         for k in range(6):
             total[k] += np.bincount(i, volumes[j] * found[:, k], len(points))
             total[k] += np.bincount(j, volumes[i] * found[:, k], len(points))
-    return total.T
+    values, vectors = np.linalg.eigh(full_tensors(total.T))
+    stiffer = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return stiffer[:, *PLACES]
 
 
 def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
