@@ -274,10 +274,11 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarr
     table = cuboid_tensors(grid(reach := (np.abs(apart).max(axis=0) + 1) * split), sides / split).reshape(*reach, 6)
     period, size = tuple(2 * split), len(filled)
     filled = np.fft.rfftn(filled, period, axes=(1, 2, 3))
-    twice = np.where(np.arange(filled.shape[3]) % split[2] == 0, 1.0, 2.0)  # other halves of the spectrum are conjugate
-    filled, twice = filled.reshape(size, -1), np.broadcast_to(twice, filled.shape[1:]).reshape(-1)
+    twice = np.where(np.arange(split[2] + 1) % split[2] == 0, 1.0, 2.0)  # other halves of the spectrum are conjugate
+    twice = np.broadcast_to(twice, filled.shape[1:]).reshape(-1)
+    filled = filled.reshape(size, -1)
     between = (grid(2 * split) + split) % (2 * split) - split
-    valid = (between > -split).all(axis=1)
+    valid = np.all(between > -split, axis=1)
     result = np.empty((len(p), 6))
     offsets, which = np.unique(apart, axis=0, return_inverse=True)
     order = np.argsort(which.reshape(-1), kind="stable")

@@ -8,6 +8,8 @@ Run as ``python -m bench.reference.plate``: the force and moment of the plate fo
 rectangles along each side change.
 """
 
+import itertools
+
 import numpy as np
 
 from bench.reference.boxes import _potentials
@@ -63,7 +65,7 @@ def _rectangles(half, centre, count: int):
         stops = np.unique(np.clip(np.concatenate([[-half[k]], inner, [half[k]]]), -half[k], half[k]))
         parts = max(2, round(count / (len(stops) - 1 if k < 2 else 2)))
         at = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, parts + 1))
-        edges.append(np.unique(np.concatenate([a + (b - a) * at for a, b in zip(stops, stops[1:], strict=False)])))
+        edges.append(np.unique(np.concatenate([a + (b - a) * at for a, b in itertools.pairwise(stops)])))
     lower, upper, axes = [], [], []
     for axis in range(3):
         a, b = (axis + 1) % 3, (axis + 2) % 3
@@ -82,9 +84,8 @@ def main() -> None:
     for gap in GAPS:
         for aside in (0.0, 0.01):
             (coarse, _), (fine, moment) = force(gap, aside, 9), force(gap, aside, 18)
-            print(
-                gap, aside, "N", fine.round(4), "A·m²", moment.round(4), "change", np.abs(fine - coarse).max().round(4)
-            )
+            change = np.abs(fine - coarse).max().round(4)
+            print(gap, aside, "N", fine.round(4), "A·m²", moment.round(4), "change", change)
 
 
 if __name__ == "__main__":
