@@ -15,7 +15,7 @@ BOXES = ((1.0, 1.0, 1.0), (1.0, 1.0, 5.0), (1.0, 1.0, 10.0), (5.0, 5.0, 1.0), (1
 def moments(sides, rectangles: int = 12) -> np.ndarray:
     """Moment over V H0 along each axis of a box of given ``sides``, shape [3]."""
     half = 0.5 * np.asarray(sides, float)
-    lower, upper, axis = _faces(half, rectangles)
+    lower, upper, axis = faces_of_eighth(half, rectangles)
     centre = 0.5 * (lower + upper)
     area = np.prod(np.where(np.arange(3) == axis[:, None], 1.0, upper - lower), axis=1)
     found = []
@@ -60,7 +60,7 @@ def _divided(face, count: int):
     return corners[0], corners[1], np.full(count * count, axis)
 
 
-def _faces(half, count: int):
+def faces_of_eighth(half, count: int):
     """Corners of the rectangles of an eighth of the surface, shapes [n, 3], and the axis that each is across."""
     lower, upper, axes = [], [], []
     for axis in range(3):

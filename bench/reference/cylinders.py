@@ -23,10 +23,7 @@ def moments(length: float, rings: int = 24) -> np.ndarray:
         length: Its length.
         rings: Rings on half a cap, and on half of the side.
     """
-    radius, half = 0.5, 0.5 * length
-    at = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, rings + 1))
-    side, cap = np.stack([np.full(rings + 1, radius), half * at]), np.stack([radius * at, np.full(rings + 1, half)])
-    lower, upper = (np.concatenate([side.T[part], cap.T[part]]) for part in (slice(None, -1), slice(1, None)))
+    radius, (lower, upper) = 0.5, rings_of(length, rings)
     middle, width = 0.5 * (lower + upper), np.linalg.norm(upper - lower, axis=1)
     found = []
     for mode, sign, values in ((0, -1.0, middle[:, 1]), (1, 1.0, middle[:, 0])):
@@ -37,21 +34,32 @@ def moments(length: float, rings: int = 24) -> np.ndarray:
     return np.array(found)
 
 
+def rings_of(length: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of rings in (ρ, z), ``count`` on half of the side, then on a cap, shape [2 count, 2] each."""
+    radius, half = 0.5, 0.5 * length
+    at = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, count + 1))
+    side, cap = np.stack([np.full(count + 1, radius), half * at]), np.stack([radius * at, np.full(count + 1, half)])
+    lower, upper = (np.concatenate([side.T[part], cap.T[part]]) for part in (slice(None, -1), slice(1, None)))
+    return lower, upper
+
+
+def nodes_on(points, a, b):
+    """Nodes and weights on a ring from a to b, for each point: they crowd where it is nearest, for logarithms."""
+    near = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+    s, weights = (0.5 + 0.5 * _NODES) ** 3, 1.5 * (0.5 + 0.5 * _NODES) ** 2 * _WEIGHTS
+    for end in (0.0, 1.0):
+        t = near[:, None] + (end - near[:, None]) * s
+        yield a + t[..., None] * (b - a), np.abs(end - near)[:, None] * weights * np.linalg.norm(b - a)
+
+
 def _potentials(points, lower, upper, mode: int) -> np.ndarray:
     """(1/4π) ∫ cos(mode φ) dA/‖x − y‖ of each ring at each point, at azimuth 0, shape [points, rings]."""
     result = np.empty((len(points), len(lower)))
     for k, (a, b) in enumerate(zip(lower, upper, strict=True)):
-        # where the point is nearest, the integral over azimuths is singular as a logarithm: nodes crowd there
-        near = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
         total = 0.0
-        for end in (0.0, 1.0):
-            s = (0.5 + 0.5 * _NODES) ** 3
-            weights = 1.5 * (0.5 + 0.5 * _NODES) ** 2 * _WEIGHTS
-            t = near[:, None] + (end - near[:, None]) * s
-            y = a + t[..., None] * (b - a)
-            values = y[..., 0] * _around(points[:, None], y, mode)
-            total = total + np.abs(end - near) * (values @ weights)
-        result[:, k] = total * np.linalg.norm(b - a) / (4.0 * np.pi)
+        for y, weights in nodes_on(points, a, b):
+            total = total + (y[..., 0] * _around(points[:, None], y, mode) * weights).sum(axis=1)
+        result[:, k] = total / (4.0 * np.pi)
     return result
 
 
@@ -60,14 +68,14 @@ def _around(x, y, mode: int) -> np.ndarray:
     rho, other, height = x[..., 0], y[..., 0], x[..., 1] - y[..., 1]
     far = np.hypot(rho + other, height)
     rest = ((rho - other) ** 2 + height**2) / far**2  # 1 − k²
-    first, second = _elliptic(rest)
+    first, second = elliptic(rest)
     if mode == 0:
         return 4.0 * first / far
     k2 = np.maximum(1.0 - rest, np.finfo(float).tiny)
     return 4.0 / far * ((2.0 / k2 - 1.0) * first - 2.0 / k2 * second)
 
 
-def _elliptic(rest) -> tuple[np.ndarray, np.ndarray]:
+def elliptic(rest) -> tuple[np.ndarray, np.ndarray]:
     """K and E of 1 − k² by the arithmetic-geometric mean (Abramowitz and Stegun 17.6)."""
     a, b = np.ones_like(rest), np.sqrt(rest)
     total, power = 0.5 * (1.0 - rest), 0.5

@@ -1,0 +1,101 @@
+"""Moments of inducible bodies against references, at the default spacing and at half of it.
+
+``python -m bench.reference.table [BODY ...] [--half]`` prints m/(V H0) across and along for susceptibilities of 1, 10,
+1000 and ∞, each with its difference from Osborn's closed form (ellipsoids) or a surface integral equation
+(``susceptible.py``), and the field evaluations of a cold solve.
+"""
+
+import argparse
+import math
+
+import numpy as np
+import warp as wp
+
+from bench.machine import describe
+from bench.reference import susceptible
+from warpmag import demagnetization, even_field, lattice
+from warpmag.system import MomentSystem
+
+SUSCEPTIBILITIES = (1.0, 10.0, 1000.0, math.inf)
+FAINT = 1e12
+"""A saturation far above any field here [A/m]."""
+
+
+def ellipsoid(semi_axes) -> np.ndarray:
+    """Moment over V H0 along each axis, shape [susceptibilities, 3]; factors by their integrals (Osborn 1945)."""
+    a = np.asarray(semi_axes, float)
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    s = np.exp(0.5 * (nodes + 1.0) * 60.0 - 30.0)[:, None]  # from e^-30 to e^30
+    integrals = (30.0 * weights[:, None] * s / ((s + a * a) * np.sqrt(np.prod(s + a * a, axis=1))[:, None])).sum(axis=0)
+    return 1.0 / (0.5 * a.prod() * integrals + 1.0 / np.array(SUSCEPTIBILITIES)[:, None])
+
+
+def box(*sides):
+    """A box and its moments."""
+    return lattice.box(0.5 * np.array(sides)), lambda: susceptible.box(sides, SUSCEPTIBILITIES)[:, [0, 2]]
+
+
+def cylinder(length):
+    """A cylinder of unit diameter and its moments."""
+    return lattice.cylinder(0.5, 0.5 * length), lambda: susceptible.cylinder(length, SUSCEPTIBILITIES)[:, ::-1]
+
+
+def spheroid(*axes):
+    """An ellipsoid and its moments."""
+    return lattice.ellipsoid(0.5 * np.array(axes)), lambda: ellipsoid(axes)[:, [0, 2]]
+
+
+BODIES = {
+    "cube": box(1.0, 1.0, 1.0), "rod 1:1:5": box(1.0, 1.0, 5.0), "rod 1:1:10": box(1.0, 1.0, 10.0),
+    "plate 5:5:1": box(5.0, 5.0, 1.0), "plate 10:10:1": box(10.0, 10.0, 1.0),
+    "cylinder 1": cylinder(1.0), "cylinder 5": cylinder(5.0), "cylinder 10": cylinder(10.0),
+    "sphere": spheroid(1.0, 1.0, 1.0), "ellipsoid 1:1:10": spheroid(1.0, 1.0, 10.0),
+    "ellipsoid 5:5:1": spheroid(5.0, 5.0, 1.0),
+}  # fmt: skip
+"""Bodies and their exact moments across z and along it, shape [susceptibilities, 2]."""
+
+
+def found(solid, half: bool, device=None):
+    """Moments over V H0 across and along, evaluations, shape [susceptibilities, 2] each, and how many cells."""
+    body = lattice.fill(solid, across=lattice.LEAST_ACROSS)
+    if half:
+        body = lattice.fill(solid, 0.5 * np.cbrt(solid.volume / len(body.volumes)))
+    coupling = even_field.corrected(demagnetization.coupling(body, body.radii), body, [solid])
+    results = np.empty((2, len(SUSCEPTIBILITIES), 2))
+    for i, j in np.ndindex(results.shape[1:]):
+        field = 1e3 * np.eye(3)[[0, 2]][j]
+        system = MomentSystem(
+            radii=body.radii, bodies=np.zeros(len(body.radii), int), couplings=[(0, coupling)], saturation=FAINT,
+            susceptibility=SUSCEPTIBILITIES[i], external_field=field, max_evaluations=5000, device=device,
+        )  # fmt: skip
+        system.positions.assign(body.positions)
+        system.solve()
+        moment = system.moments.numpy().sum(axis=0, dtype=float) @ field
+        results[:, i, j] = moment / (1e6 * body.volumes.sum()), int(system.evaluations.numpy()[0])
+    return *results, len(body.volumes)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m bench.reference.table", description=__doc__.partition("\n")[0])
+    parser.add_argument("bodies", nargs="*", metavar="BODY", help=f"of {', '.join(BODIES)}; all if none is named")
+    parser.add_argument("--half", action="store_true", help="half the default spacing")
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    if unknown := set(options.bodies) - set(BODIES):
+        parser.error(f"no such body: {', '.join(unknown)}")
+    wp.config.log_level = wp.LOG_WARNING
+    print(describe(wp.get_device(options.device)))
+    for name in options.bodies or BODIES:
+        solid, reference = BODIES[name]
+        exact, (moments, evaluations, count) = reference(), found(solid, options.half, options.device)
+        for j, way in enumerate(("across", "along")):
+            cells = "  ".join(
+                f"{value:8.4f} {100.0 * (value / true - 1.0):+5.2f} % {int(took):4d}"
+                for value, true, took in zip(moments[:, j], exact[:, j], evaluations[:, j], strict=True)
+            )
+            print(f"{name:17s} {count:5d} {way:6s} {cells}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
