@@ -83,7 +83,5 @@ def test_a_viewer_that_cannot_open_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["examples", "worlds"])
     assert examples.main() == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line == (
-        "warpmag: viewer: gl cannot open (no display); it needs `pip install 'warpmag[viewers]'` and a display, "
-        "--headless needs neither"
-    )
+    assert line.startswith("warpmag: viewer: gl cannot open, it needs the extra 'viewers' and a display, ")
+    assert line.endswith(" (no display)")

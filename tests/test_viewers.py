@@ -17,9 +17,22 @@ class Notes:
     def __init__(self):
         Notes.last = self
         self.times, self.heights, self.shown = [], [], 0
+        self.camera, self.arrows, self.paused, self.closed = None, [], set(), False
 
     def set_model(self, model):
         self.moving = int(np.argmin(model.body_mass.numpy()))
+
+    def set_camera(self, position, pitch, yaw):
+        self.camera = np.array(position), pitch, yaw
+
+    def log_arrows(self, name, starts, ends, colors, width):
+        self.arrows.append([one.numpy() for one in (starts, ends, colors)])
+
+    def should_step(self):
+        return self.shown not in self.paused
+
+    def close(self):
+        self.closed = True
 
     def begin_frame(self, time):
         self.times.append(time)
@@ -41,9 +54,9 @@ def scene(tmp_path_factory):
     return path
 
 
-def watch(scene, out, device, monkeypatch, viewer):
-    monkeypatch.setattr(newton.viewer, "ViewerGL", viewer, raising=False)
-    return cli.main(["run", str(scene), "-o", str(out), "--frames", "3", "--device", device, "--viewer", "gl"])
+def watch(scene, out, device, monkeypatch, viewer, name="gl"):
+    monkeypatch.setattr(newton.viewer, {"gl": "ViewerGL", "viser": "ViewerViser"}[name], viewer, raising=False)
+    return cli.main(["run", str(scene), "-o", str(out), "--frames", "3", "--device", device, "--viewer", name])
 
 
 def test_a_viewer_sees_every_frame(scene, device, monkeypatch, tmp_path):
@@ -52,6 +65,48 @@ def test_a_viewer_sees_every_frame(scene, device, monkeypatch, tmp_path):
     assert Notes.last.shown == 4
     # from the ground to the magnet, whose face is 30 mm above it; contacts give way by parts of a radius of 5 mm
     assert Notes.last.heights == pytest.approx([0.005, 0.025, 0.025, 0.025], abs=1e-4)
+
+
+def test_a_viewer_sees_magnetizations_and_all_of_the_scene(scene, device, monkeypatch, tmp_path):
+    """A ball of 5 mm radius below a cube of 40 mm that hangs 50 mm high; both are magnetized along z."""
+    watch(scene, tmp_path / "out.usda", device, monkeypatch, Notes)
+    starts, ends, colors = Notes.last.arrows[-1]
+    along = ends - starts
+    assert (along[:, 2] > 0.0).all() and (np.abs(along[:, :2]) < 1e-2 * along[:, 2:]).all()
+    ball = int(np.argmin(along[:, 2]))
+    np.testing.assert_allclose(0.5 * (starts + ends)[ball], (0.0, 0.0, Notes.last.heights[-1]), atol=1e-6)
+    assert along[ball, 2] > 0.01  # longer than the ball, which would hide it
+    assert colors[ball].tolist() != colors[1 - ball].tolist()
+    position, pitch, yaw = Notes.last.camera
+    turn, tip = np.radians((yaw, pitch))
+    front = np.array((np.cos(turn) * np.cos(tip), np.sin(turn) * np.cos(tip), np.sin(tip)))
+    for point in ((0.0, 0.0, 0.0), *(0.02 * np.array(corner) + (0, 0, 0.05) for corner in np.ndindex(2, 2, 2))):
+        sight = np.array(point) - position
+        angle = np.degrees(np.arccos(sight @ front / np.linalg.norm(sight)))
+        assert angle < 22.5  # half of the viewers' field of view
+    assert np.linalg.norm(position) < 0.4
+
+
+def test_a_paused_viewer_shows_the_same_frame(scene, device, monkeypatch, tmp_path):
+    def viewer():
+        notes = Notes()
+        notes.paused = {2, 3}
+        return notes
+
+    assert watch(scene, tmp_path / "out.usda", device, monkeypatch, viewer) == 0
+    assert Notes.last.times == pytest.approx([0.0, 0.017, 0.017, 0.017, 0.033, 0.05], abs=1e-9)
+
+
+def test_a_viewer_in_a_browser_stays_until_one_leaves(scene, device, monkeypatch, tmp_path, capsys):
+    asked = iter([True] * 12)
+
+    class Browser(Notes):
+        def is_running(self):
+            return next(asked, False)
+
+    assert watch(scene, tmp_path / "out.usda", device, monkeypatch, Browser, "viser") == 0
+    assert Notes.last.closed and next(asked, None) is None
+    assert "warpmag: the viser viewer keeps the last frame, Ctrl-C leaves" in capsys.readouterr().err
 
 
 def test_a_closed_window_ends_the_run(scene, device, monkeypatch, tmp_path):
@@ -71,5 +126,6 @@ def test_a_viewer_that_cannot_open_is_one_line(scene, device, monkeypatch, tmp_p
 
     assert watch(scene, tmp_path / "out.usda", device, monkeypatch, fail) == cli.BAD_INPUT
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line == f"warpmag: viewer: gl cannot open, it needs the extra 'viewers' {reason}"
+    needed = "the extra 'viewers' and a display, without one take viser or rerun"
+    assert line == f"warpmag: viewer: gl cannot open, it needs {needed} {reason}"
     assert not (tmp_path / "out.usda").exists()

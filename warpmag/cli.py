@@ -20,6 +20,8 @@ BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 
 _SOLVERS = ("xpbd", "steel", "mujoco", "semi-implicit", "featherstone", "kamino", "vbd")
 _VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
+_STAYING = ("viser", "rerun")
+"""Viewers in a browser, which shows nothing any more once the command ends."""
 _OUTPUT_FOLDER = Path("warpmag_out")
 
 
@@ -318,12 +320,12 @@ def _run(options) -> int:
     )
     known = simulation.warnings()
     _warn(known)
-    viewer = _open_viewer(options.viewer, simulation)
+    display = _open_display(options.viewer, simulation)
     progress = Progress(simulation.frames_of(options.frames))
 
     def show(frame: int) -> bool:
         progress.show(frame)
-        return _show(viewer, simulation)
+        return display is None or display.follow(simulation.time, simulation.state)
 
     try:
         statistics = simulation.run(
@@ -349,6 +351,9 @@ def _run(options) -> int:
     _warn([line for line in simulation.warnings() if line not in known])
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
+    if display is not None and options.viewer in _STAYING and display.viewer.is_running():
+        _tell(f"the {options.viewer} viewer keeps the last frame, Ctrl-C leaves")
+        display.stay()
     return 0
 
 
@@ -357,28 +362,18 @@ def _warn(lines: list[str]) -> None:
         _tell(f"warning: {line}")
 
 
-def _open_viewer(name: str, simulation):
+def _open_display(name: str, simulation):
     if name == "none":
         return None
     import newton  # noqa: PLC0415
 
+    from warpmag.engine.display import Display, no_viewer  # noqa: PLC0415
+
     try:
         viewer = getattr(newton.viewer, _VIEWERS[name])()
-    except Exception as error:  # each viewer fails in its own way without its package or without a display
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise InputError(f"viewer: {name} cannot open, it needs the extra 'viewers' ({reason})") from None
-    viewer.set_model(simulation.model)
-    return viewer
-
-
-def _show(viewer, simulation) -> bool:
-    """Show the present state; return whether to go on."""
-    if viewer is None:
-        return True
-    viewer.begin_frame(simulation.time)
-    viewer.log_state(simulation.state)
-    viewer.end_frame()
-    return viewer.is_running()
+    except Exception as error:  # each viewer fails in its own way
+        raise no_viewer(name, error) from None
+    return Display(viewer, simulation.model, simulation.magnetics)
 
 
 def _quiet_warp() -> None:

@@ -1,12 +1,14 @@
 """Shows magnets in Newton's viewers."""
 
 import math
+import time as clock
 
 import newton
 import numpy as np
 import warp as wp
 
 from warpmag.engine.magnetics import Magnetics
+from warpmag.errors import InputError
 
 _DIRECTION = np.array((0.55, -0.75, 0.45))
 """From the scene to the camera, along east, north and up."""
@@ -16,6 +18,15 @@ _COLORS = np.array([(0.27, 0.0, 0.33), (0.13, 0.57, 0.55), (0.99, 0.91, 0.14)])
 """Of no magnetization, half and all of the largest one: viridis by three of its colours."""
 _LENGTH = 1.6
 """Half the longest arrow over the radius of its shape, from which both ends look out."""
+_PAUSE = 1.0 / 60.0
+"""How long a viewer that is paused, or has nothing new to show, is left alone [s]."""
+
+
+def no_viewer(name: str, error: Exception) -> InputError:
+    """Return the one line about a viewer that could not open; each fails in its own way without what it needs."""
+    reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    needed = "the extra 'viewers'" + (" and a display, without one take viser or rerun" if name == "gl" else "")
+    return InputError(f"viewer: {name} cannot open, it needs {needed} ({reason})")
 
 
 class Display:
@@ -92,6 +103,31 @@ class Display:
         if not isinstance(self.viewer, newton.viewer.ViewerNull):
             self._show_arrows(state)
         self.viewer.end_frame()
+
+    def follow(self, time: float, state: newton.State) -> bool:
+        """Show a state, as long as the viewer is paused.
+
+        Args:
+            time: Simulated time [s].
+            state: The state.
+
+        Returns:
+            Whether to go on; the viewer may have been closed.
+        """
+        self.show(time, state)
+        while self.viewer.is_running() and not self.viewer.should_step():
+            clock.sleep(_PAUSE)
+            self.show(time, state)
+        return self.viewer.is_running()
+
+    def stay(self) -> None:
+        """Keep what was shown last until the viewer is closed, or Ctrl-C is pressed."""
+        try:
+            while self.viewer.is_running():
+                clock.sleep(_PAUSE)
+        except KeyboardInterrupt:
+            pass
+        self.viewer.close()
 
     def _show_arrows(self, state: newton.State) -> None:
         volumes = self._magnetics.shape_volumes[:, None]

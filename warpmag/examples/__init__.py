@@ -14,6 +14,7 @@ from pathlib import Path
 import newton.examples
 import warp as wp
 
+from warpmag.engine.display import no_viewer
 from warpmag.errors import InputError
 
 __all__ = ["create_parser", "get_examples", "init", "main", "run"]
@@ -49,12 +50,8 @@ def init(parser: argparse.ArgumentParser):
     wp.config.enable_backward = False  # nothing here is differentiated, and it doubles the time to compile
     try:
         return newton.examples.init(parser)
-    except Exception as error:  # each viewer fails in its own way without its package or without a display
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise InputError(
-            f"viewer: {options.viewer} cannot open ({reason}); it needs `pip install 'warpmag[viewers]'`"
-            f"{' and a display' if options.viewer == 'gl' else ''}, --headless needs neither"
-        ) from None
+    except Exception as error:  # each viewer fails in its own way
+        raise no_viewer(options.viewer, error) from None
 
 
 def run(example, options) -> None:
