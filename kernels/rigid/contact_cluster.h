@@ -116,10 +116,11 @@ template <class Plan> __device__ inline KeptSide side_of(const Arrays& a, const 
     return {{contact, {line, line + 4}}, 2};
 }
 
-// All iterations over a block's tasks; lines are in the first half of what the block keeps of them then, or else in the
-// second.
+// All iterations over a block's tasks, and what is kept for the next substep; lines are in the first half of what the
+// block keeps of them before even iterations, or else in the second.
 template <class Plan>
-__device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room, int tasks, int iterations) {
+__device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room, int tasks, int iterations,
+                                   Real relaxation, Real dt) {
     const int teams = plan.is_wide() ? 1 : BLOCK / GROUP, members = BLOCK / teams;
     const int team = threadIdx.x / members, first = threadIdx.x % members;
     int kept_at = -1;
@@ -130,14 +131,20 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
         const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
         if (taken && sides.x + first < sides.y) kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at);
     }
+    const bool sticking = a.totals[STICKING];
+    auto side_before = [&](int k, int iteration) {
+        KeptSide its = kept;
+        if (k != kept_at) its = side_of(a, plan, room, k);
+        else its.side.contact.back = back_at(a, k, sticking); // registers are few
+        its.side.other.motion += iteration % 2 * its.step;
+        return its.side;
+    };
+    auto line_of = [&](int t) {
+        return plan.is_wide() ? plan.line(a, room, room.tasks[t].slot) : room.lines + QUARTERS * t;
+    };
     for (int iteration = 0; iteration < iterations; ++iteration) {
         const int odd = iteration % 2;
-        auto side_at = [&](int k) {
-            KeptSide its = kept;
-            if (k != kept_at) its = side_of(a, plan, room, k);
-            its.side.other.motion += odd * its.step;
-            return its.side;
-        };
+        auto side_at = [&](int k) { return side_before(k, iteration); };
         auto press_at = [&](int k, auto press) {
             if (k == kept_at) return press(kept_given);
             Given given = given_at(a, k);
@@ -147,27 +154,41 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
         };
         auto totals = [&](int sides, Pressure p) { return plan.is_wide() ? block_sums(p, sides) : p; };
         for (int t = team; t < tasks; t += teams) {
-            const Task task = room.tasks[t];
-            Four* const line = plan.is_wide() ? plan.line(a, room, task.slot) : room.lines + QUARTERS * t;
-            move({line + 2 * odd, line + 4}, line + 2 * (1 - odd), task.sides, true, first, members, side_at, press_at,
-                 totals, momentum_at(iteration, iterations));
+            Four* const line = line_of(t);
+            move({line + 2 * odd, line + 4}, line + 2 * (1 - odd), room.tasks[t].sides, true, first, members, side_at,
+                 press_at, totals, momentum_at(iteration, iterations));
         }
         meet();
     }
+    if (!sticking) return;
+    for (int t = team; t < tasks; t += teams) {
+        const int2 sides = room.tasks[t].sides;
+        if (!plan.is_wide() && sides.y - sides.x > WIDE) continue;
+        const Four* const motion = line_of(t) + 2 * (iterations % 2);
+        keep_sides(
+            a, read_body([&](int quarter) { return motion[quarter]; }), sides.x + first, sides.y, members,
+            [&](int k) { return side_before(k, iterations); },
+            [&](int k) { return k == kept_at ? kept_given : given_at(a, k); }, relaxation, dt);
+    }
+    meet(); // no block ends while others read its lines
 }
 
 // Takes bodies into shared memory, moves them, and writes what they are then.
 template <class Plan>
-__device__ inline void solve_tasks(const Arrays& a, const Plan& plan, Room& room, int iterations) {
+__device__ inline void solve_tasks(const Arrays& a, const Plan& plan, Room& room, int iterations, Real relaxation,
+                                   Real dt) {
     const int tasks = plan.take_tasks(a, room), own_lines = plan.is_wide() ? 0 : tasks;
     if (CLUSTER == 1 && tasks == 0) return;
     __syncthreads();
     for (int k = threadIdx.x; k < 4 * own_lines; k += BLOCK)
         room.lines[QUARTERS * (k / 4) + k % 4 + k % 4 / 2 * 2] = own_four(a.motion, k % 4, room.tasks[k / 4].slot);
     meet();
-    iterate_all(a, plan, room, tasks, iterations);
-    for (int t = threadIdx.x / GROUP; t < own_lines; t += BLOCK / GROUP)
-        finish_body(a, room.tasks[t].slot, room.lines + QUARTERS * t + iterations % 2 * 2);
+    iterate_all(a, plan, room, tasks, iterations, relaxation, dt);
+    for (int t = threadIdx.x / GROUP; t < own_lines && share() == 0; t += BLOCK / GROUP) {
+        const Four* const motion = room.lines + QUARTERS * t + iterations % 2 * 2;
+        finish_body(a, room.tasks[t].slot, room.tasks[t].sides,
+                    read_body([&](int quarter) { return motion[quarter]; }));
+    }
 }
 
 // The whole solve, or if there are more than ``most`` sides or more bodies than fit, no more than the lists: then
@@ -178,13 +199,13 @@ __device__ inline void solve_in_cluster(const Arrays& a, int iterations, int mos
     const ClusterPlan plan(a);
     const bool fits = plan.fits() && a.totals[SIDES] <= most;
     if (!fits && threadIdx.x == 0 && plan.block == 0) a.totals[LEFT] = plan.bodies;
-    if (fits && plan.bodies > 0) solve_tasks(a, plan, room, iterations);
+    if (fits && plan.bodies > 0) solve_tasks(a, plan, room, iterations, relaxation, dt);
 }
 
 // All iterations in the block's world.
-__device__ inline void solve_world(const Arrays& a, int iterations) {
+__device__ inline void solve_world(const Arrays& a, int iterations, Real relaxation, Real dt) {
     __shared__ Room room;
-    solve_tasks(a, WorldPlan(a), room, iterations);
+    solve_tasks(a, WorldPlan(a), room, iterations, relaxation, dt);
 }
 }
 #endif

@@ -9,17 +9,19 @@ namespace warpmag {
 
 inline int rounded(int count) { return (count + WIDTH - 1) / WIDTH * WIDTH; }
 
-// What one thread finds out: how many contacts and bodies take part, and where each has its place.
+// What one thread finds out: how many contacts and bodies take part, where each has its place, and whether any sticks.
 struct Lists {
     int contacts, bodies, lines;
+    bool sticking;
 };
 inline Lists list_contacts(const Arrays& a) {
-    Lists lists = {0, 0, 0};
+    Lists lists = {0, 0, 0, false};
     for (int b = 0; b < a.bodies; ++b) a.side_count[b] = 0, a.slot[b] = -1;
     for (int c = 0, found = a.found(); c < found; ++c) {
         int ends[2];
         if (!ends_of(a, c, ends)) continue;
         a.entry[lists.contacts++] = c;
+        lists.sticking |= a.sticks(c);
         for (int end = 0; end < 2; ++end) {
             if (ends[end] < 0) continue;
             if (a.movable(ends[end])) ++a.side_count[ends[end]];
@@ -113,19 +115,36 @@ inline auto put_rows(Real* rows) {
     };
 }
 
-inline void prepare_contacts(const Arrays& a, int k, Real relaxation, Real dt) {
+// Prepares contacts of a vector, which have slipped as far as was kept.
+inline void prepare_contacts(const Arrays& a, int k, const Lists& lists, Real relaxation, Real dt) {
     const Pair p = pair_at(a, k);
-    Real* const rows = rows_at(a.side, TOUCH, k);
+    Real *const rows = rows_at(a.side, TOUCH, k), *const back = rows_at(a.back, BACK, k);
+    Slip slipped = {};
+    if (lists.sticking) {
+        for (int l = 0; l < WIDTH; ++l) {
+            Real its[6] = {};
+            if (k + l < lists.contacts) slipped_before(a, a.entry[k + l], its);
+            for (int r = 0; r < 6; ++r) back[r * CHUNK + l] = its[r];
+        }
+        slipped = read_slip(rows_of(back));
+    }
     auto inertia = [&](const int* line) { return read_inertia(fours_at(a.motion, line)); };
     auto pose = [&](const int* line) { return read_pose(fours_at(a.pose, line)); };
-    put_contact(prepared(read_touch(rows_of(rows)), pose(p.own_line), pose(p.other_line), p.own, p.other,
-                         inertia(p.own_line), inertia(p.other_line), relaxation, dt),
-                put_rows(rows));
+    const Contact c = prepared(read_touch(rows_of(rows)), pose(p.own_line), pose(p.other_line), p.own, p.other,
+                               inertia(p.own_line), inertia(p.other_line), slipped, relaxation, dt);
+    put_contact(c, put_rows(rows));
+    if (lists.sticking) put_slip(c.back, put_rows(back));
 }
 
-inline void press_contacts(const Arrays& a, int k, Real momentum) {
+inline Contact contacts_at(const Arrays& a, int k, bool sticking) {
+    Slip back = {};
+    if (sticking) back = read_slip(rows_of(rows_at(a.back, BACK, k)));
+    return read_contact(rows_of(rows_at(a.side, TOUCH, k)), back);
+}
+
+inline void press_contacts(const Arrays& a, int k, bool sticking, Real momentum) {
     const Pair p = pair_at(a, k);
-    const Contact c = read_contact(rows_of(rows_at(a.side, TOUCH, k)));
+    const Contact c = contacts_at(a, k, sticking);
     Real* const rows = rows_at(a.given, GIVEN, k);
     Given given = read_given(rows_of(rows));
     const Impulse added = press(c, p.own, p.other, given, momentum);
@@ -158,28 +177,54 @@ inline void move_bodies(const Arrays& a, int i) {
     put_body(a.motion, i, body);
 }
 
+// Keeps how far a vector of contacts has slipped, for the next substep.
+inline void keep_contacts(const Arrays& a, int k, const Lists& lists, Real relaxation, Real dt) {
+    const Pair p = pair_at(a, k);
+    const Impulse last = read_given(rows_of(rows_at(a.given, GIVEN, k))).last;
+    const Slip slipped = slipped_so_far(contacts_at(a, k, true), p.own, p.other, last, relaxation, dt);
+    Real rows[BACK * CHUNK];
+    put_slip(slipped, put_rows(rows));
+    for (int l = 0; l < WIDTH && k + l < lists.contacts; ++l)
+        for (int end = 0; end < 2; ++end) {
+            const int place = list_at(a.other, 4, 2 + end, k)[l];
+            if (place >= 2 * a.contact_max) continue;
+            Real its[6];
+            for (int r = 0; r < 6; ++r) its[r] = end == 1 ? rows[r * CHUNK + l] : -rows[r * CHUNK + l];
+            keep(a, place, a.entry[k + l], its);
+        }
+}
+inline void keep_ranges(const Arrays& a, const Lists& lists) {
+    for (int b = 0; b < a.bodies; ++b) {
+        const bool some = lists.sticking && a.side_count[b] > 0;
+        const int* const range = a.range + (some ? 2 * a.slot[b] : 0);
+        keep_range(a, b, some ? range[0] : 0, some ? range[1] : 0);
+    }
+}
+
 inline void solve_contacts(const Arrays& a, int iterations, Real relaxation, Real dt, int threads, Word* team) {
     const Lists lists = list_contacts(a);
-    if (lists.contacts == 0) return;
+    if (lists.contacts == 0) return keep_ranges(a, lists);
     write_contacts(a, lists);
     for (int i = 0; i < lists.lines; i += WIDTH) begin_lines(a, i);
     begin_lines(a, a.lines - WIDTH);
     const int helpful = lists.contacts / CONTACTS_PER_THREAD;
     threads = helpful < 1 ? 1 : helpful < threads ? helpful : threads;
-    const int passes = 2 * iterations;
-    for (int first = 0; first < passes; first += MOST_PASSES) {
-        const int last = passes - first < MOST_PASSES ? passes - first : MOST_PASSES;
+    const int passes = 2 * iterations, all = passes + lists.sticking;
+    for (int first = 0; first < all; first += MOST_PASSES) {
+        const int last = all - first < MOST_PASSES ? all - first : MOST_PASSES;
         auto items = [&](int pass) { return pass % 2 == 0 ? lists.contacts : lists.bodies; };
         run_passes(team, threads, 0, last, items, WIDTH, [&](int pass, int i) {
-            if (first + pass == 0) prepare_contacts(a, i, relaxation, dt);
+            if (first + pass == 0) prepare_contacts(a, i, lists, relaxation, dt);
             if (pass % 2 == 1) move_bodies(a, i);
-            else press_contacts(a, i, momentum_at((first + pass) / 2, iterations));
+            else if (first + pass == passes) keep_contacts(a, i, lists, relaxation, dt);
+            else press_contacts(a, i, lists.sticking, momentum_at((first + pass) / 2, iterations));
         });
     }
     for (int i = 0; i < lists.bodies; i += WIDTH) {
         const Body body = read_body([&](int quarter) { return own_four(a.motion, quarter, i); });
         end_lines(a, body, i, lists.bodies - i);
     }
+    keep_ranges(a, lists);
 }
 }
 #endif

@@ -10,12 +10,13 @@
 #if defined(__CUDA_ARCH__)
 namespace warpmag {
 
-enum Total { BODIES, SIDES, IMMOVABLE, WIDE_BODIES, LEFT, TOTALS }; // entries of ``totals``, and their number
+enum Total { BODIES, SIDES, IMMOVABLE, WIDE_BODIES, LEFT, STICKING, TOTALS }; // entries of ``totals``, and their number
 
 // For contact c: counts it for the bodies that it moves.
 __device__ inline void count_sides(int c, const Arrays& a) {
     int ends[2];
     if (c >= a.found() || !ends_of(a, c, ends)) return;
+    if (a.sticks(c)) a.totals[STICKING] = 1;
     for (int end = 0; end < 2; ++end)
         if (a.movable(ends[end])) atomicAdd(a.side_count + ends[end], 1);
 }
@@ -34,10 +35,12 @@ __device__ inline int reserve(int* counter, int count) {
 }
 
 // For body b: a line, and room for its sides; all threads of a warp take part. The body after the last is the world.
+// Nothing is kept of bodies without sides.
 __device__ inline void place_body(int b, const Arrays& a) {
     const int sides = b < a.bodies ? a.side_count[b] : 0;
     const int slot = reserve(a.totals + BODIES, sides > 0), start = reserve(a.totals + SIDES, sides);
     if (b > a.bodies) return;
+    if (b < a.bodies && sides == 0) keep_range(a, b, 0, 0);
     int line = slot;
     if (sides > 0) {
         a.range[2 * slot] = start;
@@ -59,7 +62,7 @@ __device__ inline void list_sides(int c, const Arrays& a) {
         if (!a.movable(ends[end])) continue;
         const int place = a.range[2 * a.slot[ends[end]]] + atomicAdd(a.filled + ends[end], 1);
         a.entry[place] = 2 * c + end;
-        a.key[place] = (unsigned long long)a.shape0[c] << 32 | (unsigned)a.shape1[c];
+        a.key[place] = a.key_of(c);
     }
 }
 
@@ -78,6 +81,9 @@ __device__ inline Given given_at(const Arrays& a, int k) {
 __device__ inline void put_given_of(const Arrays& a, int k, const Given& given) {
     put_given(given, [&](int quarter, Four f) { ((Four*)a.given)[GIVEN / 4 * (size_t)k + quarter] = f; });
 }
+
+// The contact that a side is of, in the half of ``other`` that sides leave.
+__device__ inline int& contact_of(const Arrays& a, int k) { return a.other[2 * (size_t)a.contact_max + k]; }
 
 // For entry k of the lists: writes the side to where it comes among those of its body.
 __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real dt) {
@@ -99,14 +105,20 @@ __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real 
     put_touch(a, c, end, touch, 1);
     const int other = a.line_of(ends[1 - end]);
     a.other[place] = other;
+    contact_of(a, place) = c;
+    Real s[6];
+    slipped_before(a, c, s);
+    const Real from = end == 1 ? 1 : -1;
+    const Slip slipped = {{from * s[0], from * s[1], from * s[2]}, {from * s[3], from * s[4], from * s[5]}};
     auto fours = [](const Real* lines, int i) { return [=](int quarter) { return own_four(lines, quarter, i); }; };
     const auto own_motion = fours(a.motion, slot), other_motion = fours(a.motion, other);
-    put_contact(prepared(read_touch([&](int q) {
-                             return Four{touch[4 * q], touch[4 * q + 1], touch[4 * q + 2], touch[4 * q + 3]};
-                         }),
-                         read_pose(fours(a.pose, slot)), read_pose(fours(a.pose, other)), read_body(own_motion),
-                         read_body(other_motion), read_inertia(own_motion), read_inertia(other_motion), relaxation, dt),
-                [&](int quarter, Four f) { put_four(a.side, quarter, place, f); });
+    auto found = [&](int q) { return Four{touch[4 * q], touch[4 * q + 1], touch[4 * q + 2], touch[4 * q + 3]}; };
+    const Contact contact = prepared(read_touch(found), read_pose(fours(a.pose, slot)), read_pose(fours(a.pose, other)),
+                                     read_body(own_motion), read_body(other_motion), read_inertia(own_motion),
+                                     read_inertia(other_motion), slipped, relaxation, dt);
+    put_contact(contact, [&](int quarter, Four f) { put_four(a.side, quarter, place, f); });
+    if (a.totals[STICKING])
+        put_slip(contact.back, [&](int half, Four f) { ((Four*)a.back)[BACK / 4 * (size_t)place + half] = f; });
     put_given_of(a, place, {});
 }
 
@@ -127,8 +139,12 @@ struct Side {
     Contact contact;
     Line other;
 };
+__device__ inline Slip back_at(const Arrays& a, int k, bool sticking) {
+    if (!sticking) return {};
+    return read_slip([&](int half) { return ((const Four*)a.back)[BACK / 4 * (size_t)k + half]; });
+}
 __device__ inline Contact contact_at(const Arrays& a, int k) {
-    return read_contact([&](int quarter) { return own_four(a.side, quarter, k); });
+    return read_contact([&](int quarter) { return own_four(a.side, quarter, k); }, back_at(a, k, a.totals[STICKING]));
 }
 
 // What each ``threads``-th contact of a body does, from k to last. ``side_at`` gives contacts, and ``press_at`` lets a
@@ -178,8 +194,19 @@ __device__ inline void move(const Line& line, Four* to, int2 sides, bool taken, 
     if (first == 0) put_body((Real*)to, 0, own);
 }
 
-// One iteration: moves the body that a group of threads shares, from one array of motions to the other. The first
-// blocks take the bodies with many contacts, a whole block each.
+// Lets a group of threads act on the body that they share, one of a line or none. The first blocks take the bodies with
+// many contacts, a whole block each.
+template <class Act> __device__ inline void share_bodies(int thread, const Arrays& a, Act act) {
+    const int block = thread / BLOCK;
+    if (block < WIDE_BLOCKS) {
+        for (int w = block; w < a.totals[WIDE_BODIES]; w += WIDE_BLOCKS) act(a.wide[w], true, threadIdx.x, BLOCK);
+        return;
+    }
+    const int slot = (thread - WIDE_BLOCKS * BLOCK) / GROUP;
+    act(slot, slot < a.totals[BODIES], share(), GROUP);
+}
+
+// One iteration: moves the body that a group of threads shares, from one array of motions to the other.
 __device__ inline void iterate(int thread, const Arrays& a, int iteration, int iterations) {
     const bool odd = iteration % 2;
     const Real* const from = odd ? a.next_motion : a.motion;
@@ -191,27 +218,45 @@ __device__ inline void iterate(int thread, const Arrays& a, int iteration, int i
         put_given_of(a, k, given);
         return added;
     };
-    auto move_slot = [&](int slot, bool taken, int first, int threads, auto totals) {
+    share_bodies(thread, a, [&](int slot, bool taken, int first, int threads) {
+        auto totals = [&](int sides, Pressure p) { return threads == GROUP ? p : block_sums(p, sides); };
         move(line_at(a, from, slot), to + 4 * (size_t)slot, ((const int2*)a.range)[slot], taken, first, threads,
              side_at, press_at, totals, momentum_at(iteration, iterations));
-    };
-    const int block = thread / BLOCK;
-    if (block < WIDE_BLOCKS) {
-        for (int w = block; w < a.totals[WIDE_BODIES]; w += WIDE_BLOCKS)
-            move_slot(a.wide[w], true, threadIdx.x, BLOCK, [](int sides, Pressure p) { return block_sums(p, sides); });
-        return;
-    }
-    const int slot = (thread - WIDE_BLOCKS * BLOCK) / GROUP;
-    move_slot(slot, slot < a.totals[BODIES], share(), GROUP, [](int, Pressure p) { return p; });
+    });
 }
 
-// Ends the solve for the body of a line that a group of threads shares: writes its velocities.
-__device__ inline void finish_body(const Arrays& a, int slot, const Four* motion) {
-    if (share() == 0) end_lines(a, read_body([&](int quarter) { return motion[quarter]; }), slot, 1);
+// Keeps each ``threads``-th side of a body, from k to last, for the next substep.
+template <class Sides, class Givens>
+__device__ inline void keep_sides(const Arrays& a, const Body& own, int k, int last, int threads, Sides side_at,
+                                  Givens given_at, Real relaxation, Real dt) {
+    for (; k < last; k += threads) {
+        const Side side = side_at(k);
+        const Body other = read_body([&](int quarter) { return side.other.motion[quarter]; });
+        const Slip s = slipped_so_far(side.contact, own, other, given_at(k).last, relaxation, dt);
+        keep(a, k, contact_of(a, k), {s.linear.x, s.linear.y, s.linear.z, s.turn.x, s.turn.y, s.turn.z});
+    }
 }
-__device__ inline void finish(int thread, const Arrays& a, int odd) {
-    const int slot = thread / GROUP;
-    if (slot < a.totals[BODIES]) finish_body(a, slot, line_at(a, odd ? a.next_motion : a.motion, slot).motion);
+// Ends the solve for the body of a line: writes its velocities, and which sides are kept.
+__device__ inline void finish_body(const Arrays& a, int slot, int2 sides, const Body& body) {
+    end_lines(a, body, slot, 1);
+    const bool sticking = a.totals[STICKING];
+    keep_range(a, a.body[slot], sticking ? sides.x : 0, sticking ? sides.y : 0);
+}
+__device__ inline void finish(int thread, const Arrays& a, int odd, Real relaxation, Real dt) {
+    const Real* const lines = odd ? a.next_motion : a.motion;
+    share_bodies(thread, a, [&](int slot, bool taken, int first, int threads) {
+        if (!taken) return;
+        const int2 sides = ((const int2*)a.range)[slot];
+        if (threads == GROUP && sides.y - sides.x > WIDE) return;
+        const Line line = line_at(a, lines, slot);
+        const Body body = read_body([&](int quarter) { return line.motion[quarter]; });
+        if (a.totals[STICKING])
+            keep_sides(
+                a, body, sides.x + first, sides.y, threads,
+                [&](int k) { return Side{contact_at(a, k), line_at(a, lines, a.other[k])}; },
+                [&](int k) { return given_at(a, k); }, relaxation, dt);
+        if (first == 0) finish_body(a, slot, sides, body);
+    });
 }
 }
 #endif

@@ -22,6 +22,13 @@
 //
 // No speed is too low to be kept.
 //
+// What sticks remembers how far it has slipped, and goes back. Iterations that end early leave it to slip a little, in
+// each substep the same way, so that heaps would creep. An overlap is pushed out sooner or later, whatever is left of
+// it in a substep; a slip would be forgotten. It is kept as long as surfaces touch (Cundall and Strack 1979, "A
+// Discrete Numerical Model for Granular Assemblies"), and so is what rolls and spins. Where friction gives way, it is
+// as far as all of the friction pushes bodies in a substep. That is position, not impulse: impulses that were kept from
+// substep to substep would hold what undoes overlap, too, and throw a chain of 1,000 balls apart.
+//
 // A contact is seen from one of its two bodies, the own one, and looks the same from the other: its impulses there are
 // opposite to the last bit, whichever of the two computes them.
 #pragma once
@@ -76,11 +83,17 @@ struct Touch {
     Vector point, other_point, rub, other_rub, normal;
     Number margin, mu, torsional, rolling, kinematic, other_kinematic;
 };
+// How far or how fast the own surface of a contact slips and turns on the other one.
+struct Slip {
+    Vector linear, turn;
+};
 // A contact as iterations need it: arms from the centres of mass to where impulses act, the speed at which a gap may
-// close, and impulses for a unit of speed that pushes, slips and turns.
+// close, impulses for a unit of speed that pushes, slips and turns, and the speed at which what sticks goes back to
+// where it stuck.
 struct Contact {
     Vector normal, arm, other_arm;
     Number gap_speed, push_rate, rub_rate, turn_rate, mu, torsional, rolling;
+    Slip back;
 };
 // On the own body, and the angular one besides that of its arm; the other body gets the opposite.
 struct Impulse {
@@ -114,6 +127,13 @@ CUDA_CALLABLE inline Vector at_most(Vector a, Number length) {
     const Number one = length * Real(0) + 1;
     return scaled(dot(a, a) > length * length ? length * inverse_length(a) : one, a);
 }
+// What of a vector is across a unit vector.
+CUDA_CALLABLE inline Vector tangential(Vector a, Vector n) { return less(a, scaled(dot(a, n), n)); }
+// What is limited to ``across`` across a unit vector, and to ``about`` along it.
+CUDA_CALLABLE inline Vector limited(Vector a, Vector n, Number across, Number about) {
+    const Number along = dot(a, n);
+    return sum(at_most(tangential(a, n), across), scaled(larger(smaller(along, about), -about), n));
+}
 // Some unit vector across a unit vector.
 CUDA_CALLABLE inline Vector across(Vector n) {
     const Number none = n.x * Real(0);
@@ -125,10 +145,10 @@ CUDA_CALLABLE inline Vector across(Vector n) {
 // Friction is relaxed by this part of what pushes are: it turns balls besides, and with momentum all of it diverges.
 constexpr Real FRICTION = Real(0.35);
 
-// Prepares a contact for iterations that relax it by a part of what it lacks.
+// Prepares a contact, which has slipped so far while it stuck, for iterations that relax it by a part of what it lacks.
 CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pose& other, const Body& body,
                                       const Body& other_body, const Inertia& inertia, const Inertia& other_inertia,
-                                      Real relaxation, Real dt) {
+                                      const Slip& slipped, Real relaxation, Real dt) {
     const Vector n = t.normal, apart = less(own.x, other.x);
     const Vector rub = turned(own.q, t.rub), other_rub = turned(other.q, t.other_rub);
     const Number total = body.inv_mass + other_body.inv_mass;
@@ -156,24 +176,27 @@ CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pos
     c.turn_rate =
         quotient(none + FRICTION * relaxation, turn_ease(body, inertia) + turn_ease(other_body, other_inertia));
     c.mu = t.mu, c.torsional = t.torsional, c.rolling = t.rolling;
+    c.back = {scaled(1 / dt, tangential(slipped.linear, n)), scaled(1 / dt, slipped.turn)};
     return c;
 }
 
+// How the own surface of a contact moves on the other one.
+CUDA_CALLABLE inline Slip slip_of(const Contact& c, const Body& own, const Body& other) {
+    const Vector mine = sum(own.v, cross(own.spin, c.arm)), its = sum(other.v, cross(other.spin, c.other_arm));
+    return {less(mine, its), less(own.spin, other.spin)};
+}
 // The impulse of a contact after an iteration, from one that its bodies have and from how they move: it does not pull,
 // and its push limits friction.
 CUDA_CALLABLE inline Impulse relaxed(const Contact& c, const Body& own, const Body& other, Impulse p) {
-    const Vector mine = sum(own.v, cross(own.spin, c.arm)), its = sum(other.v, cross(other.spin, c.other_arm));
-    const Vector slip = less(mine, its);
-    const Number opening = dot(slip, c.normal), none = opening * Real(0);
+    const Slip slip = slip_of(c, own, other);
+    const Number opening = dot(slip.linear, c.normal), none = opening * Real(0);
     const Number push = larger(dot(p.linear, c.normal) - c.push_rate * (opening + c.gap_speed), none);
     const Vector pressed = scaled(push, c.normal);
     if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return {pressed, scaled(none, c.normal)};
-    const Vector linear = less(p.linear, scaled(c.rub_rate, slip));
-    const Vector turn = less(p.turn, scaled(c.turn_rate, less(own.spin, other.spin)));
-    const Number about = dot(turn, c.normal), twist = c.torsional * push;
-    const Vector rub = at_most(less(linear, scaled(dot(linear, c.normal), c.normal)), c.mu * push);
-    const Vector roll = at_most(less(turn, scaled(about, c.normal)), c.rolling * push);
-    return {sum(rub, pressed), sum(roll, scaled(larger(smaller(about, twist), -twist), c.normal))};
+    const Vector linear = less(p.linear, scaled(c.rub_rate, sum(slip.linear, c.back.linear)));
+    const Vector turn = less(p.turn, scaled(c.turn_rate, sum(slip.turn, c.back.turn)));
+    const Vector rub = at_most(tangential(linear, c.normal), c.mu * push);
+    return {sum(rub, pressed), limited(turn, c.normal, c.rolling * push, c.torsional * push)};
 }
 
 CUDA_CALLABLE inline Impulse change(Impulse from, Impulse to) {
@@ -197,6 +220,17 @@ CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body
     const Impulse added = change(given.ahead, ahead);
     given = {now, ahead};
     return added;
+}
+// How far a contact has slipped while it stuck, at the end of a substep whose iterations left an impulse.
+CUDA_CALLABLE inline Slip slipped_so_far(const Contact& c, const Body& own, const Body& other, Impulse p,
+                                         Real relaxation, Real dt) {
+    const Slip slip = slip_of(c, own, other);
+    const Vector linear = scaled(dt, sum(c.back.linear, tangential(slip.linear, c.normal)));
+    const Vector turn = scaled(dt, sum(c.back.turn, slip.turn));
+    const Number push = FRICTION * relaxation * dt * dot(p.linear, c.normal);
+    const Number per_turn = quotient(push, c.turn_rate);
+    return {at_most(linear, quotient(c.mu * push, c.rub_rate)),
+            limited(turn, c.normal, c.rolling * per_turn, c.torsional * per_turn)};
 }
 // The angular impulses of an impulse about the centres of mass.
 CUDA_CALLABLE inline Vector on_own(const Contact& c, Impulse p) { return sum(cross(c.arm, p.linear), p.turn); }

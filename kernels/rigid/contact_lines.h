@@ -19,9 +19,9 @@ struct Arrays {
     Real* qd;
     // own
     const Real* shares;
-    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide, *world_first;
-    unsigned long long* key;
-    Real *motion, *next_motion, *pose, *side, *given, *record;
+    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide, *world_first, *kept_range;
+    unsigned long long *key, *kept_key;
+    Real *motion, *next_motion, *pose, *side, *back, *given, *record, *kept;
 
     template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
         static_assert(sizeof(*this) == sizeof(addresses), "SolveArrays has the same members in the same order");
@@ -32,9 +32,14 @@ struct Arrays {
     CUDA_CALLABLE bool movable(int b) const { return b >= 0 && inv_mass[b] > 0; }
     CUDA_CALLABLE bool kinematic(int b) const { return b >= 0 && (flags[b] & kinematic_flag) != 0; }
     CUDA_CALLABLE int line_of(int b) const { return b < 0 ? lines - 1 : slot[b]; }
+    CUDA_CALLABLE unsigned long long key_of(int c) const {
+        return (unsigned long long)shape0[c] << 32 | (unsigned)shape1[c];
+    }
+    CUDA_CALLABLE bool sticks(int c) const { return mu[shape0[c]] + mu[shape1[c]] > 0; }
 };
 
-constexpr int TOUCH = 20, GIVEN = 12, RECORD = 8; // numbers of a contact as found, of its impulses, and of a record
+// Numbers of a contact as found, of how it goes back, of its impulses, of a record, and of what is kept of a side.
+constexpr int TOUCH = 20, BACK = 8, GIVEN = 12, RECORD = 8, KEPT = 9;
 
 // Reads by four numbers, which ``fours`` gives for a quarter of a line, and writes so.
 template <class Fours> CUDA_CALLABLE inline Body read_body(Fours motion) {
@@ -65,9 +70,17 @@ template <class Fours> CUDA_CALLABLE inline Touch read_touch(Fours side) {
             e.w - 2 * its,
             its};
 }
-template <class Fours> CUDA_CALLABLE inline Contact read_contact(Fours side) {
+template <class Fours> CUDA_CALLABLE inline Contact read_contact(Fours side, const Slip& back) {
     const Four a = side(0), b = side(1), c = side(2), d = side(3);
-    return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, {c.x, c.y, c.z}, a.w, b.w, c.w, d.x, d.y, d.z, d.w};
+    return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, {c.x, c.y, c.z}, a.w, b.w, c.w, d.x, d.y, d.z, d.w, back};
+}
+template <class Fours> CUDA_CALLABLE inline Slip read_slip(Fours slip) {
+    const Four a = slip(0), b = slip(1);
+    return {{a.x, a.y, a.z}, {a.w, b.x, b.y}};
+}
+template <class PutFours> CUDA_CALLABLE inline void put_slip(const Slip& s, PutFours put) {
+    put(0, Four{s.linear.x, s.linear.y, s.linear.z, s.turn.x});
+    put(1, Four{s.turn.y, s.turn.z, 0 * s.turn.y, 0 * s.turn.z});
 }
 template <class Fours> CUDA_CALLABLE inline Given read_given(Fours given) {
     const Four a = given(0), b = given(1), c = given(2);
@@ -170,5 +183,47 @@ CUDA_CALLABLE inline void put_touch(const Arrays& a, int c, int end, Real* place
     place[11 * stride] = mean(a.mu_torsional);
     place[15 * stride] = mean(a.mu_rolling);
     place[19 * stride] = a.kinematic(a.body_of(shapes[end])) + 2 * a.kinematic(a.body_of(shapes[1 - end]));
+}
+
+// Which sides are kept of body b.
+CUDA_CALLABLE inline void keep_range(const Arrays& a, int b, int first, int last) {
+    a.kept_range[2 * (size_t)b] = first;
+    a.kept_range[2 * (size_t)b + 1] = last;
+}
+// Keeps a side of contact c for the next substep: how far it has slipped, and where on its first shape's body it is.
+CUDA_CALLABLE inline void keep(const Arrays& a, int place, int c, const Real (&slipped)[6]) {
+    Real* const kept = a.kept + KEPT * (size_t)place;
+    for (int k = 0; k < 6; ++k) kept[k] = slipped[k];
+    for (int k = 0; k < 3; ++k) kept[6 + k] = a.point0[3 * (size_t)c + k];
+    a.kept_key[place] = a.key_of(c);
+}
+// How far contact c has slipped on its second body by the end of the last substep: where shapes touch at several
+// points, the one that was nearest. Nothing if they did not touch, or if that is not finite, after an attempt that
+// failed.
+CUDA_CALLABLE inline void slipped_before(const Arrays& a, int c, Real (&slipped)[6]) {
+    for (Real& one : slipped) one = 0;
+    if (!a.sticks(c)) return;
+    int ends[2], ranges[2][2] = {};
+    ends_of(a, c, ends);
+    for (int end = 0; end < 2; ++end)
+        for (int k = 0; k < 2 && a.movable(ends[end]); ++k) ranges[end][k] = a.kept_range[2 * (size_t)ends[end] + k];
+    // either body's list has it
+    const int counts[2] = {ranges[0][1] - ranges[0][0], ranges[1][1] - ranges[1][0]};
+    const int from = !a.movable(ends[0]) || (a.movable(ends[1]) && counts[1] <= counts[0]);
+    const Real* nearest = nullptr;
+    Real least = Real(1e30);
+    for (int place = ranges[from][0]; place < ranges[from][1]; ++place) {
+        if (a.kept_key[place] != a.key_of(c)) continue;
+        const Real* const kept = a.kept + KEPT * (size_t)place;
+        Real square = 0;
+        for (int k = 0; k < 3; ++k) {
+            const Real apart = kept[6 + k] - a.point0[3 * (size_t)c + k];
+            square += apart * apart;
+        }
+        if (square < least) least = square, nearest = kept;
+    }
+    Real size = 0;
+    for (int k = 0; k < 6 && nearest; ++k) size += nearest[k] < 0 ? -nearest[k] : nearest[k];
+    for (int k = 0; k < 6 && nearest && size < Real(1e30); ++k) slipped[k] = from ? nearest[k] : -nearest[k];
 }
 }

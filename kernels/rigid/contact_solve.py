@@ -34,9 +34,10 @@ PUSH_OUT = 2.0
 0.5 ms, it undoes an overlap of 1 mm, and what 5 mm balls may newly overlap in a step in the shortest, 31 µs."""
 _ROUND = 1e-6
 """Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
-_TOUCH, _GIVEN, _RECORD = 20, 12, 8
-"""Numbers of a contact as found, of its impulses, and of a record; as in ``contact_lines.h``."""
-_TOTALS, _LEFT = 5, 4
+_TOUCH, _BACK, _GIVEN, _RECORD, _KEPT = 20, 8, 12, 8, 9
+"""Numbers of a contact as found, of how it goes back, of its impulses, of a record, and of what is kept of a side, as
+in ``contact_lines.h``."""
+_TOTALS, _LEFT = 6, 4
 """Number of totals, and which is that of bodies left to launches; as in ``contact_cuda.h``."""
 
 _SIZES = ("contact_max", "bodies", "lines", "kinematic_flag")
@@ -46,8 +47,8 @@ _OF_CONTACTS = (
 )
 _OF_BODIES = ("flags", "com", "inv_mass", "inv_inertia", "q", "qd")
 _OWN = (
-    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "world_first", "key"),
-    *("motion", "next_motion", "pose", "side", "given", "record"),
+    *("totals", "side_count", "filled", "slot", "body", "range", "entry", "other", "wide", "world_first", "kept_range"),
+    *("key", "kept_key", "motion", "next_motion", "pose", "side", "back", "given", "record", "kept"),
 )
 _ADDRESSES = (*_OF_CONTACTS, *_OF_BODIES, "shares", *_OWN)
 _DOC = "Sizes, and where arrays begin; as ``Arrays`` in ``contact_lines.h``."
@@ -67,11 +68,12 @@ class SolveBuffers:
     Attributes:
         arrays: The arrays: on a GPU
                 totals: Numbers of bodies and sides that take part, of bodies that nothing moves, of those with many
-                    contacts, and of bodies that a cluster leaves to launches, shape [5].
+                    contacts, and of bodies that a cluster leaves to launches; whether any contact sticks; shape [6].
                 side_count, filled: Sides of each body, and how many of them are listed, shape [b].
                 entry, key: Side, twice its contact plus its end, and shapes of it, by bodies, shape [2c].
-                other: Line of the body at the other end, shape [2c].
+                other: Line of the body at the other end, and then the contact of each side, shape [2, 2c].
                 side: Contacts as each end sees them, see ``contact_law.h``, shape [2c, LINE].
+                back: Speeds at which they go back to where they stuck, shape [2c, 8].
                 given: Impulses that each end has been given, shape [2c, 12].
                 wide: Lines of bodies with many contacts, shape [b].
                 world_first: First body of each world that has a block, and the one after the last, shape [worlds + 1].
@@ -80,6 +82,7 @@ class SolveBuffers:
                 entry: Contacts that take part, shape [c].
                 other: Lines of the first and second body and their records, shape [c padded / CHUNK, 4, CHUNK].
                 side: The contacts, as found and then as prepared, shape [c padded / CHUNK, 20, CHUNK].
+                back: How far they slipped, and then speeds at which they go back, shape [c padded / CHUNK, 8, CHUNK].
                 given: Impulses that they have given, shape [c padded / CHUNK, 12, CHUNK].
                 record: Impulses on each side, by bodies, and one for each vector of what nothing moves, shape
                     [2c + c padded / CHUNK, 8].
@@ -91,6 +94,10 @@ class SolveBuffers:
                 motion, next_motion: Lines of velocities, before and on a GPU after an iteration, and of inverse
                     masses and inertias, shape [lines, LINE].
                 pose: Lines of where bodies are before the substep, shape [lines, LINE].
+                kept_range: First of the sides of each body in the last substep, and the one after the last, shape
+                    [b, 2].
+                kept_key, kept: Shapes of these sides; how far they slipped and turned [m, rad], and where they were on
+                    the body of their first shape [m], shapes [2c] and [2c, 9].
         given: Their sizes and addresses, and what else the kernels are given.
         round: Whether every body has the same inertia about all axes.
         group: Threads of a GPU that share a body, 0 on a CPU.
@@ -108,6 +115,10 @@ class SolveBuffers:
     most: int
     worlds: int
     world_lines: int
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays that one substep hands on to the next one, by name."""
+        return {name: self.arrays[name] for name in ("kept_range", "kept_key", "kept")}
 
 
 def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> SolveBuffers:
@@ -140,7 +151,10 @@ def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> Solv
     arrays["side"] = zeros(sides, _TOUCH if device.is_cpu else LINE, dtype=wp.float32)
     arrays["given"] = zeros(sides, _GIVEN, dtype=wp.float32)
     arrays["record"] = zeros((2 * padded + padded // CHUNK) if device.is_cpu else 0, _RECORD, dtype=wp.float32)
+    arrays["back"] = zeros(sides, _BACK, dtype=wp.float32)
     arrays["key"] = zeros(0 if device.is_cpu else 2 * padded, dtype=wp.uint64)
+    arrays |= {"kept_range": zeros(max(bodies, 1), 2), "kept_key": zeros(2 * padded, dtype=wp.uint64)}
+    arrays["kept"] = zeros(2 * padded, _KEPT, dtype=wp.float32)
     arrays["world_first"] = wp.array(world_first, dtype=wp.int32, device=device)
     given = SolveArrays()
     for name in _OWN:
@@ -237,8 +251,8 @@ LIST = "list_sides(thread, warpmag::Arrays(given))"
 WRITE = "write_side(thread, warpmag::Arrays(given), relaxation, dt)"
 ITERATE = "iterate(thread, warpmag::Arrays(given), number, most)"
 SOLVE = "solve_in_cluster(warpmag::Arrays(given), number, most, relaxation, dt)"
-SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number)"
-FINISH = "finish(thread, warpmag::Arrays(given), number)"
+SOLVE_WORLD = "solve_world(warpmag::Arrays(given), number, relaxation, dt)"
+FINISH = "finish(thread, warpmag::Arrays(given), number, relaxation, dt)"
 
 
 def launch_solve_contacts(
@@ -281,12 +295,12 @@ def launch_solve_contacts(
     if b.worlds:
         launch(SOLVE_WORLD, 0, iterations, b.worlds, cluster=1, lines=b.world_lines)
         return
-    groups = b.group * given.bodies
+    threads = _WIDE_BLOCKS * _BLOCK + b.group * given.bodies
 
     def iterate():
         for iteration in range(iterations):
-            launch(ITERATE, _WIDE_BLOCKS * _BLOCK + groups, iteration, most=iterations)
-        launch(FINISH, groups, iterations % 2)
+            launch(ITERATE, threads, iteration, most=iterations)
+        launch(FINISH, threads, iterations % 2)
 
     left = _LEFT if b.cluster else 0
     if not b.cluster or 2 * given.contact_max > b.most or given.bodies > b.cluster // 2 * _teams(b.group):

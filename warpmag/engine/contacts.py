@@ -285,7 +285,8 @@ class RigidSolver:
 
     def carried(self) -> dict[str, wp.array]:
         """Return the arrays that one substep hands on to the next one, by name."""
-        return self._broad_phase.carried()
+        solver = self._solver.carried() if isinstance(self._solver, PileXPBD) else {}
+        return self._broad_phase.carried() | solver
 
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""

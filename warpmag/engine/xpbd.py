@@ -6,8 +6,9 @@ therefore split among their contacts (``kernels.rigid.mass_splitting``).
 Newton's solver launches every iteration over all contacts that its buffers may hold, and adds them up with atomics, in
 another order in every run. Rigid bodies are moved by ``kernels.rigid.contact_solve`` instead, which solves the same
 conditions and gives the same bits in every run. It keeps momentum and angular momentum, which Newton's lever arms and
-its damping of spins do not, and needs half the iterations (``kernels/rigid/contact_law.h``). Bodies that were put into
-each other are pushed apart at 2 m/s at most. Its end is Newton's own where no push overshoots. In heaps
+its damping of spins do not, and needs half the iterations (``kernels/rigid/contact_law.h``). What sticks stays where it
+is, since contacts remember how far they slipped. Bodies that were put into each other are pushed apart at 2 m/s at
+most. Its end is Newton's own where no push overshoots. In heaps
 Newton's pushes do, stay, and make its end depend on its relaxation: without friction these are the least that leave no
 overlap, with friction they meet Coulomb's law.
 """
@@ -79,6 +80,10 @@ class PileXPBD(newton.solvers.SolverXPBD):
             return
         with self._splitting():
             super().step(state_in, state_out, control, contacts, dt, observables=observables)
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays that one substep hands on to the next one, by name."""
+        return {} if self._solve is None else self._solve.carried()
 
     def _step_bodies(self, state_in, state_out, contacts, dt) -> None:
         assert self._solve is not None
