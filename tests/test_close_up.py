@@ -220,7 +220,7 @@ def test_iron_ball_at_a_large_cube(place, device):
 
 @pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
 def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
-    """The whole force, at face, edge and corner: the exact field's dipole, and multipoles from cells (see there)."""
+    """The whole force, at face, edge and corner: degrees above 4 are 3 % of it at an edge."""
     half, radius, weak = LARGE[1][0], BALL[1][0], 0.1 * M  # far from saturation: tanh leaves 3e-3
     outward = np.array(touched)
     place = half * outward + 1.00001 * radius * outward / np.linalg.norm(outward)
@@ -233,7 +233,7 @@ def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
     magnetics.apply(state)
     whole = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), weak), place, radius, order=20)
     found = state.body_f.numpy()
-    np.testing.assert_allclose(found[1, :3], whole, atol=0.055 * np.linalg.norm(whole))
+    np.testing.assert_allclose(found[1, :3], whole, atol=0.03 * np.linalg.norm(whole))
     np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=1e-4 * np.linalg.norm(whole))
 
 

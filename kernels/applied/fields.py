@@ -37,9 +37,11 @@ _BODY_THREADS = 32
 
 
 @cache
-def _kernel(dtype, group: int, coils: bool, solids: bool, balls: tuple):
+def _kernel(dtype, one: int, group: int, coils: bool, solids: bool, balls: tuple):
+    """Kernel of pass ``one``, or of all if that is −1."""
     call = "warpmag::apply_sources(thread, first, last, threads, team.data, arrays);"
-    constants = {"GROUP": group, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
+    constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
+    constants |= {"PASS": one, "GROUP": group}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
     return passes_kernel(call, source_arrays_type(dtype), native_options("applied/passes.h", dtype=dtype, **constants))
 
@@ -106,9 +108,9 @@ class AppliedField:
         cuda, key = self.device.is_cuda, (first, last)
         if items and key not in self._commands:
             some = self.sources
-            options = group if cuda else 1, bool(some.applied), bool(some.solids), self.balls
+            which = (first, group) if cuda else (-1, 1)
             self._commands[key] = wp.launch(
-                _kernel(some.dtype, *options),
+                _kernel(some.dtype, *which, bool(some.applied), bool(some.solids), self.balls),
                 dim=group * items if cuda else 1,
                 inputs=[first, last + 1, threads_for(items, share), None if cuda else team(), self.arrays],
                 device=self.device,
