@@ -218,6 +218,7 @@ class AppliedForces(AppliedField):
         movable = np.asarray(movable, bool)
         self._moves = bool(movable.any())
         device = sources.device
+        self._fine: dict[str, wp.array] | None = None
         self._movable, self._carried = (
             wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
             for values in (movable, carried)
@@ -290,9 +291,16 @@ class AppliedForces(AppliedField):
 
         That of moments in fields is with ``acting``. Waits for the device.
         """
-        if self._adds:
-            self._add_up(ADD_UP)
-        found = np.zeros(self.count)
-        coils = len(self.sources.applied)
-        found[[one.first for one in self.sources.solids]] = self.wrenches.numpy()[coils:, 6]
+        found, solids, arrays = np.zeros(self.count), self.sources.solids, self.arrays
+        if len(solids) < 2:
+            return found
+        self._fine = self._fine or self.sources.tables(fine=True)
+        usual = {name: self.sources.arrays[name] for name in self._fine}
+        for tables in (self._fine, usual):
+            for name, values in tables.items():
+                setattr(arrays, name, values)
+            self._commands.pop((ADD_UP, ADD_UP), None)
+            if tables is self._fine:
+                self._add_up(ADD_UP)
+        found[[one.first for one in solids]] = self.wrenches.numpy()[len(self.sources.applied) :, 6]
         return found
