@@ -7,11 +7,12 @@ import warp as wp
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 import warpmag
+from warpmag.coils import Coil, FieldMap
 from warpmag.engine.attributes import marked_shapes
 from warpmag.engine.scene import import_scene
 from warpmag.magnets import Magnet
 from warpmag.scenes_usd import bundled
-from warpmag.usd import author_magnet
+from warpmag.usd import author_coil, author_field_map, author_magnet
 
 
 def by_newton(stage):
@@ -94,3 +95,54 @@ def test_a_wrong_value_is_refused_by_name(stage):
     wrong.Save()
     with pytest.raises(warpmag.InputError, match="^/Box: "):
         by_newton(stage)
+
+
+@pytest.fixture
+def coils(stage):
+    """The same stage with a coil on the body, one in the world and a map, and a body of its own frame above."""
+    made = Usd.Stage.Open(str(stage))
+    for path, where in (("/Body/Coil", (0.1, 0.2, 0.3)), ("/Lift", (4.0, 5.0, 6.0)), ("/Earth", (0.0, 0.0, 0.0))):
+        prim = UsdGeom.Xform.Define(made, path)
+        prim.AddTranslateOp().Set(Gf.Vec3d(*where))
+        prim.AddRotateYOp().Set(25.0)
+        if path == "/Earth":
+            author_field_map(prim.GetPrim(), FieldMap((-9.0,) * 3, (18.0,) * 3, np.full((2, 2, 2, 3), 7.0)))
+        else:
+            author_coil(prim.GetPrim(), Coil("solenoid", radius=0.2, length=0.5, ampere_turns=50.0))
+    made.Save()
+    return stage
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_coils_and_field_maps_come_in(coils, turned):
+    """At the places where ``Simulation`` has them, also where the program moves the stage or has other axes."""
+    ours = warpmag.Magnetics(import_scene(coils).builder.finalize(device="cpu"))
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Y if turned else newton.Axis.Z)
+    warpmag.register_attributes(builder)
+    moved = wp.transform((1.0, 2.0, 3.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.6, 0.8), 0.7))
+    builder.add_usd(str(coils), xform=moved if turned else None)
+    model = builder.finalize(device="cpu")
+    theirs = warpmag.Magnetics(model)
+    states = [one._model.state() for one in (ours, theirs)]
+    whole = moved * wp.transform((0.0, 0.0, 0.0), newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.Y))
+    whole = whole if turned else wp.transform_identity()
+    for one, state in zip((ours, theirs), states, strict=True):
+        one.induce(state)
+    names = [[one._model.shape_label[shape] for shape in one._sources.shapes] for one in (ours, theirs)]
+    assert names[0] == names[1] == ["/Body/Coil", "/Lift", "/Earth"]
+    frames, found = (one.system.sources.frames.numpy() for one in (ours, theirs))
+    for frame, other in zip(frames, found, strict=True):
+        expected = np.array(whole * wp.transform(frame[:3], frame[3:]))
+        np.testing.assert_allclose(other[:3], expected[:3], atol=1e-5)
+        assert abs(abs(expected[3:] @ other[3:]) - 1.0) < 1e-5
+    strengths = [one.system.sources.strengths.numpy() for one in (ours, theirs)]
+    np.testing.assert_array_equal(*strengths)
+
+
+def test_a_wrong_coil_is_refused_by_name(coils):
+    """Newton wraps what its readers raise, so that the line is within another one."""
+    wrong = Usd.Stage.Open(str(coils))
+    wrong.GetPrimAtPath("/Lift").GetAttribute("warpmag:coil:radius").Set(-1.0)
+    wrong.Save()
+    with pytest.raises(RuntimeError, match="/Lift: radius: must be positive"):
+        by_newton(coils)

@@ -220,7 +220,7 @@ def test_iron_ball_at_a_large_cube(place, device):
 
 @pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
 def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
-    """The whole force, at face, edge and corner: the exact field's dipole, and multipoles from cells (see there)."""
+    """The whole force, at face, edge and corner: degrees above 4 are 3 % of it at an edge."""
     half, radius, weak = LARGE[1][0], BALL[1][0], 0.1 * M  # far from saturation: tanh leaves 3e-3
     outward = np.array(touched)
     place = half * outward + 1.00001 * radius * outward / np.linalg.norm(outward)
@@ -233,7 +233,7 @@ def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
     magnetics.apply(state)
     whole = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), weak), place, radius, order=20)
     found = state.body_f.numpy()
-    np.testing.assert_allclose(found[1, :3], whole, atol=0.055 * np.linalg.norm(whole))
+    np.testing.assert_allclose(found[1, :3], whole, atol=0.03 * np.linalg.norm(whole))
     np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=1e-4 * np.linalg.norm(whole))
 
 
@@ -292,8 +292,8 @@ def test_boxes_that_sink_into_each_other(across, device):
 
 
 def test_gradient_of_the_energy_is_the_force(device):
-    """Of two boxes and a ball, all near each other, in float64; the boxes' energy takes a gap of some points' width."""
-    places, balls = np.array([[0.0, 0.0, 0.0], [0.004, 0.002, 0.013]]), np.array([[0.0075, 0.0005, -0.001]])
+    """Of two boxes half a millimetre apart and a ball, all near each other, in float64."""
+    places, balls = np.array([[0.0, 0.0, 0.0], [0.004, 0.002, 0.0105]]), np.array([[0.0075, 0.0005, -0.001]])
     system, put = near_system((0.005, 0.005, 0.005), device, places=places, balls=balls)
     system.apply_forces()
     found = system.forces.numpy()
@@ -312,8 +312,8 @@ def test_gradient_of_the_energy_is_the_force(device):
                 put(there, around)
                 energies.append(system.energy()[0])
             slope = (energies[0] - energies[1]) / (2.0 * step)
-            # Gauss points on the faces, whose energy this is, leave 1e-3
-            assert abs(slope + forces[k, axis]) < 3e-3 * np.abs(forces).max()
+            # Gauss points on the faces, whose energy this is, leave 3e-5; step/gap of the differences
+            assert abs(slope + forces[k, axis]) < 3e-4 * np.abs(forces).max()
 
 
 def test_what_has_no_closed_form_launches_nothing(device):

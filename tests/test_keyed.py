@@ -1,102 +1,28 @@
-"""What follows keys: poses as USD composes them at any time, what they carry along, fields and magnetizations.
-
-Motions are compared with USD's own, and with closed forms of what is carried, magnetized and turned.
-"""
+"""What follows keys: poses as USD composes them at any time, and what they carry along, compared with closed forms."""
 
 import math
 
 import numpy as np
 import pytest
+from keyed_stages import (
+    BODY,
+    COLLIDER,
+    KINEMATIC,
+    MAGNET,
+    RATE,
+    G,
+    body_of,
+    cube_on_arm,
+    held_ball,
+    operations,
+    pose_of,
+    prim,
+    write,
+)
 from pxr import Gf, Ts, Usd, UsdGeom
 
 from warpmag import InputError, Simulation
 from warpmag.usd import check, hold, open_stage, survey
-
-MU0 = 4e-7 * math.pi
-G = 9.81
-RATE = 24.0
-HEAD = """#usda 1.0
-(
-    metersPerUnit = 1
-    kilogramsPerUnit = 1
-    upAxis = "Z"
-    defaultPrim = "World"
-    startTimeCode = START
-    endTimeCode = 100
-    timeCodesPerSecond = 24
-    framesPerSecond = 12
-)
-def Xform "World"
-{
-def PhysicsScene "Scene" (prepend apiSchemas = ["WarpmagSceneAPI"])
-{
-    vector3f physics:gravityDirection = (0, 0, -1)
-    float physics:gravityMagnitude = GRAVITY
-    SCENE
-}
-def Material "Rough" (prepend apiSchemas = ["PhysicsMaterialAPI"])
-{
-    float physics:staticFriction = 0.4
-    float physics:dynamicFriction = 0.4
-    float physics:restitution = 0
-}
-BODIES
-}
-"""
-MAGNET, BODY, COLLIDER = "WarpmagMagnetAPI", "PhysicsRigidBodyAPI", "PhysicsCollisionAPI"
-KINEMATIC = "bool physics:kinematicEnabled = 1"
-
-
-def prim(kind, name, apis, *lines):
-    quoted = ", ".join(f'"{one}"' for one in (*apis, "MaterialBindingAPI", "PhysicsMassAPI"))
-    inner = "\n".join(("rel material:binding = </World/Rough>", *lines))
-    return f'def {kind} "{name}" (prepend apiSchemas = [{quoted}])\n{{\n{inner}\n}}\n'
-
-
-def operations(**given):
-    """Transforms in the order given, each a value or samples, or others in the words of USD for ``order``.
-
-    Names have double underscores for colons.
-    """
-    types = {"translate": "double3", "scale": "float3", "orient": "quatd", "transform": "matrix4d", "rotate": "double3"}
-    lines, order = [], []
-    for name, value in given.items():
-        if name.startswith("order"):
-            order.append(f'"{value}"')
-            continue
-        name = f"xformOp:{name.replace('__', ':')}"
-        kind = name.split(":")[1]
-        kind = "double" if kind in ("translateX", "rotateZ", "scaleY") else types[kind.rstrip("XYZ")]
-        samples = ".timeSamples" if isinstance(value, dict) else ""
-        lines.append(f"{kind} {name}{samples} = {text(value)}")
-        order.append(f'"{name}"')
-    lines.append(f"uniform token[] xformOpOrder = [{', '.join(order)}]")
-    return "\n".join(lines)
-
-
-def text(value):
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{time:.17g}: {one}" for time, one in value.items()) + " }"
-    return str(value)
-
-
-def write(folder, *bodies, scene="", gravity=0.0, start=0, name="scene.usda"):
-    path = folder / name
-    found = HEAD.replace("START", str(start)).replace("GRAVITY", str(gravity)).replace("SCENE", scene)
-    path.write_text(found.replace("BODIES", "\n".join(bodies)))
-    return path
-
-
-def body_of(simulation, name):
-    return simulation._scene.bodies[f"/World/{name}"]
-
-
-def pose_of(stage, path, time):
-    """Position, and orientation x y z w, that USD composes."""
-    frame = Gf.Transform(UsdGeom.XformCache(time).GetLocalToWorldTransform(stage.GetPrimAtPath(path)))
-    turn = frame.GetRotation().GetQuat()
-    return np.array(frame.GetTranslation()), np.array([*turn.GetImaginary(), turn.GetReal()])
-
 
 MOTIONS = {
     "an arm": (
@@ -155,20 +81,6 @@ def test_bodies_go_where_usd_composes_them(tmp_path, device, motion, kinematic):
         rotation = Gf.Quatd(turned[3], *turned[:3]) * Gf.Quatd(turn[3], *turn[:3]).GetInverse()
         spin = 2.0 * np.array(rotation.GetImaginary()) * math.copysign(1.0, rotation.GetReal()) / dt
         np.testing.assert_allclose(qd[3:], spin, rtol=1e-4, atol=1e-8)  # sines of small angles
-
-
-def held_ball(distance):
-    return prim("Sphere", "Ball", (BODY, COLLIDER, MAGNET), "double radius = 0.005", "float physics:density = 7874",
-                operations(translate=(distance, 0, 0)))  # fmt: skip
-
-
-def cube_on_arm(**arm):
-    """A magnet of 2 cm, 5 cm from the axis of what turns it."""
-    own = operations(translate=(0.05, 0, 0))
-    lines = ("double size = 0.02", KINEMATIC, 'uniform token warpmag:kind = "permanent"')
-    field = "vector3f warpmag:magnetization = (1e6, 0, 0)"
-    cube = prim("Cube", "Magnet", (BODY, COLLIDER, MAGNET), *lines, field, own)
-    return f'def Xform "Arm"\n{{\n{operations(**arm)}\n{cube}\n}}'
 
 
 @pytest.mark.parametrize("step", [1e-3, 4e-3])
@@ -298,174 +210,3 @@ def test_a_joint_to_a_keyed_body_follows_it(tmp_path, device):
     path = write(tmp_path, carrier, held_ball(0.03), wrong, name="wrong.usda")
     with pytest.raises(InputError, match=r"^/World/Joint: hangs on /World/Carrier, which keys move, by physics:body1"):
         Simulation(path, device=device)
-
-
-def pulse(height):
-    return {0: (0, 0, 0), 1.2: (0, 0, 0), 2.4: f"(0, {height}, 0)", 4.8: (0, 0, 0)}
-
-
-def test_a_pulsed_field_turns_a_compass_and_magnetizes_iron(tmp_path, device):
-    """As much as its keys say: I ω = μ0 m ∫ H dt while the needle has hardly turned, and m = 4π R³ H of iron."""
-    height, radius, strength = 40.0, 0.005, 1e4
-    compass = prim(
-        "Sphere", "Compass", (BODY, COLLIDER, MAGNET), f"double radius = {radius}", "float physics:density = 7874",
-        'uniform token warpmag:kind = "permanent"', f"vector3f warpmag:magnetization = ({strength}, 0, 0)",
-    )  # fmt: skip
-    iron = held_ball(50.0).replace("Ball", "Iron")
-    scene = f"vector3f warpmag:externalField.timeSamples = {text(pulse(height))}"
-    simulation = Simulation(write(tmp_path, compass, iron, scene=scene), device=device)
-    assert check(tmp_path / "scene.usda").contents.field_keys is not None
-    volume = 4.0 / 3.0 * math.pi * radius**3
-    inertia, moment = 0.4 * 7874.0 * volume * radius**2, volume * strength
-    needle, spun = body_of(simulation, "Compass"), []
-    for number in range(250):
-        simulation.step()
-        field = np.interp(simulation.time - 5e-4, [0.05, 0.1, 0.2], [0.0, height, 0.0])  # of the last substep
-        found = simulation.magnetics.system.external_field.numpy()
-        assert found[:, 1] == pytest.approx(field, abs=1e-5 * height)
-        if number % 50 == 0:
-            moments = dict(zip(simulation.magnetics.shapes, simulation.magnetics.shape_moments(), strict=True))
-            shape = simulation._scene.magnet_shapes["/World/Iron"][0]
-            # of an ideally permeable ball, and the compass at 50 m; rtol of the induction
-            assert moments[shape][1] == pytest.approx(3.0 * volume * field, rel=1e-3, abs=1e-9)
-        spun.append(simulation.state.body_qd.numpy()[needle, 5])
-    area = 0.5 * height * 0.15
-    # the needle turns by 0.02 meanwhile: the cosine, and half a substep of the pulse
-    assert spun[-1] == pytest.approx(MU0 * moment * area / inertia, rel=2e-3)
-    assert spun[45] == 0.0 or abs(spun[45]) < 1e-6
-    assert simulation.capture_failure == ""
-
-
-def test_a_field_that_is_given_stands_in_for_the_keys(tmp_path, device):
-    path = write(tmp_path, held_ball(0.0), scene=f"vector3f warpmag:externalField.timeSamples = {text(pulse(9.0))}")
-    simulation = Simulation(path, device=device, external_field=(1.0, 2.0, 3.0))
-    for _ in range(120):
-        simulation.step()
-    assert (simulation.magnetics.system.external_field.numpy() == (1.0, 2.0, 3.0)).all()
-
-
-@pytest.mark.parametrize("where", ["a body", "a capsule that is no body", "a named material"])
-def test_a_magnet_that_is_switched(tmp_path, device, where):
-    """Its moment is what the keys say at each substep, in the frame of its prim."""
-    samples = {0: (0, 0, 0), 6: (0, 0, 2e5), 12: (1e5, 0, -1e5)}
-    common = ['uniform token warpmag:kind = "permanent"']
-    strength = 1.0
-    if where == "a named material":
-        samples = {0: (0, 0, 3), 6: (0, 0, 1), 12: (0.0, 0, -0.5)}
-        common.append('uniform token warpmag:material = "N42"')
-    common.append(f"vector3f warpmag:magnetization.timeSamples = {text(samples)}")
-    if where == "a capsule that is no body":
-        lines = "double radius = 0.005", "double height = 0.01", 'uniform token axis = "X"', operations(rotateZ=90)
-        magnet = prim("Capsule", "Magnet", (COLLIDER, MAGNET), *lines, *common)
-    else:
-        magnet = prim("Cube", "Magnet", (BODY, COLLIDER, MAGNET), "double size = 0.01", KINEMATIC,
-                      operations(rotateZ=90), *common)  # fmt: skip
-    path = write(tmp_path, magnet, held_ball(0.1))
-    assert list(check(path).contents.magnetization_keys) == ["/World/Magnet"]
-    simulation = Simulation(path, device=device)
-    times, values = np.array(list(samples)) / RATE, np.array(list(samples.values()), dtype=float)
-    if where == "a named material":
-        from warpmag.materials import MATERIALS  # noqa: PLC0415
-
-        strength = MATERIALS["n42"].magnetization if "n42" in MATERIALS else MATERIALS["N42"].magnetization
-        values = np.sign(values) * strength
-    shape = simulation._scene.magnet_shapes["/World/Magnet"][0]
-    row = simulation.magnetics.shapes.tolist().index(shape)
-    for _ in range(6):
-        for _ in range(100):
-            simulation.step()
-        own = [np.interp(simulation.time - 5e-4, times, column) for column in values.T]
-        turned = np.array([-own[1], own[0], own[2]])  # the prim is turned by 90 degrees about z
-        found = simulation.magnetics.shape_moments()[row] / simulation.magnetics.shape_volumes[row]
-        np.testing.assert_allclose(found, turned, rtol=0, atol=1e-5 * np.abs(values).max())
-
-
-def test_substeps_that_are_shortened_follow_the_same_keys(tmp_path, device):
-    """Balls that fall on a moving magnet: attempts are repeated, and the magnet stands where it is to."""
-    keys = {0: (0, 0, 0), 12: (0, 0, 0.05)}
-    cube = prim("Cube", "Magnet", (BODY, COLLIDER, MAGNET), "double size = 0.02", KINEMATIC,
-                'uniform token warpmag:kind = "permanent"', "vector3f warpmag:magnetization = (0, 0, 1e6)",
-                operations(translate=keys))  # fmt: skip
-    balls = [
-        held_ball(0).replace("Ball", f"Ball{k}").replace("(0, 0, 0)", f"({0.006 * k - 0.009}, {0.011 * (k % 2)}, 0.04)")
-        for k in range(4)
-    ]
-    simulation = Simulation(write(tmp_path, cube, *balls, gravity=G), device=device, step=2e-3)
-    body = body_of(simulation, "Magnet")
-    for _ in range(60):
-        simulation.step()
-        at = simulation.state.body_q.numpy()[body, 2]
-        assert at == pytest.approx(0.1 * simulation.time, abs=1e-8)
-    figures = simulation.statistics
-    assert figures.repeated > 0
-    assert figures.substeps > 4 * 60
-
-
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        (operations(translate={0: (0, 0, 0), 5: ("nan", 0, 0)}), "/World/Part: xformOp:translate is not finite"),
-        (operations(translate={0: (0, 0, 0), 5: None}), "/World/Part: xformOp:translate has no value at time code 5"),
-        (operations(translate={0: (0, 0, 0), 5: (1e12, 0, 0)}), "/World/Part: keyed transform reaches beyond"),
-        (operations(scale={0: (1, 1, 1), 5: (2, 2, 2)}), "/World/Part: its scale is keyed"),
-        (operations(scale={0: (1, 1, 1), 5: (1, 1, -1)}), "/World/Part: keyed transform"),
-        (operations(orient={0: (1, 0, 0, 0), 5: (0, 0, 0, 0)}), "/World/Part: xformOp:orient has a quaternion of zero"),
-    ],
-)
-def test_what_no_body_can_follow_is_refused(tmp_path, lines, message):
-    lines = lines.replace("'", "").replace("None", "None")
-    path = write(tmp_path, prim("Cube", "Part", (BODY, COLLIDER), "double size = 0.01", KINEMATIC, lines), held_ball(1))
-    refusals = [str(one) for one in check(path).errors]
-    assert refusals and refusals[0].startswith(message), refusals
-
-
-def test_samples_of_fields_that_are_not_finite_are_refused(tmp_path):
-    bad = text({0: "(0, 0, 0)", 5: "(0, nan, 0)"})
-    path = write(tmp_path, held_ball(0), scene=f"vector3f warpmag:externalField.timeSamples = {bad}")
-    assert [str(one) for one in check(path).errors] == [
-        "/World/Scene: warpmag:externalField at time code 5: must be finite, got (0.0, nan, 0.0)"
-    ]
-    lines = 'uniform token warpmag:kind = "permanent"', f"vector3f warpmag:magnetization.timeSamples = {bad}"
-    path = write(tmp_path, prim("Sphere", "Part", (COLLIDER, MAGNET), "double radius = 0.01", *lines), held_ball(1))
-    assert [str(one) for one in check(path).errors] == [
-        "/World/Part: warpmag:magnetization at time code 5: must be finite, got (0.0, nan, 0.0)"
-    ]
-
-
-def test_the_stage_of_a_run_has_the_scenes_keys(tmp_path, device, capsys):
-    """A run leaves them alone, so that a keyed prim stands between frames, too, where the scene says."""
-    from warpmag.cli import main  # noqa: PLC0415 - imports Warp
-
-    path = write(tmp_path, cube_on_arm(rotateZ={0: 0, 24: 180}), held_ball(0.065))
-    assert main(["check", str(path)]) == 0
-    assert "keyed       1 bodies, 0 magnetizations\n" in capsys.readouterr().out
-    Simulation(path, device=device).run(3, output=tmp_path / "out.usda")
-    scene, result = (Usd.Stage.Open(str(one)) for one in (path, tmp_path / "out.usda"))
-    for time in (0.0, 1.1, 3.3, 24.0):
-        for expected, found in zip(*(pose_of(one, "/World/Arm/Magnet", time) for one in (scene, result)), strict=True):
-            assert (expected == found).all()
-    ball = result.GetPrimAtPath("/World/Ball").GetAttribute("xformOp:translate:warpmag")
-    assert ball.GetNumTimeSamples() == 4
-    moments = result.GetPrimAtPath("/World/Arm/Magnet").GetAttribute("warpmag:moment")
-    assert moments.GetNumTimeSamples() > 2
-
-
-def test_a_resumed_run_goes_on_along_the_keys(tmp_path, device, monkeypatch):
-    """Killed and resumed, it ends with the bits of a run that nobody disturbed."""
-    from test_run_survives import samples  # noqa: PLC0415
-
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SHARE", math.inf)
-    scene = f"vector3f warpmag:externalField.timeSamples = {text(pulse(4e4))}"
-    path = write(tmp_path, cube_on_arm(rotateZ={0: 0, 24: 180}), held_ball(0.0662), scene=scene)
-
-    def run(name, last, resume):
-        simulation = Simulation(path, device=device)
-        output = tmp_path / name / "out.usda"
-        figures = simulation.run(4, output=output, resume=resume, on_frame=lambda frame: frame < last)
-        return figures.evaluations, figures.substeps, samples(output)
-
-    expected = run("whole", 4, False)
-    for last in (1, 3, 4):
-        found = run("parts", last, True)
-    assert found == expected

@@ -147,7 +147,7 @@ def test_a_ball_at_a_cube_of_cells(touched, device):
 
 @pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
 def test_a_ball_at_a_cube_magnet(touched, device):
-    """In a Newton model within 5 % of the exact force; a dipole lacks 24 % of it at an edge, 23 % at a corner."""
+    """In a Newton model within 3 % of the exact force; a dipole lacks 24 % of it at an edge, 23 % at a corner."""
     half, outward = 0.02, np.array(touched) / np.linalg.norm(touched)
     place = half * np.array(touched) + 1.0001 * R * outward
     builder = newton.ModelBuilder()
@@ -162,7 +162,7 @@ def test_a_ball_at_a_cube_magnet(touched, device):
     magnetics.apply(state)
     forces = state.body_f.numpy()[:, :3]
     exact = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), 1e4), place, R, order=20)
-    assert np.linalg.norm(forces[ball] - exact) < 0.05 * np.linalg.norm(exact)
+    assert np.linalg.norm(forces[ball] - exact) < 0.03 * np.linalg.norm(exact)
     assert np.abs(forces.sum(0)).max() < 1e-5 * np.abs(forces).max()
 
 

@@ -6,14 +6,16 @@
 
 namespace warpmag {
 
-constexpr int TENSOR_ROWS = 21, EXPANSION_ROWS = 4 * TENSOR_ROWS; // as in expansion.py
+constexpr int POINTS = 12, TENSOR_ROWS = 21, EXPANSION_ROWS = 4 * TENSOR_ROWS; // as in expansion.py
 constexpr int HELD = CHUNK <= WIDTH * SHARES ? 1 : CHUNK / (WIDTH * SHARES);
 
-// A ball, and what is seen at its CHUNK points, of which a thread has those of vector v from ``first`` on.
+// A ball, and what is seen at its CHUNK places, POINTS of which count, of which a thread has those of vector v from
+// ``first`` on.
 struct Ball {
     Three center;
     Real size, label;
     int moment;
+    bool lit; // whether any source takes part
     Seen at[HELD];
 
     CUDA_CALLABLE static int first(int v) { return WIDTH * (share() + SHARES * v); }
@@ -28,6 +30,7 @@ template <class All> CUDA_CALLABLE inline Ball ball_at(const All& all, int i) {
                  packed_at(all, 3, i),
                  packed_at(all, 7, i),
                  i,
+                 false,
                  {}};
     for (int v = 0; v < HELD; ++v) ball.at[v] = nothing_seen();
     return ball;
@@ -68,10 +71,11 @@ template <class All> CUDA_CALLABLE inline void add_source(const All& all, int s,
     const Pose pose = pose_from((const Real*)all.frame.data + 7 * (size_t)s);
     const Part part = part_of(ball, pose, three(extent), three(extent + 3));
     if (part.value == 0) return;
+    ball.lit = true;
     for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {
         const Vector x = ball.points(all, v);
         Seen seen = nothing_seen();
-        for (int l = 0; l < WIDTH; ++l) {
+        for (int l = 0; l < WIDTH && Ball::first(v) + l < POINTS; ++l) {
             const FieldAt f = field_at(all, s, {lane_of(x.x, l), lane_of(x.y, l), lane_of(x.z, l)});
             set_lane(seen.h, l, f.h), set_lane(seen.x, l, f.dx), set_lane(seen.y, l, f.dy), set_lane(seen.z, l, f.dz);
         }
@@ -82,6 +86,7 @@ template <class All> CUDA_CALLABLE inline void add_source(const All& all, int s,
 template <class All> CUDA_CALLABLE inline void add_body(const All& all, const Body& body, Ball& ball) {
     const Part part = part_of(ball, body.pose, body.middle, body.half);
     if (part.value == 0 || body.label == ball.label) return;
+    ball.lit = true;
     const bool near = dot(part.beyond, part.beyond) < body.reach * body.reach;
     const Number zero = Number(Real(0)), least2 = zero + Real(0.0625) * ball.size * ball.size;
     for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {
@@ -106,12 +111,13 @@ template <class All> CUDA_CALLABLE inline void expand(const All& all, int n) {
     for (int row = 0; row < TENSOR_ROWS; ++row) {
         Number tensor = Number(Real(0));
         Vector slope = {tensor, tensor, tensor};
-        for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {
+        for (int v = 0; ball.lit && v < HELD && Ball::first(v) < CHUNK; ++v) {
             const Real* const table = all.tables.data + 6 * CHUNK * row + Ball::first(v);
             tensor += dot(own_vector(table), ball.at[v].h);
             slope = sum(slope, pulled(ball.at[v], own_vector(table + 3 * CHUNK)));
         }
-        const Real rows[4] = {added_up(tensor), added_up(slope.x), added_up(slope.y), added_up(slope.z)};
+        const Three pull = ball.lit ? added_up(slope) : Three{0, 0, 0};
+        const Real rows[4] = {ball.lit ? added_up(tensor) : Real(0), pull.x, pull.y, pull.z};
         for (int c = 0; c < 4 && share() == 0; ++c)
             out[(c == 0 ? row : TENSOR_ROWS + 3 * row + c - 1) * CHUNK] = rows[c];
     }
@@ -119,6 +125,7 @@ template <class All> CUDA_CALLABLE inline void expand(const All& all, int n) {
 
 // Force over μ0 of one source on the multipoles of a ball.
 template <class All> CUDA_CALLABLE inline Three pull_of(const All& all, const Ball& ball) {
+    if (!ball.lit) return {0, 0, 0};
     const Real* const response = rows_at(all.response.data, RESPONSE_ROWS, ball.moment);
     Vector total = nothing_seen().h;
     for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {

@@ -37,9 +37,11 @@ _BODY_THREADS = 32
 
 
 @cache
-def _kernel(dtype, group: int, coils: bool, solids: bool, balls: tuple):
+def _kernel(dtype, one: int, group: int, coils: bool, solids: bool, balls: tuple):
+    """Kernel of pass ``one``, or of all if that is −1."""
     call = "warpmag::apply_sources(thread, first, last, threads, team.data, arrays);"
-    constants = {"GROUP": group, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
+    constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
+    constants |= {"PASS": one, "GROUP": group}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
     return passes_kernel(call, source_arrays_type(dtype), native_options("applied/passes.h", dtype=dtype, **constants))
 
@@ -106,9 +108,9 @@ class AppliedField:
         cuda, key = self.device.is_cuda, (first, last)
         if items and key not in self._commands:
             some = self.sources
-            options = group if cuda else 1, bool(some.applied), bool(some.solids), self.balls
+            which = (first, group) if cuda else (-1, 1)
             self._commands[key] = wp.launch(
-                _kernel(some.dtype, *options),
+                _kernel(some.dtype, *which, bool(some.applied), bool(some.solids), self.balls),
                 dim=group * items if cuda else 1,
                 inputs=[first, last + 1, threads_for(items, share), None if cuda else team(), self.arrays],
                 device=self.device,
@@ -216,6 +218,7 @@ class AppliedForces(AppliedField):
         movable = np.asarray(movable, bool)
         self._moves = bool(movable.any())
         device = sources.device
+        self._fine: dict[str, wp.array] | None = None
         self._movable, self._carried = (
             wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
             for values in (movable, carried)
@@ -288,9 +291,16 @@ class AppliedForces(AppliedField):
 
         That of moments in fields is with ``acting``. Waits for the device.
         """
-        if self._adds:
-            self._add_up(ADD_UP)
-        found = np.zeros(self.count)
-        coils = len(self.sources.applied)
-        found[[one.first for one in self.sources.solids]] = self.wrenches.numpy()[coils:, 6]
+        found, solids, arrays = np.zeros(self.count), self.sources.solids, self.arrays
+        if len(solids) < 2:
+            return found
+        self._fine = self._fine or self.sources.tables(fine=True)
+        usual = {name: self.sources.arrays[name] for name in self._fine}
+        for tables in (self._fine, usual):
+            for name, values in tables.items():
+                setattr(arrays, name, values)
+            self._commands.pop((ADD_UP, ADD_UP), None)
+            if tables is self._fine:
+                self._add_up(ADD_UP)
+        found[[one.first for one in solids]] = self.wrenches.numpy()[len(self.sources.applied) :, 6]
         return found

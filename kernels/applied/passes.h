@@ -3,7 +3,7 @@
 // Of a permanent body everything is a difference: the closed form less what the sums over pairs make of the lattice. On
 // a CPU a pass works on a vector of targets or of points, on a GPU a group of threads shares a target, a ball, a row of
 // targets or a body. Takes GROUP, MU0, INVERSE_4PI and the switches COILS, SOLIDS and BALLS from Python, for what there
-// is; ``All`` is the struct of sources.py, which has the names.
+// is, and PASS, the only one of a GPU's kernel; ``All`` is the struct of sources.py, which has the names.
 #pragma once
 #include "applied/balls.h"
 #include "applied/between.h"
@@ -188,15 +188,19 @@ template <class All> CUDA_CALLABLE inline void add_up(const All& all, int s) {
 template <class Word, class All>
 CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int threads, Word* team, const All& all) {
     auto make_pass = [&](int pass, int i) {
-        if (pass == AT_TARGETS) field_at_targets<false>(all, i);
-        if (pass == AT_POINTS) field_at_targets<true>(all, i);
-        if constexpr (BALLS)
+        if constexpr (PASS < 0 || PASS == AT_TARGETS)
+            if (pass == AT_TARGETS) field_at_targets<false>(all, i);
+        if constexpr (PASS < 0 || PASS == AT_POINTS)
+            if (pass == AT_POINTS) field_at_targets<true>(all, i);
+        if constexpr (BALLS && (PASS < 0 || PASS == AT_BALLS))
             if (pass == AT_BALLS) expand(all, i);
-        if (pass == REACT) react(all, i);
-        if (pass == ADD_UP) add_up(all, i);
+        if constexpr (PASS < 0 || PASS == REACT)
+            if (pass == REACT) react(all, i);
+        if constexpr (PASS < 0 || PASS == ADD_UP)
+            if (pass == ADD_UP) add_up(all, i);
     };
 #if defined(__CUDA_ARCH__)
-    make_pass(first, thread / GROUP);
+    make_pass(PASS, thread / GROUP);
 #else
     auto items = [&](int pass) {
         return pass < AT_BALLS    ? CHUNK * all.chunk.shape[0]

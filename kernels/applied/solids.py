@@ -53,11 +53,11 @@ class SolidMagnet:
         return [1.0 / self.volume, self.reach, radius, *middle, *(0.5 * (upper - lower))]
 
 
-def tables_of(solids) -> dict[str, np.ndarray]:
-    """Return the tables of the bodies' shapes, and of the bodies."""
+def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
+    """Return the tables of the bodies' shapes, with more points on faces if ``fine``, and of the bodies."""
     shapes = {id(one.shape): one.shape for one in solids}
     number = {key: k for k, key in enumerate(shapes)}
-    rows, tables = _tables(shapes.values())
+    rows, tables = _tables(shapes.values(), fine)
     tables["shape"] = rows
     tables["body"] = np.array([(number[id(one.shape)], one.first, one.count, 0) for one in solids], np.int32)
     tables["size"] = np.array([one.size() for one in solids])
@@ -72,14 +72,14 @@ def _in_chunks(points) -> np.ndarray:
     return filled.reshape(-1, CHUNK, points.shape[1]).transpose(0, 2, 1)
 
 
-def _tables(shapes):
+def _tables(shapes, fine: bool):
     """Rows of the shapes' table, and what stands in the others."""
     rows, parts = [], {name: [] for name in ("edge", "face", "corner", "begin", "edge_point", "face_point")}
     counts = np.zeros(6, int)  # edges, faces, entries of begin, corners, points on edges, points on faces
     for shape in shapes:
         edges, faces = shape.edge_rows(), shape.normals
         begin = np.append(0, np.cumsum([len(face) for face in shape.faces]))
-        on_edges, on_faces = _in_chunks(shape.edge_points()), _in_chunks(shape.face_points())
+        on_edges, on_faces = _in_chunks(shape.edge_points()), _in_chunks(shape.face_points(fine=fine))
         points = CHUNK * len(on_edges), CHUNK * len(on_faces)
         start = counts.tolist()
         rows.append([

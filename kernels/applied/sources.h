@@ -10,7 +10,8 @@ namespace warpmag {
 // As in sources.SourceKind.
 enum SourceKind { LOOP, SOLENOID, POLYLINE, FIELD_MAP };
 
-CUDA_CALLABLE inline FieldAt field_of(const AppliedSource& source, Point x) {
+// Not inlined: its kinds are long, and several passes call it.
+__attribute__((noinline)) CUDA_CALLABLE inline FieldAt field_of(const AppliedSource& source, Point x) {
     switch (source.kind) {
     case LOOP:
         return loop_field(source, x);

@@ -142,8 +142,7 @@ class Sources:
         self.arrays: dict[str, wp.array] = {"packed": packed.packed}
         self._lay_out_applied()
         if solids:
-            for name, values in tables_of(solids).items():
-                self.put(**{name: (values, wp.int32 if name in INTEGER_TABLES else self.dtype)})
+            self.arrays |= self.tables()
         self.solid_worlds = np.array([one.world for one in solids], int)
         self.put(world=(self.bodies_of(self.solid_worlds), wp.vec2i))
         transform, identity = wp.types.transformation(self.dtype), [0.0] * 6 + [1.0]
@@ -174,6 +173,13 @@ class Sources:
             list_begin=(self.lists, wp.int32),
             list=([k for world in worlds for k in world], wp.int32),
         )
+
+    def tables(self, *, fine: bool = False) -> dict[str, wp.array]:
+        """Return the tables of permanent bodies on the device, with more points on faces if ``fine``."""
+        return {
+            name: wp.array(values, dtype=wp.int32 if name in INTEGER_TABLES else self.dtype, device=self.device)
+            for name, values in tables_of(self.solids, fine=fine).items()
+        }
 
     def bodies_of(self, worlds) -> np.ndarray:
         """Return the first permanent body of each of some worlds, and the end of them, shape [..., 2]."""

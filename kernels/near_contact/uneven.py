@@ -23,7 +23,9 @@ force on the ball minus their sum: all are derivatives of E, and momentum and an
   they do not stand for their body.
 * **Saturation.** χ is the differential susceptibility at the ball's magnetization: a saturated ball is a dipole.
 
-Magnets with a recoil permeability act by the moments that they have. Inducible moments do not drive these multipoles,
+Coils, maps and permanent bodies of a closed form make b_l by their fields, which ``applied.expansion`` has, and there
+E the same; they fade over ``MAGNET_REACH`` from the box around them. Magnets with a recoil permeability act by the
+moments that they have. Inducible moments do not drive these multipoles,
 nor feel them: what balls do to each other is ``near_pairs``. So the induction stays as it is, and all this is done once
 a force. Reference: Jackson, Classical Electrodynamics, 3rd ed., ch. 4.
 

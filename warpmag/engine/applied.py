@@ -6,6 +6,7 @@ A source is a site: a shape that neither collides nor weighs anything, with a bo
 
 import fnmatch
 import re
+from typing import Any
 
 import newton
 import numpy as np
@@ -137,6 +138,51 @@ def add_source(
     frame = wp.transform() if xform is None else _checked_frame("xform", xform)
     values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
     return builder.add_site(body, xform=frame, label=label, custom_attributes=values)
+
+
+def add_placed_source(builder: newton.ModelBuilder, one, label: str, body: int, frame: wp.transform) -> int:
+    """Add the source of a stage to a body, or to the world; return the site that stands for it.
+
+    Args:
+        builder: The builder.
+        one: The source, a ``usd.coils.PlacedSource``.
+        label: Its label.
+        body: Its body, -1 for none.
+        frame: Where it is in the world.
+    """
+    strength = one.source.ampere_turns if isinstance(one.source, Coil) else one.source.factor
+    if body >= 0:
+        frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
+    return add_source(builder, body, one.source.record(), strength, frame, label)
+
+
+def add_sources_of_prim(prim, builder: newton.ModelBuilder, imported: dict[str, Any]) -> None:
+    """Add the coil and the field map of a prim where ``builder.add_usd`` has put its stage.
+
+    Args:
+        prim: The prim.
+        builder: The builder.
+        imported: What ``add_usd`` returns: which prim became what.
+
+    Raises:
+        InputError: It is no such prim, or on a body that Newton has not imported.
+    """
+    from warpmag.usd import placed_sources  # noqa: PLC0415 - a builder can do without USD
+
+    bodies, path = imported["path_body_map"], str(prim.GetPath())
+    for one in placed_sources(prim):
+        if one.body is not None and one.body not in bodies:
+            raise InputError(f"{path}: on {one.body}, of which Newton imports no body")
+        anchor = one.body or next(iter(bodies), None)
+        if anchor is None:  # nothing that moves: only the axes may have been turned
+            stage = wp.transform((0.0, 0.0, 0.0), newton.math.quat_between_axes(imported["up_axis"], builder.up_axis))
+        else:
+            found = wp.transform(*builder.body_q[bodies[anchor]])
+            found = found * imported["path_body_relative_transform"].get(anchor, wp.transform_identity())
+            drawn = newton.usd.get_transform(prim.GetStage().GetPrimAtPath(anchor), local=False)
+            stage = found * wp.transform_inverse(drawn)
+        frame = stage * wp.transform(one.position, one.rotation)
+        add_placed_source(builder, one, path, -1 if one.body is None else bodies[one.body], frame)
 
 
 def _checked_frame(name: str, xform) -> wp.transform:

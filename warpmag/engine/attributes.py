@@ -52,13 +52,38 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     Newton's solvers have class methods of this name; ``register_attributes`` is the same function.
 
     Newton's ``builder.add_usd(stage)`` then brings the magnets of a stage in, too: what colliders or their rigid bodies
-    with ``WarpmagMagnetAPI`` say, or the defaults of what they do not say.
+    with ``WarpmagMagnetAPI`` say, or the defaults of what they do not say; and its coils and field maps.
 
     Args:
         builder: The builder; declaring twice does nothing.
     """
     _check_builder(builder)
     declare_attributes(builder, usd_attribute_name="*", usd_value_transformer=_of_prim)
+    source = f"{NAMESPACE}:source_prim"
+    builder.add_custom_frequency(
+        newton.ModelBuilder.CustomFrequency(
+            "source_prim", NAMESPACE, usd_prim_filter=_is_source, usd_entry_expander=_add_sources_of
+        )
+    )
+    # without an attribute Newton does not look for prims of this kind
+    builder.add_custom_attribute(
+        newton.ModelBuilder.CustomAttribute("source_prim", str, source, namespace=NAMESPACE, default="")
+    )
+
+
+def _is_source(prim, _) -> bool:
+    """Whether a prim of a stage is a coil or a field map."""
+    from warpmag.usd import is_source  # noqa: PLC0415 - a builder can do without USD
+
+    return is_source(prim)
+
+
+def _add_sources_of(prim, context: dict[str, Any]) -> list[dict[str, Any]]:
+    """Add the coil and the field map of a prim to the builder; return no values of Newton's, since they are sites."""
+    from warpmag.engine.applied import add_sources_of_prim  # noqa: PLC0415 - which needs what is here
+
+    add_sources_of_prim(prim, context["builder"], context["result"])
+    return []
 
 
 register_attributes = register_custom_attributes

@@ -8,8 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.coils import Coil
-from warpmag.engine.applied import add_source
+from warpmag.engine.applied import add_placed_source
 from warpmag.engine.attributes import axis_turn, declare_attributes, in_shape_frame, magnet_shapes, mark_shape
 from warpmag.engine.drawn import StageBuilder
 from warpmag.errors import InputError
@@ -197,12 +196,8 @@ def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) 
     """
     currents = {}
     for prim, one in ((prim, one) for prim, placed in sources.items() for one in placed):
-        frame, body = wp.transform(one.position, one.rotation), -1
-        if one.body is not None:
-            body = bodies[one.body]
-            frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
-        strength = one.source.ampere_turns if isinstance(one.source, Coil) else one.source.factor
-        shape = add_source(builder, body, one.source.record(), strength, frame, prim)
+        body = -1 if one.body is None else bodies[one.body]
+        shape = add_placed_source(builder, one, prim, body, wp.transform(one.position, one.rotation))
         if one.currents is not None:
             currents[shape] = one.currents
     return currents

@@ -8,7 +8,7 @@ attributes right even then).
 from warpmag.usd.schemas import author_magnet, author_settings, magnet_of, magnet_prim_of  # isort: skip  (registers the schemas first)
 from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
-from warpmag.usd.coils import author_coil, author_field_map
+from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_sources
 from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
@@ -55,11 +55,13 @@ __all__ = [
     "give_densities",
     "hold",
     "inspect",
+    "is_source",
     "magnet_of",
     "magnet_prim_of",
     "metalness",
     "open_motion",
     "open_stage",
+    "placed_sources",
     "prepare_joints",
     "read_magnets",
     "read_recording",

@@ -149,8 +149,7 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
         owner = _owner(prim)
         body = owner and str(owner.GetPath())
         if keys.moves(prim, owner):
-            where = f"within its rigid body {body}" if body else "but it is on no rigid body, a kinematic one say"
-            yield Finding(path, f"keys move it, {where}: a run holds it still there", "warning")
+            yield Finding(path, f"keys move it within its rigid body {body}: a run holds it still there", "warning")
         if has_api(prim, COIL_API):
             currents = keys.keys(prim, AMPERE_TURNS, _current)
             yield PlacedSource(_scaled_coil(coil_of(prim), scale), body, position, rotation, currents)
@@ -162,6 +161,15 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
             yield PlacedSource(_scaled_map(found, scale), body, position, rotation)
     except InputError as error:
         yield finding_of(path, error)
+
+
+def placed_sources(prim: Usd.Prim) -> list[PlacedSource]:
+    """Return the coil and the field map that a prim is; raises :class:`InputError` if something is wrong with them."""
+    found = list(sources_of(prim, TransformCheck(), KeyReader(prim.GetStage())))
+    for one in found:
+        if isinstance(one, Finding) and one.severity == "error":
+            raise InputError(str(one))
+    return [one for one in found if isinstance(one, PlacedSource)]
 
 
 def coil_of(prim: Usd.Prim) -> Coil:

@@ -1,7 +1,7 @@
 """Reads what a stage gives time samples for and a run follows: transforms of kinematic bodies, fields, magnetizations.
 
 Samples are read from the stage without what its session holds, which would hide them. What moves by keys and is
-no rigid body, as artists leave it, becomes a kinematic one there.
+no rigid body, as artists leave it, becomes a kinematic one there, coils and field maps too.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -110,18 +110,22 @@ class KeyReader:
         return False
 
 
-def make_kinematic(stage: Usd.Stage, animated: Iterable[Sdf.Path]) -> None:
-    """Make what collides, moves by keys and is no rigid body a kinematic one, in the session layer.
+def make_kinematic(
+    stage: Usd.Stage, animated: Iterable[Sdf.Path], is_source: Callable[[Usd.Prim], bool] = lambda _: False
+) -> None:
+    """Make what collides or makes a field, moves by keys and is no rigid body a kinematic one, in the session layer.
 
     Args:
         stage: The stage.
         animated: Prims whose own transforms have time samples.
+        is_source: Whether a prim is a coil or a field map.
     """
     roots = [path for path in Sdf.Path.RemoveDescendentPaths(list(animated)) if stage.GetPrimAtPath(path)]
     reader, found = KeyReader(stage), []
     for root in roots:
         for prim in Usd.PrimRange(stage.GetPrimAtPath(root), Usd.TraverseInstanceProxies()):
-            if is_collider(prim) and not _belongs(prim, found) and reader.moves(prim):
+            chosen = is_collider(prim) or (prim.IsA(UsdGeom.Xformable) and is_source(prim))
+            if chosen and not _belongs(prim, found) and reader.moves(prim):
                 found.append(prim.GetPath())
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         for path in found:

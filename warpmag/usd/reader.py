@@ -181,7 +181,9 @@ def hold(stage: Usd.Stage, time_code: float) -> None:
             else:  # blocked at that time: as if it had never been authored
                 attribute.Block()
     cut_off(stage)
-    make_kinematic(stage, {one.GetPrim().GetPath() for one in sampled if one.GetName().startswith("xformOp:")})
+    make_kinematic(
+        stage, {one.GetPrim().GetPath() for one in sampled if one.GetName().startswith("xformOp:")}, is_source
+    )
 
 
 def _uncover(attribute: Usd.Attribute, session: Sdf.Layer) -> bool:
