@@ -26,7 +26,7 @@
 // each substep the same way, so that heaps would creep. An overlap is pushed out sooner or later, whatever is left of
 // it in a substep; a slip would be forgotten. It is kept as long as surfaces touch (Cundall and Strack 1979, "A
 // Discrete Numerical Model for Granular Assemblies"), and so is what rolls and spins. Where friction gives way, it is
-// as far as all of the friction pushes bodies in a substep. That is position, not impulse: impulses that were kept from
+// kept as far as all of the friction may bring it back. That is position, not impulse: impulses that were kept from
 // substep to substep would hold what undoes overlap, too, and throw a chain of 1,000 balls apart.
 //
 // A contact is seen from one of its two bodies, the own one, and looks the same from the other: its impulses there are
@@ -144,6 +144,9 @@ CUDA_CALLABLE inline Vector across(Vector n) {
 
 // Friction is relaxed by this part of what pushes are: it turns balls besides, and with momentum all of it diverges.
 constexpr Real FRICTION = Real(0.35);
+// What sticks goes back by this part of its slip in a substep: all at once, layers that fall on each other come back at
+// the speed of what the first impact left, and overlap three times as far.
+constexpr Real RETURN = Real(0.3);
 
 // Prepares a contact, which has slipped so far while it stuck, for iterations that relax it by a part of what it lacks.
 CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pose& other, const Body& body,
@@ -176,7 +179,7 @@ CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pos
     c.turn_rate =
         quotient(none + FRICTION * relaxation, turn_ease(body, inertia) + turn_ease(other_body, other_inertia));
     c.mu = t.mu, c.torsional = t.torsional, c.rolling = t.rolling;
-    c.back = {scaled(1 / dt, tangential(slipped.linear, n)), scaled(1 / dt, slipped.turn)};
+    c.back = {scaled(RETURN / dt, tangential(slipped.linear, n)), scaled(RETURN / dt, slipped.turn)};
     return c;
 }
 
@@ -225,9 +228,10 @@ CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body
 CUDA_CALLABLE inline Slip slipped_so_far(const Contact& c, const Body& own, const Body& other, Impulse p,
                                          Real relaxation, Real dt) {
     const Slip slip = slip_of(c, own, other);
-    const Vector linear = scaled(dt, sum(c.back.linear, tangential(slip.linear, c.normal)));
-    const Vector turn = scaled(dt, sum(c.back.turn, slip.turn));
-    const Number push = FRICTION * relaxation * dt * dot(p.linear, c.normal);
+    auto after = [&](Vector back, Vector now) { return scaled(dt, sum(scaled(1 / RETURN, back), now)); };
+    const Vector linear = after(c.back.linear, tangential(slip.linear, c.normal));
+    const Vector turn = after(c.back.turn, slip.turn);
+    const Number push = FRICTION * relaxation * dt / RETURN * dot(p.linear, c.normal);
     const Number per_turn = quotient(push, c.turn_rate);
     return {at_most(linear, quotient(c.mu * push, c.rub_rate)),
             limited(turn, c.normal, c.rolling * per_turn, c.torsional * per_turn)};
