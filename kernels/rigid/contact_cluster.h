@@ -108,9 +108,10 @@ struct KeptSide {
     Side side;
     int step;
 };
-template <class Plan> __device__ inline KeptSide side_of(const Arrays& a, const Plan& plan, Room& room, int k) {
+template <class Plan>
+__device__ inline KeptSide side_of(const Arrays& a, const Plan& plan, Room& room, int k, bool sticking) {
     const int j = a.other[k];
-    const Contact contact = contact_at(a, k);
+    const Contact contact = contact_at(a, k, sticking);
     if (j >= plan.bodies) return {{contact, line_at(a, a.motion, j)}, 0};
     const Four* const line = plan.line(a, room, j);
     return {{contact, {line, line + 4}}, 2};
@@ -123,18 +124,19 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, Room& room
                                    Real relaxation, Real dt) {
     const int teams = plan.is_wide() ? 1 : BLOCK / GROUP, members = BLOCK / teams;
     const int team = threadIdx.x / members, first = threadIdx.x % members;
+    const bool sticking = a.totals[STICKING];
     int kept_at = -1;
     KeptSide kept = {};
     Given kept_given = {};
     if (team < tasks) {
         const int2 sides = room.tasks[team].sides;
         const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
-        if (taken && sides.x + first < sides.y) kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at);
+        if (taken && sides.x + first < sides.y)
+            kept_at = sides.x + first, kept = side_of(a, plan, room, kept_at, sticking);
     }
-    const bool sticking = a.totals[STICKING];
     auto side_before = [&](int k, int iteration) {
         KeptSide its = kept;
-        if (k != kept_at) its = side_of(a, plan, room, k);
+        if (k != kept_at) its = side_of(a, plan, room, k, sticking);
         else its.side.contact.back = back_at(a, k, sticking); // registers are few
         its.side.other.motion += iteration % 2 * its.step;
         return its.side;

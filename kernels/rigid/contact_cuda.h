@@ -143,8 +143,8 @@ __device__ inline Slip back_at(const Arrays& a, int k, bool sticking) {
     if (!sticking) return {};
     return read_slip([&](int half) { return ((const Four*)a.back)[BACK / 4 * (size_t)k + half]; });
 }
-__device__ inline Contact contact_at(const Arrays& a, int k) {
-    return read_contact([&](int quarter) { return own_four(a.side, quarter, k); }, back_at(a, k, a.totals[STICKING]));
+__device__ inline Contact contact_at(const Arrays& a, int k, bool sticking) {
+    return read_contact([&](int quarter) { return own_four(a.side, quarter, k); }, back_at(a, k, sticking));
 }
 
 // What each ``threads``-th contact of a body does, from k to last. ``side_at`` gives contacts, and ``press_at`` lets a
@@ -208,10 +208,10 @@ template <class Act> __device__ inline void share_bodies(int thread, const Array
 
 // One iteration: moves the body that a group of threads shares, from one array of motions to the other.
 __device__ inline void iterate(int thread, const Arrays& a, int iteration, int iterations) {
-    const bool odd = iteration % 2;
+    const bool odd = iteration % 2, sticking = a.totals[STICKING];
     const Real* const from = odd ? a.next_motion : a.motion;
     Four* const to = (Four*)(odd ? a.motion : a.next_motion);
-    auto side_at = [&](int k) { return Side{contact_at(a, k), line_at(a, from, a.other[k])}; };
+    auto side_at = [&](int k) { return Side{contact_at(a, k, sticking), line_at(a, from, a.other[k])}; };
     auto press_at = [&](int k, auto press) {
         Given given = given_at(a, k);
         const Impulse added = press(given);
@@ -253,7 +253,7 @@ __device__ inline void finish(int thread, const Arrays& a, int odd, Real relaxat
         if (a.totals[STICKING])
             keep_sides(
                 a, body, sides.x + first, sides.y, threads,
-                [&](int k) { return Side{contact_at(a, k), line_at(a, lines, a.other[k])}; },
+                [&](int k) { return Side{contact_at(a, k, true), line_at(a, lines, a.other[k])}; },
                 [&](int k) { return given_at(a, k); }, relaxation, dt);
         if (first == 0) finish_body(a, slot, sides, body);
     });
