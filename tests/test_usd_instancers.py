@@ -96,12 +96,13 @@ def test_two_hundred_balls_move_as_prims_do(device, tmp_path):
     assert np.abs(poses[3] - poses[0])[:, 3].max() > 1e-3  # they jump
     np.testing.assert_allclose(poses, expected, rtol=0.0, atol=1e-5)
     np.testing.assert_allclose(moments[1:], theirs[1:], rtol=0.0, atol=1e-5 * np.abs(theirs).max())
-    export(tmp_path / "many.out.usda", tmp_path / "render.usdc", rate=60.0)
-    stage = Usd.Stage.Open(str(tmp_path / "render.usdc"))
-    shown = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/Render/Balls"))
-    above = UsdGeom.XformCache(3.0).GetLocalToWorldTransform(shown.GetPrim())
-    seen = np.array([above.Transform(one) for one in shown.GetPositionsAttr().Get(3.0)])
-    np.testing.assert_allclose(np.sort(seen, axis=0), np.sort(poses[3, :, 3, :3], axis=0), atol=1e-6)
+    for source, frame in ((tmp_path / "many.out.usda", 3), (tmp_path / "many.usda", 0)):
+        export(source, tmp_path / "render.usdc", rate=60.0)
+        stage = Usd.Stage.Open(str(tmp_path / "render.usdc"))
+        shown = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/Render/Balls"))
+        above = UsdGeom.XformCache(frame).GetLocalToWorldTransform(shown.GetPrim())
+        seen = np.array([above.Transform(one) for one in shown.GetPositionsAttr().Get(frame)])
+        np.testing.assert_allclose(np.sort(seen, axis=0), np.sort(poses[frame, :, 3, :3], axis=0), atol=1e-6)
 
 
 def test_instances_stand_where_usd_puts_them(tmp_path):

@@ -117,18 +117,21 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
 
 
 def open_motion(path: str | os.PathLike) -> Usd.Stage:
-    """Open a stage as it moves, held at no moment.
+    """Open a stage as it moves, held at no moment, in its own units, with a prim for each instance of a body.
 
     It is read in this process at once: to read a long run's samples in a process of their own first would take longer
     than to export them.
 
     Raises:
-        InputError: The file is missing, is not USD or does not compose.
+        InputError: The file is missing, is not USD, does not compose, or has instancers that make no sense.
     """
     file = usable_path(path)
     if not os.path.isfile(file):
         raise InputError(f"{path}: no such file")
-    return _open(file, path)
+    stage = _open(file, path)
+    with readable(str(path)):
+        expand_instancers(stage, start_of(stage))
+    return stage
 
 
 def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
