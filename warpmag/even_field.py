@@ -33,7 +33,7 @@ MOST_FACETS = 1500
 """A mesh of more triangles is left as its cells are."""
 
 MOST_MOMENTS = 6200
-"""A body of more moments is left as its cells are: arrays of their pairs take 0.3 GB."""
+"""A body of more moments is left as its cells are: arrays of their pairs take 0.6 GB."""
 
 _RATIOS = 0.9, 4.0
 """Moments of surfaces over those of cells: others come from surfaces that nearly meet, which facets do not resolve."""
@@ -154,10 +154,10 @@ def _operator(coupling: Coupling, lattice: Lattice):
 
     Of r(r·m), r = x − y, each factor is a sum over y that a product of matrices makes.
     """
-    unit, n = float(lattice.radii.max()), len(lattice.volumes)  # of length, for numbers of any size in float32
+    unit, n = float(lattice.radii.max()), len(lattice.volumes)
     x, radii = (lattice.positions - lattice.positions.mean(axis=0)) / unit, lattice.radii / unit
     root, tensors = np.sqrt(lattice.volumes / unit**3), full_tensors(coupling.tensor) * unit**3
-    even, odd = np.empty((2, n, n), np.float32)  # far coarser than what is sought
+    even, odd = np.empty((2, n, n))
     step = max(1, _CHUNK // n)
     for start in range(0, n, step):
         rows = slice(start, start + step)
@@ -170,10 +170,10 @@ def _operator(coupling: Coupling, lattice: Lattice):
         along = np.einsum("nk,nkf->nf", x, m)
         products = (x[:, k, None, None] * m for k in range(3))
         parts = np.concatenate([m, along[:, None], *products, x[:, :, None] * along[:, None]], axis=1)
-        sums = (odd @ parts.reshape(n, -1).astype(np.float32)).reshape(n, 16, -1)
+        sums = (odd @ parts.reshape(n, -1)).reshape(n, 16, -1)
         inner = np.einsum("nk,nkf->nf", x, sums[:, :3]) - sums[:, 3]
         outer = np.einsum("nklf,nl->nkf", sums[:, 4:13].reshape(n, 3, 3, -1), x) - sums[:, 13:]
-        near = (even @ m.reshape(n, -1).astype(np.float32)).reshape(m.shape)
+        near = (even @ m.reshape(n, -1)).reshape(m.shape)
         field = (near + x[:, :, None] * inner[:, None] - outer) / (4.0 * np.pi)
         field += np.add.reduceat(tensors @ m[coupling.other], coupling.start[:-1], axis=0)
         return -field * root[:, None, None]
