@@ -11,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
 from warpmag import cli, oracle
 from warpmag.errors import InputError
 from warpmag.export import export
 from warpmag.field_lines import trace
+from warpmag.final import render_final
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, balls_up
 from warpmag.usd import CacheWriter, open_stage
@@ -286,6 +288,26 @@ def test_a_run_for_renderers(tmp_path, device, capsys):
     assert "colour         force, from 0 to" in capsys.readouterr().out
 
 
+def test_a_finished_picture_that_cannot_be_is_told_in_a_line(run, monkeypatch):
+    monkeypatch.setenv("WARPMAG_BLENDER", str(run.with_name("no_python")))
+    command = ["render", str(run), "--quality", "final", "-o"]
+    for arguments, message in (
+        ([run.with_name("a.gif")], "a finished picture must end in .png or .jpg"),
+        ([run.with_name("a.png"), "--size", "0x9"], "width: must be at least 1"),
+        ([run.with_name("a.png"), "--frames", "0:3"], "quality: 'final' draws one frame"),
+        ([run.with_name("a.png")], "WARPMAG_BLENDER: .*no_python is no Python that can be started"),
+    ):
+        with pytest.raises(InputError, match=message):
+            options = cli._parser().parse_args([*command, *map(str, arguments)])
+            options.command(options)
+    monkeypatch.setenv("WARPMAG_BLENDER", sys.executable)  # which has none
+    if not importlib.util.find_spec("bpy"):
+        with pytest.raises(InputError, match="Blender could not draw it .*No module named 'bpy'"):
+            render_final(run, run.with_name("a.png"))
+    with pytest.raises(InputError, match="frame: .* has frames 0 to 4, got 5"):
+        render_final(run, run.with_name("a.png"), frame=5)
+
+
 BLENDER = os.environ.get("WARPMAG_BLENDER", sys.executable if importlib.util.find_spec("bpy") else "")
 """A Python that has ``bpy``: Blender's USD and ours cannot live in one process."""
 
@@ -311,3 +333,12 @@ def test_blender_shows_every_body(name, exported, run, tmp_path):
             place = [np.interp(at, times, body_q[:, body, axis]) for axis in range(3)]
             assert np.linalg.norm(places - place, axis=1).min() < 1e-5
     assert 0.2 < seen["brightness"] < 0.8
+
+
+@pytest.mark.skipif(not BLENDER, reason="needs bpy, here or in the Python that WARPMAG_BLENDER names")
+def test_a_finished_picture(run, monkeypatch):
+    """It has the size asked for, and is neither dark nor glaring."""
+    monkeypatch.setenv("WARPMAG_BLENDER", BLENDER)
+    written = render_final(run, run.with_name("final.png"), frame=2, size=(160, 90), samples=4)
+    pixels = imread(written)[..., :3]
+    assert pixels.shape == (90, 160, 3) and 0.2 < pixels.mean() < 0.8
