@@ -102,7 +102,7 @@ def table(path, units):
     author = Author(path, units)
     author.place(author.shape("Cube", "Table", size=0.2), (0.0, 0.0, -0.1))
     shoe = author.place(author.horseshoe("Horseshoe"), (0.0, 0.0, 0.035))
-    author.magnet(author.body(shoe, kinematic=True), 0.008, kind="permanent", magnetization=(6e5, 0.0, 0.0))
+    author.magnet(author.body(shoe, kinematic=True), 0.008, kind="permanent", magnetization=(3e5, 0.0, 0.0))
     for k in range(4):
         disc = author.shape("Cylinder", f"Disc{k}", radius=0.005, height=0.002, axis="Z")
         author.place(disc, (0.013 * (k - 1.5), 0.006 * (k % 2), 0.006))
@@ -142,7 +142,7 @@ def test_an_artists_table_runs_as_its_twin(device, tmp_path):
         found.append(motion(output))
     (places, moments), (theirs, others) = found
     assert places.shape == (2, 8, 3) and np.abs(places[1] - places[0]).max() > 1e-3
-    # Nails have come to rest on the table. As soon as discs hit edges, rounding grows without bound.
+    # Nails have come to rest on the table. Later, as discs hit edges, rounding grows without bound.
     np.testing.assert_allclose(theirs, places, rtol=0.0, atol=1e-5)
     np.testing.assert_allclose(others[1:], moments[1:], rtol=0.0, atol=1e-4 * np.abs(moments).max())
 
