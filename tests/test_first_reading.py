@@ -1,9 +1,11 @@
 """Stages that USD's own reader dies of are read in a process of its own first."""
 
 import os
+import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from pxr import Sdf
@@ -146,6 +148,31 @@ def test_a_reader_that_computes_without_end(tmp_path, monkeypatch):
 
     monkeypatch.setattr(subprocess, "run", busy)
     with pytest.raises(InputError, match="stage.usdc: USD did not read it within 30 s"):
+        open_stage(path)
+
+
+def test_long_layers_of_a_run_have_their_time(tmp_path, monkeypatch):
+    """The root of a run is short, and the cache that it names is what takes time to read."""
+    crate(tmp_path / "long.usdc")
+    with open(tmp_path / "long.usdc", "ab") as file:
+        file.truncate(100_000_000)
+    root = tmp_path / "root.usda"
+    root.write_text(HEAD + "(subLayers = [@./long.usdc@, @./long.usdc@, @./none.usdc@])\n")
+    limits, run = [], subprocess.run
+
+    def noted(command, **options):
+        limits.append(int(command[-1]))
+        return run(command, **options)
+
+    monkeypatch.setattr(subprocess, "run", noted)
+    assert not first_reading.first_reading(root)
+    assert limits == [50]
+
+
+def test_a_name_of_variants_that_are_not_there_is_damage(tmp_path):
+    """One byte of a stage with variants is zero, so that their set has no name; USD's validators die of it."""
+    path = Path(shutil.copy(Path(__file__).parent / "fuzz" / "lost_variants.usdc", tmp_path / "stage.usdc"))
+    with pytest.raises(InputError, match=r"stage.usdc: damaged: what /World/Earth names is not there"):
         open_stage(path)
 
 

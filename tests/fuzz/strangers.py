@@ -234,7 +234,8 @@ def empty(layer, prims, chance) -> str:
             if key not in ("primChildren", "subLayers", "subLayerOffsets"):
                 layer.pseudoRoot.ClearInfo(key)
     else:
-        for one in {path for path in prims if layer.GetPrimAtPath(path).typeName == "PhysicsScene"}:
+        scenes = {path for path in prims if layer.GetPrimAtPath(path).typeName == "PhysicsScene"}
+        for one in sorted(scenes, reverse=True):  # what is below others first
             del layer.GetPrimAtPath(one).nameParent.nameChildren[one.name]
     return ("no prims", "no metadata", "no scene")[kind]
 

@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -23,7 +24,7 @@ MOST_PRIMS = 500_000
 FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError)
 """What USD raises over a stage; its own errors are of the first kind."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 5e6
-"""CPU time that a reading may take [s], and bytes for which it may take a second more."""
+"""CPU time that a reading may take [s], and bytes, those of named files among them, for which a second more."""
 _LOADED = 2
 """How many times that it may take on a machine that has other things to do."""
 _FILLS = 165, 90
@@ -42,6 +43,7 @@ _PRINTED = {
 _TEXT = b"#usda"
 _ARCS = (b"@", b"references", b"payload", b"inherits", b"specializes", b"prototypes")
 """What a text holds by which other files, or prims again, become part of it."""
+_NAMED = re.compile(rb"@([^@\n\0]+)@")
 _OPENING, _CLOSING = b"{[(", b"}])"
 _OTHERS = bytes(set(range(256)) - {*_OPENING, *_CLOSING})
 
@@ -65,6 +67,7 @@ def first_reading(path: str | os.PathLike) -> str:
             return f"brackets are nested more than {DEEPEST_NESTING} deep"
         if not any(arc in content for arc in _ARCS):
             return ""
+        size += _bytes_named(os.path.dirname(path), content)
     limit = round(_SECONDS + size / _BYTES_PER_SECOND)
     program = [sys.executable or "", "-S", "-E", __file__]
     command = [*program, json.dumps(sys.path), str(path), str(MOST_PRIMS), str(limit)]
@@ -85,6 +88,12 @@ def first_reading(path: str | os.PathLike) -> str:
     # what USD prints itself it would print again, past all that could keep it quiet
     printed = [meaning for words, meaning in _PRINTED.items() if words in done.stderr]
     return why or "".join(printed[:1])
+
+
+def _bytes_named(folder: str, text: bytes) -> int:
+    """Return how long the files are that a text names, such as the layers of a run."""
+    names = {os.path.join(folder, os.fsdecode(name)) for name in _NAMED.findall(text)}
+    return sum(os.path.getsize(name) for name in names if os.path.isfile(name))
 
 
 def _depth(text: bytes) -> int:
@@ -118,12 +127,25 @@ def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, whic
         for layer in stage.GetUsedLayers():
             if layer.GetFileFormat().formatId == "usda":  # all of a text is read at once
                 continue
+            if lost := _lost(layer):
+                return f"damaged: what {lost} names is not there"
             if os.path.getsize(Ar.SplitPackageRelativePathOuter(layer.realPath)[0]) > _TWICE:
                 Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
             elif not _reads_alike(layer):
                 return "damaged: USD takes some of its values from memory, not from the file"
     except FAILURES as error:
         return f"not a USD file ({failure(error)})"
+    return ""
+
+
+def _lost(layer) -> str:  # pragma: no cover - in the child, too
+    """Return a place that names something which the layer does not hold; USD's validators die of it."""
+    paths = []
+    layer.Traverse("/", paths.append)
+    for path in paths:
+        spec = layer.GetObjectAtPath(path)
+        if spec is None or None in getattr(spec, "variantSets", {}).values():
+            return str(path)
     return ""
 
 
