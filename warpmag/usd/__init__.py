@@ -12,11 +12,11 @@ from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_s
 from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
-from warpmag.usd.looks import author_surface
+from warpmag.usd.looks import author_surface, metalness
 from warpmag.usd.meshes import author_mesh
 from warpmag.usd.motion import Recording, read_recording
 from warpmag.usd.paths import usable_path
-from warpmag.usd.playback import Playback, metalness
+from warpmag.usd.playback import Playback
 from warpmag.usd.reader import (
     StageContents,
     describe,

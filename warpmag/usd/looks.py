@@ -69,3 +69,12 @@ def _connect(material, name, identifier, values, output, own_output) -> None:
         kind = Sdf.ValueTypeNames.Float if isinstance(value, float) else Sdf.ValueTypeNames.Color3f
         shader.CreateInput(key, kind).Set(value)
     output.ConnectToSource(shader.ConnectableAPI(), own_output)
+
+
+def metalness(stage: Usd.Stage, prim: str) -> float:
+    """Return how metallic the surface of a prim is, 0 to 1, after the UsdPreviewSurface that is bound to it."""
+    found = stage.GetPrimAtPath(prim)
+    material, _ = UsdShade.MaterialBindingAPI(found).ComputeBoundMaterial() if found else (None, None)
+    surface = material.ComputeSurfaceSource()[0] if material else None
+    value = surface.GetInput("metallic").Get() if surface and surface.GetInput("metallic") else None
+    return min(max(float(value), 0.0), 1.0) if isinstance(value, float) else 0.0

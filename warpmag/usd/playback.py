@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Usd, UsdGeom
 
 from warpmag.usd.reader import hold
 
@@ -35,12 +35,3 @@ class Playback:
             value = self._stage.GetPrimAtPath(prim).GetAttribute("warpmag:moment").Get()
             row[:] = 0.0 if value is None else value
         return found
-
-
-def metalness(stage: Usd.Stage, prim: str) -> float:
-    """Return how metallic the surface of a prim is, 0 to 1, after the UsdPreviewSurface that is bound to it."""
-    found = stage.GetPrimAtPath(prim)
-    material, _ = UsdShade.MaterialBindingAPI(found).ComputeBoundMaterial() if found else (None, None)
-    surface = material.ComputeSurfaceSource()[0] if material else None
-    value = surface.GetInput("metallic").Get() if surface and surface.GetInput("metallic") else None
-    return min(max(float(value), 0.0), 1.0) if isinstance(value, float) else 0.0
