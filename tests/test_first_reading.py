@@ -172,7 +172,7 @@ def test_long_layers_of_a_run_have_their_time(tmp_path, monkeypatch):
 def test_a_name_of_variants_that_are_not_there_is_damage(tmp_path):
     """One byte of a stage with variants is zero, so that their set has no name; USD's validators die of it."""
     path = Path(shutil.copy(Path(__file__).parent / "fuzz" / "lost_variants.usdc", tmp_path / "stage.usdc"))
-    with pytest.raises(InputError, match=r"stage.usdc: damaged: what /World/Earth names is not there"):
+    with pytest.raises(InputError, match=r"stage.usdc: damaged: /World/Earth names variants that are not there"):
         open_stage(path)
 
 

@@ -128,7 +128,7 @@ def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, whic
             if layer.GetFileFormat().formatId == "usda":  # all of a text is read at once
                 continue
             if lost := _lost(layer):
-                return f"damaged: what {lost} names is not there"
+                return f"damaged: {lost} names variants that are not there"
             if os.path.getsize(Ar.SplitPackageRelativePathOuter(layer.realPath)[0]) > _TWICE:
                 Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
             elif not _reads_alike(layer):
@@ -139,12 +139,12 @@ def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, whic
 
 
 def _lost(layer) -> str:  # pragma: no cover - in the child, too
-    """Return a place that names something which the layer does not hold; USD's validators die of it."""
+    """Return a prim that names a set of variants which the layer does not hold; USD's validators die of it."""
     paths = []
     layer.Traverse("/", paths.append)
     for path in paths:
-        spec = layer.GetObjectAtPath(path)
-        if spec is None or None in getattr(spec, "variantSets", {}).values():
+        spec = layer.GetPrimAtPath(path) if path.IsPrimPath() else None
+        if spec and None in spec.variantSets.values():
             return str(path)
     return ""
 
