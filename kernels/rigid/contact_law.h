@@ -142,11 +142,17 @@ CUDA_CALLABLE inline Vector across(Vector n) {
     return scaled(inverse_length(t), t);
 }
 
-// Friction is relaxed by this part of what pushes are: it turns balls besides, and with momentum all of it diverges.
-constexpr Real FRICTION = Real(0.35);
 // What sticks goes back by this part of its slip in a substep: all at once, layers that fall on each other come back at
 // the speed of what the first impact left, and overlap three times as far.
 constexpr Real RETURN = Real(0.3);
+
+// How easily an impulse across a unit vector moves a share of a body along itself at most.
+CUDA_CALLABLE inline Number easiest_across(const Body& body, const Inertia& inertia, Vector arm, Vector n) {
+    const Vector a = across(n), b = cross(n, a);
+    const Number aa = ease(body, inertia, arm, a, a), ab = ease(body, inertia, arm, a, b);
+    const Number bb = ease(body, inertia, arm, b, b), half = Real(0.5) * (aa - bb);
+    return Real(0.5) * (aa + bb) + root(half * half + ab * ab);
+}
 
 // Prepares a contact, which has slipped so far while it stuck, for iterations that relax it by a part of what it lacks.
 CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pose& other, const Body& body,
@@ -167,17 +173,15 @@ CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pos
     const Vector other_drift = sum(other_body.v, its);
     const Number lent = t.kinematic * dot(n, drift) - t.other_kinematic * dot(n, other_drift);
     c.gap_speed = larger((dot(n, sum(apart, points)) - t.margin) / dt - lent, n.x * Real(0) - PUSH_OUT);
-    auto both = [&](Vector a, Vector b) {
-        return ease(body, inertia, c.arm, a, b) + ease(other_body, other_inertia, c.other_arm, a, b);
-    };
-    // the easiest direction across the normal, from those of two axes
-    const Vector a = across(n), b = cross(n, a);
-    const Number aa = both(a, a), ab = both(a, b), bb = both(b, b), half = Real(0.5) * (aa - bb);
-    const Number rub_ease = Real(0.5) * (aa + bb) + root(half * half + ab * ab), none = n.x * Real(0);
-    c.push_rate = quotient(none + relaxation, both(n, n));
-    c.rub_rate = quotient(none + FRICTION * relaxation, rub_ease);
+    // the sums over both bodies that mass_splitting.py bounds
+    const Number none = n.x * Real(0), push_ease = ease(body, inertia, c.arm, n, n),
+                 other_push_ease = ease(other_body, other_inertia, c.other_arm, n, n);
+    const Number rub_ease = easiest_across(body, inertia, c.arm, n),
+                 other_rub_ease = easiest_across(other_body, other_inertia, c.other_arm, n);
+    c.push_rate = quotient(none + relaxation, push_ease + other_push_ease);
+    c.rub_rate = quotient(none + Real(FRICTION) * relaxation, rub_ease + other_rub_ease);
     c.turn_rate =
-        quotient(none + FRICTION * relaxation, turn_ease(body, inertia) + turn_ease(other_body, other_inertia));
+        quotient(none + Real(FRICTION) * relaxation, turn_ease(body, inertia) + turn_ease(other_body, other_inertia));
     c.mu = t.mu, c.torsional = t.torsional, c.rolling = t.rolling;
     c.back = {scaled(RETURN / dt, tangential(slipped.linear, n)), scaled(RETURN / dt, slipped.turn)};
     return c;
@@ -213,8 +217,8 @@ struct Given {
 // Nesterov's momentum: the part of its last change that an impulse goes on by. It is bounded, so that nothing has to
 // tell when to begin anew, and the last iteration leaves impulses that contacts admit.
 CUDA_CALLABLE inline Real momentum_at(int iteration, int iterations) {
-    const Real part = Real(iteration) / (iteration + 3);
-    return iteration == iterations - 1 ? 0 : part < Real(0.8) ? part : Real(0.8);
+    const Real part = Real(iteration) / (iteration + 3), most = Real(MOMENTUM);
+    return iteration == iterations - 1 ? 0 : part < most ? part : most;
 }
 // One iteration of a contact: returns the impulse that it adds.
 CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body& other, Given& given, Real momentum) {
@@ -231,7 +235,7 @@ CUDA_CALLABLE inline Slip slipped_so_far(const Contact& c, const Body& own, cons
     auto after = [&](Vector back, Vector now) { return scaled(dt, sum(scaled(1 / RETURN, back), now)); };
     const Vector linear = after(c.back.linear, tangential(slip.linear, c.normal));
     const Vector turn = after(c.back.turn, slip.turn);
-    const Number push = FRICTION * relaxation * dt / RETURN * dot(p.linear, c.normal);
+    const Number push = Real(FRICTION) * relaxation * dt / RETURN * dot(p.linear, c.normal);
     const Number per_turn = quotient(push, c.turn_rate);
     return {at_most(linear, quotient(c.mu * push, c.rub_rate)),
             limited(turn, c.normal, c.rolling * per_turn, c.torsional * per_turn)};

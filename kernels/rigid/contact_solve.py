@@ -32,6 +32,8 @@ _CONTACTS_PER_THREAD = 100
 PUSH_OUT = 2.0
 """Most speed at which bodies that overlap are moved apart [m/s]: they keep it when they are. In the longest substep,
 0.5 ms, it undoes an overlap of 1 mm, and what 5 mm balls may newly overlap in a step in the shortest, 31 µs."""
+FRICTION, MOMENTUM = 0.35, 0.8
+"""Part of what pushes are relaxed by for friction, which turns balls besides, and most momentum of an iteration."""
 _ROUND = 1e-6
 """Part by which inverse inertias of a round body may differ, and products of inertia from zero: float32 rounding."""
 _TOUCH, _BACK, _GIVEN, _RECORD, _KEPT = 20, 8, 12, 8, 9
@@ -217,7 +219,9 @@ def solve_kernel(call: str, is_round: bool, group: int, cluster: int = 0, lines:
         constants["WIDE"] = 2**30  # groups take all bodies
     constants |= dict(CLUSTER=cluster, LINES=lines)
     options = dict(cluster_dim=cluster, launch_bounds=block) if cluster else {}
-    constants |= dict(PUSH_OUT=PUSH_OUT, BLOCK=block, CONTACTS_PER_THREAD=_CONTACTS_PER_THREAD)
+    constants |= dict(
+        PUSH_OUT=PUSH_OUT, FRICTION=FRICTION, MOMENTUM=MOMENTUM, BLOCK=block, CONTACTS_PER_THREAD=_CONTACTS_PER_THREAD
+    )
 
     @wp.func_native(f"warpmag::{call};")
     def run(

@@ -1,6 +1,6 @@
 """Newton's XPBD, corrected for bodies that are pressed together, whose work follows contacts.
 
-Corners of boxes that lie face to face together overshoot what each of them corrects. Bodies that are no balls are
+Corners of boxes that lie face to face together overshoot what each of them corrects. Bodies are
 therefore split among their contacts (``kernels.rigid.mass_splitting``).
 
 Newton's solver launches every iteration over all contacts that its buffers may hold, and adds them up with atomics, in
@@ -24,10 +24,12 @@ from warpmag.engine.joints import JointSolve
 from warpmag.kernels.rigid import contact_solve
 from warpmag.kernels.rigid.free_motion import launch_accelerate, launch_move
 from warpmag.kernels.rigid.joints import launch_move_by
-from warpmag.kernels.rigid.mass_splitting import launch_count_shares, launch_split_masses
+from warpmag.kernels.rigid.mass_splitting import ENTRIES, launch_find_shares, launch_split_masses
 from warpmag.kernels.rigid.newton_views import BodyView, view_bodies, view_contacts
 
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
+_ALIKE = 0.1
+"""Part by which radii and inverse masses of balls may differ that count as alike."""
 
 
 class PileXPBD(newton.solvers.SolverXPBD):
@@ -47,11 +49,11 @@ class PileXPBD(newton.solvers.SolverXPBD):
             settings: Those of Newton's solver.
         """
         super().__init__(model, **settings)
-        splits = ~_single_balls(model) & (self.body_inv_mass_effective.numpy() > 0.0)
-        self._splits = wp.array(splits.astype(np.int32), dtype=wp.int32, device=model.device) if splits.any() else None
+        splits = _splits(model, self.body_inv_mass_effective.numpy())
+        self._splits = wp.array(splits, dtype=wp.int32, device=model.device) if splits.any() else None
         self._contact_iterations = contact_iterations or self.iterations
-        self._counts = wp.zeros(model.body_count, dtype=float, device=model.device)
-        self._shares = wp.ones_like(self._counts)
+        self._entries = wp.zeros((ENTRIES, model.body_count), dtype=wp.int32, device=model.device)
+        self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
         self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         others = model.particle_count, model.tendon_segment_count, self.enable_restitution
         self._solve = self._joints = None
@@ -69,12 +71,10 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; as Newton's."""
-        if self._splits is not None:
-            view = view_contacts(self.model, contacts)
-            launch_count_shares(view, state_in.body_q, self._splits, self._counts, self._shares)
         if self._solve is not None and contacts.rigid_contact_surface_velocity is None:
             self._step_bodies(state_in, state_out, contacts, dt)
             return
+        self._find_shares(self._view_bodies(state_in), contacts, dt)
         if self._joints is not None:
             self._step_joints(state_in, state_out, control, contacts, dt)
             return
@@ -89,6 +89,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
         assert self._solve is not None
         before, after = self._view_bodies(state_in), self._view_bodies(state_out)
         launch_accelerate(before, self.model.gravity, _KINEMATIC, dt, state_out.body_q, state_out.body_qd)
+        self._find_shares(after, contacts, dt)
         contact_solve.launch_solve_contacts(
             self._solve,
             view_contacts(self.model, contacts),
@@ -99,6 +100,19 @@ class PileXPBD(newton.solvers.SolverXPBD):
             dt=dt,
         )
         launch_move(after, _KINEMATIC, dt)
+
+    def _find_shares(self, bodies: BodyView, contacts, dt: float) -> None:
+        if self._splits is None:
+            return
+        launch_find_shares(
+            view_contacts(self.model, contacts),
+            bodies,
+            self._splits,
+            self._entries,
+            self._shares,
+            relaxation=self.rigid_contact_relaxation,
+            dt=dt,
+        )
 
     def _step_joints(self, state_in, state_out, control, contacts, dt) -> None:
         assert self._joints is not None
@@ -140,12 +154,18 @@ class PileXPBD(newton.solvers.SolverXPBD):
         return then.body_q, then.body_qd
 
 
-def _single_balls(model: newton.Model) -> np.ndarray:
-    """Return which bodies are one ball, as far as they collide, or nothing at all, shape [body_count]."""
+def _splits(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:
+    """Return which bodies contacts may split, as integers, shape [body_count].
+
+    Balls that are all alike stay whole: in their heaps neighbours take half of each correction.
+    """
     colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
     shape_body, types = model.shape_body.numpy(), model.shape_type.numpy()
-    shapes = np.bincount(shape_body[colliding & (shape_body >= 0)], minlength=model.body_count)
-    others = np.bincount(
-        shape_body[colliding & (shape_body >= 0) & (types != newton.GeoType.SPHERE)], minlength=model.body_count
-    )
-    return (shapes <= 1) & (others == 0)
+    of_bodies = colliding & (shape_body >= 0)
+    shapes = np.bincount(shape_body[of_bodies], minlength=model.body_count)
+    is_ball = of_bodies & (types == newton.GeoType.SPHERE)
+    balls = (shapes == 1) & (np.bincount(shape_body[is_ball], minlength=model.body_count) == 1) & (inv_mass > 0.0)
+    radii = np.zeros(model.body_count)
+    radii[shape_body[is_ball]] = model.shape_scale.numpy()[is_ball, 0]
+    alike = not any(np.ptp(x[balls]) > _ALIKE * np.max(x[balls]) for x in (radii, inv_mass) if balls.any())
+    return ((inv_mass > 0.0) & (shapes > 0) & ~(balls & alike)).astype(np.int32)
