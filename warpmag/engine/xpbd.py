@@ -1,7 +1,7 @@
 """Newton's XPBD, corrected for bodies that are pressed together, whose work follows contacts.
 
-Corners of boxes that lie face to face together overshoot what each of them corrects. Bodies are
-therefore split among their contacts (``kernels.rigid.mass_splitting``).
+Corners of boxes that lie face to face together overshoot what each of them corrects. Bodies are therefore split among
+their contacts (``kernels.rigid.mass_splitting``).
 
 Newton's solver launches every iteration over all contacts that its buffers may hold, and adds them up with atomics, in
 another order in every run. Rigid bodies are moved by ``kernels.rigid.contact_solve`` instead, which solves the same
@@ -166,6 +166,6 @@ def _splits(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:
     is_ball = of_bodies & (types == newton.GeoType.SPHERE)
     balls = (shapes == 1) & (np.bincount(shape_body[is_ball], minlength=model.body_count) == 1) & (inv_mass > 0.0)
     radii = np.zeros(model.body_count)
-    radii[shape_body[is_ball]] = model.shape_scale.numpy()[is_ball, 0]
+    np.put(radii, shape_body[is_ball], model.shape_scale.numpy()[is_ball, 0])
     alike = not any(np.ptp(x[balls]) > _ALIKE * np.max(x[balls]) for x in (radii, inv_mass) if balls.any())
     return ((inv_mass > 0.0) & (shapes > 0) & ~(balls & alike)).astype(np.int32)
