@@ -20,6 +20,7 @@ from pathlib import Path
 
 os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # USD's threads do not survive a fork
 os.environ["CUDA_VISIBLE_DEVICES"] = ""  # nor does CUDA
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # a worker has a share of the cores, and they would wait for each other
 
 
 def main() -> int:

@@ -236,7 +236,8 @@ def empty(layer, prims, chance) -> str:
     else:
         scenes = {path for path in prims if layer.GetPrimAtPath(path).typeName == "PhysicsScene"}
         for one in sorted(scenes, reverse=True):  # what is below others first
-            del layer.GetPrimAtPath(one).nameParent.nameChildren[one.name]
+            place = layer.GetPrimAtPath(one)
+            del (place.nameParent or layer.pseudoRoot).nameChildren[one.name]
     return ("no prims", "no metadata", "no scene")[kind]
 
 

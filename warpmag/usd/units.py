@@ -230,6 +230,6 @@ def _scaled(value, scale: float):
         return value * scale
     if isinstance(value, _ARRAYS):
         numbers = np.asarray(value)
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):  # the reader refuses what is not finite
             return type(value).FromNumpy(np.ascontiguousarray(scale * numbers, dtype=numbers.dtype))
     return None
