@@ -1,5 +1,7 @@
 """Sums over pairs in cells that are neighbours, against the float64 oracle."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import warp as wp
@@ -43,7 +45,7 @@ def launch(quantity, leaves, labels, dtype, device):
     packed = np.zeros((8, columns))
     packed[:3, :n], packed[3], packed[4:7, :n], packed[7] = positions.T, radii[0], moments.T, -1
     packed[3, :n], packed[7, :n] = radii, labels
-    rows = wp.array(packed, dtype=dtype, device=device)[:, :n]
+    rows: Any = wp.array(packed, dtype=dtype, device=device)[:, :n]
 
     def integers(values):
         return wp.array(np.ascontiguousarray(values), dtype=wp.int32, device=device)
@@ -60,7 +62,7 @@ def are_near(leaves) -> np.ndarray:
     """Whether leaves of two moments are neighbours, shape [n, n]."""
     _, _, _, places, _, begin = leaves
     own = np.repeat(places, np.diff(begin), axis=0)
-    return (np.abs(own[:, None] - own[None]) <= 1).all(axis=2)
+    return np.all(np.abs(own[:, None] - own[None]) <= 1, axis=2)
 
 
 def wanted_sums(leaves, labels):
@@ -104,18 +106,20 @@ def test_sums_are_of_pairs_in_neighbouring_cells(device, quantity, dtype):
     np.testing.assert_array_equal(found, launch(quantity, leaves, labels, dtype, device))
 
 
-def test_near_and_far_make_all(device):
+def test_points_in_two_cells_a_side_are_all_near(device):
     """In a grid of two cells a side all cells are neighbours: the sums are those over all pairs."""
     leaves = make_leaves(np.full((2, 2, 2), 20), 0.0)
     positions, moments = leaves[:2]
-    found = launch(Quantity.FIELD, leaves, np.arange(len(positions)), wp.float64, device)
-    np.testing.assert_allclose(found / (4 * np.pi), oracle.h_field(positions, moments), rtol=1e-9)
+    found = launch(Quantity.FIELD, leaves, np.arange(len(positions)), wp.float32, device)
+    wanted = 4 * np.pi * oracle.h_field(positions, moments)
+    # of the nearest pairs, whose separations have lost digits
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=2e-5 * np.abs(wanted).max())
 
 
 def test_a_cell_of_many_moments_is_summed_in_parts(device):
-    counts = np.array([[[700, 3, 1300]]])
-    leaves = make_leaves(counts, 0.0)
+    counts = np.array([[[650, 3, 700]]])
+    leaves = make_leaves(counts, 0.01)
     labels = np.arange(len(leaves[0]))
-    found = launch(Quantity.FIELD, leaves, labels, wp.float64, device)
+    found = launch(Quantity.FIELD, leaves, labels, wp.float32, device)
     field = wanted_sums(leaves, labels)[2]
-    np.testing.assert_allclose(found, field, rtol=1e-9, atol=1e-12 * np.abs(field).max())
+    np.testing.assert_allclose(found, field, rtol=0, atol=2e-5 * np.abs(field).max())

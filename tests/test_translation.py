@@ -58,7 +58,7 @@ def make_grid(side: int, levels: int, kept: float) -> Grid:
 
 @cache
 def matrices(degree: int) -> np.ndarray:
-    return np.stack([harmonics.multipole_to_local(degree, -offset) for offset in displacements()])
+    return harmonics.multipole_to_local(degree, -displacements())
 
 
 def translate(grid: Grid, multipoles, degree: int, dtype, device) -> np.ndarray:

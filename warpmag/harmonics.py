@@ -69,8 +69,8 @@ def regular(degree: int, points) -> np.ndarray:
             if n > m:
                 grown = (2 * n - 1) * z * last - np.sqrt((n + m - 1) * (n - m - 1)) * r2 * before
                 last, before = grown / np.sqrt((n + m) * (n - m)), last
-            values[n * n + n - m] = last.imag
-            values[n * n + n + m] = last.real
+            values[n * n + n - m] = np.imag(last)
+            values[n * n + n + m] = np.real(last)
     return values.T.copy()
 
 
@@ -90,12 +90,22 @@ def derivatives(degree: int) -> np.ndarray:
         i = np.flatnonzero(np.abs(m + shift) < n)
         mixed[k, i, n[i] * n[i] - n[i] + m[i] + shift] = sign
     below, above, along = (_real(matrix, degree) for matrix in mixed)
-    return np.stack([((above + below) / 2).real, ((above - below) / 2j).real, along.real])
+    return np.real(np.stack([(above + below) / 2, (above - below) / 2j, along]))
 
 
 def regular_gradients(degree: int, points) -> np.ndarray:
     """Gradients of regular harmonics, shape [n, K, 3]; ``points`` as in ``regular``."""
-    return np.einsum("cij,nj->nic", derivatives(degree), regular(degree, points))
+    index, factor = _derivative_terms(degree)
+    values = regular(degree, points)
+    return (values[:, index] * factor).sum(axis=-1).transpose(0, 2, 1)
+
+
+@cache
+def _derivative_terms(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """The two harmonics that a row of ``derivatives`` has at most, and their factors, both of shape [3, K, 2]."""
+    matrices = derivatives(degree)
+    index = np.argsort(-np.abs(matrices), axis=2, kind="stable")[..., :2]
+    return index, np.take_along_axis(matrices, index, axis=2)
 
 
 def dipole_to_multipole(degree: int, points, moments) -> np.ndarray:
@@ -123,25 +133,45 @@ def multipole_to_multipole(degree: int, octant: int) -> np.ndarray:
     return shrink[:, None] * _regular_shift(degree, octant_offset(octant))
 
 
-def multipole_to_local(degree: int, offset) -> np.ndarray:
-    """Matrix that takes a cell's multipole to the local expansion of another of the same size.
+def multipole_to_local(degree: int, offsets) -> np.ndarray:
+    """Matrices that take a cell's multipole to the local expansion of another of the same size.
 
     Args:
         degree: Highest degree of both.
-        offset: From the source's centre to the target's, in units of their edge, shape [3].
+        offsets: From the source's centre to the target's, in units of their edge, shape [3] or [n, 3].
 
     Returns:
-        Shape [K, K]: the target's coefficients in rows.
+        Shape [K, K] or [n, K, K]: the target's coefficients in rows.
     """
-    n, m = degrees(degree), orders(degree)
-    # I(offset + u) of complex harmonics of degree n, in conjugates of regular ones of degree k: degree n + k at offset
-    at_offset = _complex_irregular(2 * degree, np.asarray(offset, np.float64))
-    reached, order = n[:, None] + n[None, :], m[:, None] + m[None, :]
-    shifted = np.where(n % 2, -1, 1) * at_offset[reached * reached + reached + order]
-    # the conjugate of a regular one of order m is (−1)^m that of order −m
-    shifted = (np.where(m % 2, -1, 1) * shifted)[:, _mirrored(degree)]
-    weights = _irregular_scales(degree) / _scales(degree)
-    return (weights[:, None] * _real(shifted, degree)).real.T.copy()
+    offsets = np.asarray(offsets, np.float64)
+    values = irregular(2 * degree, offsets.reshape(-1, 3))
+    added, subtracted, of_added, of_subtracted = _shift_terms(degree)
+    matrices = added * values[:, of_added] + subtracted * values[:, of_subtracted]
+    return matrices.reshape(*offsets.shape[:-1], *added.shape)
+
+
+@cache
+def _shift_terms(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What a matrix of ``multipole_to_local`` has of the harmonics at the offset: two factors, and two indices.
+
+    A complex harmonic V of degree n and order m at d + u is Σ (−1)^k conj(W) V(d), W regular ones of degree k and order
+    j at u, those at d of degree n + k and order m + j. Of the orders ±j, the terms are those of m + |j| and m − |j|.
+    """
+    n, m, sine = degrees(degree), np.abs(orders(degree)), orders(degree) < 0
+    k, j, target_sine = n[:, None], m[:, None], sine[:, None]
+    crossed = target_sine != sine  # sines at the offset
+    reached, sum_order, difference = k + n, m + j, np.abs(m - j)
+    sign = np.where(k % 2, -1.0, 1.0) * _irregular_scales(degree) / _scales(degree)[:, None]
+    added = sign * np.where(target_sine & sine, -1, 1)
+    subtracted = sign * np.where(target_sine & ~sine, -1, 1) * np.where(j % 2, -1, 1)
+    # of a negative order m − |j|, (−1)^(m − j) times the conjugate
+    subtracted = subtracted * np.where(m < j, np.where(difference % 2, -1, 1) * np.where(crossed, -1, 1), 1)
+    subtracted = np.where((j == 0) | (crossed & (difference == 0)), 0, subtracted)
+    side = np.where(crossed, -1, 1)
+    of_added = reached * reached + reached + side * sum_order
+    of_subtracted = reached * reached + reached + side * difference
+    scales = _irregular_scales(2 * degree)
+    return added / scales[of_added], subtracted / scales[of_subtracted], of_added, of_subtracted
 
 
 def local_to_local(degree: int, octant: int) -> np.ndarray:
@@ -199,11 +229,6 @@ def _complex(values: np.ndarray, degree: int) -> np.ndarray:
     return np.where(m < 0, sign * (values[mirrored] - 1j * values), values + np.where(m == 0, 0, 1j) * values[mirrored])
 
 
-def _complex_irregular(degree: int, point: np.ndarray) -> np.ndarray:
-    """Complex irregular harmonics at a point, shape [K]."""
-    return _complex(irregular(degree, point[None, :])[0] / _irregular_scales(degree), degree)
-
-
 def _regular_shift(degree: int, offset: np.ndarray) -> np.ndarray:
     """Matrix A with R_i(u + offset) = Σ_j A[i, j] R_j(u), shape [K, K]."""
     n, m = degrees(degree), orders(degree)
@@ -211,4 +236,4 @@ def _regular_shift(degree: int, offset: np.ndarray) -> np.ndarray:
     lower, order = n[:, None] - n[None, :], m[:, None] - m[None, :]
     exists = np.abs(order) <= lower
     shifted = np.where(exists, at_offset[np.where(exists, lower * lower + lower + order, 0)], 0)
-    return _real(shifted, degree).real
+    return np.real(_real(shifted, degree))
