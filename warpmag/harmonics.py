@@ -1,0 +1,214 @@
+"""Real solid harmonics and their translations, in float64: the expansions of the fast multipole method.
+
+Harmonics are Schmidt semi-normalised: with unit vectors, the squares of one degree sum to 1, so that coefficients keep
+near 1 up to high degrees, and
+
+    1/|y − x| = Σ R_i(x) I_i(y) for |x| < |y|,    i = n² + n + m, m > 0 for cos mφ, m < 0 for sin |m|φ.
+
+There are K = (degree + 1)² of them. Each is even or odd under x → −x, y → −y and z → −z (``parity``), so that
+translations by offsets that differ in signs differ in signs only.
+
+Cells have edges of length 1: positions are relative to a cell's centre, in units of its edge h. A multipole q and a
+local expansion L stand for the potential ψ, H = −∇ψ, of dipoles with moments m,
+
+    4π h² ψ(u) = Σ q_i I_i(u) far away, q_i = m·∇R_i,    4π h² ψ(u) = Σ L_i R_i(u) inside.
+
+Since h doubles from a cell to its parent, translations between them have that factor in them. The theorems are those of
+W. Dehnen, "A fast multipole method for stellar dynamics", Comput. Astrophys. Cosmol. 1 (2014), appendix A.
+"""
+
+from functools import cache
+from math import factorial
+
+import numpy as np
+
+
+def count(degree: int) -> int:
+    """Number K of harmonics up to a degree."""
+    return (degree + 1) ** 2
+
+
+def degrees(degree: int) -> np.ndarray:
+    """Degree n of each harmonic, shape [K]."""
+    return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+
+
+def orders(degree: int) -> np.ndarray:
+    """Order m of each harmonic, negative for those with a sine, shape [K]."""
+    n = degrees(degree)
+    return np.arange(count(degree)) - n * n - n
+
+
+def parity(degree: int) -> np.ndarray:
+    """Signs that harmonics take where x, y or z changes its sign, shape [3, K]."""
+    n, m = degrees(degree), orders(degree)
+    sine = np.where(m < 0, -1, 1)
+    odd_order = np.where(m % 2, -1, 1)
+    return np.stack([sine * odd_order, sine, np.where((n + m) % 2, -1, 1)])
+
+
+def regular(degree: int, points) -> np.ndarray:
+    """Regular harmonics R, polynomials of degree n.
+
+    Args:
+        degree: Highest degree.
+        points: Positions, shape [n, 3].
+
+    Returns:
+        Shape [n, K].
+    """
+    x, y, z = np.asarray(points, np.float64).T
+    r2 = x * x + y * y + z * z
+    values = np.zeros((count(degree), len(x)))
+    along = np.ones(len(x), complex)  # (cos mφ + i sin mφ) part of degree and order m
+    for m in range(degree + 1):
+        if m > 0:
+            along = along * (x + 1j * y) * (1 if m == 1 else np.sqrt((2 * m - 1) / (2 * m)))
+        last, before = along, np.zeros_like(along)
+        for n in range(m, degree + 1):
+            if n > m:
+                grown = (2 * n - 1) * z * last - np.sqrt((n + m - 1) * (n - m - 1)) * r2 * before
+                last, before = grown / np.sqrt((n + m) * (n - m)), last
+            values[n * n + n - m] = last.imag
+            values[n * n + n + m] = last.real
+    return values.T.copy()
+
+
+def irregular(degree: int, points) -> np.ndarray:
+    """Irregular harmonics I = R/r^(2n + 1), shape [n, K]; ``points`` as in ``regular``, none at the origin."""
+    r = np.linalg.norm(np.asarray(points, np.float64), axis=1)
+    return regular(degree, points) / r[:, None] ** (2 * degrees(degree) + 1)
+
+
+@cache
+def derivatives(degree: int) -> np.ndarray:
+    """Matrices D with ∇R_i = Σ_j D[:, i, j] R_j, shape [3, K, K]."""
+    size = count(degree)
+    mixed = np.zeros((3, size, size), complex)  # of complex harmonics: ∂x − i∂y, ∂x + i∂y, ∂z
+    n, m = degrees(degree), orders(degree)
+    for k, (shift, sign) in enumerate(((-1, 1), (1, -1), (0, 1))):
+        i = np.flatnonzero(np.abs(m + shift) < n)
+        mixed[k, i, n[i] * n[i] - n[i] + m[i] + shift] = sign
+    below, above, along = (_real(matrix, degree) for matrix in mixed)
+    return np.stack([((above + below) / 2).real, ((above - below) / 2j).real, along.real])
+
+
+def regular_gradients(degree: int, points) -> np.ndarray:
+    """Gradients of regular harmonics, shape [n, K, 3]; ``points`` as in ``regular``."""
+    return np.einsum("cij,nj->nic", derivatives(degree), regular(degree, points))
+
+
+def dipole_to_multipole(degree: int, points, moments) -> np.ndarray:
+    """Multipole of dipoles in a cell.
+
+    Args:
+        degree: Highest degree.
+        points: Positions relative to the cell's centre, in units of its edge, shape [n, 3].
+        moments: Magnetic moments [A·m²], shape [n, 3].
+
+    Returns:
+        Coefficients q [A·m²], shape [K].
+    """
+    return np.einsum("nic,nc->i", regular_gradients(degree, points), np.asarray(moments, np.float64))
+
+
+def octant_offset(octant: int) -> np.ndarray:
+    """Centre of a child from its parent's, in units of the child's edge; octant = x + 2 y + 4 z."""
+    return np.array([octant & 1, octant >> 1 & 1, octant >> 2 & 1]) - 0.5
+
+
+def multipole_to_multipole(degree: int, octant: int) -> np.ndarray:
+    """Matrix that takes a child's multipole to its part of its parent's, shape [K, K]."""
+    shrink = 2.0 ** (1 - degrees(degree))
+    return shrink[:, None] * _regular_shift(degree, octant_offset(octant))
+
+
+def multipole_to_local(degree: int, offset) -> np.ndarray:
+    """Matrix that takes a cell's multipole to the local expansion of another of the same size.
+
+    Args:
+        degree: Highest degree of both.
+        offset: From the source's centre to the target's, in units of their edge, shape [3].
+
+    Returns:
+        Shape [K, K]: the target's coefficients in rows.
+    """
+    n, m = degrees(degree), orders(degree)
+    # I(offset + u) of complex harmonics of degree n, in conjugates of regular ones of degree k: degree n + k at offset
+    at_offset = _complex_irregular(2 * degree, np.asarray(offset, np.float64))
+    reached, order = n[:, None] + n[None, :], m[:, None] + m[None, :]
+    shifted = np.where(n % 2, -1, 1) * at_offset[reached * reached + reached + order]
+    # the conjugate of a regular one of order m is (−1)^m that of order −m
+    shifted = (np.where(m % 2, -1, 1) * shifted)[:, _mirrored(degree)]
+    weights = _irregular_scales(degree) / _scales(degree)
+    return (weights[:, None] * _real(shifted, degree)).real.T.copy()
+
+
+def local_to_local(degree: int, octant: int) -> np.ndarray:
+    """Matrix that takes a parent's local expansion to a child's, shape [K, K]."""
+    shrink = 2.0 ** (-2 - degrees(degree))
+    return (shrink[:, None] * _regular_shift(degree, octant_offset(octant))).T.copy()
+
+
+def local_to_field(local, points) -> np.ndarray:
+    """4π h³ times the field H of a local expansion.
+
+    Args:
+        local: Coefficients L [A·m²], shape [K].
+        points: Positions relative to the cell's centre, in units of its edge h, shape [n, 3].
+
+    Returns:
+        Shape [n, 3] [A·m²].
+    """
+    degree = int(np.sqrt(len(local))) - 1
+    return -np.einsum("nic,i->nc", regular_gradients(degree, points), np.asarray(local, np.float64))
+
+
+def _mirrored(degree: int) -> np.ndarray:
+    """Index of the harmonic of order −m, shape [K]."""
+    n = degrees(degree)
+    return n * n + n - orders(degree)
+
+
+def _scales(degree: int) -> np.ndarray:
+    """Norm of each real harmonic over that of the complex ones, r^n P_n^m/(n + m)! exp(imφ), shape [K]."""
+    pairs = zip(degrees(degree).tolist(), np.abs(orders(degree)).tolist(), strict=True)
+    return np.array([np.sqrt(float((2 if m else 1) * factorial(n - m) * factorial(n + m))) for n, m in pairs])
+
+
+def _irregular_scales(degree: int) -> np.ndarray:
+    """The same for irregular ones, (n − m)! P_n^m/r^(n + 1) exp(imφ)."""
+    return np.where(orders(degree) == 0, 1, 2) / _scales(degree)
+
+
+def _real(matrix: np.ndarray, degree: int) -> np.ndarray:
+    """A matrix that maps complex regular harmonics, (−1)^m times conjugates for m < 0, as one that maps real ones."""
+    m, mirrored, scale = orders(degree), _mirrored(degree), _scales(degree)
+    sign = np.where(m % 2, -1, 1)
+    # a cosine is half the sum of the orders m and −m, a sine their difference over 2i
+    own = np.where(m == 0, scale, np.where(m > 0, scale / 2, sign * scale * 0.5j))
+    other = np.where(m == 0, 0, np.where(m > 0, sign * scale / 2, -0.5j * scale))
+    rows = own[:, None] * matrix + other[:, None] * matrix[mirrored]
+    return (rows * own.conj() + rows[:, mirrored] * other.conj()) * (np.where(m == 0, 1, 2) / scale**2)
+
+
+def _complex(values: np.ndarray, degree: int) -> np.ndarray:
+    """Complex harmonics from real ones of the same norm, shape [K]."""
+    m, mirrored = orders(degree), _mirrored(degree)
+    sign = np.where(m % 2, -1, 1)
+    return np.where(m < 0, sign * (values[mirrored] - 1j * values), values + np.where(m == 0, 0, 1j) * values[mirrored])
+
+
+def _complex_irregular(degree: int, point: np.ndarray) -> np.ndarray:
+    """Complex irregular harmonics at a point, shape [K]."""
+    return _complex(irregular(degree, point[None, :])[0] / _irregular_scales(degree), degree)
+
+
+def _regular_shift(degree: int, offset: np.ndarray) -> np.ndarray:
+    """Matrix A with R_i(u + offset) = Σ_j A[i, j] R_j(u), shape [K, K]."""
+    n, m = degrees(degree), orders(degree)
+    at_offset = _complex(regular(degree, offset[None, :])[0] / _scales(degree), degree)
+    lower, order = n[:, None] - n[None, :], m[:, None] - m[None, :]
+    exists = np.abs(order) <= lower
+    shifted = np.where(exists, at_offset[np.where(exists, lower * lower + lower + order, 0)], 0)
+    return _real(shifted, degree).real
