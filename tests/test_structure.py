@@ -14,7 +14,7 @@ from warpmag import magnets
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = ROOT / "kernels"
-ROOMS = ("shared", "material", "pairs", "applied", "cells", "induction", "near_contact", "rigid")
+ROOMS = ("shared", "material", "pairs", "fmm", "applied", "cells", "induction", "near_contact", "rigid")
 """Rooms of ``kernels/``; each may import those before it that its ``__init__`` names."""
 LONGEST_FUNCTION, LONGEST_FILE, LONGEST_STRING = 60, 450, 10
 """[lines]; a longer string is text of another language, which belongs into a file of its own."""

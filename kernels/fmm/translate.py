@@ -1,0 +1,184 @@
+"""Translation of the multipoles of cells to the local expansions of others; ``translate.h`` has the equations.
+
+A level is a grid of cells, of which only those that hold something exist. What a cell takes from afar comes from the
+children of its parent's 26 neighbours, and of its parent, that are not its own neighbours: 189 where all of them exist.
+Sums are in a fixed order, without atomics, so that results repeat bit by bit.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.team import team, threads_for
+
+_CELLS_PER_THREAD = 64
+"""Cells that make another thread worth waking."""
+OCTANTS = 8
+
+
+@dataclass(frozen=True)
+class BlockShape:
+    """Shape of the blocks of a GPU.
+
+    Attributes:
+        cells: Cells of a block.
+        slice: Harmonics of the sources that it has in shared memory at a time.
+        blocks: Blocks that a multiprocessor holds together at least, in float32.
+    """
+
+    cells: int
+    slice: int
+    blocks: int
+
+
+def pitch(harmonics: int) -> int:
+    """Coefficients of a row of an array of expansions, the last of them zero."""
+    return -(-harmonics // 16) * 16
+
+
+def displacements() -> np.ndarray:
+    """The displacements, source − target, that have a matrix, in its order, shape [56, 3]."""
+    x, y, z = np.arange(64) % 4, np.arange(64) // 4 % 4, np.arange(64) // 16
+    return np.stack([x, y, z], axis=1)[np.maximum(np.maximum(x, y), z) > 1]
+
+
+@cache
+def translation_arrays(dtype):
+    """Struct of what a translation works on."""
+
+    @wp.struct
+    class TranslationArrays:
+        multipoles: wp.array2d[dtype]
+        locals: wp.array2d[dtype]
+        neighbors: wp.array2d[int]
+        children: wp.array2d[int]
+        parent: wp.array[int]
+        order: wp.array[int]
+        octant_begin: wp.array2d[int]
+        matrices: wp.array[dtype]
+        signs: wp.array2d[dtype]
+        parity: wp.array[int]
+        row_parity: wp.array[int]
+        row_harmonic: wp.array[int]
+
+    return TranslationArrays
+
+
+class Translation:
+    """Matrices and launch of the translation of multipoles of one degree.
+
+    Args:
+        matrices: Matrix of each of ``displacements``, harmonics of the target in rows, shape [56, K, K].
+        parity: Signs ±1 that harmonics take where x, y or z changes its sign, shape [3, K].
+        dtype: Warp scalar type of the coefficients.
+        device: Warp device.
+        shape: Shape of the blocks of a GPU; None means the fastest.
+    """
+
+    def __init__(self, matrices, parity, dtype, device, shape: BlockShape | None = None):
+        """Sort and pad the rows of the matrices by parity, and copy them to the device."""
+        device = wp.get_device(device)
+        matrices, odd = np.asarray(matrices, np.float64), np.asarray(parity) < 0
+        harmonics = matrices.shape[1]
+        classes = odd[0] + 2 * odd[1] + 4 * odd[2]
+        group = 8 if device.is_cuda else 4
+        rows = _grouped_rows(classes, group)
+        self.shape = shape or _choose_shape(harmonics)
+        length = -(-harmonics // self.shape.slice) * self.shape.slice if device.is_cuda else harmonics
+        table = np.zeros((len(matrices), length, len(rows)))
+        table[:, :harmonics, rows >= 0] = matrices[:, rows[rows >= 0]].transpose(0, 2, 1)
+        if not device.is_cuda:
+            table = table.reshape(len(matrices), length, -1, group).transpose(0, 2, 1, 3)
+        octants = np.arange(OCTANTS)[:, None, None] >> np.arange(3)[None, :, None] & 1
+        width = pitch(harmonics)
+        signs = np.zeros((OCTANTS, width))
+        signs[:, :harmonics] = np.where(octants & odd[None], -1.0, 1.0).prod(axis=1)
+
+        def integers(values):
+            return wp.array(values, dtype=wp.int32, device=device)
+
+        self._device, self._dtype = device, dtype
+        self._constants = {"HARMONICS": harmonics, "PITCH": width, "ROWS": len(rows), "GROUP_ROWS": group}
+        self._arrays = a = translation_arrays(dtype)()
+        a.matrices = wp.array(table.ravel(), dtype=dtype, device=device)
+        a.signs = wp.array(signs, dtype=dtype, device=device)
+        a.parity = integers(np.pad(classes, (0, width - harmonics)))
+        a.row_parity, a.row_harmonic = integers(np.repeat(classes[rows[::group]], group)), integers(rows)
+
+    def launch(self, multipoles, local, neighbors, children, parent, order, octant_begin):
+        """Set the far part of the local expansions of all cells, with what their parents do not have.
+
+        Args:
+            multipoles: Multipoles of c cells, and a row of zeros, shape [c + 1, pitch].
+            local: Out, local expansions, of cells that are in ``order``, shape [c + 1, pitch].
+            neighbors: Cell at each offset x + 3 y + 9 z, −1 for none, shape [c, 27].
+            children: Child of each octant x + 2 y + 4 z of a cell, −1 for none, shape [c, 8].
+            parent: Parent of each cell, −1 for none, shape [c].
+            order: Cells of each level and octant.
+            octant_begin: Where those of each octant begin and end in ``order``, shape [levels, 9].
+        """
+        a = self._arrays
+        a.multipoles, a.locals, a.neighbors, a.children = multipoles, local, neighbors, children
+        a.parent, a.order, a.octant_begin = parent, order, octant_begin
+        cells = multipoles.shape[0] - 1
+        if self._device.is_cuda:
+            blocks = -(-cells // self.shape.cells) + OCTANTS * octant_begin.shape[0]
+            _launch_cuda(self._dtype, self.shape, self._constants, blocks, a)
+            return
+        kernel = _cpu_kernel(self._dtype, tuple(self._constants.items()))
+        threads = threads_for(cells, _CELLS_PER_THREAD)
+        wp.launch(kernel, dim=1, inputs=[0, 1, threads, team(), a], device=self._device)
+
+
+def _grouped_rows(classes: np.ndarray, group: int) -> np.ndarray:
+    """Harmonics sorted by class, each class padded with −1 to a multiple of ``group``; first of a group: never −1."""
+    rows = []
+    for one in range(OCTANTS):
+        members = np.flatnonzero(classes == one)
+        rows += [*members, *[-1] * (-len(members) % group)]
+    return np.array(rows)
+
+
+def _choose_shape(harmonics: int) -> BlockShape:
+    """Shape of the blocks of a GPU that is fastest."""
+    return BlockShape(64, 8, 2)
+
+
+@cache
+def _cpu_kernel(dtype, constants):
+    return passes_kernel(
+        "warpmag::cpu::translate(arrays, threads, team.data);",
+        translation_arrays(dtype),
+        native_options("fmm/translate_cpu.h", dtype=dtype, **dict(constants)),
+    )
+
+
+@cache
+def _cuda_kernel(dtype, shape: BlockShape, constants):
+    sizes = dict(constants)
+    threads = -(-(shape.cells // 8 * sizes["ROWS"] // 8) // 32) * 32
+    arrays_struct = translation_arrays(dtype)
+
+    @wp.func_native(f"warpmag::translate_block<{shape.cells}, {shape.slice}>(thread, arrays);")
+    def run(thread: int, arrays: arrays_struct): ...
+
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(threads, shape.blocks if dtype is wp.float32 else 1),
+        module_options=native_options("fmm/translate_cuda.h", dtype=dtype, **sizes),
+    )
+    def translate_cuda(arrays: arrays_struct):
+        run(wp.tid(), arrays)
+
+    return translate_cuda, threads
+
+
+def _launch_cuda(dtype, shape: BlockShape, constants, blocks: int, arrays):
+    kernel, threads = _cuda_kernel(dtype, shape, tuple(constants.items()))
+    wp.launch(kernel, dim=blocks * threads, inputs=[arrays], device=arrays.locals.device, block_dim=threads)

@@ -1,0 +1,21 @@
+// Rows and columns of a square of numbers exchanged, in vectors of a CPU.
+#pragma once
+#include "shared/lanes.h"
+
+namespace warpmag {
+
+// By blocks of STEP and more; ``lanes`` counts those of a vector.
+template <int STEP, class Simd, int LANES, int... L>
+inline void transpose(Simd (&rows)[LANES], Sequence<int, L...> lanes) {
+    if constexpr (STEP < LANES) {
+        for (int i = 0; i < LANES; ++i) {
+            if (i & STEP) continue;
+            const Simd a = rows[i], b = rows[i + STEP];
+            rows[i] = __builtin_shufflevector(a, b, (L & STEP ? LANES + L - STEP : L)...);
+            rows[i + STEP] = __builtin_shufflevector(a, b, (L & STEP ? LANES + L : L + STEP)...);
+        }
+        transpose<2 * STEP>(rows, lanes);
+    }
+}
+
+}
