@@ -13,6 +13,7 @@
 #include "pairs/pair_terms.h"
 #include "shared/inverse_root.h"
 #include "shared/team.h"
+#include "shared/transpose.h"
 #include "shared/vectors.h"
 
 namespace warpmag::cpu {
@@ -38,19 +39,6 @@ template <Quantity Q> constexpr bool is_summed(int k) {
     return Q == Quantity::WRENCH || k < 3 || k == 9;
 }
 template <Quantity Q> constexpr int SUMS = Q == Quantity::WRENCH ? 10 : MUTUAL<Q> ? 3 : 4;
-
-// Exchanges rows and columns of a square of numbers, by blocks of STEP and more.
-template <int STEP, int... L> inline void transpose(Simd (&rows)[LANES], Sequence<int, L...> lanes) {
-    if constexpr (STEP < LANES) {
-        for (int i = 0; i < LANES; ++i) {
-            if (i & STEP) continue;
-            const Simd a = rows[i], b = rows[i + STEP];
-            rows[i] = __builtin_shufflevector(a, b, (L & STEP ? LANES + L - STEP : L)...);
-            rows[i + STEP] = __builtin_shufflevector(a, b, (L & STEP ? LANES + L : L + STEP)...);
-        }
-        transpose<2 * STEP>(rows, lanes);
-    }
-}
 
 // Totals over the lanes of as many vectors, in the lanes of one. To add up the lanes of each would take three times as
 // many operations.
@@ -137,15 +125,19 @@ inline void compare_labels(Tile& tile) {
         tile.ascending &= number(tile.rows[LABEL], i - 1) < number(tile.rows[LABEL], i);
 }
 
-template <Quantity Q> __attribute__((noinline)) void fill(Tile& tile, const Table& table, int begin, int end) {
-    tile.begin = begin;
-    tile.count = end - begin;
+// Appends moments to a tile.
+inline void append(Tile& tile, const Table& table, int begin, int end) {
+    for (int r = 0; r < PACKED_ROWS; ++r)
+        __builtin_memcpy((Real*)tile.rows[r] + tile.count, table.row(r) + begin, (end - begin) * sizeof(Real));
+    tile.count += end - begin;
+}
+
+// Finishes a tile that has its moments.
+template <Quantity Q> __attribute__((noinline)) void complete(Tile& tile) {
     tile.vectors = (tile.count + LANES - 1) / LANES;
     for (int r = 0; r < PACKED_ROWS; ++r) {
-        const Real* row = table.row(r) + begin;
-        __builtin_memcpy(tile.rows[r], row, tile.count * sizeof(Real));
         // lanes beyond the last source have its position, and no moment
-        const Real beyond = r >= MOMENT && r < LABEL ? 0 : row[tile.count - 1];
+        const Real beyond = r >= MOMENT && r < LABEL ? 0 : number(tile.rows[r], tile.count - 1);
         for (int i = tile.count; i < (tile.vectors + 2) * LANES; ++i) number(tile.rows[r], i) = beyond;
     }
     constexpr Real SCALE = scaled_moment(Q);
@@ -156,6 +148,13 @@ template <Quantity Q> __attribute__((noinline)) void fill(Tile& tile, const Tabl
         }
     compare_radii(tile);
     if (Q != Quantity::FIELD) compare_labels(tile);
+}
+
+template <Quantity Q> inline void fill(Tile& tile, const Table& table, int begin, int end) {
+    tile.begin = begin;
+    tile.count = 0;
+    append(tile, table, begin, end);
+    complete<Q>(tile);
 }
 
 // While it lives, a tile has no moment that is a target itself: a moment's own field is left out.

@@ -128,8 +128,8 @@ struct LabelRange {
 // clamp is a constant of the target: 20 instructions a pair for the field and 31 for the force, next to the four or so
 // that a source takes once for all targets of a lane, and the sixty that a warp takes to stage 32. A LONG sum takes the
 // radius from each stage, decides for the whole stage, and is by parts, so that it keeps its digits.
-template <int LANES, int UNROLLED, bool LONG, Quantity Q, int HELD, class TargetAt>
-CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt target_at, const Table& sources, int begin,
+template <int LANES, int UNROLLED, bool LONG, Quantity Q, int HELD, class TargetAt, class Sources>
+CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt target_at, const Sources& sources, int begin,
                                       int end, Real radius, int own_begin, unsigned own_count, int lane, Quad* staged) {
     constexpr bool FIELD = Q == Quantity::FIELD;
     constexpr Real SCALE = scaled_moment(Q);
