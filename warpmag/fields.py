@@ -19,12 +19,15 @@ from warpmag.arrays import (
     vec3_type,
 )
 from warpmag.errors import InputError
+from warpmag.fmm import LEAST_RTOL, USUAL_RTOL, make_sums
 from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import check_not_negative, check_rtol, check_token
 
-_METHODS = ("auto", "vectorized", "reference")
+_METHODS = ("auto", "vectorized", "reference", "fmm")
+_LEAST_FMM = {"cpu": 12_000, "cuda": 60_000}
+"""Fewest moments and targets for which ``auto`` takes the fast multipole method, by kind of device."""
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
 """Least of the largest component of moments [A·m²]: fields of smaller ones have no digits left."""
 
@@ -55,8 +58,10 @@ def h_field(
         radii: Ball radii [m], scalar or [n]; None means point dipoles.
         target_radii: Radii of the balls over which to average at the targets [m], scalar or [t]; None means points.
         smoothing: Length ℓ [m] of the paper's smoothing, ε² = ℓ⁵ added to r⁵ (section 5); point dipoles only.
-        method: ``vectorized`` (native loops), ``reference`` (the plain Warp loop) or ``auto``.
-        rtol: Relative error wanted; the all-pairs sums are exact to rounding, so it is only checked against ``dtype``.
+        method: ``vectorized`` (native loops over all pairs), ``reference`` (the plain Warp loop), ``fmm`` (the fast
+            multipole method) or ``auto``: the fastest that is exact to rounding, or as ``rtol`` allows.
+        rtol: Relative error allowed, ‖H − H_exact‖/‖H_exact‖ over all targets. None means 1e-3 with ``fmm``, and none
+            otherwise.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means that of the arrays, or Warp's default.
 
@@ -84,8 +89,9 @@ def h_field(
     base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
     h = wp.zeros_like(base)
     form = _prepare(at, sources, reference)
+    sums = _fast_sums(Quantity.FIELD, kind, method, rtol, at, sources)
     segments = [(0, at.count, 0, sources.count)]
-    PairEvaluation(Quantity.FIELD, segments, at, sources, base, h, form=form, smoothing=smoothing).launch()
+    PairEvaluation(Quantity.FIELD, segments, at, sources, base, h, form=form, smoothing=smoothing, sums=sums).launch()
     _check_finite("field", kind, h, x, m, points)
     return kind.finish(h)
 
@@ -114,8 +120,8 @@ def wrench(
         external_field: Applied field H0 [A/m], shape [3] or [n, 3]; it turns moments, and, being given without a
             gradient, does not pull them.
         smoothing: Length ℓ [m] of the paper's smoothing, ε² = ℓ⁵ added to r⁵ (section 5); point dipoles only.
-        method: ``vectorized`` (native loops), ``reference`` (the plain Warp loop) or ``auto``.
-        rtol: Relative error wanted; only checked against ``dtype``, see :func:`h_field`.
+        method: As in :func:`h_field`.
+        rtol: Relative error allowed of forces and torques, see :func:`h_field`.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means that of the arrays, or Warp's default.
 
@@ -138,9 +144,10 @@ def wrench(
     forces, torques = wp.zeros_like(x), wp.zeros_like(x)
     turned = wp.ones(n, dtype=int, device=kind.device)
     form = _prepare(packed, packed, reference)
+    sums = _fast_sums(Quantity.WRENCH, kind, method, rtol, packed, packed)
     PairEvaluation(
         Quantity.WRENCH, [(0, n, 0, n)], packed, packed, external, forces, turned=turned, torques=torques, form=form,
-        smoothing=smoothing,
+        smoothing=smoothing, sums=sums,
     ).launch()  # fmt: skip
     _check_finite("force", kind, forces, x, m, x)
     _check_finite("torque", kind, torques, x, m, x, more=", external_field")
@@ -168,6 +175,20 @@ def _prepare(at, sources, reference):
     return None
 
 
+def _fast_sums(quantity, kind: Kind, method, rtol, at, sources):
+    """Sums by the fast multipole method, None where it is not wanted or would not be faster."""
+    count = at.count if at is sources else at.count + sources.count
+    wanted = method == "fmm" or (
+        method == "auto"
+        and rtol is not None
+        and rtol >= LEAST_RTOL
+        and count >= _LEAST_FMM["cuda" if at.device.is_cuda else "cpu"]
+    )
+    if not wanted or at.count == 0 or sources.count == 0:
+        return None
+    return make_sums(quantity, sources, rtol or USUAL_RTOL, None if at is sources else at)
+
+
 def _largest_radius(name, radii, dtype, reference) -> float:
     """Largest radius [m], zero for none; ``InputError`` for one that is out of range."""
     return 0.0 if radii is None else float(host_radii(name, radii, dtype, reference=reference).max(initial=0.0))
@@ -178,7 +199,11 @@ def _is_reference(kind: Kind, method, smoothing, radii, rtol, dtype) -> bool:
     check_token("method", method, _METHODS)
     if rtol is not None:
         check_rtol("rtol", rtol, dtype)
+        if method == "fmm" and rtol < LEAST_RTOL:
+            raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'vectorized'")
     check_not_negative("smoothing", smoothing)
+    if smoothing > 0.0 and method == "fmm":
+        raise InputError("smoothing: not with the method 'fmm'")
     if smoothing > 0.0 and radii is not None:
         raise InputError("smoothing: only for point dipoles; leave radii out")
     least, most = REFERENCE_RADIUS_RANGE[kind.dtype]

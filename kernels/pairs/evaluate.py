@@ -12,6 +12,8 @@ where the form of the sums is chosen:
 | ``FUSED`` | ``fused_cuda`` | few moments: one kernel sums a tile and finishes it, without partial sums |
 | ``MIRRORED`` | ``mirror_cuda`` | many moments among themselves: each pair is evaluated once, for both of its ends |
 | ``REFERENCE`` | ``reference`` | a plain Warp loop, exact for overlapping balls, or with the paper's smoothing |
+
+A caller may bring sums of its own, such as those of room ``fmm``.
 """
 
 from functools import cache
@@ -32,7 +34,7 @@ from warpmag.kernels.shared.passes import passes_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
-LOOP, FUSED, MIRRORED, REFERENCE = "loop", "fused", "mirrored", "reference"
+LOOP, FUSED, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "mirrored", "reference", "given"
 
 # Measured on an H200: the most targets for which the fused form is best, and the fewest for which the mirrored is.
 _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE: 2640, Quantity.WRENCH: 2640}
@@ -63,9 +65,11 @@ class PairEvaluation:
         extra_parts: Partial sums that the caller writes.
         smoothing: Length ℓ [m] of the paper's smoothing, with the form ``REFERENCE``.
         form: Form of the sums; None means the fastest.
+        sums: Sums of the caller's: called with effective moments, packed columns of the target rows, and the partial
+            sums to write, it launches them.
 
     Attributes:
-        form: ``LOOP``, ``FUSED``, ``MIRRORED`` or ``REFERENCE``.
+        form: ``LOOP``, ``FUSED``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
         count: Number of target rows.
         target: Packed column of each, shape [count].
         pair_count: Pairs of a target and a source.
@@ -74,12 +78,13 @@ class PairEvaluation:
 
     def __init__(
         self, quantity, segments, targets, sources, base, out, *, effective=None, turned=None, torques=None,
-        extra_parts=0, smoothing=0.0, form=None,
+        extra_parts=0, smoothing=0.0, form=None, sums=None,
     ):  # fmt: skip
         """Allocate what the form needs."""
         segments = np.asarray(segments, np.int64).reshape(-1, 4)
         device, dtype = targets.device, targets.dtype
-        self.form = form or _choose_form(quantity, segments, device, targets is sources, extra_parts)
+        self._given_sums = sums
+        self.form = GIVEN if sums else form or _choose_form(quantity, segments, device, targets is sources, extra_parts)
         if self.form == MIRRORED:
             segments = segments[:1, [2, 3, 2, 3]]
         self._arrays = a = arrays_type(dtype)()
@@ -101,6 +106,9 @@ class PairEvaluation:
     def _plan_sums(self, quantity, segments, targets, among, smoothing):
         """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
         device, finished, count = targets.device, self._finished, self.count
+        if self.form == GIVEN:
+            self._launch_sums = lambda a: self._given_sums(a.effective, a.target, a.partial)
+            return 1, ()
         if self.form == REFERENCE:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
             return 1, ()

@@ -1,0 +1,91 @@
+"""Field and force sums of packed moments by the fast multipole method: a form of the sums of ``pairs.evaluate``.
+
+Near pairs are those of the all-pairs sums, clamped at contact; far ones come from expansions. Both are added in the
+order in which the grid sorts moments, and go to the partial sums of target rows from there.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from warpmag.kernels.fmm.expansions import Expansions, ExpansionTables
+from warpmag.kernels.fmm.grid import MomentGrid
+from warpmag.kernels.fmm.near import launch_near_sums
+from warpmag.kernels.pairs.packing import PITCH
+from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+
+
+class CellSums:
+    """Sums of a quantity over all pairs of the moments of a grid.
+
+    Args:
+        grid: The cells, built by the caller whenever moments have moved.
+        tables: Numbers of the harmonics.
+        quantity: What is summed; of ``MUTUAL_FORCE`` as of ``FORCE``.
+        first: Column in the grid of the first target column.
+    """
+
+    def __init__(self, grid: MomentGrid, tables: ExpansionTables, quantity: Quantity, first: int = 0):
+        """Allocate the sums and the expansions."""
+        self._first = first
+        self._quantity = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
+        self._grid = grid
+        n, device, dtype = grid.count, grid.device, grid.sorted.dtype
+        self._sums = wp.zeros((n, WIDTHS[quantity]), dtype=dtype, device=device)
+        self._moments = grid.sorted
+        self._effective = wp.zeros((3, (1 + -(-n // PITCH)) * PITCH), dtype=dtype, device=device)[:, :n]
+        self._expansions = Expansions(grid, tables, self._quantity, self._moments, self._effective, self._sums)
+
+    def __call__(self, effective, target, partial):
+        """Launch the sums of the moments as the grid was built of them.
+
+        Args:
+            effective: Effective moments e [A·m²] of the force, shape [3, n].
+            target: Packed column of each target row.
+            partial: Out, sums of the target rows, shape [1, rows, 3 or 6].
+        """
+        grid, device, dtype = self._grid, self._grid.device, self._sums.dtype
+        if self._quantity != Quantity.FIELD:
+            wp.launch(_sort_kernel(dtype), (3, grid.count), [effective, grid.source], [self._effective], device=device)
+        launch_near_sums(
+            self._quantity, self._moments, self._effective, grid.neighbors, grid.moment_begin, grid.level_begin,
+            self._sums,
+        )  # fmt: skip
+        self._expansions.gather()
+        self._expansions.translate()
+        self._expansions.add_fields()
+        inputs = [self._sums, target, grid.place[self._first :]]
+        wp.launch(_return_kernel(dtype), partial.shape[1:], inputs, [partial], device=device)
+
+
+@cache
+def _sort_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def sort_vectors(
+        # inputs:
+        vectors: wp.array2d[dtype],
+        source: wp.array[int],
+        # outputs:
+        sorted_out: wp.array2d[dtype],
+    ):
+        c, i = wp.tid()
+        sorted_out[c, i] = vectors[c, source[i]]
+
+    return sort_vectors
+
+
+@cache
+def _return_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def return_sums(
+        # inputs:
+        sums: wp.array2d[dtype],
+        target: wp.array[int],
+        place: wp.array[int],
+        # outputs:
+        partial_out: wp.array3d[dtype],
+    ):
+        row, c = wp.tid()
+        partial_out[0, row, c] = sums[place[target[row]], c]
+
+    return return_sums

@@ -1,0 +1,294 @@
+// Expansions of cells: multipoles of moments, of parents from their children, local expansions of children from their
+// parents', and fields from those. expansions.py says what the arrays are; warpmag/harmonics.py has the equations.
+//
+// The gradient of a harmonic is a sum of a few harmonics of one degree less. So moments are first summed with plain
+// harmonics, S_jc = Σ m_c R_j(u), of which a leaf makes its multipole once; and its local expansion becomes the
+// coefficients G_jc of the field's components, H_c = −Σ G_jc R_j(u) / 4πh³, and of their derivatives.
+#pragma once
+#include "pairs/pair_terms.h"
+#include "shared/team.h"
+#include "shared/vectors.h"
+
+namespace warpmag {
+
+constexpr int BELOW = DEGREE * DEGREE; // harmonics of one degree less
+constexpr int TERMS = 5;               // terms of a multipole's coefficient, as in expansions.py
+constexpr bool is_force(Quantity q) { return q != Quantity::FIELD; }
+constexpr bool is_field(Quantity q) { return q == Quantity::FIELD || q == Quantity::WRENCH; }
+
+CUDA_CALLABLE inline int index_of(int degree, int order) { return degree * degree + degree + order; }
+
+// Calls visit(j, R_j) for the harmonics at a point below DEGREE whose order is ``first`` or a multiple of ``step``
+// more.
+template <class Visit>
+CUDA_CALLABLE inline void visit_harmonics(const Real* growth, const Real* decay, Vector u, int first, int step,
+                                          Visit visit) {
+    const Number r2 = dot(u, u), zero = Number(Real(0));
+    Number cosine = zero + 1, sine = zero;
+    for (int m = 0; m < DEGREE; ++m) {
+        if (m > 0) {
+            const Number scale = zero + growth[index_of(m, m)], c = cosine;
+            cosine = scale * (c * u.x - sine * u.y), sine = scale * (c * u.y + sine * u.x);
+        }
+        if (m % step != first) continue;
+        Number a = cosine, b = sine, a_before = zero, b_before = zero;
+        for (int n = m; n < DEGREE; ++n) {
+            const int j = index_of(n, m);
+            if (n > m) {
+                const Number up = growth[j] * u.z, down = decay[j] * r2;
+                const Number a_next = up * a - down * a_before, b_next = up * b - down * b_before;
+                a_before = a, b_before = b, a = a_next, b = b_next;
+            }
+            visit(j, a);
+            if (m > 0) visit(j - 2 * m, b);
+        }
+    }
+}
+
+// Rows of numbers of moments, one row after the other.
+struct Rows {
+    Real* data;
+    size_t pitch;
+
+    CUDA_CALLABLE Rows(const wp::array_t<Real>& table) : data(table.data), pitch(table.strides[0] / sizeof(Real)) {}
+    CUDA_CALLABLE Vector vector(int row, int i) const {
+        const Real* const at = data + row * pitch + i;
+        return {numbers(at), numbers(at + pitch), numbers(at + 2 * pitch)};
+    }
+};
+
+// Coefficient i of a multipole from the sums S of a leaf's moments.
+template <class Arrays> CUDA_CALLABLE inline Real multipole_of(const Arrays& a, const Real* sums, int i) {
+    if (i >= a.sources) return 0;
+    Real q = 0;
+    for (int t = TERMS * i; t < TERMS * (i + 1); ++t) q += a.gather_weight.data[t] * sums[a.gather_index.data[t]];
+    return q;
+}
+
+// Derivative along an axis of an expansion, its coefficient j, of one in ``from``, whose coefficients are ``stride``
+// apart.
+template <class Arrays>
+CUDA_CALLABLE inline Real derivative(const Arrays& a, const Real* from, int stride, int j, int axis) {
+    const int t = 2 * (3 * j + axis);
+    return a.spread_weight.data[t] * from[stride * a.spread_index.data[t]]
+           + a.spread_weight.data[t + 1] * from[stride * a.spread_index.data[t + 1]];
+}
+
+// Coefficients of the components of a field, and of the derivatives xx, xy, xz, yy, yz, zz.
+constexpr int FIELD_ROW = 4, FORCE_ROW = 6;
+template <Quantity Q> struct Fields {
+    Real field[BELOW][FIELD_ROW];
+    Real force[is_force(Q) ? (DEGREE - 1) * (DEGREE - 1) : 1][FORCE_ROW];
+};
+template <class Arrays> CUDA_CALLABLE inline void set_field(const Arrays& a, Real* row, const Real* local, int j) {
+    for (int c = 0; c < 3; ++c) row[c] = derivative(a, local, 1, j, c);
+}
+template <Quantity Q, class Arrays> CUDA_CALLABLE inline void set_force(const Arrays& a, Fields<Q>& fields, int j) {
+    for (int c = 0, k = 0; c < 3; ++c)
+        for (int d = c; d < 3; ++d) fields.force[j][k++] = derivative(a, fields.field[0] + c, FIELD_ROW, j, d);
+}
+
+// What moments in a leaf feel: 4π times the field H, and (e·∇)H for moments e.
+struct Felt {
+    Vector h, f;
+};
+template <Quantity Q, class Arrays>
+CUDA_CALLABLE inline Felt felt_at(const Arrays& a, const Fields<Q>& fields, Vector u, Vector e) {
+    const Number zero = Number(Real(0));
+    Felt felt = {{zero, zero, zero}, {zero, zero, zero}};
+    visit_harmonics(a.growth.data, a.decay.data, u, 0, 1, [&](int j, Number r) {
+        if (is_field(Q)) {
+            const Real* const g = fields.field[j];
+            felt.h.x -= g[0] * r, felt.h.y -= g[1] * r, felt.h.z -= g[2] * r;
+        }
+        if (is_force(Q) && j < (DEGREE - 1) * (DEGREE - 1)) {
+            const Real* const t = fields.force[j];
+            felt.f.x -= r * (t[0] * e.x + t[1] * e.y + t[2] * e.z);
+            felt.f.y -= r * (t[1] * e.x + t[3] * e.y + t[4] * e.z);
+            felt.f.z -= r * (t[2] * e.x + t[4] * e.y + t[5] * e.z);
+        }
+    });
+    const Real scale = Real(1) / (Real)a.frame.data[4], volume = scale * scale * scale;
+    return {scaled(zero + volume, felt.h), scaled(zero + scale, scaled(zero + volume, felt.f))};
+}
+CUDA_CALLABLE inline void add_vectors(Real* rows, int row, int held, Vector v) {
+    for (int l = 0; l < held && l < WIDTH; ++l, rows += row)
+        rows[0] += lane_of(v.x, l), rows[1] += lane_of(v.y, l), rows[2] += lane_of(v.z, l);
+}
+template <Quantity Q> CUDA_CALLABLE inline void add_felt(Real* sums, int held, const Felt& felt) {
+    if (is_force(Q)) add_vectors(sums, width(Q), held, felt.f);
+    if (is_field(Q)) add_vectors(sums + width(Q) - 3, width(Q), held, felt.h);
+}
+
+// The multipole of a leaf; on a GPU by a block.
+template <class Arrays> CUDA_CALLABLE inline void leaf_multipole(const Arrays& a, int leaf) {
+    const int begin = a.moment_begin.data[leaf], end = a.moment_begin.data[leaf + 1];
+    const Rows inside(a.inside), sorted(a.sorted);
+    Real* const multipole = a.multipoles.data + PITCH * (size_t)leaf;
+#if defined(__CUDA_ARCH__)
+    constexpr int EACH = (BELOW + THREADS - 1) / THREADS;
+    __shared__ Real harmonics[BELOW][33], moments[3][32], sums[3 * BELOW];
+    const int lane = threadIdx.x % 32;
+    Real own[EACH][3] = {};
+    for (int first = begin; first < end; first += 32) {
+        const int i = first + lane < end ? first + lane : end - 1;
+        __syncthreads();
+        visit_harmonics(a.growth.data, a.decay.data, inside.vector(0, i), threadIdx.x / 32, THREADS / 32,
+                        [&](int j, Real r) { harmonics[j][lane] = r; });
+        if (threadIdx.x < 32) {
+            const Vector m = sorted.vector(4, i);
+            const bool held = first + lane < end;
+            moments[0][lane] = held ? m.x : 0, moments[1][lane] = held ? m.y : 0, moments[2][lane] = held ? m.z : 0;
+        }
+        __syncthreads();
+#pragma unroll
+        for (int e = 0; e < EACH; ++e) {
+            const int j = threadIdx.x + e * THREADS;
+            if (j >= BELOW) break;
+            for (int k = 0; k < 32; ++k)
+                for (int c = 0; c < 3; ++c) own[e][c] += moments[c][k] * harmonics[j][k];
+        }
+    }
+#pragma unroll
+    for (int e = 0; e < EACH; ++e)
+        for (int c = 0; c < 3; ++c)
+            if (threadIdx.x + e * THREADS < BELOW) sums[3 * (threadIdx.x + e * THREADS) + c] = own[e][c];
+    __syncthreads();
+    for (int i = threadIdx.x; i < HARMONICS; i += THREADS) multipole[i] = multipole_of(a, sums, i);
+    __syncthreads();
+#else
+    Number harmonics[BELOW], parts[3 * BELOW] = {};
+    for (int i = begin; i < end; i += WIDTH) {
+        Vector m = sorted.vector(4, i);
+        for (int l = end - i; l < WIDTH; ++l) m.x[l] = m.y[l] = m.z[l] = 0;
+        visit_harmonics(a.growth.data, a.decay.data, inside.vector(0, i), 0, 1,
+                        [&](int j, Number r) { harmonics[j] = r; });
+        for (int j = 0; j < BELOW; ++j) {
+            parts[3 * j] += m.x * harmonics[j];
+            parts[3 * j + 1] += m.y * harmonics[j];
+            parts[3 * j + 2] += m.z * harmonics[j];
+        }
+    }
+    Real sums[3 * BELOW];
+    for (int k = 0; k < 3 * BELOW; ++k) {
+        sums[k] = 0;
+        for (int l = 0; l < WIDTH; ++l) sums[k] += parts[k][l];
+    }
+    for (int i = 0; i < HARMONICS; ++i) multipole[i] = multipole_of(a, sums, i);
+#endif
+}
+
+// Adds what all moments of a leaf feel from afar; on a GPU by a block.
+template <Quantity Q, class Arrays> CUDA_CALLABLE inline void leaf_fields(const Arrays& a, int leaf) {
+    const int begin = a.moment_begin.data[leaf], end = a.moment_begin.data[leaf + 1];
+    const Rows inside(a.inside), effective(a.effective);
+    const Real* const local = a.locals.data + PITCH * (size_t)leaf;
+#if defined(__CUDA_ARCH__)
+    __shared__ Fields<Q> fields;
+    const int first = threadIdx.x, step = THREADS;
+    __syncthreads();
+#else
+    Fields<Q> fields;
+    const int first = 0, step = 1;
+#endif
+    for (int j = first; j < BELOW; j += step) set_field(a, fields.field[j], local, j);
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+    if (is_force(Q))
+        for (int j = first; j < (DEGREE - 1) * (DEGREE - 1); j += step) set_force<Q>(a, fields, j);
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+    for (int i = begin + first * WIDTH; i < end; i += step * WIDTH) {
+        const Vector u = inside.vector(0, i), e = is_force(Q) ? effective.vector(0, i) : u;
+        add_felt<Q>(a.sums.data + (size_t)width(Q) * i, end - i, felt_at<Q>(a, fields, u, e));
+    }
+}
+
+// Adds to ``out`` the product of a matrix, of which columns follow each other, and of an expansion, both with signs.
+#if defined(__CUDA_ARCH__)
+CUDA_CALLABLE inline void add_product(Real* out, const Real* matrix, const Real* from, const Real* signs) {
+    __shared__ Real signed_from[HARMONICS];
+    __syncthreads();
+    for (int k = threadIdx.x; k < HARMONICS; k += THREADS) signed_from[k] = signs[k] * from[k];
+    __syncthreads();
+    for (int i = threadIdx.x; i < HARMONICS; i += THREADS) {
+        Real sum = 0;
+#pragma unroll 4
+        for (int k = 0; k < HARMONICS; ++k) sum += matrix[k * PITCH + i] * signed_from[k];
+        out[i] += signs[i] * sum;
+    }
+}
+#else
+inline void add_product(Real* out, const Real* matrix, const Real* from, const Real* signs) {
+    constexpr int VECTORS = PITCH / WIDTH;
+    Number sums[VECTORS] = {};
+    for (int k = 0; k < HARMONICS; ++k)
+        for (int v = 0; v < VECTORS; ++v) sums[v] += (signs[k] * from[k]) * numbers(matrix + k * PITCH + v * WIDTH);
+    for (int v = 0; v < VECTORS; ++v)
+        put(out + v * WIDTH, numbers(out + v * WIDTH) + numbers(signs + v * WIDTH) * sums[v]);
+}
+#endif
+
+// The multipole of a cell from those of its children.
+template <class Arrays> CUDA_CALLABLE inline void merge_children(const Arrays& a, int cell) {
+    Real* const multipole = a.multipoles.data + PITCH * (size_t)cell;
+#if defined(__CUDA_ARCH__)
+    for (int i = threadIdx.x; i < HARMONICS; i += THREADS) multipole[i] = 0;
+#else
+    __builtin_memset(multipole, 0, PITCH * sizeof(Real));
+#endif
+    for (int octant = 0; octant < 8; ++octant) {
+        const int child = a.children.data[8 * (size_t)cell + octant];
+        if (child < 0) continue;
+        add_product(multipole, a.up.data, a.multipoles.data + PITCH * (size_t)child, a.signs.data + PITCH * octant);
+    }
+#if defined(__CUDA_ARCH__)
+    for (int i = threadIdx.x; i < HARMONICS; i += THREADS)
+        if (i >= a.sources) multipole[i] = 0;
+#else
+    for (int i = a.sources; i < HARMONICS; ++i) multipole[i] = 0;
+#endif
+}
+
+// Adds to a cell's local expansion what its parent has.
+template <class Arrays> CUDA_CALLABLE inline void add_parent(const Arrays& a, int cell) {
+    const Real* const parent = a.locals.data + PITCH * (size_t)a.parent.data[cell];
+    add_product(a.locals.data + PITCH * (size_t)cell, a.down.data, parent, a.signs.data + PITCH * a.octant.data[cell]);
+}
+
+// Passes over cells. Only cells two levels and more below the cube are translated to each other.
+enum class Step { MULTIPOLES, MERGE, SPREAD, FIELDS };
+
+template <Step S, Quantity Q, class Arrays> CUDA_CALLABLE inline void visit_cell(const Arrays& a, int cell) {
+    if constexpr (S == Step::MULTIPOLES) leaf_multipole(a, cell);
+    else if constexpr (S == Step::MERGE) merge_children(a, cell);
+    else if constexpr (S == Step::SPREAD) add_parent(a, cell);
+    else leaf_fields<Q>(a, cell);
+}
+
+// Makes a step for all cells of a height: on a GPU by ``threads`` blocks.
+template <Step S, Quantity Q, class Word, class Arrays>
+CUDA_CALLABLE inline void visit_height(int thread, int height, int threads, Word* team, const Arrays& a) {
+    const int below = a.counts.data[0] - height, least = S == Step::SPREAD ? 3 : S == Step::MERGE ? 2 : 0;
+    if (below < least) return;
+    const int begin = a.level_begin.data[height], end = a.level_begin.data[height + 1];
+#if defined(__CUDA_ARCH__)
+    for (int cell = begin + thread / THREADS; cell < end; cell += threads) visit_cell<S, Q>(a, cell);
+#else
+    share_out(team, threads, end - begin, 4, [&](int i) { visit_cell<S, Q>(a, begin + i); });
+#endif
+}
+
+// Makes a step for some heights, one after the other; on a GPU for the first of them.
+template <Step S, Quantity Q, class Word, class Arrays>
+CUDA_CALLABLE inline void visit_cells(int thread, int first, int last, int threads, Word* team, const Arrays& a) {
+#if defined(__CUDA_ARCH__)
+    visit_height<S, Q>(thread, first, threads, team, a);
+#else
+    const int by = first <= last ? 1 : -1;
+    for (int height = first; height != last + by; height += by) visit_height<S, Q>(thread, height, threads, team, a);
+#endif
+}
+}

@@ -1,0 +1,152 @@
+"""The fast multipole method: its cells, and fields and forces against sums over all pairs in float64."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpmag
+from warpmag.arrays import resolve_dtype, vec3_type
+from warpmag.kernels.fmm.grid import MomentGrid
+from warpmag.kernels.pairs.packing import PackedMoments
+
+
+def apart(a, b) -> float:
+    """Relative difference, NaN where anything is."""
+    return float(np.linalg.norm(np.asarray(a, float) - b) / np.linalg.norm(b))
+
+
+def jittered(count: int, seed: int = 0) -> np.ndarray:
+    """About ``count`` places of which no two are near each other, edge 1 apart, exact in float32."""
+    side = round(count ** (1 / 3))
+    axis = np.arange(side)
+    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    return (places + np.random.default_rng(seed).uniform(-0.2, 0.2, places.shape)).astype(np.float32).astype(float)
+
+
+def moments_of(count: int, seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((count, 3)).astype(np.float32).astype(float)
+
+
+def make_grid(places, worlds, occupancy, device) -> MomentGrid:
+    n = len(places)
+    vectors = wp.array(places, dtype=wp.vec3, device=device)
+    radii = wp.zeros(n, dtype=wp.float32, device=device)
+    packed = PackedMoments(radii, largest_radius=0.0, groups=worlds, moving=False)
+    packed.pack(vectors, vectors)
+    grid = MomentGrid(packed.packed, packed.groups, int(worlds.max()) + 1, occupancy=occupancy)
+    grid.build()
+    return grid
+
+
+ARRANGEMENTS = {
+    "one": (np.zeros((1, 3)), 1),
+    "heap": (np.ones((500, 3)), 1),
+    "chain": (np.arange(900)[:, None] * [1.0, 0.1, 0.0], 1),
+    "box": (np.random.default_rng(2).random((4000, 3)), 1),
+    "worlds": (np.random.default_rng(3).random((4000, 3)), 7),
+    "stray": (np.concatenate([np.random.default_rng(4).random((2000, 3)), [[1e3, 2e3, -5e2]]]), 1),
+}
+
+
+@pytest.mark.parametrize("name", ARRANGEMENTS)
+def test_every_moment_is_in_one_cell_of_each_level(name, device):
+    places, worlds = ARRANGEMENTS[name]
+    places = places.astype(np.float32)
+    world = np.sort(np.random.default_rng(5).integers(0, worlds, len(places)))
+    grid = make_grid(places, world, 20, device)
+    frame, begin, (depth, cells) = grid.frame.numpy(), grid.level_begin.numpy(), grid.counts.numpy()
+    source, firsts = grid.source.numpy(), grid.moment_begin.numpy()[: begin[1] + 1]
+    assert cells <= grid.capacity
+    assert sorted(source) == list(range(len(places)))
+    assert firsts[-1] == len(places)
+    assert (np.diff(firsts) > 0).all()
+    place = (places[source].astype(float) - frame[:3]) / frame[4]
+    # positions of float32 round to either side of a cell's face
+    middle = np.floor(place) + 0.5
+    assert np.abs(grid.inside.numpy().T).max() <= 0.5 + 1e-6
+    assert np.abs(middle + grid.inside.numpy().T - place).max() <= 1.0 + 1e-6
+    found = np.column_stack([np.round(place - grid.inside.numpy().T - 0.5).astype(int), world[source]])
+    parents, octants, children = grid.parent.numpy(), grid.octant.numpy(), grid.children.numpy()
+    cell_of, numbers = np.repeat(np.arange(begin[1]), np.diff(firsts)), {}
+    for height in range(depth + 1):
+        own = np.array([found[np.flatnonzero(cell_of == cell)[0]] for cell in range(begin[height], begin[height + 1])])
+        numbers = {tuple(key): begin[height] + k for k, key in enumerate(own)}
+        assert len(numbers) == len(own)  # none twice
+        assert (np.diff(own[:, [3, 2, 1, 0]] @ [2**42, 2**28, 2**14, 1]) > 0).all() or depth > 13
+        assert (found == own[cell_of - begin[height]]).all()
+        neighbors = grid.neighbors.numpy()[begin[height] : begin[height + 1]]
+        for k in range(27):
+            offset = np.array([k % 3 - 1, k // 3 % 3 - 1, k // 9 - 1, 0])
+            assert neighbors[:, k].tolist() == [numbers.get(tuple(key), -1) for key in own + offset]
+        if height < depth:
+            assert (octants[begin[height] : begin[height + 1]] == own[:, :3] % 2 @ [1, 2, 4]).all()
+            children_of = children[parents[cell_of], octants[cell_of]]
+            assert (children_of == cell_of).all()
+            cell_of = parents[cell_of]
+        found = found // [2, 2, 2, 1]
+
+
+def order_is_by_octant(grid) -> bool:
+    depth, cells = grid.counts.numpy()
+    order, octants, begin = grid.order.numpy()[:cells], grid.octant.numpy(), grid.octant_begin.numpy()
+    level = grid.level_begin.numpy()
+    for height in range(depth + 1):
+        for octant in range(8):
+            own = order[begin[height, octant] : begin[height, octant + 1]]
+            expected = level[height] + np.flatnonzero(octants[level[height] : level[height + 1]] == octant)
+            if own.tolist() != expected.tolist():
+                return False
+    return True
+
+
+def test_cells_are_listed_by_octant(device):
+    grid = make_grid(np.random.default_rng(2).random((4000, 3)), np.zeros(4000, int), 20, device)
+    assert order_is_by_octant(grid)
+
+
+@pytest.mark.parametrize(("rtol", "dtype"), [(1e-3, "float32"), (1e-5, "float32"), (1e-5, "float64")])
+def test_field_and_wrench_are_those_of_all_pairs(rtol, dtype, device):
+    places = jittered(3500)
+    moments = moments_of(len(places))
+    expected = warpmag.h_field(places, moments, radii=0.4, dtype="float64", device=device)
+    field = warpmag.h_field(places, moments, radii=0.4, method="fmm", rtol=rtol, dtype=dtype, device=device)
+    assert apart(field, expected) <= rtol
+    expected = warpmag.wrench(places, moments, radii=0.4, dtype="float64", device=device)
+    forces, torques = warpmag.wrench(places, moments, radii=0.4, method="fmm", rtol=rtol, dtype=dtype, device=device)
+    assert apart(forces, expected[0]) <= rtol
+    assert apart(torques, expected[1]) <= rtol
+    # actions and reactions are the same numbers but for rounding
+    unit = 1e-7 if dtype == "float32" else 1e-15
+    assert np.abs(forces.astype(float).sum(axis=0)).max() <= unit * np.linalg.norm(forces, axis=1).sum()
+
+
+def test_overlapping_balls_and_targets_elsewhere(device):
+    places = jittered(3000)
+    moments, targets = moments_of(len(places)), np.random.default_rng(4).uniform(-3, 18, (400, 3))
+    for radii in (0.0, 0.6):
+        given = {"radii": radii, "target_radii": 0.3, "device": device}
+        expected = warpmag.h_field(places, moments, targets, dtype="float64", **given)
+        assert apart(warpmag.h_field(places, moments, targets, method="fmm", **given), expected) <= 1e-3
+
+
+@pytest.mark.parametrize("name", ["one", "heap", "chain", "stray"])
+def test_odd_arrangements(name, device):
+    places = ARRANGEMENTS[name][0]
+    moments = moments_of(len(places))
+    expected = warpmag.h_field(places, moments, radii=0.3, dtype="float64", device=device)
+    field = warpmag.h_field(places, moments, radii=0.3, method="fmm", device=device)
+    assert np.linalg.norm(field - expected) <= 1e-3 * np.linalg.norm(expected)
+
+
+def test_kinds_of_arrays_and_bad_arguments(device):
+    places = jittered(200)
+    moments, vec3 = moments_of(len(places)), vec3_type(resolve_dtype("float32"))
+    given = [wp.array(one, dtype=vec3, device=device) for one in (places, moments)]
+    field = warpmag.h_field(*given, method="fmm")
+    assert isinstance(field, wp.array)
+    assert (field.numpy() == warpmag.h_field(places, moments, method="fmm", device=device)).all()
+    with pytest.raises(warpmag.InputError, match="rtol"):
+        warpmag.h_field(places, moments, method="fmm", rtol=3e-7, device=device)
+    with pytest.raises(warpmag.InputError, match="smoothing"):
+        warpmag.h_field(places, moments, method="fmm", smoothing=0.1, device=device)
+    assert warpmag.h_field(np.zeros((0, 3)), np.zeros((0, 3)), method="fmm", device=device).shape == (0, 3)
