@@ -53,7 +53,8 @@ class Coupling:
         start: First entry of each moment, and the end, shape [n + 1].
         other: Moment j of each entry, ascending, shape [entries].
         tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
-        even: The same between all moments, whichever (``even_field.py``), shape [6].
+        common: What moments make of fields that they all have in common (``even_field.py``): of amounts Σ E_i^T m_i the
+            strengths of these fields [1/m³], shape [8, 8].
         positions: Where the moments are [m], shape [n, 3].
         radii: Radii of their balls [m], shape [n].
     """
@@ -61,20 +62,38 @@ class Coupling:
     start: np.ndarray
     other: np.ndarray
     tensor: np.ndarray
-    even: np.ndarray
+    common: np.ndarray
     positions: np.ndarray
     radii: np.ndarray
 
     @cached_property
+    def centre(self) -> np.ndarray:
+        """Mean of the positions [m], shape [3]."""
+        return self.positions.mean(axis=0)
+
+    @cached_property
+    def extent(self) -> float:
+        """Largest distance from there [m], or the radius if there is but one moment."""
+        return float(np.linalg.norm(self.positions - self.centre, axis=1).max()) or float(self.radii.max())
+
+    @property
+    def places(self) -> np.ndarray:
+        """Positions about their mean in extents, shape [n, 3]."""
+        return (self.positions - self.centre) / self.extent
+
+    @cached_property
     def dense(self) -> np.ndarray:
-        """Tensors between all moments [1/m³], whole ones, and those of the pair sums, shape [2, n, n, 6]."""
+        """Tensors between all moments [1/m³], whole ones, and those of the pair sums, shape [2, n, n, 6].
+
+        Only for moments without common fields but the even ones: other tensors are not symmetric.
+        """
         n = len(self.radii)
         i, j = np.divmod(np.arange(n * n), n)
         law = _pair_law(self.positions[i] - self.positions[j], self.radii[i], self.radii[j], i == j)
         law[i == j] = 0.0  # a ball's own field is in its curve
         whole = law.reshape(n, n, 6).copy()
         whole[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
-        whole += self.even
+        whole += self.common[PLACES]
         return np.stack([whole, law.reshape(n, n, 6)])
 
 
@@ -162,7 +181,7 @@ def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) ->
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
-    return Coupling(start, j[order], tensor[order], np.zeros(6), x, radii)
+    return Coupling(start, j[order], tensor[order], np.zeros((8, 8)), x, radii)
 
 
 def _pair_law(r, a, b, same):
