@@ -2,8 +2,8 @@
 
 ``python -m bench.reference.table [BODY ...] [--half] [--torque]`` prints m/(V H0) across and along for
 susceptibilities of 1, 10, 1000 and ∞, each with its difference from Osborn's closed form (ellipsoids) or a surface
-integral equation (``susceptible.py``), and the field evaluations of a cold solve. With ``--torque`` it prints the torque
-of a soft ellipsoid askew in an even field instead, over μ0 V H0², against the closed form.
+integral equation (``susceptible.py``), and the field evaluations of a cold solve. With ``--torque`` it prints the
+torque of a soft ellipsoid askew in an even field instead, over μ0 V H0², against the closed form.
 """
 
 import argparse
