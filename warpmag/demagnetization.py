@@ -101,30 +101,35 @@ def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
     """Demagnetizing tensors of equal cuboids, one averaged over the other (Newell, Williams and Dunlop 1993).
 
     Args:
-        offsets: From one centre to the other in sides, shape [n, 3].
+        offsets: From one centre to the other in sides, whole numbers, shape [n, 3].
         sides: Sides of the cuboids, shape [3].
 
     Returns:
         N, xx, yy, zz, xy, xz, yz, of H = −N M, shape [n, 6].
     """
-    unit = np.asarray(sides, float) / np.max(sides)
-    at = np.abs(np.asarray(offsets, float)) * unit
-    signs = np.where(np.asarray(offsets) < 0, -1.0, 1.0)
-    total = np.zeros((len(at), 6))
-    weights = (-1.0, 2.0, -1.0)
-    for k, weight in np.ndenumerate(np.multiply.outer(np.multiply.outer(weights, weights), weights)):
-        x, y, z = (at + (np.array(k) - 1) * unit).T
-        parts = (
-            _diagonal(x, y, z),
-            _diagonal(y, x, z),
-            _diagonal(z, y, x),
-            _mixed(x, y, z),
-            _mixed(x, z, y),
-            _mixed(y, z, x),
-        )
-        total += weight * np.stack(parts, axis=1)
+    offsets = np.asarray(offsets).astype(int)
+    signs, places = np.where(offsets < 0, -1.0, 1.0), np.abs(offsets)
+    total = _tensor_table(places.max(axis=0, initial=0) + 1, sides)[tuple(places.T)]
     total[:, 3:] *= signs[:, [0, 0, 1]] * signs[:, [1, 2, 2]]
-    return total / (4.0 * np.pi * unit.prod())
+    return total
+
+
+def _tensor_table(counts: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """:func:`cuboid_tensors` of all offsets from 0 on, ``counts`` along each axis, shape [a, b, c, 6]."""
+    unit = np.asarray(sides, float) / np.max(sides)
+    x, y, z = np.ix_(*(step * np.arange(-1, count + 1) for step, count in zip(unit, counts, strict=True)))
+    parts = (
+        _diagonal(x, y, z),
+        _diagonal(y, x, z),
+        _diagonal(z, y, x),
+        _mixed(x, y, z),
+        _mixed(x, z, y),
+        _mixed(y, z, x),
+    )
+    total = np.stack(parts)
+    for _ in range(3):  # second differences along each axis
+        total = np.moveaxis(2.0 * total[:, 1:-1] - total[:, :-2] - total[:, 2:], 1, 3)
+    return np.moveaxis(total, 0, 3) / (4.0 * np.pi * unit.prod())
 
 
 def _diagonal(x, y, z):
@@ -307,7 +312,8 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarr
     The sum over pairs of subcells is one of tensors times the correlation of what is filled, taken in Fourier's space.
     """
     split = np.array(filled.shape[1:])
-    table = cuboid_tensors(grid(reach := (np.abs(apart).max(axis=0) + 1) * split), sides / split).reshape(*reach, 6)
+    reach = (np.abs(apart).max(axis=0) + 1) * split
+    table = _tensor_table(reach, sides / split)
     period, size = tuple(2 * split), len(filled)
     filled = np.fft.rfftn(filled, period, axes=(1, 2, 3))
     twice = np.where(np.arange(split[2] + 1) % split[2] == 0, 1.0, 2.0)  # other halves of the spectrum are conjugate

@@ -52,6 +52,9 @@ _RATIOS = 0.9, 4.0
 _NEAR = 6.0
 """Distance up to which the potential of a facet is that of its area, in distances from its middle to its corners."""
 
+_ON_EDGE = 1e-15
+"""What rounding leaves of r1 + r2 − l on an edge of length l, over r1 + r2; there its logarithm is multiplied by zero."""
+
 _RESIDUAL = 1e-3
 """Relative residual of the cells' magnetization; the error of the moment is its square over the least eigenvalue."""
 
@@ -139,33 +142,55 @@ def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
     From afar, where that differs by less than 0.3 %, that of its area in its middle.
     """
-    middles, (normals, areas) = facets.middles(surface), facets.measures(surface)
-    distance = np.linalg.norm(points[:, None] - middles, axis=2)
-    extent = np.linalg.norm(surface - middles[:, None], axis=2).max(axis=1)
-    i, j = np.nonzero(distance < _NEAR * extent)
-    distance[i, j] = 1.0
-    result = areas / distance
-    result[i, j] = _near_potentials(points[i], surface[j], normals[j])
+    origin = surface.mean(axis=(0, 1))  # about which squares of distances keep their digits
+    points, surface = points - origin, surface - origin
+    middles, (_, areas) = facets.middles(surface), facets.measures(surface)
+    square = _squares(points, middles)
+    extent2 = ((surface - middles[:, None]) ** 2).sum(axis=2).max(axis=1)
+    near = square < _NEAR**2 * extent2
+    square[near] = 1.0
+    result = areas / np.sqrt(square)
+    result[near] = _near_potentials(points, surface, near)
     return result / (4.0 * np.pi)
 
 
-def _near_potentials(points: np.ndarray, surface: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """∫ dA/‖x − y‖ of a facet at a point of its own, shape [n]."""
-    tiny = np.finfo(float).tiny
-    height = np.abs(np.einsum("ik,ik->i", normals, points - surface[:, 0]))
+def _squares(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Squares of the distances between points, shape [points, others]."""
+    squares = (points * points).sum(axis=1)[:, None] + (others * others).sum(axis=1) - 2.0 * points @ others.T
+    return np.maximum(squares, 0.0)
+
+
+def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """∫ dA/‖x − y‖ for the pairs of a point and a facet that ``near`` marks.
+
+    Of each edge the distance in the plane from the point times the logarithm of its ends' distances, less the height
+    over the plane times the solid angle: that of two triangles (van Oosterom and Strackee 1983), whose scalar triple
+    products are heights times areas.
+    """
+    normals, _ = facets.measures(surface)
+    square = [_squares(points, surface[:, k])[near] for k in range(4)]
+    away = [np.sqrt(one) for one in square]
+    height = np.abs(points @ normals.T - np.einsum("mk,mk->m", normals, surface[:, 0]))[near]
+    lengths = np.linalg.norm(np.roll(surface, -1, axis=1) - surface, axis=2)
+    diagonals = np.linalg.norm(surface[:, 2] - surface[:, 0], axis=1)
+    which = np.broadcast_to(np.arange(len(surface)), near.shape)[near]
     total = np.zeros_like(height)
     for k in range(4):
-        a, b = surface[:, k] - points, surface[:, (k + 1) % 4] - points
-        length = np.linalg.norm(b - a, axis=1)
-        along = (b - a) / np.maximum(length, tiny)[:, None]
-        begin, across = np.einsum("ik,ik->i", a, along), np.einsum("ik,ik->i", a, np.cross(along, normals))
-        end, near2 = begin + length, across * across + height * height
-        first, last = np.sqrt(begin * begin + near2), np.sqrt(end * end + near2)
-        sign = np.where(begin + end > 0.0, 1.0, -1.0)  # of the form that keeps its digits
-        ratio = np.maximum(last + sign * end, tiny) / np.maximum(first + sign * begin, tiny)
-        angle = np.arctan2(across * end, near2 + height * last) - np.arctan2(across * begin, near2 + height * first)
-        total += across * sign * np.log(ratio) - height * angle
-    return total
+        side, length = surface[:, (k + 1) % 4] - surface[:, k], lengths[:, k]
+        outward = np.cross(side, normals) / np.maximum(length, np.finfo(float).tiny)[:, None]
+        across = (np.einsum("mk,mk->m", outward, surface[:, k]) - points @ outward.T)[near]
+        both, length = away[k] + away[(k + 1) % 4], length[which]
+        total += across * np.log((both + length) / np.maximum(both - length, _ON_EDGE * both))
+    turned = np.ones(len(height), complex)
+    for k in (1, 2):
+        corners = surface[:, 0], surface[:, k], surface[:, k + 1]
+        double = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]), axis=1)[which]
+        sides = (lengths[:, 0], lengths[:, 1], diagonals) if k == 1 else (diagonals, lengths[:, 2], lengths[:, 3])
+        (a, b, c), (a2, b2, c2) = (away[0], away[k], away[k + 1]), (square[0], square[k], square[k + 1])
+        ab, bc, ca = (one[which] ** 2 for one in sides)
+        real = a * b * c + 0.5 * ((a2 + b2 - ab) * c + (b2 + c2 - bc) * a + (c2 + a2 - ca) * b)
+        turned *= real + 1j * height * double
+    return total - 2.0 * height * np.angle(turned)
 
 
 def cell_moments(coupling: Coupling, lattice: Lattice) -> np.ndarray:
