@@ -53,7 +53,7 @@ _NEAR = 6.0
 """Distance up to which the potential of a facet is that of its area, in distances from its middle to its corners."""
 
 _ON_EDGE = 1e-15
-"""What rounding leaves of r1 + r2 − l on an edge of length l, over r1 + r2; there its logarithm is multiplied by zero."""
+"""What rounding leaves of r1 + r2 − l on an edge of length l, over r1 + r2; its logarithm there is multiplied by 0."""
 
 _RESIDUAL = 1e-3
 """Relative residual of the cells' magnetization; the error of the moment is its square over the least eigenvalue."""
