@@ -10,6 +10,7 @@ import warpmag
 from warpmag.coils import Coil, FieldMap
 from warpmag.engine.attributes import marked_shapes
 from warpmag.engine.scene import import_scene
+from warpmag.errors import InputError
 from warpmag.magnets import Magnet
 from warpmag.scenes_usd import bundled
 from warpmag.usd import author_coil, author_field_map, author_magnet
@@ -137,6 +138,41 @@ def test_coils_and_field_maps_come_in(coils, turned):
         assert abs(abs(expected[3:] @ other[3:]) - 1.0) < 1e-5
     strengths = [one.system.sources.strengths.numpy() for one in (ours, theirs)]
     np.testing.assert_array_equal(*strengths)
+
+
+def test_keyed_currents_are_followed(coils):
+    """Linear between two samples and held after the last, of two worlds alike, in a captured graph, too."""
+    keyed = Usd.Stage.Open(str(coils))
+    keyed.SetStartTimeCode(10.0)
+    keyed.SetTimeCodesPerSecond(20.0)
+    current = keyed.GetPrimAtPath("/Lift").GetAttribute("warpmag:coil:ampereTurns")
+    for code, value in ((10.0, -4.0), (20.0, 6.0), (30.0, 60.0)):
+        current.Set(value, code)
+    keyed.Save()
+    world, builder = newton.ModelBuilder(), newton.ModelBuilder()
+    warpmag.register_attributes(world)
+    world.add_usd(str(coils))
+    builder.replicate(world, 2)
+    model = builder.finalize(device="cpu")
+    currents, strengths = warpmag.KeyedCurrents(model), model.warpmag.strength
+    lifts = [shape for shape, label in enumerate(model.shape_label) if label.endswith("/Lift")]
+    assert list(currents.shapes) == lifts
+    assert len(lifts) == 2
+    for time, expected in ((None, -4.0), (0.25, 1.0), (0.75, 33.0), (9.0, 60.0)):
+        if time is not None:
+            currents.set(time)
+        np.testing.assert_allclose(strengths.numpy()[lifts], expected, rtol=1e-6)
+    with wp.ScopedCapture(device="cpu") as capture:
+        currents.set()
+    currents.time.fill_(0.5)
+    wp.capture_launch(capture.graph)
+    np.testing.assert_allclose(strengths.numpy()[lifts], 6.0, rtol=1e-6)
+    others = np.setdiff1d([shape for shape, text in enumerate(model.warpmag.source) if text], lifts)
+    np.testing.assert_array_equal(strengths.numpy()[others], [50.0, 1.0] * 2)
+    with pytest.raises(InputError, match="time: must be finite"):
+        currents.set(float("nan"))
+    with pytest.raises(InputError, match="no coil of the model has a current with time samples"):
+        warpmag.KeyedCurrents(newton.ModelBuilder().finalize(device="cpu"))
 
 
 def test_a_wrong_coil_is_refused_by_name(coils):

@@ -8,6 +8,7 @@ from warpmag.engine.attributes import add_permanent as add_permanent
 from warpmag.engine.attributes import register_attributes as register_attributes
 from warpmag.engine.attributes import register_custom_attributes as register_custom_attributes
 from warpmag.engine.display import Display as Display
+from warpmag.engine.drive import KeyedCurrents as KeyedCurrents
 from warpmag.engine.magnetics import Magnetics as Magnetics
 from warpmag.engine.magnetometer import SensorMagnetometer as SensorMagnetometer
 from warpmag.engine.simulation import Simulation as Simulation

@@ -53,7 +53,8 @@ class Coupling:
         start: First entry of each moment, and the end, shape [n + 1].
         other: Moment j of each entry, ascending, shape [entries].
         tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
-        even: The same between all moments, whichever (``even_field.py``), shape [6].
+        common: What moments make of fields that they all have in common (``even_field.py``): of amounts Σ E_i^T m_i the
+            strengths of these fields [1/m³], shape [8, 8].
         positions: Where the moments are [m], shape [n, 3].
         radii: Radii of their balls [m], shape [n].
     """
@@ -61,20 +62,38 @@ class Coupling:
     start: np.ndarray
     other: np.ndarray
     tensor: np.ndarray
-    even: np.ndarray
+    common: np.ndarray
     positions: np.ndarray
     radii: np.ndarray
 
     @cached_property
+    def centre(self) -> np.ndarray:
+        """Mean of the positions [m], shape [3]."""
+        return self.positions.mean(axis=0)
+
+    @cached_property
+    def extent(self) -> float:
+        """Largest distance from there [m], or the radius if there is but one moment."""
+        return float(np.linalg.norm(self.positions - self.centre, axis=1).max()) or float(self.radii.max())
+
+    @property
+    def places(self) -> np.ndarray:
+        """Positions about their mean in extents, shape [n, 3]."""
+        return (self.positions - self.centre) / self.extent
+
+    @cached_property
     def dense(self) -> np.ndarray:
-        """Tensors between all moments [1/m³], whole ones, and those of the pair sums, shape [2, n, n, 6]."""
+        """Tensors between all moments [1/m³], whole ones, and those of the pair sums, shape [2, n, n, 6].
+
+        Only for moments without common fields but the even ones: other tensors are not symmetric.
+        """
         n = len(self.radii)
         i, j = np.divmod(np.arange(n * n), n)
         law = _pair_law(self.positions[i] - self.positions[j], self.radii[i], self.radii[j], i == j)
         law[i == j] = 0.0  # a ball's own field is in its curve
         whole = law.reshape(n, n, 6).copy()
         whole[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
-        whole += self.even
+        whole += self.common[PLACES]
         return np.stack([whole, law.reshape(n, n, 6)])
 
 
@@ -82,30 +101,35 @@ def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
     """Demagnetizing tensors of equal cuboids, one averaged over the other (Newell, Williams and Dunlop 1993).
 
     Args:
-        offsets: From one centre to the other in sides, shape [n, 3].
+        offsets: From one centre to the other in sides, whole numbers, shape [n, 3].
         sides: Sides of the cuboids, shape [3].
 
     Returns:
         N, xx, yy, zz, xy, xz, yz, of H = −N M, shape [n, 6].
     """
-    unit = np.asarray(sides, float) / np.max(sides)
-    at = np.abs(np.asarray(offsets, float)) * unit
-    signs = np.where(np.asarray(offsets) < 0, -1.0, 1.0)
-    total = np.zeros((len(at), 6))
-    weights = (-1.0, 2.0, -1.0)
-    for k, weight in np.ndenumerate(np.multiply.outer(np.multiply.outer(weights, weights), weights)):
-        x, y, z = (at + (np.array(k) - 1) * unit).T
-        parts = (
-            _diagonal(x, y, z),
-            _diagonal(y, x, z),
-            _diagonal(z, y, x),
-            _mixed(x, y, z),
-            _mixed(x, z, y),
-            _mixed(y, z, x),
-        )
-        total += weight * np.stack(parts, axis=1)
+    offsets = np.asarray(offsets).astype(int)
+    signs, places = np.where(offsets < 0, -1.0, 1.0), np.abs(offsets)
+    total = _tensor_table(places.max(axis=0, initial=0) + 1, sides)[tuple(places.T)]
     total[:, 3:] *= signs[:, [0, 0, 1]] * signs[:, [1, 2, 2]]
-    return total / (4.0 * np.pi * unit.prod())
+    return total
+
+
+def _tensor_table(counts: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """:func:`cuboid_tensors` of all offsets from 0 on, ``counts`` along each axis, shape [a, b, c, 6]."""
+    unit = np.asarray(sides, float) / np.max(sides)
+    x, y, z = np.ix_(*(step * np.arange(-1, count + 1) for step, count in zip(unit, counts, strict=True)))
+    parts = (
+        _diagonal(x, y, z),
+        _diagonal(y, x, z),
+        _diagonal(z, y, x),
+        _mixed(x, y, z),
+        _mixed(x, z, y),
+        _mixed(y, z, x),
+    )
+    total = np.stack(parts)
+    for _ in range(3):  # second differences along each axis
+        total = np.moveaxis(2.0 * total[:, 1:-1] - total[:, :-2] - total[:, 2:], 1, 3)
+    return np.moveaxis(total, 0, 3) / (4.0 * np.pi * unit.prod())
 
 
 def _diagonal(x, y, z):
@@ -162,7 +186,7 @@ def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) ->
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
-    return Coupling(start, j[order], tensor[order], np.zeros(6), x, radii)
+    return Coupling(start, j[order], tensor[order], np.zeros((8, 8)), x, radii)
 
 
 def _pair_law(r, a, b, same):
@@ -288,7 +312,8 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarr
     The sum over pairs of subcells is one of tensors times the correlation of what is filled, taken in Fourier's space.
     """
     split = np.array(filled.shape[1:])
-    table = cuboid_tensors(grid(reach := (np.abs(apart).max(axis=0) + 1) * split), sides / split).reshape(*reach, 6)
+    reach = (np.abs(apart).max(axis=0) + 1) * split
+    table = _tensor_table(reach, sides / split)
     period, size = tuple(2 * split), len(filled)
     filled = np.fft.rfftn(filled, period, axes=(1, 2, 3))
     twice = np.where(np.arange(split[2] + 1) % split[2] == 0, 1.0, 2.0)  # other halves of the spectrum are conjugate

@@ -1,15 +1,19 @@
-"""How a body answers to an even field, from its surface, and what its cells lack for that.
+"""How a body answers to an even field and to one of even gradient, from its surface, and what its cells lack for that.
 
 Cells of uniform magnetization take too little moment (``demagnetization.py``): one or two across a sheet or a letter up
-to a third. What they take in an even field is known at once, by conjugate gradients; what the body takes, if it is
-ideally permeable, is known from its surface alone, which is at one potential then: (1/4π) ∫ σ/‖x − y‖ dA = H0·x, and
-the moment is ∫ σ x dA. σ is taken as constant on facets (``facets.py``), whose potentials are closed forms (Wilton et
-al., IEEE Trans. Antennas Propag. 32 (1984) 276).
+to a third. What they take in a field is known at once, by conjugate gradients; what the body takes, if it is ideally
+permeable, is known from its surface alone, which is at one potential then: (1/4π) ∫ σ/‖x − y‖ dA = ψ, where ψ is H0·x
+in an even field, and the moment is ∫ σ x dA. σ is taken as constant on facets (``facets.py``), whose potentials are
+closed forms (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276).
 
-With polarizabilities P of the cells and Q of the surface, moments over V H0, the operator of the cells N is replaced by
-N − E C Eᵀ/n, C = P⁻¹ − Q⁻¹, E an even field: all cells feel C times their mean magnetization on top. By Woodbury's
-formula the body then takes Q in an even field; and since Q is positive the operator stays positive, which a change of
-the cells' own tensors would not leave it.
+With polarizabilities P of the cells and Q of the surface the operator of the cells N is replaced by N − E C Eᵀ,
+C = P⁻¹ − Q⁻¹, E an even field: all cells feel C times the moment of the body on top. By Woodbury's formula the body
+then takes Q in an even field; and since Q is positive the operator stays positive, which a change of the cells' own
+tensors would not leave it.
+
+The same holds for more fields at once. The columns of E are gradients of harmonic polynomials ψ_k, and P and Q matrices
+of what each gives of each, Q_kl = ∫ σ_k ψ_l dA. Beside the three even fields there are five of even gradient, which a
+magnet nearby makes most of the rest of: a plate below one lacks 2 to 4 % of the force without them.
 """
 
 from collections.abc import Sequence
@@ -18,10 +22,17 @@ from dataclasses import replace
 import numpy as np
 
 from warpmag import facets
-from warpmag.demagnetization import PLACES, Coupling, full_tensors
+from warpmag.demagnetization import Coupling, full_tensors
 from warpmag.lattice import Lattice
 from warpmag.oracle import radial_factors
 from warpmag.solid import Solid
+
+FIELDS = 8
+"""Fields that all cells of a body may have in common: three even ones and five of even gradient."""
+
+_UNEVEN = 65, 2500
+"""Cells of bodies that get the fields of even gradient, too: with fewer they are tensors that are not symmetric, which
+bodies that respond as wholes do not know; with more cells lack little, and as many more fields take as much longer."""
 
 FACETS = 600
 """Facets of a body, about; from these and a quarter as many its moment is extrapolated, to 0.3 % for a cube."""
@@ -41,6 +52,9 @@ _RATIOS = 0.9, 4.0
 _NEAR = 6.0
 """Distance up to which the potential of a facet is that of its area, in distances from its middle to its corners."""
 
+_ON_EDGE = 1e-15
+"""What rounding leaves of r1 + r2 − l on an edge of length l, over r1 + r2; its logarithm there is multiplied by 0."""
+
 _RESIDUAL = 1e-3
 """Relative residual of the cells' magnetization; the error of the moment is its square over the least eigenvalue."""
 
@@ -52,7 +66,7 @@ _CHUNK = 1 << 18
 
 
 def corrected(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
-    """The coupling with the field that all cells have in common, which brings the body's moment to that of its surface.
+    """The coupling with the fields that all cells have in common, which bring the body's answer to that of its surface.
 
     Bodies in parts that are apart have none, nor those of which surface or cells are too many.
     """
@@ -62,37 +76,65 @@ def corrected(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> 
     coarse, fine = (facets.of_body(solids, count) for count in (most // 4, most))
     if len(fine) > MOST_FACETS:
         return coupling
-    of_surface, of_cells = extrapolated_moments(coarse, fine), cell_moments(coupling, lattice)
-    ratios = np.linalg.eigvals(np.linalg.solve(of_cells, of_surface)).real
-    if not (ratios.min() > _RATIOS[0] and ratios.max() < _RATIOS[1]):
-        return coupling
-    return replace(coupling, even=(np.linalg.inv(of_cells) - np.linalg.inv(of_surface))[PLACES])
+    of_surface, of_cells = extrapolated_moments(coupling, coarse, fine), cell_moments(coupling, lattice)
+    for count in range(len(of_cells), 0, -FIELDS + 3):
+        cells, surface = of_cells[:count, :count], of_surface[:count, :count]
+        parts = np.linalg.eigvals(np.linalg.solve(surface, cells)).real
+        if parts.min() > 1.0 / _RATIOS[1] and parts.max() < 1.0 / _RATIOS[0]:
+            common = np.zeros((FIELDS, FIELDS))
+            common[:count, :count] = np.linalg.inv(cells) - np.linalg.inv(surface)
+            return replace(coupling, common=common)
+    return coupling
 
 
-def extrapolated_moments(coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
+def common_potentials(places: np.ndarray) -> np.ndarray:
+    """Potentials x, y, z, (x² − z²)/2, (y² − z²)/2, xy, xz, yz at places in extents, shape [n, 8]."""
+    x, y, z = places.T
+    return np.stack([x, y, z, 0.5 * (x * x - z * z), 0.5 * (y * y - z * z), x * y, x * z, y * z], axis=1)
+
+
+def common_fields(places: np.ndarray) -> np.ndarray:
+    """Their gradients, fields that all cells of a body have in common, shape [n, 3, 8]."""
+    x, y, z = places.T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    rows = (
+        (one, zero, zero, x, zero, y, z, zero),
+        (zero, one, zero, zero, y, x, zero, z),
+        (zero, zero, one, -z, -z, zero, x, y),
+    )
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def extrapolated_moments(coupling: Coupling, coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
     """:func:`surface_moments` for ever more facets, of which the error goes as one over their number."""
-    found = surface_moments(fine)
+    found = surface_moments(coupling, fine)
     if len(fine) < 2 * len(coarse):
         return found
-    return found + (found - surface_moments(coarse)) / (len(fine) / len(coarse) - 1.0)
+    return found + (found - surface_moments(coupling, coarse)) / (len(fine) / len(coarse) - 1.0)
 
 
-def surface_moments(surface: np.ndarray) -> np.ndarray:
-    """Moments [m³] of an ideally permeable body in unit fields along each axis, shape [3, 3].
+def surface_moments(coupling: Coupling, surface: np.ndarray) -> np.ndarray:
+    """What an ideally permeable body takes of common fields in each of them [m³], in even fields moments, shape [k, k].
 
     Args:
+        coupling: The coupling of its cells, of which the number tells which fields count.
         surface: Its facets [m], shape [m, 4, 3].
     """
     middles, (_, areas) = facets.middles(surface), facets.measures(surface)
-    at = middles - areas @ middles / areas.sum()
+    count = _field_count(coupling)
+    at = coupling.extent * common_potentials((middles - coupling.centre) / coupling.extent)[:, :count]
     matrix = np.zeros((len(at) + 1, len(at) + 1))
     step = max(1, _CHUNK // len(at))
     for start in range(0, len(at), step):
         matrix[start : min(start + step, len(at)), :-1] = potentials(middles[start : start + step], surface)
     matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # the potential of the body is free, its charge is zero
-    charges = np.linalg.solve(matrix, np.append(at, np.zeros((1, 3)), axis=0))[:-1]
+    charges = np.linalg.solve(matrix, np.append(at, np.zeros((1, count)), axis=0))[:-1]
     found = (charges * areas[:, None]).T @ at
     return 0.5 * (found + found.T)
+
+
+def _field_count(coupling: Coupling) -> int:
+    return FIELDS if _UNEVEN[0] <= len(coupling.radii) <= _UNEVEN[1] else 3
 
 
 def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
@@ -100,39 +142,61 @@ def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
     From afar, where that differs by less than 0.3 %, that of its area in its middle.
     """
-    middles, (normals, areas) = facets.middles(surface), facets.measures(surface)
-    distance = np.linalg.norm(points[:, None] - middles, axis=2)
-    extent = np.linalg.norm(surface - middles[:, None], axis=2).max(axis=1)
-    i, j = np.nonzero(distance < _NEAR * extent)
-    distance[i, j] = 1.0
-    result = areas / distance
-    result[i, j] = _near_potentials(points[i], surface[j], normals[j])
+    origin = surface.mean(axis=(0, 1))  # about which squares of distances keep their digits
+    points, surface = points - origin, surface - origin
+    middles, (_, areas) = facets.middles(surface), facets.measures(surface)
+    square = _squares(points, middles)
+    extent2 = ((surface - middles[:, None]) ** 2).sum(axis=2).max(axis=1)
+    near = square < _NEAR**2 * extent2
+    square[near] = 1.0
+    result = areas / np.sqrt(square)
+    result[near] = _near_potentials(points, surface, near)
     return result / (4.0 * np.pi)
 
 
-def _near_potentials(points: np.ndarray, surface: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """∫ dA/‖x − y‖ of a facet at a point of its own, shape [n]."""
-    tiny = np.finfo(float).tiny
-    height = np.abs(np.einsum("ik,ik->i", normals, points - surface[:, 0]))
+def _squares(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Squares of the distances between points, shape [points, others]."""
+    squares = (points * points).sum(axis=1)[:, None] + (others * others).sum(axis=1) - 2.0 * points @ others.T
+    return np.maximum(squares, 0.0)
+
+
+def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """∫ dA/‖x − y‖ for the pairs of a point and a facet that ``near`` marks.
+
+    Of each edge the distance in the plane from the point times the logarithm of its ends' distances, less the height
+    over the plane times the solid angle: that of two triangles (van Oosterom and Strackee 1983), whose scalar triple
+    products are heights times areas.
+    """
+    normals, _ = facets.measures(surface)
+    square = [_squares(points, surface[:, k])[near] for k in range(4)]
+    away = [np.sqrt(one) for one in square]
+    height = np.abs(points @ normals.T - np.einsum("mk,mk->m", normals, surface[:, 0]))[near]
+    lengths = np.linalg.norm(np.roll(surface, -1, axis=1) - surface, axis=2)
+    diagonals = np.linalg.norm(surface[:, 2] - surface[:, 0], axis=1)
+    which = np.broadcast_to(np.arange(len(surface)), near.shape)[near]
     total = np.zeros_like(height)
     for k in range(4):
-        a, b = surface[:, k] - points, surface[:, (k + 1) % 4] - points
-        length = np.linalg.norm(b - a, axis=1)
-        along = (b - a) / np.maximum(length, tiny)[:, None]
-        begin, across = np.einsum("ik,ik->i", a, along), np.einsum("ik,ik->i", a, np.cross(along, normals))
-        end, near2 = begin + length, across * across + height * height
-        first, last = np.sqrt(begin * begin + near2), np.sqrt(end * end + near2)
-        sign = np.where(begin + end > 0.0, 1.0, -1.0)  # of the form that keeps its digits
-        ratio = np.maximum(last + sign * end, tiny) / np.maximum(first + sign * begin, tiny)
-        angle = np.arctan2(across * end, near2 + height * last) - np.arctan2(across * begin, near2 + height * first)
-        total += across * sign * np.log(ratio) - height * angle
-    return total
+        side, length = surface[:, (k + 1) % 4] - surface[:, k], lengths[:, k]
+        outward = np.cross(side, normals) / np.maximum(length, np.finfo(float).tiny)[:, None]
+        across = (np.einsum("mk,mk->m", outward, surface[:, k]) - points @ outward.T)[near]
+        both, length = away[k] + away[(k + 1) % 4], length[which]
+        total += across * np.log((both + length) / np.maximum(both - length, _ON_EDGE * both))
+    turned = np.ones(len(height), complex)
+    for k in (1, 2):
+        corners = surface[:, 0], surface[:, k], surface[:, k + 1]
+        double = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]), axis=1)[which]
+        sides = (lengths[:, 0], lengths[:, 1], diagonals) if k == 1 else (diagonals, lengths[:, 2], lengths[:, 3])
+        (a, b, c), (a2, b2, c2) = (away[0], away[k], away[k + 1]), (square[0], square[k], square[k + 1])
+        ab, bc, ca = (one[which] ** 2 for one in sides)
+        real = a * b * c + 0.5 * ((a2 + b2 - ab) * c + (b2 + c2 - bc) * a + (c2 + a2 - ca) * b)
+        turned *= real + 1j * height * double
+    return total - 2.0 * height * np.angle(turned)
 
 
 def cell_moments(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     """The same of the cells of a body, of which those without a coupling are dipoles to each other."""
     apply, root = _operator(coupling, lattice), np.sqrt(lattice.volumes)[:, None, None]
-    fields = root * np.eye(3)
+    fields = root * common_fields(coupling.places)[:, :, : _field_count(coupling)]
     found, rest = np.zeros_like(fields), fields
     search, size = rest, (rest**2).sum(axis=(0, 1))
     goal = _RESIDUAL**2 * size

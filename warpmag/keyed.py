@@ -3,7 +3,8 @@
 Neither Warp, Newton nor USD is imported here.
 """
 
-from dataclasses import dataclass, replace
+import json
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -30,6 +31,16 @@ class Keys:
     def in_seconds(self, start: float, rate: float) -> "Keys":
         """Return keys at time codes, ``rate`` of which make a second, as keys at seconds since the code ``start``."""
         return replace(self, times=(self.times - start) / rate)
+
+    def to_text(self) -> str:
+        """Return the keys as JSON."""
+        return json.dumps(asdict(self), default=np.ndarray.tolist)
+
+    @classmethod
+    def from_text(cls, text: str) -> "Keys":
+        """Return the keys that :meth:`to_text` wrote."""
+        found = json.loads(text)
+        return cls(np.array(found["times"]), np.array(found["values"]), found["interpolation"])
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Moments of inducible bodies against references, at the default spacing and at half of it.
 
-``python -m bench.reference.table [BODY ...] [--half]`` prints m/(V H0) across and along for susceptibilities of 1, 10,
-1000 and ∞, each with its difference from Osborn's closed form (ellipsoids) or a surface integral equation
-(``susceptible.py``), and the field evaluations of a cold solve.
+``python -m bench.reference.table [BODY ...] [--half] [--torque]`` prints m/(V H0) across and along for
+susceptibilities of 1, 10, 1000 and ∞, each with its difference from Osborn's closed form (ellipsoids) or a surface
+integral equation (``susceptible.py``), and the field evaluations of a cold solve. With ``--torque`` it prints the
+torque of a soft ellipsoid askew in an even field instead, over μ0 V H0², against the closed form.
 """
 
 import argparse
@@ -21,13 +22,13 @@ FAINT = 1e12
 """A saturation far above any field here [A/m]."""
 
 
-def ellipsoid(semi_axes) -> np.ndarray:
+def ellipsoid(semi_axes, susceptibilities=SUSCEPTIBILITIES) -> np.ndarray:
     """Moment over V H0 along each axis, shape [susceptibilities, 3]; factors by their integrals (Osborn 1945)."""
     a = np.asarray(semi_axes, float)
     nodes, weights = np.polynomial.legendre.leggauss(200)
     s = np.exp(0.5 * (nodes + 1.0) * 60.0 - 30.0)[:, None]  # from e^-30 to e^30
     integrals = (30.0 * weights[:, None] * s / ((s + a * a) * np.sqrt(np.prod(s + a * a, axis=1))[:, None])).sum(axis=0)
-    return 1.0 / (0.5 * a.prod() * integrals + 1.0 / np.array(SUSCEPTIBILITIES)[:, None])
+    return 1.0 / (0.5 * a.prod() * integrals + 1.0 / np.array(susceptibilities)[:, None])
 
 
 def box(*sides):
@@ -55,12 +56,17 @@ BODIES = {
 """Bodies and their exact moments across z and along it, shape [susceptibilities, 2]."""
 
 
-def found(solid, half: bool, device=None):
-    """Moments over V H0 across and along, evaluations, shape [susceptibilities, 2] each, and how many cells."""
+def cells_of(solid, half: bool):
+    """Cells of a body, and their coupling."""
     body = lattice.fill(solid, across=lattice.LEAST_ACROSS)
     if half:
         body = lattice.fill(solid, 0.5 * np.cbrt(solid.volume / len(body.volumes)))
-    coupling = even_field.corrected(demagnetization.coupling(body, body.radii), body, [solid])
+    return body, even_field.corrected(demagnetization.coupling(body, body.radii), body, [solid])
+
+
+def found(solid, half: bool, device=None):
+    """Moments over V H0 across and along, evaluations, shape [susceptibilities, 2] each, and how many cells."""
+    body, coupling = cells_of(solid, half)
     results = np.empty((2, len(SUSCEPTIBILITIES), 2))
     for i, j in np.ndindex(results.shape[1:]):
         field = 1e3 * np.eye(3)[[0, 2]][j]
@@ -75,17 +81,41 @@ def found(solid, half: bool, device=None):
     return *results, len(body.volumes)
 
 
+def print_torques(half: bool, device=None, susceptibility=179.0) -> None:
+    """Print the torque of an ellipsoid 1:1:10 at some angles between its axis and the field."""
+    axes = np.array([1.0, 1.0, 10.0])
+    body, coupling = cells_of(lattice.ellipsoid(0.5 * axes), half)
+    across, _, along = ellipsoid(axes, (susceptibility,))[0]
+    for degrees in (15, 30, 45, 60, 75):
+        field = 1e3 * np.array([math.sin(math.radians(degrees)), 0.0, math.cos(math.radians(degrees))])
+        system = MomentSystem(
+            radii=body.radii, bodies=np.zeros(len(body.radii), int), couplings=[(0, coupling)], saturation=FAINT,
+            susceptibility=susceptibility, external_field=field, max_evaluations=5000, device=device,
+        )  # fmt: skip
+        system.positions.assign(body.positions)
+        system.solve()
+        system.apply_forces()
+        torque = system.torques.numpy().sum(axis=0, dtype=float)[1] / (4e-7 * math.pi * 1e6 * body.volumes.sum())
+        true = (along - across) * field[0] * field[2] / 1e6
+        print(
+            f"{degrees} degrees {len(body.volumes)} {torque:8.4f} {100.0 * (torque / true - 1.0):+5.2f} %", flush=True
+        )
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m bench.reference.table", description=__doc__.partition("\n")[0])
     parser.add_argument("bodies", nargs="*", metavar="BODY", help=f"of {', '.join(BODIES)}; all if none is named")
     parser.add_argument("--half", action="store_true", help="half the default spacing")
+    parser.add_argument("--torque", action="store_true", help="the torque of a soft ellipsoid")
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     if unknown := set(options.bodies) - set(BODIES):
         parser.error(f"no such body: {', '.join(unknown)}")
     wp.config.log_level = wp.LOG_WARNING
     print(describe(wp.get_device(options.device)))
+    if options.torque:
+        return print_torques(options.half, options.device)
     for name in options.bodies or BODIES:
         solid, reference = BODIES[name]
         exact, (moments, evaluations, count) = reference(), found(solid, options.half, options.device)

@@ -1,10 +1,10 @@
 // Adds to the field at the cells of bodies what the sums over pairs lack between cells of one body: H_i += Σ T_ij m_j
 // with tensors T_ij of the body's frame.
 //
-// Three passes: moments are turned into the frame of their body, there they make the field that all its cells have in
-// common, and sums are turned into the world; and one before, where cells of two bodies overlap. On a CPU a pass works
-// on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY, GROUP and HARDENING; ``Couplings`` is the
-// struct of couplings.py.
+// Three passes: moments are turned into the frame of their body, there they make the fields that all its cells have
+// in common, and sums are turned into the world; and one before, where cells of two bodies overlap. On a CPU a pass
+// works on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY, GROUP and HARDENING; ``Couplings``
+// is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
 #include "pairs/overlap_volume.h"
@@ -13,6 +13,7 @@
 namespace warpmag {
 
 constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
+constexpr int COMMON = 8; // fields that all cells of a body have in common; as in couplings.py
 
 enum CellPass { HARDEN, TURN, SHARE, ADD }; // as in couplings.py
 
@@ -36,28 +37,43 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
     return group_sums(h);
 }
 
-// Field that all cells of a body have in common: its tensor times the moment of the body.
+// Fields that all cells of a body have in common, of given strengths, at places in it: even ones, and the gradients of
+// (x² − z²)/2, (y² − z²)/2, xy, xz and yz.
+CUDA_CALLABLE inline Vector common_field(const Real* a, Vector at) {
+    const Number &x = at.x, &y = at.y, &z = at.z;
+    return {a[0] + a[3] * x + a[5] * y + a[6] * z, a[1] + a[5] * x + a[4] * y + a[7] * z,
+            a[2] + a[6] * x + a[7] * y - (a[3] + a[4]) * z};
+}
+
+// Strengths of these fields: the matrix of the body times what it has of each of them.
 template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings& c, int body) {
     const auto& rows = c.rows.data[body]; // first row of the body, and the end of them
-    const size_t pitch = c.turned.strides[0] / sizeof(Real);
-    Vector sums = {0, 0, 0};
+    const int table = c.chunk.data[rows[0] / CHUNK][3] - rows[0];
+    const size_t pitch = c.turned.strides[0] / sizeof(Real), places = c.place.strides[0] / sizeof(Real);
+    Vector sums[3] = {};
     for (int row = rows[0] + WIDTH * share(); row < rows[1]; row += WIDTH * SHARES) {
-        const Real* const own = c.turned.data + row;
-        sums = sum(sums, {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)});
+        const Real *const own = c.turned.data + row, *const at = c.place.data + table + row;
+        const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
+        const Number x = numbers(at), y = numbers(at + places), z = numbers(at + 2 * places);
+        sums[0] = sum(sums[0], m);
+        sums[1] = sum(sums[1], {x * m.x - z * m.z, y * m.y - z * m.z, x * m.y + y * m.x});
+        sums[2] = sum(sums[2], {x * m.z + z * m.x, y * m.z + z * m.y, z * 0});
     }
-    sums = group_sums(sums);
+    for (Vector& one : sums) one = group_sums(one);
     if (share() != 0) return;
-    Real m[3] = {0, 0, 0};
-    for (int lane = 0; lane < WIDTH; ++lane) {
-        m[0] += lane_of(sums.x, lane);
-        m[1] += lane_of(sums.y, lane);
-        m[2] += lane_of(sums.z, lane);
+    Real held[3 * 3] = {};
+    for (int lane = 0; lane < WIDTH; ++lane)
+        for (int k = 0; k < 3; ++k) {
+            held[3 * k] += lane_of(sums[k].x, lane);
+            held[3 * k + 1] += lane_of(sums[k].y, lane);
+            held[3 * k + 2] += lane_of(sums[k].z, lane);
+        }
+    const Real* const matrix = c.matrix.data + (size_t)body * (COMMON * COMMON);
+    for (int k = 0; k < COMMON; ++k) {
+        Real strength = 0;
+        for (int l = 0; l < COMMON; ++l) strength += matrix[COMMON * k + l] * held[l];
+        c.common.data[(size_t)body * COMMON + k] = strength;
     }
-    const Real* const t = c.even.data + (size_t)body * TENSOR;
-    Real* const h = c.common.data + 3 * (size_t)body;
-    h[0] = t[0] * m[0] + t[3] * m[1] + t[4] * m[2];
-    h[1] = t[3] * m[0] + t[1] * m[1] + t[5] * m[2];
-    h[2] = t[4] * m[0] + t[5] * m[1] + t[2] * m[2];
 }
 
 // What the overlap of cells with those of other bodies adds to their demagnetizing factor, over their volume [1/m³].
@@ -98,12 +114,15 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
         put(own + 2 * pitch, m.z);
         return;
     }
-    const Vector sums = sum_entries(c, c.turned.data + chunk[2], row - chunk[2] + chunk[3]);
+    const int in_table = row - chunk[2] + chunk[3];
+    const Vector sums = sum_entries(c, c.turned.data + chunk[2], in_table);
     if (share() != 0) return;
     const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
-    const Real* const common = c.common.data + 3 * (size_t)body;
-    const Vector even = {Number(common[0]), Number(common[1]), Number(common[2])};
-    const Vector h = less(sum(sums, even), scaled(numbers(c.hardness.data + row), m));
+    const size_t places = c.place.strides[0] / sizeof(Real);
+    const Real* const at = c.place.data + in_table;
+    const Vector place = {numbers(at), numbers(at + places), numbers(at + 2 * places)};
+    const Vector common = common_field(c.common.data + (size_t)body * COMMON, place);
+    const Vector h = less(sum(sums, common), scaled(numbers(c.hardness.data + row), m));
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
     put_vectors(field, held, sum(vectors(field, held), turned(rotation, h)));
 }

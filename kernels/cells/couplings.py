@@ -6,6 +6,7 @@ A table belongs to a shape and serves all bodies of that shape. It has a list of
     slot_begin: First slot of each chunk of all tables, and the end.
     other: The cell of its body that an entry is about, shape [slots · CHUNK].
     tensor: T_ij [1/m³], rows xx, yy, zz, xy, xz, yz of CHUNK numbers for each slot, flat; zero where a list has ended.
+    place: Where cells are in their body, as its common fields have it, shape [3, rows].
 
 Bodies refer to them, in as many chunks:
 
@@ -13,8 +14,9 @@ Bodies refer to them, in as many chunks:
     body: Which body it is of, shape [chunks].
     rotation: Rotation of each body, from its frame to the world's (x, y, z, w), shape [bodies].
     rows: First row of each body, and the end of them, shape [bodies].
-    even: Tensor of the field that all cells of a body have in common, times its moment [1/m³], flat, six a body.
-    common: That field [A/m], frame of the body, flat, three numbers a body.
+    matrix: Strengths of the fields that all cells of a body have in common, of what it has of them [1/m³], flat,
+        COMMON rows of COMMON a body.
+    common: These strengths [A/m], frame of the body, flat, COMMON a body.
     moments: Moments [A·m²], shape [n]; those of a body follow each other.
     turned: Moments in the frames of their bodies, shape [3, chunks · CHUNK].
     world: First inducible moment of the chunk's world, and the end of them, shape [chunks].
@@ -41,6 +43,8 @@ from warpmag.kernels.shared.team import team, threads_for
 
 HARDENING = 0.2
 """Demagnetizing factor of a cell that wholly lies in another body's; least eigenvalues with 0.15 are down to -0.001."""
+COMMON = 8
+"""Fields that all cells of a body have in common; as in ``couplings.h``."""
 HARDEN, TURN, SHARE, ADD = range(4)
 """The passes, in order; as in ``couplings.h``."""
 _CELLS_PER_THREAD = 500
@@ -61,7 +65,8 @@ def couplings_type(dtype):
         body: wp.array[int]
         rotation: wp.array[quaternion]
         rows: wp.array[wp.vec2i]
-        even: wp.array[dtype]
+        place: wp.array2d[dtype]
+        matrix: wp.array[dtype]
         common: wp.array[dtype]
         moments: wp.array[vec3]
         turned: wp.array2d[dtype]
@@ -103,8 +108,8 @@ class CellCouplings:
 
     Args:
         bodies: Of each body the first moment, and the coupling of its cells: ``start``, ``other`` and ``tensor``, a
-            list for each, and ``even`` (see ``warpmag.demagnetization``). Bodies with one and the same coupling share
-            its table.
+            list for each, ``places`` and ``common`` (see ``warpmag.demagnetization``). Bodies with one and the same
+            coupling share its table.
         worlds: First inducible moment of each world, and the end of them, shape [worlds, 2].
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
@@ -152,7 +157,7 @@ class CellCouplings:
 
     def _lay_out(self, bodies, whole, worlds, dtype, device) -> int:
         """Fill the arrays; return how many chunks those bodies have that are not whole, which come first."""
-        c, found, tables, chunks, body, left = self._couplings, {}, [], [], [], 0
+        c, found, tables, places, chunks, body, left = self._couplings, {}, [], [], [], [], 0
         self.rows = np.zeros(len(bodies), int)
         whole = np.zeros(len(bodies), bool) if whole is None else np.asarray(whole, bool)
         for number in np.argsort(whole, kind="stable").tolist():
@@ -160,6 +165,7 @@ class CellCouplings:
             if id(coupling) not in found:
                 found[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.tensor))
+                places.append(np.pad(coupling.places.T, ((0, 0), (0, -len(coupling.places) % CHUNK))))
             count, row = len(coupling.start) - 1, CHUNK * len(chunks)
             self.rows[number] = row
             starts = range(0, count, CHUNK)
@@ -178,8 +184,9 @@ class CellCouplings:
         c.rotation = put(identity, wp.types.quaternion(dtype))
         ends = self.rows + CHUNK * np.bincount(body, minlength=len(bodies))
         c.rows = put(np.stack([self.rows, ends], axis=1).astype(np.int32), wp.vec2i)
-        c.even = put(np.concatenate([coupling.even for _, coupling in bodies]), dtype)
-        c.common = wp.zeros(3 * len(bodies), dtype=dtype, device=device)
+        c.place = put(np.concatenate(places, axis=1), dtype)
+        c.matrix = put(np.concatenate([coupling.common.ravel() for _, coupling in bodies]), dtype)
+        c.common = wp.zeros(COMMON * len(bodies), dtype=dtype, device=device)
         c.turned = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
         c.hardness = wp.zeros(CHUNK * len(chunks), dtype=dtype, device=device)
         world = np.searchsorted(worlds[:, 0], [first for first, *_ in chunks], side="right") - 1

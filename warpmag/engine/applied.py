@@ -126,7 +126,7 @@ def _label(builder: newton.ModelBuilder, kind: str, given: str | None) -> str:
 
 
 def add_source(
-    builder: newton.ModelBuilder, body: int, record: SourceRecord, strength: float, xform, label: str
+    builder: newton.ModelBuilder, body: int, record: SourceRecord, strength: float, xform, label: str, keys: str = ""
 ) -> int:
     """Add a source to a body, or to the world; return the site that stands for it."""
     check_registered(builder)
@@ -137,10 +137,13 @@ def add_source(
         raise InputError(f"label: must be text, got {shown(label)}")
     frame = wp.transform() if xform is None else _checked_frame("xform", xform)
     values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
+    values[f"{NAMESPACE}:current_keys"] = keys
     return builder.add_site(body, xform=frame, label=label, custom_attributes=values)
 
 
-def add_placed_source(builder: newton.ModelBuilder, one, label: str, body: int, frame: wp.transform) -> int:
+def add_placed_source(
+    builder: newton.ModelBuilder, one, label: str, body: int, frame: wp.transform, keys: str = ""
+) -> int:
     """Add the source of a stage to a body, or to the world; return the site that stands for it.
 
     Args:
@@ -149,11 +152,12 @@ def add_placed_source(builder: newton.ModelBuilder, one, label: str, body: int, 
         label: Its label.
         body: Its body, -1 for none.
         frame: Where it is in the world.
+        keys: Keys of its current as text, which :class:`KeyedCurrents` follows; none where somebody else does.
     """
     strength = one.source.ampere_turns if isinstance(one.source, Coil) else one.source.factor
     if body >= 0:
         frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
-    return add_source(builder, body, one.source.record(), strength, frame, label)
+    return add_source(builder, body, one.source.record(), strength, frame, label, keys)
 
 
 def add_sources_of_prim(prim, builder: newton.ModelBuilder, imported: dict[str, Any]) -> None:
@@ -167,7 +171,7 @@ def add_sources_of_prim(prim, builder: newton.ModelBuilder, imported: dict[str, 
     Raises:
         InputError: It is no such prim, or on a body that Newton has not imported.
     """
-    from warpmag.usd import placed_sources  # noqa: PLC0415 - a builder can do without USD
+    from warpmag.usd import placed_sources, stage_clock  # noqa: PLC0415 - a builder can do without USD
 
     bodies, path = imported["path_body_map"], str(prim.GetPath())
     for one in placed_sources(prim):
@@ -181,8 +185,11 @@ def add_sources_of_prim(prim, builder: newton.ModelBuilder, imported: dict[str, 
             found = found * imported["path_body_relative_transform"].get(anchor, wp.transform_identity())
             drawn = newton.usd.get_transform(prim.GetStage().GetPrimAtPath(anchor), local=False)
             stage = found * wp.transform_inverse(drawn)
-        frame = stage * wp.transform(one.position, one.rotation)
-        add_placed_source(builder, one, path, -1 if one.body is None else bodies[one.body], frame)
+        frame, keys = stage * wp.transform(one.position, one.rotation), ""
+        if one.currents is not None:
+            clock = stage_clock(prim.GetStage())
+            keys = one.currents.in_seconds(clock.start, clock.time_codes_per_second).to_text()
+        add_placed_source(builder, one, path, -1 if one.body is None else bodies[one.body], frame, keys)
 
 
 def _checked_frame(name: str, xform) -> wp.transform:

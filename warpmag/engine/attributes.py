@@ -33,6 +33,7 @@ _ATTRIBUTES = {
 _OF_SOURCES = {
     "source": (str, ""),  # what ``warpmag.coils`` writes; empty on a shape that is no source of a field
     "strength": (wp.float32, 0.0),
+    "current_keys": (str, ""),  # what ``Keys.to_text`` writes of a coil's current; empty where it is constant
 }
 _SOLID = (
     newton.GeoType.SPHERE,

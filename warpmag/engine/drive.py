@@ -8,11 +8,14 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.arrays import host_array
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.magnetics import Magnetics
+from warpmag.errors import InputError
 from warpmag.kernels.rigid.keyed_poses import launch_place, pose_bodies
 from warpmag.kernels.shared.keyed import follow, launch_follow
-from warpmag.keyed import SceneKeys
+from warpmag.keyed import Keys, SceneKeys
+from warpmag.magnets import shown
 
 
 class Drive:
@@ -76,6 +79,58 @@ class Drive:
         """
         if self._bodies is not None:
             launch_place(self._bodies, state, begin, horizon, at_end=False)
+
+
+class KeyedCurrents:
+    """Currents of the coils of a stage that ``builder.add_usd`` brought in with time samples, for programs that step.
+
+    ``Simulation`` follows the keys of a stage by itself. Magnetizations and motions with keys are not among these:
+    ``add_usd`` takes them where they start. Worlds that are replicas follow the same keys::
+
+        currents = warpmag.KeyedCurrents(model)
+        currents.set(0.25)
+        magnetics.apply(state)
+
+    Attributes:
+        shapes: The sites that stand for the coils.
+        time: Time since the start of the stage [s] on the device, float64, shape [1].
+    """
+
+    def __init__(self, model: newton.Model):
+        """Put the keys on the device, and set the currents to those at the start.
+
+        Args:
+            model: A finished model.
+
+        Raises:
+            InputError: No coil of the model has keys.
+        """
+        texts = getattr(getattr(model, NAMESPACE, None), "current_keys", None) or ()
+        found = {shape: Keys.from_text(text) for shape, text in enumerate(texts) if text}
+        if not found:
+            raise InputError("KeyedCurrents: no coil of the model has a current with time samples")
+        self.shapes, strength = tuple(found), getattr(model, NAMESPACE).strength
+        self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
+        self._followers = follow(
+            list(found.values()), [strength[shape : shape + 1] for shape in self.shapes], self.time
+        )
+        self.set()
+
+    def set(self, time: float | None = None) -> None:
+        """Set the currents to what they are at a time; without one, at :attr:`time`, which a captured graph may move.
+
+        Args:
+            time: Time since the start of the stage [s].
+
+        Raises:
+            InputError: It is not finite.
+        """
+        if time is not None:
+            seconds = host_array("time", time)
+            if seconds.size != 1:
+                raise InputError(f"time: must be one number, got {shown(time)}")
+            self.time.fill_(float(seconds.reshape(-1)[0]))
+        launch_follow(self._followers, 0.0)
 
 
 def _free_joints(model: newton.Model, bodies: list[int]) -> list[int]:
