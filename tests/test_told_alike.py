@@ -99,6 +99,11 @@ SLIPS = {
         "warpmag:magnetization has no effect on an inducible magnet: warpmag:kind says what it is",
         "warpmag:recoilPermeability has no effect on an inducible magnet: warpmag:kind says what it is",
     ),
+    "/World/Space": (
+        'uniform token wrapmag:kind = "permanent"\nvector3f warpMag:magnetization = (0, 0, 1e6)\nfloat wax:kind = 1',
+        "wrapmag:kind has no effect: no schema has it, the nearest is warpmag:kind",
+        "warpMag:magnetization has no effect: no schema has it, the nearest is warpmag:magnetization",
+    ),
     "/World/Bare": (
         "float warpmag:saturationMagnetization = 1e6\nfloat warpmag:rtol = 1e-2",
         "warpmag:saturationMagnetization has no effect: the prim has no WarpmagMagnetAPI",
@@ -119,6 +124,7 @@ def test_slips_are_warnings_of_both(device, tmp_path, capsys):
     assert errors == []
     expected = {f"{path}: {message}" for path, (_, *messages) in SLIPS.items() for message in messages}
     assert expected <= set(warnings)
+    assert not any("wax:" in one for one in warnings)
     [mesh] = [one for one in warnings if one.startswith("/World/Open: mesh: not closed")]
     assert "the convexHull that it collides as is magnetized in its place" in mesh
 

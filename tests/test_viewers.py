@@ -19,6 +19,9 @@ class Notes:
         self.times, self.heights, self.shown = [], [], 0
         self.camera, self.arrows, self.paused, self.closed = None, [], set(), False
 
+    def set_reset_callback(self, callback):
+        self.reset = callback
+
     def set_model(self, model):
         self.moving = int(np.argmin(model.body_mass.numpy()))
 
@@ -107,6 +110,33 @@ def test_a_viewer_in_a_browser_stays_until_one_leaves(scene, device, monkeypatch
     assert watch(scene, tmp_path / "out.usda", device, monkeypatch, Browser, "viser") == 0
     assert Notes.last.closed and next(asked, None) is None
     assert "warpmag: the viser viewer keeps the last frame, Ctrl-C leaves" in capsys.readouterr().err
+
+
+def test_a_restart_begins_anew(scene, device, monkeypatch, tmp_path, capsys):
+    """Pressed after the second frame, and again while the browser keeps the last one."""
+
+    class Browser(Notes):
+        def end_frame(self):
+            super().end_frame()
+            if self.shown == 2:
+                self.reset()
+
+        def should_step(self):
+            asked.append(self.shown)
+            if asked.count(6) == 2 and self.shown == 6:
+                self.reset()
+            return True
+
+        def is_running(self):
+            return self.shown < 10
+
+    asked = []
+    assert watch(scene, tmp_path / "out.usda", device, monkeypatch, Browser, "viser") == 0
+    frames = [0.0, 0.017, 0.033, 0.05]
+    assert Notes.last.times == pytest.approx([*frames[:2], *frames, *frames], abs=1e-9)
+    assert capsys.readouterr().out.count("written") == 2  # of the two runs that came to their end
+    stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
+    assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").GetNumTimeSamples() == 4
 
 
 def test_a_closed_window_ends_the_run(scene, device, monkeypatch, tmp_path):

@@ -49,19 +49,27 @@ def draw(stage: str, output: str, frame: int, samples: int, width: int, height: 
 def _frame_bodies(bpy, camera, aspect: float) -> None:
     """Zoom to what moves and shift the lens there, as an architect does; the camera stays where it is.
 
-    Of the bodies those count that lie, across and up, between the outermost tenths.
+    Of the bodies those count whose middles lie, across and up, between the outermost tenths, and what a usual one takes
+    on each side.
     """
-    shown = bpy.context.evaluated_depsgraph_get().object_instances
-    places = [one.matrix_world.translation.copy() for one in shown if one.is_instance]
+    from mathutils import Vector  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - of Blender
+
     back = camera.matrix_world.inverted()
-    seen = [back @ place for place in places]
-    seen = [(place.x / -place.z, place.y / -place.z) for place in seen if place.z < 0.0]
-    if len(seen) < _FEWEST:
+    boxes = []
+    for one in bpy.context.evaluated_depsgraph_get().object_instances:
+        if one.is_instance:
+            corners = [back @ (one.matrix_world @ Vector(corner)) for corner in one.object.bound_box]
+            if all(corner.z < 0.0 for corner in corners):
+                seen = [(corner.x / -corner.z, corner.y / -corner.z) for corner in corners]
+                boxes.append([(min(values), max(values)) for values in zip(*seen, strict=True)])
+    if len(boxes) < _FEWEST:
         return
     sides = []
-    for values in map(sorted, zip(*seen, strict=True)):
-        few = int(_OUTSIDE * len(values))
-        sides.append((values[few], values[-1 - few]))
+    for own in zip(*boxes, strict=True):
+        few = int(_OUTSIDE * len(own))
+        middles = sorted(0.5 * (low + high) for low, high in own)
+        size = sorted(high - low for low, high in own)[len(own) // 2]
+        sides.append((middles[few] - 0.5 * size, middles[-1 - few] + 0.5 * size))
     (left, right), (low, high) = sides
     lens = camera.data
     width = _MARGIN * max(right - left, aspect * (high - low), 1e-6)

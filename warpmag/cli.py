@@ -160,10 +160,16 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_export(commands) -> None:
-    export = commands.add_parser("export", help="write a stage for renderers, or numbers, of a scene or a finished run")
+    export = commands.add_parser(
+        "export", help="write a stage for renderers, a web page or numbers of a scene or a finished run"
+    )
     export.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     export.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help=".usda, .usdc, .usdz; .npz or .csv for numbers"
+        "-o",
+        "--output",
+        metavar="OUT",
+        required=True,
+        help=".usda, .usdc, .usdz; .html for a page; .npz or .csv for numbers",
     )
     export.add_argument(
         "--rate", type=float, default=24.0, metavar="HZ", help="frames a second (default: %(default)g, as in Blender)"
@@ -305,9 +311,23 @@ def _run(options) -> int:
     if options.rtol is not None:
         check_rtol("rtol", options.rtol)
     path, is_bundled = _find_scene(options.scene)
-    output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
+    display, resume = None, options.resume
+    while True:
+        simulation = _simulation_of(path, options)
+        if display:
+            display.restart(simulation.model, simulation.magnetics)
+        else:
+            display = _open_display(options.viewer, simulation)
+        _simulate(simulation, path, options, display, copy_scene=is_bundled, resume=resume)
+        if not (display and display.restarted):
+            return 0
+        resume = False  # what was asked for anew begins at the start
+
+
+def _simulation_of(path: Path, options):
+    """Return the simulation that a run asks for."""
     method = METHODS[options.method] if options.method else None
-    simulation = _load(
+    return _load(
         path,
         solver=options.solver,
         force=options.force or (method and method.force),
@@ -318,9 +338,13 @@ def _run(options) -> int:
         device=options.device,
         visuals=options.viewer != "none",
     )
+
+
+def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, resume: bool) -> None:
+    """Run to the end, or until one restarts or closes the viewer, and tell how it went."""
+    output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
     known = simulation.warnings()
     _warn(known)
-    display = _open_display(options.viewer, simulation)
     progress = Progress(simulation.frames_of(options.frames))
 
     def show(frame: int) -> bool:
@@ -328,18 +352,18 @@ def _run(options) -> int:
         return display is None or display.follow(simulation.time, simulation.state)
 
     try:
-        statistics = simulation.run(
-            progress.frames, output=output, copy_scene=is_bundled, resume=options.resume, on_frame=show
-        )
+        statistics = simulation.run(progress.frames, output=output, copy_scene=copy_scene, resume=resume, on_frame=show)
     except (KeyboardInterrupt, InputError, SimulationError) as end:
         if progress.done is not None:
             end.args = (f"{end}, {output} has the frames up to {progress.done}",)
         raise
     finally:
         progress.close()
+    if display and display.restarted:
+        return
     if progress.done is None:
         print(f"complete       {output} has all {progress.frames} frames already")
-        return 0
+        return
     for line in statistics.summary():
         print(line)
     print(f"written        {output}")
@@ -354,7 +378,6 @@ def _run(options) -> int:
     if display is not None and options.viewer in _STAYING and display.viewer.is_running():
         _tell(f"the {options.viewer} viewer keeps the last frame, Ctrl-C leaves")
         display.stay()
-    return 0
 
 
 def _warn(lines: list[str]) -> None:
@@ -373,7 +396,9 @@ def _open_display(name: str, simulation):
         viewer = getattr(newton.viewer, _VIEWERS[name])()
     except Exception as error:  # each viewer fails in its own way
         raise no_viewer(name, error) from None
-    return Display(viewer, simulation.model, simulation.magnetics)
+    display = Display(viewer, simulation.model, simulation.magnetics)
+    display.allow_restart()
+    return display
 
 
 def _quiet_warp() -> None:

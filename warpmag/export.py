@@ -1,4 +1,4 @@
-"""Writes what was simulated for others: stages for renderers, and arrays of numbers."""
+"""Writes what was simulated for others: stages for renderers, web pages, and arrays of numbers."""
 
 import csv
 import itertools
@@ -46,12 +46,13 @@ def export(
     """Export a scene, or what a run wrote.
 
     Positions are those of the stage, bit by bit in single precision. ``.npz`` and ``.csv`` get what was simulated in SI
-    units, and take no options.
+    units, and take no options. ``.html`` is one web page that needs no network, to orbit and play, in the colours of
+    the materials, without textures.
 
     Args:
         stage: USD file.
-        output: File to write: ``.usd``, ``.usda``, ``.usdc``, ``.usdz``, ``.npz`` or ``.csv``.
-        rate: Frames, and time codes, that a second takes [1/s]; Blender plays at 24.
+        output: File to write: ``.usd``, ``.usda``, ``.usdc``, ``.usdz``, ``.html``, ``.npz`` or ``.csv``.
+        rate: Frames, and time codes, that a second takes [1/s]; Blender plays at 24, a page as time goes.
         color: What bodies are coloured by: ``magnetization``, ``speed`` or ``force``, the magnetic one, between the
             moments of the frame; by default their materials.
         arrows: Whether to draw moments as arrows.

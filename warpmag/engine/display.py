@@ -38,6 +38,10 @@ class Display:
 
         display = warpmag.Display(newton.viewer.ViewerGL(), model, magnetics)
         display.show(time, state)
+
+    Attributes:
+        viewer: The viewer.
+        restarted: Whether the reset button was pressed, after :meth:`allow_restart`.
     """
 
     def __init__(self, viewer, model: newton.Model, magnetics: Magnetics):
@@ -48,14 +52,28 @@ class Display:
             model: The model.
             magnetics: Its magnets.
         """
-        self.viewer, self._model, self._magnetics = viewer, model, magnetics
-        viewer.set_model(model)
+        self.viewer, self.restarted = viewer, False
+        self._set_model(model, magnetics)
+        self.frame()
+
+    def _set_model(self, model: newton.Model, magnetics: Magnetics) -> None:
+        self._model, self._magnetics = model, magnetics
+        self.viewer.set_model(model)
         shapes = magnetics.shapes
         self._bodies = model.shape_body.numpy()[shapes]
         self._frames = model.shape_transform.numpy()[shapes].astype(float)
         self._radii = model.shape_collision_radius.numpy()[shapes]
         self._worlds = model.shape_world.numpy()[shapes]
-        self.frame()
+
+    def allow_restart(self) -> None:
+        """Let the reset button of the viewer, if it has one, set :attr:`restarted`."""
+        if hasattr(self.viewer, "set_reset_callback"):
+            self.viewer.set_reset_callback(lambda: setattr(self, "restarted", True))
+
+    def restart(self, model: newton.Model, magnetics: Magnetics) -> None:
+        """Show a model made anew in place of the one before, from where one looks now."""
+        self.restarted = False
+        self._set_model(model, magnetics)
 
     def frame(self) -> None:
         """Put the camera where it sees all bodies of the model as they start, those of shown worlds."""
@@ -112,22 +130,24 @@ class Display:
             state: The state.
 
         Returns:
-            Whether to go on; the viewer may have been closed.
+            Whether to go on; the viewer may have been closed, or a restart asked for.
         """
         self.show(time, state)
-        while self.viewer.is_running() and not self.viewer.should_step():
+        while self.viewer.is_running() and not self.viewer.should_step() and not self.restarted:
             clock.sleep(_PAUSE)
             self.show(time, state)
-        return self.viewer.is_running()
+        return self.viewer.is_running() and not self.restarted
 
     def stay(self) -> None:
-        """Keep what was shown last until the viewer is closed, or Ctrl-C is pressed."""
+        """Keep what was shown last until the viewer is closed, Ctrl-C is pressed, or a restart is asked for."""
         try:
-            while self.viewer.is_running():
+            while self.viewer.is_running() and not self.restarted:
                 clock.sleep(_PAUSE)
+                self.viewer.should_step()  # looks at the buttons
         except KeyboardInterrupt:
             pass
-        self.viewer.close()
+        if not self.restarted:
+            self.viewer.close()
 
     def _show_arrows(self, state: newton.State) -> None:
         volumes = self._magnetics.shape_volumes[:, None]

@@ -20,13 +20,14 @@ from warpmag.usd.instancers import expand_instancers
 from warpmag.usd.looks import author_materialx, author_surface, color_scale
 from warpmag.usd.meshes import ARROW, BALL, Shape, author_mesh, shape_of
 from warpmag.usd.motion import read_recording
+from warpmag.usd.page import page_of
 from warpmag.usd.paths import usable_path
 from warpmag.usd.placements import rigid
 from warpmag.usd.reader import copied_metadata, open_motion
 from warpmag.usd.transforms import is_body
 from warpmag.usd.values import quiet
 
-_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".html")
 _OWN = ("physics:", "newton:", "warpmag:", "collection:")
 """What attributes of simulations begin with."""
 _SCHEMAS = ("Physics", "Newton", "Warpmag", "CollectionAPI")
@@ -302,7 +303,7 @@ class RenderLayer:
     # ---------------------------------------------------------------------------------------------------------------
 
     def save(self, output: str | os.PathLike, *, materialx: bool = False) -> None:
-        """Write the stage to a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+        """Write the stage to a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, or as a web page, ``.html``.
 
         Raises:
             InputError: It cannot be written there.
@@ -318,7 +319,10 @@ class RenderLayer:
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as folder, quiet():
                 inner = Path(folder) / (f"{path.stem}.usdc" if path.suffix == ".usdz" else path.name)
-                written = self._stage.GetRootLayer().Export(str(inner))
+                if path.suffix == ".html":
+                    written = inner.write_text(page_of(self._stage, self._codes, path.stem), encoding="utf-8") > 0
+                else:
+                    written = self._stage.GetRootLayer().Export(str(inner))
                 if written and path.suffix == ".usdz":
                     package = Path(folder) / path.name
                     written = UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inner)), str(package))

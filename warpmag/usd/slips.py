@@ -1,7 +1,8 @@
 """Slips of the pen: attributes and schemas in warpmag's name that no schema has, and values that count for nothing."""
 
 import difflib
-from collections.abc import Iterator
+import functools
+from collections.abc import Collection, Iterator
 
 from pxr import Usd
 
@@ -12,16 +13,21 @@ from warpmag.usd.values import Finding
 
 _NAMES = {MAGNET_API: MAGNET_NAMES, SCENE_API: SCENE_NAMES, COIL_API: COIL_NAMES, MAP_API: MAP_NAMES}
 _SCHEMA_OF = {name: schema for schema, names in _NAMES.items() for name in names}
+_APIS = tuple(_NAMES)
 _NAMESPACE = "warpmag"
+_LIKE = 0.85
+"""How much a slip is like what is meant; one letter of seven, or two that changed places."""
 
 
 def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
     """Yield which schemas and attributes in warpmag's name a prim has for nothing."""
     path = str(prim.GetPath())
     for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
-        if api.lower().startswith(_NAMESPACE) and api not in _NAMES:
+        if api not in _NAMES and (api.lower().startswith(_NAMESPACE) or _like(api, _APIS)):
             yield Finding(path, f"{api} has no effect: there is no such schema{_nearest(api, list(_NAMES))}", "warning")
-    for name in map(Usd.Property.GetName, prim.GetAuthoredPropertiesInNamespace(_NAMESPACE)):
+    for name in prim.GetAuthoredPropertyNames():
+        if not _like(name.partition(":")[0], (_NAMESPACE,)):
+            continue
         schema = _SCHEMA_OF.get(name)
         if schema is None:
             message = f"{name} has no effect: no schema has it{_nearest(name, list(_SCHEMA_OF))}"
@@ -47,6 +53,12 @@ def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Fi
             if said:
                 message = f"warpmag:{name} has no effect on an inducible magnet: warpmag:kind says what it is"
                 yield Finding(path, message, "warning")
+
+
+@functools.cache  # thousands of prims have the same few names
+def _like(name: str, known: Collection[str]) -> bool:
+    """Return whether a name is, or may be a slip for, a known one."""
+    return any(difflib.SequenceMatcher(None, name.lower(), one.lower()).ratio() >= _LIKE for one in known)
 
 
 def _nearest(name: str, known: list[str]) -> str:
