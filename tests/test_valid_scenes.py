@@ -295,7 +295,8 @@ def test_two_letters_at_one_place_come_apart_and_a_line_says_why(device, tmp_pat
     advance(simulation, 0.1)
     velocities = simulation.state.body_qd.numpy()[:, :3]
     assert np.isfinite(velocities).all()
-    np.testing.assert_allclose(velocities.sum(axis=0), 0.0, atol=1e-4 * np.abs(velocities).max())  # equal masses
+    # masses are equal; what pushes letters apart rounds as speeds up to the fastest on the way do
+    np.testing.assert_allclose(velocities.sum(axis=0), 0.0, atol=1e-4 * simulation.finish().peak_speed)
     assert np.abs(velocities).max() < 2.0 * PUSH_OUT  # of points; centres may go faster than these
 
 

@@ -68,13 +68,14 @@ _CHUNK = 1 << 18
 def corrected(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
     """The coupling with the fields that all cells have in common, which bring the body's answer to that of its surface.
 
-    Bodies in parts that are apart have none, nor those of which surface or cells are too many.
+    Bodies in parts that are apart have none, nor those of which surface or cells are too many, nor two parts in the
+    same place, whose facets all lie on each other.
     """
     if len(lattice.volumes) > MOST_MOMENTS or not _hangs_together(coupling):
         return coupling
     most = max(FACETS, _FACETS_OF_PART * len(solids))
     coarse, fine = (facets.of_body(solids, count) for count in (most // 4, most))
-    if len(fine) > MOST_FACETS:
+    if not len(coarse) or len(fine) > MOST_FACETS:
         return coupling
     of_surface, of_cells = extrapolated_moments(coupling, coarse, fine), cell_moments(coupling, lattice)
     for count in range(len(of_cells), 0, -FIELDS + 3):

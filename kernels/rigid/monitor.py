@@ -123,7 +123,8 @@ def _watch_body(w: Watched, bodies: BodyView, body: int, substep: int, dt: float
         total += wp.abs(bodies.q[body][k])
     for k in range(6):
         total += wp.abs(bodies.qd[body][k])
-    if not wp.isfinite(total):
+    # a spin whose square is infinite leaves an orientation of zero
+    if not wp.isfinite(total) or wp.length(wp.transform_get_rotation(bodies.q[body])) < 0.5:
         wp.atomic_min(w.counts, COUNT_BAD_BODY, (w.substeps[0] + wp.max(substep, 0)) * bodies.qd.shape[0] + body)
     thickness = w.thickness[body]
     if thickness < wp.inf:

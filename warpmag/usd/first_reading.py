@@ -34,6 +34,8 @@ _PERTURB = -6
 """glibc's M_PERTURB."""
 _TWICE = 1 << 28
 """Bytes of a binary layer that is read twice; a longer one would take too much memory and time, as text."""
+_CHANGING = re.compile(r" LZ4 error code: -?\d+")
+"""What USD says of the same file differently each time."""
 _NOT_TEXT = "text that is not UTF-8"
 _PRINTED = {
     b"posix_madvise": "damaged: its table of contents names bytes beyond its end",
@@ -107,7 +109,7 @@ def failure(error: Exception) -> str:
     if not isinstance(error, UnicodeDecodeError):
         with contextlib.suppress(UnicodeDecodeError):  # it may quote the file
             said = getattr(error.args[0], "commentary", error.args[0]) if error.args else ""
-            return (str(said).strip().splitlines() or [type(error).__name__])[0]
+            return _CHANGING.sub("", (str(said).strip().splitlines() or [type(error).__name__])[0])
     return _NOT_TEXT
 
 

@@ -209,7 +209,8 @@ class _Instances:
         attribute = self._prim.GetAttribute(name)
         value = attribute.Get(time) if attribute else None
         found = np.zeros(0) if value is None else np.asarray(value)
-        if value is not None and len(found) and (found.dtype.kind not in "if" or found.ndim != (2 if width else 1)):
+        kinds = "if" if width else "i"
+        if value is not None and len(found) and (found.dtype.kind not in kinds or found.ndim != (2 if width else 1)):
             raise InputError(f"{self._path}: {name} is no array of {'vectors' if width else 'whole numbers'}")
         if name != "protoIndices" and len(found) not in (0, self._count):
             raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
