@@ -17,6 +17,8 @@ from warpmag.kernels.shared.team import team, threads_for
 
 _CELLS_PER_THREAD = 64
 """Cells that make another thread worth waking."""
+_WARPS_TOGETHER = 12
+"""Warps that a multiprocessor holds together in float32: what their registers allow."""
 OCTANTS = 8
 
 
@@ -27,12 +29,12 @@ class BlockShape:
     Attributes:
         cells: Cells of a block.
         slice: Harmonics of the sources that it has in shared memory at a time.
-        blocks: Blocks that a multiprocessor holds together at least, in float32.
+        prefetch: Whether the next slice is read while one is summed.
     """
 
     cells: int
-    slice: int
-    blocks: int
+    slice: int = 8
+    prefetch: bool = True
 
 
 def pitch(harmonics: int) -> int:
@@ -87,8 +89,8 @@ class Translation:
         classes = odd[0] + 2 * odd[1] + 4 * odd[2]
         group = 8 if device.is_cuda else 4
         rows = _grouped_rows(classes, group)
-        self.shape = shape or _choose_shape(harmonics)
-        length = -(-harmonics // self.shape.slice) * self.shape.slice if device.is_cuda else harmonics
+        self._shape = shape or BlockShape(32, 8 if dtype is wp.float32 else 4)
+        length = -(-harmonics // self._shape.slice) * self._shape.slice if device.is_cuda else harmonics
         table = np.zeros((len(matrices), length, len(rows)))
         table[:, :harmonics, rows >= 0] = matrices[:, rows[rows >= 0]].transpose(0, 2, 1)
         if not device.is_cuda:
@@ -126,8 +128,8 @@ class Translation:
         a.parent, a.order, a.octant_begin = parent, order, octant_begin
         cells = multipoles.shape[0] - 1
         if self._device.is_cuda:
-            blocks = -(-cells // self.shape.cells) + OCTANTS * octant_begin.shape[0]
-            _launch_cuda(self._dtype, self.shape, self._constants, blocks, a)
+            blocks = -(-cells // self._shape.cells) + OCTANTS * octant_begin.shape[0]
+            _launch_cuda(self._dtype, self._shape, self._constants, blocks, a)
             return
         kernel = _cpu_kernel(self._dtype, tuple(self._constants.items()))
         threads = threads_for(cells, _CELLS_PER_THREAD)
@@ -141,11 +143,6 @@ def _grouped_rows(classes: np.ndarray, group: int) -> np.ndarray:
         members = np.flatnonzero(classes == one)
         rows += [*members, *[-1] * (-len(members) % group)]
     return np.array(rows)
-
-
-def _choose_shape(harmonics: int) -> BlockShape:
-    """Shape of the blocks of a GPU that is fastest."""
-    return BlockShape(64, 8, 2)
 
 
 @cache
@@ -162,15 +159,17 @@ def _cuda_kernel(dtype, shape: BlockShape, constants):
     sizes = dict(constants)
     threads = -(-(shape.cells // 8 * sizes["ROWS"] // 8) // 32) * 32
     arrays_struct = translation_arrays(dtype)
+    blocks = max(1, _WARPS_TOGETHER // (threads // 32)) if dtype is wp.float32 else 1
+    numbers = f"{shape.cells}, {shape.slice}, {int(shape.prefetch)}"
 
-    @wp.func_native(f"warpmag::translate_block<{shape.cells}, {shape.slice}>(thread, arrays);")
+    @wp.func_native(f"warpmag::translate_block<{numbers}>(thread, arrays);")
     def run(thread: int, arrays: arrays_struct): ...
 
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        launch_bounds=(threads, shape.blocks if dtype is wp.float32 else 1),
+        launch_bounds=(threads, blocks),
         module_options=native_options("fmm/translate_cuda.h", dtype=dtype, **sizes),
     )
     def translate_cuda(arrays: arrays_struct):
