@@ -108,7 +108,7 @@ CUDA_CALLABLE inline void add_products(Real (&sums)[8][8], const Real* matrix, c
 }
 
 // A thread of the block, its rows and cells, and their sums.
-template <int CELLS, int SLICE, bool PREFETCH> struct Translator {
+template <int CELLS, int SLICE, bool PREFETCH, int SPLITS> struct Translator {
     static constexpr int COLUMNS = CELLS / 8, USED = COLUMNS * (ROWS / 8), THREADS = (USED + 31) / 32 * 32;
     static constexpr int LENGTH = (HARMONICS + SLICE - 1) / SLICE * SLICE;
     typedef TranslationStage<CELLS, SLICE> Stage;
@@ -139,6 +139,7 @@ template <int CELLS, int SLICE, bool PREFETCH> struct Translator {
             wait_for_copies();
             __syncthreads();
             const bool more = first + SLICE < LENGTH;
+            if (!more) matrix += (SPLITS - 1) * LENGTH * ROWS;
             if (more || next < 64) copy_matrix(stage, 1 - buffer);
             if constexpr (PREFETCH)
                 if (more) slice.load(arrays, stage.sources[turn], first + SLICE, lane);
@@ -148,7 +149,8 @@ template <int CELLS, int SLICE, bool PREFETCH> struct Translator {
         turn = 1 - turn;
     }
 
-    template <class Arrays> CUDA_CALLABLE void write(const Stage& stage, const Arrays& arrays, int count) const {
+    template <class Arrays>
+    CUDA_CALLABLE void write(const Stage& stage, const Arrays& arrays, int count, Real* out) const {
         if (lane >= USED) return;
 #pragma unroll
         for (int r = 0; r < 8; ++r) {
@@ -158,20 +160,28 @@ template <int CELLS, int SLICE, bool PREFETCH> struct Translator {
 #pragma unroll
             for (int c = 0; c < 8; ++c) {
                 const int l = column + c % 4 + c / 4 * (CELLS / 2);
-                if (l < count) arrays.locals.data[PITCH * (size_t)stage.cells[l] + k] = sign * sums[r][c];
+                if (l < count) out[PITCH * (size_t)stage.cells[l] + k] = sign * sums[r][c];
             }
         }
     }
 };
 
-// One thread of the block that translates to the cells of a run. With PREFETCH a slice is on its way from memory while
-// the one before is summed.
-template <int CELLS, int SLICE, bool PREFETCH, class Arrays>
+// The magnitude that follows another by some.
+CUDA_CALLABLE inline int later_magnitude(int code, int steps) {
+    for (int i = 0; i < steps; ++i) code = next_magnitude(code);
+    return code;
+}
+
+// One thread of a block that translates to the cells of a run. With PREFETCH a slice is on its way from memory while
+// the one before is summed. SPLITS blocks share the magnitudes of a run, where there are few cells for many
+// multiprocessors; each writes its own partial sums.
+template <int CELLS, int SLICE, bool PREFETCH, int SPLITS, class Arrays>
 CUDA_CALLABLE inline void translate_block(int thread, const Arrays& arrays) {
-    typedef Translator<CELLS, SLICE, PREFETCH> Own;
+    typedef Translator<CELLS, SLICE, PREFETCH, SPLITS> Own;
     __shared__ TranslationStage<CELLS, SLICE> stage;
     const int lane = thread % Own::THREADS, none = (int)arrays.multipoles.shape[0] - 1;
-    if (lane == 0) stage.run = cell_run(arrays.octant_begin, CELLS, thread / Own::THREADS);
+    const int block = thread / Own::THREADS, split = block % SPLITS;
+    if (lane == 0) stage.run = cell_run(arrays.octant_begin, CELLS, block / SPLITS);
     __syncthreads();
     const int begin = stage.run.begin, count = stage.run.end - begin;
     if (count == 0) return;
@@ -182,20 +192,21 @@ CUDA_CALLABLE inline void translate_block(int thread, const Arrays& arrays) {
     __syncthreads();
     Own own = {lane, 4 * (lane % Own::COLUMNS), 8 * min(lane / Own::COLUMNS, ROWS / 8 - 1)};
     own.row_class = arrays.row_parity.data[own.row];
-    own.matrix = arrays.matrices.data;
+    own.matrix = arrays.matrices.data + split * Own::LENGTH * ROWS;
     own.copy_matrix(stage, 0);
-    int code = next_magnitude(0);
+    int code = later_magnitude(0, 1 + split);
     find_sources<CELLS, Own::THREADS>(stage, arrays, stage.sources[0], code, lane);
     __syncthreads();
     while (code < 64) {
-        const int next = next_magnitude(code), signs = signs_of(signed_axes(code));
+        const int next = later_magnitude(code, SPLITS), signs = signs_of(signed_axes(code));
         if (signs == 8) own.template translate<8>(stage, arrays, code, next);
         else if (signs == 4) own.template translate<4>(stage, arrays, code, next);
         else if (signs == 2) own.template translate<2>(stage, arrays, code, next);
         else own.template translate<1>(stage, arrays, code, next);
         code = next;
     }
-    own.write(stage, arrays, count);
+    const size_t size = (size_t)arrays.locals.shape[0] * PITCH;
+    own.write(stage, arrays, count, SPLITS == 1 ? arrays.locals.data : arrays.parts.data + split * size);
 }
 
 }
