@@ -144,7 +144,7 @@ class Translation:
         """Launch the translation of arrays for so many cells on a GPU."""
         a = self._arrays
         shape = self._shape or BlockShape(32, self._slice, splits=_SPLITS if cells <= _MOST_SPLIT else 1)
-        if shape.splits > 1 and a.parts.shape[1] != cells + 1:
+        if shape.splits > 1 and (a.parts is None or a.parts.shape[1:] != a.locals.shape):
             a.parts = wp.zeros((shape.splits, *a.locals.shape), dtype=self._dtype, device=self._device)
         kernel, threads = _cuda_kernel(self._dtype, shape, tuple(self._constants.items()))
         blocks = shape.splits * (-(-cells // shape.cells) + OCTANTS * a.octant_begin.shape[0])
