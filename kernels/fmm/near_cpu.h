@@ -26,14 +26,17 @@ template <Quantity Q, class Arrays> void sum_leaf(const Arrays& arrays, int leaf
         clear();
     };
     clear();
-    for (int k = 0; k < 27; ++k) {
-        const int cell = arrays.neighbors.data[27 * (size_t)leaf + k];
-        if (cell < 0) continue;
-        for (int first = begin_of[cell]; first < begin_of[cell + 1];) {
-            const int room = TILE_SIZE - sources.count, left = begin_of[cell + 1] - first;
-            const int taken = left < room ? left : room;
+    for (int k = 0; k < 9; ++k) {
+        // the moments of cells side by side along x follow each other
+        const int* const row = arrays.neighbors.data + 27 * (size_t)leaf + 3 * k;
+        const int lowest = row[0] >= 0 ? row[0] : row[1] >= 0 ? row[1] : row[2];
+        const int highest = row[2] >= 0 ? row[2] : row[1] >= 0 ? row[1] : row[0];
+        if (lowest < 0) continue;
+        const int last = begin_of[highest + 1];
+        for (int first = begin_of[lowest]; first < last;) {
+            const int room = TILE_SIZE - sources.count, taken = last - first < room ? last - first : room;
             // where the targets are sources themselves, their place among these
-            if (cell == leaf) sources.begin = first - sources.count;
+            if (k == 4) sources.begin = first - sources.count;
             append(sources, share.sources, first, first + taken);
             first += taken;
             if (sources.count == TILE_SIZE) sum_tile();

@@ -23,7 +23,7 @@ constexpr int MOST_SIGNS = 8;
 CUDA_CALLABLE inline int next_magnitude(int code) {
     do ++code;
     while (code < 64 && !(code & 42));
-    return code;
+    return code < 64 ? code : 64;
 }
 
 // Axes along which both signs of a displacement of that magnitude are translated, those of a component 1 or 2.

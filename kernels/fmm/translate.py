@@ -17,6 +17,10 @@ from warpmag.kernels.shared.team import team, threads_for
 
 _CELLS_PER_THREAD = 64
 """Cells that make another thread worth waking."""
+_WARPS_TOGETHER = 12
+"""Warps that a multiprocessor holds together in float32: what their registers allow."""
+_SPLITS, _MOST_SPLIT = 4, 8192
+"""Blocks that share the displacements of the same cells, and the most cells for which a GPU has room for them."""
 OCTANTS = 8
 
 
@@ -27,12 +31,14 @@ class BlockShape:
     Attributes:
         cells: Cells of a block.
         slice: Harmonics of the sources that it has in shared memory at a time.
-        blocks: Blocks that a multiprocessor holds together at least, in float32.
+        prefetch: Whether the next slice is read while one is summed.
+        splits: Blocks that share the displacements of the same cells.
     """
 
     cells: int
-    slice: int
-    blocks: int
+    slice: int = 8
+    prefetch: bool = True
+    splits: int = 1
 
 
 def pitch(harmonics: int) -> int:
@@ -59,6 +65,7 @@ def translation_arrays(dtype):
         parent: wp.array[int]
         order: wp.array[int]
         octant_begin: wp.array2d[int]
+        parts: wp.array3d[dtype]
         matrices: wp.array[dtype]
         signs: wp.array2d[dtype]
         parity: wp.array[int]
@@ -87,8 +94,9 @@ class Translation:
         classes = odd[0] + 2 * odd[1] + 4 * odd[2]
         group = 8 if device.is_cuda else 4
         rows = _grouped_rows(classes, group)
-        self.shape = shape or _choose_shape(harmonics)
-        length = -(-harmonics // self.shape.slice) * self.shape.slice if device.is_cuda else harmonics
+        self._slice = shape.slice if shape else 8 if dtype is wp.float32 else 4
+        self._shape = shape
+        length = -(-harmonics // self._slice) * self._slice if device.is_cuda else harmonics
         table = np.zeros((len(matrices), length, len(rows)))
         table[:, :harmonics, rows >= 0] = matrices[:, rows[rows >= 0]].transpose(0, 2, 1)
         if not device.is_cuda:
@@ -126,12 +134,24 @@ class Translation:
         a.parent, a.order, a.octant_begin = parent, order, octant_begin
         cells = multipoles.shape[0] - 1
         if self._device.is_cuda:
-            blocks = -(-cells // self.shape.cells) + OCTANTS * octant_begin.shape[0]
-            _launch_cuda(self._dtype, self.shape, self._constants, blocks, a)
+            self._launch_cuda(cells)
             return
         kernel = _cpu_kernel(self._dtype, tuple(self._constants.items()))
         threads = threads_for(cells, _CELLS_PER_THREAD)
         wp.launch(kernel, dim=1, inputs=[0, 1, threads, team(), a], device=self._device)
+
+    def _launch_cuda(self, cells: int):
+        """Launch the translation of arrays for so many cells on a GPU."""
+        a = self._arrays
+        shape = self._shape or BlockShape(32, self._slice, splits=_SPLITS if cells <= _MOST_SPLIT else 1)
+        if shape.splits > 1 and (a.parts is None or a.parts.shape[1:] != a.locals.shape):
+            a.parts = wp.zeros((shape.splits, *a.locals.shape), dtype=self._dtype, device=self._device)
+        kernel, threads = _cuda_kernel(self._dtype, shape, tuple(self._constants.items()))
+        blocks = shape.splits * (-(-cells // shape.cells) + OCTANTS * a.octant_begin.shape[0])
+        wp.launch(kernel, dim=blocks * threads, inputs=[a], device=self._device, block_dim=threads)
+        if shape.splits > 1:
+            inputs = [a.parts.reshape((shape.splits, -1)), a.locals.flatten()]
+            wp.launch(_add_kernel(self._dtype), dim=a.locals.size, inputs=inputs, device=self._device)
 
 
 def _grouped_rows(classes: np.ndarray, group: int) -> np.ndarray:
@@ -141,11 +161,6 @@ def _grouped_rows(classes: np.ndarray, group: int) -> np.ndarray:
         members = np.flatnonzero(classes == one)
         rows += [*members, *[-1] * (-len(members) % group)]
     return np.array(rows)
-
-
-def _choose_shape(harmonics: int) -> BlockShape:
-    """Shape of the blocks of a GPU that is fastest."""
-    return BlockShape(64, 8, 2)
 
 
 @cache
@@ -162,15 +177,17 @@ def _cuda_kernel(dtype, shape: BlockShape, constants):
     sizes = dict(constants)
     threads = -(-(shape.cells // 8 * sizes["ROWS"] // 8) // 32) * 32
     arrays_struct = translation_arrays(dtype)
+    blocks = max(1, _WARPS_TOGETHER // (threads // 32)) if dtype is wp.float32 else 1
+    numbers = f"{shape.cells}, {shape.slice}, {int(shape.prefetch)}, {shape.splits}"
 
-    @wp.func_native(f"warpmag::translate_block<{shape.cells}, {shape.slice}>(thread, arrays);")
+    @wp.func_native(f"warpmag::translate_block<{numbers}>(thread, arrays);")
     def run(thread: int, arrays: arrays_struct): ...
 
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        launch_bounds=(threads, shape.blocks if dtype is wp.float32 else 1),
+        launch_bounds=(threads, blocks),
         module_options=native_options("fmm/translate_cuda.h", dtype=dtype, **sizes),
     )
     def translate_cuda(arrays: arrays_struct):
@@ -179,6 +196,14 @@ def _cuda_kernel(dtype, shape: BlockShape, constants):
     return translate_cuda, threads
 
 
-def _launch_cuda(dtype, shape: BlockShape, constants, blocks: int, arrays):
-    kernel, threads = _cuda_kernel(dtype, shape, tuple(constants.items()))
-    wp.launch(kernel, dim=blocks * threads, inputs=[arrays], device=arrays.locals.device, block_dim=threads)
+@cache
+def _add_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_parts(parts: wp.array2d[dtype], locals_out: wp.array[dtype]):
+        i = wp.tid()
+        total = parts[0, i]
+        for part in range(1, parts.shape[0]):
+            total += parts[part, i]
+        locals_out[i] = total
+
+    return add_parts
