@@ -51,7 +51,7 @@ AUTOMATIC_COUNT = 729
 
 LEAST_ACROSS = 3
 """Cells across an inducible shape at automatic spacing, at least. A ferrite cube of 20 mm pulls a plate of 40:40:5 mm
-with 4.4 % too little at 0.5 mm, of two across with 6 %. With more, which are flatter, solves take longer."""
+with 4 % too little at 0.5 mm, of two across with 6 %. With more, which are flatter, solves take longer."""
 
 LARGEST_COUNT = 20_000
 """Moments of one body at any spacing; a smaller spacing is refused as a mistake."""

@@ -182,7 +182,7 @@ class MomentSystem:
         self.sources = self.applied = None
         self._magnetizing = self._acting = self.external_field
         if applied or solids:
-            self.sources = Sources(applied, solids, self._packed, len(layout.ranges()))
+            self.sources = Sources(applied, solids, self._packed, len(layout.ranges()), self.bias)
             self.applied = AppliedForces(
                 self.sources, layout.worlds, self.external_field, layout.movable,
                 balls=layout.balls if self.contact_model == "multipole" else None,
@@ -260,7 +260,7 @@ class MomentSystem:
     def _make_near_contacts(self, layout: MomentLayout, turned, susceptibility):
         magnets = layout.permanent | (self._material.curve.numpy() == LINEAR)
         for one in () if self.sources is None else self.sources.solids:  # of closed forms, not of their moments
-            magnets[one.first : one.first + one.count] = False
+            magnets[one.first : one.first + one.count] = one.magnet > 0
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.balls, susceptibility, self._material,
             ranges=self.world_ranges, magnets=magnets, lone=layout.alone, field=self._mutual, movable=layout.movable,

@@ -4,10 +4,11 @@ The plate is at one potential: (1/4π) ∫ σ/‖x − y‖ dA + φ = const, φ 
 are closed forms; σ is taken as constant on rectangles that shrink towards the edges of the plate (``boxes.py``) and are
 small below the magnet. The force is μ0 ∫ σ H dA, H the magnet's.
 
-Run as ``python -m bench.reference.plate``: the force and moment of the plate for some gaps, and what twice the
-rectangles along each side change.
+Run as ``python -m bench.reference.plate [--found]``: the force and moment of the plate for some gaps, what twice the
+rectangles along each side change, and how far from it a model's plate and magnet are.
 """
 
+import argparse
 import itertools
 
 import numpy as np
@@ -19,7 +20,7 @@ MAGNET, MAGNETIZATION = 0.02, 3.2e5
 """Side of the ferrite cube [m], and its magnetization along z [A/m]."""
 PLATE = (0.04, 0.04, 0.005)
 """Sides of the plate [m]."""
-GAPS = (0.0005, 0.001, 0.002, 0.005, 0.01)
+GAPS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01)
 """Gaps between them [m]."""
 
 
@@ -79,13 +80,47 @@ def _rectangles(half, centre, count: int):
     return np.concatenate(lower), np.concatenate(upper), np.concatenate(axes)
 
 
+def found(gap: float, aside: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of a Newton model, and the force on the magnet."""
+    import newton  # noqa: PLC0415 - the reference does without the library
+    import warp as wp  # noqa: PLC0415
+
+    import warpmag  # noqa: PLC0415
+
+    wp.config.log_level = wp.LOG_WARNING
+    builder, side = newton.ModelBuilder(), 0.5 * MAGNET
+    warpmag.register_attributes(builder)
+    iron = builder.add_body()
+    builder.add_shape_box(iron, hx=0.5 * PLATE[0], hy=0.5 * PLATE[1], hz=0.5 * PLATE[2])
+    warpmag.add_inducible(builder, iron, saturation=1e12)
+    place = (aside, 0.0, 0.5 * PLATE[2] + gap + side)
+    magnet = builder.add_body(xform=wp.transform(place, wp.quat_identity()))
+    builder.add_shape_box(magnet, hx=side, hy=side, hz=side)
+    warpmag.add_permanent(builder, magnet, magnetization=(0.0, 0.0, MAGNETIZATION))
+    model = builder.finalize(device="cpu")
+    magnetics, state = warpmag.Magnetics(model), model.state()
+    magnetics.apply(state)
+    forces = state.body_f.numpy()[:, :3].astype(float)
+    return forces[0], magnetics.shape_moments()[0], forces[1]
+
+
 def main() -> None:
     """Print force and moment for all gaps."""
+    parser = argparse.ArgumentParser(prog="python -m bench.reference.plate", description=__doc__.partition("\n")[0])
+    parser.add_argument("--found", action="store_true", help="how far a model is from that")
+    options = parser.parse_args()
     for gap in GAPS:
         for aside in (0.0, 0.01):
             (coarse, _), (fine, moment) = force(gap, aside, 9), force(gap, aside, 18)
             change = np.abs(fine - coarse).max().round(4)
-            print(gap, aside, "N", fine.round(4), "A·m²", moment.round(4), "change", change)
+            print(gap, aside, "N", fine.round(4), "A·m²", moment.round(4), "change", change, flush=True)
+            if options.found:
+                pull, magnetized, back = found(gap, aside)
+                off = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in ((pull, fine), (magnetized, moment))]
+                rest = np.linalg.norm(pull + back) / np.linalg.norm(pull)
+                print(
+                    f"  off by: force {100 * off[0]:.2f} %, moment {100 * off[1]:.2f} %; left of both forces {rest:.0e}"
+                )
 
 
 if __name__ == "__main__":

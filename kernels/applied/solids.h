@@ -32,21 +32,24 @@ CUDA_CALLABLE inline Pose pose_from(const Real* at) {
             {n * (x * z + w * y), n * (y * z - w * x), 1 - n * (x * x + y * y)}};
 }
 
-// A body: its place in the tables, its lattice and its magnetization, in its frame.
+// A body: its place in the tables, its lattice and its magnetization, in its frame. Of one that yields to fields that
+// is what its remanence alone would make of a ball, ``uniform`` in the world, whatever its moments are, and ``magnet``
+// is the number of the magnet that it is part of.
 struct Body {
     Solid solid;
     Pose pose;
-    Three m, middle, half;
+    Three m, middle, half, uniform;
     Real reach, radius, label;
-    int first, count, shape;
+    int first, count, shape, magnet;
 };
 template <class All> CUDA_CALLABLE inline Real packed_at(const All& all, int row, int i) {
     return all.packed.data[row * (all.packed.strides[0] / sizeof(Real)) + i];
 }
 template <class All> CUDA_CALLABLE inline Body body_at(const All& all, int b) {
-    const int* const own = all.body.data + 4 * (size_t)b; // shape, first moment, their number
+    const int* const own = all.body.data + 4 * (size_t)b; // shape, first moment, their number, magnet
     const int* const tables = all.shape.data + 10 * (size_t)own[0];
-    const Real* const size = all.size.data + 9 * (size_t)b; // 1/V of the first moment, reach, radius, middle, half
+    // 1/V of the first moment, or what to multiply its bias by, reach, radius, middle, half
+    const Real* const size = all.size.data + 9 * (size_t)b;
     const Solid solid = {all.edge.data + EDGE_ROW * (size_t)tables[0],
                          all.face.data + FACE_ROW * (size_t)tables[2],
                          all.corner.data + 3 * (size_t)tables[5],
@@ -55,11 +58,19 @@ template <class All> CUDA_CALLABLE inline Body body_at(const All& all, int b) {
                          tables[3]};
     const Pose pose = pose_from((const Real*)all.solid_frame.data + 7 * (size_t)b);
     const int first = own[1];
-    const Three m = {size[0] * packed_at(all, 4, first), size[0] * packed_at(all, 5, first),
-                     size[0] * packed_at(all, 6, first)};
-    return {solid,           pose,    pose.to_body(m), three(size + 3),
-            three(size + 6), size[1], size[2],         packed_at(all, 7, first),
-            first,           own[2],  own[0]};
+    const Three of = own[3] ? three((const Real*)all.bias.data + 3 * (size_t)first)
+                            : Three{packed_at(all, 4, first), packed_at(all, 5, first), packed_at(all, 6, first)};
+    const Three m = mixed(size[0], of, 0, of);
+    return {solid,  pose,    pose.to_body(m), three(size + 3),          three(size + 6),
+            m,      size[1], size[2],         packed_at(all, 7, first), first,
+            own[2], own[0],  own[3]};
+}
+
+// A moment of a body's lattice that the closed form stands for.
+template <class All> CUDA_CALLABLE inline Three moment_at(const All& all, const Body& body, int j) {
+    if (!body.magnet) return {packed_at(all, 4, j), packed_at(all, 5, j), packed_at(all, 6, j)};
+    const Real radius = packed_at(all, 3, j), volume = Real(4.18879020478639) * radius * radius * radius;
+    return mixed(volume, body.uniform, 0, body.uniform);
 }
 
 template <class All> CUDA_CALLABLE inline Three center_of(const All& all, const Body& body) {
@@ -85,7 +96,7 @@ CUDA_CALLABLE inline Near lattice_field(const All& all, const Body& body, Vector
     Near out = no_field();
     for (int j = body.first + begin; j < body.first + body.count; j += step) {
         const Vector r = less(x, spread({packed_at(all, 0, j), packed_at(all, 1, j), packed_at(all, 2, j)}));
-        const Vector m = spread({packed_at(all, 4, j), packed_at(all, 5, j), packed_at(all, 6, j)});
+        const Vector m = spread(moment_at(all, body, j));
         const Number other = Number(Real(0)) + packed_at(all, 3, j), s = radius + other, d2 = dot(r, r), s2 = s * s;
         const Number c = larger(d2, s2), i = Real(0.5) * twice_inverse_root(c), i2 = i * i, i3 = i2 * i;
         const Number g2 = 3 * i2 * i3, rm = dot(r, m), g3 = -5 * i2 * g2 * rm;
@@ -123,7 +134,7 @@ CUDA_CALLABLE inline Vector lacking_inside(const All& all, const Body& body, Vec
     for (int j = body.first + begin; j < body.first + body.count; j += step) {
         const Vector r = less(x, spread({packed_at(all, 0, j), packed_at(all, 1, j), packed_at(all, 2, j)}));
         const Real radius = packed_at(all, 3, j), each = -1 / (Real(4.18879020478639) * radius * radius * radius);
-        const Vector own = spread({packed_at(all, 4, j), packed_at(all, 5, j), packed_at(all, 6, j)});
+        const Vector own = spread(moment_at(all, body, j));
         add_where(dot(r, r) < zero + radius * radius, m, scaled(zero + each, own));
     }
     return m;

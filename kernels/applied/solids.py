@@ -8,9 +8,10 @@
 
 Bodies refer to them:
 
-    body: Shape, first moment, number of moments of each, and a zero, shape [bodies, 4].
-    size: 1/V of its first moment [1/m³], reach, radius of the ball around it, middle and half sides of its box [m],
-        shape [bodies, 9].
+    body: Shape, first moment, number of moments of each, and its magnet if that yields to fields, else 0, shape
+        [bodies, 4].
+    size: 1/V of its first moment [1/m³], or its response if it yields, reach, radius of the ball around it, middle and
+        half sides of its box [m], shape [bodies, 9].
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,8 @@ INTEGER_TABLES = ("shape", "begin", "body")
 
 @dataclass(frozen=True)
 class SolidMagnet:
-    """A permanent body that is uniformly magnetized.
+    """A permanent body that is uniformly magnetized, or nearly: one that yields to fields has moments that induction
+    solves for, and the closed form stands for what its remanence alone would make of a ball.
 
     Attributes:
         first, count: Its moments.
@@ -35,6 +37,8 @@ class SolidMagnet:
         reach: Distance up to which the closed form counts [m].
         shape: The ``warpmag.polyhedra.Polyhedron`` that bounds it, in the frame of its body.
         movable: Whether the force on it is wanted.
+        magnet: Number of the magnet that it is part of, from 2 on, if that yields to fields; else 0.
+        response: k = 3χ/(3 + χ) of such a one.
     """
 
     first: int
@@ -44,13 +48,21 @@ class SolidMagnet:
     reach: float
     shape: Any
     movable: bool
+    magnet: int = 0
+    response: float = 0.0
 
     def size(self) -> list[float]:
         """Return its row of ``size``."""
         lower, upper = self.shape.corners.min(axis=0), self.shape.corners.max(axis=0)
         middle = 0.5 * (lower + upper)
         radius = np.linalg.norm(self.shape.corners - middle, axis=1).max()
-        return [1.0 / self.volume, self.reach, radius, *middle, *(0.5 * (upper - lower))]
+        return [
+            self.response if self.magnet else 1.0 / self.volume,
+            self.reach,
+            radius,
+            *middle,
+            *(0.5 * (upper - lower)),
+        ]
 
 
 def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
@@ -59,7 +71,7 @@ def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
     number = {key: k for k, key in enumerate(shapes)}
     rows, tables = _tables(shapes.values(), fine)
     tables["shape"] = rows
-    tables["body"] = np.array([(number[id(one.shape)], one.first, one.count, 0) for one in solids], np.int32)
+    tables["body"] = np.array([(number[id(one.shape)], one.first, one.count, one.magnet) for one in solids], np.int32)
     tables["size"] = np.array([one.size() for one in solids])
     return tables
 

@@ -11,6 +11,7 @@ Sources are numbered from coils and maps on, permanent bodies last:
 | shape, edge, face, corner, begin, edge_point, face_point, body, size | | ``solids`` has them |
 | solid_frame, world | [bodies] | where a permanent body is; the first body of its world, and the end of them |
 | packed, effective | | all moments, packed, and those that forces act on, shape [3, n] |
+| bias | [n] | M_r/χ of moments that yield to fields [A/m] (``induction.bias``); empty without them |
 | row | [rows] | source, first target and the end of those that push it back, and whether they are balls |
 | row_begin, partial | [sources + 1], [rows, 6] | first row of each source; force and torque of each row |
 | wrench | [sources, 7] | force [N], torque [N·m] about its origin or its first moment, and half an energy, see below |
@@ -21,7 +22,7 @@ give its moments. Targets are moments, or points:
 | array | shape | meaning |
 |---|---|---|
 | target | [8, t] | packed targets |
-| wanted | [t] | 0 of moments of permanent bodies of a closed form, 1 of others |
+| wanted | [t] | 0 of moments of permanent bodies of a closed form, their magnet if that yields, 1 of others |
 | chunk, lists | [chunks] | first target, how many, and the bodies of their world; the part of ``list`` |
 | base | [t] | what fields are added to [A/m] |
 | field | [t] | what magnetizes: ``base`` and the field of all sources [A/m] |
@@ -101,7 +102,7 @@ def source_arrays_type(dtype):
     kinds = (
         (wp.array[int], "kind table_begin table_end list list_begin begin wanted row_begin"),
         (wp.array[transform], "frame solid_frame"),
-        (wp.array[vec3], "strength base field acting along_x along_y along_z inside"),
+        (wp.array[vec3], "strength bias base field acting along_x along_y along_z inside"),
         (wp.array2d[wp.float64], "parameters"),
         (wp.array[wp.vec3d], "table"),
         (wp.array[dtype], "label edge face corner edge_point face_point points tables"),
@@ -124,6 +125,7 @@ class Sources:
         solids: Permanent bodies, ``SolidMagnet``, ordered by world.
         packed: All moments, packed (``packing.PackedMoments``).
         world_count: Number of worlds.
+        bias: M_r/χ of moments that yield to fields [A/m], shape [n]; None without them.
 
     Attributes:
         applied, solids: The sources.
@@ -135,11 +137,13 @@ class Sources:
         lists: First of each world's coils and maps in their list, and the end, NumPy.
     """
 
-    def __init__(self, applied, solids, packed, world_count: int):
+    def __init__(self, applied, solids, packed, world_count: int, bias=None):
         """Put the sources on the device."""
         self.applied, self.solids, self.packed = tuple(applied), tuple(solids), packed
         self.dtype, self.device, self.world_count = packed.dtype, packed.device, world_count
         self.arrays: dict[str, wp.array] = {"packed": packed.packed}
+        if bias is not None:
+            self.arrays["bias"] = bias
         self._lay_out_applied()
         if solids:
             self.arrays |= self.tables()

@@ -61,7 +61,7 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
             body,
             tuple(shapes),
             world,
-            sampler.sample(shapes, magnet.moment_spacing, magnet.fixed),
+            sampler.sample(shapes, magnet.moment_spacing, magnet.fixed, magnet.kind == "permanent"),
         )
         for (magnet, body, shapes), world in zip(groups, worlds, strict=True)
     ]

@@ -65,7 +65,7 @@ class ShapeSampler:
         self._frames = model.shape_transform.numpy().astype(float)
         self._known: dict[tuple, BodyLattice] = {}
 
-    def sample(self, shapes: list[int], spacing: float, permanent: bool) -> BodyLattice:
+    def sample(self, shapes: list[int], spacing: float, permanent: bool, closed: bool) -> BodyLattice:
         """Return the moments of one magnet.
 
         Balls apart from each other are one moment each if ``spacing`` is 0. Everything else is filled with moments,
@@ -75,11 +75,12 @@ class ShapeSampler:
             shapes: Shapes of one body, or one static shape.
             spacing: Distance between moments [m]; 0 for automatic.
             permanent: Whether the moments are fixed: their field is not averaged over more than their cells then.
+            closed: Whether closed forms stand for them close up, where there are some.
         """
-        key = (spacing, permanent, *(self._key(shape) for shape in shapes))
+        key = (spacing, permanent, closed, *(self._key(shape) for shape in shapes))
         if key not in self._known:
             try:
-                self._known[key] = self._sample(shapes, spacing, permanent)
+                self._known[key] = self._sample(shapes, spacing, permanent, closed)
             except InputError as error:
                 raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
         return self._known[key]
@@ -88,7 +89,7 @@ class ShapeSampler:
         source = id(self._sources[shape]) if self._sources[shape] is not None else None
         return (int(self._types[shape]), source, *self._scales[shape].tolist(), *self._frames[shape].tolist())
 
-    def _sample(self, shapes: list[int], spacing: float, permanent: bool) -> BodyLattice:
+    def _sample(self, shapes: list[int], spacing: float, permanent: bool, closed: bool) -> BodyLattice:
         if spacing == 0.0 and self._are_balls_apart(shapes):
             balls = [lattice.ball(self._scales[shape, 0]) for shape in shapes]
             return BodyLattice(
@@ -98,21 +99,21 @@ class ShapeSampler:
                 np.ones(len(shapes), dtype=int),
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
-        closed = self._polyhedra(shapes, solids) if permanent else []
-        if closed and spacing == 0.0:
-            return self._close_up(shapes, solids, closed)
+        bounds = self._polyhedra(shapes, solids) if closed else []
+        if bounds and permanent and spacing == 0.0:
+            return self._close_up(shapes, solids, bounds)
         across = 1 if permanent else lattice.LEAST_ACROSS
         filled = lattice.fill(solids, spacing, across, together=not permanent)
         counts = np.bincount(filled.owners, minlength=len(solids))
+        ends, grids = np.cumsum(counts), filled.pieces if permanent else filled.pieces * len(solids)
+        parts = tuple(
+            ClosedForm(int(end - count), int(count), shape, _REACH * float(one.sides.max()))
+            for end, count, shape, one in zip(ends, counts, bounds, grids, strict=bool(bounds))
+        )
         if permanent:
-            ends = np.cumsum(counts)
-            parts = [
-                ClosedForm(int(end - count), int(count), shape, _REACH * float(one.sides.max()))
-                for end, count, shape, one in zip(ends, counts, closed, filled.pieces, strict=bool(closed))
-            ]
-            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
+            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
         cells = corrected(coupling(filled, filled.radii), filled, solids)
-        return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells)
+        return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts)
 
     def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:
         """What bounds boxes and cylinders apart from each other, in the frame of their body; nothing for others."""
