@@ -7,7 +7,7 @@ another one. It prints one line where it cannot draw.
 import sys
 
 _FEWEST = 3
-_OUTSIDE, _MARGIN = 0.1, 1.85
+_OUTSIDE, _MARGIN = 0.1, 1.65
 """Part of the bodies that may lie outside on each side, and the width of the picture over that of the others."""
 
 
