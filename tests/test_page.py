@@ -65,6 +65,7 @@ def across(page, wanted):
     """Return how far right of the middle the box stands, over its width, once ``wanted`` says so."""
     end = time.monotonic() + 300.0  # a page that plays on shows each frame again and again, on a busy machine, too
     while time.monotonic() < end:
+        time.sleep(0.1)
         red, green, blue = np.moveaxis(page.picture(), -1, 0)
         columns = np.flatnonzero(((green > 1.5 * red) & (green > 1.5 * blue)).any(axis=0))
         if len(columns):

@@ -7,7 +7,7 @@ another one. It prints one line where it cannot draw.
 import sys
 
 _FEWEST = 3
-_OUTSIDE, _MARGIN = 0.1, 1.85
+_OUTSIDE, _MARGIN = 0.1, 1.65
 """Part of the bodies that may lie outside on each side, and the width of the picture over that of the others."""
 
 
@@ -28,6 +28,7 @@ def draw(stage: str, output: str, frame: int, samples: int, width: int, height: 
     for one in list(bpy.data.objects):
         bpy.data.objects.remove(one)
     bpy.ops.wm.usd_import(filepath=stage)
+    _paint_curves(bpy)
     scene = bpy.context.scene
     cameras = [one for one in bpy.data.objects if one.type == "CAMERA"]
     if not cameras:
@@ -44,6 +45,17 @@ def draw(stage: str, output: str, frame: int, samples: int, width: int, height: 
     scene.render.image_settings.file_format = "JPEG" if output.endswith((".jpg", ".jpeg")) else "PNG"
     bpy.ops.render.render(write_still=True)
     return ""
+
+
+def _paint_curves(bpy) -> None:
+    """Give curves their colour, which the importer leaves as an attribute, since it drops their materials."""
+    for one in bpy.data.objects:
+        color = one.data.attributes.get("displayColor") if one.type == "CURVES" and not one.data.materials else None
+        if color:
+            material = bpy.data.materials.new(one.name)
+            material.use_nodes = True
+            material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = color.data[0].color
+            one.data.materials.append(material)
 
 
 def _frame_bodies(bpy, camera, aspect: float) -> None:
