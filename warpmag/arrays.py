@@ -78,8 +78,12 @@ def resolve_device(device):
         raise InputError(f"device: no {shown(device)} here; available: {available}") from error
 
 
-def real_array(name: str, value) -> np.ndarray:
-    """Real numbers as a NumPy array of float64, whatever holds them; ``InputError`` where there is anything else."""
+def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
+    """Real numbers as a NumPy array of float64, or what is float32 as such if ``single``, whatever holds them.
+
+    Raises:
+        InputError: There is anything else.
+    """
     if isinstance(value, (wp.array, wp.indexedarray)):
         value = value.numpy()
     try:
@@ -93,6 +97,8 @@ def real_array(name: str, value) -> np.ndarray:
         kind = "b" if any(isinstance(v, bool) for v in array.flat) else "f"  # ints beyond 64 bits, fractions
     if kind not in "iuf":
         raise InputError(f"{name}: must be real numbers, got {shown(value)}")
+    if single and array.dtype == np.float32:
+        return array
     try:
         with np.errstate(over="ignore"):
             return array.astype(np.float64, copy=False)
@@ -167,7 +173,7 @@ def first_not_finite(array, count: int) -> int | None:
 class Kind:
     """Where a call computes and what it returns: device, scalar type, NumPy or Warp."""
 
-    device: object
+    device: Any
     dtype: type
     warp_out: bool
 
@@ -180,7 +186,7 @@ class Kind:
         # Warp refuses an empty slice
         return wp.clone(array[:count]) if count else wp.empty(0, dtype=array.dtype, device=array.device)
 
-    def vectors(self, name, value, count=None, *, farthest=None, least=None):
+    def vectors(self, name, value, count=None, *, farthest=None, least=None, shared=False):
         """Warp array of three-vectors, shape [n], from [n, 3] or, with ``count``, from one vector for all.
 
         Args:
@@ -189,6 +195,7 @@ class Kind:
             count: Number of vectors; None means any.
             farthest: If they are places, the largest coordinate [m] that is allowed.
             least: The least that the largest of all components may be unless they are zero, by Warp scalar type.
+            shared: Whether the array may be the caller's own memory: it is only read, before the call returns.
         """
         least = 0.0 if least is None else least[self.dtype]
         if isinstance(value, (wp.array, wp.indexedarray)):
@@ -196,14 +203,14 @@ class Kind:
             if not _within(array, least, self._most(farthest)):
                 self._check_size(name, array.numpy(), farthest, least)
             return array
-        array = real_array(name, value)
+        array = real_array(name, value, single=True)
         if count is not None and array.shape == (3,):
             array = np.broadcast_to(array, (count, 3))
         if array.ndim != 2 or array.shape[1] != 3 or (count is not None and len(array) != count):
             wanted = "[n, 3]" if count is None else f"[3] or [{count}, 3]"
             raise InputError(shape_message(name, wanted, array))
         self._check_size(name, array, farthest, least)
-        return self._upload(array, vec3_type(self.dtype))
+        return self._upload(array, vec3_type(self.dtype), shared)
 
     def scalars(self, name, value, count):
         """Warp array of scalars, shape [count], from one number or [count]."""
@@ -211,15 +218,16 @@ class Kind:
             return self._from_warp(name, value, self.dtype, count)
         return self._upload(host_scalars(name, value, count), self.dtype)
 
-    def _upload(self, array, warp_type):
-        return wp.array(np.ascontiguousarray(array, dtype=name_of(self.dtype)), dtype=warp_type, device=self.device)
+    def _upload(self, array, warp_type, shared=False):
+        array = np.ascontiguousarray(array, dtype=name_of(self.dtype))
+        return wp.array(array, dtype=warp_type, device=self.device, copy=not shared)
 
     def _most(self, farthest) -> float:
         return float(np.finfo(name_of(self.dtype)).max) if farthest is None else farthest
 
     def _check_size(self, name, array, farthest, least):
         """Raise ``InputError`` where the largest absolute value of an array is out of range, or is no number."""
-        size = np.abs(array).max(initial=0.0)  # NaN stays
+        size = max(float(array.max(initial=0.0)), -float(array.min(initial=0.0)))  # both are NaN if one is
         if least <= size <= self._most(farthest) or size == 0.0:
             return
         if np.isnan(size):

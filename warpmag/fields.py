@@ -16,14 +16,13 @@ from warpmag.arrays import (
     host_radii,
     range_message,
     resolve_kind,
-    vec3_type,
 )
 from warpmag.errors import InputError
-from warpmag.fmm import LEAST_RTOL, USUAL_RTOL, make_sums
-from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
+from warpmag.fmm import LEAST_RTOL, USUAL_RTOL
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import check_not_negative, check_rtol, check_token
+from warpmag.pair_sums import SumsShape, pair_sums
 
 _METHODS = ("auto", "vectorized", "reference", "fmm")
 _LEAST_FMM = {"cpu": 12_000, "cuda": 60_000}
@@ -79,21 +78,20 @@ def h_field(
         raise InputError("target_radii: only with targets; the moments' own radii are in radii")
     size, target_size = (_largest_radius(name, r, kind.dtype, reference) for name, r in _named(radii, target_radii))
     farthest = farthest_place(kind.dtype, size + (size if same_set else target_size), reference=reference)
-    x = kind.vectors("positions", positions, farthest=farthest)
-    m = kind.vectors("moments", moments, x.shape[0], least=_LEAST_OF_FIELD)
-    sources = at = _packed(kind, "radii", radii, size, x, m)
-    points = x
-    if not same_set:
-        points = kind.vectors("targets", targets, farthest=farthest)
-        at = _packed(kind, "target_radii", target_radii, target_size, points, wp.zeros_like(points))
-    base = wp.zeros(at.count, dtype=vec3_type(kind.dtype), device=kind.device)
-    h = wp.zeros_like(base)
-    form = _prepare(at, sources, reference)
-    sums = _fast_sums(Quantity.FIELD, kind, method, rtol, at, sources)
-    segments = [(0, at.count, 0, sources.count)]
-    PairEvaluation(Quantity.FIELD, segments, at, sources, base, h, form=form, smoothing=smoothing, sums=sums).launch()
-    _check_finite("field", kind, h, x, m, points)
-    return kind.finish(h)
+    x = kind.vectors("positions", positions, farthest=farthest, shared=True)
+    m = kind.vectors("moments", moments, x.shape[0], least=_LEAST_OF_FIELD, shared=True)
+    points = x if same_set else kind.vectors("targets", targets, farthest=farthest, shared=True)
+    t = None if same_set else points.shape[0]
+    shape = SumsShape(
+        Quantity.FIELD, kind.device.alias, kind.dtype, x.shape[0], size, t, target_size, reference, smoothing
+    )
+    with pair_sums(shape) as sums:
+        _pack(kind, "radii", radii, sums.moments, x, m)
+        if not same_set:
+            _pack(kind, "target_radii", target_radii, sums.targets, points, wp.zeros_like(points))
+        sums.launch(_fmm_rtol(method, rtol, shape))
+        _check_finite("field", kind, sums.out, x, m, points)
+        return kind.finish(sums.out, points.shape[0])
 
 
 def wrench(
@@ -136,57 +134,41 @@ def wrench(
     reference = _is_reference(kind, method, smoothing, radii, rtol, dtype)
     size = _largest_radius("radii", radii, kind.dtype, reference)
     farthest = farthest_place(kind.dtype, 2.0 * size, reference=reference)
-    x = kind.vectors("positions", positions, farthest=farthest)
+    x = kind.vectors("positions", positions, farthest=farthest, shared=True)
     n = x.shape[0]
-    m = kind.vectors("moments", moments, n, least=LEAST_OF_FORCE)
+    m = kind.vectors("moments", moments, n, least=LEAST_OF_FORCE, shared=True)
     external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
-    packed = _packed(kind, "radii", radii, size, x, m)
-    forces, torques = wp.zeros_like(x), wp.zeros_like(x)
-    turned = wp.ones(n, dtype=int, device=kind.device)
-    form = _prepare(packed, packed, reference)
-    sums = _fast_sums(Quantity.WRENCH, kind, method, rtol, packed, packed)
-    PairEvaluation(
-        Quantity.WRENCH, [(0, n, 0, n)], packed, packed, external, forces, turned=turned, torques=torques, form=form,
-        smoothing=smoothing, sums=sums,
-    ).launch()  # fmt: skip
-    _check_finite("force", kind, forces, x, m, x)
-    _check_finite("torque", kind, torques, x, m, x, more=", external_field")
-    return kind.finish(forces), kind.finish(torques)
+    shape = SumsShape(Quantity.WRENCH, kind.device.alias, kind.dtype, n, size, reference=reference, smoothing=smoothing)
+    with pair_sums(shape) as sums:
+        _pack(kind, "radii", radii, sums.moments, x, m)
+        wp.copy(sums.base, external)
+        sums.launch(_fmm_rtol(method, rtol, shape))
+        _check_finite("force", kind, sums.out, x, m, x)
+        _check_finite("torque", kind, sums.torques, x, m, x, more=", external_field")
+        return kind.finish(sums.out, n), kind.finish(sums.torques, n)
 
 
 def _named(radii, target_radii):
     return ("radii", radii), ("target_radii", target_radii)
 
 
-def _packed(kind: Kind, name, radii, largest, positions, moments) -> PackedMoments:
-    """Pack one-shot arrays, radii under ``name`` and the largest of them checked before."""
-    packed = PackedMoments(
-        kind.scalars(name, 0.0 if radii is None else radii, positions.shape[0]), largest_radius=largest, moving=False
-    )
+def _pack(kind: Kind, name, radii, packed: PackedMoments, positions, moments) -> None:
+    """Pack one-shot arrays, radii under ``name``; points have those that the packed moments began with."""
+    if radii is not None:
+        wp.copy(packed.radii, kind.scalars(name, radii, positions.shape[0]))
     packed.pack(positions, moments)
-    return packed
 
 
-def _prepare(at, sources, reference):
-    """Form of the sums, None for the fastest, which wants overlapping pairs to be found."""
-    if reference:
-        return REFERENCE
-    at.find_overlaps(None if at is sources else sources)
-    return None
-
-
-def _fast_sums(quantity, kind: Kind, method, rtol, at, sources):
-    """Sums by the fast multipole method, None where it is not wanted or would not be faster."""
-    count = at.count if at is sources else at.count + sources.count
+def _fmm_rtol(method, rtol, shape: SumsShape) -> float | None:
+    """Error to allow the fast multipole method, None where it is not wanted or would not be faster."""
+    fewest = _LEAST_FMM["cpu" if shape.device == "cpu" else "cuda"]
     wanted = method == "fmm" or (
         method == "auto"
         and rtol is not None
         and rtol >= LEAST_RTOL
-        and count >= _LEAST_FMM["cuda" if at.device.is_cuda else "cpu"]
+        and shape.count + (shape.target_count or 0) >= fewest
     )
-    if not wanted or at.count == 0 or sources.count == 0:
-        return None
-    return make_sums(quantity, sources, rtol or USUAL_RTOL, None if at is sources else at)
+    return (rtol or USUAL_RTOL) if wanted and shape.count and shape.target_count != 0 else None
 
 
 def _largest_radius(name, radii, dtype, reference) -> float:

@@ -90,7 +90,8 @@ class PackedMoments:
             largest_radius: The largest of them [m].
             labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means each its own.
             groups: World of each moment, shape [n]; None means one world.
-            moving: Whether they will move, so that lists of neighbours longer than needed pay.
+            moving: Whether they will move little by little, so that lists of neighbours longer than needed pay; else
+                they are listed afresh each time.
         """
         device, dtype, n = radii.device, radii.dtype, radii.shape[0]
         self.count = n
@@ -98,6 +99,7 @@ class PackedMoments:
         self.dtype = dtype
         self.radii = radii
         self.largest_radius = largest_radius
+        self._moving = moving
 
         def integers(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
@@ -143,11 +145,11 @@ class PackedMoments:
         """Launch the search for the ``sources`` that overlap these moments; None means these moments themselves."""
         if sources is None:
             sources = self
-        else:
-            self._lists.moved.fill_(1)  # only the motion of these moments is watched
         reach = sources.largest_radius + self.largest_radius
         if reach == 0.0 or self.count == 0 or sources.count == 0:
             return
+        if sources is not self or not self._moving:
+            self._lists.moved.fill_(1)  # of others no motion is watched
         if sources is not self:
             self._lists.reach.fill_(reach)
         neighbors.launch_find_neighbors(self._lists, sources._lists)

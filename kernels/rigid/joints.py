@@ -259,6 +259,19 @@ def _move_by(
     qd_out[body] = bodies.qd[body] + wp.spatial_vector(v, spin)
 
 
+@wp.kernel
+def _count_down(
+    # outputs:
+    left_out: wp.array[int],
+):
+    left_out[0] = left_out[0] - 1
+
+
+def launch_count_down(left):
+    """Take one from a counter, shape [1]."""
+    wp.launch(_count_down, dim=1, outputs=[left], device=left.device)
+
+
 def launch_align(joints: JointView, dof_start, one_axis, parent_frames, child_frames, axes):
     """Write frames of joints whose x axis is that of the joint, where it has one: Newton's limits know no other.
 

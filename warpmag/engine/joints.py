@@ -4,6 +4,7 @@ Newton's kernels say how far joints and contacts are off at the poses that veloc
 ``kernels.rigid.joints`` has what they lack.
 """
 
+import math
 from typing import Any
 
 import newton
@@ -19,6 +20,8 @@ _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 _ONE_AXIS = (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC)
 _ROWS_OF_FREE = (newton.JointType.FREE, newton.JointType.DISTANCE, newton.JointType.BALL, newton.JointType.FIXED)
 """Joints whose degrees of freedom have no drive here."""
+_AT_ONCE = 6
+"""Iterations between two looks at whether there are more: a graph that holds all of them takes seconds to make."""
 
 
 class JointSolve:
@@ -46,6 +49,7 @@ class JointSolve:
         slides = (counts[:, 0] > 0) & ~np.isin(types, _ROWS_OF_FREE)
         self._slides = wp.array(slides, dtype=wp.bool, device=device)
         rows, others = _rows(model)
+        self._left = wp.zeros(1, dtype=wp.int32, device=device)
         self._given = wp.zeros(len(rows), dtype=float, device=device)
         self._rows = [wp.array(column, dtype=wp.int32, device=device) for column in rows.T[:3]]
         self._rows.append(wp.array(rows[:, 3] == 1, dtype=wp.bool, device=device))
@@ -85,19 +89,28 @@ class JointSolve:
         wp.copy(self._q, after.q)
         wp.copy(self._qd, after.qd)
         self._given.zero_()
-        for _ in range(self._iterations):
-            launch_move(after, _KINEMATIC, dt, self._q, self._qd)
-            self._solve_contacts(masses, contacts, dt)
-            kernels.launch_apply(after, self._deltas)
-            launch_move(after, _KINEMATIC, dt, self._q, self._qd)
-            self._solve_joints(after, control, dt)
-            kernels.launch_turn_levers(joints, after, self._q, self._impulses, self._deltas)
-            targets = control.joint_target_q, control.joint_target_qd
-            kernels.launch_drive(
-                joints, after, targets, self._given, self._deltas, relaxation=self._relaxations[1], dt=dt
-            )
-            kernels.launch_apply(after, self._deltas)
+        at_once = math.gcd(self._iterations, _AT_ONCE)
+        self._left.fill_(self._iterations // at_once)
+
+        def iterate():
+            for _ in range(at_once):
+                self._iterate(joints, after, masses, control, contacts, dt)
+            kernels.launch_count_down(self._left)
+
+        wp.capture_while(self._left, iterate)
         launch_move(after, _KINEMATIC, dt)
+
+    def _iterate(self, joints: kernels.JointView, bodies: BodyView, masses, control, contacts, dt: float) -> None:
+        """Change velocities as contacts ask for, and then as joints and drives do."""
+        launch_move(bodies, _KINEMATIC, dt, self._q, self._qd)
+        self._solve_contacts(masses, contacts, dt)
+        kernels.launch_apply(bodies, self._deltas)
+        launch_move(bodies, _KINEMATIC, dt, self._q, self._qd)
+        self._solve_joints(bodies, control, dt)
+        kernels.launch_turn_levers(joints, bodies, self._q, self._impulses, self._deltas)
+        targets = control.joint_target_q, control.joint_target_qd
+        kernels.launch_drive(joints, bodies, targets, self._given, self._deltas, relaxation=self._relaxations[1], dt=dt)
+        kernels.launch_apply(bodies, self._deltas)
 
     def _add_joint_forces(self, body_q, joint_f, dt: float) -> None:
         model = self._model
