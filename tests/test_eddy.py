@@ -9,6 +9,7 @@ import warp as wp
 
 import warpmag
 from warpmag import oracle
+from warpmag.errors import InputError
 from warpmag.system import MomentSystem
 
 RADIUS, COUNT, PERMANENT = 0.005, 12, 3
@@ -193,3 +194,62 @@ def test_iron_is_braked_by_the_field_inside(device):
         rate = (factor * oracle.MU0 * GRADIENT) ** 2 * c / mass
         expected.append(-mass * 0.5 * rate[2] / (1.0 + 2.0 * step * rate.sum()))
     np.testing.assert_allclose(forces, expected, rtol=1e-4)
+
+
+def _ball_at_a_magnet(motion):
+    """An iron ball near a permanent box with a coil on it; ``motion`` is velocity and spin of each at its place."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_attributes(builder)
+    places = np.array([[0.0, 0.0, 0.0], [0.004, 0.002, 0.018]])
+    magnet, ball = (builder.add_body(xform=wp.transform(place, wp.quat_identity())) for place in places)
+    builder.add_shape_box(magnet, hx=0.01, hy=0.01, hz=0.01)
+    builder.add_shape_sphere(ball, radius=RADIUS)
+    warpmag.add_permanent(builder, magnet, magnetization=(0.0, 2e5, 8e5))
+    warpmag.add_coil(builder, magnet, radius=0.012, ampere_turns=500.0, xform=((0.0, 0.0, 0.01), (0.0, 0.0, 0.0, 1.0)))
+    warpmag.add_inducible(builder, ball, conductivity=1e7)
+    for body, place in zip((magnet, ball), places, strict=True):
+        velocity, spin = motion(body, place)
+        builder.body_qd[body] = wp.spatial_vector(*map(float, velocity), *map(float, spin))
+    return builder
+
+
+def _wrenches(device, motion):
+    """Force and torque on the magnet and on the ball, and what brakes them."""
+    found = []
+    for one in (lambda body, place: (np.zeros(3), np.zeros(3)), motion):
+        model = _ball_at_a_magnet(one).finalize(device=device)
+        state, magnetics = model.state(), warpmag.Magnetics(model, rtol=1e-5)
+        state.clear_forces()
+        magnetics.apply(state)
+        found.append(state.body_f.numpy().astype(float))
+    return found[1], found[1] - found[0]
+
+
+def test_a_magnet_and_its_coil_move(device):
+    """What moves and turns with the magnet is not braked; else momentum is kept, and power is lost."""
+    spin, speed = np.array([0.5, -1.0, 2.0]), np.array([0.02, 0.01, -0.03])
+    whole, along = _wrenches(device, lambda body, place: (speed + np.cross(spin, place), spin))
+    _, apart = _wrenches(device, lambda body, place: (body * speed, body * spin))
+    _, turned = _wrenches(device, lambda body, place: (0.0 * speed, (1 - body) * 20.0 * spin))
+    noise = 1e-6 * np.abs(whole).max(axis=0)  # of the forces that these are differences of, in single precision
+    assert (np.abs(along) < 5.0 * noise).all()
+    for found, power in ((apart, apart[1] @ [*speed, *spin]), (turned, turned[0, 3:] @ (20.0 * spin))):
+        assert np.abs(found).max() > 100.0 * noise.max()
+        assert power < 0.0
+        assert (np.abs(found[:, :3].sum(axis=0)) < 10.0 * noise[:3]).all()
+
+
+def test_only_balls_conduct(device):
+    builder = _ball_at_a_magnet(lambda body, place: (np.zeros(3), np.zeros(3)))
+    warpmag.add_permanent(builder, 0, magnetization=(0.0, 0.0, 8e5), conductivity=1e6)
+    with pytest.raises(InputError, match="shape_0: conductivity: only of a ball"):
+        warpmag.Magnetics(builder.finalize(device=device))
+    with pytest.raises(InputError, match="conductivity: must be zero or positive"):
+        warpmag.add_inducible(builder, 1, conductivity=-1.0)
+
+
+def test_nothing_is_prepared_without_conductors(device):
+    builder = _ball_at_a_magnet(lambda body, place: (np.zeros(3), np.zeros(3)))
+    warpmag.add_inducible(builder, 1)
+    system = warpmag.Magnetics(builder.finalize(device=device)).system
+    assert system.eddy is None and system.applied.rates is None
