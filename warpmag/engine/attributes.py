@@ -163,9 +163,9 @@ def add_inducible(
             :class:`warpmag.MagnetizationCurve` or the name of a material that has one, in place of saturation and
             susceptibility.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
-        conductivity: Electrical conductivity [S/m], for balls of one moment: eddy currents brake what moves through the
-            field (``warpmag.kernels.pairs.eddy``). Materials do not bring theirs: :class:`warpmag.materials.Material`
-            has it.
+        conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet: eddy currents brake
+            what moves through the field. 0 means none, with ``material``, too (:class:`warpmag.materials.Material` has
+            it), since it costs a sum over pairs.
 
     Raises:
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
@@ -202,9 +202,9 @@ def add_permanent(
             NdFeB, 1.1 of ferrite [dimensionless]. By default, 1, no field changes M; above, the magnet is one more
             body that induction solves for.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
-        conductivity: Electrical conductivity [S/m], for balls of one moment: eddy currents brake what moves through the
-            field (``warpmag.kernels.pairs.eddy``). Materials do not bring theirs: :class:`warpmag.materials.Material`
-            has it.
+        conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet: eddy currents brake
+            what moves through the field. 0 means none, with ``material``, too (:class:`warpmag.materials.Material` has
+            it), since it costs a sum over pairs.
 
     Raises:
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
