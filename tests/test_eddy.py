@@ -1,5 +1,6 @@
 """Eddy currents in conducting balls, against float64 differences of fields, closed forms and conservation laws."""
 
+import itertools
 import math
 
 import newton
@@ -253,3 +254,69 @@ def test_nothing_is_prepared_without_conductors(device):
     warpmag.add_inducible(builder, 1)
     system = warpmag.Magnetics(builder.finalize(device=device)).system
     assert system.eddy is None and system.applied.rates is None
+
+
+def test_worlds_do_not_see_each_other(clump, device):
+    """Twice the same balls, of which only the second world's conduct in part as those of the first."""
+    motion, alone = np.zeros((8, 2 * COUNT)), clump.braked(*_motion())
+    system = MomentSystem(
+        radii=np.full(2 * COUNT, RADIUS),
+        worlds=np.repeat([0, 1], COUNT),
+        permanent=np.tile(np.arange(COUNT) >= COUNT - PERMANENT, 2),
+        saturation=1.7e6,
+        rtol=1e-10,
+        dtype="float64",
+        device=device,
+    )
+    system.positions.assign(np.tile(clump.positions, (2, 1)))
+    system.moments.assign(np.tile(clump.moments, (2, 1)))
+    system.conduct(np.concatenate([np.zeros(COUNT), clump.conductivity]), NO_STEP)
+    system.solve()
+    found = []
+    for speed in (1.0, 0.0):
+        motion[:6] = speed * np.tile(np.concatenate([part.T for part in _motion()]), 2)
+        system.eddy.motion.assign(motion)
+        system.apply_forces()
+        found.append(np.stack([system.forces.numpy(), system.torques.numpy()]))
+    first, second = np.split(found[0] - found[1], 2, axis=1)
+    assert not first.any()
+    # two solves to 1e-10, and forces that change by 1e-5 of themselves
+    assert np.abs(second - alone).max() < 1e-5 * np.abs(alone).max()
+
+
+def test_a_ball_that_hangs_stops_to_swing(device):
+    """Closed form of small swings of an iron ball about a dipole, without friction.
+
+    The field turns by 3/2 of the swing's angle, and the ball after it at a rate of c B²/I, slower than it swings, so
+    that |dB/dt|² is B² (3/2 dφ/dt)² Ω²/(Ω² + (cB²/I)²): the amplitude falls at a quarter of that power over
+    ½ m r² (dφ/dt)².
+    """
+    magnet, start, top = 0.01, np.radians(5.0), 0.1
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    smooth = newton.ModelBuilder.ShapeConfig(density=7870.0, mu=0.0)
+    fixed = builder.add_shape_sphere(
+        -1, xform=wp.transform((0.0, 0.0, top), wp.quat_identity()), radius=magnet, cfg=smooth
+    )
+    warpmag.add_permanent(builder, shape=fixed, magnetization=(0.0, 0.0, 3e5))
+    place = 1.0005 * (magnet + RADIUS) * np.array([np.sin(start), 0.0, -np.cos(start)])
+    ball = builder.add_body(xform=wp.transform((*place[:2], top + place[2]), wp.quat_identity()))
+    builder.add_shape_sphere(ball, radius=RADIUS, cfg=smooth)
+    warpmag.add_inducible(builder, ball, conductivity=1e7)
+    simulation, step, angles = warpmag.Simulation(builder, step=1e-3, device=device), 1e-3, []
+    for _ in range(500):
+        simulation.step()
+        x, _, z = simulation.state.body_q.numpy()[0, :3]
+        angles.append(np.arctan2(x, top - z))
+    angles = np.array(angles)
+    zeros = np.flatnonzero(np.diff(np.sign(angles)) != 0)
+    swing = np.pi / (step * np.diff(zeros).mean())
+    peaks = [np.abs(angles[a:b]).max() for a, b in itertools.pairwise(zeros)]
+    found = -np.polyfit(step * zeros[:-1], np.log(peaks), 1)[0]
+
+    distance, c = magnet + RADIUS, oracle.eddy_coefficient(RADIUS, 1e7)
+    flux_density = 3.0 * oracle.MU0 * 2.0 / 3.0 * 3e5 * (magnet / distance) ** 3
+    follows = c * flux_density**2 / INERTIA
+    power = c * flux_density**2 * 1.5**2 * swing**2 / (swing**2 + follows**2)
+    # the step takes 2 % of the coefficient, the amplitude changes 1 %, a peak between steps and saturation less
+    assert found == pytest.approx(power / (2.0 * MASS * distance**2), rel=0.05)
