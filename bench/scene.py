@@ -26,7 +26,7 @@ def run_scene(count: int, device) -> dict:
     """Run Balls Up with ``count`` balls and measure its steps."""
     with tempfile.TemporaryDirectory() as folder:
         stage = Path(folder) / "pile.usdc"
-        balls_up.author(stage, **PILES[count])
+        balls_up.author(stage, conductivity=0.0, **PILES[count])
         began = time.perf_counter()
         simulation = Simulation(stage, device=str(device))
     simulation.step()

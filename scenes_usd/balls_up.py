@@ -23,6 +23,7 @@ def author(
     magnet_size: float = 0.04,
     magnetization: float = 1e6,
     height: float = 0.051,
+    conductivity: float = 1e7,
 ) -> None:
     """Write the stage to ``path``.
 
@@ -36,6 +37,8 @@ def author(
         magnet_size: Edge of the magnet [m].
         magnetization: Magnetization of the magnet along z [A/m].
         height: Centre of the magnet above the ground [m].
+        conductivity: Electrical conductivity of the balls [S/m], by default that of iron at room temperature: without
+            friction, eddy currents are what stops balls that hang and swing.
     """
     pitch = authoring.BALL_SPACING * radius
     top = (layers - 1) * pitch + 2.0 * radius
@@ -44,7 +47,7 @@ def author(
     count = columns * rows * layers
     stage = authoring.new_stage(
         f"Balls Up: {count} iron balls jump to a permanent magnet above them and stick\n\n"
-        "Kim and Han 2022, Fig. 3. No friction, no restitution, steps of 1 ms.",
+        "Kim and Han 2022, Fig. 3. No friction, no restitution, steps of 1 ms. Eddy currents brake the balls.",
         seconds=3.0,
     )
     authoring.add_scene(stage, MagneticSettings())
@@ -66,7 +69,7 @@ def author(
         motion=authoring.KINEMATIC,
     )
     UsdGeom.Scope.Define(stage, "/World/Balls")
-    ball_magnet = Magnet(saturation=saturation)
+    ball_magnet = Magnet(saturation=saturation, conductivity=conductivity)
     places = [(x, y, z) for z in range(layers) for y in range(rows) for x in range(columns)]
     for number, (x, y, z) in enumerate(places):
         position = ((x - 0.5 * (columns - 1)) * pitch, (y - 0.5 * (rows - 1)) * pitch, radius + z * pitch)

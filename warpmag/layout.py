@@ -97,6 +97,17 @@ def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
     return np.array(np.broadcast_to(ids, n), np.int32), list(measured)
 
 
+def change_material(material: CurveParameters, which, saturation, susceptibility, dtype):
+    """Change saturation [A/m] and susceptibility of some moments in place; see :meth:`MomentSystem.set_material`."""
+    host_positive("saturation", saturation, len(which), dtype)
+    host_positive("susceptibility", susceptibility, len(which), dtype, infinite=True)
+    slope = 3.0 / (1.0 + 3.0 / susceptibility)
+    for array, values in ((material.saturation, saturation), (material.slope, slope)):
+        whole = array.numpy().copy()
+        whole[which] = values
+        array.assign(whole)
+
+
 def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
     """The same layout, in which a body that has cells is no ball, even if it has only one."""
     cells = np.zeros(len(layout.radii), bool)

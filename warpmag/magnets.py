@@ -158,6 +158,7 @@ class Magnet:
             the remanent one, of no field inside.
         recoil_permeability: μ of a permanent magnet [dimensionless], M = M_r + (μ − 1) H with the field H inside.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+        conductivity: Electrical conductivity [S/m] of a ball of one moment, whose eddy currents brake it; 0 means none.
     """
 
     kind: str = "inducible"
@@ -167,6 +168,7 @@ class Magnet:
     magnetization: tuple[float, float, float] = (0.0, 0.0, 0.0)
     recoil_permeability: float = 1.0
     moment_spacing: float = 0.0
+    conductivity: float = 0.0
 
     def __post_init__(self):
         """Take what a measured curve says."""
@@ -195,6 +197,7 @@ class Magnet:
             check_finite(f"{name}: magnetization", self.magnetization)
             check_recoil(f"{name}: recoil permeability", self.recoil_permeability)
         check_not_negative(f"{name}: moment spacing", self.moment_spacing)
+        check_not_negative(f"{name}: conductivity", self.conductivity)
 
 
 @dataclass(frozen=True)

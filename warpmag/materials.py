@@ -15,7 +15,9 @@ from warpmag.magnets import check_curve, shown
 from warpmag.measured import MEASURED_CURVES
 from warpmag.oracle import MU0
 
-_BOZORTH = "R. M. Bozorth, Ferromagnetism, 1951, table of magnetic materials: permeability at 2 mT, saturation"
+_BOZORTH = (
+    "R. M. Bozorth, Ferromagnetism, 1951, table of magnetic materials: permeability at 2 mT, saturation, resistivity"
+)
 _NDFEB = "GB/T 13560-2017, sintered NdFeB, middle of the range of remanence"
 
 
@@ -32,6 +34,8 @@ class Material:
         source: Where the numbers are from.
         curve: Measured magnetization curve of an inducible material, None where it has none. Saturation and
             permeability are then what it leads to, and the largest.
+        conductivity: Electrical conductivity [S/m], 0 where the source has none. A magnet does not take it by itself:
+            only balls do (``add_inducible(..., conductivity=...)``), and it costs a sum over pairs.
     """
 
     name: str
@@ -41,6 +45,7 @@ class Material:
     density: float
     source: str
     curve: MagnetizationCurve | None = None
+    conductivity: float = 0.0
 
     @property
     def saturation(self) -> float:
@@ -58,8 +63,8 @@ class Material:
         return self.polarization / MU0
 
 
-def _inducible(name, saturation, permeability, density, source):
-    return Material(name, "inducible", saturation, permeability, density, source)
+def _inducible(name, saturation, permeability, density, resistivity, source):
+    return Material(name, "inducible", saturation, permeability, density, source, conductivity=1.0 / resistivity)
 
 
 def _measured(name, density):
@@ -76,12 +81,12 @@ def _permanent(name, remanence, density, source):
 MATERIALS = {
     one.name: one
     for one in (
-        _inducible("iron", 2.15, 200.0, 7870.0, f"{_BOZORTH}; 99.91 % Fe"),
-        _inducible("mild-steel", 2.10, 180.0, 7870.0, f"{_BOZORTH}; cold-rolled steel, 98.5 % Fe"),
-        _inducible("silicon-steel", 1.97, 500.0, 7650.0, f"{_BOZORTH}; 4 % Si"),
-        _inducible("permalloy", 1.07, 8000.0, 8600.0, f"{_BOZORTH}; 78.5 % Ni"),
-        _inducible("mumetal", 0.65, 20000.0, 8580.0, f"{_BOZORTH}; 77 % Ni, 5 % Cu, 2 % Cr"),
-        _inducible("soft-ferrite", 0.47, 2300.0, 4800.0, "Ferroxcube, Soft Ferrites, 2013; 3C90 (MnZn) at 25 °C"),
+        _inducible("iron", 2.15, 200.0, 7870.0, 1e-7, f"{_BOZORTH}; 99.91 % Fe"),
+        _inducible("mild-steel", 2.10, 180.0, 7870.0, 1e-7, f"{_BOZORTH}; cold-rolled steel, 98.5 % Fe"),
+        _inducible("silicon-steel", 1.97, 500.0, 7650.0, 6e-7, f"{_BOZORTH}; 4 % Si"),
+        _inducible("permalloy", 1.07, 8000.0, 8600.0, 1.6e-7, f"{_BOZORTH}; 78.5 % Ni"),
+        _inducible("mumetal", 0.65, 20000.0, 8580.0, 6.2e-7, f"{_BOZORTH}; 77 % Ni, 5 % Cu, 2 % Cr"),
+        _inducible("soft-ferrite", 0.47, 2300.0, 4800.0, 5.0, "Ferroxcube, Soft Ferrites, 2013; 3C90 (MnZn) at 25 °C"),
         _measured("pure-iron", 7870.0),
         _measured("1010-steel", 7870.0),
         _measured("M-19", 7650.0),

@@ -329,3 +329,55 @@ def equilibrium(
         h = h - damping * step
         value, m, derivative = trial
     return Equilibrium(m, h, float(np.linalg.norm(value) / max(np.linalg.norm(h), np.finfo(float).tiny)))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Eddy currents
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def eddy_coefficient(radii, conductivity):
+    """c = (2π/15) σ R⁵ [S·m⁴], the power of eddy currents in a ball over |dB/dt|² inside; Landau and Lifshitz, §59."""
+    return 2.0 * math.pi / 15.0 * np.asarray(conductivity, float) * np.asarray(radii, float) ** 5
+
+
+def flux_rates(positions, moments, radii, velocities, spins, derivatives, field=None, *, time=1e-6):
+    """dB/dt [T/s] inside balls, in frames that turn with them, shape [n, 3], by central differences of fields.
+
+    Args:
+        positions, moments, radii: The moments, which are fixed in their bodies.
+        velocities: Their velocities [m/s], shape [n, 3].
+        spins: Angular velocities of their bodies [rad/s], shape [n, 3].
+        derivatives: ∂M/∂H of each ball, zero of a permanent one, shape [n, 3, 3].
+        field: Function of positions: applied field [A/m]; None means none.
+        time: Half the time between the differences [s].
+    """
+
+    def h(seconds):
+        there, turned = positions + seconds * velocities, moments + seconds * np.cross(spins, moments)
+        return h_field(there, turned, radii=radii) + (0.0 if field is None else field(there))
+
+    rates = (h(time) - h(-time)) / (2.0 * time) - np.cross(spins, h(0.0))
+    return MU0 * (rates + 2.0 / 3.0 * np.einsum("nij,nj->ni", derivatives, rates))
+
+
+def eddy_wrench(coefficients, rates):
+    """Forces [N] and torques [N·m] of eddy currents, minus the slopes of ½ Σ c |dB/dt|² by velocities and spins.
+
+    Args:
+        coefficients: c of each ball, shape [n].
+        rates: Function of velocities and spins, both of shape [n, 3]: :func:`flux_rates`, which are linear in them.
+
+    Returns:
+        Power [W], forces and torques, shape [n, 3], as a function of velocities and spins.
+    """
+    n = len(coefficients)
+    unit = np.eye(6 * n).reshape(6 * n, 2, n, 3)
+    basis = np.stack([rates(v, w) for v, w in unit])
+
+    def wrench(velocities, spins):
+        now = rates(velocities, spins)
+        pull = -np.einsum("n,knc,nc->k", coefficients, basis, now).reshape(2, n, 3)
+        return float(coefficients @ (now**2).sum(axis=1)), pull[0], pull[1]
+
+    return wrench

@@ -6,14 +6,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import (
-    host_array,
-    host_positive,
-    resolve_device,
-    resolve_dtype,
-    shape_message,
-    vec3_type,
-)
+from warpmag.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedForces
@@ -25,11 +18,12 @@ from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, W
 from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
+from warpmag.kernels.pairs.eddy import EddyCurrents
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
-from warpmag.layout import MomentLayout, make_layout, make_material, with_cells
+from warpmag.layout import MomentLayout, change_material, make_layout, make_material, with_cells
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, check_count, check_force, check_rtol, check_token
 
 
@@ -86,6 +80,8 @@ class MomentSystem:
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]; permanent ones written by the caller, inducible ones by :meth:`solve`.
         external_field: Applied field [A/m], shape [n]; may be changed by the caller.
+        eddy: Eddy currents in balls (``kernels.pairs.eddy``), None unless :meth:`conduct` was called; their ``motion``
+            and ``applied.source_motion`` are written by the caller before :meth:`solve`.
         bias: M_r/χ [A/m] of permanent moments that respond, M_r the remanence, shape [n]; written by the caller before
             :meth:`solve`. None without them.
         dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
@@ -140,7 +136,7 @@ class MomentSystem:
         check_count("max_evaluations", max_evaluations)
         layout = with_cells(make_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
         self.rtol, self.max_evaluations, self.contact_model = float(rtol), int(max_evaluations), contact_model
-        self._force = force
+        self._force, self.eddy = force, None
         near = contact_model == "multipole"
         self._allocate(layout, external_field)
         made_of = saturation, susceptibility, curve
@@ -301,13 +297,14 @@ class MomentSystem:
         """
         if len(which) and self._near is not None:
             raise InputError(f"contact_model: {self.contact_model} has tables of materials, which cannot be changed")
-        host_positive("saturation", saturation, len(which), self.dtype)
-        host_positive("susceptibility", susceptibility, len(which), self.dtype, infinite=True)
-        slope = 3.0 / (1.0 + 3.0 / susceptibility)
-        for array, values in ((self._material.saturation, saturation), (self._material.slope, slope)):
-            whole = array.numpy().copy()
-            whole[which] = values
-            array.assign(whole)
+        change_material(self._material, which, saturation, susceptibility, self.dtype)
+
+    def conduct(self, conductivity, step: float):
+        """Give the balls of single moments a conductivity [S/m], shape [n], for forces that count for ``step`` [s]."""
+        turned, ranges = self._turned.numpy() == 0, [(first, last) for first, _, last in self.world_ranges]
+        self.eddy = EddyCurrents(self._packed, ranges, conductivity, turned, self._material, step)
+        if self.applied is not None:
+            self.applied.follow(self.eddy.motion)
 
     def carried(self) -> dict[str, wp.array]:
         """Return the arrays that one solve hands on to the next one, by name: with them in place it goes on alike."""
@@ -428,6 +425,8 @@ class MomentSystem:
         check_force("force", force, "dipole" if near is None else "multipole")
         if force == "zeeman":
             launch_zeeman_moments(self._packed, self.h, self._material, self._effective)
+        if self.eddy is not None:
+            self.eddy.add(self._acting, self.applied, self._effective if force == "zeeman" else None)
         if near is not None:
             near_pairs.launch_begin_forces(near)
         for evaluation in self._wrench[force]:
@@ -440,3 +439,5 @@ class MomentSystem:
         if self.applied is not None:
             effective = self._effective if force == "zeeman" else self._packed.moments
             self.applied.add(effective, self.forces, self.torques, near.arrays["response"] if expanded else None)
+        if self.eddy is not None:
+            self.eddy.finish(self.moments, self.torques)

@@ -37,11 +37,11 @@ _BODY_THREADS = 32
 
 
 @cache
-def _kernel(dtype, one: int, group: int, coils: bool, solids: bool, balls: tuple):
+def _kernel(dtype, one: int, group: int, coils: bool, solids: bool, rates: bool, balls: tuple):
     """Kernel of pass ``one``, or of all if that is −1."""
     call = "warpmag::apply_sources(thread, first, last, threads, team.data, arrays);"
     constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
-    constants |= {"PASS": one, "GROUP": group}
+    constants |= {"PASS": one, "GROUP": group, "RATES": int(rates)}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
     return passes_kernel(call, source_arrays_type(dtype), native_options("applied/passes.h", dtype=dtype, **constants))
 
@@ -64,6 +64,8 @@ class AppliedField:
 
     balls: tuple = (0, 0.0, 0.0, 0)
     """Whether fields are expanded about balls, and how; constants of ``balls.h``."""
+    rates: wp.array | None = None
+    """How fast fields change at the moments [A/(m·s)], shape [t]; None where that is not wanted."""
 
     def __init__(self, sources: Sources, targets, worlds, base, *, points: bool):
         """Allocate the results."""
@@ -110,7 +112,7 @@ class AppliedField:
             some = self.sources
             which = (first, group) if cuda else (-1, 1)
             self._commands[key] = wp.launch(
-                _kernel(some.dtype, *which, bool(some.applied), bool(some.solids), self.balls),
+                _kernel(some.dtype, *which, bool(some.applied), bool(some.solids), bool(self.rates), self.balls),
                 dim=group * items if cuda else 1,
                 inputs=[first, last + 1, threads_for(items, share), None if cuda else team(), self.arrays],
                 device=self.device,
@@ -251,6 +253,18 @@ class AppliedForces(AppliedField):
         self.wrenches = arrays.wrench = wp.zeros((len(pushed), 7), dtype=dtype, device=device)
         together = len(sources.solids) > len(np.unique(sources.solid_worlds))
         self._reacts, self._adds = bool(rows), bool(rows) or together
+
+    def follow(self, motion):
+        """Evaluate rates, too, from now on: of moments and sources that move as ``motion`` and ``source_motion`` say.
+
+        Args:
+            motion: How the moments move (``pairs.eddy.MOTION_ROWS``), written by the caller, shape [8, n].
+        """
+        arrays, sources = self.arrays, self.sources
+        self.rates = arrays.rate = wp.zeros_like(arrays.field)
+        self.source_motion = wp.zeros((len(sources.applied), 6), dtype=sources.dtype, device=self.device)
+        arrays.motion, arrays.source_motion = motion, self.source_motion
+        self._commands.clear()
 
     def expand(self):
         """Expand the field of the sources about the balls."""

@@ -2,11 +2,12 @@
 //
 // Of a permanent body everything is a difference: the closed form less what the sums over pairs make of the lattice. On
 // a CPU a pass works on a vector of targets or of points, on a GPU a group of threads shares a target, a ball, a row of
-// targets or a body. Takes GROUP, MU0, INVERSE_4PI and the switches COILS, SOLIDS and BALLS from Python, for what there
-// is, and PASS, the only one of a GPU's kernel; ``All`` is the struct of sources.py, which has the names.
+// targets or a body. Takes GROUP, MU0, INVERSE_4PI and the switches COILS, SOLIDS, BALLS and RATES from Python, for
+// what there is, and PASS, the only one of a GPU's kernel; ``All`` is the struct of sources.py, which has the names.
 #pragma once
 #include "applied/balls.h"
 #include "applied/between.h"
+#include "applied/rates.h"
 #include "shared/team.h"
 
 namespace warpmag {
@@ -72,10 +73,13 @@ template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(con
     if (held <= 0) return;
     const Targets at = targets_at(all, i, held);
     Seen acting = nothing_seen();
-    Vector h = acting.h, inside = h;
+    Vector h = acting.h, inside = h, rate = h;
     if constexpr (COILS) {
         const auto& list = all.lists.data[row / CHUNK];
-        h = add_applied(all, all.list.data + list[0], share(), SHARES, list[1] - list[0], at, held, acting);
+        const int* const first = all.list.data + list[0];
+        h = add_applied(all, first, share(), SHARES, list[1] - list[0], at, held, acting);
+        if constexpr (RATES)
+            rate = rate_of_coils(all, first, share(), SHARES, list[1] - list[0], i, held, at.x, at.label);
     }
     if constexpr (SOLIDS)
         for (int b = chunk[2]; b < chunk[3]; ++b) {
@@ -85,11 +89,14 @@ template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(con
             const Seen seen = seen_of(lacking(all, body, at.x, at.radius, near, share(), SHARES));
             add_where(near, h, seen.h);
             add_where(near & pushed_by<All>(body, at), acting, seen);
+            if constexpr (RATES)
+                add_where(near & (at.label != body.label), rate, rate_of_body(all, body, seen, i, held, at.x));
             if constexpr (POINTS) add_where(near, inside, lacking_inside(all, body, at.x, share(), SHARES));
         }
     h = group_sums(h);
     acting = {group_sums(acting.h), group_sums(acting.x), group_sums(acting.y), group_sums(acting.z)};
     if constexpr (POINTS) inside = group_sums(inside);
+    if constexpr (RATES) rate = group_sums(rate);
     if (share() != 0) return;
     const size_t column = 3 * (size_t)i;
     const Vector base = vectors((Real*)all.base.data + column, held);
@@ -99,6 +106,7 @@ template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(con
     put_vectors((Real*)all.along_y.data + column, held, acting.y);
     put_vectors((Real*)all.along_z.data + column, held, acting.z);
     if constexpr (POINTS) put_vectors((Real*)all.inside.data + column, held, inside);
+    if constexpr (RATES) put_vectors((Real*)all.rate.data + column, held, rate);
 }
 
 // What the targets of a row push their source with: the opposite of what it pushes them with.

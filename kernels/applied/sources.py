@@ -28,6 +28,9 @@ give its moments. Targets are moments, or points:
 | field | [t] | what magnetizes: ``base`` and the field of all sources [A/m] |
 | acting | [t] | what turns: ``base`` and the field of the sources of other bodies [A/m] |
 | along_x, along_y, along_z | [t] | derivatives of the field of the sources of other bodies [A/m²] |
+| rate | [t] | rate of the field of the sources of other bodies [A/(m·s)], where it is wanted |
+| motion, source_motion | [8, n], [coils, 6] | how moments move (``pairs.eddy``), and coils and maps: velocity of the |
+| | | origin [m/s] and angular velocity [rad/s] |
 | inside | [t] | of points, magnetization of the bodies there beyond that of their lattices' balls [A/m] |
 
 And balls that feel multipoles of theirs:
@@ -102,12 +105,12 @@ def source_arrays_type(dtype):
     kinds = (
         (wp.array[int], "kind table_begin table_end list list_begin begin wanted row_begin"),
         (wp.array[transform], "frame solid_frame"),
-        (wp.array[vec3], "strength bias base field acting along_x along_y along_z inside"),
+        (wp.array[vec3], "strength bias base field acting along_x along_y along_z inside rate"),
         (wp.array2d[wp.float64], "parameters"),
         (wp.array[wp.vec3d], "table"),
         (wp.array[dtype], "label edge face corner edge_point face_point points tables"),
         (wp.array3d[dtype], "expansion response"),
-        (wp.array2d[dtype], "extent size packed effective partial wrench target"),
+        (wp.array2d[dtype], "extent size packed effective partial wrench target motion source_motion"),
         (wp.array2d[int], "shape body"),
         (wp.array[wp.vec2i], "world lists"),
         (wp.array[wp.vec4i], "chunk row ball"),

@@ -121,9 +121,9 @@ class PackedMoments:
         """Rows of zeros, with room after the last moment."""
         return wp.zeros((rows, (1 + -(-self.count // PITCH)) * PITCH), dtype=self.dtype, device=self.device)
 
-    def vectors(self) -> wp.array:
-        """Return an array for more vectors of the moments, laid out as :attr:`moments`, shape [3, n]."""
-        return self._pitched(3)[:, : self.count] if self.count else self._pitched(3)
+    def vectors(self, rows: int = 3) -> wp.array:
+        """Return an array for more vectors of the moments, laid out as :attr:`moments`, shape [rows, n]."""
+        return self._pitched(rows)[:, : self.count] if self.count else self._pitched(rows)
 
     def carried(self) -> dict:
         """Return the arrays that outlive an arrangement, by name."""

@@ -57,7 +57,8 @@ class ShapeMagnets:
 
     Attributes:
         kind: 0 for a shape that is no magnet.
-        saturation, susceptibility, curve, recoil_permeability, moment_spacing: As in ``warpmag.engine.attributes``.
+        saturation, susceptibility, curve, recoil_permeability, moment_spacing, conductivity: As in
+            ``warpmag.engine.attributes``.
     """
 
     kind: wp.array[wp.int32]
@@ -66,6 +67,7 @@ class ShapeMagnets:
     curve: wp.array[wp.int32]
     recoil_permeability: wp.array[float]
     moment_spacing: wp.array[float]
+    conductivity: wp.array[float]
 
 
 @wp.func
@@ -76,6 +78,7 @@ def _alike(now: ShapeMagnets, then: ShapeMagnets, shape: int) -> bool:
         return True
     same = now.saturation[shape] == then.saturation[shape] and now.susceptibility[shape] == then.susceptibility[shape]
     same = same and now.recoil_permeability[shape] == then.recoil_permeability[shape]
+    same = same and now.conductivity[shape] == then.conductivity[shape]
     return same and now.curve[shape] == then.curve[shape] and now.moment_spacing[shape] == then.moment_spacing[shape]
 
 

@@ -86,6 +86,7 @@ AUTHORED = {
     "warpmag:susceptibility": "float",
     "warpmag:magnetization": "vector3f",
     "warpmag:momentSpacing": "float",
+    "warpmag:conductivity": "float",
     "warpmag:moment": "vector3f",
     "warpmag:externalField": "vector3f",
     "warpmag:rtol": "float",

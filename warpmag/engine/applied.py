@@ -18,6 +18,7 @@ from warpmag.coils import FARTHEST_POINT, Coil, FieldMap, SourceRecord, check_st
 from warpmag.engine.attributes import NAMESPACE, check_body, check_registered
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
+from warpmag.kernels.rigid.motion import gather_source_motion
 from warpmag.kernels.rigid.sources import SourceShapes, add_reactions, gather_sources, set_strengths
 from warpmag.magnets import check_whole, shown
 from warpmag.system import MomentSystem
@@ -260,6 +261,11 @@ class ModelSources:
         """Tell the system where the sources are, and how strong."""
         if self.applied:
             gather_sources(body_q, self._shapes, self._system.sources.frames, self._system.sources.strengths)
+
+    def gather_motion(self, state: newton.State, motion) -> None:
+        """Write how the sources move, shape [sources, 6] (``kernels.applied.sources``)."""
+        if self.applied:
+            gather_source_motion(self._shapes, self._model, state, self._system.sources.frames, motion)
 
     def add_reactions(self, state: newton.State) -> None:
         """Add what the moments do to the sources to the forces on their bodies."""

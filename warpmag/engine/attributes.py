@@ -29,6 +29,7 @@ _ATTRIBUTES = {
     "magnetization": (wp.vec3, wp.vec3(0.0, 0.0, 0.0)),  # [A/m], frame of the shape
     "recoil_permeability": (wp.float32, 1.0),
     "moment_spacing": (wp.float32, 0.0),
+    "conductivity": (wp.float32, 0.0),
 }
 _OF_SOURCES = {
     "source": (str, ""),  # what ``warpmag.coils`` writes; empty on a shape that is no source of a field
@@ -146,6 +147,7 @@ def add_inducible(
     susceptibility: float | None = None,
     curve: str | MagnetizationCurve | None = None,
     moment_spacing: float = 0.0,
+    conductivity: float = 0.0,
 ) -> None:
     """Make a body, or one shape, a magnet that the field magnetizes: iron, steel, ferrite.
 
@@ -161,6 +163,9 @@ def add_inducible(
             :class:`warpmag.MagnetizationCurve` or the name of a material that has one, in place of saturation and
             susceptibility.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+        conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet: eddy currents brake
+            what moves through the field. 0 means none, with ``material``, too (:class:`warpmag.materials.Material` has
+            it), since it costs a sum over pairs.
 
     Raises:
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
@@ -168,7 +173,7 @@ def add_inducible(
     """
     given = {"saturation": saturation, "susceptibility": susceptibility}
     values = materials.inducible_from(material, curve, {k: v for k, v in given.items() if v is not None})
-    magnet = Magnet("inducible", **values, moment_spacing=moment_spacing)
+    magnet = Magnet("inducible", **values, moment_spacing=moment_spacing, conductivity=conductivity)
     for index in magnet_shapes(builder, body, shape):
         mark_shape(builder, index, magnet)
 
@@ -182,6 +187,7 @@ def add_permanent(
     magnetization: tuple[float, float, float],
     recoil_permeability: float = 1.0,
     moment_spacing: float = 0.0,
+    conductivity: float = 0.0,
 ) -> None:
     """Make a body, or one shape, a permanent magnet.
 
@@ -196,6 +202,9 @@ def add_permanent(
             NdFeB, 1.1 of ferrite [dimensionless]. By default, 1, no field changes M; above, the magnet is one more
             body that induction solves for.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+        conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet: eddy currents brake
+            what moves through the field. 0 means none, with ``material``, too (:class:`warpmag.materials.Material` has
+            it), since it costs a sum over pairs.
 
     Raises:
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
@@ -214,6 +223,7 @@ def add_permanent(
             magnetization=tuple(in_shape),
             recoil_permeability=recoil_permeability,
             moment_spacing=moment_spacing,
+            conductivity=conductivity,
         )
         mark_shape(builder, index, magnet)
 
@@ -281,6 +291,7 @@ def _values(magnet: Magnet) -> dict[str, Any]:
         "magnetization": wp.vec3(*(float(x) for x in magnet.magnetization)),
         "recoil_permeability": float(magnet.recoil_permeability),
         "moment_spacing": float(magnet.moment_spacing),
+        "conductivity": float(magnet.conductivity),
     }
 
 
@@ -322,6 +333,7 @@ def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
             magnetization=tuple(columns["magnetization"][shape].tolist()),
             recoil_permeability=float(columns["recoil_permeability"][shape]),
             moment_spacing=float(columns["moment_spacing"][shape]),
+            conductivity=float(columns["conductivity"][shape]),
         )
         for shape in marked
     }

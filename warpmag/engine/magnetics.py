@@ -12,6 +12,7 @@ from warpmag.arrays import Kind, Numbers, farthest_place, host_array
 from warpmag.curves import MagnetizationCurve
 from warpmag.engine.applied import ModelSources
 from warpmag.engine.attributes import NAMESPACE
+from warpmag.engine.eddy import BodyEddies
 from warpmag.engine.grouping import BodyMagnet, find_magnets
 from warpmag.engine.model_values import ModelValues
 from warpmag.errors import InputError
@@ -27,7 +28,7 @@ from warpmag.kernels.rigid.bodies import (
     set_magnetization,
     sum_moments,
 )
-from warpmag.magnets import LINEAR_CURVE, MagneticSettings
+from warpmag.magnets import LINEAR_CURVE, MagneticSettings, check_positive
 from warpmag.probe import FieldProbe
 from warpmag.system import MomentSystem
 
@@ -62,6 +63,7 @@ class Magnetics:
         external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
         max_evaluations: int = 1000,
         curve: str | MagnetizationCurve | None = None,
+        step: float = 1e-3,
     ):
         """Sample the magnets of ``model`` and allocate everything that :meth:`apply` needs.
 
@@ -76,6 +78,7 @@ class Magnetics:
             external_field: Uniform applied field H0 [A/m], world frame.
             max_evaluations: Field evaluations after which induction gives up.
             curve: Magnetization curve of all magnets, as :func:`warpmag.add_inducible` takes it; by default their own.
+            step: Longest time [s] between calls of :meth:`apply`, in which eddy currents stop nothing that conducts.
 
         Raises:
             InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would be
@@ -83,6 +86,7 @@ class Magnetics:
         """
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         settings.check("Magnetics")
+        check_positive("Magnetics: step", step)
         if curve is not None:
             curve = materials.measured("Magnetics: curve", curve)
         self.magnets, self._worlds = find_magnets(model)
@@ -92,6 +96,7 @@ class Magnetics:
         self.system = self._make_system(settings, max_evaluations, curve)
         self._sources.bind(self.system)
         self._map_bodies()
+        self._eddies = BodyEddies(model, self.magnets, self._body_moments, self._sources, self.system, step)
 
     def _make_system(self, settings: MagneticSettings, max_evaluations: int, curve) -> MomentSystem:
         counts = [len(one.lattice.volumes) for one in self.magnets]
@@ -232,6 +237,7 @@ class Magnetics:
             gather_frames(state.body_q, self._solid_bodies, self.system.sources.solid_frames)
         if len(self._recoiling):
             gather_bias(state.body_q, self._body_moments, self._recoiling, self._coercivity, self.system.bias)
+        self._eddies.gather(state)
         self.system.solve()
 
     def add_forces(self, state: newton.State) -> None:

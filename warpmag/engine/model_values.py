@@ -18,7 +18,7 @@ from warpmag.magnets import CURVES, check_material
 
 _MATERIAL = ("saturation", "susceptibility")
 """What can be taken over; the others decide which moments there are, and what they are computed by."""
-_NAMES = ("kind", *_MATERIAL, "curve", "recoil_permeability", "moment_spacing")
+_NAMES = ("kind", *_MATERIAL, "curve", "recoil_permeability", "moment_spacing", "conductivity")
 
 
 class ModelValues:

@@ -96,7 +96,8 @@ class Simulation:
         settings = settings.replaced(
             force=force, dynamics=dynamics, contact_model=contact_model, rtol=rtol, external_field=external_field
         )
-        self._magnetics = Magnetics(self.model, curve=curve, max_evaluations=max_evaluations, **vars(settings))
+        how = {"curve": curve, "max_evaluations": max_evaluations, "step": LONGEST_SUBSTEP, **vars(settings)}
+        self._magnetics = Magnetics(self.model, **how)
         self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
         self._options = self._options_of(settings, solver, curve=curve, max_evaluations=max_evaluations)
 

@@ -391,6 +391,8 @@ class Stepper:
 
     def _share_forces(self, dt: float) -> None:
         predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
+        if self._magnetics.system.eddy is not None:
+            wp.copy(self._shared.body_qd, self._state.body_qd)
         if self._drive:
             self._drive.set_values(0.0, shared=self._machine.sharing, substep=dt)
         self._magnetize(self._shared)

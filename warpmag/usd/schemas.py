@@ -39,6 +39,7 @@ _MAGNET_ATTRIBUTES = {
     "magnetization": "warpmag:magnetization",
     "recoil_permeability": "warpmag:recoilPermeability",
     "moment_spacing": "warpmag:momentSpacing",
+    "conductivity": "warpmag:conductivity",
 }
 _OF_CURVE = ("saturation", "susceptibility", "curve")
 """What a measured curve says."""
@@ -56,10 +57,14 @@ SCENE_NAMES = tuple(_SETTINGS_ATTRIBUTES.values())
 def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
     """Make ``prim`` a magnet, with every attribute authored (Newton sees authored values only, no fallbacks).
 
-    But for what has no meaning for this one: a recoil permeability of 1, and what a measured curve says.
+    But for what has no meaning for this one: a recoil permeability of 1, no conductivity, and what a measured curve
+    says.
     """
     magnet.check(str(prim.GetPath()))
-    left_out = [] if magnet.recoils else ["recoil_permeability"]
+    left_out = [
+        *([] if magnet.recoils else ["recoil_permeability"]),
+        *([] if magnet.conductivity else ["conductivity"]),
+    ]
     if isinstance(magnet.curve, MagnetizationCurve):
         left_out += _OF_CURVE
         _author_curve(prim, magnet.curve)
