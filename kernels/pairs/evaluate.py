@@ -107,7 +107,9 @@ class PairEvaluation:
         """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
         device, finished, count = targets.device, self._finished, self.count
         if self.form == GIVEN:
-            self._launch_sums = lambda a: self._given_sums(a.effective, a.target, a.partial)
+            given = self._given_sums
+            assert given, "sums that the caller has"
+            self._launch_sums = lambda a: given(a.effective, a.target, a.partial)
             return 1, ()
         if self.form == REFERENCE:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
