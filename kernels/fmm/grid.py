@@ -13,11 +13,12 @@ import warp as wp
 
 from warpmag.kernels.pairs.packing import PACKED_ROWS, PITCH
 from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.scan import launch_scan
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 _BLOCK = 256
 """Moments of a block of threads, as in ``grid.h``."""
+_CHOOSING = 32 * 17
+"""Threads that choose the leaves, a warp for each level."""
 _MOST_LEVELS = 16
 _KEY_BITS, _HEIGHT_BITS, _OCTANT_BITS = 64, 5, 8
 _ROOM = 0.3
@@ -153,22 +154,22 @@ class MomentGrid:
             self._launch(one, count)
         wp.utils.radix_sort_pairs(a.cell_keys, a.cell_before, c, 0, 3 * a.depth + a.world_bits + _HEIGHT_BITS)
         self._launch(_Pass.NOTE, c)
-        launch_scan(a.held, a.moment_begin, inclusive=False)
+        wp.utils.array_scan(a.held, a.moment_begin, inclusive=False)
         self._launch(_Pass.LINK, c)
         wp.utils.radix_sort_pairs(a.order_keys, a.order, c, 0, _OCTANT_BITS)
         self._launch(_Pass.OCTANTS, a.octant_begin.size)
         self._launch(_Pass.PLACE, n)
 
     def _launch(self, one: _Pass, count: int):
-        cuda = self.device.is_cuda
-        threads = count * _BLOCK if one in _OF_BLOCKS else -(-count // _BLOCK) * _BLOCK
+        cuda, width = self.device.is_cuda, _CHOOSING if one == _Pass.CHOOSE else _BLOCK
+        threads = count * width if one in _OF_BLOCKS else -(-count // width) * width
         items = count * _BLOCK if one in _OF_BLOCKS else count
         wp.launch(
             _kernel(self.arrays.packed.dtype, one),
             dim=threads if cuda else 1,
             inputs=[count, threads_for(items, MOMENTS_PER_THREAD), None if cuda else team(), self.arrays],
             device=self.device,
-            block_dim=_BLOCK,
+            block_dim=width,
         )
 
 
