@@ -19,15 +19,13 @@ from warpmag.arrays import (
     vec3_type,
 )
 from warpmag.errors import InputError
-from warpmag.fmm import LEAST_RTOL, USUAL_RTOL, make_sums
+from warpmag.fmm import USUAL_RTOL, FastSums, check_fast, is_fast
 from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import check_not_negative, check_rtol, check_token
 
 _METHODS = ("auto", "vectorized", "reference", "fmm")
-_LEAST_FMM = {"cpu": 12_000, "cuda": 60_000}
-"""Fewest moments and targets for which ``auto`` takes the fast multipole method, by kind of device."""
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
 """Least of the largest component of moments [A·m²]: fields of smaller ones have no digits left."""
 
@@ -178,15 +176,12 @@ def _prepare(at, sources, reference):
 def _fast_sums(quantity, kind: Kind, method, rtol, at, sources):
     """Sums by the fast multipole method, None where it is not wanted or would not be faster."""
     count = at.count if at is sources else at.count + sources.count
-    wanted = method == "fmm" or (
-        method == "auto"
-        and rtol is not None
-        and rtol >= LEAST_RTOL
-        and count >= _LEAST_FMM["cuda" if at.device.is_cuda else "cpu"]
-    )
+    wanted = method == "fmm" or (method == "auto" and rtol is not None and is_fast(count, rtol, kind.device))
     if not wanted or at.count == 0 or sources.count == 0:
         return None
-    return make_sums(quantity, sources, rtol or USUAL_RTOL, None if at is sources else at)
+    fast = FastSums(sources, rtol or USUAL_RTOL, None if at is sources else at)
+    fast.grid.build()
+    return fast.sums(quantity)
 
 
 def _largest_radius(name, radii, dtype, reference) -> float:
@@ -199,8 +194,8 @@ def _is_reference(kind: Kind, method, smoothing, radii, rtol, dtype) -> bool:
     check_token("method", method, _METHODS)
     if rtol is not None:
         check_rtol("rtol", rtol, dtype)
-        if method == "fmm" and rtol < LEAST_RTOL:
-            raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'vectorized'")
+        if method == "fmm":
+            check_fast(rtol)
     check_not_negative("smoothing", smoothing)
     if smoothing > 0.0 and method == "fmm":
         raise InputError("smoothing: not with the method 'fmm'")

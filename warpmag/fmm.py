@@ -5,11 +5,13 @@ from functools import cache
 import numpy as np
 
 from warpmag import harmonics
+from warpmag.errors import InputError
 from warpmag.kernels.fmm.evaluation import CellSums
 from warpmag.kernels.fmm.expansions import ExpansionTables
 from warpmag.kernels.fmm.grid import MomentGrid, join_moments
 from warpmag.kernels.fmm.translate import displacements
 from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.magnets import check_token
 
 
 @cache
@@ -39,26 +41,77 @@ LEAST_RTOL = _DEGREES[-1][0]
 """Smallest relative error that expansions are made for."""
 
 
+_PART_OF_FIELD = 0.3
+"""Error of a field over that of the magnetization that it is for."""
+METHODS = ("auto", "vectorized", "fmm")
+"""How an induction solve sums pairs."""
+_LEAST_COUNT = {"cpu": 12_000, "cuda": 60_000}
+"""Fewest moments and targets for which the method is faster than all pairs, by kind of device."""
+
+
+def check_fast(rtol: float):
+    """Raise ``InputError`` where expansions are not made for a relative error."""
+    if rtol < LEAST_RTOL:
+        raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'vectorized'")
+
+
+def is_fast(count: int, rtol: float, device) -> bool:
+    """Whether the method reaches a relative error, and sooner than the sums over all pairs of ``count`` moments."""
+    return rtol >= LEAST_RTOL and count >= _LEAST_COUNT["cuda" if device.is_cuda else "cpu"]
+
+
 def choose_degree(rtol: float) -> tuple[int, int]:
     """Degree of the expansions for a relative error, and moments of a leaf."""
     return next((degree, held) for error, degree, held in _DEGREES if rtol >= error)
 
 
-def make_sums(quantity: Quantity, moments, rtol: float, targets=None) -> CellSums:
-    """Sums over pairs of moments, for ``pairs.evaluate.PairEvaluation``, their cells made.
+class FastSums:
+    """Cells of moments, and sums over pairs of them for ``pairs.evaluate.PairEvaluation``.
 
     Args:
-        quantity: What is summed.
         moments: Packed moments (``pairs.packing.PackedMoments``), at least one.
         rtol: Relative error wanted, at least ``LEAST_RTOL``.
         targets: Packed targets; None means the moments themselves.
+        worlds: Number of worlds.
+
+    Attributes:
+        grid: The cells, to be built whenever moments have moved.
     """
-    degree, held = choose_degree(rtol)
-    packed, groups, first = moments.packed, moments.groups, 0
-    reach = moments.largest_radius + (moments if targets is None else targets).largest_radius
-    if targets is not None:  # moments of no strength among the others
-        first = moments.count
-        packed, groups = join_moments(moments, targets)
-    grid = MomentGrid(packed, groups, occupancy=held, reach=reach)
-    grid.build()
-    return CellSums(grid, expansion_tables(degree), quantity, first)
+
+    def __init__(self, moments, rtol: float, targets=None, worlds: int = 1):
+        """Allocate the cells."""
+        degree, held = choose_degree(rtol)
+        packed, groups, self._first = moments.packed, moments.groups, 0
+        reach = moments.largest_radius + (moments if targets is None else targets).largest_radius
+        if targets is not None:  # moments of no strength among the others
+            self._first = moments.count
+            packed, groups = join_moments(moments, targets)
+        self._tables = expansion_tables(degree)
+        self.grid = MomentGrid(packed, groups, worlds, occupancy=held, reach=reach)
+
+    def sums(self, quantity: Quantity, sources=None) -> CellSums:
+        """Sums of a quantity, of some ``sources`` only (see :class:`CellSums`)."""
+        return CellSums(self.grid, self._tables, quantity, self._first, sources)
+
+
+def fast_sums_for(method: str, moments, bodies, rtol: float, worlds: int) -> FastSums | None:
+    """Cells for the fields of an induction solve, None where all pairs are summed.
+
+    Args:
+        method: One of ``METHODS``.
+        moments: Packed moments.
+        bodies: Body of each moment.
+        rtol: Relative error of the magnetization that is wanted.
+        worlds: Number of worlds.
+
+    Raises:
+        InputError: The method is wanted where it cannot be had.
+    """
+    check_token("method", method, METHODS)
+    alone, rtol = len(np.unique(bodies)) == len(bodies), _PART_OF_FIELD * rtol
+    if method == "fmm":
+        check_fast(rtol)
+        if not alone:
+            raise InputError("method: 'fmm' is not for bodies of several moments")
+    wanted = method == "fmm" or (method == "auto" and alone and is_fast(moments.count, rtol, moments.device))
+    return FastSums(moments, rtol, worlds=worlds) if wanted and moments.count else None

@@ -16,9 +16,11 @@ from warpmag.arrays import (
 )
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
+from warpmag.fmm import fast_sums_for
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.sources import Sources
 from warpmag.kernels.cells.couplings import CellCouplings
+from warpmag.kernels.fmm.check import sampled_error
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, WholeBody
@@ -58,6 +60,8 @@ class MomentSystem:
             submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
         contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
             nearly touch (see ``warpmag.kernels.near_contact``).
+        method: How pairs are summed: ``vectorized``, all of them; ``fmm``, the fast multipole method, with fields as
+            exact as ``rtol`` asks for, not for bodies of several moments; or ``auto``, the faster one.
         rtol: Relative error of the inducible moments' magnetization at which induction ends.
         max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
@@ -120,6 +124,7 @@ class MomentSystem:
         force="kelvin",
         dynamics="theta",
         contact_model="dipole",
+        method="vectorized",
         rtol=1e-3,
         max_evaluations=1000,
         step=None,
@@ -148,6 +153,7 @@ class MomentSystem:
         layout = self._make_bias(layout, dynamics)
         self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
+        self._fast = fast_sums_for(method, self._packed, layout.bodies, self.rtol, len(layout.ranges()))
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings, whole=dynamics == "theta")
         self._evaluate_wrench(layout, turned)
@@ -206,12 +212,21 @@ class MomentSystem:
         ranges = self.world_ranges
         packed, state = self._packed, self._induction
         applied = [(first, middle, middle, last) for first, middle, last in ranges]
-        self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self._magnetizing, state.h0)
+        fast = (
+            [self._fast.sums(Quantity.FIELD, which) for which in (layout.permanent, ~layout.permanent)]
+            if self._fast
+            else [None, None]
+        )
+        self._applied = PairEvaluation(
+            Quantity.FIELD, applied, packed, packed, self._magnetizing, state.h0, sums=fast[0]
+        )
         if self._applied.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing
         mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
         # near contacts write one more partial sum
-        self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
+        self._mutual = PairEvaluation(
+            Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra, sums=fast[1]
+        )
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
         """Prepare what cells lack as balls; ``whole`` tells whether small bodies respond as wholes."""
@@ -246,7 +261,7 @@ class MomentSystem:
             return [
                 PairEvaluation(
                     quantity, which, self._packed, self._packed, self._acting, self.forces, effective=effective,
-                    turned=self._turned, torques=self.torques,
+                    turned=self._turned, torques=self.torques, sums=self._fast and self._fast.sums(quantity),
                 )
                 for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
                 if which
@@ -335,6 +350,8 @@ class MomentSystem:
         if self._near is not None:
             near_pairs.launch_find_pairs(self._near)
         packed.find_overlaps()
+        if self._fast is not None:
+            self._fast.grid.build()
         if self._applied.pair_count:
             self._applied.launch()
         elif self.bias is not None:
@@ -378,6 +395,13 @@ class MomentSystem:
         """Have what is launched next wait for what near contacts do beside."""
         if self._near is not None:
             near_pairs.wait(self._near)
+
+    def field_error(self) -> float:
+        """Relative error of the field by the fast multipole method at some moments, zero without it; waits."""
+        base = wp.clone(self._magnetizing)
+        if self.bias is not None:
+            launch_add_bias(self.bias, self._biased, base)
+        return sampled_error(self._mutual, self._packed, self.world_ranges, base, self.h) if self._fast else 0.0
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""

@@ -12,8 +12,8 @@ namespace warpmag {
 
 typedef unsigned long long Bits;
 
-constexpr int BLOCK = 256;        // moments that a block of threads has, as in grid.py
-constexpr int ROOT = 3, EDGE = 4; // places of numbers in ``frame``, after the corner of the cube
+constexpr int BLOCK = 256;                    // moments that a block of threads has, as in grid.py
+constexpr int ROOT = 3, EDGE = 4, WANTED = 5; // places of numbers in ``frame``, after the corner of the cube
 
 CUDA_CALLABLE inline int highest_bit(Bits bits) {
 #if defined(__CUDA_ARCH__)
@@ -125,8 +125,9 @@ template <class Arrays> CUDA_CALLABLE inline double usual_edge(const Arrays& a, 
     return cbrt(volume * a.worlds * a.occupancy / moment_count(a));
 }
 
-// The cube around all boxes: an edge is a power of two times that of the leaves that hold as many moments as wanted.
-template <class Arrays> CUDA_CALLABLE inline void set_frame(const Arrays& a) {
+// The cube around all boxes: an edge is a power of two times that of the leaves that hold as many moments as wanted, by
+// the volume of the box in the first round, by what leaves of other sizes hold in the second.
+template <class Arrays> CUDA_CALLABLE inline void set_frame(const Arrays& a, int round) {
     const Real* const boxes = a.boxes.data;
     Box box = {{boxes[0], boxes[1], boxes[2]}, {boxes[3], boxes[4], boxes[5]}};
     for (int b = first_item(); b < (int)a.boxes.shape[0]; b += AT_ONCE) box.add(boxes + 6 * b, boxes + 6 * b + 3, 1);
@@ -137,7 +138,7 @@ template <class Arrays> CUDA_CALLABLE inline void set_frame(const Arrays& a) {
         size[c] = (double)box.high[c] - box.low[c];
         largest = size[c] > largest ? size[c] : largest;
     }
-    double root = usual_edge(a, size, largest);
+    double root = round == 0 ? usual_edge(a, size, largest) : a.frame.data[WANTED];
     if (!(root > 0)) root = 1; // all moments at one place
     for (int level = 0; level < a.depth && root <= 1.0001 * largest; ++level) root *= 2;
     if (root <= 1.0001 * largest) root = 1.0001 * largest; // more levels than there are: leaves are larger than wanted
@@ -244,6 +245,13 @@ template <class Arrays> CUDA_CALLABLE inline void choose_level(const Arrays& a, 
     double edge = a.frame.data[ROOT];
     for (int level = 0; level < chosen; ++level) edge /= 2;
     a.frame.data[EDGE] = edge;
+    // the number of cells is a power of their edge, which two levels tell
+    const double ratio = (double)moment_count(a) / totals[chosen] / a.occupancy;
+    const int other = ratio > 1 ? chosen + 1 : chosen - 1;
+    double power = other < 0 || other > a.depth ? 3 : fabs(log2((double)totals[other] / totals[chosen]));
+    power = power > 3 ? 3 : power < 1 ? 1 : power;
+    const double wanted = edge * exp2(-log2(ratio) / power), least = 1.0001 * a.reach;
+    a.frame.data[WANTED] = wanted > least ? wanted : least;
 }
 
 template <class Arrays> CUDA_CALLABLE inline void choose_leaves(const Arrays& a) {
@@ -383,9 +391,9 @@ template <class Arrays> CUDA_CALLABLE inline void place_moment(const Arrays& a, 
 // Passes of the build, in order; grid.py sorts between them.
 enum class Pass { BOUND, FRAME, KEYS, COUNT, CHOOSE, CLEAR, WRITE, NOTE, LINK, OCTANTS, PLACE };
 
-template <Pass P, class Arrays> CUDA_CALLABLE inline void make_pass(const Arrays& a, int i) {
+template <Pass P, class Arrays> CUDA_CALLABLE inline void make_pass(const Arrays& a, int i, int round) {
     if constexpr (P == Pass::BOUND) bound_moments(a, i);
-    else if constexpr (P == Pass::FRAME) set_frame(a);
+    else if constexpr (P == Pass::FRAME) set_frame(a, round);
     else if constexpr (P == Pass::KEYS) set_key(a, i);
     else if constexpr (P == Pass::COUNT) count_beginnings(a, i);
     else if constexpr (P == Pass::CHOOSE) choose_leaves(a);
@@ -404,12 +412,12 @@ template <Pass P> constexpr bool of_blocks() {
 // Makes one pass over ``count`` items: on a GPU by blocks of BLOCK threads, each of which has an item or a thread of
 // which has one.
 template <Pass P, class Word, class Arrays>
-CUDA_CALLABLE inline void build(int thread, int count, int threads, Word* team, const Arrays& a) {
+CUDA_CALLABLE inline void build(int thread, int count, int round, int threads, Word* team, const Arrays& a) {
 #if defined(__CUDA_ARCH__)
-    if (of_blocks<P>()) make_pass<P>(a, thread / BLOCK);
-    else if (thread < count) make_pass<P>(a, thread);
+    if (of_blocks<P>()) make_pass<P>(a, thread / BLOCK, round);
+    else if (thread < count) make_pass<P>(a, thread, round);
 #else
-    share_out(team, threads, count, of_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { make_pass<P>(a, i); });
+    share_out(team, threads, count, of_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { make_pass<P>(a, i, round); });
 #endif
 }
 }
