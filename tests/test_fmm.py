@@ -154,7 +154,7 @@ def test_kinds_of_arrays_and_bad_arguments(device):
 
 
 def clump(radius: float) -> np.ndarray:
-    places = jittered(int(round(2 * radius + 1)) ** 3, seed=6)
+    places = jittered(round(2 * radius + 1) ** 3, seed=6)
     return places[np.linalg.norm(places - places.mean(axis=0), axis=1) < radius]
 
 
