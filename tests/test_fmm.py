@@ -153,6 +153,17 @@ def test_kinds_of_arrays_and_bad_arguments(device):
     assert warpmag.h_field(np.zeros((0, 3)), np.zeros((0, 3)), method="fmm", device=device).shape == (0, 3)
 
 
+def test_auto_is_exact_unless_an_error_is_allowed(device):
+    places = jittered(8000 if device == "cpu" else 64000)
+    moments = moments_of(len(places))
+    exact = warpmag.h_field(places, moments, method="vectorized", device=device)
+    assert (warpmag.h_field(places, moments, device=device) == exact).all()
+    assert (warpmag.h_field(places, moments, rtol=5e-6, device=device) == exact).all()
+    assert 0.0 < apart(warpmag.h_field(places, moments, rtol=1e-3, device=device), exact) <= 1e-3
+    few = [array[:1000] for array in (places, moments)]
+    assert (warpmag.h_field(*few, rtol=1e-3, device=device) == warpmag.h_field(*few, device=device)).all()
+
+
 def clump(radius: float) -> np.ndarray:
     places = jittered(round(2 * radius + 1) ** 3, seed=6)
     return places[np.linalg.norm(places - places.mean(axis=0), axis=1) < radius]

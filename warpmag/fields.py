@@ -180,7 +180,7 @@ def _fast_sums(quantity, kind: Kind, method, rtol, at, sources):
     if not wanted or at.count == 0 or sources.count == 0:
         return None
     fast = FastSums(sources, rtol or USUAL_RTOL, None if at is sources else at)
-    fast.grid.build()
+    fast.build()
     return fast.sums(quantity)
 
 

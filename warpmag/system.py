@@ -27,7 +27,7 @@ from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, W
 from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
-from warpmag.kernels.pairs.evaluate import PairEvaluation
+from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
@@ -212,21 +212,15 @@ class MomentSystem:
         ranges = self.world_ranges
         packed, state = self._packed, self._induction
         applied = [(first, middle, middle, last) for first, middle, last in ranges]
-        fast = (
-            [self._fast.sums(Quantity.FIELD, which) for which in (layout.permanent, ~layout.permanent)]
-            if self._fast
-            else [None, None]
-        )
-        self._applied = PairEvaluation(
-            Quantity.FIELD, applied, packed, packed, self._magnetizing, state.h0, sums=fast[0]
-        )
+        among, of_magnets = (self._fast.sums(Quantity.FIELD, which) for which in (~layout.permanent, layout.permanent))
+        arrays = packed, packed, self._magnetizing, state.h0
+        self._applied = PairEvaluation(Quantity.FIELD, applied, *arrays, sums=of_magnets)
         if self._applied.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing
         mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
         # near contacts write one more partial sum
-        self._mutual = PairEvaluation(
-            Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra, sums=fast[1]
-        )
+        arrays = packed, packed, state.h0, self.h
+        self._mutual = PairEvaluation(Quantity.FIELD, mutual, *arrays, extra_parts=extra, sums=among)
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
         """Prepare what cells lack as balls; ``whole`` tells whether small bodies respond as wholes."""
@@ -261,7 +255,7 @@ class MomentSystem:
             return [
                 PairEvaluation(
                     quantity, which, self._packed, self._packed, self._acting, self.forces, effective=effective,
-                    turned=self._turned, torques=self.torques, sums=self._fast and self._fast.sums(quantity),
+                    turned=self._turned, torques=self.torques, sums=self._fast.sums(quantity),
                 )
                 for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
                 if which
@@ -350,8 +344,7 @@ class MomentSystem:
         if self._near is not None:
             near_pairs.launch_find_pairs(self._near)
         packed.find_overlaps()
-        if self._fast is not None:
-            self._fast.grid.build()
+        self._fast.build()
         if self._applied.pair_count:
             self._applied.launch()
         elif self.bias is not None:
@@ -398,10 +391,12 @@ class MomentSystem:
 
     def field_error(self) -> float:
         """Relative error of the field by the fast multipole method at some moments, zero without it; waits."""
+        if self._mutual.form != GIVEN:
+            return 0.0
         base = wp.clone(self._magnetizing)
         if self.bias is not None:
             launch_add_bias(self.bias, self._biased, base)
-        return sampled_error(self._mutual, self._packed, self.world_ranges, base, self.h) if self._fast else 0.0
+        return sampled_error(self._mutual, self._packed, self.world_ranges, base, self.h)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
