@@ -8,6 +8,7 @@ import warpmag
 from warpmag.arrays import resolve_dtype, vec3_type
 from warpmag.kernels.fmm.grid import MomentGrid
 from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.system import MomentSystem
 
 
 def apart(a, b) -> float:
@@ -150,3 +151,68 @@ def test_kinds_of_arrays_and_bad_arguments(device):
     with pytest.raises(warpmag.InputError, match="smoothing"):
         warpmag.h_field(places, moments, method="fmm", smoothing=0.1, device=device)
     assert warpmag.h_field(np.zeros((0, 3)), np.zeros((0, 3)), method="fmm", device=device).shape == (0, 3)
+
+
+def test_auto_is_exact_unless_an_error_is_allowed(device):
+    places = jittered(8000 if device == "cpu" else 64000)
+    moments = moments_of(len(places))
+    exact = warpmag.h_field(places, moments, method="vectorized", device=device)
+    assert (warpmag.h_field(places, moments, device=device) == exact).all()
+    assert (warpmag.h_field(places, moments, rtol=5e-6, device=device) == exact).all()
+    assert 0.0 < apart(warpmag.h_field(places, moments, rtol=1e-3, device=device), exact) <= 1e-3
+    few = [array[:1000] for array in (places, moments)]
+    assert (warpmag.h_field(*few, rtol=1e-3, device=device) == warpmag.h_field(*few, device=device)).all()
+
+
+def clump(radius: float) -> np.ndarray:
+    places = jittered(round(2 * radius + 1) ** 3, seed=6)
+    return places[np.linalg.norm(places - places.mean(axis=0), axis=1) < radius]
+
+
+BALLS = {
+    "clump": clump(8.0),
+    "two clumps": np.concatenate([clump(5.0), clump(6.0) + np.array([200.0, 30.0, 0.0])]),
+    "chain": np.arange(1500)[:, None] * np.array([1.0, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", BALLS)
+def test_induction_has_the_solution_of_all_pairs(name, device):
+    places = 0.005 * BALLS[name]
+    magnet = np.array([[-0.02, 0.01, 0.0]]), np.array([[3.0, 1.0, 0.0]])
+    given = {"saturation": 1.7e6, "external_field": (0.0, 1e4, 2e4), "sources": magnet, "device": device}
+    exact = warpmag.solve_induction(places, 0.0015, method="vectorized", rtol=1e-5, **given)
+    result = warpmag.solve_induction(places, 0.0015, method="fmm", rtol=1e-3, **given)
+    assert result.converged
+    assert result.field_error <= 1e-3
+    assert exact.field_error == 0.0
+    assert apart(result.magnetizations, exact.magnetizations) <= 1e-3
+    (forces, _), (expected, _) = result.wrench(), exact.wrench()
+    # a force has the errors of two magnetizations and of a gradient
+    assert apart(forces, expected) <= 3e-3
+
+
+def test_worlds_do_not_see_each_other(device):
+    """Worlds at one place, of different moments: each as if it were alone."""
+    places = 0.005 * clump(4.0)
+    n, count = len(places), 6
+    system = MomentSystem(
+        radii=np.full(n * count, 0.0015), worlds=np.repeat(np.arange(count), n), saturation=1.7e6,
+        external_field=np.repeat(np.linspace(1e4, 2e6, count), n)[:, None] * [0.0, 0.0, 1.0], method="fmm",
+        device=device,
+    )  # fmt: skip
+    system.positions.assign(np.tile(places, (count, 1)).astype(np.float32))
+    system.solve()
+    assert system.converged.numpy().all()
+    assert system.field_error() <= 1e-3
+    solved = system.magnetizations().numpy().reshape(count, n, 3)
+    for world, strength in enumerate(np.linspace(1e4, 2e6, count)):
+        lone = warpmag.solve_induction(
+            places, 0.0015, saturation=1.7e6, external_field=(0.0, 0.0, strength), method="vectorized", device=device
+        )
+        assert apart(solved[world], lone.magnetizations) <= 2e-3  # of two solves
+
+
+def test_bodies_of_several_moments_are_refused():
+    with pytest.raises(warpmag.InputError, match="several moments"):
+        MomentSystem(radii=[0.1, 0.1], bodies=[0, 0], method="fmm", device="cpu")

@@ -18,15 +18,13 @@ from warpmag.arrays import (
     resolve_kind,
 )
 from warpmag.errors import InputError
-from warpmag.fmm import LEAST_RTOL, USUAL_RTOL
+from warpmag.fmm import USUAL_RTOL, check_fast, is_fast
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import check_not_negative, check_rtol, check_token
 from warpmag.pair_sums import SumsShape, pair_sums
 
 _METHODS = ("auto", "vectorized", "reference", "fmm")
-_LEAST_FMM = {"cpu": 12_000, "cuda": 60_000}
-"""Fewest moments and targets for which ``auto`` takes the fast multipole method, by kind of device."""
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
 """Least of the largest component of moments [A·m²]: fields of smaller ones have no digits left."""
 
@@ -161,13 +159,8 @@ def _pack(kind: Kind, name, radii, packed: PackedMoments, positions, moments) ->
 
 def _fmm_rtol(method, rtol, shape: SumsShape) -> float | None:
     """Error to allow the fast multipole method, None where it is not wanted or would not be faster."""
-    fewest = _LEAST_FMM["cpu" if shape.device == "cpu" else "cuda"]
-    wanted = method == "fmm" or (
-        method == "auto"
-        and rtol is not None
-        and rtol >= LEAST_RTOL
-        and shape.count + (shape.target_count or 0) >= fewest
-    )
+    count, device = shape.count + (shape.target_count or 0), wp.get_device(shape.device)
+    wanted = method == "fmm" or (method == "auto" and rtol is not None and is_fast(count, rtol, device))
     return (rtol or USUAL_RTOL) if wanted and shape.count and shape.target_count != 0 else None
 
 
@@ -181,8 +174,8 @@ def _is_reference(kind: Kind, method, smoothing, radii, rtol, dtype) -> bool:
     check_token("method", method, _METHODS)
     if rtol is not None:
         check_rtol("rtol", rtol, dtype)
-        if method == "fmm" and rtol < LEAST_RTOL:
-            raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'vectorized'")
+        if method == "fmm":
+            check_fast(rtol)
     check_not_negative("smoothing", smoothing)
     if smoothing > 0.0 and method == "fmm":
         raise InputError("smoothing: not with the method 'fmm'")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpmag.arrays import vec3_type
-from warpmag.fmm import make_sums
+from warpmag.fmm import FastSums
 from warpmag.kernels.fmm.evaluation import CellSums
 from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
@@ -90,7 +90,9 @@ class PairSums:
         if not self._shape.reference:
             self.targets.find_overlaps(None if others is None else self.moments)
         if fmm_rtol is not None:  # its cells are of these places
-            self._evaluation(make_sums(self._shape.quantity, self.moments, fmm_rtol, others)).launch()
+            fast = FastSums(self.moments, fmm_rtol, others)
+            fast.build()
+            self._evaluation(fast.sums(self._shape.quantity)).launch()
             return
         if self._all_pairs is None:
             self._all_pairs = self._evaluation()

@@ -9,9 +9,11 @@ import warp as wp
 from warpmag.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
 from warpmag.dynamics import make_dynamics
 from warpmag.errors import InputError
+from warpmag.fmm import fast_sums_for
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.sources import Sources
 from warpmag.kernels.cells.couplings import CellCouplings
+from warpmag.kernels.fmm.check import sampled_error
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, WholeBody
@@ -19,7 +21,7 @@ from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
 from warpmag.kernels.pairs.eddy import EddyCurrents
-from warpmag.kernels.pairs.evaluate import PairEvaluation
+from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
@@ -52,6 +54,8 @@ class MomentSystem:
             submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
         contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
             nearly touch (see ``warpmag.kernels.near_contact``).
+        method: How pairs are summed: ``vectorized``, all of them; ``fmm``, the fast multipole method, with fields as
+            exact as ``rtol`` asks for, not for bodies of several moments; or ``auto``, the faster one.
         rtol: Relative error of the inducible moments' magnetization at which induction ends.
         max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
@@ -116,6 +120,7 @@ class MomentSystem:
         force="kelvin",
         dynamics="theta",
         contact_model="dipole",
+        method="vectorized",
         rtol=1e-3,
         max_evaluations=1000,
         step=None,
@@ -144,6 +149,7 @@ class MomentSystem:
         layout = self._make_bias(layout, dynamics)
         self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
+        self._fast = fast_sums_for(method, self._packed, layout.bodies, self.rtol, len(layout.ranges()))
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings, whole=dynamics == "theta")
         self._evaluate_wrench(layout, turned)
@@ -202,12 +208,15 @@ class MomentSystem:
         ranges = self.world_ranges
         packed, state = self._packed, self._induction
         applied = [(first, middle, middle, last) for first, middle, last in ranges]
-        self._applied = PairEvaluation(Quantity.FIELD, applied, packed, packed, self._magnetizing, state.h0)
+        among, of_magnets = (self._fast.sums(Quantity.FIELD, which) for which in (~layout.permanent, layout.permanent))
+        arrays = packed, packed, self._magnetizing, state.h0
+        self._applied = PairEvaluation(Quantity.FIELD, applied, *arrays, sums=of_magnets)
         if self._applied.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing
         mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
         # near contacts write one more partial sum
-        self._mutual = PairEvaluation(Quantity.FIELD, mutual, packed, packed, state.h0, self.h, extra_parts=extra)
+        arrays = packed, packed, state.h0, self.h
+        self._mutual = PairEvaluation(Quantity.FIELD, mutual, *arrays, extra_parts=extra, sums=among)
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
         """Prepare what cells lack as balls; ``whole`` tells whether small bodies respond as wholes."""
@@ -237,7 +246,7 @@ class MomentSystem:
             return [
                 PairEvaluation(
                     quantity, which, self._packed, self._packed, self._acting, self.forces, effective=effective,
-                    turned=self._turned, torques=self.torques,
+                    turned=self._turned, torques=self.torques, sums=self._fast.sums(quantity),
                 )
                 for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
                 if which
@@ -327,6 +336,7 @@ class MomentSystem:
         if self._near is not None:
             near_pairs.launch_find_pairs(self._near)
         packed.find_overlaps()
+        self._fast.build()
         if self._applied.pair_count:
             self._applied.launch()
         elif self.bias is not None:
@@ -370,6 +380,15 @@ class MomentSystem:
         """Have what is launched next wait for what near contacts do beside."""
         if self._near is not None:
             near_pairs.wait(self._near)
+
+    def field_error(self) -> float:
+        """Relative error of the field by the fast multipole method at some moments, zero without it; waits."""
+        if self._mutual.form != GIVEN:
+            return 0.0
+        base = wp.clone(self._magnetizing)
+        if self.bias is not None:
+            launch_add_bias(self.bias, self._biased, base)
+        return sampled_error(self._mutual, self._packed, self.world_ranges, base, self.h)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""

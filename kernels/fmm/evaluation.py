@@ -6,6 +6,7 @@ order in which the grid sorts moments, and go to the partial sums of target rows
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from warpmag.kernels.fmm.expansions import Expansions, ExpansionTables
@@ -23,11 +24,14 @@ class CellSums:
         tables: Numbers of the harmonics.
         quantity: What is summed; of ``MUTUAL_FORCE`` as of ``FORCE``.
         first: Column in the grid of the first target column.
+        sources: Whether each moment counts as a source, NumPy, shape [n]; None means all do.
     """
 
-    def __init__(self, grid: MomentGrid, tables: ExpansionTables, quantity: Quantity, first: int = 0):
+    def __init__(self, grid: MomentGrid, tables: ExpansionTables, quantity: Quantity, first: int = 0, sources=None):
         """Allocate the sums and the expansions."""
         self._first = first
+        counts = np.ones(grid.count, np.int32) if sources is None else sources.astype(np.int32)
+        self._sources = wp.array(counts, dtype=wp.int32, device=grid.device)
         self._quantity = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         self._grid = grid
         n, device, dtype = grid.count, grid.device, grid.sorted.dtype
@@ -37,7 +41,7 @@ class CellSums:
         self._expansions = Expansions(grid, tables, self._quantity, self._moments, self._effective, self._sums)
 
     def __call__(self, effective, target, partial):
-        """Launch the sums of the moments as the grid was built of them.
+        """Launch the sums of the moments as they are now, where they were when the grid was built.
 
         Args:
             effective: Effective moments e [A·m²] of the force, shape [3, n].
@@ -45,6 +49,13 @@ class CellSums:
             partial: Out, sums of the target rows, shape [1, rows, 3 or 6].
         """
         grid, device, dtype = self._grid, self._grid.device, self._sums.dtype
+        wp.launch(
+            _moments_kernel(dtype),
+            grid.count,
+            [grid.packed, grid.source, self._sources],
+            [self._moments],
+            device=device,
+        )
         if self._quantity != Quantity.FIELD:
             wp.launch(_sort_kernel(dtype), (3, grid.count), [effective, grid.source], [self._effective], device=device)
         launch_near_sums(
@@ -56,6 +67,25 @@ class CellSums:
         self._expansions.add_fields()
         inputs = [self._sums, target, grid.place[self._first :]]
         wp.launch(_return_kernel(dtype), partial.shape[1:], inputs, [partial], device=device)
+
+
+@cache
+def _moments_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def sort_moments(
+        # inputs:
+        packed: wp.array2d[dtype],
+        source: wp.array[int],
+        counts: wp.array[int],
+        # outputs:
+        sorted_out: wp.array2d[dtype],
+    ):
+        i = wp.tid()
+        j = source[i]
+        for c in range(4, 7):
+            sorted_out[c, i] = wp.where(counts[j] == 1, packed[c, j], dtype(0.0))
+
+    return sort_moments
 
 
 @cache

@@ -30,7 +30,7 @@ class _Step(IntEnum):
     MULTIPOLES, MERGE, SPREAD, FIELDS = range(4)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ExpansionTables:
     """Numbers of the harmonics up to a degree p, K = (p + 1)² of them, in float64.
 
@@ -104,32 +104,18 @@ class Expansions:
         harmonics = (tables.degree + 1) ** 2
         width = pitch(harmonics)
         self._grid, self._quantity, self._dtype = grid, quantity, dtype
-        self._translation = Translation(tables.across, tables.parity, dtype, device)
+        self._translation = _translation(tables, dtype, device.alias)
         self._constants = {"DEGREE": tables.degree, "HARMONICS": harmonics, "PITCH": width, "THREADS": _THREADS}
         self._arrays = a = _arrays_type(dtype)()
-        for name in (*("counts", "level_begin", "moment_begin", "children", "parent", "octant", "frame", "inside"),):
+        for name in ("counts", "level_begin", "moment_begin", "children", "parent", "octant", "frame", "inside"):
             setattr(a, name, getattr(grid, name))
+        for name, array in _device_tables(tables, dtype, device.alias).items():
+            setattr(a, name, array)
         a.sorted, a.effective, a.sums = moments, effective, sums
         a.multipoles = wp.zeros((grid.capacity + 1, width), dtype=dtype, device=device)
         a.locals = wp.zeros_like(a.multipoles)
         # forces: sources to one degree less, for actions and reactions to add up to zero
         a.sources = harmonics if quantity == Quantity.FIELD else tables.degree**2
-
-        def numbers(values):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        def integers(values):
-            return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
-
-        a.growth, a.decay = numbers(tables.growth), numbers(tables.decay)
-        gather, spread = _sparse_derivatives(tables)
-        a.gather_index, a.gather_weight = integers(gather[0]), numbers(gather[1])
-        a.spread_index, a.spread_weight = integers(spread[0]), numbers(spread[1])
-        padding = (0, 0), (0, width - harmonics)
-        a.up, a.down = (numbers(np.pad(matrix.T, padding)) for matrix in (tables.up, tables.down))
-        octants = np.arange(8)[:, None, None] >> np.arange(3)[None, :, None] & 1
-        signs = np.where(octants & (tables.parity < 0)[None], -1.0, 1.0).prod(axis=1)
-        a.signs = numbers(np.pad(signs, padding))
 
     def gather(self):
         """Launch the multipoles of leaves."""
@@ -164,6 +150,40 @@ class Expansions:
                 device=device,
                 block_dim=_THREADS,
             )
+
+
+@cache
+def _translation(tables: ExpansionTables, dtype, device: str) -> Translation:
+    """Matrices on a device, of which all evaluations have one copy."""
+    return Translation(tables.across, tables.parity, dtype, device)
+
+
+@cache
+def _device_tables(tables: ExpansionTables, dtype, device: str) -> dict[str, wp.array]:
+    """The other numbers of the harmonics on a device, by their names in the struct."""
+    harmonics = (tables.degree + 1) ** 2
+    padding = (0, 0), (0, pitch(harmonics) - harmonics)
+
+    def numbers(values):
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+    def integers(values):
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
+
+    gather, spread = _sparse_derivatives(tables)
+    octants = np.arange(8)[:, None, None] >> np.arange(3)[None, :, None] & 1
+    signs = np.where(octants & (tables.parity < 0)[None], -1.0, 1.0).prod(axis=1)
+    return {
+        "growth": numbers(tables.growth),
+        "decay": numbers(tables.decay),
+        "gather_index": integers(gather[0]),
+        "gather_weight": numbers(gather[1]),
+        "spread_index": integers(spread[0]),
+        "spread_weight": numbers(spread[1]),
+        "up": numbers(np.pad(tables.up.T, padding)),
+        "down": numbers(np.pad(tables.down.T, padding)),
+        "signs": numbers(np.pad(signs, padding)),
+    }
 
 
 def _sparse_derivatives(tables: ExpansionTables):

@@ -12,8 +12,8 @@ namespace warpmag {
 
 typedef unsigned long long Bits;
 
-constexpr int BLOCK = 256;        // moments that a block of threads has, as in grid.py
-constexpr int ROOT = 3, EDGE = 4; // places of numbers in ``frame``, after the corner of the cube
+constexpr int BLOCK = 256;                    // moments that a block of threads has, as in grid.py
+constexpr int ROOT = 3, EDGE = 4, WANTED = 5; // places of numbers in ``frame``, after the corner of the cube
 
 CUDA_CALLABLE inline int highest_bit(Bits bits) {
 #if defined(__CUDA_ARCH__)
@@ -74,33 +74,48 @@ template <class Key> CUDA_CALLABLE inline int lower_bound(const Key* keys, int b
     return begin;
 }
 
-// The box around some moments.
-template <class Arrays> CUDA_CALLABLE inline void bound_moments(const Arrays& a, int block) {
-    const int begin = block * BLOCK, end = begin + BLOCK < moment_count(a) ? begin + BLOCK : moment_count(a);
+// Smallest and largest of some places along each axis; on a GPU of a block's threads, the same for all of them.
+struct Box {
+    Real low[3], high[3];
+
+    CUDA_CALLABLE void add(const Real* least, const Real* most, size_t stride) {
+        for (int c = 0; c < 3; ++c) {
+            const Real x = least[c * stride], y = most[c * stride];
+            low[c] = x < low[c] ? x : low[c], high[c] = y > high[c] ? y : high[c];
+        }
+    }
+};
 #if defined(__CUDA_ARCH__)
-    __shared__ Real edges[6][BLOCK];
-    const int t = threadIdx.x, i = begin + t < end ? begin + t : end - 1;
-    for (int c = 0; c < 3; ++c) edges[c][t] = edges[3 + c][t] = position(a, c, i);
+CUDA_CALLABLE inline Box joined(Box box) {
+    __shared__ Box boxes[BLOCK];
+    boxes[threadIdx.x] = box;
     for (int step = BLOCK / 2; step > 0; step /= 2) {
         __syncthreads();
-        if (t >= step) continue;
-        for (int c = 0; c < 3; ++c) {
-            edges[c][t] = smaller(edges[c][t], edges[c][t + step]);
-            edges[3 + c][t] = larger(edges[3 + c][t], edges[3 + c][t + step]);
-        }
+        if (threadIdx.x >= step) continue;
+        boxes[threadIdx.x].add(boxes[threadIdx.x + step].low, boxes[threadIdx.x + step].high, 1);
     }
-    if (t == 0)
-        for (int c = 0; c < 6; ++c) a.boxes.data[6 * block + c] = edges[c][0];
+    __syncthreads();
+    return boxes[0];
+}
+CUDA_CALLABLE inline int first_item() { return threadIdx.x; }
+constexpr int AT_ONCE = BLOCK;
 #else
-    for (int c = 0; c < 3; ++c) {
-        Real low = position(a, c, begin), high = low;
-        for (int i = begin + 1; i < end; ++i) {
-            const Real x = position(a, c, i);
-            low = x < low ? x : low, high = x > high ? x : high;
-        }
-        a.boxes.data[6 * block + c] = low, a.boxes.data[6 * block + 3 + c] = high;
-    }
+inline Box joined(const Box& box) { return box; }
+inline int first_item() { return 0; }
+constexpr int AT_ONCE = 1;
 #endif
+
+// The box around a block of moments.
+template <class Arrays> CUDA_CALLABLE inline void bound_moments(const Arrays& a, int block) {
+    const int begin = block * BLOCK, end = begin + BLOCK < moment_count(a) ? begin + BLOCK : moment_count(a);
+    const size_t pitch = a.packed.strides[0] / sizeof(Real);
+    Box box = {{position(a, 0, begin), position(a, 1, begin), position(a, 2, begin)},
+               {position(a, 0, begin), position(a, 1, begin), position(a, 2, begin)}};
+    for (int i = begin + first_item(); i < end; i += AT_ONCE) box.add(a.packed.data + i, a.packed.data + i, pitch);
+    box = joined(box);
+    Real* const out = a.boxes.data + 6 * block;
+    if (first_item() == 0)
+        for (int c = 0; c < 3; ++c) out[c] = box.low[c], out[3 + c] = box.high[c];
 }
 
 // Edge of a leaf that holds as many moments as wanted where they fill their box, which may be flat.
@@ -110,36 +125,24 @@ template <class Arrays> CUDA_CALLABLE inline double usual_edge(const Arrays& a, 
     return cbrt(volume * a.worlds * a.occupancy / moment_count(a));
 }
 
-// The cube around all boxes: an edge is a power of two times that of the leaves that hold as many moments as wanted.
-template <class Arrays> CUDA_CALLABLE inline void set_frame(const Arrays& a) {
-    const int blocks = a.boxes.shape[0];
-    double low[3], size[3], largest = 0;
+// The cube around all boxes: an edge is a power of two times that of the leaves that hold as many moments as wanted, by
+// the volume of the box in the first round, by what leaves of other sizes hold in the second.
+template <class Arrays> CUDA_CALLABLE inline void set_frame(const Arrays& a, int round) {
+    const Real* const boxes = a.boxes.data;
+    Box box = {{boxes[0], boxes[1], boxes[2]}, {boxes[3], boxes[4], boxes[5]}};
+    for (int b = first_item(); b < (int)a.boxes.shape[0]; b += AT_ONCE) box.add(boxes + 6 * b, boxes + 6 * b + 3, 1);
+    box = joined(box);
+    if (first_item() > 0) return;
+    double size[3], largest = 0;
     for (int c = 0; c < 3; ++c) {
-#if defined(__CUDA_ARCH__)
-        Real least = a.boxes.data[c], most = a.boxes.data[3 + c];
-        for (int b = threadIdx.x; b < blocks; b += 32) {
-            least = smaller(least, a.boxes.data[6 * b + c]), most = larger(most, a.boxes.data[6 * b + 3 + c]);
-        }
-        for (int other = 1; other < 32; other *= 2) {
-            least = smaller(least, __shfl_xor_sync(~0u, least, other));
-            most = larger(most, __shfl_xor_sync(~0u, most, other));
-        }
-#else
-        Real least = a.boxes.data[c], most = a.boxes.data[3 + c];
-        for (int b = 1; b < blocks; ++b) {
-            const Real x = a.boxes.data[6 * b + c], y = a.boxes.data[6 * b + 3 + c];
-            least = x < least ? x : least, most = y > most ? y : most;
-        }
-#endif
-        low[c] = least, size[c] = (double)most - least;
+        size[c] = (double)box.high[c] - box.low[c];
         largest = size[c] > largest ? size[c] : largest;
     }
-    double edge = usual_edge(a, size, largest);
-    if (!(edge > 0)) edge = 1; // all moments at one place
-    double root = edge;
+    double root = round == 0 ? usual_edge(a, size, largest) : a.frame.data[WANTED];
+    if (!(root > 0)) root = 1; // all moments at one place
     for (int level = 0; level < a.depth && root <= 1.0001 * largest; ++level) root *= 2;
     if (root <= 1.0001 * largest) root = 1.0001 * largest; // more levels than there are: leaves are larger than wanted
-    for (int c = 0; c < 3; ++c) a.frame.data[c] = low[c] - 0.5 * (root - size[c]);
+    for (int c = 0; c < 3; ++c) a.frame.data[c] = box.low[c] - 0.5 * (root - size[c]);
     a.frame.data[ROOT] = root;
 }
 
@@ -186,21 +189,30 @@ template <class Arrays> CUDA_CALLABLE inline void count_beginnings(const Arrays&
 #endif
 }
 
-// Sums up the numbers of a level's cells before each block; returns how many cells the level has.
+// Sums up the numbers of a level's cells before each block; returns how many cells the level has. On a GPU a warp has
+// a level, and each lane four blocks at a time.
 template <class Arrays> CUDA_CALLABLE inline int scan_level(const Arrays& a, int level) {
+    constexpr int HELD = 4;
     const int blocks = a.beginnings.shape[0], stride = a.depth + 1;
     int* const counts = a.beginnings.data + level;
     int total = 0;
 #if defined(__CUDA_ARCH__)
     const int lane = threadIdx.x % 32;
-    for (int first = 0; first < blocks; first += 32) {
-        const int own = first + lane < blocks ? counts[(first + lane) * stride] : 0;
+    for (int first = HELD * lane; first - HELD * lane < blocks; first += 32 * HELD) {
+        int held[HELD], own = 0;
+#pragma unroll
+        for (int k = 0; k < HELD; ++k) own += held[k] = first + k < blocks ? counts[(first + k) * stride] : 0;
         int sum = own;
         for (int step = 1; step < 32; step *= 2) {
             const int other = __shfl_up_sync(~0u, sum, step);
             if (lane >= step) sum += other;
         }
-        if (first + lane < blocks) counts[(first + lane) * stride] = total + sum - own;
+        int before = total + sum - own;
+#pragma unroll
+        for (int k = 0; k < HELD; ++k) {
+            if (first + k < blocks) counts[(first + k) * stride] = before;
+            before += held[k];
+        }
         total += __shfl_sync(~0u, sum, 31);
     }
 #else
@@ -233,12 +245,19 @@ template <class Arrays> CUDA_CALLABLE inline void choose_level(const Arrays& a, 
     double edge = a.frame.data[ROOT];
     for (int level = 0; level < chosen; ++level) edge /= 2;
     a.frame.data[EDGE] = edge;
+    // the number of cells is a power of their edge, which two levels tell
+    const double ratio = (double)moment_count(a) / totals[chosen] / a.occupancy;
+    const int other = ratio > 1 ? chosen + 1 : chosen - 1;
+    double power = other < 0 || other > a.depth ? 3 : fabs(log2((double)totals[other] / totals[chosen]));
+    power = power > 3 ? 3 : power < 1 ? 1 : power;
+    const double wanted = edge * exp2(-log2(ratio) / power), least = 1.0001 * a.reach;
+    a.frame.data[WANTED] = wanted > least ? wanted : least;
 }
 
 template <class Arrays> CUDA_CALLABLE inline void choose_leaves(const Arrays& a) {
 #if defined(__CUDA_ARCH__)
     __shared__ int totals[32];
-    for (int level = threadIdx.x / 32; level <= a.depth; level += BLOCK / 32) {
+    for (int level = threadIdx.x / 32; level <= a.depth; level += blockDim.x / 32) {
         const int total = scan_level(a, level);
         if (threadIdx.x % 32 == 0) totals[level] = total;
     }
@@ -372,9 +391,9 @@ template <class Arrays> CUDA_CALLABLE inline void place_moment(const Arrays& a, 
 // Passes of the build, in order; grid.py sorts between them.
 enum class Pass { BOUND, FRAME, KEYS, COUNT, CHOOSE, CLEAR, WRITE, NOTE, LINK, OCTANTS, PLACE };
 
-template <Pass P, class Arrays> CUDA_CALLABLE inline void make_pass(const Arrays& a, int i) {
+template <Pass P, class Arrays> CUDA_CALLABLE inline void make_pass(const Arrays& a, int i, int round) {
     if constexpr (P == Pass::BOUND) bound_moments(a, i);
-    else if constexpr (P == Pass::FRAME) set_frame(a);
+    else if constexpr (P == Pass::FRAME) set_frame(a, round);
     else if constexpr (P == Pass::KEYS) set_key(a, i);
     else if constexpr (P == Pass::COUNT) count_beginnings(a, i);
     else if constexpr (P == Pass::CHOOSE) choose_leaves(a);
@@ -393,12 +412,12 @@ template <Pass P> constexpr bool of_blocks() {
 // Makes one pass over ``count`` items: on a GPU by blocks of BLOCK threads, each of which has an item or a thread of
 // which has one.
 template <Pass P, class Word, class Arrays>
-CUDA_CALLABLE inline void build(int thread, int count, int threads, Word* team, const Arrays& a) {
+CUDA_CALLABLE inline void build(int thread, int count, int round, int threads, Word* team, const Arrays& a) {
 #if defined(__CUDA_ARCH__)
-    if (of_blocks<P>()) make_pass<P>(a, thread / BLOCK);
-    else if (thread < count) make_pass<P>(a, thread);
+    if (of_blocks<P>()) make_pass<P>(a, thread / BLOCK, round);
+    else if (thread < count) make_pass<P>(a, thread, round);
 #else
-    share_out(team, threads, count, of_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { make_pass<P>(a, i); });
+    share_out(team, threads, count, of_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { make_pass<P>(a, i, round); });
 #endif
 }
 }

@@ -1,7 +1,8 @@
 """The grid of cells that hold moments, on all levels from the leaves up, made on the device in buffers of fixed size.
 
 A cube around all moments is halved until its cells hold about as many moments as wanted, or more where there is no room
-for finer ones: on a level there are at least as many cells as on the one above. Worlds have the same cube, and cells of
+for finer ones: on a level there are at least as many cells as on the one above. How large the cube is for that, a first
+round tells. Worlds have the same cube, and cells of
 their own. Heights count from the leaves, 0, to the cube, and cells of all heights are numbered one height after the
 other, and by world, z, y and x within one. ``grid.h`` makes them.
 """
@@ -13,11 +14,12 @@ import warp as wp
 
 from warpmag.kernels.pairs.packing import PACKED_ROWS, PITCH
 from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.scan import launch_scan
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 _BLOCK = 256
 """Moments of a block of threads, as in ``grid.h``."""
+_CHOOSING = 32 * 17
+"""Threads that choose the leaves, a warp for each level."""
 _MOST_LEVELS = 16
 _KEY_BITS, _HEIGHT_BITS, _OCTANT_BITS = 64, 5, 8
 _ROOM = 0.3
@@ -90,7 +92,7 @@ class MomentGrid:
         count: Number of moments n.
         capacity: Number of cells c that there is room for.
         levels: Most levels that cells can have.
-        frame: Corner of the cube, edge of it, and edge of a leaf [m], shape [5].
+        frame: Corner of the cube, edge of it, of a leaf, and of a leaf that would hold what is wanted [m], shape [6].
         counts: Levels below the cube, and number of cells, shape [2].
         level_begin: First cell of each height, shape [levels + 1].
         moment_begin: First sorted moment of each leaf, shape [c + 1].
@@ -103,7 +105,8 @@ class MomentGrid:
         source: Packed column of each sorted moment, shape [n].
         place: Sorted place of each packed column, shape [n].
         leaf: Leaf of each sorted moment, shape [n].
-        sorted: Packed moments as they are sorted, shape [8, n].
+        packed: The packed moments, shape [8, n].
+        sorted: Those as they are sorted, shape [8, n].
         inside: Place of each sorted moment in its leaf, from the centre, in units of its edge, shape [3, n].
     """
 
@@ -127,7 +130,7 @@ class MomentGrid:
         a.packed, a.group = packed, groups
         a.depth, a.worlds, a.world_bits, a.capacity = depth, worlds, bits, c
         a.occupancy, a.reach = occupancy, reach
-        a.boxes, a.frame = zeros(blocks, 6, dtype=dtype), zeros(5, dtype=wp.float64)
+        a.boxes, a.frame = zeros(blocks, 6, dtype=dtype), zeros(6, dtype=wp.float64)
         a.keys, a.index, a.fork = zeros(2 * n, dtype=wp.uint64), zeros(2 * n), zeros(n)
         a.beginnings, a.counts, a.level_begin = zeros(blocks, depth + 1), zeros(2), zeros(depth + 2)
         a.leaf_before, a.first, a.parent_before = zeros(n), zeros(c), zeros(c)
@@ -139,36 +142,40 @@ class MomentGrid:
         a.sorted, a.inside = pitched(PACKED_ROWS), pitched(3)
         self.frame, self.counts, self.level_begin, self.moment_begin = a.frame, a.counts, a.level_begin, a.moment_begin
         self.neighbors, self.children, self.parent, self.octant = a.neighbors, a.children, a.parent, a.octant
-        self.order, self.octant_begin = a.order, a.octant_begin
+        self.order, self.octant_begin, self.packed = a.order, a.octant_begin, packed
         self.source, self.place, self.leaf, self.sorted, self.inside = a.source, a.place, a.leaf, a.sorted, a.inside
 
     def build(self):
         """Launch the build for the moments as they are packed."""
         a, n, c = self.arrays, self.count, self.capacity
         blocks = -(-n // _BLOCK)
-        for one, count in ((_Pass.BOUND, blocks), (_Pass.FRAME, 1), (_Pass.KEYS, n)):
-            self._launch(one, count)
-        wp.utils.radix_sort_pairs(a.keys, a.index, n, 0, 3 * a.depth + a.world_bits)
-        for one, count in ((_Pass.COUNT, blocks), (_Pass.CHOOSE, 1), (_Pass.CLEAR, c), (_Pass.WRITE, blocks)):
+        self._launch(_Pass.BOUND, blocks)
+        for choice in range(2):
+            self._launch(_Pass.FRAME, 1, choice)
+            self._launch(_Pass.KEYS, n)
+            wp.utils.radix_sort_pairs(a.keys, a.index, n, 0, 3 * a.depth + a.world_bits)
+            self._launch(_Pass.COUNT, blocks)
+            self._launch(_Pass.CHOOSE, 1)
+        for one, count in ((_Pass.CLEAR, c), (_Pass.WRITE, blocks)):
             self._launch(one, count)
         wp.utils.radix_sort_pairs(a.cell_keys, a.cell_before, c, 0, 3 * a.depth + a.world_bits + _HEIGHT_BITS)
         self._launch(_Pass.NOTE, c)
-        launch_scan(a.held, a.moment_begin, inclusive=False)
+        wp.utils.array_scan(a.held, a.moment_begin, inclusive=False)
         self._launch(_Pass.LINK, c)
         wp.utils.radix_sort_pairs(a.order_keys, a.order, c, 0, _OCTANT_BITS)
         self._launch(_Pass.OCTANTS, a.octant_begin.size)
         self._launch(_Pass.PLACE, n)
 
-    def _launch(self, one: _Pass, count: int):
-        cuda = self.device.is_cuda
-        threads = count * _BLOCK if one in _OF_BLOCKS else -(-count // _BLOCK) * _BLOCK
+    def _launch(self, one: _Pass, count: int, choice: int = 0):
+        cuda, width = self.device.is_cuda, _CHOOSING if one == _Pass.CHOOSE else _BLOCK
+        threads = count * width if one in _OF_BLOCKS else -(-count // width) * width
         items = count * _BLOCK if one in _OF_BLOCKS else count
         wp.launch(
             _kernel(self.arrays.packed.dtype, one),
             dim=threads if cuda else 1,
-            inputs=[count, threads_for(items, MOMENTS_PER_THREAD), None if cuda else team(), self.arrays],
+            inputs=[count, choice, threads_for(items, MOMENTS_PER_THREAD), None if cuda else team(), self.arrays],
             device=self.device,
-            block_dim=_BLOCK,
+            block_dim=width,
         )
 
 
@@ -188,8 +195,8 @@ def join_moments(first, second) -> tuple[wp.array, wp.array]:
 def _kernel(dtype, one: _Pass):
     arrays = _arrays_type(dtype)
 
-    @wp.func_native(f"warpmag::build<warpmag::Pass({one:d})>(thread, count, threads, team.data, arrays);")
-    def run(thread: int, count: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays): ...
+    @wp.func_native(f"warpmag::build<warpmag::Pass({one:d})>(thread, count, choice, threads, team.data, arrays);")
+    def run(thread: int, count: int, choice: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays): ...
 
     @wp.kernel(
         module="unique",
@@ -197,7 +204,7 @@ def _kernel(dtype, one: _Pass):
         grid_stride=False,
         module_options=native_options("fmm/grid.h", dtype=dtype),
     )
-    def build_cells(count: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays):
-        run(wp.tid(), count, threads, team, arrays)
+    def build_cells(count: int, choice: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays):
+        run(wp.tid(), count, choice, threads, team, arrays)
 
     return build_cells
