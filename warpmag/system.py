@@ -260,7 +260,7 @@ class MomentSystem:
     def _make_near_contacts(self, layout: MomentLayout, turned, susceptibility):
         magnets = layout.permanent | (self._material.curve.numpy() == LINEAR)
         for one in () if self.sources is None else self.sources.solids:  # of closed forms, not of their moments
-            magnets[one.first : one.first + one.count] = one.magnet > 0
+            magnets[one.first : one.first + one.count] = one.response > 0.0
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.balls, susceptibility, self._material,
             ranges=self.world_ranges, magnets=magnets, lone=layout.alone, field=self._mutual, movable=layout.movable,

@@ -84,7 +84,7 @@ template <class All> CUDA_CALLABLE inline void add_source(const All& all, int s,
 }
 // Adds what a permanent body does: by its closed form, from its reach on by its lattice, which keeps more digits there.
 template <class All> CUDA_CALLABLE inline void add_body(const All& all, const Body& body, Ball& ball) {
-    if (body.magnet) return; // its moments are neighbours of the ball
+    if (body.yields) return; // its moments are neighbours of the ball
     const Part part = part_of(ball, body.pose, body.middle, body.half);
     if (part.value == 0 || body.label == ball.label) return;
     ball.lit = true;

@@ -59,7 +59,7 @@ CUDA_CALLABLE inline void between(const All& all, const Body& q, const Body& s, 
         const Mask held = first_lanes(q.first + q.count - i);
         const Number radius = numbers(rows + 3 * pitch);
         const Vector moment =
-            q.magnet ? scaled(Real(4.18879020478639) * radius * radius * radius, spread(q.uniform))
+            q.yields ? scaled(Real(4.18879020478639) * radius * radius * radius, spread(q.uniform))
                      : Vector{numbers(rows + 4 * pitch), numbers(rows + 5 * pitch), numbers(rows + 6 * pitch)};
         const Near field = lattice_field(all, s, x, radius, held, 0, 1);
         push_moments(push, held, seen_of(field), scaled(minus, moment), x, center);

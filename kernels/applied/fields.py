@@ -90,7 +90,7 @@ class AppliedField:
         """List the chunks of targets, each of one world, and which targets closed forms count for."""
         sources, wanted = self.sources, np.ones(self.count)
         for one in () if self._points else sources.solids:
-            wanted[one.first : one.first + one.count] = one.magnet
+            wanted[one.first : one.first + one.count] = 0
         self._put("wanted", wanted, wp.int32)
         edges, starts = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1)), []
         for begin, end in itertools.pairwise(edges):

@@ -57,14 +57,9 @@ CUDA_CALLABLE inline Vector add_applied(const All& all, const int* list, int beg
     return h;
 }
 
-// Targets that a body's closed form counts for: not those of the magnet that it is part of.
+// Targets that a body's closed form counts for.
 template <class All> CUDA_CALLABLE inline Mask near_to(const Body& body, const Targets& at) {
-    const Mask others = mask_of(at.wanted != 0) & mask_of(at.wanted != body.magnet);
-    return others & (away2(body, body.pose.place(at.x)) < body.reach * body.reach);
-}
-// Those of them that it pushes; between closed forms there is another law (between.h).
-template <class All> CUDA_CALLABLE inline Mask pushed_by(const Body& body, const Targets& at) {
-    return mask_of(at.wanted == 1) & (at.label != body.label);
+    return mask_of(at.wanted != 0) & (away2(body, body.pose.place(at.x)) < body.reach * body.reach);
 }
 
 template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(const All& all, int row) {
@@ -88,7 +83,7 @@ template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(con
             if (!any(near)) continue;
             const Seen seen = seen_of(lacking(all, body, at.x, at.radius, near, share(), SHARES));
             add_where(near, h, seen.h);
-            add_where(near & pushed_by<All>(body, at), acting, seen);
+            add_where(near & (at.label != body.label), acting, seen);
             if constexpr (RATES)
                 add_where(near & (at.label != body.label), rate, rate_of_body(all, body, seen, i, held, at.x));
             if constexpr (POINTS) add_where(near, inside, lacking_inside(all, body, at.x, share(), SHARES));
@@ -122,7 +117,7 @@ template <class All> CUDA_CALLABLE inline Push push_of(const All& all, int s, co
         Seen seen = nothing_seen();
         if constexpr (SOLIDS)
             if (solid) {
-                pushed &= near_to<All>(body, at) & pushed_by<All>(body, at);
+                pushed &= near_to<All>(body, at) & (at.label != body.label);
                 if (!any(pushed)) continue;
                 seen = seen_of(lacking(all, body, at.x, at.radius, pushed, 0, 1));
             }

@@ -33,20 +33,19 @@ CUDA_CALLABLE inline Pose pose_from(const Real* at) {
 }
 
 // A body: its place in the tables, its lattice and its magnetization, in its frame. Of one that yields to fields that
-// is what its remanence alone would make of a ball, ``uniform`` in the world, whatever its moments are, and ``magnet``
-// is the number of the magnet that it is part of.
+// is what its remanence alone would make of a ball, ``uniform`` in the world, whatever its moments are.
 struct Body {
     Solid solid;
     Pose pose;
     Three m, middle, half, uniform;
     Real reach, radius, label;
-    int first, count, shape, magnet;
+    int first, count, shape, yields;
 };
 template <class All> CUDA_CALLABLE inline Real packed_at(const All& all, int row, int i) {
     return all.packed.data[row * (all.packed.strides[0] / sizeof(Real)) + i];
 }
 template <class All> CUDA_CALLABLE inline Body body_at(const All& all, int b) {
-    const int* const own = all.body.data + 4 * (size_t)b; // shape, first moment, their number, magnet
+    const int* const own = all.body.data + 4 * (size_t)b; // shape, first moment, their number, whether it yields
     const int* const tables = all.shape.data + 10 * (size_t)own[0];
     // 1/V of the first moment, or what to multiply its bias by, reach, radius, middle, half
     const Real* const size = all.size.data + 9 * (size_t)b;
@@ -68,7 +67,7 @@ template <class All> CUDA_CALLABLE inline Body body_at(const All& all, int b) {
 
 // A moment of a body's lattice that the closed form stands for.
 template <class All> CUDA_CALLABLE inline Three moment_at(const All& all, const Body& body, int j) {
-    if (!body.magnet) return {packed_at(all, 4, j), packed_at(all, 5, j), packed_at(all, 6, j)};
+    if (!body.yields) return {packed_at(all, 4, j), packed_at(all, 5, j), packed_at(all, 6, j)};
     const Real radius = packed_at(all, 3, j), volume = Real(4.18879020478639) * radius * radius * radius;
     return mixed(volume, body.uniform, 0, body.uniform);
 }

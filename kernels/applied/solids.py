@@ -8,8 +8,7 @@
 
 Bodies refer to them:
 
-    body: Shape, first moment, number of moments of each, and its magnet if that yields to fields, else 0, shape
-        [bodies, 4].
+    body: Shape, first moment, number of moments of each, and whether it yields to fields, shape [bodies, 4].
     size: 1/V of its first moment [1/m³], or its response if it yields, reach, radius of the ball around it, middle and
         half sides of its box [m], shape [bodies, 9].
 """
@@ -37,8 +36,7 @@ class SolidMagnet:
         reach: Distance up to which the closed form counts [m].
         shape: The ``warpmag.polyhedra.Polyhedron`` that bounds it, in the frame of its body.
         movable: Whether the force on it is wanted.
-        magnet: Number of the magnet that it is part of, from 2 on, if that yields to fields; else 0.
-        response: k = 3χ/(3 + χ) of such a one.
+        response: k = 3χ/(3 + χ) of one that yields to fields; 0 of others.
     """
 
     first: int
@@ -48,7 +46,6 @@ class SolidMagnet:
     reach: float
     shape: Any
     movable: bool
-    magnet: int = 0
     response: float = 0.0
 
     def size(self) -> list[float]:
@@ -57,7 +54,7 @@ class SolidMagnet:
         middle = 0.5 * (lower + upper)
         radius = np.linalg.norm(self.shape.corners - middle, axis=1).max()
         return [
-            self.response if self.magnet else 1.0 / self.volume,
+            self.response or 1.0 / self.volume,
             self.reach,
             radius,
             *middle,
@@ -71,7 +68,9 @@ def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
     number = {key: k for k, key in enumerate(shapes)}
     rows, tables = _tables(shapes.values(), fine)
     tables["shape"] = rows
-    tables["body"] = np.array([(number[id(one.shape)], one.first, one.count, one.magnet) for one in solids], np.int32)
+    tables["body"] = np.array(
+        [(number[id(one.shape)], one.first, one.count, one.response > 0.0) for one in solids], np.int32
+    )
     tables["size"] = np.array([one.size() for one in solids])
     return tables
 

@@ -22,7 +22,7 @@ give its moments. Targets are moments, or points:
 | array | shape | meaning |
 |---|---|---|
 | target | [8, t] | packed targets |
-| wanted | [t] | 0 of moments of permanent bodies of a closed form, their magnet if that yields, 1 of others |
+| wanted | [t] | 0 of moments of permanent bodies of a closed form, 1 of others |
 | chunk, lists | [chunks] | first target, how many, and the bodies of their world; the part of ``list`` |
 | base | [t] | what fields are added to [A/m] |
 | field | [t] | what magnetizes: ``base`` and the field of all sources [A/m] |

@@ -129,7 +129,7 @@ class Magnetics:
                 part.reach,
                 part.shape,
                 move,
-                *((k + 2, 3.0 - 9.0 / (2.0 + one.magnet.recoil_permeability)) if one.magnet.recoils else ()),
+                3.0 - 9.0 / (2.0 + one.magnet.recoil_permeability),
             )
             for k, one, move, part in parts
         ]
