@@ -7,6 +7,8 @@ from warpmag.engine.attributes import add_inducible as add_inducible
 from warpmag.engine.attributes import add_permanent as add_permanent
 from warpmag.engine.attributes import register_attributes as register_attributes
 from warpmag.engine.attributes import register_custom_attributes as register_custom_attributes
+from warpmag.engine.balls import Balls as Balls
+from warpmag.engine.balls import add_balls as add_balls
 from warpmag.engine.display import Display as Display
 from warpmag.engine.drive import KeyedCurrents as KeyedCurrents
 from warpmag.engine.magnetics import Magnetics as Magnetics

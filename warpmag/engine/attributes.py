@@ -266,9 +266,16 @@ def _check_index(name: str, index: int, count: int, kind: str) -> None:
 
 def mark_shape(builder: newton.ModelBuilder, shape: int, magnet: Magnet) -> None:
     """Store ``magnet``, its magnetization in the frame of the shape, on one shape."""
-    magnet.check(builder.shape_label[shape])
+    mark_shapes(builder, range(shape, shape + 1), magnet)
+
+
+def mark_shapes(builder: newton.ModelBuilder, shapes: range, magnet: Magnet) -> None:
+    """Store ``magnet``, its magnetization in the frame of each shape, on shapes."""
+    if shapes:
+        magnet.check(builder.shape_label[shapes[0]])
     for name, value in _values(magnet).items():
-        builder.custom_attributes[f"{NAMESPACE}:{name}"].values[shape] = value
+        values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values  # a dictionary, by Newton a list too
+        values.update(dict.fromkeys(shapes, value))
 
 
 def _values(magnet: Magnet) -> dict[str, Any]:

@@ -1,0 +1,136 @@
+"""Balls added in bulk, against Newton's own calls for each of them."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+import warpmag
+from warpmag.errors import InputError
+
+COUNT = 7  # two rows of two and three alone: every way in which copies come about
+
+
+def _builder(*, world=False):
+    builder = newton.ModelBuilder(gravity=(0.0, 1.0, -3.0))
+    builder.rigid_gap = 3e-4
+    builder.default_shape_cfg.restitution = 0.25
+    warpmag.register_custom_attributes(builder)
+    body = builder.add_body(label="first")
+    builder.add_shape_box(body, hx=0.01, hy=0.01, hz=0.01)
+    if world:
+        builder.begin_world(gravity=(1.0, 0.0, 0.0))
+    return builder
+
+
+def _poses(count=COUNT):
+    random = np.random.default_rng(3)
+    turns = random.normal(size=(count, 4))
+    return random.uniform(-1.0, 1.0, (count, 3)), turns / np.linalg.norm(turns, axis=1, keepdims=True)
+
+
+def _finished(builder, world):
+    if world:
+        builder.end_world()
+    body = builder.add_body(label="last")
+    builder.add_shape_sphere(body, radius=0.1)
+    return builder.finalize(device="cpu")
+
+
+def _fields(thing):
+    for name, value in sorted(vars(thing).items()):
+        if isinstance(value, newton.Model.AttributeNamespace):
+            yield from ((f"{name}.{inner}", one) for inner, one in _fields(value))
+        elif isinstance(value, wp.array):
+            yield name, value.numpy()
+        elif isinstance(value, (list, dict, tuple, set, int, float, str, wp.vec3, np.ndarray, type(None))):
+            yield name, value
+
+
+def _same(found, wanted):
+    """Compare two models field by field; return how many there are."""
+    found, wanted = dict(_fields(found)), dict(_fields(wanted))
+    assert found.keys() == wanted.keys()
+    for name, value in wanted.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            # a quotient or a product in single precision, rounded in another order
+            np.testing.assert_allclose(found[name], value, rtol=3e-7, atol=0.0, err_msg=name)
+        elif isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(found[name], value, err_msg=name)
+        else:
+            assert repr(found[name]) == repr(value), name
+    return len(wanted)
+
+
+@pytest.mark.parametrize("world", [False, True])
+@pytest.mark.parametrize("several", [False, True])
+@pytest.mark.parametrize("permanent", [False, True])
+def test_model_is_that_of_newtons_own_calls(world, several, permanent):
+    places, turns = _poses()
+    radii = np.array([0.004, 0.005, 0.004, 0.007, 0.004, 0.005, 0.006]) if several else np.full(COUNT, 0.005)
+    given = {"magnetization": (1e5, 0.0, 2e5)} if permanent else {"saturation": 1.1e6, "susceptibility": 40.0}
+    one, many = _builder(world=world), _builder(world=world)
+    cfg = one.default_shape_cfg.copy()
+    cfg.density, cfg.mu = 7870.0, 0.3
+    for number, (place, turn, radius) in enumerate(zip(places, turns, radii, strict=True)):
+        body = one.add_body(xform=wp.transform(place, turn), label=f"ball_{number}")
+        one.add_shape_sphere(body, radius=radius, cfg=cfg, color=(0.1, 0.2, 0.3), label=f"ball_{number}_shape")
+        (warpmag.add_permanent if permanent else warpmag.add_inducible)(one, body, **given)
+    added = warpmag.add_balls(
+        *(many, places, radii if several else 0.005),
+        orientations=turns,
+        density=7870.0,
+        friction=0.3,
+        color=(0.1, 0.2, 0.3),
+        label="ball",
+        **given,
+    )
+    assert added == warpmag.Balls(range(1, 1 + COUNT), range(1, 1 + COUNT))
+    assert _same(_finished(many, world), _finished(one, world)) > 150
+
+
+def test_nothing_said_is_as_newton_has_it():
+    one, many = _builder(), _builder()
+    places, _ = _poses()
+    for place in places:
+        body = one.add_body(xform=wp.transform(place, wp.quat_identity()))
+        one.add_shape_sphere(body, radius=0.005, color=(0.5, 0.5, 0.5))
+        warpmag.add_inducible(one, body)
+    warpmag.add_balls(many, places, 0.005, color=(0.5, 0.5, 0.5))
+    _same(_finished(many, False), _finished(one, False))
+
+
+def test_none_is_none():
+    one, many = _builder(), _builder()
+    assert warpmag.add_balls(many, np.zeros((0, 3)), 0.005).bodies == range(1, 1)
+    _same(_finished(many, False), _finished(one, False))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": np.zeros((3, 2))}, r"positions: shape"),
+        ({"positions": [[0.0, np.nan, 0.0]]}, r"positions: must be finite"),
+        ({"positions": [[0.0, 1e300, 0.0]]}, r"positions: must be finite in single precision"),
+        ({"radius": 0.0}, r"radius: must be positive"),
+        ({"radius": [0.1, 0.2, 0.3]}, r"radius: shape"),
+        ({"radius": "wide"}, r"radius: "),
+        ({"orientations": [[0.0, 0.0, 0.0, 1.0]]}, r"orientations: shape"),
+        ({"orientations": [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 2.0]]}, r"orientations: .* ball 1 has length 2"),
+        ({"density": -1.0}, r"density: must be positive"),
+        ({"friction": float("inf")}, r"friction: must be zero or positive and finite"),
+        ({"saturation": -1.0}, r"saturation"),
+        ({"material": "cheese"}, r"material: "),
+        ({"magnetization": (0.0, 0.0, 1e6), "saturation": 1e6}, r"saturation: is of inducible magnets only"),
+        ({"recoil_permeability": 1.05}, r"recoil_permeability: is of permanent magnets only"),
+        ({"color": (2.0, 0.0)}, r"color: "),
+        ({"builder": newton.ModelBuilder()}, r"builder: call warpmag.register_custom_attributes"),
+    ],
+)
+def test_wrong_arguments_are_one_clear_line_and_add_nothing(change, message):
+    builder = _builder()
+    given = {"builder": builder, "positions": np.zeros((2, 3)), "radius": 0.005} | change
+    with pytest.raises(InputError, match=message) as told:
+        warpmag.add_balls(given.pop("builder"), given.pop("positions"), given.pop("radius"), **given)
+    assert "\n" not in str(told.value)
+    assert (builder.body_count, builder.shape_count) == (1, 1)
