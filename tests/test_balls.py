@@ -7,6 +7,7 @@ import warp as wp
 
 import warpmag
 from warpmag.errors import InputError
+from warpmag.layout import MomentLayout
 
 COUNT = 7  # two rows of two and three alone: every way in which copies come about
 
@@ -134,3 +135,24 @@ def test_wrong_arguments_are_one_clear_line_and_add_nothing(change, message):
         warpmag.add_balls(given.pop("builder"), given.pop("positions"), given.pop("radius"), **given)
     assert "\n" not in str(told.value)
     assert (builder.body_count, builder.shape_count) == (1, 1)
+
+
+def test_runs_of_moments_are_those_of_each_world_by_itself():
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        count = int(random.integers(0, 12))
+        worlds = np.sort(random.integers(0, 4, count))
+        permanent = np.zeros(count, bool)
+        ranges, runs, wanted = [], [], random.random(count) < 0.6
+        for world in range(worlds.max(initial=-1) + 1):
+            (inside,) = np.nonzero(worlds == world)
+            first = int(np.searchsorted(worlds, world))
+            middle = first + int(random.integers(0, len(inside) + 1))
+            last = first + len(inside)
+            permanent[middle:last] = True
+            ranges.append((first, middle, last))
+            edges = np.flatnonzero(np.diff([0, *wanted[first:last].astype(int), 0])).reshape(-1, 2) + first
+            runs += [(int(begin), int(end), first, last) for begin, end in edges]
+        layout = MomentLayout(np.zeros(count), worlds, permanent, worlds, wanted, wanted, wanted)
+        assert layout.ranges() == ranges
+        assert layout.runs(wanted) == runs

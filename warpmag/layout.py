@@ -1,7 +1,6 @@
 """What each moment of a system is: its world and its body, and what it is made of."""
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -42,11 +41,27 @@ class MomentLayout:
 
     def ranges(self) -> list[tuple[int, int, int]]:
         """For each world its first moment, its first permanent one, and the end."""
-        edges = np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))
-        return [
-            (int(first), int(last - np.count_nonzero(self.permanent[first:last])), int(last))
-            for first, last in pairwise(edges)
-        ]
+        edges = self._edges()
+        permanent = np.concatenate([[0], np.cumsum(self.permanent)])[edges]
+        return list(
+            zip(edges[:-1].tolist(), (edges[1:] - np.diff(permanent)).tolist(), edges[1:].tolist(), strict=True)
+        )
+
+    def runs(self, wanted: np.ndarray) -> list[tuple[int, int, int, int]]:
+        """For each run of ``wanted`` moments in one world its first moment and its end, and those of the world."""
+        edges = self._edges()
+        inside = np.ones(len(wanted) + 1, bool)  # whether a moment and the one before are of one world
+        inside[edges] = False
+        padded = np.concatenate([[False], wanted, [False]])
+        first = np.flatnonzero(wanted & ~(padded[:-2] & inside[:-1]))
+        last = np.flatnonzero(wanted & ~(padded[2:] & inside[1:])) + 1
+        world = self.worlds[first]
+        columns = (first, last, edges[world], edges[world + 1])
+        return list(zip(*(column.tolist() for column in columns), strict=True))
+
+    def _edges(self) -> np.ndarray:
+        """First moment of each world, and the end of the last."""
+        return np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))
 
 
 def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayout:

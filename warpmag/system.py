@@ -234,12 +234,7 @@ class MomentSystem:
     def _evaluate_wrench(self, layout: MomentLayout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
         self._turned = wp.array(turned.astype(np.int32), dtype=wp.int32, device=self.device)
-        segments = [], []
-        for first, _, last in layout.ranges():
-            for k, which in enumerate((~turned[first:last], turned[first:last])):
-                wanted = np.concatenate([[0], (layout.movable[first:last] & which).astype(int), [0]])
-                edges = first + np.flatnonzero(np.diff(wanted)).reshape(-1, 2)
-                segments[k].extend((a, b, first, last) for a, b in edges)
+        segments = [layout.runs(layout.movable & which) for which in (~turned, turned)]
 
         def evaluations(force, effective):
             # those with a torque come last, since the others' mirrored form writes forces on all moments

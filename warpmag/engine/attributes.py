@@ -319,16 +319,31 @@ def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
     marked = np.flatnonzero(kinds != NO_MAGNET)
     if not len(marked):
         raise InputError("model: has no magnets, add some with add_inducible or add_permanent before finalize()")
-    columns = {name: getattr(attributes, name).numpy() for name in _ATTRIBUTES}
-    return {
-        int(shape): Magnet(
-            kind=KINDS[kinds[shape] - 1],
-            saturation=float(columns["saturation"][shape]),
-            susceptibility=float(columns["susceptibility"][shape]),
-            curve=_curve_of(columns["curve"][shape]),
-            magnetization=tuple(columns["magnetization"][shape].tolist()),
-            recoil_permeability=float(columns["recoil_permeability"][shape]),
-            moment_spacing=float(columns["moment_spacing"][shape]),
-        )
-        for shape in marked
-    }
+    columns = [getattr(attributes, name).numpy()[marked] for name in _ATTRIBUTES]
+    rows, which = unique_rows(np.column_stack([column.reshape(len(marked), -1) for column in columns]))
+    kinds = [_magnet_of_row(*row) for row in rows.tolist()]
+    return dict(zip(marked.tolist(), map(kinds.__getitem__, which.tolist()), strict=True))
+
+
+def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the different rows of numbers, shape [k, m], and which of them each row is, shape [n]."""
+    order = np.lexsort(rows.T)
+    differs = np.ones(len(rows), bool)
+    differs[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    which = np.empty(len(rows), int)
+    which[order] = np.cumsum(differs) - 1
+    return rows[order[differs]], which
+
+
+def _magnet_of_row(kind, saturation, susceptibility, curve, *rest: float) -> Magnet:
+    """The magnet of a row of all attributes of ``_ATTRIBUTES``, in their order."""
+    *magnetization, recoil_permeability, moment_spacing = rest
+    return Magnet(
+        kind=KINDS[int(kind) - 1],
+        saturation=saturation,
+        susceptibility=susceptibility,
+        curve=_curve_of(int(curve)),
+        magnetization=tuple(magnetization),
+        recoil_permeability=recoil_permeability,
+        moment_spacing=moment_spacing,
+    )

@@ -43,11 +43,11 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
     body_of, rotations = model.shape_body.numpy().tolist(), model.shape_transform.numpy()[:, 3:].tolist()
     groups: list[tuple[Magnet, int, list[int]]] = []
     of_body: dict[int, list[tuple[Magnet, int, list[int]]]] = {}
-    for shape, magnet in marked_shapes(model).items():
-        body = body_of[shape]
-        turned = wp.quat_rotate(wp.quat(*rotations[shape]), wp.vec3(*magnet.magnetization))
-        magnet = replace(magnet, magnetization=tuple(turned))
-        alike = [group for group in of_body.get(body, []) if body >= 0 and _alike(group[0], magnet)]
+    known: dict[tuple, Magnet] = {}  # few materials and rotations, of many shapes
+    for shape, stored in marked_shapes(model).items():
+        body, key = body_of[shape], (id(stored), *rotations[shape])
+        magnet = known.get(key) or known.setdefault(key, _turned(stored, rotations[shape]))
+        alike = [group for group in of_body.get(body, ()) if body >= 0 and _alike(group[0], magnet)]
         if alike:
             alike[0][2].append(shape)
         else:
@@ -68,8 +68,16 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
     return sorted(magnets, key=lambda one: (one.world, one.magnet.fixed, one.body, one.shapes)), held
 
 
+def _turned(magnet: Magnet, rotation: list[float]) -> Magnet:
+    """Return a magnet of a shape in the frame of its body."""
+    turned = wp.quat_rotate(wp.quat(*rotation), wp.vec3(*magnet.magnetization))
+    return replace(magnet, magnetization=tuple(turned))
+
+
 def _alike(a: Magnet, b: Magnet) -> bool:
     """Return whether two magnets of one body are the same material, magnetized alike up to rounding."""
+    if a is b:
+        return True
     if replace(a, magnetization=b.magnetization) != b:
         return False
     difference = np.linalg.norm(np.subtract(a.magnetization, b.magnetization))
@@ -86,5 +94,5 @@ def _number_worlds(model: newton.Model, shapes: list[int]) -> tuple[list[int], n
     if len(held) > 1 and (worlds < 0).any():
         label = model.shape_label[shapes[int(np.argmax(worlds < 0))]]
         raise InputError(f"{label}: a magnet outside all worlds, while {len(held)} worlds hold magnets of their own")
-    numbers = [int(np.searchsorted(held, world)) if world >= 0 else 0 for world in worlds]
+    numbers = np.where(worlds >= 0, np.searchsorted(held, worlds), 0).tolist()
     return numbers, held if len(held) else np.array([-1])

@@ -8,6 +8,7 @@ import numpy as np
 
 from warpmag import lattice, polyhedra
 from warpmag.demagnetization import Coupling, coupling
+from warpmag.engine.attributes import unique_rows
 from warpmag.errors import InputError
 from warpmag.even_field import corrected
 from warpmag.polyhedra import Polyhedron
@@ -63,6 +64,9 @@ class ShapeSampler:
         self._bodies = model.shape_body.numpy()
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
         self._frames = model.shape_transform.numpy().astype(float)
+        sources = [0.0 if source is None else float(id(source)) for source in self._sources]
+        numbers = np.column_stack([self._types, sources, self._scales, self._frames])
+        self._kinds = unique_rows(numbers)[1].tolist()  # shapes of equal numbers are alike
         self._known: dict[tuple, BodyLattice] = {}
 
     def sample(self, shapes: list[int], spacing: float, permanent: bool) -> BodyLattice:
@@ -76,17 +80,13 @@ class ShapeSampler:
             spacing: Distance between moments [m]; 0 for automatic.
             permanent: Whether the moments are fixed: their field is not averaged over more than their cells then.
         """
-        key = (spacing, permanent, *(self._key(shape) for shape in shapes))
+        key = (spacing, permanent, *(self._kinds[shape] for shape in shapes))
         if key not in self._known:
             try:
                 self._known[key] = self._sample(shapes, spacing, permanent)
             except InputError as error:
                 raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
         return self._known[key]
-
-    def _key(self, shape: int) -> tuple:
-        source = id(self._sources[shape]) if self._sources[shape] is not None else None
-        return (int(self._types[shape]), source, *self._scales[shape].tolist(), *self._frames[shape].tolist())
 
     def _sample(self, shapes: list[int], spacing: float, permanent: bool) -> BodyLattice:
         if spacing == 0.0 and self._are_balls_apart(shapes):
