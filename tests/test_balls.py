@@ -1,5 +1,8 @@
 """Balls added in bulk, against Newton's own calls for each of them."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import newton
 import numpy as np
 import pytest
@@ -38,7 +41,7 @@ def _finished(builder, world):
     return builder.finalize(device="cpu")
 
 
-def _fields(thing):
+def _fields(thing) -> Iterator[tuple[str, Any]]:
     for name, value in sorted(vars(thing).items()):
         if isinstance(value, newton.Model.AttributeNamespace):
             yield from ((f"{name}.{inner}", one) for inner, one in _fields(value))

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
+from warpmag.engine import scene as scenes
+from warpmag.engine.scene import import_scene
 from warpmag.engine.simulation import Simulation
 from warpmag.errors import InputError
 from warpmag.export import export
@@ -240,3 +242,32 @@ def test_an_instancer_within_itself(tmp_path):
     path = write(tmp_path, instancer(["Ball"], [0], [(0, 0, 0)], inner=BALL).replace("/Kinds/Ball", ""))
     with pytest.raises(InputError, match=r"^/World/Many: a PointInstancer that is part of its own prototypes"):
         open_stage(path)
+
+
+def test_alike_balls_are_imported_as_each_would_be_by_itself(tmp_path, monkeypatch):
+    lines = """quath[] orientations = [(1,0,0,0), (0.6,0,0.8,0), (0,0.6,0,0.8), (0.8,0,0,0.6)]
+        float3[] scales = [(1,1,1), (1.5,1.5,1.5), (1,1,1), (1.5,1.5,1.5)]"""
+    turned = BALL.replace("radius = 0.004", "radius = 0.004 \n double3 xformOp:translate = (0.01, 0.02, 0)").replace(
+        "(0.01, 0.02, 0)", '(0.01, 0.02, 0) \n uniform token[] xformOpOrder = ["xformOp:translate"]'
+    )
+    places = "[(0, 0, 0), (0.1, 0, 0), (0.2, 0.1, 0), (0, 0.2, 0.3)]"
+    path = write(tmp_path, instancer(["Ball"], [0, 0, 0, 0], places, lines, turned))
+    found = import_scene(path)
+    assert [len(balls.others) for balls in found.apart] == [1, 1]
+    monkeypatch.setattr(scenes, "open_apart", lambda path, time: (open_stage(path, time), []))
+    wanted = import_scene(path)
+    assert found.bodies.keys() == wanted.bodies.keys()
+    assert found.magnets == wanted.magnets
+    one, other = found.builder.finalize(device="cpu"), wanted.builder.finalize(device="cpu")
+    for prim, body in wanted.bodies.items():
+        own, (shape,), (own_shape,) = found.bodies[prim], wanted.magnet_shapes[prim], found.magnet_shapes[prim]
+        pose, wanted_pose = one.body_q.numpy()[own].astype(float), other.body_q.numpy()[body].astype(float)
+        np.testing.assert_allclose(pose[:3], wanted_pose[:3], rtol=0.0, atol=1e-7)  # single precision of 0.5 m
+        assert abs(abs(pose[3:] @ wanted_pose[3:]) - 1.0) < 1e-6  # of quaternions, which have two signs
+        for name in ("body_mass", "body_inertia", "shape_scale", "shape_material_mu", "shape_gap", "shape_flags"):
+            rows = (own, body) if name.startswith("body") else (own_shape, shape)
+            np.testing.assert_array_equal(getattr(one, name).numpy()[rows[0]], getattr(other, name).numpy()[rows[1]])
+        assert one.body_label[own] == one.shape_label[own_shape] == prim
+    assert sorted(map(str, [one.GetPath() for one in found.stage.Traverse()])) == sorted(
+        str(one.GetPath()) for one in wanted.stage.Traverse()
+    )

@@ -18,6 +18,8 @@ from warpmag.magnets import Magnet, check_finite, check_not_negative, check_posi
 
 _SUFFIXES = {"body": "", "joint": "_free_joint", "articulation": "_articulation", "shape": "_shape"}
 """What Newton's ``add_body`` appends to the label of a body for what it makes with it, and we for the shape."""
+_OWN = ("body_q", "body_qd", "body_world", "body_label", "shape_body", "shape_world", "shape_label")
+"""What a copy of a ball has of its own."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,43 @@ def add_balls(
         builder.replicate(added, 1, separate_worlds=False)
         mark_shapes(builder, shapes, magnet)
     return Balls(bodies, shapes)
+
+
+def copy_ball(builder: newton.ModelBuilder, body: int, poses: np.ndarray, first: str, others: list[str]) -> Balls:
+    """Add balls that are like one that a builder has: what it says of body and shape, magnets included, but the pose.
+
+    Args:
+        builder: The builder.
+        body: A free body with one shape, a ball.
+        poses: Positions [m] and quaternions x y z w, shape [n, 7].
+        first: What labels of the body and of what belongs to it begin with.
+        others: What those of each new one begin with in its place.
+    """
+    (shape,) = builder.body_shapes[body]
+    rows, count = {"body": body, "shape": shape}, len(poses)
+    template = _template(builder, builder.shape_scale[shape][0], builder.default_shape_cfg, None)
+    for name, values in vars(template).items():
+        kind = name.partition("_")[0]
+        if kind in rows and name not in _OWN and isinstance(values, list) and len(values) == 1:
+            values[0] = getattr(builder, name)[rows[kind]]
+    added = _copies(template, count)
+    _place(added, poses)
+    _name(added, builder, None)
+    for kind, row in rows.items():
+        label = getattr(builder, f"{kind}_label")[row]
+        setattr(added, f"{kind}_label", [f"{one}{label.removeprefix(first)}" for one in others])
+    added.articulation_label = list(added.body_label)  # as in an import
+    new = {
+        "body": range(builder.body_count, builder.body_count + count),
+        "shape": range(builder.shape_count, builder.shape_count + count),
+    }
+    builder.replicate(added, 1, separate_worlds=False)
+    for attribute in builder.custom_attributes.values():
+        kind = getattr(attribute.frequency, "name", "").lower()
+        values: Any = attribute.values
+        if kind in rows and rows[kind] in values:
+            values.update(dict.fromkeys(new[kind], values[rows[kind]]))
+    return Balls(new["body"], new["shape"])
 
 
 def _poses(positions, orientations) -> np.ndarray:
@@ -188,6 +227,7 @@ def _copies(template: newton.ModelBuilder, count: int) -> newton.ModelBuilder:
 
 def _place(added: newton.ModelBuilder, poses: np.ndarray) -> None:
     """Put bodies, and the free joints that hold them, where they are."""
+    poses = np.ascontiguousarray(poses, np.float32)
     added.body_q = list(map(wp.transform.from_buffer_copy, poses))
     added.joint_q = poses.ravel().tolist()
 

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import newton
@@ -10,18 +11,21 @@ import warp as wp
 
 from warpmag.engine.applied import add_placed_source
 from warpmag.engine.attributes import axis_turn, declare_attributes, in_shape_frame, magnet_shapes, mark_shape
+from warpmag.engine.balls import copy_ball
 from warpmag.engine.drawn import StageBuilder
 from warpmag.errors import InputError
 from warpmag.keyed import Keys, SceneKeys
 from warpmag.magnets import Magnet, StageMagnets
 from warpmag.usd import (
+    AlikeBalls,
     GroundedJoint,
     StageClock,
     StageContents,
+    complete_instances,
     enabled_joints,
     give_densities,
     inspect,
-    open_stage,
+    open_apart,
     prepare_joints,
     refusals,
     strained_joints,
@@ -33,7 +37,8 @@ class ImportedScene:
     """A stage as Newton sees it.
 
     Attributes:
-        stage: The open stage, for a :class:`warpmag.usd.CacheWriter`.
+        opened: The open stage as it was read, without prims for instances that are like others.
+        apart: Those instances.
         builder: Bodies, shapes and joints; world frame and units are the stage's.
         clock: How time runs on the stage.
         magnets: What the stage says about magnets.
@@ -44,7 +49,8 @@ class ImportedScene:
         warnings: What the user should know about the stage, a line each.
     """
 
-    stage: object
+    opened: Any
+    apart: list[AlikeBalls]
     builder: newton.ModelBuilder
     clock: StageClock
     magnets: StageMagnets
@@ -53,6 +59,12 @@ class ImportedScene:
     keys: SceneKeys
     strained: tuple[str, ...]
     warnings: tuple[str, ...]
+
+    @cached_property
+    def stage(self) -> Any:
+        """The open stage with a prim for each body, for a :class:`warpmag.usd.CacheWriter`."""
+        complete_instances(self.apart)
+        return self.opened
 
 
 def import_scene(
@@ -73,7 +85,7 @@ def import_scene(
     Raises:
         InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
     """
-    stage = open_stage(path, time_code)
+    stage, apart = open_apart(path, time_code)
     report = inspect(stage, path)
     if report.errors:
         raise InputError(str(report.errors[0]))
@@ -97,14 +109,18 @@ def import_scene(
     covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
     currents = _add_sources(builder, contents.sources, bodies)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
+    keys = _scene_keys(builder, stage, contents, clock, bodies, covered, currents)
+    for balls in apart:
+        _copy_balls(builder, stage, balls, bodies, covered, magnets)
     return ImportedScene(
-        stage=stage,
+        opened=stage,
+        apart=apart,
         builder=builder,
         clock=clock,
         magnets=magnets,
         bodies=bodies,
         magnet_shapes=covered,
-        keys=_scene_keys(builder, stage, contents, clock, bodies, covered, currents),
+        keys=keys,
         strained=strained,
         warnings=tuple(map(str, report.warnings)),
     )
@@ -116,6 +132,27 @@ def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, vis
         return builder.add_usd(
             stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals, only_load_enabled_rigid_bodies=True
         )
+
+
+def _copy_balls(
+    builder: newton.ModelBuilder,
+    stage,
+    balls: AlikeBalls,
+    bodies: dict[str, int],
+    covered: dict[str, list[int]],
+    magnets: StageMagnets,
+) -> None:
+    """Copy what Newton has made of the first of balls that are alike, and what is known of its magnet."""
+    first, others = balls.bodies()
+    body = bodies[first]
+    added = copy_ball(builder, body, balls.poses(stage, np.array(builder.body_q[body])[3:]), first, others)
+    bodies |= dict(zip(others, added.bodies, strict=True))
+    for prim in [one for one in covered if one == first or one.startswith(f"{first}/")]:
+        own = [f"{other}{prim.removeprefix(first)}" for other in others]
+        covered |= zip(own, ([shape] for shape in added.shapes), strict=True)
+        for values in (magnets.magnets, magnets.initial_moments):
+            if prim in values:
+                values |= dict.fromkeys(own, values[prim])
 
 
 def _place_on_ground(

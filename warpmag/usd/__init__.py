@@ -6,11 +6,13 @@ attributes right even then).
 """
 
 from warpmag.usd.schemas import author_magnet, author_settings, magnet_of, magnet_prim_of  # isort: skip  (registers the schemas first)
+from warpmag.usd.alike import AlikeBalls
 from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
 from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_sources
 from warpmag.usd.densities import give_densities
 from warpmag.usd.guard import refusals
+from warpmag.usd.instancers import complete_instances
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
 from warpmag.usd.looks import author_surface, metalness
 from warpmag.usd.meshes import author_mesh
@@ -22,6 +24,7 @@ from warpmag.usd.reader import (
     describe,
     first_camera,
     hold,
+    open_apart,
     open_motion,
     open_stage,
     read_magnets,
@@ -32,6 +35,7 @@ from warpmag.usd.values import Finding
 from warpmag.usd.writer import CacheWriter, Earlier
 
 __all__ = [
+    "AlikeBalls",
     "CacheWriter",
     "Earlier",
     "Finding",
@@ -49,6 +53,7 @@ __all__ = [
     "author_settings",
     "author_surface",
     "check",
+    "complete_instances",
     "describe",
     "enabled_joints",
     "first_camera",
@@ -59,6 +64,7 @@ __all__ = [
     "magnet_of",
     "magnet_prim_of",
     "metalness",
+    "open_apart",
     "open_motion",
     "open_stage",
     "placed_sources",

@@ -7,15 +7,18 @@ not be made of stays as it is.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
+from warpmag.usd.alike import AlikeBalls, alike, ball_in, may_be_alike
 from warpmag.usd.first_reading import MOST_PRIMS
 from warpmag.usd.session import INSTANCES, add_layer, new_layer, release_instances
 from warpmag.usd.transforms import is_body, is_collider
+from warpmag.usd.units import units_of
 
 _TYPES = Sdf.ValueTypeNames
 _NAME = "instance"
@@ -28,21 +31,32 @@ _OPERATIONS = (
 _RESET = "!resetXformStack!"
 
 
-def expand_instancers(stage: Usd.Stage, time_code: float) -> None:
+def expand_instancers(stage: Usd.Stage, time_code: float, *, apart: bool = False) -> list[AlikeBalls]:
     """Let a stage have a prim for each instance of what is physical, by a layer of its session.
 
     Args:
         stage: The stage.
         time_code: The moment at which instances stand, those left out whose transforms are followed over time.
+        apart: Leave it at the first of those instances that are alike.
+
+    Returns:
+        The instances left out, which :func:`complete_instances` makes prims of.
 
     Raises:
         InputError: An instancer is not what USD says one must be, or stands for too many prims.
     """
-    expansion = _Expansion(stage, time_code)
+    expansion = _Expansion(stage, time_code, apart)
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     found = [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]
     for path in found:
         expansion.expand(path)
+    return expansion.apart
+
+
+def complete_instances(apart: list[AlikeBalls]) -> None:
+    """Let a stage have prims for those instances, too, that :func:`expand_instancers` has left out."""
+    for balls in apart:
+        balls.write()
 
 
 def _is_physical(prim: Usd.Prim) -> bool:
@@ -72,8 +86,9 @@ class _Prototype:
 class _Expansion:
     """Expands the instancers of one stage, those first that are in prototypes of others."""
 
-    def __init__(self, stage: Usd.Stage, time_code: float):
+    def __init__(self, stage: Usd.Stage, time_code: float, apart: bool):
         self._stage, self._time = stage, time_code
+        self._left_apart, self.apart = apart, list[AlikeBalls]()
         self._layer: Sdf.Layer | None = None
         self._done: set[Sdf.Path] = set()
         self._prims = 0
@@ -133,18 +148,28 @@ class _Expansion:
         prefix = _NAME
         while any(name.startswith(prefix) for name in instancer.GetPrim().GetAllChildrenNames()):
             prefix += "_"
+        write = partial(_write_instances, layer, path, prefix, instances, prototypes, followed)
+        left = self._alike(instancer, instances, prefix) if self._left_apart and not followed else []
+        later = [[int(one.rpartition(prefix)[2]) for one in balls.others] for balls in left]
+        self.apart += [replace(balls, write=partial(write, rows)) for balls, rows in zip(left, later, strict=True)]
         with Sdf.ChangeBlock():
             own = Sdf.CreatePrimInLayer(layer, path)
             own.typeName = "Xform"
             for target in targets:
                 if target.HasPrefix(path):
                     Sdf.CreatePrimInLayer(layer, target).active = False
-            for row in instances.rows:
-                prim = Sdf.PrimSpec(own, f"{prefix}{row}", Sdf.SpecifierDef, "Xform")
-                prototype = prototypes[instances.prototypes[row]]
-                _write_transform(prim, instances, row, followed)
-                _write_prototype(prim, prototype)
-                _write_velocities(prim, prototype, instances, row)
+        unwritten = {row for rows in later for row in rows}
+        write([row for row in instances.rows if row not in unwritten])
+
+    def _alike(self, instancer: UsdGeom.PointInstancer, instances: "_Instances", prefix: str) -> list[AlikeBalls]:
+        """Find out which instances are alike; those that move by themselves, or are in other units, are not."""
+        moving = len(instances.velocities) or len(instances.spins)
+        if moving or not units_of(self._stage).are_si or not may_be_alike(self._stage, instancer, self._time):
+            return []
+        targets = instancer.GetPrototypesRel().GetForwardedTargets()
+        found = {number: ball_in(self._stage.GetPrimAtPath(target)) for number, target in enumerate(targets)}
+        balls = {number: body for number, body in found.items() if body is not None}
+        return list(alike(*instances.listed(f"{instancer.GetPath()}/{prefix}"), balls))
 
     def _follows_keys(self, target: Sdf.Path) -> bool:
         """Whether something of a prototype moves as its instance does over time: what is no dynamic body."""
@@ -190,6 +215,15 @@ class _Instances:
         """Return what an array says of an instance, None where it is empty."""
         values = self._values[name]
         return _typed(name, values[row]) if len(values) else None
+
+    def listed(self, prefix: str) -> tuple[list[str], list[tuple], np.ndarray, np.ndarray]:
+        """Return paths, kinds, positions and orientations of the active ones as :func:`alike` takes them."""
+        rows = np.array(self.rows, int)
+        scales, turns = self._values["scales"], self._values["orientations"]
+        kinds = np.c_[self.prototypes, scales] if len(scales) else self.prototypes[:, None]
+        paths = [f"{prefix}{row}" for row in self.rows]
+        own = turns[rows] if len(turns) else turns
+        return paths, list(map(tuple, kinds[rows].tolist())), self._values["positions"][rows], own
 
     def samples(self) -> tuple[tuple[float, dict[str, np.ndarray]], ...]:
         """Return the arrays that move instances at all their times, nothing where they have but one."""
@@ -244,6 +278,18 @@ def _prototype(root: Usd.Prim) -> _Prototype:
     )
     kept = [one for one in order if one != _RESET] if order and _RESET in order else None
     return _Prototype(root.GetPath(), root.GetName(), kept, bodies, len(below))
+
+
+def _write_instances(layer, path, prefix: str, instances: _Instances, prototypes, followed, rows: list[int]) -> None:
+    """Write the prims of some instances of the instancer at a path."""
+    own = layer.GetPrimAtPath(path)
+    with Sdf.ChangeBlock():
+        for row in rows:
+            prim = Sdf.PrimSpec(own, f"{prefix}{row}", Sdf.SpecifierDef, "Xform")
+            prototype = prototypes[instances.prototypes[row]]
+            _write_transform(prim, instances, row, followed)
+            _write_prototype(prim, prototype)
+            _write_velocities(prim, prototype, instances, row)
 
 
 def _typed(name: str, value) -> object:

@@ -18,12 +18,13 @@ from warpmag.errors import InputError
 from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
+from warpmag.usd.alike import AlikeBalls
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.coils import PlacedSource, is_source, sources_of
 from warpmag.usd.first_reading import FAILURES, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.guard import readable
-from warpmag.usd.instancers import expand_instancers
+from warpmag.usd.instancers import complete_instances, expand_instancers
 from warpmag.usd.keyed import KeyReader, make_kinematic
 from warpmag.usd.materials import material_findings
 from warpmag.usd.paths import full_path, usable_path
@@ -102,6 +103,17 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     Raises:
         InputError: The file is missing, is not USD or does not compose.
     """
+    stage, apart = open_apart(path, time_code)
+    complete_instances(apart)
+    return stage
+
+
+def open_apart(path: str | os.PathLike, time_code: float | None = None) -> tuple[Usd.Stage, list[AlikeBalls]]:
+    """Open a stage as :func:`open_stage` does, but for instances that are like others.
+
+    Returns:
+        The stage, and the instances that :func:`complete_instances` makes prims of.
+    """
     file = usable_path(path)
     if not os.path.isfile(file):
         raise InputError(f"{path}: no such file")
@@ -110,10 +122,10 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
     stage = _open(file, path)
     with readable(str(path)):
         time_code = start_of(stage) if time_code is None else time_code
-        expand_instancers(stage, time_code)
+        apart = expand_instancers(stage, time_code, apart=True)
         convert_units(stage)
         hold(stage, time_code)
-    return stage
+    return stage, apart
 
 
 def open_motion(path: str | os.PathLike) -> Usd.Stage:
