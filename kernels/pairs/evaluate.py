@@ -106,9 +106,8 @@ class PairEvaluation:
     def _plan_sums(self, quantity, segments, targets, among, smoothing):
         """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
         device, finished, count = targets.device, self._finished, self.count
-        if self.form == GIVEN:
-            given = self._given_sums
-            assert given, "sums that the caller has"
+        given = self._given_sums
+        if given is not None:
             self._launch_sums = lambda a: given(a.effective, a.target, a.partial)
             return 1, ()
         if self.form == REFERENCE:
