@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import sys
+import time
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
@@ -36,8 +37,8 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, default=Path("fuzz_out"), help="folder (default: %(default)s)")
     options = parser.parse_args()
 
-    from .campaign import Campaign, warm_up  # noqa: PLC0415 - imports USD, which reads the environment
-    from .sources import author  # noqa: PLC0415
+    from .campaign import Campaign, in_fresh_process, in_process, warm_up  # noqa: PLC0415 - imports USD, which reads the environment
+    from .sources import author, author_others  # noqa: PLC0415
 
     folder = options.output.absolute()
     sources = author(folder / "sources")
@@ -50,8 +51,11 @@ def main() -> int:
         fresh=options.fresh,
         keep=options.only is not None,
     )
+    began = time.monotonic()
+    warm_up([*sources, *author_others(folder / "others")], in_fresh_process)
+    print(f"kernels ready after {time.monotonic() - began:.0f} s", flush=True)
     if not options.fresh:
-        warm_up(sources)
+        warm_up(sources, in_process)
     numbers = [options.only] if options.only is not None else range(options.first, options.first + options.count)
     table, slowest = Counter(), 0.0
     with open(folder / "verdicts.jsonl", "a", encoding="utf-8") as file:

@@ -82,15 +82,16 @@ def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Pat
     return path, form, f"{source.stem}: {done}"
 
 
-def warm_up(sources: list[Path]) -> None:
-    """Import Newton and load the kernels that small scenes need."""
+def warm_up(stages: list[Path], command: Callable) -> None:
+    """Run sound stages: in a fresh process to have their kernels compiled, in this one to have them loaded.
+
+    A fresh one has no limits. Else all workers would compile the same kernels at first, and be killed for it.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        for source in sources:
-            code, _, said = in_process(
-                "run", str(source), "--frames", "1", "--device", "cpu", "-o", f"{folder}/out.usda"
-            )
+        for stage in stages:
+            code, _, said = command("run", str(stage), "--frames", "1", "--device", "cpu", "-o", f"{folder}/out.usda")
             if code != OK:
-                raise RuntimeError(f"{source}: {said}")
+                raise RuntimeError(f"{stage}: {said}")
 
 
 def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Callable, device: str = "cpu") -> Verdict:

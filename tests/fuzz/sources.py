@@ -3,6 +3,8 @@
 import shutil
 from pathlib import Path
 
+from pxr import Sdf
+
 from warpmag.scenes_usd import balls_up, crystal_balls, falling_magnet, sakura_tree
 
 STRANGE = [Path(__file__).with_name(name) for name in ("workshop.usda", "laboratory.usda", "studio.usda")]
@@ -22,3 +24,18 @@ def author(folder: Path) -> list[Path]:
         paths.append(folder / f"{scene.__name__.rpartition('.')[2]}.usda")
         scene.author(paths[-1], **options)
     return [*paths, *(Path(shutil.copyfile(stage, folder / stage.name)) for stage in STRANGE)]
+
+
+def author_others(folder: Path) -> list[Path]:
+    """Write sound stages that need kernels which only mutants need else; return their files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / name for name in ("multipole.usda", "box.usda")]
+    for path in paths:
+        balls_up.author(path, columns=2, rows=1, layers=1)
+        layer = Sdf.Layer.FindOrOpen(str(path))
+        if path.stem == "box":
+            layer.GetPrimAtPath("/World/Balls/Ball_0000").typeName = "Cube"
+        else:
+            layer.GetAttributeAtPath("/World/PhysicsScene.warpmag:contactModel").default = "multipole"
+        layer.Save()
+    return paths

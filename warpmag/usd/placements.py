@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from warpmag.usd.transforms import is_animated
 
@@ -42,16 +42,24 @@ class Placements:
         moving, count = set(self.paths), len(self.paths)
         self.scales, self.free = np.ones((count, 3)), np.zeros(count, dtype=bool)
         below: dict[int, np.ndarray] = {}
+        known: dict[Sdf.Path, tuple[np.ndarray | None, float, bool]] = {}  # thousands of bodies may have one parent
         for index, path in enumerate(self.paths):
             prim = stage.GetPrimAtPath(path)
             world = np.array(self._transforms.GetLocalToWorldTransform(prim))
             self.scales[index] = np.diag(world[:3, :3] @ rigid(world)[:3, :3].T)
-            parent = self._parent(prim, moving)
+            above = prim.GetPath().GetParentPath()
+            if above not in known:
+                parent = self._parent(prim, moving)
+                known[above] = (
+                    (parent, 1.0, True)
+                    if parent is None
+                    else (parent, _scale(parent), np.array_equal(parent, np.eye(4)))
+                )
+            parent, scale, same = known[above]
             self.free[index] = parent is None
-            if parent is not None:
-                self.scales[index] /= _scale(parent)
-                if not np.array_equal(parent, np.eye(4)):
-                    below[index] = parent
+            self.scales[index] /= scale
+            if not same:
+                below[index] = parent
         self._below = np.array(list(below), dtype=int)
         parents = list(below.values())
         self._into = np.reshape([np.linalg.inv(parent) for parent in parents], (-1, 4, 4))

@@ -97,6 +97,7 @@ class SampleFile:
         self._file, self._places = file, places
         self._offsets = (np.cumsum(sizes) - sizes).astype(np.uint64)
         self._frame_size = int(np.sum(sizes))
+        self._told = -1  # number of samples that all rows say they have; -1 where a run before may have closed the file
 
     @classmethod
     def begin(cls, path: str | os.PathLike, sizes: np.ndarray, frames: int | None) -> "SampleFile":
@@ -180,8 +181,9 @@ class SampleFile:
     def close(self) -> None:
         """Close the file, complete: readers of other makes compare the number of samples with that of the times."""
         try:
-            for attribute in range(len(self._offsets)):
-                self._write(self._row(attribute) + 16, struct.pack("<Q", self.count))
+            if self.count != self._told:
+                for attribute in range(len(self._offsets)):
+                    self._write(self._row(attribute) + 16, struct.pack("<Q", self.count))
         finally:
             self._file.close()
 
@@ -198,6 +200,7 @@ class SampleFile:
         for attribute, sampled in enumerate(old.sampled):
             times = self._types_and(old.times if sampled else empty, 0)
             self._write(self._row(attribute), times + struct.pack("<qQ", 8, capacity))
+        self._told = capacity
         self._fill_rows(0, min(-(-old.count // _AHEAD) * _AHEAD, capacity))
         end = self._row(len(self._offsets))
         self._write(end, structure.moved_to(end))
@@ -277,8 +280,9 @@ def _find_marks(layer: bytes, attributes: int) -> _Places:
     """Find the records of the time samples in a layer."""
     jumps, types = np.full(attributes, -1), np.zeros(1 + attributes, dtype=np.uint64)
     end_code = -1
-    for found in re.finditer(b"(?=(....)" + re.escape(struct.pack("<I", _MARK)) + b")", layer, re.DOTALL):
-        (number,), at = struct.unpack("<I", found.group(1)), found.start()
+    for found in re.finditer(re.escape(struct.pack("<I", _MARK)), layer):
+        at = found.start() - 4
+        (number,) = struct.unpack_from("<I", layer, at)
         if number == 0xFFFFFFFF:
             end_code = at
         elif number < attributes and struct.unpack_from("<qQ", layer, at - 16) == (24, 1):

@@ -376,9 +376,10 @@ class CacheWriter:
                 for path, value in zip(prims, kind.array.FromNumpy(np.ascontiguousarray(first)), strict=True):
                     place = _author_default(cache, path, kind.name, kind.usd_type, value)
                     cache.SetTimeSample(place, time_mark(next(number)), value)
-            for path, scale, free in zip(bodies.paths, bodies.scales, bodies.free, strict=True):
+            scaled = ~np.isclose(bodies.scales, 1.0, rtol=0.0, atol=1e-6).all(axis=1)
+            for path, scale, free, has_scale in zip(bodies.paths, bodies.scales, bodies.free, scaled, strict=True):
                 order = ["!resetXformStack!"] * bool(free) + [TRANSLATE, ORIENT]
-                if not np.allclose(scale, 1.0, rtol=0.0, atol=1e-6):
+                if has_scale:
                     _author_default(cache, path, SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
                     order.append(SCALE)
                 kind, value = _TYPES.TokenArray, Vt.TokenArray(order)
