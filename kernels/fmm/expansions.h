@@ -127,10 +127,11 @@ template <class Arrays> CUDA_CALLABLE inline void leaf_multipole(const Arrays& a
     Real* const multipole = a.multipoles.data + PITCH * (size_t)leaf;
 #if defined(__CUDA_ARCH__)
     constexpr int EACH = (BELOW + THREADS - 1) / THREADS;
-    __shared__ Real harmonics[BELOW][33], moments[3][32], sums[3 * BELOW];
-    const int lane = threadIdx.x % 32;
+    constexpr int BATCH = sizeof(Real) == 8 ? 16 : 32; // moments at a time: 48 KiB hold their harmonics
+    __shared__ Real harmonics[BELOW][BATCH + 1], moments[3][BATCH], sums[3 * BELOW];
+    const int lane = threadIdx.x % BATCH;
     Real own[EACH][3] = {};
-    for (int first = begin; first < end; first += 32) {
+    for (int first = begin; first < end; first += BATCH) {
         const int i = first + lane < end ? first + lane : end - 1;
         __syncthreads();
         visit_harmonics(a.growth.data, a.decay.data, inside.vector(0, i), threadIdx.x / 32, THREADS / 32,
@@ -145,7 +146,7 @@ template <class Arrays> CUDA_CALLABLE inline void leaf_multipole(const Arrays& a
         for (int e = 0; e < EACH; ++e) {
             const int j = threadIdx.x + e * THREADS;
             if (j >= BELOW) break;
-            for (int k = 0; k < 32; ++k)
+            for (int k = 0; k < BATCH; ++k)
                 for (int c = 0; c < 3; ++c) own[e][c] += moments[c][k] * harmonics[j][k];
         }
     }

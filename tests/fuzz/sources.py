@@ -31,7 +31,7 @@ def author_others(folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("multipole.usda", "box.usda")]
     for path in paths:
-        balls_up.author(path, columns=2, rows=1, layers=1)
+        balls_up.author(path, columns=2, rows=1, layers=1, conductivity=0.0)  # which only balls have
         layer = Sdf.Layer.FindOrOpen(str(path))
         if path.stem == "box":
             layer.GetPrimAtPath("/World/Balls/Ball_0000").typeName = "Cube"
