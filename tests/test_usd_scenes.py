@@ -33,7 +33,7 @@ def test_balls_up_is_the_scene_of_the_paper():
     assert len(report.magnets("inducible")) == 243
     assert report.magnets("permanent") == report.contents.kinematic == ["/World/Magnet"]
     assert report.contents.magnets["/World/Magnet"].magnetization == (0.0, 0.0, 1e6)
-    assert all(report.contents.magnets[path] == Magnet() for path in report.magnets("inducible"))
+    assert all(report.contents.magnets[path] == Magnet(conductivity=1e7) for path in report.magnets("inducible"))
     assert report.contents.settings == MagneticSettings()
     assert (report.clock.step, report.clock.frames_per_second, report.clock.start) == (1e-3, 60.0, 0.0)
 
