@@ -122,11 +122,12 @@ def extruded(curves: list[np.ndarray], depth: float, bevel: float) -> tuple[np.n
         Points, shape [n, 3], z across the letter and zero in its middle; and the faces as indices, counterclockwise
         seen from outside.
     """
-    rims, inner = np.concatenate(curves), np.concatenate([_inset(curve, bevel) for curve in curves])
+    insets = [_inset(curve, bevel) for curve in curves]
+    rims, inner = np.concatenate(curves), np.concatenate(insets)
     count = len(rims)
     rings = [(inner, 0.5 * depth), (rims, 0.5 * depth - bevel), (rims, bevel - 0.5 * depth), (inner, -0.5 * depth)]
     points = np.concatenate([np.c_[ring, np.full(count, z)] for ring, z in rings])
-    caps = triangles(curves)
+    caps = triangles(insets)  # the outline's triangles would fold at the ends of curved strokes
     following = np.concatenate(
         [start + np.roll(np.arange(len(curve)), -1) for start, curve in zip(_starts(curves), curves, strict=True)]
     )

@@ -63,7 +63,10 @@ def test_extruded_letters_are_closed_and_have_their_volume(letter):
     assert np.ptp(points[:, 2]) == pytest.approx(depth)
     normals = corner_normals(points, faces)
     flat = [np.cross(points[face[1]] - points[face[0]], points[face[2]] - points[face[0]]) for face in faces]
-    flat = np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), [len(face) for face in faces], axis=0)
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    outwards = flat[:, 2] * points[[face[0] for face in faces], 2]
+    assert (outwards[np.abs(flat[:, 2]) > 0.99] > 0.0).all()  # no triangle of a cap is folded over another
+    flat = np.repeat(flat, [len(face) for face in faces], axis=0)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
     # within the crease, 35°, and 10° more where the bevel of a sharp corner is twisted
     assert (np.einsum("ni,ni->n", normals, flat) > 0.7).all()

@@ -222,6 +222,13 @@ REFUSED = {
         "quath[] orientations = [(0, 0, 0, 0)]",
         "quaternion of zeros",
     ),
+    "an infinite quaternion": (
+        ["Ball"],
+        [0],
+        [(0, 0, 0)],
+        "quath[] orientations = [(inf, 0, 0, 0)]",
+        "what is no number",
+    ),
     "a prototype that is not there": (["Gone"], [0], [(0, 0, 0)], "", "/World/Many/Kinds/Gone, which is not there"),
     "a place that is no number": (["Ball"], [0], [(0, 0, "nan")], "", "transform is not finite"),
     "too many": (["Ball"], [0] * 260_000, "[(0, 0, 0)" + ", (0, 0, 0)" * 259_999 + "]", "", "more than 500000 prims"),

@@ -179,7 +179,9 @@ def time_samples(layer, prims, chance) -> str:
 
 def metadata(layer, prims, chance) -> str:
     """Change units and times."""
-    key, value = chance.choice(METADATA), chance.choice((*NUMBERS, 1.0, 0.01))
+    key = chance.choice(METADATA)
+    sound = 0.01 if key.endswith("Unit") else 10.0  # a frame of 100 s would run for hours, and rightly
+    value = chance.choice((*NUMBERS, 1.0, sound))
     layer.pseudoRoot.SetInfo(key, value)
     return f"{key} = {value}"
 

@@ -258,7 +258,7 @@ class _Instances:
         if len(found) not in (0, self._count):
             raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
         lengths = np.linalg.norm(found, axis=1)
-        if not (lengths > 0.0).all():
+        if not ((lengths > 0.0) & (lengths < np.inf)).all():
             raise InputError(f"{self._path}: {name} has a quaternion of zeros or what is no number")
         return found / lengths[:, None]
 
