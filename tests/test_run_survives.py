@@ -201,7 +201,7 @@ def test_a_full_disk_ends_a_run_in_one_line(scene, tmp_path, device, always, mon
     """And where there is room again, it goes on."""
     command = ["run", str(scene), "--frames", "9", "--device", device, "--resume", "-o"]
     assert cli.main([*command, str(tmp_path / "whole" / "out.usda")]) == 0
-    output, write, room = tmp_path / "parts" / "out.usda", os.pwrite, 20000
+    output, write, room = tmp_path / "parts" / "out.usda", os.pwrite, 28000
 
     def limited(file, data, place):
         nonlocal room

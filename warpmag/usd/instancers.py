@@ -1,7 +1,7 @@
 """Point instancers of bodies: Newton imports nothing from them, so each instance becomes prims of its own.
 
 They lie in a layer of the session, below the instancer, which is an Xform there: ``/Balls/instance12/Ball`` with a
-reference to the prototype. A run copies that layer into its cache, in which the instances then move one by one.
+reference to the prototype. A run writes that layer below its cache, in which the instances then move one by one.
 Instances with an inactive id are left out, invisible ones are not. What instancers of colliders, bodies or magnets need
 not be made of stays as it is.
 """

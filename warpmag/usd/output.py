@@ -1,8 +1,9 @@
 """The files of a run on disk: how they come into place, the lock on them, and the checkpoint beside them.
 
-For ``out.usda`` they are ``out.usda`` and ``out.cache.usdc``; ``out.scene.usdc`` or the folder ``out.scene`` where the
-scene is copied; while the run is not complete ``out.resume.npz``; and while it runs ``.out.lock`` and a folder
-``.out.tmp*``. What is written there first is moved into place when it is whole.
+For ``out.usda`` they are ``out.usda`` and ``out.cache.usdc``; ``out.instances.usdc`` where the scene has instancers of
+bodies; ``out.scene.usdc`` or the folder ``out.scene`` where the scene is copied; while the run is not complete
+``out.resume.npz``; and while it runs ``.out.lock`` and a folder ``.out.tmp*``. What is written there first is moved
+into place when it is whole.
 """
 
 import contextlib
@@ -37,6 +38,7 @@ class Output:
     Attributes:
         root: The thin root layer.
         cache: The layer with the motion.
+        instances: The layer with the prims of instances.
         checkpoint: What :meth:`save_checkpoint` writes.
     """
 
@@ -55,11 +57,15 @@ class Output:
         if self.root.suffix not in _SUFFIXES:
             raise InputError(f"{self.root}: the output must end in {', '.join(_SUFFIXES)}")
         self.cache = self.beside(".cache.usdc")
+        self.instances = self.beside(".instances.usdc")
         self.checkpoint = self.beside(".resume.npz")
         self._lock = -1
         self._folder: Path | None = None
         with self.errors(self.root):
-            self._check(scene, [self.root, self.cache] + copy_scene * [self.beside(f".scene{end}") for end in _SCENES])
+            self._check(
+                scene,
+                [self.root, self.cache, self.instances] + copy_scene * [self.beside(f".scene{end}") for end in _SCENES],
+            )
 
     def beside(self, ending: str) -> Path:
         """Return the file of the same stem with another ending."""

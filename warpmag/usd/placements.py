@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Usd, UsdGeom
 
 from warpmag.usd.transforms import is_animated
 
@@ -39,15 +39,15 @@ class Placements:
         """Look at the prims ``paths`` and what is above them, which get lengths in a ``unit`` [m]."""
         self.paths, self._unit = list(paths), unit
         self._transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
-        moving, count = set(self.paths), len(self.paths)
-        self.scales, self.free = np.ones((count, 3)), np.zeros(count, dtype=bool)
+        prims, moving = [stage.GetPrimAtPath(path) for path in self.paths], set(self.paths)
+        self.scales = _scales(
+            np.reshape([self._transforms.GetLocalToWorldTransform(prim) for prim in prims], (-1, 4, 4))
+        )
+        self.free = np.zeros(len(prims), dtype=bool)
         below: dict[int, np.ndarray] = {}
-        known: dict[Sdf.Path, tuple[np.ndarray | None, float, bool]] = {}  # thousands of bodies may have one parent
-        for index, path in enumerate(self.paths):
-            prim = stage.GetPrimAtPath(path)
-            world = np.array(self._transforms.GetLocalToWorldTransform(prim))
-            self.scales[index] = np.diag(world[:3, :3] @ rigid(world)[:3, :3].T)
-            above = prim.GetPath().GetParentPath()
+        known: dict[str, tuple[np.ndarray | None, float, bool]] = {}  # thousands of bodies may have one parent
+        for index, (path, prim) in enumerate(zip(self.paths, prims, strict=True)):
+            above = path.rpartition("/")[0]
             if above not in known:
                 parent = self._parent(prim, moving)
                 known[above] = (
@@ -110,6 +110,12 @@ class Placements:
 def _scale(matrix) -> float:
     """Return the mean scale of a transform, the cube root of its determinant."""
     return float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+
+
+def _scales(matrices: np.ndarray) -> np.ndarray:
+    """Return the scales of transforms without what :func:`rigid` leaves of them, shape [n, 3]."""
+    turns, values, _ = np.linalg.svd(matrices[:, :3, :3])
+    return np.sign(np.linalg.det(matrices[:, :3, :3]))[:, None] * np.einsum("nij,nj->ni", turns**2, values)
 
 
 def rigid(matrix) -> np.ndarray:

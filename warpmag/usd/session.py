@@ -50,7 +50,10 @@ def without_held(stage: Usd.Stage) -> Usd.Stage:
 def as_written(stage: Usd.Stage) -> Usd.Stage:
     """Return the stage in the units of its file, no values held, with its instances as prims."""
     layer = added_layer(stage, INSTANCES)
-    return _opened(stage, [layer.identifier] if layer else [])
+    added = [layer.identifier] if layer else []
+    session = stage.GetSessionLayer()
+    as_it_is = list(session.subLayerPaths) == added and not session.rootPrims
+    return stage if as_it_is else _opened(stage, added)
 
 
 def file_of(stage: Usd.Stage) -> Usd.Stage:

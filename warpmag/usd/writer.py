@@ -1,31 +1,31 @@
 """Writes a run as a cache layer over an untouched scene, frame by frame.
 
-``out.usda`` is a thin root whose sublayers are ``./out.cache.usdc``, which holds the motion, and the scene. The root
-repeats the metadata of the scene, since that does not compose, and has no prims: an opinion there would hide the
-samples of the cache. ``samples.py`` lets the cache grow, ``output.py`` has the files.
+``out.usda`` is a thin root whose sublayers are ``./out.cache.usdc``, which holds the motion, and the scene; between
+them stand the prims that were made of instances, if there are any. The root repeats the metadata of the scene, since
+that does not compose, and has no prims: an opinion there would hide the samples of the cache. ``crate.py`` writes the
+cache, ``samples.py`` lets it grow, ``output.py`` has the files.
 """
 
 import contextlib
-import ctypes
 import hashlib
-import itertools
 import os
 import time as clock_time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
+from warpmag.usd import crate
 from warpmag.usd.clock import stage_clock
 from warpmag.usd.output import Output
 from warpmag.usd.paths import path_between
 from warpmag.usd.placements import Placements
 from warpmag.usd.reader import copied_metadata
-from warpmag.usd.samples import END_MARK, SampleFile, time_mark
+from warpmag.usd.samples import SampleFile
 from warpmag.usd.scene_copy import copy_scene
 from warpmag.usd.schemas import MOMENT
 from warpmag.usd.session import INSTANCES, added_layer, as_written
@@ -33,7 +33,6 @@ from warpmag.usd.units import units_of
 
 TRANSLATE, ORIENT, SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
 """What moves a body, in this order."""
-_TYPES = Sdf.ValueTypeNames
 _CHECKPOINT_SECONDS = 1.0
 _CHECKPOINT_SHARE = 0.01
 """Checkpoints come so often, and take at most this part of the time."""
@@ -44,19 +43,19 @@ class _Kind:
     """An attribute that is written for every body or every magnet."""
 
     name: str
-    usd_type: object
-    array: Callable
+    type_name: str
+    kind: int
     dtype: type
     size: int
 
 
 _BODY = (
-    _Kind(TRANSLATE, _TYPES.Double3, Vt.Vec3dArray, np.float64, 3),
-    _Kind(ORIENT, _TYPES.Quatf, Vt.QuatfArray, np.float32, 4),
-    _Kind("physics:velocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
-    _Kind("physics:angularVelocity", _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3),
+    _Kind(TRANSLATE, "double3", crate.VEC3D, np.float64, 3),
+    _Kind(ORIENT, "quatf", crate.QUATF, np.float32, 4),
+    _Kind("physics:velocity", "vector3f", crate.VEC3F, np.float32, 3),
+    _Kind("physics:angularVelocity", "vector3f", crate.VEC3F, np.float32, 3),
 )
-_KINDS = (*_BODY, _Kind(MOMENT, _TYPES.Vector3f, Vt.Vec3fArray, np.float32, 3))
+_KINDS = (*_BODY, _Kind(MOMENT, "vector3f", crate.VEC3F, np.float32, 3))
 """In the order of a frame, see :class:`warpmag.usd.placements.Placed`."""
 
 
@@ -119,7 +118,7 @@ class CacheWriter:
         self._first: list[np.ndarray] = []
         self._last_turns: np.ndarray | None = None
         self._last_time = -np.inf
-        self._below = ""
+        self._below: list[str] = []
         self._save_time = 0.0
 
     def __enter__(self) -> "CacheWriter":
@@ -263,7 +262,7 @@ class CacheWriter:
                 output.checkpoint.unlink(missing_ok=True)
         finally:
             output.close()
-        for path in (output.beside(".scene.usdc"), output.cache, output.root):
+        for path in (output.beside(".scene.usdc"), output.instances, output.cache, output.root):
             if known := Sdf.Layer.Find(str(path)):  # an earlier run's result that this process has open
                 known.Reload(force=True)
 
@@ -274,16 +273,15 @@ class CacheWriter:
         output = self._output
         output.lock()
         with output.errors(output.cache):
-            output.write(self._cache_layer(values), output.cache)
-            samples = SampleFile.begin(output.temporary(output.cache), self._value_sizes(), self._frames)
+            layer, path = self._cache_layer().encode(), output.temporary(output.cache)
+            samples = SampleFile.begin(path, layer, self._value_sizes(), self._frames)
         try:
-            _give_back_memory()
             self._first = values
             self._append(samples, time, values)
-            copied = self._write_scene_and_root()
+            written = self._write_scene_and_root()
             with output.errors(output.root):
                 output.checkpoint.unlink(missing_ok=True)
-                for target in (*copied, output.cache, output.root):
+                for target in (*written, output.cache, output.root):
                     output.place(target)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -292,28 +290,33 @@ class CacheWriter:
         return samples
 
     def _append(self, samples: SampleFile, time: float, values: list[np.ndarray]) -> None:
-        changed, begin = [], 0
-        for own, first in zip(values, self._first, strict=True):
-            rows = np.flatnonzero(~samples.sampled[begin : begin + len(own)])
-            changed += (begin + rows[(own[rows] != first[rows]).any(axis=1)]).tolist()
-            begin += len(own)
-        data = np.concatenate([np.ascontiguousarray(one).view(np.uint8).ravel() for one in values])
+        changed = np.zeros(0, dtype=int)
+        if not samples.sampled.all():
+            moved = [(own != first).any(axis=1) for own, first in zip(values, self._first, strict=True)]
+            changed = np.flatnonzero(np.concatenate(moved) & ~samples.sampled)
+        data = b"".join(one.tobytes() for one in values)
         with self._output.errors(self._output.cache):
             samples.append(self._code(time), data, changed)
 
     def _write_scene_and_root(self) -> list[Path]:
-        """Write copies of the scene and the root, without placing them; return what to place before the root."""
-        output, copied = self._output, []
+        """Write what the root names, without placing it, and the root; return what to place before that."""
+        output, written = self._output, []
+        self._below = []
+        if instances := added_layer(self._stage, INSTANCES):
+            written.append(output.instances)
+            with output.errors(output.instances):
+                output.write(instances, output.instances)
+            self._below.append(f"./{output.instances.name}")
         if self._copy_scene:
             with output.errors(output.beside(".scene")):
                 target, scene = copy_scene(self._stage, output)
-            copied.append(target)
-            self._below = f"./{scene.relative_to(output.root.parent)}"
+            written.append(target)
+            self._below.append(f"./{scene.relative_to(output.root.parent)}")
         else:
-            self._below = path_between(output.root, Path(self._stage.GetRootLayer().realPath))
+            self._below.append(path_between(output.root, Path(self._stage.GetRootLayer().realPath)))
         with output.errors(output.root):
             output.write(self._root_layer(), output.root)
-        return copied
+        return written
 
     def _place_root(self) -> None:
         with self._output.errors(self._output.root):
@@ -338,15 +341,17 @@ class CacheWriter:
             place += values.nbytes
         return found
 
-    def _set_metadata(self, layer, end: float) -> None:
-        """Repeat on ``layer`` what says how the numbers of the scene are meant."""
-        layer.pseudoRoot.SetInfo("metersPerUnit", self._units.metres)
-        layer.pseudoRoot.SetInfo("kilogramsPerUnit", self._units.kilograms)
-        layer.pseudoRoot.SetInfo("upAxis", UsdGeom.GetStageUpAxis(self._stage))
-        layer.timeCodesPerSecond = self._clock.time_codes_per_second  # equal in all layers: USD rescales otherwise
-        layer.framesPerSecond = self._clock.frames_per_second
-        layer.startTimeCode = self._clock.start
-        layer.endTimeCode = end
+    def _metadata(self, end: float) -> dict[str, float | str]:
+        """Return what says how the numbers of the scene are meant; the cache and the root repeat it."""
+        return {
+            "metersPerUnit": self._units.metres,
+            "kilogramsPerUnit": self._units.kilograms,
+            "upAxis": str(UsdGeom.GetStageUpAxis(self._stage)),
+            "timeCodesPerSecond": self._clock.time_codes_per_second,  # equal in all layers: USD rescales otherwise
+            "framesPerSecond": self._clock.frames_per_second,
+            "startTimeCode": self._clock.start,
+            "endTimeCode": end,
+        }
 
     def _root_layer(self) -> Sdf.Layer:
         scene = self._stage.GetRootLayer()
@@ -355,60 +360,43 @@ class CacheWriter:
             root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
         # Players stop at whole frames: the last one, which stands at the step nearest to it, is not to be cut off.
         whole = round(self._last_time * self._clock.frames_per_second) / self._clock.frames_per_second
-        self._set_metadata(root, self._code(max(whole, self._last_time)))
-        root.subLayerPaths[:] = [f"./{self._output.cache.name}", self._below]
+        for key, value in self._metadata(self._code(max(whole, self._last_time))).items():
+            root.pseudoRoot.SetInfo(key, value)
+        root.subLayerPaths[:] = [f"./{self._output.cache.name}", *self._below]
         return root
 
-    def _cache_layer(self, values: list[np.ndarray]) -> Sdf.Layer:
-        """Return the layer with the first frame, with room for samples."""
-        cache = Sdf.Layer.CreateAnonymous()
-        if instances := added_layer(self._stage, INSTANCES):
-            cache.TransferContent(instances)
-        self._set_metadata(cache, END_MARK)
-        cache.customLayerData = {"warpmag": self._about}
-        bodies, paths = self._bodies, [*[self._bodies.paths] * len(_BODY), self._magnet_paths]
-        scene = as_written(self._stage)
-        with Sdf.ChangeBlock():
-            for path in (*bodies.paths, *self._magnet_paths):
-                _over(cache, scene, path)
-            number = itertools.count()
-            for kind, prims, first in zip(_KINDS, paths, values, strict=True):
-                for path, value in zip(prims, kind.array.FromNumpy(np.ascontiguousarray(first)), strict=True):
-                    place = _author_default(cache, path, kind.name, kind.usd_type, value)
-                    cache.SetTimeSample(place, time_mark(next(number)), value)
-            scaled = ~np.isclose(bodies.scales, 1.0, rtol=0.0, atol=1e-6).all(axis=1)
-            for path, scale, free, has_scale in zip(bodies.paths, bodies.scales, bodies.free, scaled, strict=True):
-                order = ["!resetXformStack!"] * bool(free) + [TRANSLATE, ORIENT]
-                if has_scale:
-                    _author_default(cache, path, SCALE, _TYPES.Double3, Gf.Vec3d(*scale.tolist()))
-                    order.append(SCALE)
-                kind, value = _TYPES.TokenArray, Vt.TokenArray(order)
-                _author_default(cache, path, "xformOpOrder", kind, value, Sdf.VariabilityUniform)
+    def _cache_layer(self) -> crate.Overs:
+        """Return the layer with the motion, without its frames."""
+        cache, bodies = crate.Overs(self._value_sizes()), self._bodies
+        for name, value in self._metadata(self._clock.start).items():
+            cache.set_metadata(name, value)
+        cache.set_metadata("customLayerData", {"warpmag": self._about})
+        for kind, paths in zip(_KINDS, [*[bodies.paths] * len(_BODY), self._magnet_paths], strict=True):
+            cache.add_sampled(paths, kind.name, kind.type_name, kind.kind)
+        scaled = ~np.isclose(bodies.scales, 1.0, rtol=0.0, atol=1e-6).all(axis=1)
+        orders: dict[tuple[str, ...], list[str]] = {}
+        for path, scale, free, has_scale in zip(bodies.paths, bodies.scales, bodies.free, scaled, strict=True):
+            if has_scale:
+                cache.add_vector(path, SCALE, scale)
+            order = (*["!resetXformStack!"] * bool(free), TRANSLATE, ORIENT, *[SCALE] * bool(has_scale))
+            orders.setdefault(order, []).append(path)
+        for order, paths in orders.items():
+            cache.add_tokens(paths, "xformOpOrder", order)
+        for path in _instances(as_written(self._stage), (*bodies.paths, *self._magnet_paths)):
+            cache.make_editable(path)
         return cache
 
 
-def _give_back_memory() -> None:
-    """Give the system back what USD took to write a layer and has freed: 32 MB for 2,500 bodies, for all of the run."""
-    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # of the GNU library
-        trim(0)
-
-
-def _over(layer, stage, path) -> None:
-    """Make room for opinions on ``path``, which inside an instance have no effect until that is made editable."""
-    Sdf.CreatePrimInLayer(layer, path)
-    prim = stage.GetPrimAtPath(path)
-    while prim.IsInstanceProxy():
-        prim = prim.GetParent()
-        if prim.IsInstance():
-            Sdf.CreatePrimInLayer(layer, prim.GetPath()).instanceable = False
-
-
-def _author_default(layer, path, name, kind, value, variability=Sdf.VariabilityVarying) -> Sdf.Path:
-    place = Sdf.Path(f"{path}.{name}")
-    if not layer.GetAttributeAtPath(place):  # an instance may have it
-        Sdf.JustCreatePrimAttributeInLayer(layer, place, kind, variability, False)
-    layer.GetAttributeAtPath(place).default = value
-    return place
+def _instances(stage: Usd.Stage, paths: Iterable[str]) -> list[str]:
+    """Return the instances that prims are in: opinions there have no effect until these are made editable."""
+    found = []
+    for path in {path.rpartition("/")[0] or "/" for path in paths}:
+        prim = stage.GetPrimAtPath(path)
+        while prim.IsInstance() or prim.IsInstanceProxy():
+            if prim.IsInstance():
+                found.append(str(prim.GetPath()))
+            prim = prim.GetParent()
+    return found
 
 
 def _digest(stage: Usd.Stage) -> str:
