@@ -419,8 +419,12 @@ class Magnetics:
         Where shapes of one body overlap, the common volume belongs to the first of them.
         """
         self.check_model()
+        return self.sum_moments().numpy()
+
+    def sum_moments(self) -> wp.array:
+        """Return what :meth:`shape_moments` does, on the device, in an array that the next call overwrites."""
         sum_moments(self._part_start, self.system.moments, self._totals)
-        return self._totals.numpy()
+        return self._totals
 
     def moments_at(self, state: newton.State) -> np.ndarray:
         """Return what :meth:`shape_moments` is once :meth:`induce` has been called; nothing goes on differently for it.

@@ -4,39 +4,63 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
+import warp as wp
 
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.scene import ImportedScene
-from warpmag.usd import CacheWriter, Earlier
+from warpmag.engine.statistics import Statistics
+from warpmag.engine.stepper import Stepper
+from warpmag.errors import InputError
+from warpmag.usd import CacheWriter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_STATISTICS = "stat."
 
 
 class Recorder:
     """Takes the frames of a simulation.
 
-    Frames are written as they come, on a GPU during the steps that follow. What interrupts a run waits until the frame
-    that is being written is whole.
+    Frames are written as they come, on a GPU during the steps that follow, and the host does not wait for them. What
+    interrupts a run waits until the frame that is being written is whole.
     """
 
     def __init__(
         self,
         scene: ImportedScene,
         magnetics: Magnetics,
+        stepper: Stepper,
+        statistics: Statistics,
         output: str | os.PathLike,
         *,
         copy_scene: bool,
         frames: int,
         options: dict[str, str],
+        resumable: bool,
     ):
-        """Prepare to write; see :class:`warpmag.usd.CacheWriter`."""
+        """Prepare to write; see :class:`warpmag.usd.CacheWriter`.
+
+        Args:
+            scene: The scene.
+            magnetics: Its magnets.
+            stepper: What moves it.
+            statistics: Figures of the run so far.
+            output: File of the root layer.
+            copy_scene: Copy the scene beside it.
+            frames: Frames that are expected.
+            options: What a run that goes on from this one must have in common with it.
+            resumable: Whether one can.
+        """
         shapes = list(scene.magnet_shapes.values())
         row = {shape: index for index, shape in enumerate(magnetics.shapes.tolist())}
-        self._magnetics = magnetics
-        self._taken: tuple | None = None
+        self._magnetics, self._stepper, self._statistics = magnetics, stepper, statistics
+        self._output, self._resumable = output, resumable
+        self._taken: float | None = None
+        state = stepper.state
+        self._mirrors = _Mirrors((state.body_q, state.body_qd, magnetics.sum_moments()))
         # keyed bodies have samples of their own
         own = {prim: body for prim, body in scene.bodies.items() if body not in scene.keys.motions}
         self._bodies = np.array(list(own.values()), dtype=int)
@@ -52,39 +76,73 @@ class Recorder:
             options=options,
         )
 
-    def resume(self) -> Earlier | None:
-        """Go on with the run that is at the output; returns what was found."""
-        with _interrupts_held():
-            return self._writer.resume()
+    def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
+        """Go on with the run at the output.
 
-    def add_frame(self, time: float, state, save: Callable[[], dict[str, np.ndarray]] | None) -> None:
+        Args:
+            frames: Frames that are wanted.
+            steps: Steps that are done then.
+            step_size: Time step [s].
+
+        Returns:
+            Whether there was a run, and whether it is complete.
+
+        Raises:
+            InputError: What is there cannot be resumed.
+        """
+        with _interrupts_held():
+            found = self._writer.resume()
+        if found is None or (found.state is None and found.time <= 0.0):
+            return False, False  # nothing there, or no more than the first frame
+        done, output = round(found.time / step_size), Path(self._output)
+        if done > steps:
+            raise InputError(f"frames: {output} has {found.time:g} s already, more than {frames} frames")
+        if found.state is not None:
+            names = [name for name in found.state if name.startswith(_STATISTICS)]
+            self._stepper.load(found.state)
+            self._statistics.load({name.removeprefix(_STATISTICS): found.state[name] for name in names})
+        elif done < steps:
+            raise InputError(f"frames: the run of {output} ended at {found.time:g} s, there is nothing to resume")
+        return True, found.state is None
+
+    def add_frame(self, time: float, state) -> None:
         """Take a frame, and write it; on a GPU :meth:`write` does that, while the next steps run.
 
         Moments are those of the last substep. Before the first step there are none: they are solved for, and forgotten.
 
         Args:
             time: Time since the start [s].
-            state: Newton's state.
-            save: Returns all that the run needs to go on from here; None if it cannot be resumed.
+            state: Newton's state, of which no step is being done.
         """
-        moments = (self._magnetics.shape_moments() if time > 0.0 else self._magnetics.moments_at(state))[self._shapes]
-        totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
-        body_q, body_qd = state.body_q.numpy()[self._bodies], state.body_qd.numpy()[self._bodies]
         self.write()
-        self._taken = (time, body_q, body_qd, totals)
+        if time > 0.0:
+            self._magnetics.sum_moments()
+        else:
+            self._magnetics.moments_at(state)
+        self._mirrors.take()
+        self._taken = time
         if self._writer.save_due:
             self.write()
             with _interrupts_held():
-                self._writer.save(save() if save else None)
+                self._writer.save(self._save() if self._resumable else None)
         elif not self._magnetics.system.device.is_cuda:
             self.write()
+
+    def _save(self) -> dict[str, np.ndarray]:
+        """Return all that a run has to know to go on from the present state."""
+        figures = {f"{_STATISTICS}{name}": one for name, one in self._statistics.save().items()}
+        return self._stepper.save() | figures
 
     def write(self) -> None:
         """Write the frame that has been taken, if it has not been written yet."""
         with _interrupts_held():
-            if taken := self._taken:
-                self._taken = None
-                self._writer.add_frame(*taken)
+            if self._taken is None:
+                return
+            time, self._taken = self._taken, None
+            body_q, body_qd, moments = self._mirrors.read()
+            moments = moments[self._shapes]
+            totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
+            self._writer.add_frame(time, body_q[self._bodies], body_qd[self._bodies], totals)
 
     def close(self, complete: bool) -> None:
         """Close the files; unless the run is complete, it can be resumed."""
@@ -93,6 +151,29 @@ class Recorder:
         finally:
             with _interrupts_held():
                 self._writer.close(complete)
+
+
+class _Mirrors:
+    """Copies of arrays on the host, for which it need not wait."""
+
+    def __init__(self, arrays: Sequence[wp.array]):
+        """Make room for copies of arrays of one device."""
+        self._arrays, device = arrays, arrays[0].device
+        self._copies = [wp.empty_like(array, device="cpu", pinned=device.is_cuda) for array in arrays]
+        self._taken = wp.Event(device) if device.is_cuda else None
+
+    def take(self) -> None:
+        """Copy the arrays as they are once what has been launched so far is done."""
+        for copy, array in zip(self._copies, self._arrays, strict=True):
+            wp.copy(copy, array)
+        if self._taken:
+            self._arrays[0].device.stream.record_event(self._taken)
+
+    def read(self) -> list[np.ndarray]:
+        """Return the copies, which the next :meth:`take` overwrites."""
+        if self._taken:
+            wp.synchronize_event(self._taken)
+        return [copy.numpy() for copy in self._copies]
 
 
 @contextlib.contextmanager

@@ -168,7 +168,7 @@ class Simulation:
         self._statistics = Statistics(magnets=len(self._moving))
         if self._scene:
             self._start_from_stage()
-        self._center = self._positions().mean(axis=0) if len(self._moving) else np.zeros(3)
+        self._center = self._positions(self.state).mean(axis=0) if len(self._moving) else np.zeros(3)
         self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
         self._statistics.coarseness = self._coarseness()
 
@@ -295,8 +295,8 @@ class Simulation:
                 return f"{name.format(strongest)} moves magnets too fast for the shortest substep"
         return ""
 
-    def _positions(self) -> np.ndarray:
-        return self.state.body_q.numpy()[self._moving, :3].astype(float)
+    def _positions(self, state: newton.State) -> np.ndarray:
+        return state.body_q.numpy()[self._moving, :3].astype(float)
 
     def run(
         self,
@@ -331,12 +331,14 @@ class Simulation:
         recorder = None if output is None else self._open_recorder(output, copy_scene, frames)
         if resume and recorder is None:
             raise InputError("resume: only a run with an output can be resumed")
+        if resume and self._stepper.steps:
+            raise ValueError("only a simulation that has not begun can resume another")
         if resume and self._options["solver"] in UNRESUMABLE:
             raise InputError(f"resume: runs of the solver {self._options['solver']} cannot be resumed")
         resumed = complete = False
         try:
             if resume:
-                resumed, complete = self._resume(recorder, output, frames)
+                resumed, complete = recorder.resume(frames, self._steps_at(frames), self.step_size)
             if not complete:
                 complete = self._run_frames(frames, recorder, on_frame, resumed)
         finally:
@@ -358,11 +360,11 @@ class Simulation:
                     self.step()
                     if recorder and self._stepper.steps == ahead:
                         recorder.write()
-                self._follow()
+                state = self.state
+                self._follow(state)
                 figures.wall_seconds = before + time.perf_counter() - began
                 if recorder:
-                    resumable = self._options["solver"] not in UNRESUMABLE
-                    recorder.add_frame(self.time, self.state, self._save if resumable else None)
+                    recorder.add_frame(self.time, state)
                 if on_frame and on_frame(frame) is False:
                     return frame == frames
             return True
@@ -385,40 +387,22 @@ class Simulation:
         return Recorder(
             self._scene,
             self._magnetics,
+            self._stepper,
+            self._statistics,
             output,
             copy_scene=copy_scene,
             frames=frames + 1,
             options=self._options,
+            resumable=self._options["solver"] not in UNRESUMABLE,
         )
-
-    def _resume(self, recorder, output: str | os.PathLike, frames: int) -> tuple[bool, bool]:
-        """Go on with the run at the output; return whether there was one, and whether it is complete."""
-        if self._stepper.steps:
-            raise ValueError("only a simulation that has not begun can resume another")
-        found = recorder.resume()
-        if found is None or (found.state is None and found.time <= 0.0):
-            return False, False  # nothing there, or no more than the first frame
-        done, wanted = round(found.time / self.step_size), self._steps_at(frames)
-        if done > wanted:
-            raise InputError(f"frames: {Path(output)} has {found.time:g} s already, more than {frames} frames")
-        if found.state is not None:
-            self._stepper.load(found.state)
-            self._statistics.load({name[5:]: one for name, one in found.state.items() if name.startswith("stat.")})
-        elif done < wanted:
-            raise InputError(f"frames: the run of {Path(output)} ended at {found.time:g} s, there is nothing to resume")
-        return True, found.state is None
-
-    def _save(self) -> dict[str, np.ndarray]:
-        """Return all that a run has to know to go on from the present state."""
-        return self._stepper.save() | {f"stat.{name}": one for name, one in self.statistics.save().items()}
 
     def _steps_at(self, frame: int) -> int:
         """Return how many steps are done at a frame."""
         return round(frame / (self.frame_rate * self.step_size))
 
-    def _follow(self) -> None:
+    def _follow(self, state: newton.State) -> None:
         if len(self._moving):
-            distance = np.linalg.norm(self._positions() - self._center, axis=1).max()
+            distance = np.linalg.norm(self._positions(state) - self._center, axis=1).max()
             self._statistics.farthest = max(self._statistics.farthest, float(distance))
 
     def finish(self) -> Statistics:
