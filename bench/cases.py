@@ -56,6 +56,11 @@ CASES = {
             "steps of Balls Up while it runs: induction, forces, rigid bodies, host",
             {"cpu": (243, 2500), "cuda": (243, 2500, 10000)},
         ),
+        Case(
+            "writing",
+            "runs of Balls Up with and without output, in turns; memory",
+            {"cpu": (243,), "cuda": (2500,)},
+        ),
     )
 }
 

@@ -1,8 +1,8 @@
-"""Check, then time: ``python -m bench.run field|force|induction|worlds|scene [--device cuda:0] [--sizes 243 2560]``.
+"""Check, then time: ``python -m bench.run CASE [--device cuda:0] [--sizes 243 2560]``.
 
 Each size is compared with the float64 oracle on some targets before it is timed; induction and scenes give the error
-of the solve itself. One JSON line a measurement, with machine, commit, error and the time of the first call, which
-compiles.
+of the solve itself, and ``writing`` compares runs with and without output. One JSON line a measurement, with machine,
+commit, error and the time of the first call, which compiles.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
 from bench.machine import describe
 from bench.scene import run_scene
 from bench.timing import measure
+from bench.writing import run_writing
 from warpmag import oracle
 from warpmag.system import MomentSystem
 
@@ -153,13 +154,15 @@ def _relative(found, expected) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def run_case(case: Case, device, sizes) -> None:
+def run_case(case: Case, device, sizes, frames: int | None) -> None:
     """Print a JSON line for each size and precision of a case."""
     machine = describe(device)
     for dtype in case.dtypes:
         for count in sizes or case.sizes["cpu" if device.is_cpu else "cuda"]:
             if case.name in RUNNERS:
                 result = run_system(case, count, dtype, device)
+            elif case.name == "writing":
+                result = run_writing(count, device, frames)
             else:
                 result = (run_worlds if case.name == "worlds" else run_scene)(count, device)
             print(json.dumps({"case": case.name, "dtype": dtype, "count": count, **result, **machine}), flush=True)
@@ -171,9 +174,10 @@ def main() -> None:
     parser.add_argument("case", choices=sorted(CASES), help="; ".join(f"{c.name}: {c.summary}" for c in CASES.values()))
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--sizes", type=int, nargs="+")
+    parser.add_argument("--frames", type=int, help="frames of a run, for writing")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    run_case(CASES[options.case], wp.get_device(options.device), options.sizes)
+    run_case(CASES[options.case], wp.get_device(options.device), options.sizes, options.frames)
 
 
 if __name__ == "__main__":
