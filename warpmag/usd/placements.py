@@ -90,11 +90,13 @@ class Placements:
             body_qd: Linear velocity of the centre of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
             last_turns: Orientations of the frame before, next to which those of this one are to be; None in the first.
         """
-        positions, turns = body_q[:, :3].astype(np.float64), body_q[:, 3:].astype(np.float64)
+        # column by column in memory, which takes half the time
+        positions, turns = (values.astype(np.float64, order="F") for values in (body_q[:, :3], body_q[:, 3:]))
+        body_qd = body_qd.astype(np.float64, order="F")
         turns /= np.sqrt(dot(turns, turns))
         in_body = turns * (-1.0, -1.0, -1.0, 1.0)
         linear = rotate(in_body, body_qd[:, :3])
-        angular = rotate(in_body, np.degrees(body_qd[:, 3:].astype(np.float64)))
+        angular = rotate(in_body, np.degrees(body_qd[:, 3:]))
         below = self._below
         if len(below):
             local = np.c_[positions[below], np.ones(len(below))]
@@ -148,7 +150,7 @@ def rotate(turns, vectors) -> np.ndarray:
 def cross(a, b) -> np.ndarray:
     """Return cross products of rows; ``numpy.cross`` takes three times as long."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]).T
 
 
 def dot(a, b) -> np.ndarray:
