@@ -58,7 +58,7 @@ class Recorder:
         row = {shape: index for index, shape in enumerate(magnetics.shapes.tolist())}
         self._magnetics, self._stepper, self._statistics = magnetics, stepper, statistics
         self._output, self._resumable = output, resumable
-        self._taken: float | None = None
+        self._taken: tuple[float, bool, dict[str, np.ndarray] | None] | None = None
         state = stepper.state
         self._mirrors = _Mirrors((state.body_q, state.body_qd, magnetics.sum_moments()))
         # keyed bodies have samples of their own
@@ -120,12 +120,9 @@ class Recorder:
         else:
             self._magnetics.moments_at(state)
         self._mirrors.take()
-        self._taken = time
-        if self._writer.save_due:
-            self.write()
-            with _interrupts_held():
-                self._writer.save(self._save() if self._resumable else None)
-        elif not self._magnetics.system.device.is_cuda:
+        due = self._writer.save_due
+        self._taken = time, due, self._save() if due and self._resumable else None
+        if not self._magnetics.system.device.is_cuda:
             self.write()
 
     def _save(self) -> dict[str, np.ndarray]:
@@ -134,15 +131,17 @@ class Recorder:
         return self._stepper.save() | figures
 
     def write(self) -> None:
-        """Write the frame that has been taken, if it has not been written yet."""
+        """Write the frame that has been taken, and a checkpoint if it is time, unless that has been done."""
         with _interrupts_held():
             if self._taken is None:
                 return
-            time, self._taken = self._taken, None
+            (time, due, saved), self._taken = self._taken, None
             body_q, body_qd, moments = self._mirrors.read()
             moments = moments[self._shapes]
             totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
             self._writer.add_frame(time, body_q[self._bodies], body_qd[self._bodies], totals)
+            if due:
+                self._writer.save(saved)
 
     def close(self, complete: bool) -> None:
         """Close the files; unless the run is complete, it can be resumed."""

@@ -33,8 +33,8 @@ _TOUCHING = 0.05
 """Bodies closer than this part of their thickness touch, for the count of held ones."""
 _FRAME_RATE = 60.0
 """Output frames per second [Hz] of a scene that is no stage."""
-_AHEAD = 4
-"""Steps that a GPU is given before the host writes the frame before them."""
+_AHEAD = 16
+"""Steps that a GPU is given before the host writes the frame before them; a GPU makes it wait from some 20 on."""
 _STRONGEST_FIELD = 1e8
 """Field, magnetization [A/m] or current [A] that is named where a run ends; the strongest are ten times less."""
 
