@@ -271,7 +271,7 @@ def _triangles(faces: Sequence[np.ndarray]) -> np.ndarray:
 
 def _write_numbers(stage: str | os.PathLike, path: Path) -> None:
     """Write what a stage shows as arrays, SI units, world frame."""
-    record = read_recording(open_motion(stage))
+    record = read_recording(*open_motion(stage))
     columns = {
         "positions": record.positions * record.metres_per_unit,
         "orientations": record.turns,

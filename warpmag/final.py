@@ -51,7 +51,7 @@ def render_final(
     for name, value in zip(("width", "height", "samples"), (*size, samples), strict=True):
         check_count(name, value)
     python = _python()
-    clock = stage_clock(open_motion(stage))
+    clock = stage_clock(open_motion(stage)[0])
     per_code = clock.frames_per_second / clock.time_codes_per_second
     last = round((clock.end - clock.start) * per_code)
     if frame is not None and not 0 <= frame <= last:

@@ -104,13 +104,16 @@ def add_balls(
     return Balls(bodies, shapes)
 
 
-def copy_ball(builder: newton.ModelBuilder, body: int, poses: np.ndarray, first: str, others: list[str]) -> Balls:
+def copy_ball(
+    builder: newton.ModelBuilder, body: int, poses: np.ndarray, velocities: np.ndarray, first: str, others: list[str]
+) -> Balls:
     """Add balls that are like one that a builder has: what it says of body and shape, magnets included, but the pose.
 
     Args:
         builder: The builder.
         body: A free body with one shape, a ball.
         poses: Positions [m] and quaternions x y z w, shape [n, 7].
+        velocities: Linear [m/s] and angular velocities [rad/s], world, shape [n, 6].
         first: What labels of the body and of what belongs to it begin with.
         others: What those of each new one begin with in its place.
     """
@@ -123,6 +126,8 @@ def copy_ball(builder: newton.ModelBuilder, body: int, poses: np.ndarray, first:
             values[0] = getattr(builder, name)[rows[kind]]
     added = _copies(template, count)
     _place(added, poses)
+    added.body_qd = list(map(wp.spatial_vector, *np.asarray(velocities, np.float32).T.tolist()))
+    added.joint_qd = np.asarray(velocities, np.float32).ravel().tolist()
     _name(added, builder, None)
     for kind, row in rows.items():
         label = getattr(builder, f"{kind}_label")[row]

@@ -23,7 +23,7 @@ from warpmag.engine import pictures
 from warpmag.engine.scene import ImportedScene, import_scene
 from warpmag.engine.shading import AMBIENT, SUN, shade, to_linear, to_srgb
 from warpmag.errors import InputError
-from warpmag.usd import Playback, StageClock, first_camera, metalness, open_stage, stage_clock
+from warpmag.usd import Playback, StageClock, first_camera, metalness, open_apart, stage_clock
 
 _SAMPLES = 3
 """Rays per pixel, along each of its sides."""
@@ -66,7 +66,7 @@ def render(
     pictures.check_name(output)
     if min(size) < 1 or max(size) > 2**14:
         raise InputError(f"size: must be 1 to 16384, got {size[0]} x {size[1]}")
-    clock = stage_clock(open_stage(stage))
+    clock = stage_clock(open_apart(stage)[0])
     numbers = _numbers(stage, clock, output, frame, frames)
     codes = [clock.start + number * clock.time_codes_per_second / clock.frames_per_second for number in numbers]
     with wp.ScopedDevice(resolve_device(device)):
@@ -100,7 +100,7 @@ class _Studio:
     """
 
     def __init__(self, scene: ImportedScene, path, size: tuple[int, int], moments: bool):
-        self._scene, self._motion, (self._width, self._height) = scene, Playback(scene.stage), size
+        self._scene, self._motion, (self._width, self._height) = scene, Playback(scene.stage, scene.swarms), size
         self._arrows = _Arrows(scene, path) if moments else None
         self._model = model = scene.builder.finalize()
         self._state = model.state()
@@ -111,7 +111,11 @@ class _Studio:
         self._bodies = list(scene.bodies)
         self._rows = np.array([scene.bodies[prim] for prim in self._bodies], dtype=int)
         self._albedo = to_linear(model.shape_color.numpy())
-        self._metal = np.array([metalness(scene.stage, label) for label in model.shape_label])
+        like = {
+            one: prim for swarm in scene.swarms for prim, own in swarm.like(model.shape_label).items() for one in own
+        }
+        metal = {label: metalness(scene.stage, label) for label in model.shape_label if label not in like}
+        self._metal = np.array([metal[like.get(label, label)] for label in model.shape_label])
         self._view = _view(scene, model, camera, _SAMPLES * self._width, _SAMPLES * self._height)
 
     def picture(self, time_code: float) -> np.ndarray:
@@ -168,7 +172,7 @@ class _Arrows:
 
     def __init__(self, scene: ImportedScene, path):
         self._prims = list(scene.magnet_shapes)
-        if not Playback(scene.stage).moments(self._prims).any():
+        if not Playback(scene.stage, scene.swarms).moments(self._prims).any():
             raise InputError(f"{path}: holds no moments to show; a run writes them")
         builder = scene.builder
         self._holders = [scene.magnet_shapes[prim][0] for prim in self._prims]

@@ -17,10 +17,13 @@ from warpmag.errors import InputError
 from warpmag.keyed import Keys, SceneKeys
 from warpmag.magnets import Magnet, StageMagnets
 from warpmag.usd import (
+    MOMENTS,
     AlikeBalls,
+    BallFrames,
     GroundedJoint,
     StageClock,
     StageContents,
+    Swarm,
     complete_instances,
     enabled_joints,
     give_densities,
@@ -29,6 +32,7 @@ from warpmag.usd import (
     prepare_joints,
     refusals,
     strained_joints,
+    swarms_of,
 )
 
 
@@ -62,9 +66,14 @@ class ImportedScene:
 
     @cached_property
     def stage(self) -> Any:
-        """The open stage with a prim for each body, for a :class:`warpmag.usd.CacheWriter`."""
-        complete_instances(self.apart)
+        """The open stage with a prim for each body but those of :attr:`swarms`."""
+        complete_instances([one for one in self.apart if not one.whole])
         return self.opened
+
+    @cached_property
+    def swarms(self) -> list[Swarm]:
+        """Instancers that hold too many bodies for prims."""
+        return swarms_of(self.opened, self.apart)
 
 
 def import_scene(
@@ -145,14 +154,18 @@ def _copy_balls(
     """Copy what Newton has made of the first of balls that are alike, and what is known of its magnet."""
     first, others = balls.bodies()
     body = bodies[first]
-    added = copy_ball(builder, body, balls.poses(stage, np.array(builder.body_q[body])[3:]), first, others)
+    frames = BallFrames(stage, balls, np.array(builder.body_q[body], float)[3:])
+    speeds = frames.velocities(balls.arrays, np.array(builder.body_qd[body], float))
+    added = copy_ball(builder, body, frames.poses(balls.arrays)[1:], speeds[1:], first, others)
     bodies |= dict(zip(others, added.bodies, strict=True))
+    moments = balls.arrays[MOMENTS]
     for prim in [one for one in covered if one == first or one.startswith(f"{first}/")]:
-        own = [f"{other}{prim.removeprefix(first)}" for other in others]
+        own = balls.others_of(prim)
         covered |= zip(own, ([shape] for shape in added.shapes), strict=True)
-        for values in (magnets.magnets, magnets.initial_moments):
-            if prim in values:
-                values |= dict.fromkeys(own, values[prim])
+        magnets.magnets.update(dict.fromkeys(own, magnets.magnets[prim]))
+        if prim in magnets.initial_moments:
+            each = moments[1:].astype(float).tolist() if len(moments) else [magnets.initial_moments[prim]] * len(own)
+            magnets.initial_moments.update({path: (x, y, z) for path, (x, y, z) in zip(own, each, strict=True)})
 
 
 def _place_on_ground(

@@ -6,7 +6,7 @@ attributes right even then).
 """
 
 from warpmag.usd.schemas import author_magnet, author_settings, magnet_of, magnet_prim_of  # isort: skip  (registers the schemas first)
-from warpmag.usd.alike import AlikeBalls
+from warpmag.usd.alike import MOMENTS, AlikeBalls, BallFrames
 from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
 from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_sources
@@ -31,11 +31,14 @@ from warpmag.usd.reader import (
     survey,
 )
 from warpmag.usd.render_layer import RenderLayer
+from warpmag.usd.swarms import Swarm, swarms_of
 from warpmag.usd.values import Finding
 from warpmag.usd.writer import CacheWriter, Earlier
 
 __all__ = [
+    "MOMENTS",
     "AlikeBalls",
+    "BallFrames",
     "CacheWriter",
     "Earlier",
     "Finding",
@@ -46,6 +49,7 @@ __all__ = [
     "StageClock",
     "StageContents",
     "StageReport",
+    "Swarm",
     "author_coil",
     "author_field_map",
     "author_magnet",
@@ -75,5 +79,6 @@ __all__ = [
     "stage_clock",
     "strained_joints",
     "survey",
+    "swarms_of",
     "usable_path",
 ]

@@ -8,9 +8,11 @@ from pxr import Tf, Usd, UsdGeom, UsdValidation
 from warpmag.errors import InputError
 from warpmag.usd.clock import StageClock, stage_clock, stage_name
 from warpmag.usd.guard import readable
+from warpmag.usd.instancers import complete_instances
 from warpmag.usd.joints import joint_findings
-from warpmag.usd.reader import StageContents, open_stage, survey
+from warpmag.usd.reader import StageContents, open_apart, survey
 from warpmag.usd.session import file_of
+from warpmag.usd.swarms import Swarm, swarms_of
 from warpmag.usd.units import units_of
 from warpmag.usd.values import Finding, quiet
 
@@ -62,7 +64,12 @@ def check(path: str | os.PathLike) -> StageReport:
     Raises:
         InputError: The file cannot be opened as a stage at all.
     """
-    return inspect(open_stage(path), path)
+    stage, apart = open_apart(path)
+    complete_instances([one for one in apart if not one.whole])
+    report = inspect(stage, path)
+    for swarm in swarms_of(stage, apart):
+        _name_balls(report.contents, swarm)
+    return report
 
 
 def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
@@ -74,6 +81,16 @@ def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
     """
     with readable(str(path)):
         return _report(stage, path)
+
+
+def _name_balls(contents: StageContents, swarm: Swarm) -> None:
+    """Let the balls of an instancer be among what a stage holds, behind the one that has prims."""
+    for names in (contents.bodies, contents.colliders):
+        for prim, others in swarm.like(names).items():
+            after = names.index(prim) + 1
+            names[after:after] = others
+    for prim, others in swarm.like(list(contents.magnets)).items():
+        contents.magnets |= dict.fromkeys(others, contents.magnets[prim])
 
 
 def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:

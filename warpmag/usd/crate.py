@@ -91,12 +91,12 @@ class Overs:
         self._metadata.append(self._field(name, found))
 
     def add_sampled(self, paths: Sequence[str], name: str, type_name: str, kind: int) -> None:
-        """Let prims have an attribute that gets time samples."""
+        """Let prims have an attribute that gets time samples, of a name like ``quatf[]`` arrays of values of a kind."""
         type_field = self._field("typeName", self._token_reference(type_name))
         token = self._token(name)
         for number, path in enumerate(paths, len(self._types)):
             self._properties_of(path).append((token, _PER_SAMPLED * number))
-        self._types += [kind << 48] * len(paths)
+        self._types += [reference(kind, 0, _ARRAY if type_name.endswith("[]") else 0)] * len(paths)
         self._type_fields += [type_field] * len(paths)
 
     def add_vector(self, path: str, name: str, value: np.ndarray) -> None:

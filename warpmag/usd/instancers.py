@@ -3,7 +3,7 @@
 They lie in a layer of the session, below the instancer, which is an Xform there: ``/Balls/instance12/Ball`` with a
 reference to the prototype. A run writes that layer below its cache, in which the instances then move one by one.
 Instances with an inactive id are left out, invisible ones are not. What instancers of colliders, bodies or magnets need
-not be made of stays as it is.
+not be made of stays as it is. Very many balls that are alike stay one instancer in the cache, too (``swarms.py``).
 """
 
 from collections.abc import Iterator
@@ -14,8 +14,9 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
-from warpmag.usd.alike import AlikeBalls, alike, ball_in, may_be_alike
+from warpmag.usd.alike import ARRAYS, MOMENTS, AlikeBalls, alike, ball_in, may_be_alike, may_stay_whole
 from warpmag.usd.first_reading import MOST_PRIMS
+from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
 from warpmag.usd.session import INSTANCES, add_layer, new_layer, release_instances
 from warpmag.usd.transforms import is_body, is_collider
 from warpmag.usd.units import units_of
@@ -28,6 +29,7 @@ _OPERATIONS = (
     ("xformOp:scale", "scales", _TYPES.Float3),
 )
 """What moves an instance, in the order of operations, the array of the instancer and the type of a value."""
+_SPEEDS = "velocities", "angularVelocities"
 _RESET = "!resetXformStack!"
 
 
@@ -73,6 +75,7 @@ class _Prototype:
         name: Name of its root.
         order: Its operations where it would leave the transform of its instance behind, else None.
         bodies: Rigid bodies in it, by their path below the root, and their transforms there.
+        magnets: Magnets in it.
         prims: How many prims it has.
     """
 
@@ -80,6 +83,7 @@ class _Prototype:
     name: str
     order: list[str] | None
     bodies: tuple[tuple[Sdf.Path, Gf.Matrix4d], ...]
+    magnets: tuple[Sdf.Path, ...]
     prims: int
 
 
@@ -137,7 +141,7 @@ class _Expansion:
         """Write the prims of all instances of an instancer."""
         path, layer = instancer.GetPath(), self._layer_of_prims()
         instances = _Instances(instancer, len(targets), self._time)
-        if len(instances.velocities) or len(instances.spins):  # which bodies get, in instances, too
+        if any(len(instances.arrays[name]) for name in _SPEEDS):  # which bodies get, in instances, too
             for target in targets:
                 release_instances(self._stage, layer, target)
         prototypes = [_prototype(self._stage.GetPrimAtPath(target)) for target in targets]
@@ -150,7 +154,7 @@ class _Expansion:
             prefix += "_"
         write = partial(_write_instances, layer, path, prefix, instances, prototypes, followed)
         left = self._alike(instancer, instances, prefix) if self._left_apart and not followed else []
-        later = [[int(one.rpartition(prefix)[2]) for one in balls.others] for balls in left]
+        later = [balls.rows[1:].tolist() for balls in left]
         self.apart += [replace(balls, write=partial(write, rows)) for balls, rows in zip(left, later, strict=True)]
         with Sdf.ChangeBlock():
             own = Sdf.CreatePrimInLayer(layer, path)
@@ -162,14 +166,17 @@ class _Expansion:
         write([row for row in instances.rows if row not in unwritten])
 
     def _alike(self, instancer: UsdGeom.PointInstancer, instances: "_Instances", prefix: str) -> list[AlikeBalls]:
-        """Find out which instances are alike; those that move by themselves, or are in other units, are not."""
-        moving = len(instances.velocities) or len(instances.spins)
-        if moving or not units_of(self._stage).are_si or not may_be_alike(self._stage, instancer, self._time):
+        """Find out which instances are alike; those in other units are not, nor are any where a number is none."""
+        finite = all(np.isfinite(values).all() for values in instances.arrays.values())
+        if not (finite and units_of(self._stage).are_si and may_be_alike(self._stage, instancer, self._time)):
             return []
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         found = {number: ball_in(self._stage.GetPrimAtPath(target)) for number, target in enumerate(targets)}
         balls = {number: body for number, body in found.items() if body is not None}
-        return list(alike(*instances.listed(f"{instancer.GetPath()}/{prefix}"), balls))
+        groups = list(alike(*instances.listed(f"{instancer.GetPath()}/{prefix}"), instances.arrays, balls))
+        if not may_stay_whole(instancer, self._time):
+            groups = [replace(one, whole=False) for one in groups]
+        return groups
 
     def _follows_keys(self, target: Sdf.Path) -> bool:
         """Whether something of a prototype moves as its instance does over time: what is no dynamic body."""
@@ -190,6 +197,7 @@ class _Instances:
     Attributes:
         rows: Indices of the instances that are active.
         prototypes: Number of the prototype of each, shape [n].
+        arrays: What else is said of single ones, see :data:`warpmag.usd.alike.ARRAYS`; empty where nothing is.
     """
 
     def __init__(self, instancer: UsdGeom.PointInstancer, prototypes: int, time_code: float):
@@ -201,11 +209,11 @@ class _Instances:
         wrong = self.prototypes[(self.prototypes < 0) | (self.prototypes >= prototypes)]
         if len(wrong):
             raise InputError(f"{self._path}: protoIndices names prototype {wrong[0]}, but there are {prototypes}")
-        self._values = {name: self._array(name, time, 3) for name in ("positions", "scales")}
-        self._values["orientations"] = self._turns(time)
-        if not len(self._values["positions"]) and self._count:
+        self.arrays = {name: self._array(name, time, 3) for name, width in ARRAYS.items() if width == 3}
+        self.arrays["orientations"] = self._turns(time)
+        self._scales = self._array("scales", time, 3)
+        if not len(self.arrays["positions"]) and self._count:
             raise InputError(f"{self._path}: positions is missing, of {self._count} instances")
-        self.velocities, self.spins = (self._array(name, time, 3) for name in ("velocities", "angularVelocities"))
         ids = self._array("ids", time, None)
         inactive = self._prim.GetMetadata("inactiveIds")
         off = set(inactive.GetAppliedItems() if inactive else ())
@@ -213,17 +221,14 @@ class _Instances:
 
     def value(self, name: str, row: int):
         """Return what an array says of an instance, None where it is empty."""
-        values = self._values[name]
+        values = self._scales if name == "scales" else self.arrays[name]
         return _typed(name, values[row]) if len(values) else None
 
-    def listed(self, prefix: str) -> tuple[list[str], list[tuple], np.ndarray, np.ndarray]:
-        """Return paths, kinds, positions and orientations of the active ones as :func:`alike` takes them."""
+    def listed(self, prefix: str) -> tuple[list[str], np.ndarray, np.ndarray]:
+        """Return paths, rows and kinds of the active ones as :func:`alike` takes them."""
         rows = np.array(self.rows, int)
-        scales, turns = self._values["scales"], self._values["orientations"]
-        kinds = np.c_[self.prototypes, scales] if len(scales) else self.prototypes[:, None]
-        paths = [f"{prefix}{row}" for row in self.rows]
-        own = turns[rows] if len(turns) else turns
-        return paths, list(map(tuple, kinds[rows].tolist())), self._values["positions"][rows], own
+        kinds = np.c_[self.prototypes, self._scales] if len(self._scales) else self.prototypes[:, None]
+        return [f"{prefix}{row}" for row in self.rows], rows, kinds[rows]
 
     def samples(self) -> tuple[tuple[float, dict[str, np.ndarray]], ...]:
         """Return the arrays that move instances at all their times, nothing where they have but one."""
@@ -254,8 +259,8 @@ class _Instances:
         """Return the orientations, the precise ones if there are any, quaternions x y z w of length 1."""
         name = "orientationsf" if len(self._prim.GetAttribute("orientationsf").Get(time) or ()) else "orientations"
         value = self._prim.GetAttribute(name).Get(time) or ()
-        found = np.array([(*one.GetImaginary(), one.GetReal()) for one in value], dtype=float).reshape(-1, 4)
-        if len(found) not in (0, self._count):
+        found = np.array(value, dtype=float) if len(value) else np.zeros((0, 4))
+        if found.shape not in ((0, 4), (self._count, 4)):
             raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
         lengths = np.linalg.norm(found, axis=1)
         if not ((lengths > 0.0) & (lengths < np.inf)).all():
@@ -277,7 +282,8 @@ def _prototype(root: Usd.Prim) -> _Prototype:
         if is_body(one)
     )
     kept = [one for one in order if one != _RESET] if order and _RESET in order else None
-    return _Prototype(root.GetPath(), root.GetName(), kept, bodies, len(below))
+    magnets = tuple(one.GetPath().MakeRelativePath(root.GetPath()) for one in below if has_api(one, MAGNET_API))
+    return _Prototype(root.GetPath(), root.GetName(), kept, bodies, magnets, len(below))
 
 
 def _write_instances(layer, path, prefix: str, instances: _Instances, prototypes, followed, rows: list[int]) -> None:
@@ -290,6 +296,9 @@ def _write_instances(layer, path, prefix: str, instances: _Instances, prototypes
             _write_transform(prim, instances, row, followed)
             _write_prototype(prim, prototype)
             _write_velocities(prim, prototype, instances, row)
+            if len(prototype.magnets) == 1 and (moment := instances.value(MOMENTS, row)) is not None:
+                magnet = prim.path.AppendChild(prototype.name).AppendPath(prototype.magnets[0])
+                Sdf.AttributeSpec(Sdf.CreatePrimInLayer(layer, magnet), MOMENT, _TYPES.Vector3f).default = moment
 
 
 def _typed(name: str, value) -> object:
@@ -327,10 +336,10 @@ def _write_prototype(instance: Sdf.PrimSpec, prototype: _Prototype) -> None:
 
 def _write_velocities(prim: Sdf.PrimSpec, prototype: _Prototype, instances: _Instances, row: int) -> None:
     """Give the bodies of an instance its velocities, which are in the frame of the instancer, in their own frames."""
-    given = [values[row] if len(values) else None for values in (instances.velocities, instances.spins)]
+    given = [instances.value(name, row) for name in _SPEEDS]
     if all(one is None for one in given):
         return
-    velocity, spin = (Gf.Vec3d(0.0) if one is None else Gf.Vec3d(*map(float, one)) for one in given)
+    velocity, spin = (Gf.Vec3d(0.0) if one is None else Gf.Vec3d(one) for one in given)
     turn = instances.value("orientations", row) or Gf.Quatf(1.0)
     scale = instances.value("scales", row) or Gf.Vec3f(1.0)
     rotation = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Quatd(turn)))

@@ -1,14 +1,18 @@
 """Reads what a stage, a run's above all, shows of its rigid bodies and magnets, sample by sample."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pxr import Usd, UsdGeom, Vt
 
+from warpmag.usd.alike import MOMENTS
+from warpmag.usd.columns import ORIENT, SCALE, TRANSLATE
 from warpmag.usd.placements import product, rigid, rotate, turn_of
 from warpmag.usd.schemas import MAGNET_API, MOMENT, SCENE_API, has_api
+from warpmag.usd.swarms import Swarm
 from warpmag.usd.transforms import is_animated, is_body
-from warpmag.usd.writer import ORIENT, SCALE, TRANSLATE
 
 _VELOCITIES = "physics:velocity", "physics:angularVelocity"
 
@@ -46,17 +50,20 @@ class Recording:
     external: np.ndarray
 
 
-def read_recording(stage: Usd.Stage) -> Recording:
+def read_recording(stage: Usd.Stage, swarms: Sequence[Swarm] = ()) -> Recording:
     """Read a stage at all samples of its bodies and moments.
 
     Args:
         stage: The stage, not held at any moment.
+        swarms: Instancers whose balls have no prims; they come behind those bodies and magnets that have.
     """
     prims = [prim for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()) if prim.IsActive()]
+    firsts = [one for swarm in swarms for one in swarm.firsts]
+    prims = [prim for prim in prims if not any(map(prim.GetPath().HasPrefix, firsts))]
     bodies = [prim for prim in prims if is_body(prim)]
     magnets = [prim for prim in prims if has_api(prim, MAGNET_API) and prim.GetAttribute(MOMENT).HasAuthoredValue()]
     fields = [prim.GetAttribute("warpmag:externalField") for prim in prims if has_api(prim, SCENE_API)]
-    codes = _codes(stage, bodies, magnets)
+    codes = _codes(stage, bodies, magnets, swarms)
     seconds = (codes - codes[0]) / stage.GetTimeCodesPerSecond()
     poses = _Poses(codes)
     count = len(codes), len(bodies)
@@ -74,7 +81,8 @@ def read_recording(stage: Usd.Stage) -> Recording:
     linear[:, recorded] = world[:, recorded]
     angular = np.radians(rotate(turns.reshape(-1, 4), angular.reshape(-1, 3))).reshape(angular.shape)
     moments = [_values(prim.GetAttribute(MOMENT), codes, Vt.Vec3fArray) for prim in magnets]
-    return Recording(
+    moments = np.stack(moments, axis=1) if moments else np.zeros((len(codes), 0, 3), dtype=np.float32)
+    found = Recording(
         codes,
         seconds,
         UsdGeom.GetStageMetersPerUnit(stage),
@@ -84,13 +92,35 @@ def read_recording(stage: Usd.Stage) -> Recording:
         linear,
         angular.astype(np.float32),
         [str(prim.GetPath()) for prim in magnets],
-        np.stack(moments, axis=1) if moments else np.zeros((len(codes), 0, 3), dtype=np.float32),
+        moments.astype(np.float32),
         np.array([prim.GetAttribute("warpmag:kind").Get() == "permanent" for prim in magnets], dtype=bool),
         _values(next((one for one in fields if one.HasAuthoredValue()), None), codes, Vt.Vec3fArray),
     )
+    for swarm in swarms:
+        found = _with_balls(found, swarm)
+    return found
 
 
-def _codes(stage, bodies, magnets) -> np.ndarray:
+def _with_balls(record: Recording, swarm: Swarm) -> Recording:
+    """Return a recording with the balls of an instancer."""
+    said = [swarm.arrays(Usd.TimeCode(code)) for code in record.codes.tolist()]
+    poses, speeds = np.stack([swarm.poses(one) for one in said]), np.stack([swarm.velocities(one) for one in said])
+    given = {
+        "positions": poses[..., :3],
+        "turns": poses[..., 3:].astype(np.float32),
+        "linear": speeds[..., :3].astype(np.float32),
+        "angular": speeds[..., 3:].astype(np.float32),
+    }
+    found: dict[str, Any] = {name: np.concatenate([getattr(record, name), one], axis=1) for name, one in given.items()}
+    if len(said[0][MOMENTS]):
+        held = np.flatnonzero([one is not None for one in swarm.magnets])
+        found["magnets"] = record.magnets + swarm.magnets[held].tolist()
+        found["moments"] = np.concatenate([record.moments, np.stack([one[MOMENTS][held] for one in said])], axis=1)
+        found["permanent"] = np.append(record.permanent, swarm.permanent[held])
+    return replace(record, bodies=[*record.bodies, *swarm.bodies], **found)
+
+
+def _codes(stage, bodies, magnets, swarms) -> np.ndarray:
     """Return the time codes at which a body or a moment has a sample, in order."""
     lists: set[tuple[float, ...]] = set()
     for prim in bodies:
@@ -99,6 +129,7 @@ def _codes(stage, bodies, magnets) -> np.ndarray:
                 lists.add(tuple(UsdGeom.Xformable(prim).GetTimeSamples()))
             prim = prim.GetParent()
     lists |= {tuple(prim.GetAttribute(MOMENT).GetTimeSamples()) for prim in magnets}
+    lists |= {tuple(stage.GetPrimAtPath(one.path).GetAttribute("positions").GetTimeSamples()) for one in swarms}
     codes = sorted(set().union(*lists))
     return np.array(codes or [stage.GetStartTimeCode()])
 

@@ -39,6 +39,7 @@ from warpmag.usd.schemas import (
     settings_of,
 )
 from warpmag.usd.slips import kind_findings, stray_findings
+from warpmag.usd.swarms import Swarm, swarms_of
 from warpmag.usd.transforms import TransformCheck, is_body, is_collider
 from warpmag.usd.units import convert_units
 from warpmag.usd.values import (
@@ -128,11 +129,14 @@ def open_apart(path: str | os.PathLike, time_code: float | None = None) -> tuple
     return stage, apart
 
 
-def open_motion(path: str | os.PathLike) -> Usd.Stage:
-    """Open a stage as it moves, held at no moment, in its own units, with a prim for each instance of a body.
+def open_motion(path: str | os.PathLike) -> tuple[Usd.Stage, list[Swarm]]:
+    """Open a stage as it moves, held at no moment, in its own units.
 
     It is read in this process at once: to read a long run's samples in a process of their own first would take longer
     than to export them.
+
+    Returns:
+        The stage, with a prim for each instance of a body, and the instancers whose balls have none.
 
     Raises:
         InputError: The file is missing, is not USD, does not compose, or has instancers that make no sense.
@@ -142,8 +146,9 @@ def open_motion(path: str | os.PathLike) -> Usd.Stage:
         raise InputError(f"{path}: no such file")
     stage = _open(file, path)
     with readable(str(path)):
-        expand_instancers(stage, start_of(stage))
-    return stage
+        apart = expand_instancers(stage, start_of(stage), apart=True)
+        complete_instances([one for one in apart if not one.whole])
+        return stage, swarms_of(stage, apart)
 
 
 def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:

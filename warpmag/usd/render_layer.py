@@ -16,7 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from warpmag.errors import InputError
 from warpmag.usd.instance_arrays import InstanceArrays, author_curves, author_instances, turns_to
-from warpmag.usd.instancers import expand_instancers
+from warpmag.usd.instancers import complete_instances, expand_instancers
 from warpmag.usd.looks import author_materialx, author_surface, color_scale
 from warpmag.usd.meshes import ARROW, BALL, Shape, author_mesh, shape_of
 from warpmag.usd.motion import read_recording
@@ -24,6 +24,7 @@ from warpmag.usd.page import page_of
 from warpmag.usd.paths import usable_path
 from warpmag.usd.placements import rigid
 from warpmag.usd.reader import copied_metadata, open_motion
+from warpmag.usd.swarms import Swarm
 from warpmag.usd.transforms import is_body
 from warpmag.usd.values import quiet
 
@@ -91,17 +92,19 @@ class RenderLayer:
         Raises:
             InputError: It is no stage.
         """
-        source = open_motion(path)
+        source, swarms = open_motion(path)
         self._files = {Path(layer.realPath).resolve() for layer in source.GetUsedLayers() if layer.realPath}
-        self.recording = read_recording(source)
+        self.recording = read_recording(source, swarms)
         self._codes = self.recording.codes * (rate / source.GetTimeCodesPerSecond())
-        self._stage = stage = Usd.Stage.Open(_scene_of(source, rate))
+        self._stage = stage = Usd.Stage.Open(_scene_of(source, swarms, rate))
         stage.SetStartTimeCode(float(np.floor(self._codes[0] + 1e-6)))
         # the last frame stands at the step nearest to it, which may be a bit later
         stage.SetEndTimeCode(float(np.ceil(self._codes[-1] - 0.05)))
         self._before = Sdf.Layer.CreateAnonymous(".usda")
         self._before.TransferContent(stage.GetRootLayer())
         self.shapes = self._find_shapes()
+        for swarm in swarms:
+            self.shapes = swarm.with_shapes(self.shapes, self.recording.bodies)
         instanced = self._instanced()
         self._instances = [one for one in self.shapes if one.drawn and one.row >= 0 and instanced[one.row]]
         self._root = self._make_root()
@@ -155,7 +158,8 @@ class RenderLayer:
         record, magnets = self.recording, set(self.recording.magnets)
         found = np.ptp(record.positions, axis=0).any(axis=1) | np.ptp(record.turns, axis=0).any(axis=1)
         for row, path in enumerate(record.bodies):
-            flag = self._stage.GetPrimAtPath(path).GetAttribute("physics:kinematicEnabled")
+            prim = self._stage.GetPrimAtPath(path)  # none of a ball in an instancer, which is dynamic
+            flag = prim and prim.GetAttribute("physics:kinematicEnabled")
             found[row] |= path in magnets or not (flag and flag.Get())
         return found
 
@@ -240,7 +244,7 @@ class RenderLayer:
         stage = self._stage
         UsdGeom.Scope.Define(stage, path.GetParentPath())
         source = self._before.GetPrimAtPath(shape.path)
-        if source.typeName == "Mesh":
+        if source and source.typeName == "Mesh":  # a ball of an instancer has no prim
             Sdf.CopySpec(self._before, shape.path, stage.GetRootLayer(), path)
             with Sdf.ChangeBlock():
                 _strip(stage.GetRootLayer(), [], below=path)
@@ -336,8 +340,11 @@ class RenderLayer:
             known.Reload(force=True)
 
 
-def _scene_of(source: Usd.Stage, rate: float) -> Sdf.Layer:
-    """Return the stage without what runs wrote over it, as one layer with ``rate`` time codes per second."""
+def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.Layer:
+    """Return the stage without what runs wrote over it, as one layer with ``rate`` time codes per second.
+
+    It has prims for instances, as the run had that wrote their motion; of ``swarms`` only for those like no other.
+    """
     root = source.GetRootLayer()
     top = Sdf.Layer.CreateAnonymous(".usda")
     for key in copied_metadata(root):
@@ -348,7 +355,9 @@ def _scene_of(source: Usd.Stage, rate: float) -> Sdf.Layer:
     for layer in stage.GetUsedLayers():
         if "warpmag" in layer.customLayerData:
             stage.MuteLayer(layer.identifier)
-    expand_instancers(stage, stage.GetStartTimeCode())  # as the run did that wrote their motion
+    whole = {one.path for one in swarms}
+    apart = expand_instancers(stage, stage.GetStartTimeCode(), apart=True)
+    complete_instances([one for one in apart if str(one.instancer) not in whole])
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
             for prim in instances:

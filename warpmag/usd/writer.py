@@ -20,43 +20,22 @@ from pxr import Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
 from warpmag.usd import crate
+from warpmag.usd.alike import MOMENTS
 from warpmag.usd.clock import stage_clock
+from warpmag.usd.columns import BODY, MAGNET, ORIENT, SCALE, TRANSLATE, Column
 from warpmag.usd.output import Output
 from warpmag.usd.paths import path_between
 from warpmag.usd.placements import Placements
 from warpmag.usd.reader import copied_metadata
 from warpmag.usd.samples import SampleFile
 from warpmag.usd.scene_copy import copy_scene
-from warpmag.usd.schemas import MOMENT
 from warpmag.usd.session import INSTANCES, added_layer, as_written
+from warpmag.usd.swarms import Swarm
 from warpmag.usd.units import units_of
 
-TRANSLATE, ORIENT, SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
-"""What moves a body, in this order."""
 _CHECKPOINT_SECONDS = 1.0
 _CHECKPOINT_SHARE = 0.01
 """Checkpoints come so often, and take at most this part of the time."""
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """An attribute that is written for every body or every magnet."""
-
-    name: str
-    type_name: str
-    kind: int
-    dtype: type
-    size: int
-
-
-_BODY = (
-    _Kind(TRANSLATE, "double3", crate.VEC3D, np.float64, 3),
-    _Kind(ORIENT, "quatf", crate.QUATF, np.float32, 4),
-    _Kind("physics:velocity", "vector3f", crate.VEC3F, np.float32, 3),
-    _Kind("physics:angularVelocity", "vector3f", crate.VEC3F, np.float32, 3),
-)
-_KINDS = (*_BODY, _Kind(MOMENT, "vector3f", crate.VEC3F, np.float32, 3))
-"""In the order of a frame, see :class:`warpmag.usd.placements.Placed`."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +49,33 @@ class Earlier:
 
     time: float
     state: dict[str, np.ndarray] | None
+
+
+class _Rows:
+    """Which rows of what a run hands over go where.
+
+    Attributes:
+        bodies: Rows of the bodies that have prims.
+        magnets: Rows of the magnets that have prims.
+        of_swarms: Instancers, the rows of their balls, and those of the magnets that these are, -1 where they are none.
+    """
+
+    def __init__(self, body_paths: Sequence[str], magnet_paths: Sequence[str], swarms: Sequence[Swarm]):
+        self.body_count, self.magnet_count = len(body_paths), len(magnet_paths)
+        of_body = {path: row for row, path in enumerate(body_paths)} if swarms else {}
+        of_magnet = {path: row for row, path in enumerate(magnet_paths)} if swarms else {}
+        self.of_swarms = [
+            (
+                one,
+                np.array([of_body[path] for path in one.bodies], int),
+                np.array([of_magnet.get(path, -1) for path in one.magnets], int),
+            )
+            for one in swarms
+        ]
+        bodies, magnets = np.ones(self.body_count, bool), np.ones(self.magnet_count, bool)
+        for _, own, held in self.of_swarms:
+            bodies[own], magnets[held[held >= 0]] = False, False
+        self.bodies, self.magnets = np.flatnonzero(bodies), np.flatnonzero(magnets)
 
 
 class CacheWriter:
@@ -86,6 +92,7 @@ class CacheWriter:
         body_paths: Sequence[str],
         magnet_paths: Sequence[str],
         *,
+        swarms: Sequence[Swarm] = (),
         copy_scene: bool = False,
         frames: int | None = None,
         options: dict[str, str] | None = None,
@@ -97,6 +104,7 @@ class CacheWriter:
             path: File of the root layer, ``.usd``, ``.usda`` or ``.usdc``.
             body_paths: Prims of the rigid bodies, in the order of the frames' rows.
             magnet_paths: Prims of the magnets, in the order of the frames' moments.
+            swarms: Instancers that hold some of the bodies and stay instancers.
             copy_scene: Copy the scene beside the root, as is right for a bundled one, instead of pointing to it. A
                 scene that is no file is always copied.
             frames: Frames that are expected; without it the file may become longer than it has to be.
@@ -110,13 +118,15 @@ class CacheWriter:
         self._copy_scene = copy_scene or stage.GetRootLayer().anonymous
         scene = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
         self._output = Output(path, scene, copy_scene=self._copy_scene)
-        self._magnet_paths = list(magnet_paths)
-        self._bodies = Placements(stage, body_paths, self._units.metres)
-        self._counts = [len(self._bodies.paths)] * len(_BODY) + [len(self._magnet_paths)]
+        self._rows = _Rows(body_paths, magnet_paths, swarms)
+        self._bodies = Placements(stage, [body_paths[row] for row in self._rows.bodies.tolist()], self._units.metres)
+        self._magnet_paths = [magnet_paths[row] for row in self._rows.magnets.tolist()]
+        self._columns = [Column(kind, self._bodies.paths) for kind in BODY] + [Column(MAGNET, self._magnet_paths)]
+        self._columns += [column for one in swarms for column in one.columns()]
         self._frames, self._options = frames, options or {}
         self._samples: SampleFile | None = None
         self._first: list[np.ndarray] = []
-        self._last_turns: np.ndarray | None = None
+        self._last: list[np.ndarray] | None = None
         self._last_time = -np.inf
         self._below: list[str] = []
         self._save_time = 0.0
@@ -157,7 +167,7 @@ class CacheWriter:
         with output.errors(output.cache):
             self._samples = SampleFile.resume(output.cache, self._value_sizes(), places)
         self._first = self._unpack(self._samples.frame(0))
-        self._last_turns = self._unpack(self._samples.frame(self._samples.count - 1))[1]
+        self._last = self._unpack(self._samples.frame(self._samples.count - 1))
         self._last_time = float(about["time"])
         for target in self._write_scene_and_root():
             output.place(target)
@@ -205,13 +215,17 @@ class CacheWriter:
         """
         if not time > self._last_time:
             raise ValueError(f"time must rise from frame to frame: {time} after {self._last_time}")
-        count = len(self._bodies.paths)
-        body_q = np.asarray(body_q, dtype=np.float32).reshape(count, 7)
-        body_qd = np.asarray(body_qd, dtype=np.float32).reshape(count, 6)
-        moments = np.asarray(moments, dtype=np.float32).reshape(len(self._magnet_paths), 3)
-        placed = self._bodies.place(body_q, body_qd, self._last_turns)
-        values = [placed.positions, placed.turns, placed.linear, placed.angular, moments]
-        self._last_time, self._last_turns = float(time), placed.turns
+        rows, last = self._rows, self._last
+        body_q = np.asarray(body_q, dtype=np.float32).reshape(rows.body_count, 7)
+        body_qd = np.asarray(body_qd, dtype=np.float32).reshape(rows.body_count, 6)
+        moments = np.asarray(moments, dtype=np.float32).reshape(rows.magnet_count, 3)
+        placed = self._bodies.place(body_q[rows.bodies], body_qd[rows.bodies], last and last[1])
+        values = [placed.positions, placed.turns, placed.linear, placed.angular, moments[rows.magnets]]
+        for swarm, bodies, magnets in rows.of_swarms:
+            own = np.where(magnets[:, None] < 0, np.float32(0.0), moments[magnets] if len(moments) else np.float32(0.0))
+            turns = last and last[len(values) + 1]
+            values += swarm.place(body_q[bodies], body_qd[bodies], own, turns)
+        self._last_time, self._last = float(time), values
         if self._samples is None:
             self._samples = self._begin(time, values)
         else:
@@ -294,7 +308,7 @@ class CacheWriter:
         if not samples.sampled.all():
             moved = [(own != first).any(axis=1) for own, first in zip(values, self._first, strict=True)]
             changed = np.flatnonzero(np.concatenate(moved) & ~samples.sampled)
-        data = b"".join(one.tobytes() for one in values)
+        data = b"".join(column.packed(one) for column, one in zip(self._columns, values, strict=True))
         with self._output.errors(self._output.cache):
             samples.append(self._code(time), data, changed)
 
@@ -302,7 +316,7 @@ class CacheWriter:
         """Write what the root names, without placing it, and the root; return what to place before that."""
         output, written = self._output, []
         self._below = []
-        if instances := added_layer(self._stage, INSTANCES):
+        if instances := self._instances_layer():
             written.append(output.instances)
             with output.errors(output.instances):
                 output.write(instances, output.instances)
@@ -330,15 +344,14 @@ class CacheWriter:
 
     def _value_sizes(self) -> np.ndarray:
         """Return the size of each value of a frame [bytes]."""
-        return np.repeat([kind.size * np.dtype(kind.dtype).itemsize for kind in _KINDS], self._counts)
+        return np.concatenate([column.sizes for column in self._columns])
 
     def _unpack(self, data: bytes) -> list[np.ndarray]:
         """Return the values of a frame, as they were written."""
         found, place = [], 0
-        for kind, count in zip(_KINDS, self._counts, strict=True):
-            values = np.frombuffer(data, dtype=kind.dtype, count=count * kind.size, offset=place)
-            found.append(values.reshape(count, kind.size))
-            place += values.nbytes
+        for column in self._columns:
+            found.append(column.unpacked(data, place))
+            place += int(column.sizes.sum())
         return found
 
     def _metadata(self, end: float) -> dict[str, float | str]:
@@ -365,14 +378,29 @@ class CacheWriter:
         root.subLayerPaths[:] = [f"./{self._output.cache.name}", *self._below]
         return root
 
+    def _instances_layer(self) -> Sdf.Layer | None:
+        """Return the layer with the prims of instances, without those of instancers that stay such; None without."""
+        found, swarms = added_layer(self._stage, INSTANCES), [swarm for swarm, *_ in self._rows.of_swarms]
+        if found is None or not swarms:
+            return found
+        layer = Sdf.Layer.CreateAnonymous()
+        layer.TransferContent(found)
+        for one in swarms:
+            spec = layer.GetPrimAtPath(one.path)
+            del (spec.nameParent or layer.pseudoRoot).nameChildren[spec.name]
+            prim = Sdf.CreatePrimInLayer(layer, one.path)
+            moments = Sdf.AttributeSpec(prim, MOMENTS, Sdf.ValueTypeNames.Vector3fArray)
+            moments.SetInfo("interpolation", UsdGeom.Tokens.vertex)
+        return layer
+
     def _cache_layer(self) -> crate.Overs:
         """Return the layer with the motion, without its frames."""
         cache, bodies = crate.Overs(self._value_sizes()), self._bodies
         for name, value in self._metadata(self._clock.start).items():
             cache.set_metadata(name, value)
         cache.set_metadata("customLayerData", {"warpmag": self._about})
-        for kind, paths in zip(_KINDS, [*[bodies.paths] * len(_BODY), self._magnet_paths], strict=True):
-            cache.add_sampled(paths, kind.name, kind.type_name, kind.kind)
+        for column in self._columns:
+            cache.add_sampled(column.paths, column.kind.name, column.kind.type_name, column.kind.kind)
         scaled = ~np.isclose(bodies.scales, 1.0, rtol=0.0, atol=1e-6).all(axis=1)
         orders: dict[tuple[str, ...], list[str]] = {}
         for path, scale, free, has_scale in zip(bodies.paths, bodies.scales, bodies.free, scaled, strict=True):
@@ -382,7 +410,7 @@ class CacheWriter:
             orders.setdefault(order, []).append(path)
         for order, paths in orders.items():
             cache.add_tokens(paths, "xformOpOrder", order)
-        for path in _instances(as_written(self._stage), (*bodies.paths, *self._magnet_paths)):
+        for path in _instances(as_written(self._stage), {path for one in self._columns for path in one.paths}):
             cache.make_editable(path)
         return cache
 
