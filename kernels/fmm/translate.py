@@ -131,7 +131,7 @@ class Translation:
         blocks = splits * (-(-cells // _CELLS) + OCTANTS * a.octant_begin.shape[0])
         wp.launch(kernel, dim=blocks * threads, inputs=[a], device=self._device, block_dim=threads)
         if splits > 1:
-            inputs = [a.parts.reshape((splits, -1)), a.locals.flatten()]
+            inputs = [a.octant_begin, a.locals.shape[1], a.parts.reshape((splits, -1)), a.locals.flatten()]
             wp.launch(_add_kernel(self._dtype), dim=a.locals.size, inputs=inputs, device=self._device)
 
 
@@ -185,8 +185,17 @@ def _cuda_kernel(dtype, splits: int, constants):
 @cache
 def _add_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False)
-    def add_parts(parts: wp.array2d[dtype], locals_out: wp.array[dtype]):
+    def add_parts(
+        # inputs:
+        octant_begin: wp.array2d[int],
+        width: int,
+        parts: wp.array2d[dtype],
+        # outputs:
+        locals_out: wp.array[dtype],
+    ):
         i = wp.tid()
+        if i >= octant_begin[octant_begin.shape[0] - 1, 8] * width:  # no cell
+            return
         total = parts[0, i]
         for part in range(1, parts.shape[0]):
             total += parts[part, i]
