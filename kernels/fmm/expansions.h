@@ -6,6 +6,7 @@
 // coefficients G_jc of the field's components, H_c = −Σ G_jc R_j(u) / 4πh³, and of their derivatives.
 #pragma once
 #include "pairs/pair_terms.h"
+#include "shared/arrival.h"
 #include "shared/team.h"
 #include "shared/vectors.h"
 
@@ -289,22 +290,6 @@ template <class Arrays> void spread_to_children(const Arrays& a, int cell) {
 enum class Step { RISE, FALL, FIELDS };
 
 #if defined(__CUDA_ARCH__)
-// Whether a block is the last that comes to a cell, of one for each of the cell's children.
-template <class Arrays> CUDA_CALLABLE inline bool is_last_child(const Arrays& a, int cell) {
-    __shared__ bool last;
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        int children = 0;
-        for (int o = 0; o < 8; ++o) children += a.children.data[8 * (size_t)cell + o] >= 0;
-        __threadfence();
-        last = atomicAdd(a.arrived.data + cell, 1) == children - 1;
-        if (last) a.arrived.data[cell] = 0;
-        __threadfence();
-    }
-    __syncthreads();
-    return last;
-}
-
 // A block has a leaf; the last of those of a cell's children goes on with the cell.
 template <class Arrays> CUDA_CALLABLE inline void rise(const Arrays& a, int block) {
     if (block >= a.level_begin.data[1]) return;
@@ -312,7 +297,9 @@ template <class Arrays> CUDA_CALLABLE inline void rise(const Arrays& a, int bloc
     int cell = block;
     for (int level = a.counts.data[0] - 1; level >= 2; --level) {
         cell = a.parent.data[cell];
-        if (!is_last_child(a, cell)) return;
+        int children = 0;
+        for (int o = 0; o < 8; ++o) children += a.children.data[8 * (size_t)cell + o] >= 0;
+        if (!is_last_of(a.arrived.data + cell, children)) return;
         merge_children(a, cell);
     }
 }
