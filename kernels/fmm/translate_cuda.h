@@ -1,6 +1,6 @@
 // Translation of multipoles to local expansions on a GPU: a block takes CELLS cells of one octant through all
-// displacements. A thread has 8 rows, of one parity class, of 8 cells in registers; SLICE harmonics of the sources at a
-// time, and their columns of the matrix, are in shared memory.
+// displacements. A thread has GROUP_ROWS rows (8, or 6 in 8 places), of one parity class, of 8 cells in registers;
+// SLICE harmonics of the sources at a time, and their columns of the matrix, are in shared memory.
 #pragma once
 #include "fmm/translate.h"
 
@@ -93,15 +93,15 @@ template <int N, int CELLS, int SLICE, int THREADS> struct Slice {
     }
 };
 
-// Adds the products of a thread's 8 rows and 8 cells for the slice in shared memory.
+// Adds the products of a thread's rows and 8 cells for the slice in shared memory.
 template <int CELLS, int SLICE, int ROW>
-CUDA_CALLABLE inline void add_products(Real (&sums)[8][8], const Real* matrix, const Real* plane) {
+CUDA_CALLABLE inline void add_products(Real (&sums)[GROUP_ROWS][8], const Real* matrix, const Real* plane) {
 #pragma unroll
     for (int k = 0; k < SLICE; ++k, matrix += ROWS, plane += ROW) {
         const Quad a[2] = {*(const Quad*)matrix, *(const Quad*)(matrix + 4)};
         const Quad b[2] = {*(const Quad*)plane, *(const Quad*)(plane + CELLS / 2)};
 #pragma unroll
-        for (int r = 0; r < 8; ++r)
+        for (int r = 0; r < GROUP_ROWS; ++r)
 #pragma unroll
             for (int c = 0; c < 8; ++c) sums[r][c] += ((const Real*)a)[r] * ((const Real*)b)[c];
     }
@@ -114,7 +114,7 @@ template <int CELLS, int SLICE, int SPLITS> struct Translator {
     typedef TranslationStage<CELLS, SLICE> Stage;
     int lane, column, row, row_class, turn = 0, buffer = 0;
     const Real* matrix; // of the next slice that is copied
-    Real sums[8][8] = {};
+    Real sums[GROUP_ROWS][8] = {};
 
     CUDA_CALLABLE void copy_matrix(Stage& stage, int to) {
         constexpr int SIZE = SLICE * ROWS;
@@ -150,7 +150,7 @@ template <int CELLS, int SLICE, int SPLITS> struct Translator {
     CUDA_CALLABLE void write(const Stage& stage, const Arrays& arrays, int count, Real* out) const {
         if (lane >= USED) return;
 #pragma unroll
-        for (int r = 0; r < 8; ++r) {
+        for (int r = 0; r < GROUP_ROWS; ++r) {
             const int k = arrays.row_harmonic.data[row + r];
             if (k < 0) continue;
             const Real sign = arrays.signs.data[stage.run.octant * PITCH + k];
