@@ -121,7 +121,8 @@ def run(device, sizes, names, seconds: float, slowest: float, emit) -> None:
         emit: Takes each result, a dict.
     """
     machine = describe(device)
-    peers = {p.name.removeprefix("with_"): p for p in PEERS if ("cpu" if device.is_cpu else "cuda") in p.devices}
+    kind = "cpu" if device.is_cpu else "cuda"
+    peers = {p.name.removeprefix("with_"): p for p in PEERS if kind in p.devices and not p.charges}
     peers = {name: peer for name, peer in peers.items() if not names or name in names}
     for count in sizes:
         lines = compare(peers, count, str(device), seconds)
@@ -132,15 +133,15 @@ def run(device, sizes, names, seconds: float, slowest: float, emit) -> None:
 
 def main(arguments=None) -> None:
     """Run the comparison that the command line asks for."""
-    names = [p.name.removeprefix("with_") for p in PEERS]
+    summaries = {p.name.removeprefix("with_"): p.summary for p in PEERS if not p.charges}
     parser = argparse.ArgumentParser(
         prog="python -m bench.compare",
         description=__doc__.partition("\n")[0],
-        epilog="peers: " + "; ".join(f"{n} ({p.summary})" for n, p in zip(names, PEERS, strict=True)),
+        epilog="peers: " + "; ".join(f"{name} ({summary})" for name, summary in summaries.items()),
     )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--sizes", type=int, nargs="+", help="numbers of dipoles; default by device")
-    parser.add_argument("--peers", nargs="+", choices=names, help="default: all")
+    parser.add_argument("--peers", nargs="+", choices=summaries, help="default: all")
     parser.add_argument("--seconds", type=float, default=0.3, help="time for each measurement (default 0.3)")
     parser.add_argument(
         "--slowest",

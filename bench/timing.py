@@ -9,10 +9,10 @@ _CHAINED = 10
 """Pieces of work in a captured graph."""
 
 
-def measure(work, device, *, seconds: float = 1.0, repeats: int = 5) -> float:
+def measure(work, device, *, seconds: float = 1.0, repeats: int = 5, chained: int = _CHAINED) -> float:
     """Median time [s] of ``work``, which only launches kernels.
 
-    On a GPU it is captured ``_CHAINED`` times in one graph, between two events: a graph's own launch takes 5 µs, which
+    On a GPU it is captured ``chained`` times in one graph, between two events: a graph's own launch takes 5 µs, which
     a step in a simulation's graph does not pay.
     """
     work()
@@ -28,7 +28,7 @@ def measure(work, device, *, seconds: float = 1.0, repeats: int = 5) -> float:
             laps.append((time.perf_counter() - began) / count)
         return float(np.median(laps))
     with wp.ScopedCapture(device) as capture:
-        for _ in range(_CHAINED):
+        for _ in range(chained):
             work()
     laps = []
     for _ in range(4 * repeats):
@@ -36,5 +36,5 @@ def measure(work, device, *, seconds: float = 1.0, repeats: int = 5) -> float:
         wp.record_event(first)
         wp.capture_launch(capture.graph)
         wp.record_event(last)
-        laps.append(1e-3 * wp.get_event_elapsed_time(first, last) / _CHAINED)
+        laps.append(1e-3 * wp.get_event_elapsed_time(first, last) / chained)
     return float(np.median(laps))

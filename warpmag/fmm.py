@@ -49,9 +49,14 @@ _PART_OF_FIELD = 0.3
 """Error of a field over that of the magnetization that it is for."""
 SUMS_OF_SOLVES = ("auto", "vectorized", "fmm")
 """How an induction solve sums pairs."""
-_LEAST_COUNT = {"cpu": 700, "cuda": 4000}
-"""Fewest moments and targets, for each degree of the expansions, with which the method beats all pairs, by kind
-of device: on two cores 6,300 at 1e-3."""
+_COSTS = {
+    ("cpu", Quantity.FIELD): (2.8e7, 55.0),
+    ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
+    ("cuda", Quantity.FIELD): (8.7e8, 70.0),
+    ("cuda", Quantity.WRENCH): (7.0e8, 55.0),
+}
+"""What the method takes, in pairs that are summed in the same time: for itself, and for each harmonic of each moment.
+On two cores both ways are as fast with 8,000 moments at 1e-3 and 13,500 at 1e-5, forces with 4,600 and 8,000."""
 
 
 def check_fast(rtol: float):
@@ -60,11 +65,12 @@ def check_fast(rtol: float):
         raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'vectorized'")
 
 
-def is_fast(count: int, rtol: float, device) -> bool:
-    """Whether the method reaches a relative error, and sooner than the sums over all pairs of ``count`` moments."""
+def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device) -> bool:
+    """Whether the method reaches a relative error, and sooner than the sums over so many pairs of ``count`` moments."""
     if rtol < LEAST_RTOL:
         return False
-    return count >= _LEAST_COUNT["cuda" if device.is_cuda else "cpu"] * (choose_degree(rtol)[0] + 1)
+    alone, each = _COSTS["cuda" if device.is_cuda else "cpu", quantity]
+    return pairs >= alone + each * (choose_degree(rtol)[0] + 1) ** 2 * count
 
 
 def choose_degree(rtol: float) -> tuple[int, int]:
@@ -115,7 +121,7 @@ class NoFastSums:
         """Return nothing."""
 
 
-def fast_sums_for(method: str, moments, bodies, rtol: float, worlds: int) -> FastSums | NoFastSums:
+def fast_sums_for(method: str, moments, bodies, rtol: float, ranges) -> FastSums | NoFastSums:
     """Cells for the fields of an induction solve, none where all pairs are summed.
 
     Args:
@@ -123,7 +129,7 @@ def fast_sums_for(method: str, moments, bodies, rtol: float, worlds: int) -> Fas
         moments: Packed moments.
         bodies: Body of each moment.
         rtol: Relative error of the magnetization that is wanted.
-        worlds: Number of worlds.
+        ranges: For each world the first of its moments, the first that is no target, and the end, integers [worlds, 3].
 
     Raises:
         InputError: The method is wanted where it cannot be had.
@@ -134,5 +140,7 @@ def fast_sums_for(method: str, moments, bodies, rtol: float, worlds: int) -> Fas
         check_fast(rtol)
         if not alone:
             raise InputError("method: 'fmm' is not for bodies of several moments")
-    wanted = method == "fmm" or (method == "auto" and alone and is_fast(moments.count, rtol, moments.device))
-    return FastSums(moments, rtol, worlds=worlds) if wanted and moments.count else NoFastSums()
+    begin, targets_end, end = np.reshape(ranges, (-1, 3)).T.astype(float)
+    pairs, count, device = ((targets_end - begin) @ (end - begin)), moments.count, moments.device
+    better = method == "auto" and alone and is_fast(pairs, count, Quantity.FIELD, rtol, device)
+    return FastSums(moments, rtol, worlds=len(end)) if (better or method == "fmm") and count else NoFastSums()

@@ -149,7 +149,7 @@ class MomentSystem:
         layout = self._make_bias(layout, dynamics)
         self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
-        self._fast = fast_sums_for(method, self._packed, layout.bodies, self.rtol, len(layout.ranges()))
+        self._fast = fast_sums_for(method, self._packed, layout.bodies, self.rtol, layout.ranges())
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings, whole=dynamics == "theta")
         self._evaluate_wrench(layout, turned)

@@ -36,11 +36,13 @@ class Peer:
         name: Module name.
         summary: What it is.
         devices: Where it runs, ``cpu``, ``cuda`` or both.
+        charges: Whether it sums the field of point charges, shape [n], and knows no dipoles; ``many`` alone runs it.
     """
 
     name: str
     summary: str
     devices: tuple[str, ...]
+    charges: bool = False
 
 
 PEERS = (
@@ -57,4 +59,6 @@ PEERS = (
     Peer("with_pykeops", "KeOps: symbolic matrix, reduced without being stored", ("cpu", "cuda")),
     Peer("with_magpylib", "magpylib: its dipole formula over all pairs, float64", ("cpu",)),
     Peer("with_fmm3d", "FMM3D: fast multipole method, eps 1e-3, float64", ("cpu",)),
+    Peer("with_jaxfmm", "jaxFMM: fast multipole method, error 2e-3, tree kept", ("cpu", "cuda"), charges=True),
+    Peer("with_jzfmm", "jz-FMM: fast multipole method, order 5", ("cuda",), charges=True),
 )

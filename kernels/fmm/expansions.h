@@ -6,6 +6,7 @@
 // coefficients G_jc of the field's components, H_c = −Σ G_jc R_j(u) / 4πh³, and of their derivatives.
 #pragma once
 #include "pairs/pair_terms.h"
+#include "shared/arrival.h"
 #include "shared/team.h"
 #include "shared/vectors.h"
 
@@ -207,18 +208,50 @@ template <Quantity Q, class Arrays> CUDA_CALLABLE inline void leaf_fields(const 
     }
 }
 
-// Adds to ``out`` the product of a matrix, of which columns follow each other, and of an expansion, both with signs.
+// The multipole of a cell from those of its children, and what its local expansion adds to theirs: a matrix for a child
+// in octant 0, mirrored for the others. On a GPU a block reads it once for all children.
 #if defined(__CUDA_ARCH__)
-CUDA_CALLABLE inline void add_product(Real* out, const Real* matrix, const Real* from, const Real* signs) {
-    __shared__ Real signed_from[HARMONICS];
-    __syncthreads();
-    for (int k = threadIdx.x; k < HARMONICS; k += THREADS) signed_from[k] = signs[k] * from[k];
+// Row i of a matrix, of which columns follow each other, times the expansions of 8 children side by side.
+CUDA_CALLABLE inline void multiply_row(Real (&sums)[8], const Real* matrix, const Real (*children)[8], int i) {
+#pragma unroll 8
+    for (int k = 0; k < HARMONICS; ++k) {
+        const Real m = matrix[k * PITCH + i];
+#pragma unroll
+        for (int o = 0; o < 8; ++o) sums[o] += m * children[k][o];
+    }
+}
+
+// Other blocks of this launch write what is read of expansions here, so that it comes from the cache of all of them.
+template <class Arrays> CUDA_CALLABLE inline void merge_children(const Arrays& a, int cell) {
+    __shared__ alignas(16) Real signed_from[HARMONICS][8];
+    for (int item = threadIdx.x; item < 8 * HARMONICS; item += THREADS) {
+        const int o = item / HARMONICS, k = item % HARMONICS, child = a.children.data[8 * (size_t)cell + o];
+        const Real* const from = a.multipoles.data + PITCH * (size_t)child + k;
+        signed_from[k][o] = child < 0 ? 0 : a.signs.data[PITCH * o + k] * __ldcg(from);
+    }
     __syncthreads();
     for (int i = threadIdx.x; i < HARMONICS; i += THREADS) {
-        Real sum = 0;
-#pragma unroll 4
-        for (int k = 0; k < HARMONICS; ++k) sum += matrix[k * PITCH + i] * signed_from[k];
-        out[i] += signs[i] * sum;
+        Real sums[8] = {}, q = 0;
+        multiply_row(sums, a.up.data, signed_from, i);
+        for (int o = 0; o < 8; ++o) q += a.signs.data[PITCH * o + i] * sums[o];
+        a.multipoles.data[PITCH * (size_t)cell + i] = i < a.sources ? q : 0;
+    }
+}
+template <class Arrays> CUDA_CALLABLE inline void spread_to_children(const Arrays& a, int cell) {
+    __shared__ alignas(16) Real signed_from[HARMONICS][8];
+    for (int k = threadIdx.x; k < HARMONICS; k += THREADS) {
+        const Real own = __ldcg(a.locals.data + PITCH * (size_t)cell + k);
+        for (int o = 0; o < 8; ++o) signed_from[k][o] = a.signs.data[PITCH * o + k] * own;
+    }
+    __syncthreads();
+    for (int i = threadIdx.x; i < HARMONICS; i += THREADS) {
+        Real sums[8] = {};
+        multiply_row(sums, a.down.data, signed_from, i);
+#pragma unroll
+        for (int o = 0; o < 8; ++o) {
+            const int child = a.children.data[8 * (size_t)cell + o];
+            if (child >= 0) a.locals.data[PITCH * (size_t)child + i] += a.signs.data[PITCH * o + i] * sums[o];
+        }
     }
 }
 #else
@@ -230,66 +263,91 @@ inline void add_product(Real* out, const Real* matrix, const Real* from, const R
     for (int v = 0; v < VECTORS; ++v)
         put(out + v * WIDTH, numbers(out + v * WIDTH) + numbers(signs + v * WIDTH) * sums[v]);
 }
-#endif
-
-// The multipole of a cell from those of its children.
-template <class Arrays> CUDA_CALLABLE inline void merge_children(const Arrays& a, int cell) {
-    Real* const multipole = a.multipoles.data + PITCH * (size_t)cell;
-#if defined(__CUDA_ARCH__)
-    for (int i = threadIdx.x; i < HARMONICS; i += THREADS) multipole[i] = 0;
-#else
-    __builtin_memset(multipole, 0, PITCH * sizeof(Real));
-#endif
+// Calls visit(child, signs of its octant).
+template <class Arrays, class Visit> void visit_children(const Arrays& a, int cell, Visit visit) {
     for (int octant = 0; octant < 8; ++octant) {
         const int child = a.children.data[8 * (size_t)cell + octant];
-        if (child < 0) continue;
-        add_product(multipole, a.up.data, a.multipoles.data + PITCH * (size_t)child, a.signs.data + PITCH * octant);
+        if (child >= 0) visit(child, a.signs.data + PITCH * octant);
     }
-#if defined(__CUDA_ARCH__)
-    for (int i = threadIdx.x; i < HARMONICS; i += THREADS)
-        if (i >= a.sources) multipole[i] = 0;
-#else
+}
+template <class Arrays> void merge_children(const Arrays& a, int cell) {
+    Real* const multipole = a.multipoles.data + PITCH * (size_t)cell;
+    __builtin_memset(multipole, 0, PITCH * sizeof(Real));
+    visit_children(a, cell, [&](int child, const Real* signs) {
+        add_product(multipole, a.up.data, a.multipoles.data + PITCH * (size_t)child, signs);
+    });
     for (int i = a.sources; i < HARMONICS; ++i) multipole[i] = 0;
+}
+template <class Arrays> void spread_to_children(const Arrays& a, int cell) {
+    visit_children(a, cell, [&](int child, const Real* signs) {
+        add_product(a.locals.data + PITCH * (size_t)child, a.down.data, a.locals.data + PITCH * (size_t)cell, signs);
+    });
+}
 #endif
-}
 
-// Adds to a cell's local expansion what its parent has.
-template <class Arrays> CUDA_CALLABLE inline void add_parent(const Arrays& a, int cell) {
-    const Real* const parent = a.locals.data + PITCH * (size_t)a.parent.data[cell];
-    add_product(a.locals.data + PITCH * (size_t)cell, a.down.data, parent, a.signs.data + PITCH * a.octant.data[cell]);
-}
+// Steps over all cells: up from the leaves, down to them, and the fields at their moments. Only cells two levels and
+// more below the cube are translated to each other, so that none above has an expansion.
+enum class Step { RISE, FALL, FIELDS };
 
-// Passes over cells. Only cells two levels and more below the cube are translated to each other.
-enum class Step { MULTIPOLES, MERGE, SPREAD, FIELDS };
-
-template <Step S, Quantity Q, class Arrays> CUDA_CALLABLE inline void visit_cell(const Arrays& a, int cell) {
-    if constexpr (S == Step::MULTIPOLES) leaf_multipole(a, cell);
-    else if constexpr (S == Step::MERGE) merge_children(a, cell);
-    else if constexpr (S == Step::SPREAD) add_parent(a, cell);
-    else leaf_fields<Q>(a, cell);
-}
-
-// Makes a step for all cells of a height: on a GPU by ``threads`` blocks.
-template <Step S, Quantity Q, class Word, class Arrays>
-CUDA_CALLABLE inline void visit_height(int thread, int height, int threads, Word* team, const Arrays& a) {
-    const int below = a.counts.data[0] - height, least = S == Step::SPREAD ? 3 : S == Step::MERGE ? 2 : 0;
-    if (below < least) return;
-    const int begin = a.level_begin.data[height], end = a.level_begin.data[height + 1];
 #if defined(__CUDA_ARCH__)
-    for (int cell = begin + thread / THREADS; cell < end; cell += threads) visit_cell<S, Q>(a, cell);
-#else
-    share_out(team, threads, end - begin, 4, [&](int i) { visit_cell<S, Q>(a, begin + i); });
-#endif
+// A block has a leaf; the last of those of a cell's children goes on with the cell.
+template <class Arrays> CUDA_CALLABLE inline void rise(const Arrays& a, int block) {
+    if (block >= a.level_begin.data[1]) return;
+    leaf_multipole(a, block);
+    int cell = block;
+    for (int level = a.counts.data[0] - 1; level >= 2; --level) {
+        cell = a.parent.data[cell];
+        int children = 0;
+        for (int o = 0; o < 8; ++o) children += a.children.data[8 * (size_t)cell + o] >= 0;
+        if (!is_last_of(a.arrived.data + cell, children)) return;
+        merge_children(a, cell);
+    }
 }
 
-// Makes a step for some heights, one after the other; on a GPU for the first of them.
-template <Step S, Quantity Q, class Word, class Arrays>
-CUDA_CALLABLE inline void visit_cells(int thread, int first, int last, int threads, Word* team, const Arrays& a) {
-#if defined(__CUDA_ARCH__)
-    visit_height<S, Q>(thread, first, threads, team, a);
-#else
-    const int by = first <= last ? 1 : -1;
-    for (int height = first; height != last + by; height += by) visit_height<S, Q>(thread, height, threads, team, a);
-#endif
+// Blocks have cells in turn, from the top down, and wait for a cell's parent. It belongs to an earlier turn, or to a
+// block before this one, which GPUs start before.
+template <class Arrays> CUDA_CALLABLE inline void fall(const Arrays& a, int block, int blocks) {
+    const int levels = a.counts.data[0];
+    if (levels < 3) return;
+    const int leaves = a.level_begin.data[1], parents = a.level_begin.data[2], top = a.level_begin.data[levels - 2];
+    for (int cell = a.level_begin.data[levels - 1] - 1 - block; cell >= leaves; cell -= blocks) {
+        if (cell < top && threadIdx.x == 0) {
+            while (*(volatile int*)(a.arrived.data + cell) == 0) __nanosleep(50);
+            a.arrived.data[cell] = 0;
+            __threadfence();
+        }
+        __syncthreads();
+        spread_to_children(a, cell);
+        __syncthreads();
+        const int child = cell >= parents && threadIdx.x < 8 ? a.children.data[8 * (size_t)cell + threadIdx.x] : -1;
+        if (child >= 0) {
+            __threadfence();
+            atomicExch(a.arrived.data + child, 1);
+        }
+    }
 }
+
+template <Step S, Quantity Q, class Word, class Arrays>
+CUDA_CALLABLE inline void visit_cells(int thread, int threads, Word*, const Arrays& a) {
+    const int block = thread / THREADS;
+    if constexpr (S == Step::RISE) rise(a, block);
+    else if constexpr (S == Step::FALL) fall(a, block, threads);
+    else if (block < a.level_begin.data[1]) leaf_fields<Q>(a, block);
+}
+#else
+template <Step S, Quantity Q, class Word, class Arrays>
+void visit_cells(int, int threads, Word* team, const Arrays& a) {
+    const int levels = a.counts.data[0], *const begin = a.level_begin.data;
+    const auto visit = [&](int height, auto work) {
+        share_out(team, threads, begin[height + 1] - begin[height], 4, [&](int i) { work(begin[height] + i); });
+    };
+    if constexpr (S == Step::RISE) {
+        visit(0, [&](int leaf) { leaf_multipole(a, leaf); });
+        for (int height = 1; height <= levels - 2; ++height) visit(height, [&](int cell) { merge_children(a, cell); });
+    } else if constexpr (S == Step::FALL) {
+        for (int height = levels - 2; height > 0; --height)
+            visit(height, [&](int cell) { spread_to_children(a, cell); });
+    } else visit(0, [&](int leaf) { leaf_fields<Q>(a, leaf); });
+}
+#endif
 }

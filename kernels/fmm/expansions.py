@@ -18,8 +18,8 @@ from warpmag.kernels.shared.team import team, threads_for
 
 _THREADS = 128
 """Threads of a block, which has a cell."""
-_BLOCKS_OF_HEIGHT = 1056
-"""Blocks that share the cells of a height above the leaves: eight for each multiprocessor of an H200."""
+_FALLING_BLOCKS = 8
+"""Blocks for each multiprocessor that share the cells above the leaves on the way down."""
 _CELLS_PER_THREAD = 64
 """Cells of a CPU that make another thread worth waking."""
 TERMS = 5
@@ -27,7 +27,7 @@ TERMS = 5
 
 
 class _Step(IntEnum):
-    MULTIPOLES, MERGE, SPREAD, FIELDS = range(4)
+    RISE, FALL, FIELDS = range(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ def _arrays_type(dtype):
         moment_begin: wp.array[int]
         children: wp.array2d[int]
         parent: wp.array[int]
-        octant: wp.array[int]
+        arrived: wp.array[int]
         frame: wp.array[wp.float64]
         inside: wp.array2d[dtype]
         sorted: wp.array2d[dtype]
@@ -107,49 +107,43 @@ class Expansions:
         self._translation = _translation(tables, dtype, device.alias)
         self._constants = {"DEGREE": tables.degree, "HARMONICS": harmonics, "PITCH": width, "THREADS": _THREADS}
         self._arrays = a = _arrays_type(dtype)()
-        for name in ("counts", "level_begin", "moment_begin", "children", "parent", "octant", "frame", "inside"):
+        for name in ("counts", "level_begin", "moment_begin", "children", "parent", "frame", "inside"):
             setattr(a, name, getattr(grid, name))
         for name, array in _device_tables(tables, dtype, device.alias).items():
             setattr(a, name, array)
         a.sorted, a.effective, a.sums = moments, effective, sums
         a.multipoles = wp.zeros((grid.capacity + 1, width), dtype=dtype, device=device)
         a.locals = wp.zeros_like(a.multipoles)
+        a.arrived = wp.zeros(grid.capacity, dtype=wp.int32, device=device)
         # forces: sources to one degree less, for actions and reactions to add up to zero
         a.sources = harmonics if quantity == Quantity.FIELD else tables.degree**2
 
     def gather(self):
-        """Launch the multipoles of leaves."""
-        self._launch(_Step.MULTIPOLES, 0, 0)
+        """Launch the multipoles of all cells."""
+        self._launch(_Step.RISE)
 
     def translate(self):
-        """Launch all translations: up, across and down."""
-        a, grid, top = self._arrays, self._grid, self._grid.levels - 3
-        self._launch(_Step.MERGE, 1, top)
+        """Launch the local expansions of all cells: across, and down."""
+        a, grid = self._arrays, self._grid
         self._translation.launch(
             *(a.multipoles, a.locals, grid.neighbors, a.children, a.parent, grid.order, grid.octant_begin)
         )
-        self._launch(_Step.SPREAD, top - 1, 0)
+        self._launch(_Step.FALL)
 
     def add_fields(self):
         """Launch the fields of local expansions at all moments, added to ``sums``."""
-        self._launch(_Step.FIELDS, 0, 0)
+        self._launch(_Step.FIELDS)
 
-    def _launch(self, step: _Step, first: int, last: int):
+    def _launch(self, step: _Step):
         grid, device = self._grid, self._grid.device
         kernel = _kernel(self._dtype, step, self._quantity, tuple(self._constants.items()))
         if device.is_cpu:
             threads = threads_for(grid.capacity, _CELLS_PER_THREAD)
-            wp.launch(kernel, dim=1, inputs=[first, last, threads, team(), self._arrays], device=device)
+            wp.launch(kernel, dim=1, inputs=[threads, team(), self._arrays], device=device)
             return
-        for height in range(first, last + (1 if first <= last else -1), 1 if first <= last else -1):
-            blocks = grid.capacity if step in (_Step.MULTIPOLES, _Step.FIELDS) else _BLOCKS_OF_HEIGHT
-            wp.launch(
-                kernel,
-                dim=blocks * _THREADS,
-                inputs=[height, height, blocks, None, self._arrays],
-                device=device,
-                block_dim=_THREADS,
-            )
+        blocks = min(grid.capacity, _FALLING_BLOCKS * device.sm_count) if step == _Step.FALL else grid.capacity
+        inputs = [blocks, None, self._arrays]
+        wp.launch(kernel, dim=blocks * _THREADS, inputs=inputs, device=device, block_dim=_THREADS)
 
 
 @cache
@@ -210,8 +204,8 @@ def _kernel(dtype, step: _Step, quantity: Quantity, constants):
     arrays_struct = _arrays_type(dtype)
     call = f"visit_cells<warpmag::Step({step:d}), warpmag::Quantity({quantity:d})>"
 
-    @wp.func_native(f"warpmag::{call}(thread, first, last, threads, team.data, arrays);")
-    def run(thread: int, first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct): ...
+    @wp.func_native(f"warpmag::{call}(thread, threads, team.data, arrays);")
+    def run(thread: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct): ...
 
     @wp.kernel(
         module="unique",
@@ -219,7 +213,7 @@ def _kernel(dtype, step: _Step, quantity: Quantity, constants):
         grid_stride=False,
         module_options=native_options("fmm/expansions.h", dtype=dtype, **dict(constants)),
     )
-    def expand(first: int, last: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct):
-        run(wp.tid(), first, last, threads, team, arrays)
+    def expand(threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct):
+        run(wp.tid(), threads, team, arrays)
 
     return expand

@@ -5,6 +5,7 @@
 // before it part, a cell begins at that level and at all finer ones: the ranks of those beginnings number the cells.
 // Then cells are sorted by rows, x fastest, and moments with them.
 #pragma once
+#include "shared/arrival.h"
 #include "shared/lanes.h"
 #include "shared/team.h"
 
@@ -146,8 +147,17 @@ template <class Arrays> CUDA_CALLABLE inline void set_frame(const Arrays& a, int
     a.frame.data[ROOT] = root;
 }
 
-// Key of a moment on the Morton curve of its world.
+// Makes a cell's entry one that is sorted behind all others.
+template <class Arrays> CUDA_CALLABLE inline void clear_cell(const Arrays& a, int cell) {
+    a.cell_keys.data[cell] = ~0ull;
+    a.cell_before.data[cell] = cell;
+    for (int o = 0; o < 8; ++o) a.children.data[8 * (size_t)cell + o] = -1;
+}
+
+// Key of a moment on the Morton curve of its world; and an entry for a cell.
 template <class Arrays> CUDA_CALLABLE inline void set_key(const Arrays& a, int i) {
+    if (i < a.capacity) clear_cell(a, i);
+    if (i >= moment_count(a)) return;
     const double* const frame = a.frame.data;
     const double cells = (double)(1ull << a.depth) / frame[ROOT];
     Bits key = 0;
@@ -263,6 +273,7 @@ template <class Arrays> CUDA_CALLABLE inline void choose_leaves(const Arrays& a)
     }
     __syncthreads();
     if (threadIdx.x == 0) choose_level(a, totals);
+    __syncthreads();
 #else
     int totals[32];
     for (int level = 0; level <= a.depth; ++level) totals[level] = scan_level(a, level);
@@ -314,13 +325,6 @@ template <class Arrays> CUDA_CALLABLE inline void write_cells(const Arrays& a, i
 #endif
 }
 
-// Makes a cell's entry one that is sorted behind all others.
-template <class Arrays> CUDA_CALLABLE inline void clear_cell(const Arrays& a, int cell) {
-    a.cell_keys.data[cell] = ~0ull;
-    a.cell_before.data[cell] = cell;
-    for (int o = 0; o < 8; ++o) a.children.data[8 * (size_t)cell + o] = -1;
-}
-
 // Notes where a cell went when cells were sorted, and how many moments a leaf has.
 template <class Arrays> CUDA_CALLABLE inline void note_cell(const Arrays& a, int cell) {
     int held = 0;
@@ -366,14 +370,11 @@ template <class Arrays> CUDA_CALLABLE inline void link_cell(const Arrays& a, int
     find_neighbors(a, cell, at);
 }
 
-// Where a height's cells of each octant begin in ``order``.
-template <class Arrays> CUDA_CALLABLE inline void find_octants(const Arrays& a, int i) {
-    const int height = i / 9, octant = i % 9;
-    a.octant_begin.data[i] = lower_bound(a.order_keys.data, 0, cell_count(a), 8 * height + octant);
-}
-
-// Puts a moment where its leaf has it.
+// Puts a moment where its leaf has it; and finds where a height's cells of an octant begin in ``order``.
 template <class Arrays> CUDA_CALLABLE inline void place_moment(const Arrays& a, int i) {
+    if (i < 9 * (int)a.octant_begin.shape[0])
+        a.octant_begin.data[i] = lower_bound(a.order_keys.data, 0, cell_count(a), 8 * (i / 9) + i % 9);
+    if (i >= moment_count(a)) return;
     const int before = a.leaf_before.data[i], leaf = a.cell_after.data[before], from = a.index.data[i];
     const int to = a.moment_begin.data[leaf] + i - a.first.data[before];
     const size_t pitch = a.sorted.strides[0] / sizeof(Real), given = a.packed.strides[0] / sizeof(Real);
@@ -389,24 +390,25 @@ template <class Arrays> CUDA_CALLABLE inline void place_moment(const Arrays& a, 
 }
 
 // Passes of the build, in order; grid.py sorts between them.
-enum class Pass { BOUND, FRAME, KEYS, COUNT, CHOOSE, CLEAR, WRITE, NOTE, LINK, OCTANTS, PLACE };
+enum class Pass { BOUND, KEYS, COUNT, WRITE, NOTE, LINK, PLACE };
 
-template <Pass P, class Arrays> CUDA_CALLABLE inline void make_pass(const Arrays& a, int i, int round) {
+template <Pass P, class Arrays> CUDA_CALLABLE inline void make_pass(const Arrays& a, int i) {
     if constexpr (P == Pass::BOUND) bound_moments(a, i);
-    else if constexpr (P == Pass::FRAME) set_frame(a, round);
     else if constexpr (P == Pass::KEYS) set_key(a, i);
     else if constexpr (P == Pass::COUNT) count_beginnings(a, i);
-    else if constexpr (P == Pass::CHOOSE) choose_leaves(a);
-    else if constexpr (P == Pass::CLEAR) clear_cell(a, i);
     else if constexpr (P == Pass::WRITE) write_cells(a, i);
     else if constexpr (P == Pass::NOTE) note_cell(a, i);
     else if constexpr (P == Pass::LINK) link_cell(a, i);
-    else if constexpr (P == Pass::OCTANTS) find_octants(a, i);
     else place_moment(a, i);
 }
 
-template <Pass P> constexpr bool of_blocks() {
-    return P == Pass::BOUND || P == Pass::FRAME || P == Pass::COUNT || P == Pass::CHOOSE || P == Pass::WRITE;
+template <Pass P> constexpr bool of_blocks() { return P == Pass::BOUND || P == Pass::COUNT || P == Pass::WRITE; }
+template <Pass P> constexpr bool is_concluded() { return P == Pass::BOUND || P == Pass::COUNT; }
+
+// What follows all items of a pass; on a GPU by a block.
+template <Pass P, class Arrays> CUDA_CALLABLE inline void conclude(const Arrays& a, int round) {
+    if (P == Pass::COUNT) choose_leaves(a);
+    if (P == Pass::BOUND || round == 0) set_frame(a, P == Pass::BOUND ? 0 : 1);
 }
 
 // Makes one pass over ``count`` items: on a GPU by blocks of BLOCK threads, each of which has an item or a thread of
@@ -414,10 +416,13 @@ template <Pass P> constexpr bool of_blocks() {
 template <Pass P, class Word, class Arrays>
 CUDA_CALLABLE inline void build(int thread, int count, int round, int threads, Word* team, const Arrays& a) {
 #if defined(__CUDA_ARCH__)
-    if (of_blocks<P>()) make_pass<P>(a, thread / BLOCK, round);
-    else if (thread < count) make_pass<P>(a, thread, round);
+    if (of_blocks<P>()) make_pass<P>(a, thread / BLOCK);
+    else if (thread < count) make_pass<P>(a, thread);
+    if constexpr (is_concluded<P>())
+        if (is_last_of(a.arrived.data, count)) conclude<P>(a, round);
 #else
-    share_out(team, threads, count, of_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { make_pass<P>(a, i, round); });
+    share_out(team, threads, count, of_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { make_pass<P>(a, i); });
+    if constexpr (is_concluded<P>()) conclude<P>(a, round);
 #endif
 }
 }

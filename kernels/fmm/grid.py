@@ -18,20 +18,19 @@ from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 _BLOCK = 256
 """Moments of a block of threads, as in ``grid.h``."""
-_CHOOSING = 32 * 17
-"""Threads that choose the leaves, a warp for each level."""
-_MOST_LEVELS = 16
-_KEY_BITS, _HEIGHT_BITS, _OCTANT_BITS = 64, 5, 8
+_MOST_LEVELS = 13
+"""Levels below the cube: leaves down to 1/8192 of it, by keys that are sorted in five passes of 8 bits."""
+_KEY_BITS, _HEIGHT_BITS, _OCTANT_BITS = 64, 4, 8
 _ROOM = 0.3
 """Cells for which there is room, over the leaves that hold as many moments as wanted: levels differ by a factor of up
 to 8, of which the nearest is chosen."""
 
 
 class _Pass(IntEnum):
-    BOUND, FRAME, KEYS, COUNT, CHOOSE, CLEAR, WRITE, NOTE, LINK, OCTANTS, PLACE = range(11)
+    BOUND, KEYS, COUNT, WRITE, NOTE, LINK, PLACE = range(7)
 
 
-_OF_BLOCKS = (_Pass.BOUND, _Pass.FRAME, _Pass.COUNT, _Pass.CHOOSE, _Pass.WRITE)
+_OF_BLOCKS = (_Pass.BOUND, _Pass.COUNT, _Pass.WRITE)
 
 
 @cache
@@ -47,6 +46,7 @@ def _arrays_type(dtype):
         occupancy: wp.float64
         reach: wp.float64
         boxes: wp.array2d[dtype]
+        arrived: wp.array[int]
         frame: wp.array[wp.float64]
         keys: wp.array[wp.uint64]
         index: wp.array[int]
@@ -130,7 +130,7 @@ class MomentGrid:
         a.packed, a.group = packed, groups
         a.depth, a.worlds, a.world_bits, a.capacity = depth, worlds, bits, c
         a.occupancy, a.reach = occupancy, reach
-        a.boxes, a.frame = zeros(blocks, 6, dtype=dtype), zeros(6, dtype=wp.float64)
+        a.boxes, a.arrived, a.frame = zeros(blocks, 6, dtype=dtype), zeros(1), zeros(6, dtype=wp.float64)
         a.keys, a.index, a.fork = zeros(2 * n, dtype=wp.uint64), zeros(2 * n), zeros(n)
         a.beginnings, a.counts, a.level_begin = zeros(blocks, depth + 1), zeros(2), zeros(depth + 2)
         a.leaf_before, a.first, a.parent_before = zeros(n), zeros(c), zeros(c)
@@ -151,31 +151,26 @@ class MomentGrid:
         blocks = -(-n // _BLOCK)
         self._launch(_Pass.BOUND, blocks)
         for choice in range(2):
-            self._launch(_Pass.FRAME, 1, choice)
-            self._launch(_Pass.KEYS, n)
+            self._launch(_Pass.KEYS, max(n, c))
             wp.utils.radix_sort_pairs(a.keys, a.index, n, 0, 3 * a.depth + a.world_bits)
-            self._launch(_Pass.COUNT, blocks)
-            self._launch(_Pass.CHOOSE, 1)
-        for one, count in ((_Pass.CLEAR, c), (_Pass.WRITE, blocks)):
-            self._launch(one, count)
+            self._launch(_Pass.COUNT, blocks, choice)
+        self._launch(_Pass.WRITE, blocks)
         wp.utils.radix_sort_pairs(a.cell_keys, a.cell_before, c, 0, 3 * a.depth + a.world_bits + _HEIGHT_BITS)
         self._launch(_Pass.NOTE, c)
         wp.utils.array_scan(a.held, a.moment_begin, inclusive=False)
         self._launch(_Pass.LINK, c)
         wp.utils.radix_sort_pairs(a.order_keys, a.order, c, 0, _OCTANT_BITS)
-        self._launch(_Pass.OCTANTS, a.octant_begin.size)
-        self._launch(_Pass.PLACE, n)
+        self._launch(_Pass.PLACE, max(n, a.octant_begin.size))
 
     def _launch(self, one: _Pass, count: int, choice: int = 0):
-        cuda, width = self.device.is_cuda, _CHOOSING if one == _Pass.CHOOSE else _BLOCK
-        threads = count * width if one in _OF_BLOCKS else -(-count // width) * width
-        items = count * _BLOCK if one in _OF_BLOCKS else count
+        cuda, each = self.device.is_cuda, _BLOCK if one in _OF_BLOCKS else 1
+        threads = threads_for(count * each, MOMENTS_PER_THREAD)
         wp.launch(
             _kernel(self.arrays.packed.dtype, one),
-            dim=threads if cuda else 1,
-            inputs=[count, choice, threads_for(items, MOMENTS_PER_THREAD), None if cuda else team(), self.arrays],
+            dim=-(-count * each // _BLOCK) * _BLOCK if cuda else 1,
+            inputs=[count, choice, threads, None if cuda else team(), self.arrays],
             device=self.device,
-            block_dim=width,
+            block_dim=_BLOCK,
         )
 
 

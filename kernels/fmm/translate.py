@@ -5,7 +5,6 @@ children of its parent's 26 neighbours, and of its parent, that are not its own 
 Sums are in a fixed order, without atomics, so that results repeat bit by bit.
 """
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -19,26 +18,13 @@ _CELLS_PER_THREAD = 64
 """Cells that make another thread worth waking."""
 _WARPS_TOGETHER = 12
 """Warps that a multiprocessor holds together in float32: what their registers allow."""
+_CELLS = 32
+"""Cells of a block of a GPU."""
+_GROUP_ROWS = 8
+"""Places for the rows of a thread of a GPU."""
 _SPLITS, _MOST_SPLIT = 4, 8192
 """Blocks that share the displacements of the same cells, and the most cells for which a GPU has room for them."""
 OCTANTS = 8
-
-
-@dataclass(frozen=True)
-class BlockShape:
-    """Shape of the blocks of a GPU.
-
-    Attributes:
-        cells: Cells of a block.
-        slice: Harmonics of the sources that it has in shared memory at a time.
-        prefetch: Whether the next slice is read while one is summed.
-        splits: Blocks that share the displacements of the same cells.
-    """
-
-    cells: int
-    slice: int = 8
-    prefetch: bool = True
-    splits: int = 1
 
 
 def pitch(harmonics: int) -> int:
@@ -83,20 +69,19 @@ class Translation:
         parity: Signs ±1 that harmonics take where x, y or z changes its sign, shape [3, K].
         dtype: Warp scalar type of the coefficients.
         device: Warp device.
-        shape: Shape of the blocks of a GPU; None means the fastest.
     """
 
-    def __init__(self, matrices, parity, dtype, device, shape: BlockShape | None = None):
+    def __init__(self, matrices, parity, dtype, device):
         """Sort and pad the rows of the matrices by parity, and copy them to the device."""
         device = wp.get_device(device)
         matrices, odd = np.asarray(matrices, np.float64), np.asarray(parity) < 0
         harmonics = matrices.shape[1]
         classes = odd[0] + 2 * odd[1] + 4 * odd[2]
-        group = 8 if device.is_cuda else 4
-        rows = _grouped_rows(classes, group)
-        self._slice = shape.slice if shape else 8 if dtype is wp.float32 else 4
-        self._shape = shape
-        length = -(-harmonics // self._slice) * self._slice if device.is_cuda else harmonics
+        group = _GROUP_ROWS if device.is_cuda else 4
+        used = _used_rows(classes) if device.is_cuda else group
+        rows = _grouped_rows(classes, group, used)
+        slice_size = _slice(dtype)
+        length = -(-harmonics // slice_size) * slice_size if device.is_cuda else harmonics
         table = np.zeros((len(matrices), length, len(rows)))
         table[:, :harmonics, rows >= 0] = matrices[:, rows[rows >= 0]].transpose(0, 2, 1)
         if not device.is_cuda:
@@ -110,7 +95,7 @@ class Translation:
             return wp.array(values, dtype=wp.int32, device=device)
 
         self._device, self._dtype = device, dtype
-        self._constants = {"HARMONICS": harmonics, "PITCH": width, "ROWS": len(rows), "GROUP_ROWS": group}
+        self._constants = {"HARMONICS": harmonics, "PITCH": width, "ROWS": len(rows), "GROUP_ROWS": used}
         self._arrays = a = translation_arrays(dtype)()
         a.matrices = wp.array(table.ravel(), dtype=dtype, device=device)
         a.signs = wp.array(signs, dtype=dtype, device=device)
@@ -142,25 +127,41 @@ class Translation:
 
     def _launch_cuda(self, cells: int):
         """Launch the translation of arrays for so many cells on a GPU."""
-        a = self._arrays
-        shape = self._shape or BlockShape(32, self._slice, splits=_SPLITS if cells <= _MOST_SPLIT else 1)
-        if shape.splits > 1 and (a.parts is None or a.parts.shape[1:] != a.locals.shape):
-            a.parts = wp.zeros((shape.splits, *a.locals.shape), dtype=self._dtype, device=self._device)
-        kernel, threads = _cuda_kernel(self._dtype, shape, tuple(self._constants.items()))
-        blocks = shape.splits * (-(-cells // shape.cells) + OCTANTS * a.octant_begin.shape[0])
+        a, splits = self._arrays, _SPLITS if cells <= _MOST_SPLIT else 1
+        if splits > 1 and (a.parts is None or a.parts.shape != (splits, *a.locals.shape)):
+            a.parts = wp.zeros((splits, *a.locals.shape), dtype=self._dtype, device=self._device)
+        kernel, threads = _cuda_kernel(self._dtype, splits, tuple(self._constants.items()))
+        blocks = splits * (-(-cells // _CELLS) + OCTANTS * a.octant_begin.shape[0])
         wp.launch(kernel, dim=blocks * threads, inputs=[a], device=self._device, block_dim=threads)
-        if shape.splits > 1:
-            inputs = [a.parts.reshape((shape.splits, -1)), a.locals.flatten()]
+        if splits > 1:
+            inputs = [a.octant_begin, a.locals.shape[1], a.parts.reshape((splits, -1)), a.locals.flatten()]
             wp.launch(_add_kernel(self._dtype), dim=a.locals.size, inputs=inputs, device=self._device)
 
 
-def _grouped_rows(classes: np.ndarray, group: int) -> np.ndarray:
-    """Harmonics sorted by class, each class padded with −1 to a multiple of ``group``; first of a group: never −1."""
-    rows = []
+def _slice(dtype) -> int:
+    """Harmonics of the sources that a block has in shared memory at a time."""
+    return 8 if dtype is wp.float32 else 4
+
+
+def _grouped_rows(classes: np.ndarray, group: int, used: int) -> np.ndarray:
+    """Harmonics sorted by class, in groups of which the first ``used`` hold some of one class, and −1 behind them."""
+    groups = []
     for one in range(OCTANTS):
         members = np.flatnonzero(classes == one)
-        rows += [*members, *[-1] * (-len(members) % group)]
-    return np.array(rows)
+        padded = np.append(members, np.full(-len(members) % used, -1)).reshape(-1, used)
+        groups.append(np.pad(padded, ((0, 0), (0, group - used)), constant_values=-1))
+    return np.concatenate(groups).ravel()
+
+
+def _threads(rows: int) -> int:
+    """Threads of a block of a GPU for so many rows, in whole warps."""
+    return -(-(_CELLS // 8 * rows // _GROUP_ROWS) // 32) * 32
+
+
+def _used_rows(classes: np.ndarray) -> int:
+    """Rows of a thread of a GPU: 6 where classes fill groups of these so much better that a block has a tenth less."""
+    work = {used: used * _threads(len(_grouped_rows(classes, _GROUP_ROWS, used))) for used in (6, 8)}
+    return 6 if work[6] <= 0.9 * work[8] else 8
 
 
 @cache
@@ -173,12 +174,12 @@ def _cpu_kernel(dtype, constants):
 
 
 @cache
-def _cuda_kernel(dtype, shape: BlockShape, constants):
+def _cuda_kernel(dtype, splits: int, constants):
     sizes = dict(constants)
-    threads = -(-(shape.cells // 8 * sizes["ROWS"] // 8) // 32) * 32
+    threads = _threads(sizes["ROWS"])
     arrays_struct = translation_arrays(dtype)
     blocks = max(1, _WARPS_TOGETHER // (threads // 32)) if dtype is wp.float32 else 1
-    numbers = f"{shape.cells}, {shape.slice}, {int(shape.prefetch)}, {shape.splits}"
+    numbers = f"{_CELLS}, {_slice(dtype)}, {splits}"
 
     @wp.func_native(f"warpmag::translate_block<{numbers}>(thread, arrays);")
     def run(thread: int, arrays: arrays_struct): ...
@@ -199,8 +200,17 @@ def _cuda_kernel(dtype, shape: BlockShape, constants):
 @cache
 def _add_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False)
-    def add_parts(parts: wp.array2d[dtype], locals_out: wp.array[dtype]):
+    def add_parts(
+        # inputs:
+        octant_begin: wp.array2d[int],
+        width: int,
+        parts: wp.array2d[dtype],
+        # outputs:
+        locals_out: wp.array[dtype],
+    ):
         i = wp.tid()
+        if i >= octant_begin[octant_begin.shape[0] - 1, 8] * width:  # no cell
+            return
         total = parts[0, i]
         for part in range(1, parts.shape[0]):
             total += parts[part, i]

@@ -1,6 +1,6 @@
 // Translation of multipoles to local expansions on a GPU: a block takes CELLS cells of one octant through all
-// displacements. A thread has 8 rows, of one parity class, of 8 cells in registers; SLICE harmonics of the sources at a
-// time, and their columns of the matrix, are in shared memory.
+// displacements. A thread has GROUP_ROWS rows (8, or 6 in 8 places), of one parity class, of 8 cells in registers;
+// SLICE harmonics of the sources at a time, and their columns of the matrix, are in shared memory.
 #pragma once
 #include "fmm/translate.h"
 
@@ -93,28 +93,28 @@ template <int N, int CELLS, int SLICE, int THREADS> struct Slice {
     }
 };
 
-// Adds the products of a thread's 8 rows and 8 cells for the slice in shared memory.
+// Adds the products of a thread's rows and 8 cells for the slice in shared memory.
 template <int CELLS, int SLICE, int ROW>
-CUDA_CALLABLE inline void add_products(Real (&sums)[8][8], const Real* matrix, const Real* plane) {
+CUDA_CALLABLE inline void add_products(Real (&sums)[GROUP_ROWS][8], const Real* matrix, const Real* plane) {
 #pragma unroll
     for (int k = 0; k < SLICE; ++k, matrix += ROWS, plane += ROW) {
         const Quad a[2] = {*(const Quad*)matrix, *(const Quad*)(matrix + 4)};
         const Quad b[2] = {*(const Quad*)plane, *(const Quad*)(plane + CELLS / 2)};
 #pragma unroll
-        for (int r = 0; r < 8; ++r)
+        for (int r = 0; r < GROUP_ROWS; ++r)
 #pragma unroll
             for (int c = 0; c < 8; ++c) sums[r][c] += ((const Real*)a)[r] * ((const Real*)b)[c];
     }
 }
 
 // A thread of the block, its rows and cells, and their sums.
-template <int CELLS, int SLICE, bool PREFETCH, int SPLITS> struct Translator {
+template <int CELLS, int SLICE, int SPLITS> struct Translator {
     static constexpr int COLUMNS = CELLS / 8, USED = COLUMNS * (ROWS / 8), THREADS = (USED + 31) / 32 * 32;
     static constexpr int LENGTH = (HARMONICS + SLICE - 1) / SLICE * SLICE;
     typedef TranslationStage<CELLS, SLICE> Stage;
     int lane, column, row, row_class, turn = 0, buffer = 0;
     const Real* matrix; // of the next slice that is copied
-    Real sums[8][8] = {};
+    Real sums[GROUP_ROWS][8] = {};
 
     CUDA_CALLABLE void copy_matrix(Stage& stage, int to) {
         constexpr int SIZE = SLICE * ROWS;
@@ -127,12 +127,11 @@ template <int CELLS, int SLICE, bool PREFETCH, int SPLITS> struct Translator {
     CUDA_CALLABLE void translate(Stage& stage, const Arrays& arrays, int code, int next) {
         const int axes = signed_axes(code);
         const Real* const plane = stage.planes[extract_axes(row_class, axes)] + column;
-        Slice<N, CELLS, SLICE, THREADS> slice;
-        if constexpr (PREFETCH) slice.load(arrays, stage.sources[turn], 0, lane);
 #pragma unroll 1
         for (int first = 0; first < LENGTH; first += SLICE) {
+            Slice<N, CELLS, SLICE, THREADS> slice;
+            slice.load(arrays, stage.sources[turn], first, lane);
             __syncthreads(); // what was staged before has been used
-            if constexpr (!PREFETCH) slice.load(arrays, stage.sources[turn], first, lane);
             slice.store(stage, arrays, axes, first, lane);
             if (first == 0 && next < 64)
                 find_sources<CELLS, THREADS>(stage, arrays, stage.sources[1 - turn], next, lane);
@@ -141,8 +140,6 @@ template <int CELLS, int SLICE, bool PREFETCH, int SPLITS> struct Translator {
             const bool more = first + SLICE < LENGTH;
             if (!more) matrix += (SPLITS - 1) * LENGTH * ROWS;
             if (more || next < 64) copy_matrix(stage, 1 - buffer);
-            if constexpr (PREFETCH)
-                if (more) slice.load(arrays, stage.sources[turn], first + SLICE, lane);
             add_products<CELLS, SLICE, Stage::ROW>(sums, &stage.matrix[buffer][0][row], plane);
             buffer = 1 - buffer;
         }
@@ -153,7 +150,7 @@ template <int CELLS, int SLICE, bool PREFETCH, int SPLITS> struct Translator {
     CUDA_CALLABLE void write(const Stage& stage, const Arrays& arrays, int count, Real* out) const {
         if (lane >= USED) return;
 #pragma unroll
-        for (int r = 0; r < 8; ++r) {
+        for (int r = 0; r < GROUP_ROWS; ++r) {
             const int k = arrays.row_harmonic.data[row + r];
             if (k < 0) continue;
             const Real sign = arrays.signs.data[stage.run.octant * PITCH + k];
@@ -172,12 +169,11 @@ CUDA_CALLABLE inline int later_magnitude(int code, int steps) {
     return code;
 }
 
-// One thread of a block that translates to the cells of a run. With PREFETCH a slice is on its way from memory while
-// the one before is summed. SPLITS blocks share the magnitudes of a run, where there are few cells for many
-// multiprocessors; each writes its own partial sums.
-template <int CELLS, int SLICE, bool PREFETCH, int SPLITS, class Arrays>
+// One thread of a block that translates to the cells of a run. SPLITS blocks share the magnitudes of a run, where there
+// are few cells for many multiprocessors; each writes its own partial sums.
+template <int CELLS, int SLICE, int SPLITS, class Arrays>
 CUDA_CALLABLE inline void translate_block(int thread, const Arrays& arrays) {
-    typedef Translator<CELLS, SLICE, PREFETCH, SPLITS> Own;
+    typedef Translator<CELLS, SLICE, SPLITS> Own;
     __shared__ TranslationStage<CELLS, SLICE> stage;
     const int lane = thread % Own::THREADS, none = (int)arrays.multipoles.shape[0] - 1;
     const int block = thread / Own::THREADS, split = block % SPLITS;

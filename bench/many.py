@@ -1,0 +1,250 @@
+"""Time and error over the number of moments, of all pairs and of the fast multipole method: ``python -m bench.many``.
+
+Field, and force with torque, of moments of random directions in a jittered cubic lattice that fills a cube, data in
+place, the making of the cells included. Errors are of some moments, against sums over all pairs in float64. One JSON
+line a measurement; ``--draw`` makes a picture of such lines. Peers are fast multipole methods of dipoles or, where
+they know none, of point charges, which take less; their errors are against the sums that they replace.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from bench.machine import describe
+from bench.peers import PEERS, Peer
+from bench.report import machine_of, read
+from bench.timing import measure
+from warpmag.fmm import FastSums
+from warpmag.kernels.pairs.evaluate import PairEvaluation
+from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.kernels.pairs.pair_terms import Quantity
+
+SIZES = {
+    "cpu": (1_000, 2_197, 4_913, 10_648, 21_952, 50_653, 97_336),
+    "cuda": (1_000, 4_913, 10_648, 21_952, 32_768, 50_653, 97_336, 205_379, 512_000, 1_000_000, 2_048_383, 4_019_679),
+}
+RTOLS = (None, 1e-3, 1e-5)
+"""Relative errors asked for; None means all pairs."""
+_SPACING = 0.005
+"""Edge of the lattice [m]."""
+_CHECKED = 100
+"""Moments at which errors are measured."""
+
+
+class Moments:
+    """Moments on a device, and what their sums are written to.
+
+    Args:
+        places: Positions [m], shape [n, 3].
+        moments: Moments [A·m²], shape [n, 3].
+        dtype: Warp scalar type.
+        device: Warp device.
+    """
+
+    def __init__(self, places, moments, dtype, device):
+        """Copy them to the device."""
+        n, vec3 = len(places), wp.types.vector(3, dtype)
+        x, m = (wp.array(one, dtype=vec3, device=device) for one in (places, moments))
+        self.packed = PackedMoments(wp.zeros(n, dtype=dtype, device=device), largest_radius=0.0, moving=False)
+        self.packed.pack(x, m)
+        self._base, self.out, self._torques = (wp.zeros_like(x) for _ in range(3))
+        self._turned = wp.ones(n, dtype=int, device=device)
+
+    def evaluation(self, quantity: Quantity, rows=None, sums=None) -> PairEvaluation:
+        """Evaluation of a quantity to ``out``, at some rows only, or by ``sums`` in place of all pairs."""
+        n = self.packed.count
+        segments = [(0, n, 0, n)] if rows is None else [(row, row + 1, 0, n) for row in rows]
+        return PairEvaluation(
+            quantity, segments, self.packed, self.packed, self._base, self.out, turned=self._turned,
+            torques=self._torques, sums=sums,
+        )  # fmt: skip
+
+    def work(self, quantity: Quantity, rtol: float | None) -> Callable[[], None]:
+        """What evaluates a quantity to ``out``, for moments that have moved; by all pairs where ``rtol`` is None."""
+        if rtol is None:
+            return self.evaluation(quantity).launch
+        fast = FastSums(self.packed, rtol)
+        evaluation = self.evaluation(quantity, sums=fast.sums(quantity))
+
+        def build_and_evaluate():
+            fast.build()
+            evaluation.launch()
+
+        return build_and_evaluate
+
+
+def lattice(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [m] and moments [A·m²] of the first ``count`` sites, alike in every run, float32, shape [n, 3]."""
+    random, side = np.random.default_rng(1), int(np.ceil(count ** (1 / 3) - 1e-9))
+    sites = np.stack(np.meshgrid(*3 * [np.arange(side)], indexing="ij"), axis=-1).reshape(-1, 3)[:count]
+    places = _SPACING * (sites + random.uniform(-0.15, 0.15, sites.shape))
+    return places.astype(np.float32), random.normal(size=sites.shape).astype(np.float32)
+
+
+def errors(found, expected) -> dict:
+    """Relative error of vectors at some moments, and the largest one over their mean, shape [rows, 3] both."""
+    apart = np.linalg.norm(found - expected, axis=1)
+    mean = np.sqrt((expected**2).sum() / len(expected))
+    return {"error": float(np.sqrt((apart**2).mean()) / mean), "largest_error": float(apart.max() / mean)}
+
+
+def run_size(count: int, device, slowest: float, seconds: dict):
+    """Yield what there is to say of each quantity and method at one size.
+
+    Args:
+        count: Number of moments.
+        device: Warp device.
+        slowest: Time [s] beyond which a sum over all pairs is not tried.
+        seconds: Times of all pairs so far, by quantity and count; more are added.
+    """
+    places, moments = lattice(count)
+    rows = np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
+    exact = Moments(places.astype(float), moments.astype(float), wp.float64, device)
+    own = Moments(places, moments, wp.float32, device)
+    for quantity in (Quantity.FIELD, Quantity.WRENCH):
+        exact.evaluation(quantity, rows).launch()
+        expected = exact.out.numpy()[rows]
+        for rtol in RTOLS:
+            began = time.perf_counter()
+            expects = max((t * (count / n) ** 2 for (q, n), t in seconds.items() if q == quantity), default=0.0)
+            if rtol is None and expects > slowest:
+                continue
+            work = own.work(quantity, rtol)
+            work()
+            wp.synchronize_device(device)
+            first = time.perf_counter() - began
+            few = {"repeats": 2, "chained": 1} if count > 200_000 else {}  # as far as a graph's own launch does not show
+            taken = measure(work, device, **few)
+            if rtol is None:
+                seconds[quantity, count] = taken
+            line = {"quantity": quantity.name.lower(), "method": "direct" if rtol is None else "fmm", "rtol": rtol}
+            yield (
+                line
+                | {"count": count, "seconds": taken, **errors(own.out.numpy()[rows], expected)}
+                | {"first_call_seconds": first}
+            )
+
+
+def run_peer(peer: Peer, count: int, device) -> dict:
+    """What there is to say of a peer at one size; ``failed`` where its library is missing, or fails."""
+    line = {"quantity": "field", "method": peer.name.removeprefix("with_"), "rtol": None, "count": count}
+    places, moments = lattice(count)
+    given = np.ascontiguousarray(moments[:, 0]) if peer.charges else moments
+    rows = np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
+    try:
+        began = time.perf_counter()
+        evaluation = importlib.import_module(f"bench.peers.{peer.name}").prepare(places, given, str(device))
+        evaluation.run()
+        evaluation.wait()
+        first, times = time.perf_counter() - began, []
+        while not times or (sum(times) < 1.0 and len(times) < 20):
+            began = time.perf_counter()
+            evaluation.run()
+            evaluation.wait()
+            times.append(time.perf_counter() - began)
+        found = evaluation.result()[rows]
+    except Exception as problem:  # a peer's failure is a result: the others go on
+        return line | {"failed": f"{type(problem).__name__}: {problem}".splitlines()[0][:200]}
+    expected = field_of_charges(places, given, rows) if peer.charges else field_of_dipoles(places, given, rows, device)
+    return line | {"seconds": float(np.median(times)), **errors(found, expected), "first_call_seconds": first}
+
+
+def field_of_dipoles(places, moments, rows, device) -> np.ndarray:
+    """Field [A/m] at some moments, shape [rows, 3]."""
+    exact = Moments(places.astype(float), moments.astype(float), wp.float64, device)
+    exact.evaluation(Quantity.FIELD, rows).launch()
+    return exact.out.numpy()[rows]
+
+
+def field_of_charges(places, charges, rows) -> np.ndarray:
+    """Field Σ q r / 4π|r|³ at some of the charges, shape [rows, 3]."""
+    x, q, fields = places.astype(float), charges.astype(float), []
+    for row in rows:
+        r = x[row] - x
+        cubes = (r**2).sum(axis=1) ** 1.5
+        cubes[row] = np.inf
+        fields.append((q / cubes) @ r / (4.0 * np.pi))
+    return np.array(fields)
+
+
+def draw(lines, path: Path) -> None:
+    """Draw time and error over the number of moments."""
+    import matplotlib  # noqa: PLC0415 - a run goes without it
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt  # noqa: PLC0415
+
+    figure, (times, wrong) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
+    series: dict[tuple, list] = {}
+    for x in sorted((x for x in lines if "seconds" in x), key=lambda x: x["count"]):
+        series.setdefault((x["method"], x["rtol"], x["quantity"]), []).append(x)
+    methods = sorted({key[:2] for key in series}, key=lambda m: (m[0] not in ("direct", "fmm"), m[0], -(m[1] or 1.0)))
+    colors = dict(zip(methods, plt.rcParams["axes.prop_cycle"].by_key()["color"], strict=False))
+    words = {"direct": "all pairs", "fmm": "multipoles"}
+    for (method, rtol, quantity), points in series.items():
+        own = {"color": colors[method, rtol], "linestyle": "-" if quantity == "field" else "--", "marker": "."}
+        label = f"{words.get(method, method)}{f', rtol {rtol:g}' if rtol else ''}"
+        counts = [x["count"] for x in points]
+        named = f"{label}: {'field' if quantity == 'field' else 'force, torque'}"
+        times.plot(counts, [1e3 * x["seconds"] for x in points], label=named, **own)
+        wrong.plot(counts, [x["error"] for x in points], **own)
+    times.set(xscale="log", yscale="log", xlabel="moments", ylabel="time [ms]")
+    wrong.set(xscale="log", yscale="log", xlabel="moments", ylabel="relative error")
+    times.legend(fontsize="x-small")
+    for axis in (times, wrong):
+        axis.grid(True, alpha=0.3)
+    figure.suptitle(f"{machine_of(lines[0])}, commit {lines[0]['commit']}")
+    figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
+    plt.close(figure)
+
+
+def main(arguments=None) -> None:
+    """Measure, or draw what was measured, as the command line asks for."""
+    fast = {p.name.removeprefix("with_"): p for p in PEERS if p.charges or p.name == "with_fmm3d"}
+    parser = argparse.ArgumentParser(prog="python -m bench.many", description=__doc__.partition("\n")[0])
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--sizes", type=int, nargs="+", help="numbers of moments; default by device")
+    parser.add_argument("--peers", nargs="*", choices=fast, default=(), help="besides warpmag; default: none")
+    parser.add_argument(
+        "--slowest", type=float, default=2.0, help="seconds beyond which all pairs and peers get no larger sizes (2)"
+    )
+    parser.add_argument("--draw", type=Path, nargs="+", help="draw these files instead of measuring")
+    parser.add_argument("-o", "--output", type=Path, help="file that lines are added to, or the picture")
+    options = parser.parse_args(arguments)
+    if options.draw:
+        kept = {(x["method"], x["rtol"], x["quantity"], x["count"]): x for x in read(options.draw)}  # the last of each
+        draw(list(kept.values()), options.output or Path("bench_out/many.png"))
+        return
+    wp.config.log_level = wp.LOG_WARNING
+    device, seconds = wp.get_device(options.device), {}
+    kind, machine = "cpu" if device.is_cpu else "cuda", describe(device)
+    peers = [fast[name] for name in options.peers if kind in fast[name].devices]
+
+    def emit(line):
+        text = json.dumps({"case": "many"} | line | machine)
+        print(text, flush=True)
+        if options.output:
+            with options.output.open("a") as file:
+                file.write(text + "\n")
+
+    for count in options.sizes or SIZES[kind]:
+        for line in run_size(count, device, options.slowest, seconds):
+            emit(line)
+        for peer in list(peers):
+            line = run_peer(peer, count, device)
+            emit(line)
+            if "failed" in line:
+                print(f"{line['method']} at {count}: {line['failed']}", file=sys.stderr)
+            if line.get("seconds", np.inf) > options.slowest:
+                peers.remove(peer)
+
+
+if __name__ == "__main__":
+    main()
