@@ -12,7 +12,7 @@ from pathlib import Path
 
 from warpmag import __version__
 from warpmag.errors import InputError, SimulationError
-from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, check_rtol
+from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
 from warpmag.progress import Progress, silence
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
@@ -123,6 +123,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
     run.add_argument("--contact-model", choices=CONTACT_MODELS, help="balls that nearly touch (default: the stage's)")
+    run.add_argument(
+        "--sums",
+        choices=SUMS,
+        default=SUMS[0],
+        help="sums over pairs: all, or multipoles (default: %(default)s)",
+    )
     run.add_argument("--rtol", type=float, metavar="X", help="magnetization error to reach (default: the stage's)")
     run.add_argument(
         "--viewer", choices=("none", *_VIEWERS), default="none", help="watch the run (default: %(default)s)"
@@ -334,6 +340,7 @@ def _simulation_of(path: Path, options):
         dynamics=options.dynamics or (method and method.dynamics),
         contact_model=options.contact_model,
         curve=method and method.curve,
+        method=options.sums,
         rtol=options.rtol,
         device=options.device,
         visuals=options.viewer != "none",

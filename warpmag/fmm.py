@@ -11,7 +11,7 @@ from warpmag.kernels.fmm.expansions import ExpansionTables
 from warpmag.kernels.fmm.grid import MomentGrid, join_moments
 from warpmag.kernels.fmm.translate import displacements
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.magnets import check_token
+from warpmag.magnets import SUMS, check_token
 
 
 @cache
@@ -47,8 +47,8 @@ LEAST_RTOL = _DEGREES[-1][0]
 
 _PART_OF_FIELD = 0.3
 """Error of a field over that of the magnetization that it is for."""
-SUMS_OF_SOLVES = ("auto", "vectorized", "fmm")
-"""How an induction solve sums pairs."""
+_SLACK = 1.001
+"""Part by which rounding may take moments of a body farther from each other."""
 _LEAST_COUNT = {"cpu": 700, "cuda": 4000}
 """Fewest moments and targets, for each degree of the expansions, with which the method beats all pairs, by kind
 of device: on two cores 6,300 at 1e-3."""
@@ -60,7 +60,7 @@ def check_fast(rtol: float):
         raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'vectorized'")
 
 
-def is_fast(count: int, rtol: float, device) -> bool:
+def is_fast(count: float, rtol: float, device) -> bool:
     """Whether the method reaches a relative error, and sooner than the sums over all pairs of ``count`` moments."""
     if rtol < LEAST_RTOL:
         return False
@@ -80,14 +80,16 @@ class FastSums:
         rtol: Relative error wanted, at least ``LEAST_RTOL``.
         targets: Packed targets; None means the moments themselves.
         worlds: Number of worlds.
+        extent: Distance up to which pairs must be summed one by one [m], whether they touch or not.
 
     """
 
-    def __init__(self, moments, rtol: float, targets=None, worlds: int = 1):
+    def __init__(self, moments, rtol: float, targets=None, worlds: int = 1, extent: float = 0.0):
         """Allocate the cells."""
         degree, held = choose_degree(rtol)
         packed, groups, self._first = moments.packed, moments.groups, 0
         reach = moments.largest_radius + (moments if targets is None else targets).largest_radius
+        reach = max(reach, _SLACK * extent)
         if targets is not None:  # moments of no strength among the others
             self._first = moments.count
             packed, groups = join_moments(moments, targets)
@@ -115,24 +117,39 @@ class NoFastSums:
         """Return nothing."""
 
 
-def fast_sums_for(method: str, moments, bodies, rtol: float, worlds: int) -> FastSums | NoFastSums:
-    """Cells for the fields of an induction solve, none where all pairs are summed.
+def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: float) -> FastSums | NoFastSums:
+    """Cells for the sums of an induction solve and of its forces, none where all pairs are summed.
+
+    Moments of a body exert no force on each other. Expansions do not tell bodies apart, so that the moments of one that
+    may move have to be near each other: in cells that are neighbours.
 
     Args:
-        method: One of ``SUMS_OF_SOLVES``.
+        method: One of ``magnets.SUMS``.
         moments: Packed moments.
-        bodies: Body of each moment.
+        layout: What each of them is (``layout.MomentLayout``).
+        extent: Largest distance between moments of a body that may move [m]; None means not known.
         rtol: Relative error of the magnetization that is wanted.
-        worlds: Number of worlds.
 
     Raises:
         InputError: The method is wanted where it cannot be had.
     """
-    check_token("method", method, SUMS_OF_SOLVES)
-    alone, rtol = len(np.unique(bodies)) == len(bodies), _PART_OF_FIELD * rtol
+    check_token("method", method, SUMS)
+    several, rtol = layout.movable & ~layout.alone, _PART_OF_FIELD * rtol
+    known = extent is not None or not several.any()
     if method == "fmm":
         check_fast(rtol)
-        if not alone:
-            raise InputError("method: 'fmm' is not for bodies of several moments")
-    wanted = method == "fmm" or (method == "auto" and alone and is_fast(moments.count, rtol, moments.device))
-    return FastSums(moments, rtol, worlds=worlds) if wanted and moments.count else NoFastSums()
+        if not known:
+            body = layout.bodies[several.argmax()]
+            raise InputError(f"method: 'fmm' has to know the extent of body {body}, which has several moments")
+    worlds, extent = layout.ranges(), extent or 0.0
+    largest = max((last - first for first, _, last in worlds), default=0)
+    crowding = _crowding(layout.radii, max(2.0 * moments.largest_radius, extent), rtol)
+    wanted = method == "fmm" or (known and method == "auto" and is_fast(largest / crowding, rtol, moments.device))
+    return FastSums(moments, rtol, worlds=len(worlds), extent=extent) if wanted and moments.count else NoFastSums()
+
+
+def _crowding(radii: np.ndarray, reach: float, rtol: float) -> float:
+    """Moments in a leaf as large as it has to be [m] where they touch, over as many as are wanted; at least 1."""
+    usual = float(np.median(radii)) if len(radii) else 0.0
+    held = (0.5 * reach / usual) ** 3 if usual > 0.0 else 0.0
+    return max(1.0, held / choose_degree(max(rtol, LEAST_RTOL))[1])
