@@ -195,7 +195,7 @@ def _scenes(options) -> int:
 
     lines = {name: describe(path) for name, path in bundled().items()} | {name: summary(name) for name in MADE}
     width = max(map(len, lines))
-    for name, line in lines.items():
+    for name, line in sorted(lines.items()):
         print(f"{name:{width}}  {line}")
     return 0
 
