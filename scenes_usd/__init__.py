@@ -1,10 +1,49 @@
 """The bundled scenes of warpmag: USD stages, and the scripts that author them."""
 
+import importlib
+import inspect
 from pathlib import Path
 
+from warpmag.errors import InputError
+
 _SUFFIXES = (".usd", ".usda", ".usdc")
+MADE = ("million",)
+"""Scenes too large to be bundled: they are authored when they are wanted."""
 
 
 def bundled() -> dict[str, Path]:
     """Return the file of each bundled scene by its name."""
     return {path.stem: path for path in sorted(Path(__file__).parent.iterdir()) if path.suffix in _SUFFIXES}
+
+
+def summary(name: str) -> str:
+    """Return what a scene of :data:`MADE` shows, in a line."""
+    return (inspect.getdoc(_module(name)) or "").partition("\n")[0]
+
+
+def make(name: str, folder: Path, balls: int | None = None) -> Path:
+    """Author a scene with a number of balls.
+
+    Args:
+        name: A bundled scene, or one of :data:`MADE`.
+        folder: Where to write it.
+        balls: The number; None means the scene's own.
+
+    Returns:
+        The file, whose name tells the number.
+
+    Raises:
+        InputError: The scene has no such number, or it is out of range.
+    """
+    module = _module(name)
+    parameter = inspect.signature(module.author).parameters.get("balls")
+    if parameter is None:
+        raise InputError(f"balls: the scene {name} has no number of balls to choose")
+    count = parameter.default if balls is None else balls
+    path = folder / f"{name}_{count}.usdc"
+    module.author(path, balls=count)
+    return path
+
+
+def _module(name: str):
+    return importlib.import_module(f"warpmag.scenes_usd.{name}")

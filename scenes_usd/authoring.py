@@ -163,6 +163,33 @@ def add_ball(
     return _finish(ball, material, color, motion, magnet)
 
 
+def add_balls(
+    stage: Usd.Stage,
+    path: str,
+    positions: np.ndarray,
+    radius: float,
+    material: UsdShade.Material,
+    *,
+    magnet: Magnet | None = None,
+    color: Sequence[float] = STEEL_COLOR,
+) -> Usd.Prim:
+    """Author very many balls as instances of one, with centres at ``positions`` [m], shape [n, 3]."""
+    instancer = UsdGeom.PointInstancer.Define(stage, path)
+    ball = f"{path}/Ball"
+    add_ball(stage, ball, (0.0, 0.0, 0.0), radius, material, magnet=magnet, color=color)
+    instancer.CreatePrototypesRel().SetTargets([Sdf.Path(ball)])
+    instancer.CreateProtoIndicesAttr(Vt.IntArray.FromNumpy(np.zeros(len(positions), np.int32)))
+    instancer.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(positions, np.float32)))
+    bounds = np.array([positions.min(axis=0) - radius, positions.max(axis=0) + radius], np.float32)
+    instancer.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(bounds))
+    return instancer.GetPrim()
+
+
+def scatter(places: np.ndarray, spacing: float, apart: float, random: np.random.Generator) -> np.ndarray:
+    """Return places of a cubic lattice of ``spacing``, shape [n, 3], shifted at random so as to stay ``apart`` [m]."""
+    return places + 0.5 * (spacing - apart) * random.uniform(-1.0, 1.0, places.shape)
+
+
 def add_box(
     stage: Usd.Stage,
     path: str,

@@ -35,6 +35,10 @@ _TAPER = 1.015
 """Growth of the radius from one segment to the one below it."""
 _BALLS_APART = 0.75
 """Least distance of the balls in the sky over their mean spacing; beyond 0.9 no such rain would be found."""
+_USUAL = 2500
+"""Balls of which the rain falls on the crown; more of them make a rain that is wider and higher alike."""
+_MANY = 10_000
+"""Balls beyond which they are instances, in a rain that is drawn at once."""
 _CROWN_CENTER, _CROWN = (0.0, 0.0, 0.66), (0.56, 0.56, 0.34)
 """Centre and semi-axes of the ellipsoid that the crown fills, over the tree's height."""
 _TRUNK = ((0.0, 0.0, 0.0), (0.01, -0.006, 0.05), (0.012, -0.014, 0.1), (0.002, -0.018, 0.15), (-0.012, -0.01, 0.2))
@@ -113,10 +117,14 @@ def author(
     ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8, friction=friction)
     authoring.add_ground(stage, ground, size=10.0 * height)
     _add_tree(stage, tree, bark, bud, bud_radius, magnetization)
-    UsdGeom.Scope.Define(stage, "/World/Balls")
     ball_magnet = Magnet(saturation=saturation)
-    for number, position in enumerate(rain(balls, radius, spacing, height, np.random.default_rng(seed))):
-        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
+    positions = rain(balls, radius, spacing, height, np.random.default_rng(seed))
+    if balls > _MANY:
+        authoring.add_balls(stage, "/World/Balls", positions, radius, iron, magnet=ball_magnet)
+    else:
+        UsdGeom.Scope.Define(stage, "/World/Balls")
+        for number, position in enumerate(positions):
+            authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
     authoring.add_camera(stage, (1.3 * height, -4.6 * height, 1.2 * height), (0.0, 0.0, 0.8 * height))
     authoring.save(stage, path)
 
@@ -243,9 +251,11 @@ def rain(count: int, radius: float, spacing: float, height: float, random: np.ra
     if apart < authoring.BALL_SPACING * radius:
         least = authoring.BALL_SPACING * radius / _BALLS_APART
         raise InputError(f"spacing: balls of radius {radius:g} m need at least {least:g} m, got {spacing:g} m")
-    reach = max(_CROWN[0] * height, spacing)
+    reach = max(_CROWN[0] * height, spacing) * max(1.0, count / _USUAL) ** (1.0 / 3.0)
     bottom = (_CROWN_CENTER[2] + _CROWN[2] + 0.15) * height
     depth = count * spacing**3 / (math.pi * reach**2)
+    if count > _MANY:
+        return _lattice_rain(count, reach, spacing, random) + np.array([0.0, 0.0, bottom])
     places: list[list[float]] = []
     cells: dict[tuple[int, ...], list[list[float]]] = {}
     around = list(itertools.product((-1, 0, 1), repeat=3))
@@ -257,6 +267,18 @@ def rain(count: int, radius: float, spacing: float, height: float, random: np.ra
             places.append(place)
             cells.setdefault((x, y, z), []).append(place)
     return np.array(sorted(places, key=lambda place: place[2]))
+
+
+def _lattice_rain(count: int, reach: float, spacing: float, random: np.random.Generator) -> np.ndarray:
+    """Return places above z = 0 within ``reach`` of the z axis, from the lowest up, shape [count, 3]."""
+    side = math.ceil(reach / spacing)
+    axis = np.arange(-side, side + 1) * spacing
+    disc = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    disc = disc[np.hypot(*disc.T) <= reach]
+    layers = math.ceil(count / len(disc))
+    heights = np.repeat((np.arange(layers) + 0.5) * spacing, len(disc))
+    places = np.column_stack([np.tile(disc, (layers, 1)), heights])[:count]
+    return authoring.scatter(places, spacing, _BALLS_APART * spacing, random)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,17 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from warpmag.errors import InputError
 from warpmag.magnets import MagneticSettings
-from warpmag.scenes_usd import alphabets, authoring, balls_up, bundled, crystal_balls, falling_magnet, sakura_tree
+from warpmag.scenes_usd import (
+    alphabets,
+    authoring,
+    balls_up,
+    bundled,
+    crystal_balls,
+    falling_magnet,
+    make,
+    million,
+    sakura_tree,
+)
 from warpmag.usd import check, open_stage, read_magnets
 
 needs_outlines = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="the letters' outlines")
@@ -211,6 +221,30 @@ def test_other_counts_and_sizes(tmp_path):
     assert len(found.magnets("inducible")) == 34 and not found.findings
 
 
+def test_very_many_balls_are_instances_apart(tmp_path):
+    places = sakura_tree.rain(11_000, 0.005, 0.022, 0.4, np.random.default_rng(1))
+    assert places.shape == (11_000, 3)
+    assert (np.diff(places[:, 2].round(2)) >= -0.02).all()
+    some = places[:2000]
+    assert _least_gap(some, np.full(len(some), 0.005)) > 0.0
+    assert (
+        _least_gap(cloud := million.cloud(1500, 0.0025, 0.0075, 0.04, np.random.default_rng(1)), np.full(1500, 0.0025))
+        > 0.0
+    )
+    assert np.abs(cloud).max(axis=1).min() > 0.0225
+    found = check(make("million", tmp_path, 300))
+    assert [str(finding) for finding in found.findings] == []
+    assert len(found.magnets("inducible")) == 300 and len(found.contents.kinematic) == 1
+    assert found.path.endswith("million_300.usdc")
+
+
+def test_a_number_of_balls_only_where_there_is_one(tmp_path):
+    with pytest.raises(InputError, match="balls: the scene alphabets has no number"):
+        make("alphabets", tmp_path, 10)
+    with pytest.raises(InputError, match="balls: must be positive"):
+        make("million", tmp_path, 0)
+
+
 @pytest.mark.parametrize(
     "author,parameters,body",
     [
@@ -249,6 +283,8 @@ def test_other_letters(tmp_path):
         (crystal_balls.author, {"spacing": 0.01}, "spacing"),
         (crystal_balls.author, {"strength": "huge"}, "strength"),
         (alphabets.author, {"layers": 0}, "layers"),
+        (million.author, {"spacing": 0.005}, "spacing"),
+        (million.author, {"magnet": 1.5}, "magnet"),
     ],
 )
 def test_parameters_that_make_no_scene_are_refused(tmp_path, author, parameters, word):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from warpmag import __version__
 from warpmag.errors import InputError, SimulationError
-from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, check_rtol
+from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
 from warpmag.progress import Progress, silence
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
@@ -111,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")
     run.add_argument("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
     run.add_argument("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
+    run.add_argument("--balls", type=int, metavar="N", help="balls of a bundled scene (default: its own number)")
     run.add_argument("--frames", type=int, metavar="N", help="output frames to simulate (default: those of the stage)")
     run.add_argument("--resume", action="store_true", help="go on with the run at the output, if there is one")
     run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
@@ -123,6 +124,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
     run.add_argument("--contact-model", choices=CONTACT_MODELS, help="balls that nearly touch (default: the stage's)")
+    run.add_argument(
+        "--sums",
+        choices=SUMS,
+        default=SUMS[0],
+        help="sums over pairs: all, or multipoles (default: %(default)s)",
+    )
     run.add_argument("--rtol", type=float, metavar="X", help="magnetization error to reach (default: the stage's)")
     run.add_argument(
         "--viewer", choices=("none", *_VIEWERS), default="none", help="watch the run (default: %(default)s)"
@@ -183,27 +190,33 @@ def _add_export(commands) -> None:
 
 
 def _scenes(options) -> int:
-    from warpmag.scenes_usd import bundled  # noqa: PLC0415 - each command imports what it needs
+    from warpmag.scenes_usd import MADE, bundled, summary  # noqa: PLC0415 - each command imports what it needs
     from warpmag.usd import describe  # noqa: PLC0415
 
-    scenes = bundled()
-    width = max(map(len, scenes), default=0)
-    for name, path in scenes.items():
-        print(f"{name:{width}}  {describe(path)}")
+    lines = {name: describe(path) for name, path in bundled().items()} | {name: summary(name) for name in MADE}
+    width = max(map(len, lines))
+    for name, line in sorted(lines.items()):
+        print(f"{name:{width}}  {line}")
     return 0
 
 
-def _find_scene(name: str) -> tuple[Path, bool]:
-    """Return the file of a scene and whether it is a bundled one."""
-    from warpmag.scenes_usd import bundled  # noqa: PLC0415
+def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLDER) -> tuple[Path, bool]:
+    """Return the file of a scene, and whether it is a bundled one; one that has to be made is written to ``folder``."""
+    from warpmag.scenes_usd import MADE, bundled, make  # noqa: PLC0415
     from warpmag.usd import usable_path  # noqa: PLC0415
 
     scenes = bundled()
     path = usable_path(name)
-    if name in scenes and not os.path.isfile(path):
-        return scenes[name], True
+    if name in (*scenes, *MADE) and not os.path.isfile(path):
+        if balls is None and name in scenes:
+            return scenes[name], True
+        made = make(name, folder, balls)
+        _tell(f"scene: {made}")
+        return made, False
     if not os.path.exists(path) and not path.suffix:
-        raise InputError(f"{name}: no such file and no bundled scene (there are {', '.join(scenes)})")
+        raise InputError(f"{name}: no such file and no bundled scene (there are {', '.join((*scenes, *MADE))})")
+    if balls is not None:
+        raise InputError(f"balls: only of bundled scenes, and {name} is a file")
     return path, False
 
 
@@ -310,7 +323,8 @@ def _run(options) -> int:
         raise InputError(f"frames: must be positive, got {options.frames}")
     if options.rtol is not None:
         check_rtol("rtol", options.rtol)
-    path, is_bundled = _find_scene(options.scene)
+    folder = Path(options.output).parent if options.output else _OUTPUT_FOLDER
+    path, is_bundled = _find_scene(options.scene, options.balls, folder)
     display, resume = None, options.resume
     while True:
         simulation = _simulation_of(path, options)
@@ -334,6 +348,7 @@ def _simulation_of(path: Path, options):
         dynamics=options.dynamics or (method and method.dynamics),
         contact_model=options.contact_model,
         curve=method and method.curve,
+        method=options.sums,
         rtol=options.rtol,
         device=options.device,
         visuals=options.viewer != "none",

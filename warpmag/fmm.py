@@ -11,7 +11,7 @@ from warpmag.kernels.fmm.expansions import ExpansionTables
 from warpmag.kernels.fmm.grid import MomentGrid, join_moments
 from warpmag.kernels.fmm.translate import displacements
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.magnets import check_token
+from warpmag.magnets import SUMS, check_token
 
 
 @cache
@@ -47,8 +47,8 @@ LEAST_RTOL = _DEGREES[-1][0]
 
 _PART_OF_FIELD = 0.3
 """Error of a field over that of the magnetization that it is for."""
-SUMS_OF_SOLVES = ("auto", "vectorized", "fmm")
-"""How an induction solve sums pairs."""
+_SLACK = 1.001
+"""Part by which rounding may take moments of a body farther from each other."""
 _COSTS = {
     ("cpu", Quantity.FIELD): (2.8e7, 55.0),
     ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
@@ -86,14 +86,16 @@ class FastSums:
         rtol: Relative error wanted, at least ``LEAST_RTOL``.
         targets: Packed targets; None means the moments themselves.
         worlds: Number of worlds.
+        extent: Distance up to which pairs must be summed one by one [m], whether they touch or not.
 
     """
 
-    def __init__(self, moments, rtol: float, targets=None, worlds: int = 1):
+    def __init__(self, moments, rtol: float, targets=None, worlds: int = 1, extent: float = 0.0):
         """Allocate the cells."""
         degree, held = choose_degree(rtol)
         packed, groups, self._first = moments.packed, moments.groups, 0
         reach = moments.largest_radius + (moments if targets is None else targets).largest_radius
+        reach = max(reach, _SLACK * extent)
         if targets is not None:  # moments of no strength among the others
             self._first = moments.count
             packed, groups = join_moments(moments, targets)
@@ -121,26 +123,41 @@ class NoFastSums:
         """Return nothing."""
 
 
-def fast_sums_for(method: str, moments, bodies, rtol: float, ranges) -> FastSums | NoFastSums:
-    """Cells for the fields of an induction solve, none where all pairs are summed.
+def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: float) -> FastSums | NoFastSums:
+    """Cells for the sums of an induction solve and of its forces, none where all pairs are summed.
+
+    Moments of a body exert no force on each other. Expansions do not tell bodies apart, so that the moments of one that
+    may move have to be near each other: in cells that are neighbours.
 
     Args:
-        method: One of ``SUMS_OF_SOLVES``.
+        method: One of ``magnets.SUMS``.
         moments: Packed moments.
-        bodies: Body of each moment.
+        layout: What each of them is (``layout.MomentLayout``).
+        extent: Largest distance between moments of a body that may move [m]; None means not known.
         rtol: Relative error of the magnetization that is wanted.
-        ranges: For each world the first of its moments, the first that is no target, and the end, integers [worlds, 3].
 
     Raises:
         InputError: The method is wanted where it cannot be had.
     """
-    check_token("method", method, SUMS_OF_SOLVES)
-    alone, rtol = len(np.unique(bodies)) == len(bodies), _PART_OF_FIELD * rtol
+    check_token("method", method, SUMS)
+    several, rtol = layout.movable & ~layout.alone, _PART_OF_FIELD * rtol
+    known = extent is not None or not several.any()
     if method == "fmm":
         check_fast(rtol)
-        if not alone:
-            raise InputError("method: 'fmm' is not for bodies of several moments")
-    begin, targets_end, end = np.reshape(ranges, (-1, 3)).T.astype(float)
-    pairs, count, device = ((targets_end - begin) @ (end - begin)), moments.count, moments.device
-    better = method == "auto" and alone and is_fast(pairs, count, Quantity.FIELD, rtol, device)
-    return FastSums(moments, rtol, worlds=len(end)) if (better or method == "fmm") and count else NoFastSums()
+        if not known:
+            body = layout.bodies[several.argmax()]
+            raise InputError(f"method: 'fmm' has to know the extent of body {body}, which has several moments")
+    worlds, extent = layout.ranges(), extent or 0.0
+    begin, targets_end, end = np.reshape(worlds, (-1, 3)).T.astype(float)
+    pairs = (targets_end - begin) @ (end - begin)
+    crowding = _crowding(layout.radii, max(2.0 * moments.largest_radius, extent), rtol)
+    better = is_fast(pairs / crowding, moments.count, Quantity.FIELD, rtol, moments.device)
+    wanted = method == "fmm" or (method == "auto" and known and better)
+    return FastSums(moments, rtol, worlds=len(worlds), extent=extent) if wanted and moments.count else NoFastSums()
+
+
+def _crowding(radii: np.ndarray, reach: float, rtol: float) -> float:
+    """Moments in a leaf as large as it has to be [m] where they touch, over as many as are wanted; at least 1."""
+    usual = float(np.median(radii)) if len(radii) else 0.0
+    held = (0.5 * reach / usual) ** 3 if usual > 0.0 else 0.0
+    return max(1.0, held / choose_degree(max(rtol, LEAST_RTOL))[1])

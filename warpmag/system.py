@@ -8,8 +8,9 @@ import warp as wp
 
 from warpmag.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
 from warpmag.dynamics import make_dynamics
+from warpmag.energies import MomentEnergies
 from warpmag.errors import InputError
-from warpmag.fmm import fast_sums_for
+from warpmag.fmm import FastSums, fast_sums_for
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.sources import Sources
 from warpmag.kernels.cells.couplings import CellCouplings
@@ -17,7 +18,6 @@ from warpmag.kernels.fmm.check import sampled_error
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, WholeBody
-from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
 from warpmag.kernels.pairs.eddy import EddyCurrents
@@ -55,7 +55,9 @@ class MomentSystem:
         contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
             nearly touch (see ``warpmag.kernels.near_contact``).
         method: How pairs are summed: ``vectorized``, all of them; ``fmm``, the fast multipole method, with fields as
-            exact as ``rtol`` asks for, not for bodies of several moments; or ``auto``, the faster one.
+            exact as ``rtol`` asks for; or ``auto``, the faster one.
+        body_extent: Largest distance between two moments of a body that may move [m], which the method ``fmm`` needs
+            to know: it sums such pairs one by one. None means not known.
         rtol: Relative error of the inducible moments' magnetization at which induction ends.
         max_evaluations: Field evaluations after which it gives up, with ``converged`` 0.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
@@ -121,6 +123,7 @@ class MomentSystem:
         dynamics="theta",
         contact_model="dipole",
         method="vectorized",
+        body_extent=None,
         rtol=1e-3,
         max_evaluations=1000,
         step=None,
@@ -149,7 +152,7 @@ class MomentSystem:
         layout = self._make_bias(layout, dynamics)
         self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
-        self._fast = fast_sums_for(method, self._packed, layout.bodies, self.rtol, layout.ranges())
+        self._fast = fast_sums_for(method, self._packed, layout, body_extent, self.rtol)
         self._evaluate_field(layout, near)
         self._make_cells(layout, couplings, whole=dynamics == "theta")
         self._evaluate_wrench(layout, turned)
@@ -381,6 +384,11 @@ class MomentSystem:
         if self._near is not None:
             near_pairs.wait(self._near)
 
+    @property
+    def is_fast(self) -> bool:
+        """Whether pairs are summed by the fast multipole method."""
+        return isinstance(self._fast, FastSums)
+
     def field_error(self) -> float:
         """Relative error of the field by the fast multipole method at some moments, zero without it; waits."""
         if self._mutual.form != GIVEN:
@@ -408,13 +416,8 @@ class MomentSystem:
         if self.contact_model != "dipole":
             raise InputError(f"contact_model: the energy of {self.contact_model} is not known, only that of dipole")
         if self._energies is None:
-            self._make_energy()
-        assert self._energies is not None
-        self._permanents.launch()
-        energies, state = self._energies, self._induction
-        fields = state.h, state.h0, self._permanents_field, self._acting
-        launch_energy(self.radii, self.moments, self._material, *fields, energies)
-        each = energies.numpy()
+            self._energies = MomentEnergies(self._packed, self.world_ranges, self.moments)
+        each = self._energies.of_each(self._material, self._induction, self._acting)
         if self.applied is not None:
             each += self.applied.energies()
         if self.bias is not None:  # counted from where nothing but the remanence is
@@ -422,16 +425,6 @@ class MomentSystem:
             volumes = 4.0 / 3.0 * np.pi * self.radii.numpy().astype(float) ** 3
             each += 0.5 * MU0 * volumes * self._material.slope.numpy() * bias**2
         return np.array([each[first:last].sum() for first, _, last in self.world_ranges])
-
-    def _make_energy(self):
-        """Allocate what only the energy needs."""
-        segments = [(middle, last, middle, last) for _, middle, last in self.world_ranges if last > middle]
-        nothing = wp.zeros_like(self.moments)
-        self._permanents_field = wp.zeros_like(self.moments)
-        self._permanents = PairEvaluation(
-            Quantity.FIELD, segments, self._packed, self._packed, nothing, self._permanents_field
-        )
-        self._energies = wp.zeros(self.count, dtype=wp.float64, device=self.device)
 
     def apply_forces(self, force=None):
         """Launch forces and torques of the moments as :meth:`solve` left them; ``force`` overrides the law."""

@@ -15,8 +15,8 @@ from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.eddy import BodyEddies
 from warpmag.engine.grouping import BodyMagnet, find_magnets
 from warpmag.engine.model_values import ModelValues
+from warpmag.engine.moments import KINEMATIC, make_system
 from warpmag.errors import InputError
-from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
@@ -28,11 +28,8 @@ from warpmag.kernels.rigid.bodies import (
     set_magnetization,
     sum_moments,
 )
-from warpmag.magnets import LINEAR_CURVE, MagneticSettings, check_positive
+from warpmag.magnets import MagneticSettings, check_positive
 from warpmag.probe import FieldProbe
-from warpmag.system import MomentSystem
-
-_KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 
 class Magnetics:
@@ -59,6 +56,7 @@ class Magnetics:
         force: str = "kelvin",
         dynamics: str = "theta",
         contact_model: str = "dipole",
+        method: str = "auto",
         rtol: float = 1e-3,
         external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
         max_evaluations: int = 1000,
@@ -74,6 +72,8 @@ class Magnetics:
                 ``llg-damping`` (Eq. 6, with and without precession).
             contact_model: ``dipole``, or ``multipole``, which adds what balls of one moment lack where they nearly
                 touch.
+            method: How fields and forces are summed: ``vectorized``, over all pairs; ``fmm``, by the fast multipole
+                method, to an error that ``rtol`` allows; or ``auto``, the faster one.
             rtol: Relative magnetization error at which induction ends.
             external_field: Uniform applied field H0 [A/m], world frame.
             max_evaluations: Field evaluations after which induction gives up.
@@ -93,72 +93,16 @@ class Magnetics:
         self._model, self._values = model, ModelValues(model)
         self._sources = ModelSources(model, self._worlds)
         self._induced = False
-        self.system = self._make_system(settings, max_evaluations, curve)
+        self.system, celled, solid = make_system(
+            model, self.magnets, settings, applied=self._sources.applied, curve=curve,
+            method=method, max_evaluations=max_evaluations,
+        )  # fmt: skip
+        self._celled, self._solid_bodies = (
+            wp.array(one, dtype=wp.int32, device=model.device) for one in (celled, solid)
+        )
         self._sources.bind(self.system)
         self._map_bodies()
         self._eddies = BodyEddies(model, self.magnets, self._body_moments, self._sources, self.system, step)
-
-    def _make_system(self, settings: MagneticSettings, max_evaluations: int, curve) -> MomentSystem:
-        counts = [len(one.lattice.volumes) for one in self.magnets]
-
-        def spread(values, dtype=float):
-            return np.repeat(np.asarray(values, dtype=dtype), counts)
-
-        first = np.cumsum(counts) - counts
-        celled = [(k, one) for k, one in zip(first, self.magnets, strict=True) if one.lattice.coupling is not None]
-        couplings = [(int(k), one.lattice.coupling) for k, one in celled]
-        self._celled = wp.array([one.body for _, one in celled], dtype=wp.int32, device=self._model.device)
-        magnets = [one.magnet for one in self.magnets]
-        flags = self._model.body_flags  # None in a model without bodies
-        kinematic = [] if flags is None else (flags.numpy() & _KINEMATIC) != 0
-        fixed = np.cumsum([one.body < 0 for one in self.magnets]) + self._model.body_count
-        bodies = [one.body if one.body >= 0 else own for one, own in zip(self.magnets, fixed, strict=True)]
-        movable = [one.body >= 0 and not kinematic[one.body] for one in self.magnets]
-        parts = [
-            (int(k), one, move, part)
-            for k, one, move in zip(first, self.magnets, movable, strict=True)
-            for part in one.lattice.solids
-        ]
-        self._solid_bodies = wp.array([one.body for _, one, *_ in parts], dtype=wp.int32, device=self._model.device)
-        solids = [
-            SolidMagnet(
-                k + part.first,
-                part.count,
-                float(one.lattice.volumes[part.first]),
-                one.world,
-                part.reach,
-                part.shape,
-                move,
-                3.0 - 9.0 / (2.0 + one.magnet.recoil_permeability),
-            )
-            for k, one, move, part in parts
-        ]
-        return MomentSystem(
-            worlds=spread([one.world for one in self.magnets], int),
-            permanent=spread([one.fixed for one in magnets], bool),
-            radii=np.concatenate([one.lattice.radii for one in self.magnets]),
-            bodies=spread(bodies, int),
-            movable=spread(movable, bool),
-            saturation=spread([one.saturation for one in magnets]),
-            susceptibility=spread(
-                [one.recoil_permeability - 1.0 if one.recoils else one.susceptibility for one in magnets]
-            ),
-            curve=[
-                LINEAR_CURVE if one.recoils else curve or one.curve
-                for one, count in zip(magnets, counts, strict=True)
-                for _ in range(count)
-            ],
-            external_field=settings.external_field,
-            force=settings.force,
-            dynamics=settings.dynamics,
-            contact_model=settings.contact_model,
-            rtol=settings.rtol,
-            max_evaluations=max_evaluations,
-            couplings=couplings,
-            applied=self._sources.applied,
-            solids=solids,
-            device=self._model.device,
-        )
 
     def _map_bodies(self) -> None:
         """List for the kernels which moments belong to which body and to which shape."""
@@ -192,7 +136,7 @@ class Magnetics:
         moments.body_list = put(bodies[dynamic], wp.int32)
         moments.body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
         moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
-        moments.kinematic_flag = _KINEMATIC
+        moments.kinematic_flag = KINEMATIC
 
         self._parts = np.concatenate([[0], np.cumsum(of_shape)])
         volume = np.concatenate([[0.0], np.cumsum(self._volumes)])

@@ -58,6 +58,7 @@ class Simulation:
         force: str | None = None,
         dynamics: str | None = None,
         contact_model: str | None = None,
+        method: str = "auto",
         rtol: float | None = None,
         max_evaluations: int = 1000,
         external_field: tuple[float, float, float] | None = None,
@@ -75,6 +76,7 @@ class Simulation:
             force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
+            method: How pairs are summed: ``vectorized``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
             max_evaluations: Field evaluations after which induction gives up.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
@@ -96,10 +98,10 @@ class Simulation:
         settings = settings.replaced(
             force=force, dynamics=dynamics, contact_model=contact_model, rtol=rtol, external_field=external_field
         )
-        how = {"curve": curve, "max_evaluations": max_evaluations, "step": LONGEST_SUBSTEP, **vars(settings)}
-        self._magnetics = Magnetics(self.model, **how)
+        how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
+        self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
         self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
-        self._options = self._options_of(settings, solver, curve=curve, max_evaluations=max_evaluations)
+        self._options = self._options_of(settings, solver, **how)
 
     def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
@@ -243,7 +245,10 @@ class Simulation:
     def warnings(self) -> list[str]:
         """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
         known = *(self._scene.warnings if self._scene else ()), *solver_warnings(self._options["solver"])
-        return [*known, *self.statistics.warnings()]
+        lines, figures, rtol = [], self.statistics, self._magnetics.system.rtol
+        if figures.field_error > rtol:
+            lines = [f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; sum vectorized"]
+        return [*known, *figures.warnings(), *lines]
 
     @property
     def capture_failure(self) -> str:
@@ -408,6 +413,7 @@ class Simulation:
     def finish(self) -> Statistics:
         """Fill in the figures of the end and return the statistics."""
         figures = self.statistics
+        figures.field_error = self._magnetics.system.field_error()
         figures.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
         figures.overlap, figures.depth = max(figures.overlap, figures.final_overlap), max(figures.depth, depth)
         speeds = np.linalg.norm(self.state.body_qd.numpy()[:, :3], axis=1)

@@ -1,0 +1,94 @@
+"""Million: a cloud of iron balls without weight is drawn into a clump by a permanent magnet in its middle.
+
+``python -m warpmag.scenes_usd.million -o million.usdc``
+"""
+
+import math
+import os
+
+import numpy as np
+
+from warpmag.errors import InputError
+from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.scenes_usd import authoring
+
+_CELLS = 12
+"""Moments along an edge of the magnet, at most."""
+
+
+def author(
+    path: str | os.PathLike,
+    *,
+    balls: int = 1_000_000,
+    radius: float = 0.0025,
+    saturation: float = 1.7e6,
+    spacing: float = 0.0075,
+    magnet: float = 0.4,
+    magnetization: float = 1e6,
+    friction: float = 0.4,
+    seed: int = 1,
+) -> None:
+    """Write the stage to ``path``.
+
+    Args:
+        path: USD file to write.
+        balls: Number of balls.
+        radius: Radius of the balls [m].
+        saturation: Saturation magnetization of the balls [A/m].
+        spacing: Mean distance of neighbouring balls [m].
+        magnet: Edge of the magnet, a cube, over the radius of the cloud.
+        magnetization: Magnetization of the magnet, along z [A/m].
+        friction: Coefficient of friction of everything.
+        seed: Seed of where the balls are.
+    """
+    authoring.check_count("balls", balls)
+    if not 0.0 < magnet < 1.0:
+        raise InputError(f"magnet: must be between 0 and 1, got {magnet:g}")
+    if not spacing > 2.2 * radius:
+        raise InputError(f"spacing: balls of radius {radius:g} m need more than {2.2 * radius:g} m, got {spacing:g}")
+    size = spacing * np.cbrt(0.75 * balls / math.pi)
+    edge = float(max(magnet * size, 4.0 * radius))
+    places = cloud(balls, radius, spacing, edge, np.random.default_rng(seed))
+    stage = authoring.new_stage(
+        f"Million: {balls} iron balls without weight are drawn into a clump by a permanent magnet\n\n"
+        "No gravity, ordinary friction, steps of 1 ms.",
+        seconds=1.0,
+    )
+    authoring.add_scene(stage, MagneticSettings(), gravity=0.0)
+    looks = {"density": authoring.IRON_DENSITY, "friction": friction}
+    iron = authoring.add_material(stage, "Iron", color=authoring.STEEL_COLOR, metallic=1.0, roughness=0.3, **looks)
+    red = authoring.add_material(stage, "Magnet", color=authoring.MAGNET_COLOR, roughness=0.3, coat=1.0, **looks)
+    # cells not much larger than balls: what touches must be near, and is summed pair by pair
+    cell = max(edge / _CELLS, 2.0 * radius)
+    authoring.add_box(
+        stage,
+        "/World/Magnet",
+        (0.0, 0.0, 0.0),
+        (edge, edge, edge),
+        red,
+        motion=authoring.KINEMATIC,
+        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization), moment_spacing=cell),
+    )
+    authoring.add_balls(stage, "/World/Balls", places, radius, iron, magnet=Magnet(saturation=saturation))
+    far = float(np.linalg.norm(places, axis=1).max())
+    authoring.add_camera(stage, (1.2 * far, -3.6 * far, 1.2 * far), (0.0, 0.0, 0.0))
+    authoring.save(stage, path)
+
+
+def cloud(count: int, radius: float, spacing: float, edge: float, random: np.random.Generator) -> np.ndarray:
+    """Return places of balls around a cube with edges of ``edge`` [m], from the middle out.
+
+    Returns:
+        Centres [m], shape [count, 3], no two of which are nearer than 2.1 radii.
+    """
+    free = 0.5 * edge + radius + 0.5 * spacing
+    reach = math.ceil(np.cbrt(0.75 * (count + (2.0 * free / spacing) ** 3) / math.pi)) + 2
+    axis = np.arange(-reach, reach + 1) * spacing
+    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = places[np.abs(places).max(axis=1) >= free]
+    nearest = np.argsort(np.round((places**2).sum(axis=1) / spacing**2, 6), kind="stable")[:count]
+    return authoring.scatter(places[nearest], spacing, 2.1 * radius, random)
+
+
+if __name__ == "__main__":
+    authoring.run(author)

@@ -1,0 +1,192 @@
+"""Models of many magnets, whose fields and forces are sums by the fast multipole method."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+import warpmag
+from warpmag import fmm, oracle
+from warpmag.cli import main
+from warpmag.scenes_usd import falling_magnet
+
+RADIUS = 0.0025  # m
+FIELD = (0.0, 1e4, 3e4)  # A/m
+RTOL = 1e-3
+
+
+def apart(a, b) -> float:
+    """Relative difference, NaN where anything is."""
+    return float(np.linalg.norm(np.asarray(a, float) - b) / np.linalg.norm(b))
+
+
+def places_of(count: int, seed: int = 0) -> np.ndarray:
+    """Places of ``count`` balls in a round clump, none of which touch [m]."""
+    side = int(np.ceil((2.0 * count) ** (1 / 3)))
+    axis = np.arange(side) - 0.5 * (side - 1)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    near = grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")[:count]]
+    shifted = near + np.random.default_rng(seed).uniform(-0.15, 0.15, near.shape)
+    return (3.0 * RADIUS * shifted).astype(np.float32).astype(float)
+
+
+def new_builder() -> newton.ModelBuilder:
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    return builder
+
+
+def applied(magnetics, model) -> tuple[np.ndarray, np.ndarray]:
+    """Forces [N] and torques [N·m] on bodies at their first poses."""
+    state = model.state()
+    magnetics.apply(state)
+    found = state.body_f.numpy().astype(float)
+    return found[:, :3], found[:, 3:]
+
+
+@pytest.fixture(autouse=True)
+def small_leaves(monkeypatch):
+    """Leaves small enough for few magnets to be far from each other; their errors are larger than with usual ones."""
+    monkeypatch.setattr(fmm, "_DEGREES", tuple((rtol, degree, 12) for rtol, degree, _ in fmm._DEGREES))
+
+
+def far_cells(magnetics) -> bool:
+    """Whether there are cells that are not neighbours, so that expansions count."""
+    return magnetics.system._fast._grid.counts.numpy()[0] >= 2
+
+
+def test_moments_and_forces_are_those_of_all_pairs(device):
+    x, builder = places_of(1500), new_builder()
+    warpmag.add_balls(builder, x, RADIUS)
+    magnet = np.array([[0.0, 0.01, 0.08]]), np.array([[0.0, 0.3, 1.0]])  # m, A·m²
+    volume = 4.0 / 3.0 * np.pi * 0.004**3
+    warpmag.add_balls(builder, magnet[0], 0.004, magnetization=tuple(magnet[1][0] / volume))
+    model = builder.finalize(device=device)
+    magnetics = warpmag.Magnetics(model, method="fmm", external_field=FIELD)
+    forces, torques = applied(magnetics, model)
+    assert magnetics.system.is_fast
+    assert far_cells(magnetics)
+    assert 0.0 < magnetics.system.field_error() <= RTOL
+    exact = warpmag.solve_induction(
+        x, RADIUS, saturation=warpmag.magnets.SATURATION_OF_IRON, external_field=FIELD, sources=magnet,
+        method="vectorized", rtol=1e-6, dtype="float64", device="cpu",
+    )  # fmt: skip
+    moments = magnetics.system.moments.numpy().astype(float)
+    assert apart(moments[:-1], exact.magnetizations * 4.0 / 3.0 * np.pi * RADIUS**3) <= RTOL
+    every = np.concatenate([x, magnet[0]])
+    gradient = oracle.field_gradient(every, moments, radii=np.append(np.full(len(x), RADIUS), 0.004))
+    assert apart(forces, oracle.kelvin_force(moments, gradient)) <= RTOL
+    turning = oracle.h_field(x, moments[:-1], magnet[0])[0] + FIELD
+    scale = oracle.MU0 * np.linalg.norm(moments[-1]) * np.linalg.norm(turning)
+    assert np.linalg.norm(torques[-1] - oracle.MU0 * np.cross(moments[-1], turning)) <= RTOL * scale
+    # a pair's forces are one number of float32 and its opposite
+    assert np.abs(forces.sum(axis=0)).max() <= 1e-6 * np.linalg.norm(forces, axis=1).sum()
+
+
+def test_worlds_are_as_if_alone(device):
+    x, clump, whole = places_of(400), new_builder(), new_builder()
+    warpmag.add_balls(clump, x, RADIUS)
+    for _ in range(3):
+        whole.add_world(clump)
+    model = whole.finalize(device=device)
+    magnetics = warpmag.Magnetics(model, method="fmm", external_field=FIELD)
+    strengths = np.array([[0.0, 0.0, 1e4], FIELD, [1e6, 0.0, 0.0]])
+    magnetics.set_external_field(strengths)
+    forces, _ = applied(magnetics, model)
+    assert far_cells(magnetics)
+    alone = clump.finalize(device=device)
+    for own, field in zip(np.split(forces, 3), strengths, strict=True):
+        expected, _ = applied(warpmag.Magnetics(alone, method="vectorized", external_field=tuple(field)), alone)
+        # a force has the errors of two magnetizations, each of two solves
+        assert apart(own, expected) <= 4.0 * RTOL
+
+
+@pytest.fixture
+def rods():
+    """Bodies of two balls and of a magnet and a ball, turned at random; none of them touch."""
+    random, builder = np.random.default_rng(5), new_builder()
+    for place in places_of(300):
+        turn = random.standard_normal(4)
+        body = builder.add_body(xform=wp.transform(2.0 * place, wp.quat(*(turn / np.linalg.norm(turn)).tolist())))
+        for end in (-1.0, 1.0):
+            shape = builder.add_shape_sphere(body, xform=wp.transform((end * RADIUS, 0.0, 0.0)), radius=RADIUS)
+            if end > 0.0 and body % 2:
+                warpmag.add_permanent(builder, body, shape=shape, magnetization=(3e5, 2e5, 0.0))
+            else:
+                warpmag.add_inducible(builder, body, shape=shape)
+    return builder
+
+
+def test_bodies_of_several_moments_do_not_turn_themselves(rods, device):
+    model = rods.finalize(device=device)
+    magnetics = warpmag.Magnetics(model, method="fmm")
+    found, expected = (
+        applied(one, model) for one in (magnetics, warpmag.Magnetics(model, method="vectorized", rtol=1e-5))
+    )
+    assert far_cells(magnetics)
+    for own, exact in zip(found, expected, strict=True):
+        assert apart(own, exact) <= 3.0 * RTOL
+
+
+def test_long_bodies_are_right_and_not_chosen(device):
+    """Of a chain of magnets in one body no part acts on another."""
+    builder = new_builder()
+    body = builder.add_body()
+    for place in np.arange(300)[:, None] * [0.006, 0.002, 0.0]:
+        shape = builder.add_shape_sphere(body, xform=wp.transform(tuple(place.tolist())), radius=RADIUS)
+        warpmag.add_permanent(builder, body, shape=shape, magnetization=(0.0, 1e6, 0.0))
+    warpmag.add_balls(builder, [[0.0, 0.1, 0.1]], RADIUS, magnetization=(0.0, 0.0, 1e6))
+    model = builder.finalize(device=device)
+    forces, torques = applied(warpmag.Magnetics(model, method="fmm"), model)
+    expected = applied(warpmag.Magnetics(model), model)
+    assert apart(forces, expected[0]) <= RTOL
+    assert apart(torques, expected[1]) <= RTOL
+
+
+def test_a_graph_does_what_launches_do(device):
+    builder = new_builder()
+    warpmag.add_balls(builder, places_of(600), RADIUS)
+    model = builder.finalize(device=device)
+    found = []
+    for captured in (False, True):
+        magnetics, state = warpmag.Magnetics(model, method="fmm", external_field=FIELD), model.state()
+        magnetics.apply(state)
+        magnetics.system.forget()
+        state.body_q.assign(state.body_q.numpy() * np.float32(1.3))  # other cells
+        state.clear_forces()
+        if captured:
+            with wp.ScopedCapture(device) as capture:
+                magnetics.apply(state)
+            wp.capture_launch(capture.graph)
+        else:
+            magnetics.apply(state)
+        found.append(state.body_f.numpy())
+    assert np.isfinite(found[0]).all()
+    assert (found[0] == found[1]).all()
+
+
+def test_a_run_of_a_stage(device, tmp_path, capsys):
+    stage, output = tmp_path / "stage.usdc", tmp_path / "out.usda"
+    falling_magnet.author(stage, balls=300, drop=0.01)
+    assert main(["run", str(stage), "--sums", "fmm", "--frames", "1", "--device", device, "-o", str(output)]) == 0
+    assert "of fields by multipoles" in capsys.readouterr().out
+    poses = []
+    for method in ("fmm", "vectorized"):
+        simulation = warpmag.Simulation(stage, method=method, device=device)
+        statistics = simulation.run(1)
+        assert (statistics.field_error > 0.0) == (method == "fmm")
+        assert statistics.field_error <= RTOL
+        poses.append(simulation.state.body_q.numpy()[:, :3])
+    # 16 ms at accelerations of up to 100 m/s², a thousandth of which differ
+    assert np.abs(poses[0] - poses[1]).max() <= 2e-5
+
+
+def test_auto_and_bad_arguments(device):
+    builder = new_builder()
+    warpmag.add_balls(builder, places_of(300), RADIUS)
+    model = builder.finalize(device=device)
+    assert not warpmag.Magnetics(model).system.is_fast
+    with pytest.raises(warpmag.InputError, match="method: 'multipole' is not one of"):
+        warpmag.Magnetics(model, method="multipole")
+    with pytest.raises(warpmag.InputError, match="rtol: the fast multipole method reaches"):
+        warpmag.Magnetics(model, method="fmm", rtol=1e-5)
