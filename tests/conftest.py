@@ -1,8 +1,7 @@
-"""Options, markers and fixtures of the whole test suite.
+"""Options, markers and fixtures of the whole test suite."""
 
-Warp is imported by the ``device`` fixture only, so that tests of host code start without it.
-"""
-
+import functools
+import sys
 from pathlib import Path
 
 import pytest
@@ -41,6 +40,21 @@ def pytest_configure(config):
         wp.config.cpu_compiler_flags = f"-march=native {SANITIZERS[kind]}"
 
 
+def pytest_collectstart():
+    """Have Newton's kernels compiled as the command does, where test files import them: without their derivatives."""
+    import warp as wp  # noqa: PLC0415 - not by the process that only hands out tests
+
+    wp.config.enable_backward = False
+
+
+def pytest_collection_finish():
+    """Have Newton write the sources of its contact kernels once a process, not at each of a thousand simulations."""
+    if phase := sys.modules.get("newton._src.geometry.narrow_phase"):
+        for name, create in list(vars(phase).items()):
+            if name.startswith("create_narrow_phase"):
+                setattr(phase, name, functools.cache(create))
+
+
 def pytest_collection_modifyitems(config, items):
     skips = {}
     if not config.getoption("--long"):
@@ -60,5 +74,4 @@ def device(request):
 
     wp.config.log_level = wp.LOG_WARNING
     wp.config.verbose_warnings = False
-    wp.config.enable_backward = False  # as the command does, so that both find the same compiled kernels
     return str(wp.get_device(request.config.getoption("--device")))
