@@ -120,7 +120,9 @@ def run_size(count: int, device, slowest: float, seconds: dict):
             work()
             wp.synchronize_device(device)
             first = time.perf_counter() - began
-            few = {"repeats": 2, "chained": 1} if count > 200_000 else {}  # as far as a graph's own launch does not show
+            few = (
+                {"repeats": 2, "chained": 1} if count > 200_000 else {}
+            )  # as far as a graph's own launch does not show
             taken = measure(work, device, **few)
             if rtol is None:
                 seconds[quantity, count] = taken
