@@ -3,22 +3,26 @@
 The equation is that of ``susceptible.py`` with χ = ∞, w/2 − (1/4π) ∫ w dΩ = H0·x, w constant on triangles, whose solid
 angles are those of Van Oosterom and Strackee (1983). Triangles are halved until there are 1,500 of them, and 4,500.
 
-Run as ``python -m bench.reference.letters [LETTER ...]``: how many cells each letter has, m/(V H0) of its surface along
-x, y and z, what three times the triangles changed of it, and how far from it the letter's cells are.
+Run as ``python -m bench.reference.letters [LETTER ...]``: the cells of each letter, m/(V H0) of its surface to the right,
+up and across, what three times the triangles changed of it, and how far from it the letter's cells are.
 """
 
 import argparse
+import itertools
+import string
 
 import numpy as np
 import warp as wp
 
 from bench.reference.table import FAINT
 from warpmag import demagnetization, even_field, facets, lattice
-from warpmag.scenes_usd import bundled
+from warpmag.scenes_usd import lettering
 from warpmag.system import MomentSystem
 
-SPACING = 0.004
-"""Distance between the moments of a letter in the scene [m]."""
+SIZE, THICKNESS, SPACING = 0.02, 0.005, 0.004
+"""Height and thickness of letters in the scene, and the distance between their moments [m]."""
+BEVEL = 0.02
+"""Width of their bevels over the height."""
 TRIANGLES = 1500
 """How many there are at least, the first time."""
 
@@ -66,32 +70,20 @@ def found(solid) -> tuple[np.ndarray, int]:
     return result, len(body.volumes)
 
 
-def letters() -> dict[str, np.ndarray]:
-    """Triangles of the scene's letters [m], shape [n, 3, 3] each."""
-    from pxr import Usd, UsdGeom  # noqa: PLC0415 - the reference does without USD
-
-    shapes = {}
-    stage = Usd.Stage.Open(str(bundled()["alphabets"]))
-    for prim in stage.Traverse():
-        letter = prim.GetParent().GetName().partition("_")[0]
-        if not prim.IsA(UsdGeom.Mesh) or letter in shapes:
-            continue  # all letters of a kind are one mesh
-        mesh = UsdGeom.Mesh(prim)
-        points = np.array(mesh.GetPointsAttr().Get(), dtype=float)
-        indices = np.split(mesh.GetFaceVertexIndicesAttr().Get(), np.cumsum(mesh.GetFaceVertexCountsAttr().Get())[:-1])
-        shapes[letter] = points[[[face[0], face[k], face[k + 1]] for face in indices for k in range(1, len(face) - 1)]]
-    return shapes
+def triangles(letter: str) -> np.ndarray:
+    """Triangles of a letter [m], z across it, shape [n, 3, 3]."""
+    points, faces = lettering.extruded(lettering.outline(letter), THICKNESS / SIZE, BEVEL)
+    return SIZE * points[[[face[0], a, b] for face in faces for a, b in itertools.pairwise(face[1:])]]
 
 
 def main() -> None:
     """Print the table."""
-    shapes = letters()
     parser = argparse.ArgumentParser(prog="python -m bench.reference.letters", description=__doc__.partition("\n")[0])
-    parser.add_argument("letters", nargs="*", metavar="LETTER", help=f"of {', '.join(sorted(shapes))}; all if none")
+    parser.add_argument("letters", nargs="*", metavar="LETTER", help="of the capitals; all if none is named")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    for letter in options.letters or sorted(shapes):
-        corners = shapes[letter]
+    for letter in options.letters or string.ascii_uppercase:
+        corners = triangles(letter)
         coarse, fine = (moments(facets.mesh(corners, k * TRIANGLES)[:, :3]) for k in (1, 3))
         body, count = found(lattice.mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)))
         numbers = (*fine, *(100.0 * (fine - coarse) / fine), *(100.0 * (body / fine - 1.0)))
