@@ -29,7 +29,9 @@ import numpy as np
 from warpmag.usd.crate import CONTENTS, DOUBLE_VECTOR, HEAD, SECTION, SECTION_NAME, LayerFile, reference
 
 _AHEAD = 512
-"""Frames whose references are written at once: a page of the file for each row."""
+"""Frames whose references are written to a row at once, a page of the file, some rows with each frame before."""
+_FIRST_AHEAD = 64
+"""The same where all rows are written at once, so that it takes no longer than it has to."""
 _BLOCK = 1 << 17
 """References that are held in memory at once."""
 _FIRST_CAPACITY = 64
@@ -82,6 +84,7 @@ class SampleFile:
         self._file, self._places = file, places
         self._offsets = (np.cumsum(sizes) - sizes).astype(np.uint64)
         self._frame_size = int(np.sum(sizes))
+        self._ahead = 0  # rows that have references of the frames behind those that all rows have
         self._told = -1  # number of samples that all rows say they have; -1 where a run before may have closed the file
 
     @classmethod
@@ -146,8 +149,7 @@ class SampleFile:
         places = self._places
         if places.count == places.capacity:
             self._extend(os.fstat(self._file.fileno()).st_size, 2 * places.capacity, _Structure.read(self._file))
-        if places.count == places.filled:
-            self._fill_rows(places.filled, min(places.filled + _AHEAD, places.capacity))
+        self._fill_ahead()
         self._write(int(self._frame_places(places.count, places.count + 1)[0]), values)
         self._write(places.times + 8 * (1 + places.count), struct.pack("<d", code))
         if len(changed):
@@ -187,9 +189,10 @@ class SampleFile:
         old.first_frames, old.stretches = np.append(old.first_frames, old.capacity), np.append(old.stretches, start)
         empty = start + (capacity - old.capacity) * self._frame_size
         old.times, old.capacity = empty + 8, capacity
+        old.filled, self._ahead = min(old.count + _FIRST_AHEAD, capacity), 0
         self._write(empty, struct.pack("<QQ", 0, old.count) + codes.tobytes())
         self._told = capacity
-        self._fill_rows(0, min(-(-max(old.count, 1) // _AHEAD) * _AHEAD, capacity))
+        self._fill_rows(0, old.filled, 0, len(self._offsets))
         end = self._rows().stop
         self._write(end, structure.moved_to(end))
         self._write_heads(0, len(self._offsets))
@@ -207,22 +210,42 @@ class SampleFile:
         inside = frames - self._places.first_frames[stretch]
         return (self._places.stretches[stretch] + inside * self._frame_size).astype(np.uint64)
 
-    def _fill_rows(self, first: int, last: int) -> None:
-        """Write the references of frames that may not be there yet; before the first one the number of samples."""
-        places = self._frame_places(first, last)
+    def _fill_ahead(self) -> None:
+        """Write references of the frames that come after those that have some: to so many rows that all get them."""
+        places, rows = self._places, len(self._offsets)
+        left = places.filled - places.count
+        if places.filled == places.capacity or left > _AHEAD:
+            return
+        last = min(places.filled + _AHEAD, places.capacity)
+        end = self._ahead + -(-(rows - self._ahead) // (left + 1))
+        self._fill_rows(places.filled, last, self._ahead, end)
+        self._ahead = end
+        if end == rows:
+            places.filled, self._ahead = last, 0
+
+    def _fill_rows(self, first: int, last: int, begin: int, end: int) -> None:
+        """Write the references of frames that may not be there yet; before the first one the number of samples.
+
+        Args:
+            first: The first frame.
+            last: Behind the last one.
+            begin: The first row.
+            end: Behind the last one.
+        """
+        frames = self._frame_places(first, last)
         block = max(1, _BLOCK // max(1, last - first))
-        for begin in range(0, len(self._offsets), block):
-            part = slice(begin, begin + block)
-            words = self._places.types[part, None] | (self._offsets[part, None] + places)
+        for start in range(begin, end, block):
+            part = slice(start, min(start + block, end))
+            words = self._places.types[part, None] | (self._offsets[part, None] + frames)
             if first == 0:
                 words = np.insert(words, 0, self._places.capacity, axis=1)
-            rows = self._rows()[part]
-            if words.nbytes == len(rows) * rows.step:  # they touch
-                self._write(rows.start, words.tobytes())
+            rows, size = self._rows()[part], words[0].nbytes
+            data, inside = words.tobytes(), 8 * (1 + first) if first else 0
+            if size == rows.step:  # they touch
+                self._write(rows.start, data)
                 continue
-            for row, data in zip(rows, words, strict=True):
-                self._write(row + (8 * (1 + first) if first else 0), data.tobytes())
-        self._places.filled = last
+            for number, row in enumerate(rows):
+                self._write(row + inside, data[number * size : (number + 1) * size])
 
     def _write_heads(self, first: int, last: int) -> None:
         """Let the time samples of attributes have the present times, where these change, and rows."""
