@@ -17,7 +17,7 @@ import pytest
 from pxr import Sdf, Usd, UsdPhysics
 from run_server import RunServer
 
-from warpmag import Simulation, cli
+from warpmag import InputError, Simulation, cli
 from warpmag.scenes_usd import balls_up
 
 FRAMES = 60
@@ -54,6 +54,32 @@ def frames_of(output):
     last = times[-1] if times else 0.0
     assert stage.GetEndTimeCode() <= max(last, round(last))  # the frame of the last step, at which players stop
     return times
+
+
+def rub(layer, friction):
+    """Give all materials of a scene a coefficient of friction."""
+    stage = Usd.Stage.Open(layer)
+    for prim in stage.Traverse():
+        if prim.HasAPI(UsdPhysics.MaterialAPI):
+            UsdPhysics.MaterialAPI(prim).GetDynamicFrictionAttr().Set(friction)
+
+
+def first_difference(found, expected):
+    """Where two runs, evaluations, substeps and samples, differ first: a step or the samples of the earliest time."""
+    steps = [step for step, pair in enumerate(zip(found[0], expected[0], strict=False)) if pair[0] != pair[1]]
+    lines = [f"step {step}: {found[0][step]} evaluations, not {expected[0][step]}" for step in steps[:1]]
+    (of_found, of_expected), missing = (found[2], expected[2]), (None, {})
+    paths = sorted(of_found.keys() | of_expected.keys())
+    both = [(path, of_found.get(path, missing), of_expected.get(path, missing)) for path in paths]
+    lines += [f"{path}: {mine[0]}, not {its[0]}" for path, mine, its in both if mine[0] != its[0]][:1]
+    apart = [
+        (time, path, mine[1].get(time), its[1].get(time))
+        for path, mine, its in both
+        for time in mine[1].keys() | its[1].keys()
+        if mine[1].get(time) != its[1].get(time)
+    ]
+    lines += [f"{path} at {time}: {a}, not {b}" for time, path, a, b in sorted(apart, key=lambda one: one[:2])[:1]]
+    return "; ".join([*lines, f"{found[1]} substeps and {expected[1]}"])
 
 
 def assert_begins_like(output, reference):
@@ -153,12 +179,10 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, device, always, 
     options, friction = dict(options), options.get("friction")
     if friction:  # contacts then remember how far they slipped
         del options["friction"]
-        stage = Usd.Stage.Open(str(scene))
-        for prim in stage.Traverse():
-            if prim.HasAPI(UsdPhysics.MaterialAPI):
-                UsdPhysics.MaterialAPI(prim).GetDynamicFrictionAttr().Set(friction)
-        scene = tmp_path / "rubs.usda"
-        stage.Export(str(scene))
+        # not the layer of the file, which the process shares as long as anything holds it: other tests would read this
+        layer, scene = Sdf.Layer.OpenAsAnonymous(str(scene)), tmp_path / "rubs.usda"
+        rub(layer, friction)
+        layer.Export(str(scene))
 
     def run(name, last, resume):
         simulation = Simulation(scene, device=device, **options)
@@ -169,8 +193,29 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, device, always, 
     expected = run("whole", 9, False)
     for last in (2, 5, 9):
         found = run("parts", last, True)
-    assert found == expected
+    same = found == expected
+    assert same, first_difference(found, expected)
     assert sorted(os.listdir(tmp_path / "parts")) == ["out.cache.usdc", "out.usda"]
+
+
+def test_a_scene_edited_in_memory_is_another_scene(scene, tmp_path, device, always):
+    """A process reads its own edits where it has not saved them, and who resumes without them has another scene."""
+    own, output = tmp_path / "own.usda", tmp_path / "out.usda"
+    own.write_bytes(scene.read_bytes())
+    layer = Sdf.Layer.FindOrOpen(str(own))
+
+    def run(last):
+        Simulation(own, device=device).run(4, output=output, resume=True, on_frame=lambda frame: frame < last)
+
+    rub(layer, 0.5)
+    run(1)
+    run(2)
+    layer.Reload(force=True)
+    with pytest.raises(InputError, match="out.usda: cannot resume, it was run with another scene"):
+        run(4)
+    rub(layer, 0.5)
+    run(4)
+    assert layer.dirty
 
 
 def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, always, capsys):

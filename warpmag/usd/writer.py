@@ -428,12 +428,12 @@ def _instances(stage: Usd.Stage, paths: Iterable[str]) -> list[str]:
 
 
 def _digest(stage: Usd.Stage) -> str:
-    """Return a digest of the files that a stage is made of, wherever they lie."""
+    """Return a digest of the layers that a stage is made of, wherever they lie, with edits that nobody has saved."""
     digests = []
     for layer in stage.GetUsedLayers():
-        if layer.realPath:
+        if layer.realPath and not layer.dirty:
             with open(layer.realPath, "rb") as file:
                 digests.append(hashlib.file_digest(file, "sha256").hexdigest())
-        elif layer == stage.GetRootLayer():
+        elif layer.realPath or layer == stage.GetRootLayer():
             digests.append(hashlib.sha256(layer.ExportToString().encode()).hexdigest())
     return hashlib.sha256("".join(sorted(digests)).encode()).hexdigest()
