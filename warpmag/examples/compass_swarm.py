@@ -34,7 +34,8 @@ class Example:
         for column in range(args.columns):
             needle = row.add_link()
             row.add_shape_box(needle, hx=EXTENT[0], hy=EXTENT[1], hz=EXTENT[2])
-            warpmag.add_permanent(row, needle, magnetization=(MAGNETIZATION, 0.0, 0.0))
+            # one moment is all that others feel of a needle so far away; by default it would be 252
+            warpmag.add_permanent(row, needle, magnetization=(MAGNETIZATION, 0.0, 0.0), moment_spacing=2.0 * EXTENT[0])
             place = wp.transform((column * PITCH, 0.0, 0.0), wp.quat_identity())
             hinge = row.add_joint_revolute(
                 -1, needle, parent_xform=place, axis=(0.0, 0.0, 1.0), target_kd=self.damping,
