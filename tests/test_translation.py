@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from warpmag import harmonics
-from warpmag.kernels.fmm.translate import OCTANTS, Translation, displacements, pitch
+from warpmag.kernels.fmm.translate import OCTANTS, Translation, _grouped_rows, _used_rows, displacements, pitch
 
 
 @dataclass
@@ -115,6 +115,17 @@ def test_every_cell_takes_what_its_parent_does_not_have(device, dtype, degree, s
     np.testing.assert_allclose(found, wanted, rtol=0, atol=32 * epsilon * np.abs(wanted).max())
     assert (found[grid.begin[-2] :] == 0).all()  # nothing is far from the cells of the highest level
     np.testing.assert_array_equal(found, translate(grid, multipoles, degree, dtype, device))
+
+
+@pytest.mark.parametrize("degree", [5, 8, 9, 14])
+def test_threads_of_a_gpu_have_rows_of_one_class(degree):
+    classes = (harmonics.parity(degree) < 0).T @ [1, 2, 4]
+    used = _used_rows(classes)
+    groups = _grouped_rows(classes, 8, used).reshape(-1, 8)
+    assert (groups[:, used:] == -1).all()
+    assert sorted(groups[groups >= 0]) == list(range(harmonics.count(degree)))
+    assert all(len(set(classes[group[group >= 0]])) == 1 for group in groups)
+    assert (groups[:, 0] >= 0).all()  # whose class the group has
 
 
 @pytest.mark.cuda

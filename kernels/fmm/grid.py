@@ -18,8 +18,9 @@ from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 _BLOCK = 256
 """Moments of a block of threads, as in ``grid.h``."""
-_MOST_LEVELS = 13
-"""Levels below the cube: leaves down to 1/8192 of it, by keys that are sorted in five passes of 8 bits."""
+_MOST_LEVELS = 14
+"""Levels below the cube, for keys of cells and moments that are sorted in six passes of 8 bits, an even number: after
+an odd one the results are copied."""
 _KEY_BITS, _HEIGHT_BITS, _OCTANT_BITS = 64, 4, 8
 _ROOM = 0.3
 """Cells for which there is room, over the leaves that hold as many moments as wanted: levels differ by a factor of up
