@@ -9,6 +9,7 @@ from pxr import Usd
 import warpmag
 from warpmag import fmm, oracle
 from warpmag.cli import BAD_INPUT, main
+from warpmag.system import MomentSystem
 
 RADIUS = 0.0025  # m
 FIELD = (0.0, 1e4, 3e4)  # A/m
@@ -196,6 +197,22 @@ def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     assert apart(np.array(moments), simulation.magnetics.shape_moments()[:150]) <= 3.0 * RTOL
     assert main(["run", str(scene), "--balls", "3"]) == BAD_INPUT
     assert "balls: only of bundled scenes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", [np.nan, np.inf, -np.inf, 1e30])
+def test_a_place_that_is_no_place_makes_no_harm(place, device):
+    """As at the end of a simulation that explodes: whoever looks finds what is not finite."""
+    x = places_of(300)
+    x[77, 1] = place
+    system = MomentSystem(
+        radii=np.full(300, RADIUS), saturation=1e6, external_field=FIELD, method="fmm", max_evaluations=5, device=device
+    )
+    system.positions.assign(x.astype(np.float32))
+    system.solve()
+    system.apply_forces()
+    assert abs(place) == 1e30 or not np.isfinite(system.forces.numpy()).all()
+    grid = system._fast._grid
+    assert grid.moment_begin.numpy()[grid.level_begin.numpy()[1]] == 300
 
 
 def test_auto_and_bad_arguments(device):
