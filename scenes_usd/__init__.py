@@ -18,7 +18,7 @@ def bundled() -> dict[str, Path]:
 
 def summary(name: str) -> str:
     """Return what a scene of :data:`MADE` shows, in a line."""
-    return (inspect.getdoc(_module(name)) or "").partition("\n")[0]
+    return (inspect.getdoc(_module(name)) or "").partition("\n")[0].rstrip(".")
 
 
 def make(name: str, folder: Path, balls: int | None = None) -> Path:

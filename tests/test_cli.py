@@ -47,17 +47,6 @@ def test_run_writes_a_stage_and_a_summary(scene, device, tmp_path, capfd):
     assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").GetNumTimeSamples() == 4
 
 
-def test_a_scene_of_another_number_of_balls(device, tmp_path, capfd):
-    out = tmp_path / "out.usda"
-    assert cli.main(["run", "million", "--balls", "40", "-o", str(out), "--frames", "1", "--device", device]) == 0
-    printed = capfd.readouterr()
-    assert "40 moving" in printed.out
-    assert f"scene: {tmp_path / 'million_40.usdc'}" in printed.err
-    assert Usd.Stage.Open(str(out)).GetPrimAtPath("/World/Magnet")
-    assert cli.main(["run", str(tmp_path / "million_40.usdc"), "--balls", "3"]) == cli.BAD_INPUT
-    assert "balls: only of bundled scenes" in capfd.readouterr().err
-
-
 def test_version(capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main(["--version"])

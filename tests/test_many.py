@@ -4,11 +4,12 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from pxr import Usd
 
 import warpmag
 from warpmag import fmm, oracle
-from warpmag.cli import main
-from warpmag.scenes_usd import falling_magnet
+from warpmag.cli import BAD_INPUT, main
+from warpmag.system import MomentSystem
 
 RADIUS = 0.0025  # m
 FIELD = (0.0, 1e4, 3e4)  # A/m
@@ -81,6 +82,20 @@ def test_moments_and_forces_are_those_of_all_pairs(device):
     assert np.linalg.norm(torques[-1] - oracle.MU0 * np.cross(moments[-1], turning)) <= RTOL * scale
     # a pair's forces are one number of float32 and its opposite
     assert np.abs(forces.sum(axis=0)).max() <= 1e-6 * np.linalg.norm(forces, axis=1).sum()
+
+
+def test_a_field_of_magnets_far_away_is_as_exact(device):
+    """Fields of few magnets at balls that are far from them and from each other, of which no near pair is a part."""
+    random, builder = np.random.default_rng(3), new_builder()
+    warpmag.add_balls(builder, 4.0 * places_of(1000) + [0.0, 0.0, 0.7], RADIUS)
+    for place in random.uniform(-0.2, 0.2, (30, 3)):
+        along = random.standard_normal(3)
+        warpmag.add_balls(builder, [place], 0.004, magnetization=tuple(6e6 * along / np.linalg.norm(along)))
+    model = builder.finalize(device=device)
+    magnetics = warpmag.Magnetics(model, method="fmm")
+    applied(magnetics, model)
+    assert far_cells(magnetics)
+    assert magnetics.system.field_error() <= 0.3 * RTOL
 
 
 def test_worlds_are_as_if_alone(device):
@@ -165,20 +180,39 @@ def test_a_graph_does_what_launches_do(device):
     assert (found[0] == found[1]).all()
 
 
-def test_a_run_of_a_stage(device, tmp_path, capsys):
-    stage, output = tmp_path / "stage.usdc", tmp_path / "out.usda"
-    falling_magnet.author(stage, balls=300, drop=0.01)
-    assert main(["run", str(stage), "--sums", "fmm", "--frames", "1", "--device", device, "-o", str(output)]) == 0
-    assert "of fields by multipoles" in capsys.readouterr().out
-    poses = []
-    for method in ("fmm", "vectorized"):
-        simulation = warpmag.Simulation(stage, method=method, device=device)
-        statistics = simulation.run(1)
-        assert (statistics.field_error > 0.0) == (method == "fmm")
-        assert statistics.field_error <= RTOL
-        poses.append(simulation.state.body_q.numpy()[:, :3])
-    # 16 ms at accelerations of up to 100 m/s², a thousandth of which differ
-    assert np.abs(poses[0] - poses[1]).max() <= 2e-5
+def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
+    out, scene = tmp_path / "out.usda", tmp_path / "falling_magnet_150.usdc"
+    options = ["--sums", "fmm", "--frames", "1", "--device", device, "-o", str(out)]
+    assert main(["run", "falling_magnet", "--balls", "150", *options]) == 0
+    printed = capsys.readouterr()
+    assert "151 moving" in printed.out
+    assert "of fields by multipoles" in printed.out
+    assert f"scene: {scene}" in printed.err
+    written = Usd.Stage.Open(str(out))
+    balls = [written.GetPrimAtPath(f"/World/Balls/Ball_{number:05d}") for number in range(150)]
+    moments = [ball.GetAttribute("warpmag:moment").Get(written.GetEndTimeCode()) for ball in balls]
+    simulation = warpmag.Simulation(scene, method="vectorized", device=device)
+    assert simulation.run(1).field_error == 0.0
+    # of two solves, at places that differ by a hundredth of a ball
+    assert apart(np.array(moments), simulation.magnetics.shape_moments()[:150]) <= 3.0 * RTOL
+    assert main(["run", str(scene), "--balls", "3"]) == BAD_INPUT
+    assert "balls: only of bundled scenes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", [np.nan, np.inf, -np.inf, 1e30])
+def test_a_place_that_is_no_place_makes_no_harm(place, device):
+    """As at the end of a simulation that explodes: whoever looks finds what is not finite."""
+    x = places_of(300)
+    x[77, 1] = place
+    system = MomentSystem(
+        radii=np.full(300, RADIUS), saturation=1e6, external_field=FIELD, method="fmm", max_evaluations=5, device=device
+    )
+    system.positions.assign(x.astype(np.float32))
+    system.solve()
+    system.apply_forces()
+    assert abs(place) == 1e30 or not np.isfinite(system.forces.numpy()).all()
+    grid = system._fast._grid
+    assert grid.moment_begin.numpy()[grid.level_begin.numpy()[1]] == 300
 
 
 def test_auto_and_bad_arguments(device):

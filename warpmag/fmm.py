@@ -1,5 +1,6 @@
 """What the fast multipole method needs to know: expansions of which degree, and cells of which size, for an error."""
 
+import math
 from functools import cache
 
 import numpy as np
@@ -100,16 +101,22 @@ class FastSums:
         if targets is not None:  # moments of no strength among the others
             self._first = moments.count
             packed, groups = join_moments(moments, targets)
-        self._tables = expansion_tables(degree)
+        self._tables, self._rtol = expansion_tables(degree), rtol
         self._grid = MomentGrid(packed, groups, worlds, occupancy=held, reach=reach)
 
     def build(self):
         """Launch the making of the cells, for moments that have moved."""
         self._grid.build()
 
-    def sums(self, quantity: Quantity, sources=None) -> CellSums | None:
-        """Sums of a quantity, of some ``sources`` only (see :class:`CellSums`); None for those of none."""
+    def sums(self, quantity: Quantity, sources=None, pairs: float = math.inf) -> CellSums | None:
+        """Sums of a quantity, of some ``sources`` only (see :class:`CellSums`).
+
+        None for those of none, and of so few ``pairs`` that they are better summed one by one: sooner, and without an
+        error that counts where nothing is near, as in the field of a few magnets at many balls.
+        """
         if sources is not None and not sources.any():
+            return None
+        if not is_fast(math.sqrt(pairs), self._rtol, self._grid.device):
             return None
         return CellSums(self._grid, self._tables, quantity, self._first, sources)
 
@@ -120,7 +127,7 @@ class NoFastSums:
     def build(self):
         """Do nothing."""
 
-    def sums(self, quantity: Quantity, sources=None) -> None:
+    def sums(self, quantity: Quantity, sources=None, pairs: float = math.inf) -> None:
         """Return nothing."""
 
 

@@ -21,9 +21,10 @@ from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, W
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
 from warpmag.kernels.pairs.eddy import EddyCurrents
-from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
+from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.work_list import pair_count
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
 from warpmag.layout import MomentLayout, change_material, make_layout, make_material, with_cells
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, check_count, check_force, check_rtol, check_token
@@ -153,7 +154,7 @@ class MomentSystem:
         self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
         self._fast = fast_sums_for(method, self._packed, layout, body_extent, self.rtol)
-        self._evaluate_field(layout, near)
+        self._evaluate_field(layout, near, always=method == "fmm")
         self._make_cells(layout, couplings, whole=dynamics == "theta")
         self._evaluate_wrench(layout, turned)
         self._energies = None
@@ -205,21 +206,20 @@ class MomentSystem:
             self.bias = wp.zeros_like(self.moments)
         return replace(layout, lone=layout.lone & ~linear)
 
-    def _evaluate_field(self, layout: MomentLayout, near: bool):
-        """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
+    def _evaluate_field(self, layout: MomentLayout, near: bool, always: bool):
+        """Prepare the field of permanent moments at others, and of those among themselves, ``always`` by multipoles."""
         self.worlds, self.world_ranges = layout.worlds, layout.ranges()
-        ranges = self.world_ranges
+        first, middle, last = np.reshape(self.world_ranges, (-1, 3)).T
+        applied, mutual = (np.stack(one, axis=1) for one in ((first, middle, middle, last), (first, middle) * 2))
         packed, state = self._packed, self._induction
-        applied = [(first, middle, middle, last) for first, middle, last in ranges]
-        among, of_magnets = (self._fast.sums(Quantity.FIELD, which) for which in (~layout.permanent, layout.permanent))
+        of_magnets = self._fast.sums(Quantity.FIELD, layout.permanent, pair_count(applied))
+        among = self._fast.sums(Quantity.FIELD, ~layout.permanent, math.inf if always else pair_count(mutual))
         arrays = packed, packed, self._magnetizing, state.h0
         self._applied = PairEvaluation(Quantity.FIELD, applied, *arrays, sums=of_magnets)
         if self._applied.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing
-        mutual, extra = [(first, middle, first, middle) for first, middle, _ in ranges], int(near)
-        # near contacts write one more partial sum
-        arrays = packed, packed, state.h0, self.h
-        self._mutual = PairEvaluation(Quantity.FIELD, mutual, *arrays, extra_parts=extra, sums=among)
+        arrays = packed, packed, state.h0, self.h  # near contacts write one more partial sum
+        self._mutual = PairEvaluation(Quantity.FIELD, mutual, *arrays, extra_parts=int(near), sums=among)
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
         """Prepare what cells lack as balls; ``whole`` tells whether small bodies respond as wholes."""
@@ -391,7 +391,7 @@ class MomentSystem:
 
     def field_error(self) -> float:
         """Relative error of the field by the fast multipole method at some moments, zero without it; waits."""
-        if self._mutual.form != GIVEN:
+        if not self.is_fast or self._mutual.count == 0:
             return 0.0
         base = wp.clone(self._magnetizing)
         if self.bias is not None:

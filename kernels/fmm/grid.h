@@ -163,7 +163,7 @@ template <class Arrays> CUDA_CALLABLE inline void set_key(const Arrays& a, int i
     Bits key = 0;
     for (int c = 0; c < 3; ++c) {
         const double at = ((double)position(a, c, i) - frame[c]) * cells, most = (double)((1ull << a.depth) - 1);
-        key |= spread_bits((Bits)(at < 0 ? 0 : at > most ? most : at)) << c;
+        key |= spread_bits((Bits)(at > 0 ? at < most ? at : most : 0)) << c; // 0 of what is no number, too
     }
     a.keys.data[i] = (Bits)a.group.data[i] << 3 * a.depth | key;
     a.index.data[i] = i;
