@@ -1,12 +1,15 @@
 """Options, markers and fixtures of the whole test suite."""
 
 import functools
+import os
 import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # a worker has a core: threads of NumPy's would wait for those of the others
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 FOLDER = Path(__file__).parent
 UNDEFINED = (
     *("alignment", "array-bounds", "bool", "builtin", "enum", "float-cast-overflow", "integer-divide-by-zero"),

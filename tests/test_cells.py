@@ -8,26 +8,26 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from cell_bodies import (
+    FAINT,
+    TURN,
+    coupled,
+    demagnetizing_matrix,
+    filled,
+    full,
+    make_system,
+    matrix,
+    polarizability,
+    posed,
+)
 from scipy.integrate import quad
 
 import warpmag
 from bench.reference import boxes, cylinders, plate, susceptible
-from warpmag import demagnetization, even_field, lattice, oracle
+from warpmag import demagnetization, lattice, oracle
 from warpmag.system import MomentSystem
 
 SIDES = np.array([1.0, 0.7, 0.4])
-FAINT = 1e12  # A/m, a saturation far above any field here
-TURN = np.array([0.2, -0.4, 0.1, 0.8]) / np.linalg.norm([0.2, -0.4, 0.1, 0.8])
-
-
-def full(six):
-    """Symmetric tensors of xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz, xy, xz, yz = np.moveaxis(np.asarray(six), -1, 0)
-    return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(*xx.shape, 3, 3)
-
-
-def matrix(quaternion):
-    return lattice.box([1.0] * 3).posed((0.0, 0.0, 0.0), quaternion).rotation
 
 
 def demagnetizing_factors(semi_axes):
@@ -36,54 +36,6 @@ def demagnetizing_factors(semi_axes):
     return np.array(
         [a.prod() / 2 * quad(lambda s, x=x: 1 / ((s + x * x) * np.sqrt((s + a * a).prod())), 0, np.inf)[0] for x in a]
     )
-
-
-def make_system(body, *, turn=(0.0, 0.0, 0.0, 1.0), permanent=(), coupling=None, **settings):
-    """System of one body at the origin, and permanent dipoles (position, moment) of another."""
-    count = len(body.volumes)
-    coupling = demagnetization.coupling(body, body.radii) if coupling is None else coupling
-    system = MomentSystem(
-        radii=np.append(body.radii, np.zeros(len(permanent))), permanent=np.arange(count + len(permanent)) >= count,
-        bodies=np.append(np.zeros(count, int), np.ones(len(permanent), int)),
-        couplings=[(0, coupling)], **{"saturation": FAINT, **settings},
-    )  # fmt: skip
-    positions = body.positions @ matrix(turn).T
-    system.positions.assign(np.concatenate([positions, *(np.atleast_2d(x) for x, _ in permanent)]))
-    system.moments.assign(np.concatenate([np.zeros((count, 3)), *(np.atleast_2d(m) for _, m in permanent)]))
-    system.rotations.assign(np.atleast_2d(turn))
-    return system
-
-
-def polarizability(body, susceptibility, device, **settings):
-    """Moment over V H0 along x and along z, shape [2]."""
-    found = []
-    for axis in np.eye(3)[[0, 2]]:
-        system = make_system(body, susceptibility=susceptibility, external_field=1e3 * axis, device=device, **settings)
-        system.solve()
-        assert system.converged.numpy().all()
-        found.append(system.moments.numpy().sum(axis=0) @ axis / (1e3 * body.volumes.sum()))
-    return np.array(found)
-
-
-def demagnetizing_matrix(body, coupling=None):
-    """Operator H = −D M of a body at rest, as balls and couplings make it, symmetrized by volumes, [3 n, 3 n]."""
-    coupling = demagnetization.coupling(body, body.radii) if coupling is None else coupling
-    x, n = body.positions, len(body.volumes)
-    r = x[:, None] - x
-    g1, g2, _ = oracle.radial_factors(np.linalg.norm(r, axis=2), body.radii[:, None], body.radii)
-    t = (g1[..., None, None] * np.eye(3) + g2[..., None, None] * r[..., :, None] * r[..., None, :]) / (4 * math.pi)
-    t[np.arange(n), np.arange(n)] = -np.eye(3) / (3.0 * body.volumes[:, None, None])
-    i = np.repeat(np.arange(n), np.diff(coupling.start))
-    t[i, coupling.other] += full(coupling.tensor)
-    fields = even_field.common_fields(coupling.places)
-    t += np.einsum("ipk,kl,jql->ijpq", fields, coupling.common, fields)
-    t *= -np.sqrt(body.volumes[:, None] * body.volumes)[..., None, None]
-    return t.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
-
-
-def coupled(body, solids):
-    """Coupling of a body's cells, as a model has it."""
-    return even_field.corrected(demagnetization.coupling(body, body.radii), body, solids)
 
 
 def test_tensors_of_cuboids_are_their_exact_fields_averaged():
@@ -391,106 +343,6 @@ def test_bodies_of_one_shape_share_a_table_and_balls_have_none(device):
     balls.add_shape_sphere(body, radius=0.01)
     warpmag.add_inducible(balls, body)
     assert warpmag.Magnetics(balls.finalize(device=device)).system.rotations is None
-
-
-def posed(*boxes_at):
-    return [lattice.box(half).posed(at) for half, at in boxes_at]
-
-
-L_SHAPE = posed(([1.0, 1.0, 3.0], [0.0, 0.0, 3.0]), ([2.0, 1.0, 1.0], [3.0, 0.0, 1.0]))
-
-
-def filled(solids, spacing=0.0):
-    return lattice.fill(solids, spacing, lattice.LEAST_ACROSS, together=True)
-
-
-def test_halves_of_a_box_are_the_box(device):
-    """Cells are the same: what is left is the residual, and what rod and halves make of rounding."""
-    half, at = [1.0, 1.0, 5.0], [0.0, 0.0, 5.0]
-    turned = lattice.box([5.0, 1.0, 1.0]).posed([0.0, 0.0, -5.0], [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)])
-    whole = polarizability(filled([lattice.box([1.0, 1.0, 10.0])]), math.inf, device, rtol=1e-5)
-    halves = filled([lattice.box(half).posed(at), turned])
-    np.testing.assert_allclose(np.bincount(halves.owners, halves.volumes), [40.0, 40.0], rtol=1e-12)
-    np.testing.assert_allclose(polarizability(halves, math.inf, device, rtol=1e-5), whole, rtol=1e-3)
-
-
-def test_an_l_of_two_boxes_takes_the_moment_of_a_surface_integral_equation(device):
-    """5 % as for rods and sheets, at 5 cells across; the reference is good to 0.3 %."""
-    body = filled(L_SHAPE)
-    corners = [
-        (np.array(lower), np.array(upper)) for lower, upper in (((-1, -1, 0), (1, 1, 6)), ((1, -1, 0), (5, 1, 2)))
-    ]
-    faces = [((1, -1, 2), (1, 1, 6))]
-    for lower, upper in corners:
-        for axis, end in np.ndindex(3, 2):
-            face = np.array([lower, upper])
-            face[:, axis] = (lower, upper)[end][axis]
-            if axis != 0 or face[0, 0] != 1:  # where the boxes touch
-                faces.append(face)
-    expected = boxes.moments_within(faces, 40.0, 8)
-    for axis in (0, 2):
-        system = make_system(body, susceptibility=math.inf, external_field=1e3 * np.eye(3)[axis], device=device)
-        system.solve()
-        found = system.moments.numpy().sum(axis=0) / (1e3 * body.volumes.sum())
-        assert np.linalg.norm(found - expected[axis]) < 0.05 * np.linalg.norm(expected[axis])
-
-
-def test_parts_apart_are_dipoles_to_each_other(device):
-    """Two cubes 100 sides apart in two corners of a common grid of 10 million cells."""
-    body = filled(posed(([0.01] * 3, [0.0] * 3), ([0.01] * 3, [1.0, -1.5, 2.0])))
-    one = filled([lattice.box([0.01] * 3)], 0.02 / 7)
-    coupling = demagnetization.coupling(body, body.radii)
-    assert len(coupling.other) == 2 * len(demagnetization.coupling(one, one.radii).other)
-    expected = polarizability(one, math.inf, device)
-    np.testing.assert_allclose(polarizability(body, math.inf, device), expected, rtol=2e-3)  # rtol of the solves
-
-
-@pytest.mark.parametrize(
-    "solids",
-    [
-        L_SHAPE,
-        [lattice.cylinder(1.0, 10.0), lattice.box([4.0, 1.5, 1.5]).posed([0.0, 0.0, 11.0])],
-        [lattice.cylinder(1.0, 4.0), lattice.box([3.0, 1.5, 1.5]).posed([0.0, 0.0, 4.0], TURN)],
-        [lattice.sphere(1.0), lattice.box([2.0, 2.0, 0.002]).posed([0.0, 0.0, 2.0], TURN)],
-        [lattice.box([1.0] * 3), lattice.box([0.01, 0.01, 0.02]).posed([0.0, 0.0, 1.02])],
-        [lattice.sphere(1.0), lattice.sphere(0.5).posed([0.2, 0.0, 0.0]), lattice.capsule(0.2, 2.0)],
-    ],
-    ids=["L", "hammer", "crooked hammer", "foil", "screw", "inner"],
-)  # fmt: skip
-def test_operator_of_several_shapes_is_positive(solids):
-    """And the volume is what the shapes fill, common volume once and to the test points."""
-    body = filled(solids, (solids[0].volume / 100.0) ** (1 / 3))
-    values = np.linalg.eigvalsh(demagnetizing_matrix(body, coupled(body, solids)))
-    assert values[0] > 0.0
-    assert values[-1] < 1.0
-    owned = np.bincount(body.owners, body.volumes, len(solids))
-    assert owned[0] == pytest.approx(solids[0].volume, rel=1e-12)  # the first takes what it fills
-    assert (owned[1:] <= [one.volume * (1 + 1e-12) for one in solids[1:]]).all()
-    if solids[0].name != "cylinder" and len(solids) == 2:
-        assert owned[1] == pytest.approx(solids[1].volume, rel=1e-12)
-
-
-def test_shapes_of_one_body_magnetize_as_one(device):
-    """A rod of two boxes takes the moment of the rod in a model, too, and says how much each shape has."""
-    moments = []
-    for parts in (1, 2):
-        builder = newton.ModelBuilder()
-        warpmag.register_attributes(builder)
-        body = builder.add_body()
-        for k in range(parts):
-            frame = wp.transform((0.0, 0.0, 0.05 * (2 * k + 1 - parts)), wp.quat_identity())
-            builder.add_shape_box(body, xform=frame, hx=0.01, hy=0.01, hz=0.1 / parts)
-        warpmag.add_inducible(builder, body, saturation=FAINT / 1e3)
-        model = builder.finalize(device=device)
-        magnetics = warpmag.Magnetics(model, external_field=(0.0, 0.0, 1e3))
-        magnetics.apply(model.state())
-        counts = magnetics.magnets[0].lattice.counts
-        shares = np.add.reduceat(magnetics.system.moments.numpy()[:, 2], np.cumsum(counts) - counts)
-        assert len(shares) == parts
-        np.testing.assert_allclose(shares, shares.mean(), rtol=2e-3)  # rtol of the solve
-        moments.append(shares.sum() / (8e-5 * 1e3))
-    assert moments[0] == pytest.approx(boxes.moments((1.0, 1.0, 10.0), 8)[2], rel=0.05)
-    assert moments[1] == pytest.approx(moments[0], rel=4e-3)
 
 
 def test_thin_bodies_have_several_cells_across():

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
+from small_builders import add_ball, new_builder
 from test_applied import CORNERS, HALF, LOOP, SINGLE, VOLUME, A, R, field_of
 from test_arguments_wild import STRANGE, chosen, refusals
 
@@ -15,23 +16,6 @@ from warpmag import oracle
 newton = pytest.importorskip("newton")
 import warpmag  # noqa: E402
 from warpmag.coils import Coil, FieldMap, SourceRecord  # noqa: E402
-
-
-def new_builder(**arguments):
-    builder = newton.ModelBuilder(**arguments)
-    warpmag.register_attributes(builder)
-    return builder
-
-
-def add_ball(builder, position, magnetization=None, **arguments):
-    """Add a ball, permanent if it has a magnetization, else inducible."""
-    body = builder.add_body(xform=wp.transform(position, wp.quat_identity()), **arguments)
-    builder.add_shape_sphere(body, radius=R)
-    if magnetization is None:
-        warpmag.add_inducible(builder, body)
-    else:
-        warpmag.add_permanent(builder, body, magnetization=magnetization)
-    return body
 
 
 def test_a_coil_on_a_body_feels_what_it_does(device):

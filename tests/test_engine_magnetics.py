@@ -6,33 +6,15 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from small_builders import R, add_ball, new_builder
 
 import warpmag
 import warpmag.magnets
 from warpmag import contact_oracle, oracle
 
 M = 1e6  # A/m
-R = 0.005  # m
 VOLUME = 4.0 / 3.0 * math.pi * R**3
 SINGLE = 2e-6  # sums of a few float32 terms, relative to the largest
-
-
-def new_builder(**arguments):
-    builder = newton.ModelBuilder(**arguments)
-    warpmag.register_attributes(builder)
-    return builder
-
-
-def add_ball(builder, position, magnetization=None, rotation=None, **arguments):
-    """Add a ball, permanent if it has a magnetization, else inducible."""
-    rotation = wp.quat_identity() if rotation is None else rotation
-    body = builder.add_body(xform=wp.transform(position, rotation), **arguments)
-    builder.add_shape_sphere(body, radius=R)
-    if magnetization is None:
-        warpmag.add_inducible(builder, body)
-    else:
-        warpmag.add_permanent(builder, body, magnetization=magnetization)
-    return body
 
 
 def wrenches(model, **arguments):

@@ -1,4 +1,7 @@
-"""Stages spoiled at random: each ends in one line, or in a run that says what the stage says."""
+"""Stages spoiled at random: each ends in one line, or in a run that says what the stage says.
+
+Three of each source by default, seventeen more with ``--long``, and as many as wanted with ``python -m tests.fuzz``.
+"""
 
 import os
 import signal
@@ -9,7 +12,8 @@ from fuzz import campaign
 from fuzz.campaign import BAD_INPUT, Campaign, Verdict, in_process, judge, make
 from fuzz.sources import author
 
-COUNT, SEED = 60, 20
+FEW, MANY, SEED = range(21), range(21, 140), 20
+"""Mutants that are judged by default, and with ``--long``; sources take turns."""
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +22,7 @@ def sources(tmp_path_factory):
 
 
 def test_mutants_repeat(sources, tmp_path):
-    for number in range(0, COUNT, 13):
+    for number in range(0, 60, 13):
         made = []
         for name in ("once", "again"):
             folder = tmp_path / f"{name}{number}"
@@ -28,11 +32,13 @@ def test_mutants_repeat(sources, tmp_path):
         assert made[0] == made[1]
 
 
-def test_spoiled_stages_are_refused_or_run(device, sources, tmp_path):
-    verdicts = [judge(number, SEED, tmp_path, sources, in_process, device) for number in range(COUNT)]
+@pytest.mark.no_cover  # what is drawn decides no line of the report, and counting lines doubles its time
+@pytest.mark.parametrize("numbers", [FEW, pytest.param(MANY, marks=pytest.mark.long)], ids=["few", "many"])
+def test_spoiled_stages_are_refused_or_run(numbers, device, sources, tmp_path):
+    verdicts = [judge(number, SEED, tmp_path, sources, in_process, device) for number in numbers]
     assert [(one.number, one.done, one.problems) for one in verdicts if one.problems] == []
     refused = sum(one.run == BAD_INPUT for one in verdicts)
-    assert COUNT // 5 < refused < COUNT  # the mutator does neither too little nor too much
+    assert len(numbers) // 5 < refused < len(numbers)  # the mutator does neither too little nor too much
 
 
 @pytest.mark.parametrize(("batch", "workers"), [(1, 1), (1, 3), (5, 2), (50, 4)])

@@ -2,10 +2,10 @@
 
 import math
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
+from small_builders import R, add_ball, new_builder
 
 import warpmag
 from warpmag import oracle
@@ -13,27 +13,9 @@ from warpmag.probe import FieldProbe
 from warpmag.system import MomentSystem
 
 M = 1e6  # A/m
-R = 0.005  # m
 VOLUME = 4.0 / 3.0 * math.pi * R**3
 H0 = np.array([1e4, 2e4, 5e4])  # A/m
 SINGLE = 3e-6  # sums of some float32 terms, relative to the largest
-
-
-def new_builder():
-    builder = newton.ModelBuilder()
-    warpmag.register_attributes(builder)
-    return builder
-
-
-def add_ball(builder, position, magnetization=None, **arguments):
-    """Add a ball, permanent if it has a magnetization, else inducible."""
-    body = builder.add_body(xform=wp.transform(position, wp.quat_identity()), **arguments)
-    builder.add_shape_sphere(body, radius=R)
-    if magnetization is None:
-        warpmag.add_inducible(builder, body)
-    else:
-        warpmag.add_permanent(builder, body, magnetization=magnetization)
-    return body
 
 
 def apart(rng, count, least):
