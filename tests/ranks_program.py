@@ -10,7 +10,7 @@ from warpmag.ranks import ranks
 from warpmag.system import MomentSystem
 
 
-def main(path: str, device: str) -> None:
+def main(path: str, device: str | None) -> None:
     """Write what this rank ends with to ``path``, ``_``, the rank and ``.npz``."""
     wp.config.enable_backward = False  # as the tests do, so that both find the same compiled kernels
     all_ranks, merged = ranks(), []
@@ -30,11 +30,13 @@ def main(path: str, device: str) -> None:
         )
         results[f"magnetization {n}"], results[f"field {n}"] = solved.magnetizations, solved.h_field
         results[f"pull {n}"] = solved.wrench()[0]
+        results[f"multipoles {n}"] = warpmag.h_field(x, m, x[::2] + 0.1, method="fmm", device=device)
+        results[f"multipole force {n}"] = warpmag.wrench(x, m, method="fmm", device=device)[0]
     results["worlds"] = several_worlds(device)
     np.savez(f"{path}_{0 if all_ranks is None else all_ranks.rank}.npz", merged=len(merged), **results)
 
 
-def several_worlds(device: str) -> np.ndarray:
+def several_worlds(device: str | None) -> np.ndarray:
     """Magnetizations of worlds of different sizes."""
     worlds, random = np.repeat([0, 1, 2, 3], [3, 700, 641, 800]), np.random.default_rng(0)
     system = MomentSystem(
@@ -46,4 +48,4 @@ def several_worlds(device: str) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(sys.argv[1], None if sys.argv[2] == "cuda" else sys.argv[2])  # each rank has a GPU of its own

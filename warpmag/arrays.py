@@ -71,13 +71,13 @@ def resolve_dtype(dtype: str):
 
 
 def resolve_device(device):
-    """Warp device of a name, a device or None: Warp's default, of several ranks each its own GPU.
+    """Warp device of a name, a device or None: Warp's default, which of several ranks is each its own GPU.
 
     Raises:
         InputError: There is no such device.
     """
     if device is None and wp.is_cuda_available() and (all_ranks := ranks()) is not None:
-        device = f"cuda:{all_ranks.local_rank}"
+        wp.set_device(f"cuda:{all_ranks.local_rank % wp.get_cuda_device_count()}")
     try:
         return wp.get_device(device)
     except Exception as error:  # Warp raises RuntimeError, ValueError or TypeError, with long texts

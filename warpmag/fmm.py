@@ -12,6 +12,7 @@ from warpmag.kernels.fmm.grid import MomentGrid, join_moments
 from warpmag.kernels.fmm.translate import displacements
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import SUMS, check_token
+from warpmag.ranks import ranks
 
 
 @cache
@@ -110,7 +111,7 @@ class FastSums:
         """Sums of a quantity, of some ``sources`` only (see :class:`CellSums`); None for those of none."""
         if sources is not None and not sources.any():
             return None
-        return CellSums(self._grid, self._tables, quantity, self._first, sources)
+        return CellSums(self._grid, self._tables, quantity, self._first, sources, ranks())
 
 
 class NoFastSums:

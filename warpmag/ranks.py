@@ -15,7 +15,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -70,7 +70,7 @@ class Ranks:
         self.size, self.rank = self._all.size, self._all.rank
         host = self._all.Split_type(mpi.COMM_TYPE_SHARED)
         self.local_rank = host.rank
-        self._failures = self._all.Dup()
+        self._failures, self._gpus = self._all.Dup(), None
 
     def share(self, count: int) -> tuple[int, int]:
         """Begin and end of this rank's part of ``count`` pieces of work."""
@@ -79,7 +79,8 @@ class Ranks:
     def merge(self, array) -> None:
         """Give each rank what any of them has in a contiguous Warp array, where the others have zeros."""
         if array.device.is_cuda:
-            self._nccl.merge(array)
+            self._gpus = self._gpus or _Nccl(self, array.device)
+            self._gpus.merge(array)
             return
         self._all.Allreduce(self._mpi.IN_PLACE, array.numpy().reshape(-1).view(np.int32), self._mpi.SUM)
 
@@ -118,25 +119,25 @@ class Ranks:
         if self.rank == 0:
             tell(line)
 
-    @cached_property
-    def _nccl(self) -> "_Nccl":
-        return _Nccl(self)
-
 
 class _Nccl:
     """NVIDIA's library for GPUs of several ranks."""
 
-    def __init__(self, others: Ranks):
-        """Make a communicator of the GPUs of all ranks."""
+    def __init__(self, others: Ranks, device):
+        """Make a communicator of the Warp devices of all ranks."""
         import warp as wp  # noqa: PLC0415 - the command asks for ranks before it quiets Warp
 
-        self._library, self._current = (library := ctypes.CDLL(_nccl_path())), wp.ScopedDevice
+        try:
+            self._library = library = ctypes.CDLL(_nccl_path())
+        except OSError as error:
+            raise InputError(f"device: ranks on GPUs need nvidia-nccl-cu12 or -cu13 of pip ({error})") from None
+        self._current = wp.ScopedDevice
         library.ncclGetErrorString.restype = ctypes.c_char_p
         identifier = (ctypes.c_char * _ID_BYTES)()
         if others.rank == 0:
             self._check(library.ncclGetUniqueId(ctypes.byref(identifier)))
         identifier = _Identifier.from_buffer_copy(others.broadcast(bytes(identifier)))
-        self._communicator, device = ctypes.c_void_p(), wp.get_device(f"cuda:{others.local_rank}")
+        self._communicator = ctypes.c_void_p()
         with wp.ScopedDevice(device):
             self._check(
                 library.ncclCommInitRank(ctypes.byref(self._communicator), others.size, identifier, others.rank)
@@ -154,7 +155,7 @@ class _Nccl:
     def _check(self, result: int) -> None:
         if result:
             text = self._library.ncclGetErrorString(result).decode()
-            raise InputError(f"device: NCCL between the ranks' GPUs fails: {text}; NCCL_DEBUG=WARN tells more")
+            raise InputError(f"device: NCCL between the ranks' GPUs fails ({text}): has each one of its own?")
 
 
 class _Identifier(ctypes.Structure):
