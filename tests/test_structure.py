@@ -32,7 +32,7 @@ OWNERS = {
         "warpmag/cli.py",
         *(
             f"warpmag/{name}.py"
-            for name in "arrays dynamics energies fields induction layout pair_sums probe snapshot system".split()
+            for name in "arrays dynamics energies fields induction layout pair_sums probe ranks snapshot system".split()
         ),
     ),
 }

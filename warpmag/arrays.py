@@ -11,6 +11,7 @@ import warp as wp
 
 from warpmag.errors import InputError
 from warpmag.magnets import MATERIAL_RANGE, check_token, shown
+from warpmag.ranks import ranks
 
 Numbers = npt.ArrayLike | wp.array
 """What arguments take: numbers, lists of them and NumPy arrays, or a Warp array."""
@@ -70,7 +71,13 @@ def resolve_dtype(dtype: str):
 
 
 def resolve_device(device):
-    """Warp device of a name, a device or None (Warp's default); ``InputError`` where there is no such device."""
+    """Warp device of a name, a device or None: Warp's default, which of several ranks is each its own GPU.
+
+    Raises:
+        InputError: There is no such device.
+    """
+    if device is None and wp.is_cuda_available() and (all_ranks := ranks()) is not None:
+        wp.set_device(f"cuda:{all_ranks.local_rank % wp.get_cuda_device_count()}")
     try:
         return wp.get_device(device)
     except Exception as error:  # Warp raises RuntimeError, ValueError or TypeError, with long texts

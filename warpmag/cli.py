@@ -7,6 +7,7 @@ import signal
 import sys
 import tempfile
 import threading
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from warpmag import __version__
 from warpmag.errors import InputError, SimulationError
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
 from warpmag.progress import Progress, silence
+from warpmag.ranks import Ranks, by_first, ranks
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes; 0 where all went well, ``STOPPED`` and the signal's number where a signal ended it."""
@@ -44,24 +46,44 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
     _open_standard_files()
     try:
-        with _signals_raised():
-            options = _parser().parse_args(arguments)
-            code = options.command(options)
-            sys.stdout.flush()
-            return code
+        all_ranks = ranks()
     except InputError as error:
         _tell(error)
         return BAD_INPUT
+    code, line = _do(arguments, all_ranks)
+    if line and all_ranks is not None:
+        all_ranks.fail(line, code, _tell)
+    elif line:
+        _tell(line)
+    return code
+
+
+def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]:
+    """Do what the arguments say; return the exit code, and a line of what went wrong."""
+    try:
+        with _signals_raised():
+            options = _parser().parse_args(arguments)
+            if all_ranks is not None and all_ranks.rank > 0:
+                if options.command is not _run:
+                    return 0, ""  # only a run is shared out
+                silence(1)
+            code = options.command(options)
+            sys.stdout.flush()
+            return code, ""
+    except InputError as error:
+        return BAD_INPUT, str(error)
     except SimulationError as error:
-        _tell(error)
-        return FAILED
+        return FAILED, str(error)
     except _Stopped as stopped:
-        _tell(stopped)
-        return STOPPED + stopped.number
+        return STOPPED + stopped.number, str(stopped)
     except BrokenPipeError:
-        _tell("nobody reads the standard output any more")
         silence(1)
-        return STOPPED + signal.SIGPIPE
+        return STOPPED + signal.SIGPIPE, "nobody reads the standard output any more"
+    except Exception as error:
+        if all_ranks is None:
+            raise
+        traceback.print_exc()  # and the others must not wait for this one
+        return FAILED, f"{type(error).__name__}: {error}"
 
 
 def _open_standard_files() -> None:
@@ -200,6 +222,12 @@ def _scenes(options) -> int:
     return 0
 
 
+def _is_first() -> bool:
+    """Whether this process is the one that writes and prints."""
+    all_ranks = ranks()
+    return all_ranks is None or all_ranks.rank == 0
+
+
 def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLDER) -> tuple[Path, bool]:
     """Return the file of a scene, and whether it is a bundled one; one that has to be made is written to ``folder``."""
     from warpmag.scenes_usd import MADE, bundled, make  # noqa: PLC0415
@@ -210,8 +238,9 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
     if name in (*scenes, *MADE) and not os.path.isfile(path):
         if balls is None and name in scenes:
             return scenes[name], True
-        made = make(name, folder, balls)
-        _tell(f"scene: {made}")
+        made = by_first(lambda: make(name, folder, balls))
+        if _is_first():
+            _tell(f"scene: {made}")
         return made, False
     if not os.path.exists(path) and not path.suffix:
         raise InputError(f"{name}: no such file and no bundled scene (there are {', '.join((*scenes, *MADE))})")
@@ -323,6 +352,8 @@ def _run(options) -> int:
         raise InputError(f"frames: must be positive, got {options.frames}")
     if options.rtol is not None:
         check_rtol("rtol", options.rtol)
+    if options.viewer != "none" and ranks() is not None:
+        raise InputError("viewer: not with several ranks")
     folder = Path(options.output).parent if options.output else _OUTPUT_FOLDER
     path, is_bundled = _find_scene(options.scene, options.balls, folder)
     display, resume = None, options.resume
@@ -363,7 +394,8 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     progress = Progress(simulation.frames_of(options.frames))
 
     def show(frame: int) -> bool:
-        progress.show(frame)
+        if _is_first():
+            progress.show(frame)
         return display is None or display.follow(simulation.time, simulation.state)
 
     try:
@@ -374,7 +406,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
         raise
     finally:
         progress.close()
-    if display and display.restarted:
+    if (display and display.restarted) or not _is_first():
         return
     if progress.done is None:
         print(f"complete       {output} has all {progress.frames} frames already")
@@ -396,7 +428,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
 
 
 def _warn(lines: list[str]) -> None:
-    for line in lines:
+    for line in lines if _is_first() else ():
         _tell(f"warning: {line}")
 
 

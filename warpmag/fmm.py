@@ -13,6 +13,7 @@ from warpmag.kernels.fmm.grid import MomentGrid, join_moments
 from warpmag.kernels.fmm.translate import displacements
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import SUMS, check_token
+from warpmag.ranks import ranks
 
 
 @cache
@@ -95,11 +96,11 @@ class FastSums:
     def __init__(self, moments, rtol: float, targets=None, worlds: int = 1, extent: float = 0.0):
         """Allocate the cells."""
         degree, held = choose_degree(rtol)
-        packed, groups, self._first = moments.packed, moments.groups, 0
+        packed, groups, self._first, self._count = moments.packed, moments.groups, 0, moments.count
         reach = moments.largest_radius + (moments if targets is None else targets).largest_radius
         reach = max(reach, _SLACK * extent)
         if targets is not None:  # moments of no strength among the others
-            self._first = moments.count
+            self._first, self._count = moments.count, moments.count + targets.count
             packed, groups = join_moments(moments, targets)
         self._tables, self._rtol = expansion_tables(degree), rtol
         self._grid = MomentGrid(packed, groups, worlds, occupancy=held, reach=reach)
@@ -116,9 +117,9 @@ class FastSums:
         """
         if sources is not None and not sources.any():
             return None
-        if not is_fast(math.sqrt(pairs), self._rtol, self._grid.device):
+        if not is_fast(pairs, self._count, quantity, self._rtol, self._grid.device):
             return None
-        return CellSums(self._grid, self._tables, quantity, self._first, sources)
+        return CellSums(self._grid, self._tables, quantity, self._first, sources, ranks())
 
 
 class NoFastSums:

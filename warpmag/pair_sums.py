@@ -18,6 +18,7 @@ from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
+from warpmag.ranks import ranks
 
 _MOST_KEPT, _MOST_MOMENTS_KEPT = 4, 40_000
 """Sums that are kept, and the most moments and targets of one: half a kilobyte each."""
@@ -87,6 +88,9 @@ class PairSums:
             fmm_rtol: Relative error to sum by the fast multipole method; None means over all pairs.
         """
         others = None if self.targets is self.moments else self.targets
+        if (all_ranks := ranks()) is not None:
+            arrays = self.moments.packed, self.targets.packed, self.base
+            all_ranks.check_alike("positions, moments, options", repr((self._shape, fmm_rtol)), *arrays)
         if not self._shape.reference:
             self.targets.find_overlaps(None if others is None else self.moments)
         if fmm_rtol is not None:  # its cells are of these places
@@ -103,7 +107,7 @@ class PairSums:
         return PairEvaluation(
             shape.quantity, [(0, count, 0, shape.count)], self.targets, self.moments, self.base, self.out,
             turned=self._turned, torques=self.torques, form=REFERENCE if shape.reference else None,
-            smoothing=shape.smoothing, sums=sums,
+            smoothing=shape.smoothing, sums=sums, ranks=ranks(),
         )  # fmt: skip
 
 

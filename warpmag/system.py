@@ -28,6 +28,7 @@ from warpmag.kernels.pairs.work_list import pair_count
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
 from warpmag.layout import MomentLayout, change_material, make_layout, make_material, with_cells
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, check_count, check_force, check_rtol, check_token
+from warpmag.ranks import ranks
 
 
 class MomentSystem:
@@ -145,7 +146,7 @@ class MomentSystem:
         check_count("max_evaluations", max_evaluations)
         layout = with_cells(make_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
         self.rtol, self.max_evaluations, self.contact_model = float(rtol), int(max_evaluations), contact_model
-        self._force, self.eddy = force, None
+        self._force, self.eddy, self._ranks, self._graph = force, None, ranks(), None
         near = contact_model == "multipole"
         self._allocate(layout, external_field)
         made_of = saturation, susceptibility, curve
@@ -215,11 +216,13 @@ class MomentSystem:
         of_magnets = self._fast.sums(Quantity.FIELD, layout.permanent, pair_count(applied))
         among = self._fast.sums(Quantity.FIELD, ~layout.permanent, math.inf if always else pair_count(mutual))
         arrays = packed, packed, self._magnetizing, state.h0
-        self._applied = PairEvaluation(Quantity.FIELD, applied, *arrays, sums=of_magnets)
+        self._applied = PairEvaluation(Quantity.FIELD, applied, *arrays, sums=of_magnets, ranks=self._ranks)
         if self._applied.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing
-        arrays = packed, packed, state.h0, self.h  # near contacts write one more partial sum
-        self._mutual = PairEvaluation(Quantity.FIELD, mutual, *arrays, extra_parts=int(near), sums=among)
+        # near contacts write one more partial sum
+        arrays = packed, packed, state.h0, self.h
+        more = {"extra_parts": int(near), "sums": among, "ranks": self._ranks}
+        self._mutual = PairEvaluation(Quantity.FIELD, mutual, *arrays, **more)
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
         """Prepare what cells lack as balls; ``whole`` tells whether small bodies respond as wholes."""
@@ -249,7 +252,7 @@ class MomentSystem:
             return [
                 PairEvaluation(
                     quantity, which, self._packed, self._packed, self._acting, self.forces, effective=effective,
-                    turned=self._turned, torques=self.torques, sums=self._fast.sums(quantity),
+                    turned=self._turned, torques=self.torques, sums=self._fast.sums(quantity), ranks=self._ranks,
                 )
                 for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
                 if which
@@ -327,8 +330,9 @@ class MomentSystem:
         self.begin()
         if self._mutual.count:
             # no world is done before the first evaluation, and a loop costs a GPU more than what is in it
-            self.iterate()
-            wp.capture_while(self._induction.condition, self.iterate)
+            iterate = self.iterate if self._ranks is None else self._iterate_together
+            iterate()
+            wp.capture_while(self._induction.condition, iterate)
 
     def begin(self):
         """Launch the start of a solve. Callers of :meth:`solve` do not need it; it serves to watch the iteration."""
@@ -362,6 +366,17 @@ class MomentSystem:
             self._cells.launch_others()
         self.dynamics.iterate()
         self._end_sweeps()
+
+    def _iterate_together(self):
+        """Launch :meth:`iterate` with the other ranks, on a GPU as a graph: what merges sums is in no loop of one."""
+        if self._graph is None:
+            self.iterate()
+            if self.device.is_cuda:
+                with wp.ScopedCapture(self.device) as capture:
+                    self.iterate()
+                self._graph = capture.graph
+        else:
+            wp.capture_launch(self._graph)
 
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step; :meth:`solve` does not need it."""

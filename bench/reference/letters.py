@@ -3,8 +3,8 @@
 The equation is that of ``susceptible.py`` with χ = ∞, w/2 − (1/4π) ∫ w dΩ = H0·x, w constant on triangles, whose solid
 angles are those of Van Oosterom and Strackee (1983). Triangles are halved until there are 1,500 of them, and 4,500.
 
-Run as ``python -m bench.reference.letters [LETTER ...]``: the cells of each letter, m/(V H0) of its surface to the right,
-up and across, what three times the triangles changed of it, and how far from it the letter's cells are.
+Run as ``python -m bench.reference.letters [LETTER ...]``: the cells of each letter, m/(V H0) of its surface right, up
+and across, what three times the triangles changed of it, and how far from it the letter's cells are.
 """
 
 import argparse

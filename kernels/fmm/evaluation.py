@@ -12,6 +12,7 @@ import warp as wp
 from warpmag.kernels.fmm.expansions import Expansions, ExpansionTables
 from warpmag.kernels.fmm.grid import MomentGrid
 from warpmag.kernels.fmm.near import launch_near_sums
+from warpmag.kernels.fmm.sharing import share_cells
 from warpmag.kernels.pairs.packing import PITCH
 from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
 
@@ -25,11 +26,15 @@ class CellSums:
         quantity: What is summed; of ``MUTUAL_FORCE`` as of ``FORCE``.
         first: Column in the grid of the first target column.
         sources: Whether each moment counts as a source, NumPy, shape [n]; None means all do.
+        ranks: Processes that share out the sums (``warpmag.ranks.Ranks``); None means that there is but this one.
     """
 
-    def __init__(self, grid: MomentGrid, tables: ExpansionTables, quantity: Quantity, first: int = 0, sources=None):
+    def __init__(
+        self, grid: MomentGrid, tables: ExpansionTables, quantity: Quantity, first: int = 0, sources=None, ranks=None
+    ):
         """Allocate the sums and the expansions."""
-        self._first = first
+        self._first, self._shares = first, share_cells(grid, ranks)
+        self._leaves = grid.level_begin if self._shares is None else self._shares.leaves
         counts = np.ones(grid.count, np.int32) if sources is None else sources.astype(np.int32)
         self._sources = wp.array(counts, dtype=wp.int32, device=grid.device)
         self._quantity = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
@@ -39,6 +44,7 @@ class CellSums:
         self._moments = grid.sorted
         self._effective = wp.zeros((3, (1 + -(-n // PITCH)) * PITCH), dtype=dtype, device=device)[:, :n]
         self._expansions = Expansions(grid, tables, self._quantity, self._moments, self._effective, self._sums)
+        self._expansions.share(self._leaves, self._shares)
 
     def __call__(self, effective, target, partial):
         """Launch the sums of the moments as they are now, where they were when the grid was built.
@@ -58,13 +64,17 @@ class CellSums:
         )
         if self._quantity != Quantity.FIELD:
             wp.launch(_sort_kernel(dtype), (3, grid.count), [effective, grid.source], [self._effective], device=device)
+        if self._shares is not None:
+            self._shares.find()
+            self._sums.zero_()
         launch_near_sums(
-            self._quantity, self._moments, self._effective, grid.neighbors, grid.moment_begin, grid.level_begin,
-            self._sums,
-        )  # fmt: skip
+            self._quantity, self._moments, self._effective, grid.neighbors, grid.moment_begin, self._leaves, self._sums
+        )
         self._expansions.gather()
         self._expansions.translate()
         self._expansions.add_fields()
+        if self._shares is not None:
+            self._shares.ranks.merge(self._sums)
         inputs = [self._sums, target, grid.place[self._first :]]
         wp.launch(_return_kernel(dtype), partial.shape[1:], inputs, [partial], device=device)
 

@@ -329,25 +329,26 @@ template <class Arrays> CUDA_CALLABLE inline void fall(const Arrays& a, int bloc
 
 template <Step S, Quantity Q, class Word, class Arrays>
 CUDA_CALLABLE inline void visit_cells(int thread, int threads, Word*, const Arrays& a) {
-    const int block = thread / THREADS;
+    const int block = thread / THREADS, leaf = a.leaves.data[0] + block;
     if constexpr (S == Step::RISE) rise(a, block);
     else if constexpr (S == Step::FALL) fall(a, block, threads);
-    else if (block < a.level_begin.data[1]) leaf_fields<Q>(a, block);
+    else if (leaf < a.leaves.data[1]) leaf_fields<Q>(a, leaf);
 }
 #else
 template <Step S, Quantity Q, class Word, class Arrays>
 void visit_cells(int, int threads, Word* team, const Arrays& a) {
     const int levels = a.counts.data[0], *const begin = a.level_begin.data;
-    const auto visit = [&](int height, auto work) {
-        share_out(team, threads, begin[height + 1] - begin[height], 4, [&](int i) { work(begin[height] + i); });
+    const auto visit_run = [&](const int* run, auto work) {
+        share_out(team, threads, run[1] - run[0], 4, [&](int i) { work(run[0] + i); });
     };
+    const auto visit = [&](int height, auto work) { visit_run(begin + height, work); };
     if constexpr (S == Step::RISE) {
         visit(0, [&](int leaf) { leaf_multipole(a, leaf); });
         for (int height = 1; height <= levels - 2; ++height) visit(height, [&](int cell) { merge_children(a, cell); });
     } else if constexpr (S == Step::FALL) {
         for (int height = levels - 2; height > 0; --height)
             visit(height, [&](int cell) { spread_to_children(a, cell); });
-    } else visit(0, [&](int leaf) { leaf_fields<Q>(a, leaf); });
+    } else visit_run(a.leaves.data, [&](int leaf) { leaf_fields<Q>(a, leaf); });
 }
 #endif
 }

@@ -61,6 +61,7 @@ def _arrays_type(dtype):
     class ExpansionArrays:
         counts: wp.array[int]
         level_begin: wp.array[int]
+        leaves: wp.array[int]
         moment_begin: wp.array[int]
         children: wp.array2d[int]
         parent: wp.array[int]
@@ -118,6 +119,13 @@ class Expansions:
         # forces: sources to one degree less, for actions and reactions to add up to zero
         a.sources = harmonics if quantity == Quantity.FIELD else tables.degree**2
 
+    def share(self, leaves, shares=None):
+        """Set the first of the leaves whose moments are targets, and the end after the last, shape [2].
+
+        Where several processes share out the cells, ``shares`` has those of this one (``sharing.CellShares``).
+        """
+        self._arrays.leaves, self._shares = leaves, shares
+
     def gather(self):
         """Launch the multipoles of all cells."""
         self._launch(_Step.RISE)
@@ -125,9 +133,12 @@ class Expansions:
     def translate(self):
         """Launch the local expansions of all cells: across, and down."""
         a, grid = self._arrays, self._grid
-        self._translation.launch(
-            *(a.multipoles, a.locals, grid.neighbors, a.children, a.parent, grid.order, grid.octant_begin)
-        )
+        if self._shares is not None:
+            self._shares.translate(self._translation, a.multipoles, a.locals, a.children, a.parent)
+        else:
+            self._translation.launch(
+                *(a.multipoles, a.locals, grid.neighbors, a.children, a.parent, grid.order, grid.octant_begin)
+            )
         self._launch(_Step.FALL)
 
     def add_fields(self):

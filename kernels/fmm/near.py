@@ -37,13 +37,13 @@ def near_arrays(dtype):
         effective: wp.array2d[dtype]
         neighbors: wp.array2d[int]
         moment_begin: wp.array[int]
-        level_begin: wp.array[int]
+        leaves: wp.array[int]
         sums: wp.array2d[dtype]
 
     return NearArrays
 
 
-def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_begin, level_begin, sums):
+def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_begin, leaves, sums):
     """Sum a quantity over the pairs in leaves that are neighbours.
 
     Labels of moments of a leaf that are near each other make forces fast: those of single balls are best their columns.
@@ -55,19 +55,19 @@ def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_b
         effective: Effective moments e [A·m²] of the force, sorted likewise, shape [3, n].
         neighbors: Leaf at each offset x + 3 y + 9 z, itself in the middle, −1 for none, shape [cells, 27].
         moment_begin: First column of each leaf, and the end after the last, shape [cells + 1] or more.
-        level_begin: First cell of each level; leaves end where the second begins.
+        leaves: First leaf whose moments are targets, and the end after the last.
         sums: Out, a row for each sorted moment: 4π times the force sum and the field, shape [n, 3 or 6].
     """
     a = near_arrays(sums.dtype)()
     a.moments, a.effective, a.neighbors = moments, effective, neighbors
-    a.moment_begin, a.level_begin, a.sums = moment_begin, level_begin, sums
-    device, leaves = sums.device, moment_begin.shape[0] - 1
+    a.moment_begin, a.leaves, a.sums = moment_begin, leaves, sums
+    device, most = sums.device, moment_begin.shape[0] - 1
     if device.is_cuda:
         block = 32 * _WARPS
-        dim = -(-leaves // _WARPS) * block
+        dim = -(-most // _WARPS) * block
         wp.launch(_cuda_kernel(sums.dtype, quantity, MOST_HELD), dim=dim, inputs=[a], device=device, block_dim=block)
         return
-    threads = threads_for(leaves, _LEAVES_PER_THREAD)
+    threads = threads_for(most, _LEAVES_PER_THREAD)
     wp.launch(_cpu_kernel(sums.dtype, quantity), dim=1, inputs=[0, 1, threads, team(), a], device=device)
 
 

@@ -45,9 +45,10 @@ template <Quantity Q, class Arrays> void sum_leaf(const Arrays& arrays, int leaf
     sum_tile();
 }
 
-// Sums of the moments of all leaves.
+// Sums of the moments of the leaves wanted.
 template <Quantity Q, class Arrays> void sum_near(const Arrays& arrays, int threads, Word* team) {
-    share_out(team, threads, arrays.level_begin.data[1], 8, [&](int leaf) { sum_leaf<Q>(arrays, leaf); });
+    const int first = arrays.leaves.data[0], count = arrays.leaves.data[1] - first;
+    share_out(team, threads, count, 8, [&](int leaf) { sum_leaf<Q>(arrays, first + leaf); });
 }
 
 }

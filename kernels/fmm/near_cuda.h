@@ -64,8 +64,8 @@ template <int LANES, int HELD> struct Form {
 template <Quantity Q, int WARPS, class Arrays> CUDA_CALLABLE inline void sum_leaf(int thread, const Arrays& arrays) {
     __shared__ Quad staging[WARPS][80];
     __shared__ NearRanges all_ranges[WARPS];
-    const int leaf = thread / 32, lane = thread % 32, warp = leaf % WARPS;
-    if (leaf >= arrays.level_begin.data[1]) return;
+    const int lane = thread % 32, warp = thread / 32 % WARPS, leaf = arrays.leaves.data[0] + thread / 32;
+    if (leaf >= arrays.leaves.data[1]) return;
     const int* const begin_of = arrays.moment_begin.data;
     NearRanges& ranges = all_ranges[warp];
     int begin = 0, length = 0;

@@ -13,7 +13,8 @@ where the form of the sums is chosen:
 | ``MIRRORED`` | ``mirror_cuda`` | many moments among themselves: each pair is evaluated once, for both of its ends |
 | ``REFERENCE`` | ``reference`` | a plain Warp loop, exact for overlapping balls, or with the paper's smoothing |
 
-A caller may bring sums of its own, such as those of room ``fmm``.
+A caller may bring sums of its own, such as those of room ``fmm``. Where several processes have the same moments, each
+sums a part of the work list, which is that of one of them; they merge the partial sums, and each finishes all of them.
 """
 
 from functools import cache
@@ -27,7 +28,15 @@ from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
 from warpmag.kernels.pairs.sums_cpu import pair_loop_kernel
-from warpmag.kernels.pairs.work_list import arrays_type, block_tiles, cpu_tiles, loop_tiles, pair_count, target_rows
+from warpmag.kernels.pairs.work_list import (
+    arrays_type,
+    block_tiles,
+    cpu_tiles,
+    loop_tiles,
+    pair_count,
+    target_rows,
+    tiles_of_rank,
+)
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
@@ -41,6 +50,8 @@ _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE
 _LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
 _LEAST_MUTUAL = 0.75
 """Least part of the sources that are targets, for both ends of a pair to be worth what the mirrored form costs."""
+_LEAST_SHARED = {"cpu": 800_000, "cuda": 1_000_000_000}
+"""Fewest pairs that are worth sharing out between processes, by kind of device."""
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
 
 
@@ -67,6 +78,7 @@ class PairEvaluation:
         form: Form of the sums; None means the fastest.
         sums: Sums of the caller's: called with effective moments, packed columns of the target rows, and the partial
             sums to write, it launches them.
+        ranks: Processes that share out the sums (``warpmag.ranks.Ranks``); None means that there is but this one.
 
     Attributes:
         form: ``LOOP``, ``FUSED``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
@@ -78,7 +90,7 @@ class PairEvaluation:
 
     def __init__(
         self, quantity, segments, targets, sources, base, out, *, effective=None, turned=None, torques=None,
-        extra_parts=0, smoothing=0.0, form=None, sums=None,
+        extra_parts=0, smoothing=0.0, form=None, sums=None, ranks=None,
     ):  # fmt: skip
         """Allocate what the form needs."""
         segments = np.asarray(segments, np.int64).reshape(-1, 4)
@@ -90,10 +102,13 @@ class PairEvaluation:
         self._arrays = a = arrays_type(dtype)()
         a.target, a.begin, a.end = target_rows(segments, device)
         self.target, self.count, self.pair_count = a.target, a.target.shape[0], pair_count(segments)
+        worth = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
+        self._ranks = ranks if worth else None
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         parts, tiles = self._plan_sums(quantity, segments, targets, targets is sources, smoothing)
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
         self.partial = a.partial = (wp.zeros if extra_parts else wp.empty)(shape, dtype=dtype, device=device)
+        self._summed = self.partial[:parts]
         a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
         a.overlap, a.overlap_count = targets.overlaps, targets.overlap_counts
@@ -114,7 +129,7 @@ class PairEvaluation:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
             return 1, ()
         if self.form == MIRRORED:
-            mirror = mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, targets.dtype, device)
+            mirror = mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, targets.dtype, device, self._ranks)
             self._launch_sums = lambda a: mirror_cuda.launch_pair_loop_mirrored(mirror, a.sources, a.partial)
             return mirror.slabs + mirror.splits, ()
         if self.form == FUSED:
@@ -124,12 +139,16 @@ class PairEvaluation:
         if device.is_cuda:
             shape = sums_cuda.choose_loop_shape(finished, count)
             tiles, parts = loop_tiles(segments, shape, device.sm_count)
+            if self._ranks is not None:
+                tiles = tiles[slice(*self._ranks.share(len(tiles)))]
             self._launch_sums = lambda a: sums_cuda.launch_pair_loop_cuda(
                 finished, shape, a.targets, a.sources, a.effective, a.tiles, a.partial
             )
             return parts, tiles
         mutual = among and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
         tiles, shares, parts, threads = cpu_tiles(segments, mutual, targets.dtype)
+        if self._ranks is not None:
+            tiles, shares = tiles_of_rank(tiles, shares, self._ranks)
         self._arrays.shares = wp.array(shares, dtype=wp.int32, device=device)
         pair_loop = pair_loop_kernel(targets.dtype, quantity)
         self._launch_sums = lambda _: self._launch_pass(pair_loop, threads)
@@ -139,7 +158,11 @@ class PairEvaluation:
         """Evaluate at all target rows; ``wait``, if given, is called before the partial sums are added up."""
         if self.count == 0:
             return
+        if self._ranks is not None:
+            self._summed.zero_()
         self._launch_sums(self._arrays)
+        if self._ranks is not None:
+            self._ranks.merge(self._summed)
         if wait is not None:
             wait()
         if self.form != FUSED:

@@ -48,6 +48,8 @@ _SLAB_BYTES = 2**28
 """Memory that slabs may take."""
 _MOST_SPLITS, _MOST_STAGES = 32, 32
 """Blocks that share the walk of a tile, and stages that a warp sums in one piece: longer sums would lose digits."""
+_SPLITS_TOGETHER = 4
+"""Splits of several passes are a multiple of so many, for as many processes to share them out."""
 _FIXED_COST = 0.1
 """Time that a block takes to start and to end, and that a split takes to be added up, in stages of a warp."""
 
@@ -92,8 +94,8 @@ class Mirror:
     splits: int
 
 
-def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device) -> Mirror:
-    """Plan the walk of ``count`` moments from packed column ``origin`` on."""
+def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, ranks=None) -> Mirror:
+    """Plan the walk of ``count`` moments from packed column ``origin`` on, or what one of ``ranks`` has to do of it."""
     shape = next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
     if dtype is wp.float64 and shape.warps > _MOST_DOUBLE_WARPS:
         shape = replace(shape, warps=shape.warps // 2, blocks=2 * shape.blocks)
@@ -104,12 +106,21 @@ def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device) -> M
     slabs = min(farthest, max(1, _SLAB_BYTES // (12 * count)))
     slabs = math.ceil(farthest / math.ceil(farthest / slabs))  # as many in each pass
     splits = _choose_splits(shape, tiles, stages * min(slabs + 1, farthest + 1), device.sm_count)
+    several = slabs < farthest
+    if several:  # a split has the same slabs in each pass, so that one process adds to a partial sum
+        splits = min(-(-splits // _SPLITS_TOGETHER) * _SPLITS_TOGETHER, slabs)
+    own = (0, tiles * splits) if ranks is None else ranks.share(tiles * splits)
+    if ranks is not None and several:
+        own = tuple(tiles * edge for edge in ranks.share(splits))
     blocks, passes = [], []
     for nearest in range(1, farthest + 1, slabs):
         # the first pass has the pairs within a tile, too
         begin, end = stages * (nearest if nearest > 1 else 0), stages * min(nearest + slabs, farthest + 1)
         cuts = begin + (end - begin) * np.arange(splits + 1) // splits
-        passes.append((len(blocks), tiles * splits, nearest))
+        if several:
+            cuts = np.minimum(stages * (nearest + slabs * np.arange(splits + 1) // splits), end)
+            cuts[0] = begin
+        passes.append((len(blocks) + own[0], own[1] - own[0], nearest))
         blocks += [(tile, cuts[k], cuts[k + 1], k) for k in range(splits) for tile in range(tiles)]
     walk = MirrorTiles()
     walk.origin, walk.stages, walk.slabs = origin, stages, slabs

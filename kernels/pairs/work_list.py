@@ -88,6 +88,16 @@ def cpu_tiles(segments, mutual: bool, dtype):
     return tiles, begin, parts, threads
 
 
+def tiles_of_rank(tiles, begin, ranks):
+    """Tiles of one of several processes, and where each share of them begins: every so manieth share of all.
+
+    Shares are sorted by size, so that each process has as much to do.
+    """
+    own = range(ranks.rank, len(begin) - 1, ranks.size)
+    pieces = [tiles[begin[share] : begin[share + 1]] for share in own]
+    return np.concatenate([tiles[:0], *pieces]), np.cumsum([0, *map(len, pieces)])
+
+
 @lru_cache(maxsize=4)
 def _cut(segments, mutual: bool, most: int):
     """Tiles, where each share begins, and the number of partial sums; kept for one-shot calls that repeat."""

@@ -15,6 +15,7 @@ from warpmag.engine.scene import ImportedScene
 from warpmag.engine.statistics import Statistics
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError
+from warpmag.ranks import by_first, ranks
 from warpmag.usd import CacheWriter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -66,16 +67,19 @@ class Recorder:
         self._bodies = np.array(list(own.values()), dtype=int)
         self._shapes = np.array([row[shape] for of_prim in shapes for shape in of_prim], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
-        self._writer = CacheWriter(
-            scene.stage,
-            output,
-            list(own),
-            list(scene.magnet_shapes),
-            swarms=scene.swarms,
-            copy_scene=copy_scene,
-            frames=frames,
-            options=options,
-        )
+        all_ranks = ranks()
+        self._writer: CacheWriter | _NoWriter = _NoWriter()
+        if all_ranks is None or all_ranks.rank == 0:
+            self._writer = CacheWriter(
+                scene.stage,
+                output,
+                list(own),
+                list(scene.magnet_shapes),
+                swarms=scene.swarms,
+                copy_scene=copy_scene,
+                frames=frames,
+                options=options,
+            )
 
     def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
         """Go on with the run at the output.
@@ -92,7 +96,7 @@ class Recorder:
             InputError: What is there cannot be resumed.
         """
         with _interrupts_held():
-            found = self._writer.resume()
+            found = by_first(self._writer.resume)
         if found is None or (found.state is None and found.time <= 0.0):
             return False, False  # nothing there, or no more than the first frame
         done, output = round(found.time / step_size), Path(self._output)
@@ -151,6 +155,24 @@ class Recorder:
         finally:
             with _interrupts_held():
                 self._writer.close(complete)
+
+
+class _NoWriter:
+    """Writes nothing: what ranks other than the first have."""
+
+    save_due = False
+
+    def resume(self):
+        """Find nothing."""
+
+    def add_frame(self, *frame):
+        """Write no frame."""
+
+    def save(self, state):
+        """Write no checkpoint."""
+
+    def close(self, complete):
+        """Close nothing."""
 
 
 class _Mirrors:

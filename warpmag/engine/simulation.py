@@ -22,6 +22,7 @@ from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError, SimulationError
 from warpmag.magnets import MagneticSettings, check_flag, check_positive, shown
+from warpmag.ranks import ranks
 
 DEFAULT_STEP = 1e-3
 """Time step [s] where neither the user nor the stage gives one: the paper's."""
@@ -100,8 +101,12 @@ class Simulation:
         )
         how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
         self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
+        all_ranks = ranks()
+        graphs &= all_ranks is None  # what merges the sums of ranks is in no graph of a step
         self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
         self._options = self._options_of(settings, solver, **how)
+        if all_ranks is not None:
+            all_ranks.check_alike("scene, options", repr(self._options), *self._stepper.save().values())
 
     def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
