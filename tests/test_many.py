@@ -143,7 +143,7 @@ def test_bodies_of_several_moments_do_not_turn_themselves(rods, device):
         assert apart(own, exact) <= 3.0 * RTOL
 
 
-def test_long_bodies_are_right_and_not_chosen(device):
+def test_long_bodies_are_right_and_not_chosen(device, monkeypatch):
     """Of a chain of magnets in one body no part acts on another."""
     builder = new_builder()
     body = builder.add_body()
@@ -153,7 +153,10 @@ def test_long_bodies_are_right_and_not_chosen(device):
     warpmag.add_balls(builder, [[0.0, 0.1, 0.1]], RADIUS, magnetization=(0.0, 0.0, 1e6))
     model = builder.finalize(device=device)
     forces, torques = applied(warpmag.Magnetics(model, method="fmm"), model)
-    expected = applied(warpmag.Magnetics(model), model)
+    monkeypatch.setattr(fmm, "_COSTS", dict.fromkeys(fmm._COSTS, (3e4, 0.0)))
+    chosen = warpmag.Magnetics(model)
+    assert not chosen.system.is_fast
+    expected = applied(chosen, model)
     assert apart(forces, expected[0]) <= RTOL
     assert apart(torques, expected[1]) <= RTOL
 
@@ -215,11 +218,14 @@ def test_a_place_that_is_no_place_makes_no_harm(place, device):
     assert grid.moment_begin.numpy()[grid.level_begin.numpy()[1]] == 300
 
 
-def test_auto_and_bad_arguments(device):
+def test_auto_and_bad_arguments(device, monkeypatch):
     builder = new_builder()
     warpmag.add_balls(builder, places_of(300), RADIUS)
     model = builder.finalize(device=device)
     assert not warpmag.Magnetics(model).system.is_fast
+    monkeypatch.setattr(fmm, "_COSTS", dict.fromkeys(fmm._COSTS, (3e4, 0.0)))
+    assert warpmag.Magnetics(model).system.is_fast
+    assert not warpmag.Magnetics(model, rtol=1e-5).system.is_fast
     with pytest.raises(warpmag.InputError, match="method: 'multipole' is not one of"):
         warpmag.Magnetics(model, method="multipole")
     with pytest.raises(warpmag.InputError, match="rtol: the fast multipole method reaches"):

@@ -51,6 +51,8 @@ _PART_OF_FIELD = 0.3
 """Error of a field over that of the magnetization that it is for."""
 _SLACK = 1.001
 """Part by which rounding may take moments of a body farther from each other."""
+_LARGE_PART = 0.1
+"""Part of all pairs from which on the method sums them where it is asked for."""
 _COSTS = {
     ("cpu", Quantity.FIELD): (2.8e7, 0.0, 55.0),
     ("cpu", Quantity.WRENCH): (1.0e7, 0.0, 30.0),
@@ -96,43 +98,74 @@ class FastSums:
     def __init__(self, moments, rtol: float, targets=None, worlds: int = 1, extent: float = 0.0):
         """Allocate the cells."""
         degree, held = choose_degree(rtol)
-        packed, groups, self._first, self._count = moments.packed, moments.groups, 0, moments.count
+        packed, groups, self._first = moments.packed, moments.groups, 0
         reach = moments.largest_radius + (moments if targets is None else targets).largest_radius
         reach = max(reach, _SLACK * extent)
         if targets is not None:  # moments of no strength among the others
-            self._first, self._count = moments.count, moments.count + targets.count
+            self._first = moments.count
             packed, groups = join_moments(moments, targets)
-        self._tables, self._rtol = expansion_tables(degree), rtol
+        self._tables = expansion_tables(degree)
         self._grid = MomentGrid(packed, groups, worlds, occupancy=held, reach=reach)
 
     def build(self):
         """Launch the making of the cells, for moments that have moved."""
         self._grid.build()
 
-    def sums(self, quantity: Quantity, sources=None, pairs: float = math.inf) -> CellSums | None:
-        """Sums of a quantity, of some ``sources`` only (see :class:`CellSums`).
-
-        None for those of none, and of so few ``pairs`` that they are better summed one by one: sooner, and without an
-        error that counts where nothing is near, as in the field of a few magnets at many balls.
-        """
+    def sums(self, quantity: Quantity, sources=None) -> CellSums | None:
+        """Sums of a quantity, of some ``sources`` only (see :class:`CellSums`); None for those of none."""
         if sources is not None and not sources.any():
-            return None
-        if not is_fast(pairs, self._count, quantity, self._rtol, self._grid.device):
             return None
         return CellSums(self._grid, self._tables, quantity, self._first, sources, ranks())
 
 
+class SystemSums(FastSums):
+    """Sums over pairs of the moments of a system, those of a part of them only where that is better.
+
+    Args:
+        moments: Packed moments, at least one.
+        rtol: Relative error wanted.
+        worlds: Number of worlds.
+        extent: Distance up to which pairs must be summed one by one [m].
+        crowding: Moments of a leaf over those that are wanted.
+        always_from: Fewest pairs for which the method is to be used even if it is slower.
+    """
+
+    def __init__(self, moments, rtol: float, worlds: int, extent: float, crowding: float, always_from: float):
+        """Allocate the cells."""
+        super().__init__(moments, rtol, worlds=worlds, extent=extent)
+        self._costs = moments.count, rtol, moments.device
+        self._crowding, self._always_from = crowding, always_from
+
+    def serves(self, quantity: Quantity, pairs: float) -> bool:
+        """Whether so many pairs of a target and a source are to be summed by the method.
+
+        Few are not: one by one they are summed sooner, and without an error that counts where nothing is near, as in
+        the field of a few magnets at many balls.
+        """
+        count, rtol, device = self._costs
+        kind = Quantity.FIELD if quantity == Quantity.FIELD else Quantity.WRENCH
+        return pairs >= self._always_from or is_fast(pairs / self._crowding, count, kind, rtol, device)
+
+    def sums_of(self, quantity: Quantity, pairs: float, sources=None) -> CellSums | None:
+        """Sums as :meth:`sums` has them; None where so many pairs are better summed one by one."""
+        return self.sums(quantity, sources) if self.serves(quantity, pairs) else None
+
+
 class NoFastSums:
-    """What stands for :class:`FastSums` where all pairs are summed."""
+    """What stands for :class:`SystemSums` where all pairs are summed."""
 
     def build(self):
         """Do nothing."""
 
-    def sums(self, quantity: Quantity, sources=None, pairs: float = math.inf) -> None:
+    def sums_of(self, quantity: Quantity, pairs: float, sources=None) -> None:
         """Return nothing."""
 
+    def serves(self, quantity: Quantity, pairs: float) -> bool:
+        """Return False."""
+        return False
 
-def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: float) -> FastSums | NoFastSums:
+
+def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: float) -> SystemSums | NoFastSums:
     """Cells for the sums of an induction solve and of its forces, none where all pairs are summed.
 
     Moments of a body exert no force on each other. Expansions do not tell bodies apart, so that the moments of one that
@@ -157,12 +190,19 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
             body = layout.bodies[several.argmax()]
             raise InputError(f"method: 'fmm' has to know the extent of body {body}, which has several moments")
     worlds, extent = layout.ranges(), extent or 0.0
-    begin, targets_end, end = np.reshape(worlds, (-1, 3)).T.astype(float)
-    pairs = (targets_end - begin) @ (end - begin)
+    counts = np.diff([0, *(end for _, _, end in worlds)])
+    pairs = counts @ counts
     crowding = _crowding(layout.radii, max(2.0 * moments.largest_radius, extent), rtol)
-    better = is_fast(pairs / crowding, moments.count, Quantity.FIELD, rtol, moments.device)
-    wanted = method == "fmm" or (method == "auto" and known and better)
-    return FastSums(moments, rtol, worlds=len(worlds), extent=extent) if wanted and moments.count else NoFastSums()
+    forces = counts[layout.worlds] @ layout.movable
+    of_fields = (counts[layout.worlds] @ ~layout.permanent, Quantity.FIELD)
+    better = any(
+        is_fast(which / crowding, moments.count, quantity, rtol, moments.device)
+        for which, quantity in (of_fields, (forces, Quantity.WRENCH))
+    )
+    if not moments.count or method == "vectorized" or (method == "auto" and not (known and better)):
+        return NoFastSums()
+    always_from = _LARGE_PART * pairs if method == "fmm" else math.inf
+    return SystemSums(moments, rtol, len(worlds), extent, crowding, always_from)
 
 
 def _crowding(radii: np.ndarray, reach: float, rtol: float) -> float:

@@ -10,7 +10,7 @@ from warpmag.arrays import host_array, resolve_device, resolve_dtype, shape_mess
 from warpmag.dynamics import make_dynamics
 from warpmag.energies import MomentEnergies
 from warpmag.errors import InputError
-from warpmag.fmm import FastSums, fast_sums_for
+from warpmag.fmm import SystemSums, fast_sums_for
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.sources import Sources
 from warpmag.kernels.cells.couplings import CellCouplings
@@ -93,6 +93,7 @@ class MomentSystem:
         bias: M_r/χ [A/m] of permanent moments that respond, M_r the remanence, shape [n]; written by the caller before
             :meth:`solve`. None without them.
         dynamics: What moves the inducible moments, an object of ``warpmag.dynamics``.
+        is_fast: Whether pairs are summed by the fast multipole method.
         worlds: World of each moment, NumPy, shape [n].
         world_ranges: For each world its first moment, its first permanent one, and the end.
         h: Field at inducible moments [A/m], external and all other moments', of which the dynamics ``theta`` makes M =
@@ -155,7 +156,8 @@ class MomentSystem:
         self._apply_sources(layout, applied, solids)
         turned = ~layout.lone | lone_torque
         self._fast = fast_sums_for(method, self._packed, layout, body_extent, self.rtol)
-        self._evaluate_field(layout, near, always=method == "fmm")
+        self.is_fast = isinstance(self._fast, SystemSums)
+        self._evaluate_field(layout, near)
         self._make_cells(layout, couplings, whole=dynamics == "theta")
         self._evaluate_wrench(layout, turned)
         self._energies = None
@@ -207,14 +209,13 @@ class MomentSystem:
             self.bias = wp.zeros_like(self.moments)
         return replace(layout, lone=layout.lone & ~linear)
 
-    def _evaluate_field(self, layout: MomentLayout, near: bool, always: bool):
-        """Prepare the field of permanent moments at others, and of those among themselves, ``always`` by multipoles."""
+    def _evaluate_field(self, layout: MomentLayout, near: bool):
+        """Prepare the field of permanent moments at inducible ones, and that of inducible ones among themselves."""
         self.worlds, self.world_ranges = layout.worlds, layout.ranges()
-        first, middle, last = np.reshape(self.world_ranges, (-1, 3)).T
-        applied, mutual = (np.stack(one, axis=1) for one in ((first, middle, middle, last), (first, middle) * 2))
-        packed, state = self._packed, self._induction
-        of_magnets = self._fast.sums(Quantity.FIELD, layout.permanent, pair_count(applied))
-        among = self._fast.sums(Quantity.FIELD, ~layout.permanent, math.inf if always else pair_count(mutual))
+        ranges, packed, state = np.reshape(self.world_ranges, (-1, 3)), self._packed, self._induction
+        applied, mutual = ranges[:, [0, 1, 1, 2]], ranges[:, [0, 1, 0, 1]]
+        of_magnets = self._fast.sums_of(Quantity.FIELD, pair_count(applied), layout.permanent)
+        among = self._fast.sums_of(Quantity.FIELD, pair_count(mutual), ~layout.permanent)
         arrays = packed, packed, self._magnetizing, state.h0
         self._applied = PairEvaluation(Quantity.FIELD, applied, *arrays, sums=of_magnets, ranks=self._ranks)
         if self._applied.pair_count == 0 and self.bias is None:
@@ -245,17 +246,25 @@ class MomentSystem:
     def _evaluate_wrench(self, layout: MomentLayout, turned):
         """Prepare, for each force law, the force of everything on whatever moves, and its torque if it is wanted."""
         self._turned = wp.array(turned.astype(np.int32), dtype=wp.int32, device=self.device)
-        segments = [layout.runs(layout.movable & which) for which in (~turned, turned)]
+        segments = [np.reshape(layout.runs(layout.movable & which), (-1, 4)) for which in (~turned, turned)]
+        pairs = pair_count(whole := np.concatenate(segments))  # by multipoles all in one: actions equal reactions
 
         def evaluations(force, effective):
             # those with a torque come last, since the others' mirrored form writes forces on all moments
+            parts = [(force, segments[0]), (Quantity.WRENCH, segments[1])]
+            if self._fast.serves(Quantity.WRENCH, pairs):
+                parts = [(Quantity.WRENCH if len(segments[1]) else force, whole)]
             return [
                 PairEvaluation(
                     quantity, which, self._packed, self._packed, self._acting, self.forces, effective=effective,
+<<<<<<< HEAD
                     turned=self._turned, torques=self.torques, sums=self._fast.sums(quantity), ranks=self._ranks,
+=======
+                    turned=self._turned, torques=self.torques, sums=self._fast.sums_of(quantity, pairs),
+>>>>>>> fmmsim
                 )
-                for which, quantity in zip(segments, (force, Quantity.WRENCH), strict=True)
-                if which
+                for quantity, which in parts
+                if len(which)
             ]  # fmt: skip
 
         self._wrench = {
@@ -398,11 +407,6 @@ class MomentSystem:
         """Have what is launched next wait for what near contacts do beside."""
         if self._near is not None:
             near_pairs.wait(self._near)
-
-    @property
-    def is_fast(self) -> bool:
-        """Whether pairs are summed by the fast multipole method."""
-        return isinstance(self._fast, FastSums)
 
     def field_error(self) -> float:
         """Relative error of the field by the fast multipole method at some moments, zero without it; waits."""
