@@ -22,8 +22,8 @@ _CELLS = 32
 """Cells of a block of a GPU."""
 _GROUP_ROWS = 8
 """Places for the rows of a thread of a GPU."""
-_SPLITS, _MOST_SPLIT = 4, 8192
-"""Blocks that share the displacements of the same cells, and the most cells for which a GPU has room for them."""
+_MOST_SPLIT = 8192
+"""Most cells for which a GPU has room for several blocks that share the displacements of the same cells."""
 OCTANTS = 8
 
 
@@ -127,7 +127,7 @@ class Translation:
 
     def _launch_cuda(self, cells: int):
         """Launch the translation of arrays for so many cells on a GPU."""
-        a, splits = self._arrays, _SPLITS if cells <= _MOST_SPLIT else 1
+        a, splits = self._arrays, _splits(self._constants["ROWS"]) if cells <= _MOST_SPLIT else 1
         if splits > 1 and (a.parts is None or a.parts.shape != (splits, *a.locals.shape)):
             a.parts = wp.zeros((splits, *a.locals.shape), dtype=self._dtype, device=self._device)
         kernel, threads = _cuda_kernel(self._dtype, splits, tuple(self._constants.items()))
@@ -156,6 +156,11 @@ def _grouped_rows(classes: np.ndarray, group: int, used: int) -> np.ndarray:
 def _threads(rows: int) -> int:
     """Threads of a block of a GPU for so many rows, in whole warps."""
     return -(-(_CELLS // 8 * rows // _GROUP_ROWS) // 32) * 32
+
+
+def _splits(rows: int) -> int:
+    """Blocks that share the 56 displacements of the same few cells: of small ones more have room."""
+    return 14 if _threads(rows) <= 64 else 4
 
 
 def _used_rows(classes: np.ndarray) -> int:
