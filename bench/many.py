@@ -113,7 +113,7 @@ def run_size(count: int, device, slowest: float, seconds: dict):
         expected = exact.out.numpy()[rows]
         for rtol in RTOLS:
             began = time.perf_counter()
-            expects = max((t * (count / n) ** 2 for (q, n), t in seconds.items() if q == quantity), default=0.0)
+            expects = min((t * (count / n) ** 2 for (q, n), t in seconds.items() if q == quantity), default=0.0)
             if rtol is None and expects > slowest:
                 continue
             work = own.work(quantity, rtol)

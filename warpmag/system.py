@@ -257,11 +257,8 @@ class MomentSystem:
             return [
                 PairEvaluation(
                     quantity, which, self._packed, self._packed, self._acting, self.forces, effective=effective,
-<<<<<<< HEAD
-                    turned=self._turned, torques=self.torques, sums=self._fast.sums(quantity), ranks=self._ranks,
-=======
                     turned=self._turned, torques=self.torques, sums=self._fast.sums_of(quantity, pairs),
->>>>>>> fmmsim
+                    ranks=self._ranks,
                 )
                 for quantity, which in parts
                 if len(which)

@@ -4,6 +4,7 @@ Near pairs are those of the all-pairs sums, clamped at contact; far ones come fr
 order in which the grid sorts moments, and go to the partial sums of target rows from there.
 """
 
+from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
@@ -45,6 +46,8 @@ class CellSums:
         self._effective = wp.zeros((3, (1 + -(-n // PITCH)) * PITCH), dtype=dtype, device=device)[:, :n]
         self._expansions = Expansions(grid, tables, self._quantity, self._moments, self._effective, self._sums)
         self._expansions.share(self._leaves, self._shares)
+        self._stream = wp.Stream(device, priority=-1) if device.is_cuda else None
+        self._events = [wp.Event(device) for _ in range(2)] if device.is_cuda else []
 
     def __call__(self, effective, target, partial):
         """Launch the sums of the moments as they are now, where they were when the grid was built.
@@ -67,16 +70,30 @@ class CellSums:
         if self._shares is not None:
             self._shares.find()
             self._sums.zero_()
+        with self._beside():
+            self._expansions.gather()
+            self._expansions.translate()
         launch_near_sums(
             self._quantity, self._moments, self._effective, grid.neighbors, grid.moment_begin, self._leaves, self._sums
         )
-        self._expansions.gather()
-        self._expansions.translate()
+        if self._stream is not None:
+            wp.get_stream(device).wait_event(self._events[1])
         self._expansions.add_fields()
         if self._shares is not None:
             self._shares.ranks.merge(self._sums)
         inputs = [self._sums, target, grid.place[self._first :]]
         wp.launch(_return_kernel(dtype), partial.shape[1:], inputs, [partial], device=device)
+
+    @contextmanager
+    def _beside(self):
+        """On a GPU, launch what follows on a stream of its own: far cells wait for each other, which near ones fill."""
+        if self._stream is None:
+            yield
+            return
+        self._stream.wait_event(wp.get_stream(self._stream.device).record_event(self._events[0]))
+        with wp.ScopedStream(self._stream, sync_enter=False):
+            yield
+            self._stream.record_event(self._events[1])
 
 
 @cache

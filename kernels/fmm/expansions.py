@@ -115,6 +115,7 @@ class Expansions:
         a.sorted, a.effective, a.sums = moments, effective, sums
         a.multipoles = wp.zeros((grid.capacity + 1, width), dtype=dtype, device=device)
         a.locals = wp.zeros_like(a.multipoles)
+        self._parts = self._translation.parts(a.locals.shape)  # its own: graphs that were captured write to them
         a.arrived = wp.zeros(grid.capacity, dtype=wp.int32, device=device)
         # forces: sources to one degree less, for actions and reactions to add up to zero
         a.sources = harmonics if quantity == Quantity.FIELD else tables.degree**2
@@ -137,7 +138,8 @@ class Expansions:
             self._shares.translate(self._translation, a.multipoles, a.locals, a.children, a.parent)
         else:
             self._translation.launch(
-                *(a.multipoles, a.locals, grid.neighbors, a.children, a.parent, grid.order, grid.octant_begin)
+                *(a.multipoles, a.locals, grid.neighbors, a.children, a.parent, grid.order, grid.octant_begin),
+                parts=self._parts,
             )
         self._launch(_Step.FALL)
 

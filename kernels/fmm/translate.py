@@ -22,8 +22,8 @@ _CELLS = 32
 """Cells of a block of a GPU."""
 _GROUP_ROWS = 8
 """Places for the rows of a thread of a GPU."""
-_SPLITS, _MOST_SPLIT = 4, 8192
-"""Blocks that share the displacements of the same cells, and the most cells for which a GPU has room for them."""
+_MOST_SPLIT = 8192
+"""Most cells for which a GPU has room for several blocks that share the displacements of the same cells."""
 OCTANTS = 8
 
 
@@ -102,7 +102,12 @@ class Translation:
         a.parity = integers(np.pad(classes, (0, width - harmonics)))
         a.row_parity, a.row_harmonic = integers(np.repeat(classes[rows[::group]], group)), integers(rows)
 
-    def launch(self, multipoles, local, neighbors, children, parent, order, octant_begin):
+    def parts(self, shape) -> wp.array | None:
+        """Partial sums for local expansions of a shape, which blocks of a GPU share where cells are few; else None."""
+        splits = _splits(self._constants["ROWS"]) if self._device.is_cuda and shape[0] <= _MOST_SPLIT else 1
+        return wp.zeros((splits, *shape), dtype=self._dtype, device=self._device) if splits > 1 else None
+
+    def launch(self, multipoles, local, neighbors, children, parent, order, octant_begin, parts=None):
         """Set the far part of the local expansions of all cells, with what their parents do not have.
 
         Args:
@@ -113,28 +118,29 @@ class Translation:
             parent: Parent of each cell, −1 for none, shape [c].
             order: Cells of each level and octant.
             octant_begin: Where those of each octant begin and end in ``order``, shape [levels, 9].
+            parts: What :meth:`parts` returned for these local expansions.
         """
         a = self._arrays
         a.multipoles, a.locals, a.neighbors, a.children = multipoles, local, neighbors, children
         a.parent, a.order, a.octant_begin = parent, order, octant_begin
         cells = multipoles.shape[0] - 1
         if self._device.is_cuda:
-            self._launch_cuda(cells)
+            self._launch_cuda(cells, parts)
             return
         kernel = _cpu_kernel(self._dtype, tuple(self._constants.items()))
         threads = threads_for(cells, _CELLS_PER_THREAD)
         wp.launch(kernel, dim=1, inputs=[0, 1, threads, team(), a], device=self._device)
 
-    def _launch_cuda(self, cells: int):
+    def _launch_cuda(self, cells: int, parts):
         """Launch the translation of arrays for so many cells on a GPU."""
-        a, splits = self._arrays, _SPLITS if cells <= _MOST_SPLIT else 1
-        if splits > 1 and (a.parts is None or a.parts.shape != (splits, *a.locals.shape)):
-            a.parts = wp.zeros((splits, *a.locals.shape), dtype=self._dtype, device=self._device)
+        a, splits = self._arrays, 1 if parts is None else parts.shape[0]
+        if parts is not None:
+            a.parts = parts
         kernel, threads = _cuda_kernel(self._dtype, splits, tuple(self._constants.items()))
         blocks = splits * (-(-cells // _CELLS) + OCTANTS * a.octant_begin.shape[0])
         wp.launch(kernel, dim=blocks * threads, inputs=[a], device=self._device, block_dim=threads)
         if splits > 1:
-            inputs = [a.octant_begin, a.locals.shape[1], a.parts.reshape((splits, -1)), a.locals.flatten()]
+            inputs = [a.octant_begin, a.locals.shape[1], parts.reshape((splits, -1)), a.locals.flatten()]
             wp.launch(_add_kernel(self._dtype), dim=a.locals.size, inputs=inputs, device=self._device)
 
 
@@ -156,6 +162,11 @@ def _grouped_rows(classes: np.ndarray, group: int, used: int) -> np.ndarray:
 def _threads(rows: int) -> int:
     """Threads of a block of a GPU for so many rows, in whole warps."""
     return -(-(_CELLS // 8 * rows // _GROUP_ROWS) // 32) * 32
+
+
+def _splits(rows: int) -> int:
+    """Blocks that share the 56 displacements of the same few cells: of small ones more have room."""
+    return 14 if _threads(rows) <= 64 else 4
 
 
 def _used_rows(classes: np.ndarray) -> int:
