@@ -206,9 +206,16 @@ def test_animation_of_the_scene_keeps_its_time(tmp_path, scene, rates):
     assert swings[1].GetTimeSamples() == swings[0].GetTimeSamples() == [10.0, 20.0]
 
 
-def test_scene_in_a_package(tmp_path, scene):
-    package = str(tmp_path / "scene.usdz")
-    assert UsdUtils.CreateNewUsdzPackage(str(scene), package)
+@pytest.mark.parametrize("layers", [1, 2])
+def test_scene_in_a_package(tmp_path, scene, layers):
+    package, top = str(tmp_path / "scene.usdz"), scene
+    if layers == 2:
+        top = scene.with_name("top.usda")
+        layer = Sdf.Layer.CreateNew(str(top))
+        UsdUtils.CopyLayerMetadata(Sdf.Layer.FindOrOpen(str(scene)), layer)
+        layer.subLayerPaths[:] = ["./scene.usda"]
+        layer.Save()
+    assert UsdUtils.CreateNewUsdzPackage(str(top), package)
     bodies, magnets, frames = write(package, tmp_path / "run.usda", [0.0, 0.1])
     assert_equal_to_frame(Usd.Stage.Open(str(tmp_path / "run.usda")), 14.8, bodies, magnets, frames[1])
 

@@ -24,7 +24,7 @@ def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
         shutil.copyfile(scene.realPath, output.temporary(copied))
         return copied, copied
     layers, assets, _ = ([], [], []) if scene.anonymous else UsdUtils.ComputeAllDependencies(scene.realPath)
-    files = {_file(path) for path in (*(layer.realPath for layer in layers), *assets)}
+    files = {file_with(path) for path in (*(layer.realPath for layer in layers), *assets)}
     if len(files) < 2:
         copied = output.beside(".scene.usdc")
         output.write(scene, copied)
@@ -41,7 +41,7 @@ def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
     return folder, folder / os.path.relpath(scene.realPath, top)
 
 
-def _file(path: str) -> str:
+def file_with(path: str) -> str:
     """Return the file that a layer or an asset is in, perhaps a package."""
     return Ar.SplitPackageRelativePathOuter(path)[0]
 

@@ -28,7 +28,7 @@ from warpmag.usd.paths import path_between
 from warpmag.usd.placements import Placements
 from warpmag.usd.reader import copied_metadata
 from warpmag.usd.samples import SampleFile
-from warpmag.usd.scene_copy import copy_scene
+from warpmag.usd.scene_copy import copy_scene, file_with
 from warpmag.usd.session import INSTANCES, added_layer, as_written
 from warpmag.usd.swarms import Swarm
 from warpmag.usd.units import units_of
@@ -429,11 +429,10 @@ def _instances(stage: Usd.Stage, paths: Iterable[str]) -> list[str]:
 
 def _digest(stage: Usd.Stage) -> str:
     """Return a digest of the layers that a stage is made of, wherever they lie, with edits that nobody has saved."""
-    digests = []
-    for layer in stage.GetUsedLayers():
-        if layer.realPath and not layer.dirty:
-            with open(layer.realPath, "rb") as file:
-                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
-        elif layer.realPath or layer == stage.GetRootLayer():
-            digests.append(hashlib.sha256(layer.ExportToString().encode()).hexdigest())
+    layers = [layer for layer in stage.GetUsedLayers() if layer.realPath or layer == stage.GetRootLayer()]
+    in_memory = [layer for layer in layers if layer.dirty or not layer.realPath]
+    digests = [hashlib.sha256(layer.ExportToString().encode()).hexdigest() for layer in in_memory]
+    for path in {file_with(layer.realPath) for layer in layers if layer not in in_memory}:
+        with open(path, "rb") as file:
+            digests.append(hashlib.file_digest(file, "sha256").hexdigest())
     return hashlib.sha256("".join(sorted(digests)).encode()).hexdigest()
