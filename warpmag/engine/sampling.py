@@ -66,7 +66,7 @@ class ShapeSampler:
         self._frames = model.shape_transform.numpy().astype(float)
         sources = [0.0 if source is None else float(id(source)) for source in self._sources]
         numbers = np.column_stack([self._types, sources, self._scales, self._frames])
-        self._kinds = unique_rows(numbers)[1].tolist()  # shapes of equal numbers are alike
+        self.kinds = unique_rows(numbers)[1]
         self._known: dict[tuple, BodyLattice] = {}
 
     def sample(self, shapes: list[int], spacing: float, permanent: bool, closed: bool) -> BodyLattice:
@@ -81,7 +81,7 @@ class ShapeSampler:
             permanent: Whether the moments are fixed: their field is not averaged over more than their cells then.
             closed: Whether closed forms stand for them close up, where there are some.
         """
-        key = (spacing, permanent, closed, *(self._kinds[shape] for shape in shapes))
+        key = (spacing, permanent, closed, *self.kinds[shapes].tolist())
         if key not in self._known:
             try:
                 self._known[key] = self._sample(shapes, spacing, permanent, closed)
