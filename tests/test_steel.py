@@ -1,4 +1,4 @@
-"""Measured magnetization curves: tables, their interpolation, and what balls and stages of such materials do.
+"""Measured magnetization curves: tables, their interpolation, and what balls of such materials do.
 
 The independent reference interpolates with SciPy's PCHIP and finds each ball's field inside by bisection.
 """
@@ -9,26 +9,21 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from pxr import Sdf, UsdGeom, UsdPhysics, UsdShade
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.optimize import brentq
 
 import warpmag
-from tests.test_materials import FLOAT, stage_with
 from warpmag import MagnetizationCurve, oracle
 from warpmag.engine.attributes import marked_shapes
-from warpmag.engine.scene import import_scene
 from warpmag.errors import InputError
 from warpmag.kernels.material import curves as kernel_curves
 from warpmag.kernels.shared.native import native_options
 from warpmag.materials import MATERIALS
 from warpmag.measured import MEASURED_CURVES
 from warpmag.system import MomentSystem
-from warpmag.usd import author_magnet, read_magnets
 
 MU0 = 4e-7 * math.pi
 NAMES = list(MEASURED_CURVES)
-DOUBLE = Sdf.ValueTypeNames.DoubleArray
 
 
 def points_of(name):
@@ -401,106 +396,6 @@ def test_two_curves_in_one_model(how, device):
 def test_bodies_that_contradict(magnet, message):
     with pytest.raises(InputError, match=message):
         builder_with(**magnet)
-
-
-def test_curves_on_a_stage():
-    h, b = (list(map(float, values)) for values in GOOD)
-    named = stage_with("", curve=(Sdf.ValueTypeNames.Token, "M-19"))
-    given = stage_with("", **{"curve:h": (DOUBLE, h), "curve:b": (DOUBLE, b)})
-    of_material = stage_with("M-19")
-    curves = [read_magnets(stage).magnets["/Ball"].curve for stage in (named, given, of_material)]
-    assert curves == [MATERIALS["M-19"].curve, MagnetizationCurve.from_bh(h, b), MATERIALS["M-19"].curve]
-    for curve in curves[:2]:
-        stage = stage_with("")
-        author_magnet(stage.GetPrimAtPath("/Ball"), warpmag.magnets.Magnet(curve=curve))
-        again = read_magnets(stage).magnets["/Ball"].curve
-        np.testing.assert_allclose(again.magnetizations, curve.magnetizations, rtol=1e-9)
-    assert UsdGeom.Sphere(stage.GetPrimAtPath("/Ball"))
-
-
-@pytest.mark.parametrize(
-    "material,attributes,message",
-    [
-        ("M-19", {"susceptibility": (FLOAT, 9.0)}, "M-19 says what warpmag:susceptibility is"),
-        ("M-19", {"curve": (Sdf.ValueTypeNames.Token, "tanh")}, "M-19 says what warpmag:curve is"),
-        (
-            "M-19",
-            {"curve": (Sdf.ValueTypeNames.Token, "1010-steel")},
-            "M-19 says what the magnet is made of",
-        ),
-        ("iron", {"curve": (Sdf.ValueTypeNames.Token, "1010-steel")}, "iron says what the magnet is made of"),
-        ("", {"curve:h": (DOUBLE, [0.0, 1e3])}, "warpmag:curve:h and warpmag:curve:b: 2 fields, but 0 values"),
-        ("", {"curve:b": (DOUBLE, [0.0, 1.3])}, "warpmag:curve:h and warpmag:curve:b: 0 fields, but 2 values"),
-        (
-            "",
-            {"curve:h": (DOUBLE, GOOD[0]), "curve:b": (DOUBLE, GOOD[1]), "saturationMagnetization": (FLOAT, 1e6)},
-            "warpmag:saturationMagnetization: a measured curve says it",
-        ),
-        (
-            "",
-            {"curve:h": (DOUBLE, [0.0, 1e3, 1e4]), "curve:b": (DOUBLE, [0.0, 1.5, 1.2])},
-            "M = B/μ0 − H must not fall",
-        ),
-    ],
-)
-def test_bad_curves_on_a_stage_are_refused_by_name(material, attributes, message):
-    with pytest.raises(InputError, match=f"^/Ball: .*{message}"):
-        read_magnets(stage_with(material, **attributes))
-
-
-def mass_of(tmp_path, material, edit=lambda stage: None):
-    """Mass [kg] of a ball of 5 mm of a material after ``edit``, as Newton imports it from a file."""
-    stage = stage_with(material)
-    edit(stage)
-    path = tmp_path / "scene.usda"
-    stage.Export(str(path))
-    scene = import_scene(path)
-    return scene.builder.body_mass[scene.bodies["/Ball"]]
-
-
-VOLUME = 4.0 / 3.0 * math.pi * 0.005**3
-
-
-@pytest.mark.parametrize("material", ["1010-steel", "soft-ferrite", ""])
-def test_a_magnet_weighs_what_its_material_does(tmp_path, material):
-    density = MATERIALS[material].density if material else 1000.0  # Newton's own
-    assert mass_of(tmp_path, material) == pytest.approx(density * VOLUME, rel=1e-5)
-
-
-def _mass_of_ball(stage):
-    UsdPhysics.MassAPI.Apply(stage.GetPrimAtPath("/Ball")).CreateMassAttr(0.25)
-
-
-def _density_of_ball(stage):
-    UsdPhysics.MassAPI.Apply(stage.GetPrimAtPath("/Ball")).CreateDensityAttr(0.25 / VOLUME)
-
-
-def _density_of_bound_material(stage):
-    bound = UsdShade.Material.Define(stage, "/Looks")
-    UsdPhysics.MaterialAPI.Apply(bound.GetPrim()).CreateDensityAttr(0.25 / VOLUME)
-    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/Ball")).Bind(bound)
-
-
-@pytest.mark.parametrize("edit", [_mass_of_ball, _density_of_ball, _density_of_bound_material])
-def test_what_a_stage_says_of_its_weight_counts(tmp_path, edit):
-    assert mass_of(tmp_path, "1010-steel", edit) == pytest.approx(0.25, rel=1e-5)
-
-
-def test_a_body_of_several_parts_weighs_what_each_is_made_of(tmp_path):
-    def with_lid(stage):
-        lid = UsdGeom.Cube.Define(stage, "/Ball/Lid")
-        lid.CreateSizeAttr(0.002)
-        UsdPhysics.CollisionAPI.Apply(lid.GetPrim())
-        UsdPhysics.MassAPI.Apply(lid.GetPrim()).CreateMassAttr(0.01)
-
-    density = MATERIALS["M-19"].density
-    assert mass_of(tmp_path, "M-19", with_lid) == pytest.approx(density * VOLUME + 0.01, rel=1e-5)
-
-
-def test_densities_are_those_of_matter():
-    """Of iron 7,874 kg/m³ (CRC Handbook), of alloys and oxides of it 3,000 to 9,000."""
-    assert MATERIALS["pure-iron"].density == pytest.approx(7874.0, rel=1e-3)
-    assert all(3e3 < one.density < 9e3 for one in MATERIALS.values())
 
 
 def test_a_changed_number_does_not_bend_a_measured_curve(device):

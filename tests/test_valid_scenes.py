@@ -48,6 +48,7 @@ FALLING = {
 }
 
 
+@pytest.mark.no_cover  # lines of joints that other tests reach
 @pytest.mark.parametrize("case", FALLING)
 def test_what_nothing_holds_falls_freely(case, device, tmp_path, capsys):
     path = write(tmp_path, *FALLING[case])
@@ -207,6 +208,7 @@ ARTICULATIONS = {
 }
 
 
+@pytest.mark.no_cover  # lines of joints that other tests reach
 @pytest.mark.parametrize("case", ARTICULATIONS)
 def test_an_articulation_moves_as_its_joints_do(case, device, tmp_path):
     """The default solver knows joints one by one: a root above them changes nothing but rounding."""
