@@ -61,7 +61,7 @@ _COSTS = {
 }
 """What the method takes, in pairs that are summed in the same time: at all, for each harmonic, and for each harmonic of
 each moment. On two cores both ways are as fast with 8,000 moments at 1e-3 and 13,500 at 1e-5, forces with 4,600 and
-8,000; on an H200 with 31,000 and 40,000, whole calls for forces with 6,700."""
+8,000. Those of a GPU change ways at 31,000 and 40,000, and for forces, of which only whole calls ask, at 6,700."""
 
 
 def check_fast(rtol: float):
