@@ -9,7 +9,10 @@ from pxr import Usd
 import warpmag
 from warpmag import fmm, oracle
 from warpmag.cli import BAD_INPUT, main
+from warpmag.engine.scene import import_scene
+from warpmag.scenes_usd import make
 from warpmag.system import MomentSystem
+from warpmag.usd import alike, instancers
 
 RADIUS = 0.0025  # m
 FIELD = (0.0, 1e4, 3e4)  # A/m
@@ -200,6 +203,16 @@ def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     assert apart(np.array(moments), simulation.magnetics.shape_moments()[:150]) <= 3.0 * RTOL
     assert main(["run", str(scene), "--balls", "3"]) == BAD_INPUT
     assert "balls: only of bundled scenes" in capsys.readouterr().err
+
+
+def test_instances_that_stay_one_prim_are_not_counted_as_prims(tmp_path, monkeypatch):
+    monkeypatch.setattr(alike, "MANY", 50)
+    monkeypatch.setattr(instancers, "MOST_PRIMS", 60)
+    stage = make("million", tmp_path, 100)
+    assert import_scene(stage).builder.body_count == 101
+    monkeypatch.setattr(alike, "MANY", 200)
+    with pytest.raises(warpmag.InputError, match="more than 60 prims"):
+        import_scene(stage)
 
 
 @pytest.mark.parametrize("place", [np.nan, np.inf, -np.inf, 1e30])

@@ -234,7 +234,13 @@ REFUSED = {
     ),
     "a prototype that is not there": (["Gone"], [0], [(0, 0, 0)], "", "/World/Many/Kinds/Gone, which is not there"),
     "a place that is no number": (["Ball"], [0], [(0, 0, "nan")], "", "transform is not finite"),
-    "too many": (["Ball"], [0] * 260_000, "[(0, 0, 0)" + ", (0, 0, 0)" * 259_999 + "]", "", "more than 500000 prims"),
+    "too many, one unlike the others, so that they become prims": (
+        ["Ball"],
+        [0] * 260_000,
+        "[(0, 0, 0)" + ", (0, 0, 0)" * 259_999 + "]",
+        "float3[] scales = [(2, 2, 2)" + ", (1, 1, 1)" * 259_999 + "]",
+        "more than 500000 prims",
+    ),
 }
 
 

@@ -145,15 +145,18 @@ class _Expansion:
             for target in targets:
                 release_instances(self._stage, layer, target)
         prototypes = [_prototype(self._stage.GetPrimAtPath(target)) for target in targets]
-        self._prims += sum(1 + prototypes[instances.prototypes[row]].prims for row in instances.rows)
-        if self._prims > MOST_PRIMS:
-            raise InputError(f"{path}: instances of bodies that stand for more than {MOST_PRIMS} prims")
         followed = instances.samples() if any(map(self._follows_keys, targets)) else ()
         prefix = _NAME
         while any(name.startswith(prefix) for name in instancer.GetPrim().GetAllChildrenNames()):
             prefix += "_"
         write = partial(_write_instances, layer, path, prefix, instances, prototypes, followed)
         left = self._alike(instancer, instances, prefix) if self._left_apart and not followed else []
+        whole = {row for balls in left if balls.whole for row in balls.rows.tolist()}  # never are prims
+        self._prims += sum(
+            1 + prototypes[instances.prototypes[row]].prims for row in instances.rows if row not in whole
+        )
+        if self._prims > MOST_PRIMS:
+            raise InputError(f"{path}: instances of bodies that stand for more than {MOST_PRIMS} prims")
         later = [balls.rows[1:].tolist() for balls in left]
         self.apart += [replace(balls, write=partial(write, rows)) for balls, rows in zip(left, later, strict=True)]
         with Sdf.ChangeBlock():
