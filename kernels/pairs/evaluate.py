@@ -108,7 +108,7 @@ class PairEvaluation:
         parts, tiles = self._plan_sums(quantity, segments, targets, targets is sources, smoothing)
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
         self.partial = a.partial = (wp.zeros if extra_parts else wp.empty)(shape, dtype=dtype, device=device)
-        self._summed = self.partial[:parts]
+        self._summed = self.partial[:parts] if self._ranks is not None else None
         a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
         a.overlap, a.overlap_count = targets.overlaps, targets.overlap_counts
