@@ -164,6 +164,17 @@ def test_cubes_in_contact(place, device):
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.linalg.norm(expected))
 
 
+@pytest.mark.filterwarnings("ignore:Inertia validation corrected")  # Newton's bodies are larger
+@pytest.mark.parametrize("side", [1.0, 3e-6])
+def test_cubes_of_any_size(side, device):
+    """Forces go as the square of sizes, to the roundings of places; r⁻⁷ of a micrometre is no float."""
+    found = [
+        force_on_second(device, ("box", (a / 2,) * 3), ("box", (a / 2,) * 3, (0.1 * a, 0.2 * a, 1.1 * a))) / a**2
+        for a in (SIDE, side)
+    ]
+    np.testing.assert_allclose(found[1], found[0], atol=1e-5 * np.linalg.norm(found[0]))
+
+
 @pytest.mark.parametrize("gap", [0.0, 1e-4, 5e-4, 2e-3])
 def test_discs_in_line(gap, device):
     """The prism's rim is 0.2 % of the radius off the cylinder's, in and out."""

@@ -99,6 +99,24 @@ def test_single_precision(device):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=5e-3 * np.abs(other).max())
 
 
+def test_micrometres(device):
+    """Balls of 1 µm in single precision as in double; r⁻⁷ there is no float."""
+    found = []
+    for dtype in ("float32", "float64"):
+        system = MomentSystem(radii=[1e-6, 1e-6], saturation=1.7e6, permanent=[False, True], dtype=dtype, device=device)
+        system.positions.assign([[0.5e-6, 0.0, 2.5e-6], [0.0, 0.0, 0.0]])
+        system.moments.assign([[0.0, 0.0, 0.0], [0.0, 0.0, 4e-12]])
+        system.conduct([1e16, 0.0], 1e-12)  # so good that currents show beside the pull
+        system.solve()
+        system.eddy.motion.assign(np.outer([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0]))
+        system.apply_forces()
+        found.append(system.forces.numpy().astype(float))
+    np.testing.assert_allclose(found[0], found[1], rtol=0.0, atol=1e-5 * np.abs(found[1]).max())
+    system.eddy.motion.zero_()
+    system.apply_forces()
+    assert np.abs(found[1] - system.forces.numpy()).max() > 0.1 * np.abs(found[1]).max()
+
+
 def test_momentum_and_angular_momentum_are_kept(clump):
     forces, torques = clump.braked(*_motion())
     turned = np.cross(clump.positions, forces)

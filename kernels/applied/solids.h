@@ -98,7 +98,8 @@ CUDA_CALLABLE inline Near lattice_field(const All& all, const Body& body, Vector
         const Vector m = spread(moment_at(all, body, j));
         const Number other = Number(Real(0)) + packed_at(all, 3, j), s = radius + other, d2 = dot(r, r), s2 = s * s;
         const Number c = larger(d2, s2), i = Real(0.5) * twice_inverse_root(c), i2 = i * i, i3 = i2 * i;
-        const Number g2 = 3 * i2 * i3, rm = dot(r, m), g3 = -5 * i2 * g2 * rm;
+        const Number g2 = 3 * i2 * i3, rm = dot(r, m);
+        const Number g3 = -5 * i2 * (g2 * rm); // without r⁻⁷, which is no float at 1 µm
         out.h = sum(out.h, less(scaled(g2 * rm, r), scaled(i3, m)));
         add_product(out.t, g2, r, m), add_product(out.t, g2, m, r), add_product(out.t, g3, r, r);
         out.t.xx += g2 * rm, out.t.yy += g2 * rm, out.t.zz += g2 * rm;
