@@ -87,6 +87,10 @@ def main() -> int:
         except InputError as error:
             print(f"warpmag: {error}", file=sys.stderr)
             return 2
+        except ImportError as error:  # of Newton's solvers, which name it
+            reason = " ".join(str(error.__cause__ or error).split())
+            print(f"warpmag: {name} needs what `pip install 'warpmag[sim]'` installs ({reason})", file=sys.stderr)
+            return 2
         return 0
     known = name in (None, "-h", "--help", "--list")
     if not known:

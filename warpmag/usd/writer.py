@@ -44,7 +44,7 @@ class Earlier:
 
     Attributes:
         time: Time of its last frame since the start of the stage [s].
-        state: What the run handed to :meth:`CacheWriter.add_frame` then; None if it was complete.
+        state: What the run had saved by then; None if it was complete.
     """
 
     time: float
