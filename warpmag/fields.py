@@ -161,7 +161,11 @@ def _fmm_rtol(method, rtol, shape: SumsShape) -> float | None:
     """Error to allow the fast multipole method, None where it is not wanted or would not be faster."""
     targets = shape.count if shape.target_count is None else shape.target_count
     count, pairs = shape.count + (shape.target_count or 0), targets * shape.count
-    better = rtol is not None and is_fast(pairs, count, shape.quantity, rtol, wp.get_device(shape.device))
+    better = (
+        rtol is not None
+        and not shape.reference  # the plain loop alone has the smoothed law
+        and is_fast(pairs, count, shape.quantity, rtol, wp.get_device(shape.device))
+    )
     wanted = method == "fmm" or (method == "auto" and better)
     return (rtol or USUAL_RTOL) if wanted and shape.count and shape.target_count != 0 else None
 
