@@ -9,6 +9,7 @@ from warpmag import fmm
 from warpmag.arrays import resolve_dtype, vec3_type
 from warpmag.kernels.fmm.grid import MomentGrid
 from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.system import MomentSystem
 
 
@@ -196,6 +197,21 @@ def test_induction_has_the_solution_of_all_pairs(name, device):
     (forces, _), (expected, _) = result.wrench(), exact.wrench()
     # a force has the errors of two magnetizations and of a gradient
     assert apart(forces, expected) <= 3e-3
+
+
+def test_the_error_of_fields_is_of_the_sums_alone(device, monkeypatch):
+    """Not what balls that touch lack as dipoles, which both ways of summing add to; and none where forces alone are
+    by multipoles."""
+    places = 0.0101 * np.stack(np.meshgrid(*3 * [np.arange(4.0)]), axis=-1).reshape(-1, 3)
+    given = {"saturation": 1.7e6, "external_field": (0.0, 0.0, 1e4), "contact_model": "multipole", "device": device}
+    result = warpmag.solve_induction(places, 0.005, method="fmm", **given)
+    assert result._system.is_fast
+    assert result.field_error <= 1e-6  # one cell holds them all, and every pair is summed
+    kinds = {key: (0.0 if key[1] == Quantity.WRENCH else 1e9, 0.0) for key in fmm._COSTS}
+    monkeypatch.setattr(fmm, "_COSTS", kinds)
+    result = warpmag.solve_induction(places, 0.005, method="auto", **given)
+    assert result._system.is_fast
+    assert result.field_error == 0.0
 
 
 def test_worlds_do_not_see_each_other(device):

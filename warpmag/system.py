@@ -21,7 +21,7 @@ from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, W
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
 from warpmag.kernels.pairs.eddy import EddyCurrents
-from warpmag.kernels.pairs.evaluate import PairEvaluation
+from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.work_list import pair_count
@@ -215,14 +215,14 @@ class MomentSystem:
         ranges, packed, state = np.reshape(self.world_ranges, (-1, 3)), self._packed, self._induction
         applied, mutual = ranges[:, [0, 1, 1, 2]], ranges[:, [0, 1, 0, 1]]
         of_magnets = self._fast.sums_of(Quantity.FIELD, pair_count(applied), layout.permanent)
-        among = self._fast.sums_of(Quantity.FIELD, pair_count(mutual), ~layout.permanent)
+        self._among = self._fast.sums_of(Quantity.FIELD, pair_count(mutual), ~layout.permanent)
         arrays = packed, packed, self._magnetizing, state.h0
         self._applied = PairEvaluation(Quantity.FIELD, applied, *arrays, sums=of_magnets, ranks=self._ranks)
         if self._applied.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing
         # near contacts write one more partial sum
         arrays = packed, packed, state.h0, self.h
-        more = {"extra_parts": int(near), "sums": among, "ranks": self._ranks}
+        more = {"extra_parts": int(near), "sums": self._among, "ranks": self._ranks}
         self._mutual = PairEvaluation(Quantity.FIELD, mutual, *arrays, **more)
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
@@ -406,13 +406,16 @@ class MomentSystem:
             near_pairs.wait(self._near)
 
     def field_error(self) -> float:
-        """Relative error of the field by the fast multipole method at some moments, zero without it; waits."""
-        if not self.is_fast or self._mutual.count == 0:
+        """Relative error of the field by the fast multipole method at some moments, zero without it; waits.
+
+        What else acts on moments, cells and near contacts, is in neither of the fields that are compared.
+        """
+        if self._mutual.count == 0 or GIVEN not in (self._applied.form, self._mutual.form):
             return 0.0
         base = wp.clone(self._magnetizing)
         if self.bias is not None:
             launch_add_bias(self.bias, self._biased, base)
-        return sampled_error(self._mutual, self._packed, self.world_ranges, base, self.h)
+        return sampled_error(self._among, self._packed, self.world_ranges, self._induction.h0, base)
 
     def magnetizations(self):
         """Magnetizations M [A/m] of all moments, a fresh array, shape [n]; zero for point dipoles."""
