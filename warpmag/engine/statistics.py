@@ -101,8 +101,8 @@ class Statistics:
         return tuple((1e3 * timed.mean(axis=0)).tolist()) if len(timed) else (0.0, 0.0, 0.0)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return all figures by name."""
-        return {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
+        """Return copies of all figures by name: they are written while steps go on."""
+        return {one.name: np.array(getattr(self, one.name)) for one in fields(self)}
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
         """Take over the figures that :meth:`save` returned."""
