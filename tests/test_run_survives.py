@@ -18,6 +18,7 @@ from pxr import Sdf, Usd, UsdPhysics
 from run_server import RunServer
 
 from warpmag import InputError, Simulation, cli
+from warpmag.engine import recording
 from warpmag.scenes_usd import balls_up
 
 FRAMES = 60
@@ -266,6 +267,33 @@ def test_a_full_disk_ends_a_run_in_one_line(scene, tmp_path, device, always, mon
     monkeypatch.setattr(os, "pwrite", write)
     assert cli.main([*command, str(output)]) == 0
     assert samples(output) == samples(tmp_path / "whole" / "out.usda")
+
+
+def test_a_last_frame_that_cannot_be_written_can_be_resumed(scene, tmp_path, device, always, monkeypatch):
+    """On a GPU it is written when all steps are done, and the run is not complete without it."""
+
+    class Late(recording.Recorder):
+        """Writes a frame before the next one is taken, on a CPU, too."""
+
+        def add_frame(self, time, state):
+            self.write()
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(self, "write", lambda: None)
+                super().add_frame(time, state)
+
+    def full(*frame):
+        raise InputError("no room")
+
+    monkeypatch.setattr(recording, "Recorder", Late)
+    output = tmp_path / "out.usda"
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(InputError, match="no room"):
+        Simulation(scene, device=device).run(
+            1, output=output, on_frame=lambda k: k < 1 or patch.setattr(recording.CacheWriter, "add_frame", full)
+        )
+    assert (tmp_path / "out.resume.npz").exists()
+    Simulation(scene, device=device).run(1, output=output, resume=True)
+    assert len(frames_of(output)) == 2
+    assert sorted(os.listdir(tmp_path)) == ["out.cache.usdc", "out.usda"]
 
 
 def test_nobody_reads_what_a_run_prints(scene, tmp_path):

@@ -149,12 +149,14 @@ class Recorder:
                 self._writer.save(saved)
 
     def close(self, complete: bool) -> None:
-        """Close the files; unless the run is complete, it can be resumed."""
+        """Close the files; unless the run is complete, and its last frame written, it can be resumed."""
+        written = False
         try:
             self.write()
+            written = True
         finally:
             with _interrupts_held():
-                self._writer.close(complete)
+                self._writer.close(complete and written)
 
 
 class _NoWriter:
