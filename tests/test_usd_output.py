@@ -166,6 +166,38 @@ def test_ended_at_any_write_the_stage_has_all_frames(tmp_path, stage, monkeypatc
             assert not output.exists()
 
 
+def test_a_frame_that_found_no_room_can_be_added_again(tmp_path, stage, monkeypatch):
+    """Whichever write failed: of the second frame, with which samples begin, or of one that makes the file longer."""
+    frames, write, count, missing, spans = make_frames(67), os.pwrite, 0, 0, {}
+
+    def limited(file, data, place):
+        nonlocal count
+        count += 1
+        if count == missing:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(file, data, place)
+
+    def run(output):
+        with CacheWriter(stage, output, PATHS, PATHS) as writer:
+            for k in range(67):
+                before = count
+                try:
+                    add(writer, frames, [k])
+                except InputError:
+                    writer.save(None)
+                    assert k > 1 or Sdf.Layer.OpenAsAnonymous(str(output)).endTimeCode == 0.0
+                    add(writer, frames, [k])
+                spans[k] = range(before + 1, count + 1)
+        assert_has(output, frames, 67)
+
+    monkeypatch.setattr(os, "pwrite", limited)
+    run(tmp_path / "whole" / "run.usda")
+    assert len(spans[64]) > len(spans[63])
+    for number in (*spans[1], *spans[64]):
+        count, missing = 0, number
+        run(tmp_path / f"{number}" / "run.usda")
+
+
 def test_a_run_goes_on_where_it_was(tmp_path, stage, monkeypatch):
     """Frames that came after the checkpoint are dropped, and those that are added grow the file."""
     monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)

@@ -21,7 +21,7 @@ reference for each sample, here the row; jumps count from where they stand, and 
 import contextlib
 import os
 import struct
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import BinaryIO
 
 import numpy as np
@@ -146,20 +146,21 @@ class SampleFile:
         Raises:
             OSError: The file cannot be written; the frame is not in it.
         """
+        if self.count == self._places.capacity:
+            self._extend(os.fstat(self._file.fileno()).st_size, 2 * self.count, _Structure.read(self._file))
         places = self._places
-        if places.count == places.capacity:
-            self._extend(os.fstat(self._file.fileno()).st_size, 2 * places.capacity, _Structure.read(self._file))
         self._fill_ahead()
         self._write(int(self._frame_places(places.count, places.count + 1)[0]), values)
         self._write(places.times + 8 * (1 + places.count), struct.pack("<d", code))
-        if len(changed):
-            places.sampled[changed] = True
-            self._write_heads(int(changed.min()), int(changed.max()) + 1)
+        places.sampled[changed] = True
         places.count += 1
         try:
+            if len(changed):
+                self._write_heads(int(changed.min()), int(changed.max()) + 1)
             self._set_count(code)
         except OSError:
             places.count -= 1
+            places.sampled[changed] = False
             raise
 
     def frame(self, number: int) -> bytes:
@@ -184,19 +185,28 @@ class SampleFile:
 
     def _extend(self, start: int, capacity: int, structure: "_Structure") -> None:
         """Make room for ``capacity`` frames in all, with new times, rows and structure, from ``start`` on."""
-        old = self._places
+        old, told = self._places, self._told
         codes = self.codes() if old.count else np.zeros(0)
-        old.first_frames, old.stretches = np.append(old.first_frames, old.capacity), np.append(old.stretches, start)
         empty = start + (capacity - old.capacity) * self._frame_size
-        old.times, old.capacity = empty + 8, capacity
-        old.filled, self._ahead = min(old.count + _FIRST_AHEAD, capacity), 0
-        self._write(empty, struct.pack("<QQ", 0, old.count) + codes.tobytes())
-        self._told = capacity
-        self._fill_rows(0, old.filled, 0, len(self._offsets))
-        end = self._rows().stop
-        self._write(end, structure.moved_to(end))
-        self._write_heads(0, len(self._offsets))
-        self._write(CONTENTS, struct.pack("<q", structure.contents))
+        self._places = replace(
+            old,
+            first_frames=np.append(old.first_frames, old.capacity),
+            stretches=np.append(old.stretches, start),
+            capacity=capacity,
+            times=empty + 8,
+            filled=min(old.count + _FIRST_AHEAD, capacity),
+        )
+        self._told, self._ahead = capacity, 0
+        try:
+            self._write(empty, struct.pack("<QQ", 0, old.count) + codes.tobytes())
+            self._fill_rows(0, self._places.filled, 0, len(self._offsets))
+            end = self._rows().stop
+            self._write(end, structure.moved_to(end))
+            self._write_heads(0, len(self._offsets))
+            self._write(CONTENTS, struct.pack("<q", structure.contents))
+        except OSError:
+            self._places, self._told = old, told  # what the file has still stands there
+            raise
 
     def _rows(self) -> range:
         """Return where the rows begin."""

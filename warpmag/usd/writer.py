@@ -225,7 +225,6 @@ class CacheWriter:
             own = np.where(magnets[:, None] < 0, np.float32(0.0), moments[magnets] if len(moments) else np.float32(0.0))
             turns = last and last[len(values) + 1]
             values += swarm.place(body_q[bodies], body_qd[bodies], own, turns)
-        self._last_time, self._last = float(time), values
         if self._samples is None:
             self._samples = self._begin(time, values)
         else:
@@ -311,6 +310,7 @@ class CacheWriter:
         data = b"".join(column.packed(one) for column, one in zip(self._columns, values, strict=True))
         with self._output.errors(self._output.cache):
             samples.append(self._code(time), data, changed)
+        self._last_time, self._last = float(time), values
 
     def _write_scene_and_root(self) -> list[Path]:
         """Write what the root names, without placing it, and the root; return what to place before that."""
