@@ -10,6 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
+
+from warpmag.errors import InputError
+from warpmag.ranks import Ranks
 
 MPIRUN = Path(sysconfig.get_path("scripts"), "mpirun")
 SCRIPT = Path(__file__).with_name("ranks_program.py")
@@ -60,6 +64,12 @@ def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device):
     assert told[0].stdout.count("\n") == told[1].stdout.count("\n")  # rank 0 alone tells of it
     first, second = ((tmp_path / f"{ranks}" / "out.cache.usdc").read_bytes() for ranks in (1, 2))
     assert first == second
+
+
+def test_a_graph_of_a_cpu_that_would_not_merge_sums_is_refused():
+    sums = wp.zeros(3, dtype=float, device="cpu")
+    with wp.ScopedCapture("cpu"), pytest.raises(InputError, match="no graph of a CPU"):
+        Ranks.merge(object.__new__(Ranks), sums)
 
 
 def test_ranks_with_other_input_are_told_so():

@@ -77,11 +77,17 @@ class Ranks:
         return count * self.rank // self.size, count * (self.rank + 1) // self.size
 
     def merge(self, array) -> None:
-        """Give each rank what any of them has in a contiguous Warp array, where the others have zeros."""
+        """Give each rank what any of them has in a contiguous Warp array, where the others have zeros.
+
+        Raises:
+            InputError: A graph of a CPU is being captured, which would not do this when it is launched.
+        """
         if array.device.is_cuda:
             self._gpus = self._gpus or _Nccl(self, array.device)
             self._gpus.merge(array)
             return
+        if array.device.is_capturing:
+            raise InputError("device: what ranks exchange is in no graph of a CPU; launch without one")
         self._all.Allreduce(self._mpi.IN_PLACE, array.numpy().reshape(-1).view(np.int32), self._mpi.SUM)
 
     def check_alike(self, what: str, *values) -> None:
