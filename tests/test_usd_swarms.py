@@ -24,6 +24,7 @@ LINES = f"""
     vector3f[] velocities = [{", ".join(f"(0.01, {0.02 * k}, 0.3)" for k in range(COUNT))}]
     vector3f[] angularVelocities = [{", ".join(f"({90 * k}, 0, 300)" for k in range(COUNT))}]
 """
+OUTER = "int[] protoIndices = [0]\npoint3f[] positions = [(0, 0, 1)]\n"
 
 
 @pytest.fixture(scope="module")
@@ -136,16 +137,30 @@ def test_it_is_played_and_exported_as_prims_are(runs, whole, tmp_path):
 
 
 def test_few_balls_and_those_that_are_not_alone_become_prims(runs, monkeypatch):
-    """An instancer that is scaled, that moves, or that holds something else beside balls that are alike."""
+    """An instancer that is scaled, that moves or speeds up, or that holds something else beside balls that are alike;
+    and each ball by itself where something may speak of single ones."""
     monkeypatch.setattr(alike, "MANY", COUNT)
     text = (runs / "scene.usda").read_text()
     by_two = '"xformOp:rotateZ", "xformOp:scale"]\n float3 xformOp:scale = (2, 2, 2)'
     scaled = text.replace('"xformOp:rotateZ"]', by_two, 1)
     moved = text.replace("double xformOp:rotateZ = 30", "double xformOp:rotateZ.timeSamples = { 0: 30, 60: 30 }")
     single = text.replace("protoIndices = [0, 0, 1, 0,", "protoIndices = [1, 0, 1, 0,")
-    for name, other in (("scaled", scaled), ("moved", moved), ("single", single), ("same", text)):
+    faster = text.replace(
+        "vector3f[] velocities", f"vector3f[] accelerations = {[(0, 0, 1)] * COUNT}\nvector3f[] velocities"
+    )
+    several = {"scaled": scaled, "moved": moved, "single": single, "faster": faster, "same": text}
+    for name, other in several.items():
         assert (other == text) == (name == "same")
         path = runs / f"{name}.usda"
         path.write_text(other)
         apart = expand_instancers(Usd.Stage.Open(str(path)), 0.0, apart=True)
         assert apart and [one.whole for one in apart] == [name == "same"] * len(apart), name
+    for name, more in (
+        ("joint", 'def PhysicsFixedJoint "Joint" {\nrel physics:body1 = </World/Many/instance1/Ball>\n}\n'),
+        ("group", 'def PhysicsCollisionGroup "Group" {\n}\n'),
+        ("pairs", 'def Scope "Pairs" (prepend apiSchemas = ["PhysicsFilteredPairsAPI"]) {\n}\n'),
+        ("outer", f'def PointInstancer "Outer" {{\nrel prototypes = </World>\n{OUTER}}}\n'),
+    ):
+        path = runs / f"{name}.usda"
+        path.write_text(text + more)
+        assert not expand_instancers(Usd.Stage.Open(str(path)), 0.0, apart=True), name
