@@ -335,6 +335,19 @@ def test_magnet_in_a_world_of_its_own(device):
     assert relative(system.magnetizations().numpy()[:1], expected) < 1e-5
 
 
+def test_bodies_that_cannot_be_told_apart_are_refused(device, monkeypatch):
+    """Neighbouring numbers that are one in single precision would be one body, whose moments do not act."""
+    given = {"radii": [0.01, 0.01], "bodies": [2**24, 2**24 + 1], "device": device}
+    with pytest.raises(InputError, match="bodies: numbers too large, at most 16777216 in float32; use float64"):
+        MomentSystem(**given)
+    assert MomentSystem(dtype="float64", **given).count == 2
+    monkeypatch.setattr("warpmag.arrays.MOST_BODIES", {wp.float32: 2, wp.float64: 3})
+    places = np.eye(3)
+    with pytest.raises(InputError, match="positions: 3 moments that act on each other, at most 2 in float32"):
+        warpmag.wrench(places, places, device=device)
+    assert warpmag.wrench(places, places, dtype="float64", device=device)[0].any()
+
+
 def test_moments_out_of_order_are_refused(device):
     """Inducible moments come first in each world, and worlds one after the other."""
     for wrong in ({"permanent": [True, False]}, {"worlds": [1, 0]}):

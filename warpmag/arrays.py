@@ -37,6 +37,16 @@ def name_of(dtype) -> str:
     return next(name for name, one in DTYPES.items() if one is dtype)
 
 
+MOST_BODIES = {wp.float32: 2**24, wp.float64: 2**31 - 1}
+"""Bodies that are told apart by their numbers, which are packed with moments, by Warp scalar type."""
+
+
+def check_bodies(text: str, count: int, dtype) -> None:
+    """Raise ``InputError`` that begins with a text where ``count`` numbers of bodies are too many for ``dtype``."""
+    if count > MOST_BODIES[dtype]:
+        raise InputError(f"{text}, at most {MOST_BODIES[dtype]} {hint(dtype)}")
+
+
 def hint(dtype) -> str:
     """End of a message about numbers that are out of range of the Warp scalar type ``dtype``."""
     return "in float32; use float64" if dtype is wp.float32 else "in float64"

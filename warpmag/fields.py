@@ -10,6 +10,7 @@ from warpmag.arrays import (
     REFERENCE_RADIUS_RANGE,
     Kind,
     Numbers,
+    check_bodies,
     farthest_place,
     first_not_finite,
     hint,
@@ -134,6 +135,7 @@ def wrench(
     farthest = farthest_place(kind.dtype, 2.0 * size, reference=reference)
     x = kind.vectors("positions", positions, farthest=farthest, shared=True)
     n = x.shape[0]
+    check_bodies(f"positions: {n} moments that act on each other", n, kind.dtype)
     m = kind.vectors("moments", moments, n, least=LEAST_OF_FORCE, shared=True)
     external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
     shape = SumsShape(Quantity.WRENCH, kind.device.alias, kind.dtype, n, size, reference=reference, smoothing=smoothing)

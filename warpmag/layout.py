@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from warpmag.arrays import host_positive, host_radii, host_scalars, shape_message
+from warpmag.arrays import check_bodies, host_positive, host_radii, host_scalars, shape_message
 from warpmag.curves import MagnetizationCurve
 from warpmag.errors import InputError
 from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, LINEAR, MIXED, CurveParameters, curve_tables
@@ -86,6 +86,7 @@ def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayou
         raise InputError(
             "worlds, permanent: moments must be ordered by world, from 0 on, the inducible ones of each first"
         )
+    check_bodies("bodies: numbers too large", int(bodies.max(initial=-1)) + 1, dtype)
     _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
     alone = size[body] == 1
     return MomentLayout(radii, worlds, permanent, bodies, movable, ~permanent & alone, alone)
