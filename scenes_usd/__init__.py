@@ -33,7 +33,7 @@ def make(name: str, folder: Path, balls: int | None = None) -> Path:
         The file, whose name tells the number.
 
     Raises:
-        InputError: The scene has no such number, or it is out of range.
+        InputError: The scene has no such number, it is out of range, or the file cannot be written.
     """
     module = _module(name)
     parameter = inspect.signature(module.author).parameters.get("balls")
@@ -41,7 +41,10 @@ def make(name: str, folder: Path, balls: int | None = None) -> Path:
         raise InputError(f"balls: the scene {name} has no number of balls to choose")
     count = parameter.default if balls is None else balls
     path = folder / f"{name}_{count}.usdc"
-    module.author(path, balls=count)
+    try:
+        module.author(path, balls=count)
+    except MemoryError:
+        raise InputError(f"balls: there is no room for {count}") from None
     return path
 
 

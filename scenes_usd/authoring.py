@@ -15,6 +15,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.usd import author_magnet, author_settings, author_surface
+from warpmag.usd.output import Output
 
 GRAVITY = 9.81
 """Acceleration of free fall [m/s²]."""
@@ -66,9 +67,15 @@ def new_stage(documentation: str, *, seconds: float, frames_per_second: float = 
 
 
 def save(stage: Usd.Stage, path: str | os.PathLike) -> None:
-    """Write a stage to a file."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    stage.GetRootLayer().Export(str(path))
+    """Write a stage to a file.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    path = Path(path)
+    with Output.errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stage.GetRootLayer().Export(str(path))
 
 
 def add_scene(

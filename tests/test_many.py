@@ -205,6 +205,16 @@ def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     assert "balls: only of bundled scenes" in capsys.readouterr().err
 
 
+def test_a_scene_that_cannot_be_made_is_told_in_one_line(tmp_path, capsys):
+    (tmp_path / "file").write_text("no folder")
+    for balls, folder, reason in (
+        (3, "file", f"{tmp_path}/file/million_3.usdc: cannot be written (File exists)"),
+        (10**15, "new", f"balls: there is no room for {10**15}"),
+    ):
+        assert main(["run", "million", "--balls", str(balls), "-o", str(tmp_path / folder / "out.usda")]) == BAD_INPUT
+        assert capsys.readouterr().err == f"warpmag: {reason}\n"
+
+
 def test_instances_that_stay_one_prim_are_not_counted_as_prims(tmp_path, monkeypatch):
     monkeypatch.setattr(alike, "MANY", 50)
     monkeypatch.setattr(instancers, "MOST_PRIMS", 60)

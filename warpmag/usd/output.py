@@ -86,8 +86,9 @@ class Output:
         if len(os.fsencode(longest)) > os.pathconf(folder, "PC_NAME_MAX"):
             raise InputError(f"{self.root}: the name is too long")
 
+    @staticmethod
     @contextlib.contextmanager
-    def errors(self, path: Path) -> Iterator[None]:
+    def errors(path: Path) -> Iterator[None]:
         """Make one line of what goes wrong with a file."""
         try:
             with quiet():
