@@ -222,6 +222,24 @@ def test_a_run_goes_on_where_it_was(tmp_path, stage, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == ["run.cache.usdc", "run.usda", "scene.usda"]
 
 
+@pytest.mark.parametrize("complete", [False, True])
+def test_a_cache_that_is_cut_off_is_refused_in_one_line(tmp_path, stage, complete):
+    output, cache = tmp_path / "run.usda", tmp_path / "run.cache.usdc"
+    writer = CacheWriter(stage, output, PATHS, PATHS)
+    add(writer, make_frames(2), range(2), state=dict)
+    writer.close(complete=complete)
+    whole = cache.read_bytes()
+    for size in (0, 100, 2000, len(whole) - 1):
+        cache.write_bytes(whole[:size])
+        with pytest.raises(InputError, match=r"run\.cache\.usdc: (is shorter|USD cannot read it)") as refused:
+            CacheWriter(stage, output, PATHS, PATHS).resume()
+        assert "\n" not in str(refused.value)
+    cache.write_bytes(whole)
+    writer = CacheWriter(stage, output, PATHS, PATHS)
+    assert (writer.resume().state is None) == complete
+    writer.close(complete=complete)
+
+
 def test_a_checkpoint_that_is_none_is_refused_in_one_line(tmp_path, stage):
     output = tmp_path / "run.usda"
     for content in (b"", b"nonsense", b"PK\x03\x04 cut off"):

@@ -26,6 +26,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from warpmag.errors import InputError
 from warpmag.usd.crate import CONTENTS, DOUBLE_VECTOR, HEAD, SECTION, SECTION_NAME, LayerFile, reference
 
 _AHEAD = 512
@@ -49,6 +50,7 @@ class _Places:
         stretches: Where each stretch begins.
         capacity: Frames that all stretches hold.
         times: Number of frames, then the time code of each; before it an empty list, after it the rows.
+        size: Least size of the file, up to the end of the structure.
         filled: Frames whose references are written.
         count: Frames.
         sampled: Whether an attribute has samples, shape [attributes].
@@ -62,6 +64,7 @@ class _Places:
     sampled: np.ndarray
     capacity: int = 0
     times: int = 0
+    size: int = 0
     filled: int = 0
     count: int = 0
 
@@ -111,11 +114,17 @@ class SampleFile:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, sizes: np.ndarray, places: dict[str, np.ndarray]) -> "SampleFile":
-        """Go on with a file where it was at :meth:`places`; frames since then are dropped."""
+        """Go on with a file where it was at :meth:`places`; frames since then are dropped.
+
+        Raises:
+            InputError: The file is not that one, or has lost its end.
+        """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
             known = {name: value if value.ndim else int(value) for name, value in places.items()}
             self = cls(file, sizes, _Places(**known))
+            if os.fstat(file.fileno()).st_size < self._places.size:
+                raise InputError(f"{path}: is shorter than the run left it, which cannot go on")
             self._set_count(float(self.codes()[-1]))
             self._write_heads(0, len(sizes))
             stack.pop_all()
@@ -201,7 +210,8 @@ class SampleFile:
             self._write(empty, struct.pack("<QQ", 0, old.count) + codes.tobytes())
             self._fill_rows(0, self._places.filled, 0, len(self._offsets))
             end = self._rows().stop
-            self._write(end, structure.moved_to(end))
+            self._write(end, moved := structure.moved_to(end))
+            self._places.size = end + len(moved)
             self._write_heads(0, len(self._offsets))
             self._write(CONTENTS, struct.pack("<q", structure.contents))
         except OSError:

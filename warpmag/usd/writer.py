@@ -23,6 +23,7 @@ from warpmag.usd import crate
 from warpmag.usd.alike import MOMENTS
 from warpmag.usd.clock import stage_clock
 from warpmag.usd.columns import BODY, MAGNET, ORIENT, SCALE, TRANSLATE, Column
+from warpmag.usd.guard import readable
 from warpmag.usd.output import Output
 from warpmag.usd.paths import path_between
 from warpmag.usd.placements import Placements
@@ -176,7 +177,9 @@ class CacheWriter:
 
     def _completed(self) -> Earlier:
         """Return what there is to say about a run that has left no checkpoint."""
-        cache = Sdf.Layer.OpenAsAnonymous(str(self._output.cache)) if self._output.cache.exists() else None
+        path = self._output.cache
+        with readable(str(path)):
+            cache = Sdf.Layer.OpenAsAnonymous(str(path)) if path.exists() else None
         about = cache.customLayerData.get("warpmag") if cache else None
         if about is None:
             raise InputError(f"{self._output.root}: nothing to resume, no run of this version has written it")
