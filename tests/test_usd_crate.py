@@ -1,5 +1,7 @@
 """Crate files written by hand: USD reads from them what it would have written itself."""
 
+import struct
+
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Vt
@@ -58,6 +60,25 @@ def test_usd_reads_what_it_would_write(tmp_path, count):
     file.close()
     found = Sdf.Layer.FindOrOpen(str(tmp_path / "hand.usdc"))
     assert specs(found) == specs(usd)
+
+
+@pytest.mark.parametrize("count", [1, 5, 64, 70])
+def test_a_closed_file_has_as_many_references_as_times(tmp_path, count):
+    """USD goes by the times alone, readers of other makes compare them; 70 frames need a longer file than there is."""
+    hand, path = crate.Overs(np.full(3, 12)), tmp_path / "hand.usdc"
+    hand.set_metadata("endTimeCode", 0.0)
+    hand.add_sampled(["/A", "/B", "/C"], "warpmag:moment", "vector3f", crate.VEC3F)
+    layer = hand.encode()
+    file = SampleFile.begin(path, layer, np.full(3, 12), None)
+    for number in range(count):
+        values = np.full((3, 3), number, dtype=np.float32)
+        file.append(float(number), values.tobytes(), np.array([0, 2] if number == 1 else [], dtype=int))
+    file.close()
+    data, found = path.read_bytes(), []
+    for head in range(layer.heads, layer.heads + 3 * crate.HEAD, crate.HEAD):
+        _, times, jump = struct.unpack_from("<qQq", data, head)
+        found += [struct.unpack_from("<2Q", data, place)[0] for place in (times & (1 << 48) - 1, head + 16 + jump)]
+    assert found == [count if sampled and count > 1 else 0 for sampled in (True, False, True) for _ in range(2)]
 
 
 def author(layer, path, type_name, value, uniform=False):

@@ -183,10 +183,10 @@ class SampleFile:
     def close(self) -> None:
         """Close the file, complete: readers of other makes compare the number of samples with that of the times."""
         try:
-            if self.count != self._told:
-                count = struct.pack("<Q", self.count)
-                for row in self._rows():
-                    self._write(row, count)
+            counts = np.where(self.sampled, self.count, 0).tolist()
+            for row, count in zip(self._rows(), counts, strict=True):
+                if count != self._told:
+                    self._write(row, struct.pack("<Q", count))
         finally:
             self._file.close()
 
