@@ -113,6 +113,21 @@ SLIPS = {
 }
 
 
+def test_what_only_newton_complains_of_is_told_in_the_same_words(device, tmp_path, capsys):
+    """USD passes over what an instance has of its own; converting units makes it seen, and that it has a cycle."""
+    copy = """def Xform "Copy" (instanceable = true
+        references = </World/Kinds>) {
+        def "Again" (references = </World/Copy>) {
+        }
+    }
+    """
+    kinds = f'def Xform "Kinds" {{\n{ball("Ball", (0, 0, 1))}}}\n'
+    path = write(tmp_path, physics(), kinds, copy)
+    path.write_text(path.read_text().replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
+    (error,), _ = told(path, tmp_path, device, capsys)
+    assert "Copy/Again" in error and "anon" not in error
+
+
 def test_slips_are_warnings_of_both(device, tmp_path, capsys):
     parts = [
         ball(path.rpartition("/")[2], (0.1 * number, 0, 1), lines, magnet="Bare" not in path)
