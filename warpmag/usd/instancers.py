@@ -17,7 +17,7 @@ from warpmag.errors import InputError
 from warpmag.usd.alike import ARRAYS, MOMENTS, AlikeBalls, alike, ball_in, may_be_alike, may_stay_whole
 from warpmag.usd.first_reading import MOST_PRIMS
 from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
-from warpmag.usd.session import INSTANCES, add_layer, new_layer, release_instances
+from warpmag.usd.session import INSTANCES, add_layer, new_layer, release, release_instances
 from warpmag.usd.transforms import is_body, is_collider
 from warpmag.usd.units import units_of
 
@@ -131,7 +131,7 @@ class _Expansion:
                 break  # only seen, or what it has is elsewhere, which must not be in an instance
             while not prim.IsInstance():
                 prim = prim.GetParent()
-            Sdf.CreatePrimInLayer(self._layer_of_prims(), prim.GetPath()).instanceable = False
+            release(self._layer_of_prims(), [prim])
         return prim
 
     def _prototype_prim(self, instancer: Sdf.Path, target: Sdf.Path) -> Usd.Prim:

@@ -37,6 +37,7 @@ from warpmag.usd.schemas import (
     moment_of,
     settings_of,
 )
+from warpmag.usd.session import instance_findings, instances_around
 from warpmag.usd.slips import kind_findings, stray_findings
 from warpmag.usd.swarms import Swarm, swarms_of
 from warpmag.usd.transforms import TransformCheck, is_body, is_collider
@@ -268,6 +269,8 @@ def survey(stage: Usd.Stage) -> StageContents:
         contents.findings += stray_findings(prim)
         if is_source(prim):
             _read_sources(prim, transforms, keys, contents)
+    moved = [prim for prim in prims if prim.IsInstanceProxy() and (is_body(prim) or has_api(prim, MAGNET_API))]
+    contents.findings += instance_findings(instances_around(moved))
     contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))

@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import os
 import time as clock_time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +29,7 @@ from warpmag.usd.placements import Placements
 from warpmag.usd.reader import copied_metadata
 from warpmag.usd.samples import SampleFile
 from warpmag.usd.scene_copy import copy_scene, file_with
-from warpmag.usd.session import INSTANCES, added_layer, as_written
+from warpmag.usd.session import INSTANCES, added_layer, as_written, instances_around
 from warpmag.usd.swarms import Swarm
 from warpmag.usd.units import units_of
 
@@ -410,21 +410,10 @@ class CacheWriter:
             orders.setdefault(order, []).append(path)
         for order, paths in orders.items():
             cache.add_tokens(paths, "xformOpOrder", order)
-        for path in _instances(as_written(self._stage), {path for one in self._columns for path in one.paths}):
-            cache.make_editable(path)
+        stage, above = as_written(self._stage), {path.rpartition("/")[0] for one in self._columns for path in one.paths}
+        for prim in instances_around(stage.GetPrimAtPath(path or "/") for path in above):
+            cache.make_editable(str(prim.GetPath()))  # opinions in it have no effect before
         return cache
-
-
-def _instances(stage: Usd.Stage, paths: Iterable[str]) -> list[str]:
-    """Return the instances that prims are in: opinions there have no effect until these are made editable."""
-    found = []
-    for path in {path.rpartition("/")[0] or "/" for path in paths}:
-        prim = stage.GetPrimAtPath(path)
-        while prim.IsInstance() or prim.IsInstanceProxy():
-            if prim.IsInstance():
-                found.append(str(prim.GetPath()))
-            prim = prim.GetParent()
-    return found
 
 
 def _digest(stage: Usd.Stage) -> str:
