@@ -5,6 +5,7 @@ Runs are children that are really killed. What they leave is compared, bit by bi
 
 import contextlib
 import errno
+import json
 import math
 import os
 import random
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdPhysics
 from run_server import RunServer
@@ -234,6 +236,21 @@ def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, alw
         printed = capsys.readouterr()
         (line,) = printed.err.splitlines()
         assert line.startswith("warpmag: ") and "out.usda" in line and message in line and not printed.out
+    checkpoint = tmp_path / "out.resume.npz"
+    content = checkpoint.read_bytes()
+    with np.load(checkpoint) as saved:
+        arrays = dict(saved)
+    noted = json.loads(str(arrays.pop("about")))
+    for name, message in [
+        ("buffers", "its checkpoint has no 'buffers'"),
+        ("stat.steps", "its checkpoint has no 'steps'"),
+        ("state.0", "checkpoint: state.0 is not that of this run"),
+    ]:
+        left = {key: array for key, array in arrays.items() if key != f"state/{name}"}
+        np.savez(checkpoint, about=np.array(json.dumps({**noted, "names": sorted(left)})), **left)
+        assert cli.main([*command, str(scene), "--frames", "6"]) == 2
+        assert capsys.readouterr().err == f"warpmag: {output}: cannot resume, {message}\n"
+    checkpoint.write_bytes(content)
     assert cli.main([*command, str(scene), "--frames", "6"]) == 0
     assert "written" in capsys.readouterr().out
     assert cli.main([*command, str(scene), "--frames", "6"]) == 0

@@ -183,8 +183,9 @@ class Output:
         except FileNotFoundError:
             return None
         except (OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile) as error:
-            raise InputError(f"{self.checkpoint}: cannot be read ({' '.join(str(error).split())})") from None
-        if noted.get("format") != _FORMAT:
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{self.checkpoint}: cannot be read ({said})") from None
+        if not isinstance(noted, dict) or noted.get("format") != _FORMAT:
             raise InputError(f"{self.checkpoint}: cannot be resumed, another version of warpmag has written it")
         if noted["names"] != sorted(arrays):
             raise InputError(f"{self.checkpoint}: cannot be read (some of it is missing)")

@@ -26,7 +26,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from warpmag.usd.crate import CONTENTS, DOUBLE_VECTOR, HEAD, SECTION, SECTION_NAME, LayerFile, reference
+from warpmag.errors import InputError
+from warpmag.usd.crate import CONTENTS, DOUBLE_VECTOR, HEAD, MAGIC, SECTION, SECTION_NAME, LayerFile, reference
 
 _AHEAD = 512
 """Frames whose references are written to a row at once, a page of the file, some rows with each frame before."""
@@ -52,6 +53,7 @@ class _Places:
         filled: Frames whose references are written.
         count: Frames.
         sampled: Whether an attribute has samples, shape [attributes].
+        length: Length of the file when it was last looked at.
     """
 
     heads: int
@@ -64,6 +66,7 @@ class _Places:
     times: int = 0
     filled: int = 0
     count: int = 0
+    length: int = 0
 
 
 class SampleFile:
@@ -111,11 +114,18 @@ class SampleFile:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, sizes: np.ndarray, places: dict[str, np.ndarray]) -> "SampleFile":
-        """Go on with a file where it was at :meth:`places`; frames since then are dropped."""
+        """Go on with a file where it was at :meth:`places`; frames since then are dropped.
+
+        Raises:
+            InputError: It is not that file, or not all of it.
+            OSError: It cannot be opened or written.
+        """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
             known = {name: value if value.ndim else int(value) for name, value in places.items()}
             self = cls(file, sizes, _Places(**known))
+            if not self._is_there():
+                raise InputError(f"{path}: cannot be resumed, it is not as the run left it")
             self._set_count(float(self.codes()[-1]))
             self._write_heads(0, len(sizes))
             stack.pop_all()
@@ -133,6 +143,7 @@ class SampleFile:
 
     def places(self) -> dict[str, np.ndarray]:
         """Return what :meth:`resume` needs to come back to the present state."""
+        self._places.length = os.fstat(self._file.fileno()).st_size
         return {name: np.asarray(value) for name, value in asdict(self._places).items()}
 
     def append(self, code: float, values: bytes, changed: np.ndarray) -> None:
@@ -197,6 +208,14 @@ class SampleFile:
         self._write(end, structure.moved_to(end))
         self._write_heads(0, len(self._offsets))
         self._write(CONTENTS, struct.pack("<q", structure.contents))
+
+    def _is_there(self) -> bool:
+        """Whether the file is as long as it was, and has counted the frames."""
+        places, descriptor = self._places, self._file.fileno()
+        if os.fstat(descriptor).st_size < places.length:
+            return False
+        (counted,) = struct.unpack("<Q", os.pread(descriptor, 8, places.times))
+        return os.pread(descriptor, len(MAGIC), 0) == MAGIC and places.count <= counted <= places.capacity
 
     def _rows(self) -> range:
         """Return where the rows begin."""
