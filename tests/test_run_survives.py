@@ -16,7 +16,7 @@ import time
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdPhysics
+from pxr import Sdf, Usd, UsdPhysics, UsdUtils
 from run_server import RunServer
 
 from warpmag import InputError, Simulation, cli
@@ -218,6 +218,42 @@ def test_a_scene_edited_in_memory_is_another_scene(scene, tmp_path, device, alwa
     rub(layer, 0.5)
     run(4)
     assert layer.dirty
+
+
+@pytest.mark.parametrize("kind", ["below", "package"])
+def test_what_is_written_of_a_scene_edited_in_memory_has_the_edits(kind, scene, tmp_path, device):
+    """The file has not, and what is read of the result elsewhere would be a motion of other things."""
+    edited, output = tmp_path / "scene" / "edited.usda", tmp_path / "out" / "out.usda"
+    edited.parent.mkdir()
+    edited.write_bytes(scene.read_bytes())
+    path = edited
+    if kind == "below":
+        path = edited.with_name("root.usda")
+        layer = Sdf.Layer.CreateNew(str(path))
+        layer.pseudoRoot.SetInfo("metersPerUnit", 1.0)
+        layer.subLayerPaths.append(str(edited))
+        layer.Save()
+    if kind == "package":
+        path = edited.with_suffix(".usdz")
+        assert UsdUtils.CreateNewUsdzPackage(str(edited), str(path))
+    layer = Sdf.Layer.FindOrOpen(str(path if kind == "package" else edited))
+    rub(layer, 0.25)
+    simulation = Simulation(path, device=device)
+    (warning,) = [line for line in simulation.warnings() if "not saved" in line]
+    assert warning.startswith(f"{layer.realPath}: has edits in this process that are not saved")
+    if kind == "package":
+        with pytest.raises(InputError, match=r"edited.usdz: has edits that are not saved, and is in a package"):
+            simulation.run(1, output=output)
+        return
+    simulation.run(1, output=output)
+    program = (
+        f"from pxr import Usd, UsdPhysics\nstage = Usd.Stage.Open({str(output)!r})\n"
+        "found = [UsdPhysics.MaterialAPI(one).GetDynamicFrictionAttr().Get() for one in stage.Traverse()]\n"
+        "print({one for one in found if one is not None})"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "{0.25}\n"
+    layer.Reload(force=True)
 
 
 def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, always, capsys):

@@ -325,7 +325,7 @@ class Simulation:
         Args:
             frames: Output frames after the first; by default those of the stage, else one second.
             output: USD file to write; only for a scene that came from a stage.
-            copy_scene: Copy the scene beside the output instead of pointing to it.
+            copy_scene: Copy the scene beside the output instead of pointing to it; one with unsaved edits always is.
             resume: Go on with the run at the output, of the same scene with the same options, if there is one; on a CPU
                 it ends with the bits of a run that was never interrupted.
             on_frame: Called after each frame with its number, from 0; returning False ends the run.

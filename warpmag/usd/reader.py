@@ -37,7 +37,7 @@ from warpmag.usd.schemas import (
     moment_of,
     settings_of,
 )
-from warpmag.usd.session import instance_findings, instances_around
+from warpmag.usd.session import instance_findings, instances_around, unsaved_layers
 from warpmag.usd.slips import kind_findings, stray_findings
 from warpmag.usd.swarms import Swarm, swarms_of
 from warpmag.usd.transforms import TransformCheck, is_body, is_collider
@@ -258,6 +258,8 @@ def survey(stage: Usd.Stage) -> StageContents:
     """Find out what a stage holds and everything that is wrong with it."""
     contents = StageContents()
     contents.findings += [*_metadata_findings(stage), *unit_findings(stage)]
+    unsaved = "has edits in this process that are not saved: a run has them, and writes a copy of the scene with them"
+    contents.findings += [Finding(layer.realPath, unsaved, "warning") for layer in unsaved_layers(stage)]
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     transforms, keys = TransformCheck(), KeyReader(stage)
     for prim in prims:

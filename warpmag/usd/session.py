@@ -108,6 +108,11 @@ def _opinion(spec: Sdf.PrimSpec) -> Sdf.PrimSpec | None:
     return spec if says else next((one for child in spec.nameChildren if (one := _opinion(child))), None)
 
 
+def unsaved_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
+    """Return the layers with files, of those a stage is made of, that this process has edited and not saved."""
+    return [layer for layer in stage.GetUsedLayers() if layer.realPath and layer.dirty]
+
+
 def without_held(stage: Usd.Stage) -> Usd.Stage:
     """Return the stage without the values that are held at one moment."""
     return _opened(stage, list(stage.GetSessionLayer().subLayerPaths))

@@ -29,7 +29,7 @@ from warpmag.usd.placements import Placements
 from warpmag.usd.reader import copied_metadata
 from warpmag.usd.samples import SampleFile
 from warpmag.usd.scene_copy import copy_scene, file_with
-from warpmag.usd.session import INSTANCES, added_layer, as_written, instances_around
+from warpmag.usd.session import INSTANCES, added_layer, as_written, instances_around, unsaved_layers
 from warpmag.usd.swarms import Swarm
 from warpmag.usd.units import units_of
 
@@ -106,7 +106,7 @@ class CacheWriter:
             magnet_paths: Prims of the magnets, in the order of the frames' moments.
             swarms: Instancers that hold some of the bodies and stay instancers.
             copy_scene: Copy the scene beside the root, as is right for a bundled one, instead of pointing to it. A
-                scene that is no file is always copied.
+                scene that is no file, or has edits that are not saved, is always copied.
             frames: Frames that are expected; without it the file may become longer than it has to be.
             options: What a run that goes on from this one must have in common with it, besides the scene.
 
@@ -115,7 +115,7 @@ class CacheWriter:
         """
         self._stage, self._units = stage, units_of(stage)
         self._clock = stage_clock(stage)
-        self._copy_scene = copy_scene or stage.GetRootLayer().anonymous
+        self._copy_scene = copy_scene or stage.GetRootLayer().anonymous or bool(unsaved_layers(stage))
         scene = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
         self._output = Output(path, scene, copy_scene=self._copy_scene)
         self._rows = _Rows(body_paths, magnet_paths, swarms)
