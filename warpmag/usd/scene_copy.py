@@ -56,7 +56,7 @@ def file_with(path: str) -> str:
 
 
 def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path], *, edited: bool) -> None:
-    """Let the copy of ``layer`` name the other copies and have its edits; relative to its folder all names are right."""
+    """Let the copy of ``layer`` name the other copies and have its edits; names relative to its folder stay right."""
     changed = edited
     resolver = Ar.GetResolver()
 
