@@ -56,6 +56,22 @@ def test_parts_apart_are_dipoles_to_each_other(device):
     np.testing.assert_allclose(polarizability(body, math.inf, device), expected, rtol=2e-3)  # rtol of the solves
 
 
+@pytest.mark.parametrize("spacing", [8.0, 20.0, 1e10, 1e38])
+def test_a_spacing_larger_than_the_body_is_as_large_as_the_body(spacing):
+    """The L is 6 m wide; a spacing of 1e38 m overflowed, and 1e10 m had one test point in all of it."""
+    body, wanted = (lattice.fill(L_SHAPE, one, together=True) for one in (spacing, 6.0))
+    np.testing.assert_array_equal(body.positions, wanted.positions)
+    np.testing.assert_array_equal(body.volumes, wanted.volumes)
+    builder = newton.ModelBuilder()
+    warpmag.register_custom_attributes(builder)
+    magnet = builder.add_body()
+    for solid in L_SHAPE:
+        builder.add_shape_box(magnet, xform=(solid.position, (0.0, 0.0, 0.0, 1.0)), hx=1.0, hy=1.0, hz=1.0)
+    warpmag.add_inducible(builder, magnet, saturation=1.7e6, moment_spacing=spacing)
+    (magnet,) = warpmag.Magnetics(builder.finalize(device="cpu")).magnets
+    assert np.isfinite(magnet.lattice.coupling.common).all()
+
+
 @pytest.mark.parametrize(
     "solids",
     [

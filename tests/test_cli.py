@@ -47,6 +47,16 @@ def test_run_writes_a_stage_and_a_summary(scene, device, tmp_path, capfd):
     assert stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("warpmag:moment").GetNumTimeSamples() == 4
 
 
+@pytest.mark.parametrize("said", ["", "Unable to allocate 9 EiB"])
+def test_too_little_memory_is_one_line(scene, said, monkeypatch, capsys):
+    def load(*_, **__):
+        raise MemoryError(*[said] * bool(said))
+
+    monkeypatch.setattr(cli, "_load", load)
+    assert cli.main(["run", str(scene)]) == cli.FAILED
+    assert capsys.readouterr().err == f"warpmag: not enough memory{f' ({said})' * bool(said)}\n"
+
+
 def test_version(capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main(["--version"])

@@ -5,12 +5,14 @@ import shutil
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Tf
 
-from warpmag.errors import InputError
+from warpmag import cli
+from warpmag.errors import InputError, one_line
 from warpmag.usd import first_reading, open_stage
 
 HEAD = "#usda 1.0\n"
@@ -167,6 +169,68 @@ def test_long_layers_of_a_run_have_their_time(tmp_path, monkeypatch):
     monkeypatch.setattr(subprocess, "run", noted)
     assert not first_reading.first_reading(root)
     assert limits == [50]
+
+
+def many_specs(path):
+    """A binary stage whose table of specs says to have 65,536 more, of each of which USD then complains."""
+    content = bytearray(crate(path).read_bytes())
+    entry = content.rindex(b"SPECS\0")
+    place = int.from_bytes(content[entry + 16 : entry + 24], "little")
+    content[place + 2] = 1
+    path.write_bytes(content)
+    return path
+
+
+def test_a_long_complaint_is_cut_before_it_goes_anywhere(tmp_path):
+    """With another byte changed it would be 640 MB, of which a line made character by character takes 5 GB."""
+    path = many_specs(tmp_path / "stage.usdc")
+    with pytest.raises(Tf.ErrorException) as caught:
+        Sdf.Layer.OpenAsAnonymous(str(path))
+    assert len(caught.value.args[0].commentary) > 1e6
+    assert len(first_reading.failure(caught.value)) <= 1000
+    assert 0 < len(first_reading.first_reading(path)) < 1100
+    with pytest.raises(InputError, match=r"stage.usdc: not a USD file \(Corrupt asset"):
+        open_stage(path)
+
+
+def test_a_line_of_a_very_long_text_takes_no_memory():
+    text = "x" * 20_000_000
+    tracemalloc.start()
+    line = one_line(text)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert line == f"{'x' * 400} ... {'x' * 200}"
+    assert most < 100_000  # bytes; a list of its characters would have 8 for each
+
+
+def test_the_process_gets_no_more_memory_than_there_is_here(tmp_path):
+    """Or it would read what cannot be read here."""
+    program = (
+        "import resource, runpy; resource.setrlimit(resource.RLIMIT_AS, (1 << 31, 1 << 32)); "
+        f"reading = runpy.run_path({first_reading.__file__!r}); reading['_limit'](7); "
+        "print(*(resource.getrlimit(getattr(resource, f'RLIMIT_{name}'))[0] for name in ('AS', 'CORE', 'CPU')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(1 << 31), "0", "7"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "file", "name"),
+    [
+        (MemoryError, "reader", "hold"),
+        (RecursionError, "check", "complete_instances"),
+        (OverflowError, "check", "validate"),
+        (SystemError, "check", "swarms_of"),
+    ],
+)
+def test_whatever_reading_ends_with_is_one_line_about_the_file(kind, file, name, tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise kind("too much")
+
+    path = crate(tmp_path / "stage.usdc")
+    monkeypatch.setattr(sys.modules[f"warpmag.usd.{file}"], name, fail)
+    assert cli.main(["check", str(path)]) == cli.BAD_INPUT
+    assert capsys.readouterr().err == f"warpmag: {path}: USD cannot read it (too much)\n"
 
 
 def test_a_name_of_variants_that_are_not_there_is_damage(tmp_path):

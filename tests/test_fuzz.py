@@ -3,14 +3,19 @@
 Three of each source by default, seventeen more with ``--long``, and as many as wanted with ``python -m tests.fuzz``.
 """
 
+import math
 import os
 import signal
 import time
 
 import pytest
-from fuzz import campaign
+from fuzz import campaign, truth
 from fuzz.campaign import BAD_INPUT, Campaign, Verdict, in_process, judge, make
 from fuzz.sources import author
+from pxr import Usd
+from small_stages import physics, write
+
+from warpmag.engine.scene import import_scene
 
 FEW, MANY, SEED = range(21), range(21, 140), 20
 """Mutants that are judged by default, and with ``--long``; sources take turns."""
@@ -39,6 +44,40 @@ def test_spoiled_stages_are_refused_or_run(numbers, device, sources, tmp_path):
     assert [(one.number, one.done, one.problems) for one in verdicts if one.problems] == []
     refused = sum(one.run == BAD_INPUT for one in verdicts)
     assert len(numbers) // 5 < refused < len(numbers)  # the mutator does neither too little nor too much
+
+
+WEIGHS = {
+    "its material": ("", "", 7870.0),
+    "its own density": ("float physics:density = 500", "", 500.0),
+    "that of what is bound": ("rel material:binding:physics = </World/Oak>", "float physics:density = 700", 700.0),
+    "nothing else": ("rel material:binding:physics = </World/Oak>", "", 7870.0),
+}
+
+
+@pytest.mark.parametrize("metres", [1.0, 0.01])
+@pytest.mark.parametrize("case", WEIGHS)
+def test_what_a_named_material_weighs_is_known_to_both(case, metres, tmp_path):
+    """Of USD alone as the campaign reads it, and of the model."""
+    lines, of_oak, density = WEIGHS[case]
+    schemas = "RigidBody Collision Mass".split()
+    iron = f"""def Sphere "Ball" (prepend apiSchemas = [{"".join(f'"Physics{one}API", ' for one in schemas)}
+        "MaterialBindingAPI", "WarpmagMagnetAPI"]) {{
+        uniform token warpmag:material = "iron"
+        {lines}
+    }}
+    def Material "Oak" (prepend apiSchemas = ["PhysicsMaterialAPI"]) {{
+        {of_oak}
+    }}
+    """
+    path = write(tmp_path, physics(), iron)
+    path.write_text(path.read_text().replace("metersPerUnit = 1", f"metersPerUnit = {metres}"))
+    stage = Usd.Stage.Open(str(path))
+    usual = density if "density" not in lines + of_oak else density / metres**3  # the stage's own in its own unit
+    wanted = 4.0 / 3.0 * math.pi * usual * metres**3
+    reading = truth.Reading(stage)
+    assert reading.mass(stage.GetPrimAtPath("/World/Ball")) == pytest.approx(wanted, rel=1e-6)
+    scene = import_scene(path)
+    assert scene.builder.body_mass[scene.bodies["/World/Ball"]] == pytest.approx(wanted, rel=1e-5)  # single precision
 
 
 @pytest.mark.parametrize(("batch", "workers"), [(1, 1), (1, 3), (5, 2), (50, 4)])

@@ -5,6 +5,7 @@ Runs are children that are really killed. What they leave is compared, bit by bi
 
 import contextlib
 import errno
+import json
 import math
 import os
 import random
@@ -13,8 +14,9 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdPhysics
+from pxr import Sdf, Usd, UsdPhysics, UsdUtils
 from run_server import RunServer
 
 from warpmag import InputError, Simulation, cli
@@ -219,6 +221,42 @@ def test_a_scene_edited_in_memory_is_another_scene(scene, tmp_path, device, alwa
     assert layer.dirty
 
 
+@pytest.mark.parametrize("kind", ["below", "package"])
+def test_what_is_written_of_a_scene_edited_in_memory_has_the_edits(kind, scene, tmp_path, device):
+    """The file has not, and what is read of the result elsewhere would be a motion of other things."""
+    edited, output = tmp_path / "scene" / "edited.usda", tmp_path / "out" / "out.usda"
+    edited.parent.mkdir()
+    edited.write_bytes(scene.read_bytes())
+    path = edited
+    if kind == "below":
+        path = edited.with_name("root.usda")
+        layer = Sdf.Layer.CreateNew(str(path))
+        layer.pseudoRoot.SetInfo("metersPerUnit", 1.0)
+        layer.subLayerPaths.append(str(edited))
+        layer.Save()
+    if kind == "package":
+        path = edited.with_suffix(".usdz")
+        assert UsdUtils.CreateNewUsdzPackage(str(edited), str(path))
+    layer = Sdf.Layer.FindOrOpen(str(path if kind == "package" else edited))
+    rub(layer, 0.25)
+    simulation = Simulation(path, device=device)
+    (warning,) = [line for line in simulation.warnings() if "not saved" in line]
+    assert warning.startswith(f"{layer.realPath}: has edits in this process that are not saved")
+    if kind == "package":
+        with pytest.raises(InputError, match=r"edited.usdz: has edits that are not saved, and is in a package"):
+            simulation.run(1, output=output)
+        return
+    simulation.run(1, output=output)
+    program = (
+        f"from pxr import Usd, UsdPhysics\nstage = Usd.Stage.Open({str(output)!r})\n"
+        "found = [UsdPhysics.MaterialAPI(one).GetDynamicFrictionAttr().Get() for one in stage.Traverse()]\n"
+        "print({one for one in found if one is not None})"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "{0.25}\n"
+    layer.Reload(force=True)
+
+
 def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, always, capsys):
     output = tmp_path / "out.usda"
     Simulation(scene, device=device).run(6, output=output, on_frame=lambda frame: frame < 3)
@@ -235,6 +273,21 @@ def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, alw
         printed = capsys.readouterr()
         (line,) = printed.err.splitlines()
         assert line.startswith("warpmag: ") and "out.usda" in line and message in line and not printed.out
+    checkpoint = tmp_path / "out.resume.npz"
+    content = checkpoint.read_bytes()
+    with np.load(checkpoint) as saved:
+        arrays = dict(saved)
+    noted = json.loads(str(arrays.pop("about")))
+    for name, message in [
+        ("buffers", "its checkpoint has no 'buffers'"),
+        ("stat.steps", "its checkpoint has no 'steps'"),
+        ("state.0", "checkpoint: state.0 is not that of this run"),
+    ]:
+        left = {key: array for key, array in arrays.items() if key != f"state/{name}"}
+        np.savez(checkpoint, about=np.array(json.dumps({**noted, "names": sorted(left)})), **left)
+        assert cli.main([*command, str(scene), "--frames", "6"]) == 2
+        assert capsys.readouterr().err == f"warpmag: {output}: cannot resume, {message}\n"
+    checkpoint.write_bytes(content)
     assert cli.main([*command, str(scene), "--frames", "6"]) == 0
     assert "written" in capsys.readouterr().out
     assert cli.main([*command, str(scene), "--frames", "6"]) == 0

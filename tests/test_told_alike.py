@@ -4,8 +4,10 @@ import pytest
 from pxr import Usd, UsdGeom, UsdPhysics
 from small_stages import FIELD, LEFT, RIGHT, A, B, R, ball, joint, physics, told, write
 
+from warpmag import Simulation
+from warpmag.errors import InputError
 from warpmag.magnets import Magnet, MagneticSettings
-from warpmag.usd import author_magnet, author_settings, check
+from warpmag.usd import author_magnet, author_settings, check, refusals
 
 OPEN = """def Mesh "Open" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI",
     "PhysicsMeshCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"]) {{
@@ -111,6 +113,66 @@ SLIPS = {
         "WarpMagMagnetAPI has no effect: there is no such schema, the nearest is WarpmagMagnetAPI",
     ),
 }
+
+
+IN_INSTANCE = {
+    "a prim": (ball("Extra", (0.1, 0, 1)), "Extra"),
+    "a value": ('over "Ball" {\n double radius = 0.02\n}\n', "Ball"),
+    "a schema": ('over "Ball" (prepend apiSchemas = ["PhysicsMassAPI"]) {\n}\n', "Ball"),
+    "a cycle": ('def "Again" (references = </World/Copy>) {\n}\n', "Again"),
+}
+KINDS = f'def Xform "Kinds" {{\n{ball("Ball", (0, 0, 1))}}}\n'
+COPY = 'def Xform "Copy" (instanceable = true\n references = </World/Kinds>) {{\n{}}}\n'
+NESTED = 'def Xform "Outer" (instanceable = true\n references = </World/Inner>) {\n}\n'
+
+
+@pytest.mark.parametrize("metres", [1, 0.01])
+@pytest.mark.parametrize("case", IN_INSTANCE)
+def test_what_usd_passes_over_in_an_instance_is_refused(case, metres, tmp_path):
+    """It would count in the result of a run, which makes such an instance editable, or when units are converted."""
+    text, name = IN_INSTANCE[case]
+    path = write(tmp_path, physics(), KINDS, COPY.format(text))
+    path.write_text(path.read_text().replace("metersPerUnit = 1", f"metersPerUnit = {metres}"))
+    with pytest.raises(InputError) as caught:
+        Simulation(path, device="cpu")
+    assert str(caught.value).startswith(f"/World/Copy: USD passes over /World/Copy/{name}, for it is in an instance")
+
+
+def test_so_is_what_an_instance_in_an_instance_says(tmp_path, device, capsys):
+    inner = f'def Xform "Inner" {{\n{COPY.format(IN_INSTANCE["a value"][0])}}}\n'
+    path = write(tmp_path, physics(), KINDS, inner.replace("def Xform", "over", 1), NESTED)
+    (error,), _ = told(path, tmp_path, device, capsys)
+    assert error.startswith("/World/Outer/Copy: USD passes over /World/Inner/Copy/Ball, for it is in an instance")
+
+
+def test_an_instance_that_says_nothing_runs(tmp_path, device, capsys):
+    """Nor does one that is only seen, or that says of itself where it is, or in a variant, which instances share."""
+    seen = KINDS.replace("Kinds", "Seen").replace("Physics", "Nothing").replace("WarpmagMagnetAPI", "NothingAPI")
+    copy_of_seen = COPY.replace("Kinds", "Seen").replace("Copy", "CopyOfSeen").format(IN_INSTANCE["a value"][0])
+    large = 'variantSet "size" = {\n "large" {\n over "Ball" {\n double radius = 0.02\n}\n}\n}\n'
+    variant, moved = (
+        COPY.replace("Copy", name).format(
+            f"""{text}double3 xformOp:translate = ({x}, 0, 0)
+            uniform token[] xformOpOrder = ["xformOp:translate"]\n"""
+        )
+        for name, text, x in (("Copy", large, 1), ("Moved", 'over "Ball" {\n}\n', 2))
+    )
+    variant = variant.replace("true", 'true\n variantSets = "size"\n variants = {\n string size = "large"\n}')
+    path = write(tmp_path, physics(), KINDS, seen, copy_of_seen, variant, moved)
+    errors, _ = told(path, tmp_path, device, capsys, frames=1)
+    assert errors == []
+    stage, copies = Usd.Stage.Open(str(tmp_path / "out.usda")), ["/World/Copy/Ball", "/World/Moved/Ball"]
+    assert [stage.GetPrimAtPath(one).GetAttribute("radius").Get() for one in copies] == [0.02, R]
+
+
+def test_what_newton_complains_of_is_told_in_the_same_words():
+    """USD names a stage with its session layer, which has an address."""
+    with pytest.raises(InputError) as caught, refusals("scene.usda", "import"):
+        raise ValueError("Cycle: @a.usda@,@anon:0x56157832e270:a-session.usda@</A/B> CANNOT reference: @a.usda@</A>")
+    assert (
+        str(caught.value)
+        == "scene.usda: Newton cannot import it (Cycle: @a.usda@</A/B> CANNOT reference: @a.usda@</A>)"
+    )
 
 
 def test_slips_are_warnings_of_both(device, tmp_path, capsys):

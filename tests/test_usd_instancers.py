@@ -239,6 +239,14 @@ REFUSED = {
         "quath[] orientations = [(1, 0, 0, 0), (1, 0, 1, 0)]",
         "orientations of instance 1 has length 1.41421 in place of 1",
     ),
+    **{
+        f"{name} of {kind}": (["Ball"], [0], [(0, 0, 0)], f"{kind} {name} = {value}", f"{name} is no array of {wanted}")
+        for name, kind, value, wanted in (
+            ("orientations", "Odd[]", "[(1, 0, 0, 0)]", "quaternions"),  # a type that USD does not know
+            ("orientationsf", "float[]", "[1]", "quaternions"),
+            ("scales", "Odd[]", "[(1, 1, 1)]", "vectors"),
+        )
+    },
     "a prototype that is not there": (["Gone"], [0], [(0, 0, 0)], "", "/World/Many/Kinds/Gone, which is not there"),
     "a place that is no number": (["Ball"], [0], [(0, 0, "nan")], "", "transform is not finite"),
     "too many, one unlike the others, so that they become prims": (

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import itertools
+import json
 import os
 import random
 import signal
@@ -15,6 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
 from warpmag.usd import CacheWriter, open_stage
+from warpmag.usd.output import Output
 
 PATHS = [f"/World/Ball_{k}" for k in range(3)]
 NAMES = ("xformOp:translate:warpmag", "xformOp:orient:warpmag", "physics:velocity", "physics:angularVelocity")
@@ -247,7 +249,69 @@ def test_a_checkpoint_that_is_none_is_refused_in_one_line(tmp_path, stage):
         with pytest.raises(InputError, match=r"run\.resume\.npz: cannot be read") as refused:
             CacheWriter(stage, output, PATHS, PATHS).resume()
         assert "\n" not in str(refused.value)
-    (tmp_path / "run.resume.npz").unlink()
+
+
+@pytest.fixture
+def begun(tmp_path, stage, monkeypatch):
+    """The checkpoint of a run that was ended."""
+    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
+    writer = CacheWriter(stage, tmp_path / "run.usda", PATHS, PATHS)
+    add(writer, make_frames(3), range(3), state=lambda: {"seed": np.arange(5)})
+    writer.close(complete=False)
+    return tmp_path / "run.resume.npz"
+
+
+def refusal(stage, checkpoint):
+    """Why a run cannot be resumed."""
+    with pytest.raises(InputError) as refused:
+        CacheWriter(stage, checkpoint.with_name("run.usda"), PATHS, PATHS).resume()
+    return str(refused.value).removeprefix(f"{checkpoint}: ")
+
+
+def test_a_checkpoint_of_another_version_is_refused_in_one_line(begun, stage):
+    """Without a number, as they were once: with the run's options alone."""
+    with np.load(begun) as saved:
+        arrays = dict(saved)
+    noted = json.loads(str(arrays.pop("about")))
+    for about in (noted["run"], {**noted, "format": 0}, {**noted, "format": noted["format"] + 1}, "kelvin"):
+        np.savez(begun, about=np.array(json.dumps(about)), **arrays)
+        assert refusal(stage, begun) == "cannot be resumed, another version of warpmag has written it"
+    np.savez(begun, about=np.array(json.dumps(noted)), **{name: arrays[name] for name in list(arrays)[1:]})
+    assert refusal(stage, begun) == "cannot be read (some of it is missing)"
+    np.savez(begun, about=np.array(json.dumps(noted)), **arrays)
+    with CacheWriter(stage, begun.with_name("run.usda"), PATHS, PATHS) as writer:
+        assert np.array_equal(writer.resume().state["seed"], np.arange(5))
+
+
+def test_a_damaged_checkpoint_is_refused_or_read(begun, stage):
+    """Whatever a byte is changed to: Python's reader of archives has many words for it."""
+    content, chance = begun.read_bytes(), random.Random(3)
+    with np.load(begun) as saved:
+        whole = dict(saved)
+    for place in chance.sample(range(len(content)), 150) + list(range(12)):
+        begun.write_bytes(content[:place] + bytes([content[place] ^ chance.randrange(1, 256)]) + content[place + 1 :])
+        try:
+            _, arrays = Output(begun.with_name("run.usda"), set()).load_checkpoint()
+        except InputError as error:
+            assert str(error).startswith(f"{begun}: cannot be read (") and not str(error).endswith("()")
+        else:  # when it was written, say
+            assert all(np.array_equal(array, whole[name]) for name, array in arrays.items())
+
+
+def test_a_run_whose_cache_was_cut_is_refused_in_one_line(begun, stage):
+    cache, output = begun.with_name("run.cache.usdc"), begun.with_name("run.usda")
+    content = cache.read_bytes()
+    for size in range(0, len(content), len(content) // 20):
+        cache.write_bytes(content[:size])
+        with pytest.raises(InputError, match=f"^{cache}: "):
+            CacheWriter(stage, output, PATHS, PATHS).resume()
+    cache.unlink()
+    with pytest.raises(InputError, match=f"^{cache}: "):
+        CacheWriter(stage, output, PATHS, PATHS).resume()
+
+
+def test_what_is_no_run_is_not_resumed(tmp_path, stage):
+    output = tmp_path / "run.usda"
     output.write_text("#usda 1.0\n")
     with pytest.raises(InputError, match=r"run\.usda: nothing to resume"):
         CacheWriter(stage, output, PATHS, PATHS).resume()

@@ -137,6 +137,7 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     half = np.array([np.abs(one.rotation) @ (0.5 * (one.upper - one.lower)) for one in own])
     middle = np.array([one.to_body(0.5 * (one.lower + one.upper)) for one in own])
     lower, upper = (middle - half).min(axis=0), (middle + half).max(axis=0)
+    spacing = min(spacing, (upper - lower).max())  # cells that are larger yet have fewer test points in the shapes
     large = np.array([part.volume >= _SMALL * home.volume for part in parts])
     thinnest = np.where(large[:, None], half, np.inf).argmin(axis=0), np.arange(3)
     thin, face = 2.0 * half[thinnest], (middle - half)[thinnest]

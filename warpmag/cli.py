@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from warpmag import __version__
-from warpmag.errors import InputError, SimulationError
+from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
 from warpmag.progress import Progress, silence
 from warpmag.ranks import Ranks, by_first, ranks
@@ -76,6 +76,8 @@ def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]
         return FAILED, str(error)
     except _Stopped as stopped:
         return STOPPED + stopped.number, str(stopped)
+    except MemoryError as error:
+        return FAILED, one_line(f"not enough memory ({error})" if str(error) else "not enough memory")
     except BrokenPipeError:
         silence(1)
         return STOPPED + signal.SIGPIPE, "nobody reads the standard output any more"

@@ -6,8 +6,9 @@ _BEGIN, _END = 400, 200
 
 def one_line(text: str) -> str:
     """Return a text as one line that a terminal shows as it is, its middle left out where it is very long."""
-    line = "".join(one if one.isprintable() else " " for one in text)
-    return line if len(line) <= _BEGIN + _END else f"{line[:_BEGIN]} ... {line[-_END:]}"
+    if len(text) > _BEGIN + _END:  # first of all: of a gigabyte the characters one by one are more than memory holds
+        text = f"{text[:_BEGIN]} ... {text[-_END:]}"
+    return "".join(one if one.isprintable() else " " for one in text)
 
 
 class InputError(ValueError):

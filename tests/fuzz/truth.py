@@ -12,6 +12,8 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
 WRITTEN = ("physics:velocity", "physics:angularVelocity", "warpmag:moment")
 FAST = 1000.0  # degrees/s
 DENSITY = 1000.0  # kg/m³: UsdPhysics where nobody gives one
+DENSITIES = {"iron": 7870.0, "N42": 7500.0}
+"""What the named materials of the sources weigh by any handbook [kg/m³], where nobody gives anything else."""
 
 
 def differences(path: Path, output: Path, simulation) -> list[str]:
@@ -139,7 +141,13 @@ class Reading:
         material = self.material(prim)
         given = material and "PhysicsMaterialAPI" in material.GetAppliedSchemas()
         own = given and self.get(material, "physics:density", 0.0)
-        return own or DENSITY * self.metres**3 / self.kilograms
+        return own or self.usual_density(prim) * self.metres**3 / self.kilograms
+
+    def usual_density(self, prim) -> float:
+        """Density of a collider of which nobody says anything [kg/m³]: that of the magnet's material, or water's."""
+        magnets = [one for one in (prim, self.above(prim)) if one and "WarpmagMagnetAPI" in one.GetAppliedSchemas()]
+        named = [name for one in magnets if (name := self.get(one, "warpmag:material"))]
+        return DENSITIES[named[0]] if named else DENSITY
 
     def own_mass(self, prim) -> float:
         """Mass that a prim gives itself, 0 where it does not."""

@@ -104,8 +104,13 @@ class Recorder:
             raise InputError(f"frames: {output} has {found.time:g} s already, more than {frames} frames")
         if found.state is not None:
             names = [name for name in found.state if name.startswith(_STATISTICS)]
-            self._stepper.load(found.state)
-            self._statistics.load({name.removeprefix(_STATISTICS): found.state[name] for name in names})
+            try:
+                self._stepper.load(found.state)
+                self._statistics.load({name.removeprefix(_STATISTICS): found.state[name] for name in names})
+            except KeyError as name:
+                raise InputError(f"{output}: cannot resume, its checkpoint has no {name}") from None
+            except InputError as error:
+                raise InputError(f"{output}: cannot resume, {error}") from None
         elif done < steps:
             raise InputError(f"frames: the run of {output} ended at {found.time:g} s, there is nothing to resume")
         return True, found.state is None

@@ -30,6 +30,7 @@ from warpmag.usd import (
     inspect,
     open_apart,
     prepare_joints,
+    readable,
     refusals,
     strained_joints,
     swarms_of,
@@ -94,6 +95,11 @@ def import_scene(
     Raises:
         InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
     """
+    with readable(str(path)):
+        return _import(path, visuals, time_code, articulations)
+
+
+def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, articulations: bool) -> ImportedScene:
     stage, apart = open_apart(path, time_code)
     report = inspect(stage, path)
     if report.errors:

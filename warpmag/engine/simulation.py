@@ -16,7 +16,7 @@ from warpmag.arrays import resolve_device
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
-from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings
+from warpmag.engine.fitness import articulate, check_control, check_model, check_places, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -101,6 +101,7 @@ class Simulation:
         )
         how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
         self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
+        check_places(self.model, self._magnetics.magnets, solver)
         all_ranks = ranks()
         graphs &= all_ranks is None  # what merges the sums of ranks is in no graph of a step
         self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
@@ -325,7 +326,7 @@ class Simulation:
         Args:
             frames: Output frames after the first; by default those of the stage, else one second.
             output: USD file to write; only for a scene that came from a stage.
-            copy_scene: Copy the scene beside the output instead of pointing to it.
+            copy_scene: Copy the scene beside the output instead of pointing to it; one with unsaved edits always is.
             resume: Go on with the run at the output, of the same scene with the same options, if there is one; on a CPU
                 it ends with the bits of a run that was never interrupted.
             on_frame: Called after each frame with its number, from 0; returning False ends the run.

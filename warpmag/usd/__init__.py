@@ -11,7 +11,7 @@ from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
 from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_sources
 from warpmag.usd.densities import give_densities
-from warpmag.usd.guard import refusals
+from warpmag.usd.guard import readable, refusals
 from warpmag.usd.instancers import complete_instances
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
 from warpmag.usd.looks import author_surface, metalness
@@ -75,6 +75,7 @@ __all__ = [
     "prepare_joints",
     "read_magnets",
     "read_recording",
+    "readable",
     "refusals",
     "stage_clock",
     "strained_joints",

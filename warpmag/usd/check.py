@@ -65,10 +65,11 @@ def check(path: str | os.PathLike) -> StageReport:
         InputError: The file cannot be opened as a stage at all.
     """
     stage, apart = open_apart(path)
-    complete_instances([one for one in apart if not one.whole])
-    report = inspect(stage, path)
-    for swarm in swarms_of(stage, apart):
-        _name_balls(report.contents, swarm)
+    with readable(str(path)):
+        complete_instances([one for one in apart if not one.whole])
+        report = inspect(stage, path)
+        for swarm in swarms_of(stage, apart):
+            _name_balls(report.contents, swarm)
     return report
 
 

@@ -17,6 +17,8 @@ import numpy as np
 BOOL, DOUBLE, STRING, TOKEN, QUATF, VEC3D, VEC3F, DICTIONARY = 1, 9, 10, 11, 17, 23, 24, 31
 TOKEN_VECTOR, SPECIFIER, VARIABILITY, TIME_SAMPLES, DOUBLE_VECTOR = 41, 42, 44, 46, 48
 """Types of values, by their numbers in references."""
+MAGIC = b"PXR-USDC"
+"""What a crate file begins with."""
 HEAD = 24
 """Size of what begins the time samples of an attribute, see ``samples.py`` [bytes]."""
 CONTENTS = 16
@@ -138,7 +140,7 @@ class Overs:
         for name, data in sections.items():
             contents.append(struct.pack("<16sqq", name.encode(), place, len(data)))
             place += len(data)
-        struct.pack_into("<8s8s", self._values, 0, b"PXR-USDC", _VERSION)
+        struct.pack_into("<8s8s", self._values, 0, MAGIC, _VERSION)
         structure = b"".join([*sections.values(), *contents])
         values = bytes(self._values) + bytes(start - heads)
         types = np.array(self._types, dtype=np.uint64)

@@ -21,8 +21,10 @@ DEEPEST_NESTING = 5_000
 """Brackets within brackets of a text. USD reads 10,000 on the stack of a main thread, and dies of 100,000."""
 MOST_PRIMS = 500_000
 """Prims of a stage."""
-FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError)
-"""What USD raises over a stage; its own errors are of the first kind."""
+FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError, OverflowError, SystemError)
+"""What USD raises over a stage; its own errors are of the first kind, and so is too deep a recursion."""
+_LONGEST = 1_000
+"""Characters that are kept of what USD says: of a damaged file that may be a gigabyte."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 5e6
 """CPU time that a reading may take [s], and bytes, those of named files among them, for which a second more."""
 _LOADED = 2
@@ -36,6 +38,7 @@ _TWICE = 1 << 28
 """Bytes of a binary layer that is read twice; a longer one would take too much memory and time, as text."""
 _CHANGING = re.compile(r" LZ4 error code: -?\d+")
 """What USD says of the same file differently each time."""
+NOT_USD = "not a USD file"
 _NOT_TEXT = "text that is not UTF-8"
 _PRINTED = {
     b"posix_madvise": "damaged: its table of contents names bytes beyond its end",
@@ -106,11 +109,16 @@ def _depth(text: bytes) -> int:
 
 def failure(error: Exception) -> str:
     """Return the first thing that an error raised by USD says, on one line."""
-    if not isinstance(error, UnicodeDecodeError):
-        with contextlib.suppress(UnicodeDecodeError):  # it may quote the file
-            said = getattr(error.args[0], "commentary", error.args[0]) if error.args else ""
-            return _CHANGING.sub("", (str(said).strip().splitlines() or [type(error).__name__])[0])
-    return _NOT_TEXT
+    if isinstance(error, UnicodeDecodeError):
+        return _NOT_TEXT
+    try:
+        said = getattr(error.args[0], "commentary", error.args[0]) if error.args else ""
+    except UnicodeDecodeError:  # it quotes the file
+        return _NOT_TEXT
+    except MemoryError:
+        said = ""
+    lines = str(said)[:_LONGEST].strip().splitlines()
+    return _CHANGING.sub("", lines[0]) if lines else type(error).__name__
 
 
 def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, which has nothing of coverage's
@@ -135,8 +143,8 @@ def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, whic
                 Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
             elif not _reads_alike(layer):
                 return "damaged: USD takes some of its values from memory, not from the file"
-    except FAILURES as error:
-        return f"not a USD file ({failure(error)})"
+    except Exception as error:  # of any kind: nothing but USD is at work here
+        return f"{NOT_USD} ({failure(error)})"
     return ""
 
 
@@ -167,13 +175,13 @@ def _fill_memory(byte: int) -> None:  # pragma: no cover - in the child, too
 
 
 def _limit(seconds: int) -> None:  # pragma: no cover - in the child, too
-    """Let the process have half of the machine's memory at most, and so much CPU time [s]."""
+    """Let the process have half of the machine's memory at most, and so much CPU time [s], never more than it has."""
     import resource  # noqa: PLC0415 - not everywhere
 
     half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
-    resource.setrlimit(resource.RLIMIT_AS, (half, resource.RLIM_INFINITY))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
+    for kind, most in ((resource.RLIMIT_AS, half), (resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, seconds)):
+        soft, hard = resource.getrlimit(kind)
+        resource.setrlimit(kind, (most if soft == resource.RLIM_INFINITY else min(soft, most), hard))
 
 
 if __name__ == "__main__":  # pragma: no cover - in the child, too

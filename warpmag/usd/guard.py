@@ -14,6 +14,8 @@ from warpmag.usd.values import quiet
 
 _LOSSES = re.compile(r"[Ss]kipp|Invalid|Ignoring(?! body-level density)|unspecified|zero mass|not imported|result\.")
 """What a warning says by which something of the stage is lost; the others are remarks."""
+_SESSION = re.compile(r",@anon:[^@]*@")
+"""How USD names a stage's session layer, by an address that is another one each time."""
 _TOLD = "Custom attribute '"
 """What a warning begins with of which the reader has told already, and named the prim."""
 
@@ -33,9 +35,9 @@ def refusals(where: str, what: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # of any kind: nothing of Newton's or Warp's is to reach the user as a traceback
-        said = failure(error) if isinstance(error, Tf.ErrorException) else _line(error)
+        said = failure(error) if isinstance(error, Tf.ErrorException) else line_of(error)
         raise InputError(f"{where}: Newton cannot {what} it ({said or type(error).__name__})") from None
-    for said in (*(_line(one.message) for one in caught), *logged):
+    for said in (*(line_of(one.message) for one in caught), *logged):
         if _LOSSES.search(said) and not said.startswith(_TOLD):
             raise InputError(f"{where}: Newton cannot {what} all of it ({said})")
 
@@ -47,7 +49,7 @@ def _logged() -> Iterator[list[str]]:
 
     class _Lines(logging.Handler):
         def emit(self, record):
-            lines.append(_line(record.getMessage()))
+            lines.append(line_of(record.getMessage()))
 
     handler, before = _Lines(logging.WARNING), logger.propagate
     logger.addHandler(handler)
@@ -60,11 +62,12 @@ def _logged() -> Iterator[list[str]]:
 
 
 @contextlib.contextmanager
-def readable(where: str) -> Iterator[None]:
+def readable(where: str, otherwise: str = "USD cannot read it") -> Iterator[None]:
     """Raise :class:`InputError` for what USD raises in the block, and keep what it has to say off stderr.
 
     Args:
         where: The stage, as messages call it.
+        otherwise: What is wrong with it then.
     """
     try:
         with quiet():
@@ -72,8 +75,9 @@ def readable(where: str) -> Iterator[None]:
     except InputError:
         raise
     except FAILURES as error:
-        raise InputError(f"{where}: USD cannot read it ({failure(error)})") from None
+        raise InputError(f"{where}: {otherwise} ({failure(error)})") from None
 
 
-def _line(text) -> str:
-    return " ".join(str(text).split())
+def line_of(text) -> str:
+    """Return a text on one line, without the session layers that it names, which USD calls otherwise each time."""
+    return " ".join(_SESSION.sub("", str(text)).split())

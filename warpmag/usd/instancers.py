@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from warpmag.errors import InputError
 from warpmag.usd.alike import ARRAYS, MOMENTS, AlikeBalls, alike, ball_in, may_be_alike, may_stay_whole
 from warpmag.usd.first_reading import MOST_PRIMS
 from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
-from warpmag.usd.session import INSTANCES, add_layer, new_layer, release_instances
+from warpmag.usd.session import INSTANCES, add_layer, new_layer, release, release_instances
 from warpmag.usd.transforms import is_body, is_collider
 from warpmag.usd.units import units_of
 
@@ -30,6 +30,7 @@ _OPERATIONS = (
 )
 """What moves an instance, in the order of operations, the array of the instancer and the type of a value."""
 _SPEEDS = "velocities", "angularVelocities"
+_TURNS = tuple, Vt.QuathArray, Vt.QuatfArray, Vt.QuatdArray
 _RESET = "!resetXformStack!"
 _LENGTH_ERROR = 0.01
 """How far from 1 the length of an orientation may be, which half precision leaves 1e-3: USD skews what is farther."""
@@ -131,7 +132,7 @@ class _Expansion:
                 break  # only seen, or what it has is elsewhere, which must not be in an instance
             while not prim.IsInstance():
                 prim = prim.GetParent()
-            Sdf.CreatePrimInLayer(self._layer_of_prims(), prim.GetPath()).instanceable = False
+            release(self._layer_of_prims(), [prim])
         return prim
 
     def _prototype_prim(self, instancer: Sdf.Path, target: Sdf.Path) -> Usd.Prim:
@@ -254,7 +255,7 @@ class _Instances:
         value = attribute.Get(time) if attribute else None
         found = np.zeros(0) if value is None else np.asarray(value)
         kinds = "if" if width else "i"
-        if value is not None and len(found) and (found.dtype.kind not in kinds or found.ndim != (2 if width else 1)):
+        if found.size and (found.dtype.kind not in kinds or found.ndim != (2 if width else 1)):
             raise InputError(f"{self._path}: {name} is no array of {'vectors' if width else 'whole numbers'}")
         if name != "protoIndices" and len(found) not in (0, self._count):
             raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
@@ -262,9 +263,12 @@ class _Instances:
 
     def _turns(self, time) -> np.ndarray:
         """Return the orientations, the precise ones if there are any, quaternions x y z w of length 1."""
-        name = "orientationsf" if len(self._prim.GetAttribute("orientationsf").Get(time) or ()) else "orientations"
-        value = self._prim.GetAttribute(name).Get(time) or ()
-        found = np.array(value, dtype=float) if len(value) else np.zeros((0, 4))
+        values = {name: self._prim.GetAttribute(name).Get(time) or () for name in ("orientations", "orientationsf")}
+        for name, value in values.items():
+            if not isinstance(value, _TURNS):
+                raise InputError(f"{self._path}: {name} is no array of quaternions")
+        name = "orientationsf" if len(values["orientationsf"]) else "orientations"
+        found = np.array(values[name], dtype=float) if len(values[name]) else np.zeros((0, 4))
         if found.shape not in ((0, 4), (self._count, 4)):
             raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
         lengths = np.linalg.norm(found, axis=1)

@@ -28,6 +28,8 @@ from warpmag.usd.values import quiet
 _SUFFIXES = (".usd", ".usda", ".usdc")
 _SCENES = (".usdc", ".usdz")
 _ABOUT = "about"
+_FORMAT = 1
+"""What a checkpoint is like. Another number for each change of what is in one, here or in what the engine carries."""
 _UNLOCKABLE = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
 """What file systems say that know no locks."""
 
@@ -164,21 +166,28 @@ class Output:
 
     def save_checkpoint(self, about: dict[str, str], arrays: dict[str, np.ndarray]) -> None:
         """Write a checkpoint, or leave the earlier one."""
+        noted = {"format": _FORMAT, "run": about, "names": sorted(arrays)}
         with open(self.temporary(self.checkpoint), "wb") as file:
-            np.savez(file, **{_ABOUT: np.array(json.dumps(about)), **arrays})
+            np.savez(file, **{_ABOUT: np.array(json.dumps(noted)), **arrays})
         self.place(self.checkpoint)
 
     def load_checkpoint(self) -> tuple[dict[str, str], dict[str, np.ndarray]] | None:
         """Return the checkpoint, None where there is none.
 
         Raises:
-            InputError: It cannot be read.
+            InputError: It cannot be read, or another version of warpmag wrote it.
         """
         try:
             with open(self.checkpoint, "rb") as file, np.load(file, allow_pickle=False) as saved:
                 arrays = dict(saved)
-            return json.loads(str(arrays.pop(_ABOUT))), arrays
+            noted = json.loads(str(arrays.pop(_ABOUT)))
         except FileNotFoundError:
             return None
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise InputError(f"{self.checkpoint}: cannot be read ({' '.join(str(error).split())})") from None
+        except (OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile) as error:
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{self.checkpoint}: cannot be read ({said})") from None
+        if not isinstance(noted, dict) or noted.get("format") != _FORMAT:
+            raise InputError(f"{self.checkpoint}: cannot be resumed, another version of warpmag has written it")
+        if noted["names"] != sorted(arrays):
+            raise InputError(f"{self.checkpoint}: cannot be read (some of it is missing)")
+        return noted["run"], arrays

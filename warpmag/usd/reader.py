@@ -7,7 +7,6 @@ metres and kilograms are converted (``units.py``), in layers of the session (``s
 """
 
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,9 +20,9 @@ from warpmag.usd.addresses import cut_off
 from warpmag.usd.alike import AlikeBalls
 from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
 from warpmag.usd.coils import PlacedSource, is_source, sources_of
-from warpmag.usd.first_reading import FAILURES, failure, first_reading
+from warpmag.usd.first_reading import NOT_USD, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
-from warpmag.usd.guard import readable
+from warpmag.usd.guard import line_of, readable
 from warpmag.usd.instancers import complete_instances, expand_instancers
 from warpmag.usd.keyed import KeyReader, make_kinematic
 from warpmag.usd.materials import material_findings
@@ -38,6 +37,7 @@ from warpmag.usd.schemas import (
     moment_of,
     settings_of,
 )
+from warpmag.usd.session import instance_findings, instances_around, unsaved_layers
 from warpmag.usd.slips import kind_findings, stray_findings
 from warpmag.usd.swarms import Swarm, swarms_of
 from warpmag.usd.transforms import TransformCheck, is_body, is_collider
@@ -52,8 +52,6 @@ from warpmag.usd.values import (
     quiet,
 )
 
-_SESSION = re.compile(r",@anon:[^@]*@")
-"""How USD names a stage's session layer, by an address that is another one each time."""
 _ORDER = "xformOpOrder"
 _COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")
 """Metadata of a layer that layers above it get from it."""
@@ -105,7 +103,8 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
         InputError: The file is missing, is not USD or does not compose.
     """
     stage, apart = open_apart(path, time_code)
-    complete_instances(apart)
+    with readable(str(path)):
+        complete_instances(apart)
     return stage
 
 
@@ -153,15 +152,12 @@ def open_motion(path: str | os.PathLike) -> tuple[Usd.Stage, list[Swarm]]:
 
 def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
     """Open a file that is there; ``path`` is what messages call it."""
-    try:
-        with quiet():  # what USD has to say goes into the error
-            stage = Usd.Stage.Open(str(full_path(file)))
-            _refresh(stage)
-            broken = [str(error) for error in stage.GetCompositionErrors()]
-    except FAILURES as error:
-        raise InputError(f"{path}: not a USD file ({failure(error)})") from None
+    with readable(str(path), NOT_USD):
+        stage = Usd.Stage.Open(str(full_path(file)))
+        _refresh(stage)
+        broken = [str(error) for error in stage.GetCompositionErrors()]
     if broken:
-        raise InputError(f"{path}: {' '.join(_SESSION.sub('', broken[0]).split())}")
+        raise InputError(f"{path}: {line_of(broken[0])}")
     return stage
 
 
@@ -262,6 +258,8 @@ def survey(stage: Usd.Stage) -> StageContents:
     """Find out what a stage holds and everything that is wrong with it."""
     contents = StageContents()
     contents.findings += [*_metadata_findings(stage), *unit_findings(stage)]
+    unsaved = "has edits in this process that are not saved: a run has them, and writes a copy of the scene with them"
+    contents.findings += [Finding(layer.realPath, unsaved, "warning") for layer in unsaved_layers(stage)]
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     transforms, keys = TransformCheck(), KeyReader(stage)
     for prim in prims:
@@ -273,6 +271,8 @@ def survey(stage: Usd.Stage) -> StageContents:
         contents.findings += stray_findings(prim)
         if is_source(prim):
             _read_sources(prim, transforms, keys, contents)
+    moved = [prim for prim in prims if prim.IsInstanceProxy() and (is_body(prim) or has_api(prim, MAGNET_API))]
+    contents.findings += instance_findings(instances_around(moved))
     contents.findings += material_findings([prim for prim in prims if str(prim.GetPath()) in contents.colliders])
     if not any(has_api(prim, MAGNET_API) for prim in prims):
         contents.findings.append(Finding(stage_name(stage), f"no magnets: no prim has {MAGNET_API} applied"))

@@ -27,7 +27,7 @@ from typing import BinaryIO
 import numpy as np
 
 from warpmag.errors import InputError
-from warpmag.usd.crate import CONTENTS, DOUBLE_VECTOR, HEAD, SECTION, SECTION_NAME, LayerFile, reference
+from warpmag.usd.crate import CONTENTS, DOUBLE_VECTOR, HEAD, MAGIC, SECTION, SECTION_NAME, LayerFile, reference
 
 _AHEAD = 512
 """Frames whose references are written to a row at once, a page of the file, some rows with each frame before."""
@@ -117,14 +117,15 @@ class SampleFile:
         """Go on with a file where it was at :meth:`places`; frames since then are dropped.
 
         Raises:
-            InputError: The file is not that one, or has lost its end.
+            InputError: It is not that file, or not all of it.
+            OSError: It cannot be opened or written.
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
             known = {name: value if value.ndim else int(value) for name, value in places.items()}
             self = cls(file, sizes, _Places(**known))
-            if os.fstat(file.fileno()).st_size < self._places.size:
-                raise InputError(f"{path}: is shorter than the run left it, which cannot go on")
+            if not self._is_there():
+                raise InputError(f"{path}: cannot be resumed, it is not as the run left it")
             self._set_count(float(self.codes()[-1]))
             self._write_heads(0, len(sizes))
             stack.pop_all()
@@ -217,6 +218,14 @@ class SampleFile:
         except OSError:
             self._places, self._told = old, told  # what the file has still stands there
             raise
+
+    def _is_there(self) -> bool:
+        """Whether the file has its end, and has counted the frames."""
+        places, descriptor = self._places, self._file.fileno()
+        if os.fstat(descriptor).st_size < places.size:
+            return False
+        (counted,) = struct.unpack("<Q", os.pread(descriptor, 8, places.times))
+        return os.pread(descriptor, len(MAGIC), 0) == MAGIC and places.count <= counted <= places.capacity
 
     def _rows(self) -> range:
         """Return where the rows begin."""

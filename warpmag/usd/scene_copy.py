@@ -6,19 +6,28 @@ from pathlib import Path
 
 from pxr import Ar, Sdf, Usd, UsdUtils
 
+from warpmag.errors import InputError
 from warpmag.usd.output import Output
+from warpmag.usd.session import unsaved_layers
 
 
 def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
     """Write a copy of the scene of a stage, to be placed beside a run's output.
 
     A scene of one layer becomes ``out.scene.usdc`` and a package ``out.scene.usdz``. What has sublayers, references,
-    payloads or assets, textures say, becomes a folder ``out.scene`` with all of them, as they lie to each other.
+    payloads or assets, textures say, becomes a folder ``out.scene`` with all of them, as they lie to each other. Edits
+    that are not saved are in the copy.
 
     Returns:
         The file or folder, and in it the root layer of the scene.
+
+    Raises:
+        InputError: There are such edits in a package.
     """
-    scene = stage.GetRootLayer()
+    scene, edited = stage.GetRootLayer(), unsaved_layers(stage)
+    for layer in edited:
+        if Ar.IsPackageRelativePath(layer.realPath) or layer.GetFileFormat().IsPackage():
+            raise InputError(f"{layer.realPath}: has edits that are not saved, and is in a package, which holds none")
     if scene.GetFileFormat().IsPackage():
         copied = output.beside(".scene.usdz")
         shutil.copyfile(scene.realPath, output.temporary(copied))
@@ -37,7 +46,7 @@ def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
         shutil.copyfile(file, place)
     for layer in layers:
         if layer.realPath in places:  # not inside a package
-            _point_to_copies(layer, places)
+            _point_to_copies(layer, places, edited=layer in edited)
     return folder, folder / os.path.relpath(scene.realPath, top)
 
 
@@ -46,9 +55,9 @@ def file_with(path: str) -> str:
     return Ar.SplitPackageRelativePathOuter(path)[0]
 
 
-def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path]) -> None:
-    """Let the copy of ``layer`` name the other copies; what it names relative to its folder is right as it is."""
-    changed = False
+def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path], *, edited: bool) -> None:
+    """Let the copy of ``layer`` name the other copies and have its edits; names relative to its folder stay right."""
+    changed = edited
     resolver = Ar.GetResolver()
 
     def moved(path: str) -> str:
@@ -64,7 +73,9 @@ def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path]) -> None:
         short = short if short.startswith("../") else f"./{short}"
         return Ar.JoinPackageRelativePath(short, inner) if inner else short
 
-    copied = Sdf.Layer.OpenAsAnonymous(layer.realPath)
+    copied = Sdf.Layer.CreateAnonymous() if edited else Sdf.Layer.OpenAsAnonymous(layer.realPath)
+    if edited:
+        copied.TransferContent(layer)
     UsdUtils.ModifyAssetPaths(copied, moved)
     if changed:
         copied.Export(str(places[layer.realPath]))

@@ -5,7 +5,12 @@ session layer itself, which holds the values of one moment. Who reads the stage 
 writes over the scene takes :func:`as_written` for what a layer over it finds there.
 """
 
+from collections.abc import Iterable, Iterator
+
 from pxr import Sdf, Usd
+
+from warpmag.errors import InputError
+from warpmag.usd.values import Finding
 
 INSTANCES, UNITS = "warpmag_instances", "warpmag_units"
 """Names of the layers."""
@@ -31,15 +36,81 @@ def added_layer(stage: Usd.Stage, name: str) -> Sdf.Layer | None:
 
 
 def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> None:
-    """Make what instances below a prim hold editable, those in instances included, by opinions in ``layer``."""
+    """Make what instances below a prim hold editable, those in instances included, by opinions in ``layer``.
+
+    Raises:
+        InputError: One would change by that.
+    """
     while True:
         prims = Usd.PrimRange(stage.GetPrimAtPath(within), Usd.PrimAllPrimsPredicate)
-        instances = [prim.GetPath() for prim in prims if prim.IsInstance()]
+        instances = [prim for prim in prims if prim.IsInstance()]
         if not instances:
             return
-        with Sdf.ChangeBlock():
-            for path in instances:
-                Sdf.CreatePrimInLayer(layer, path).instanceable = False
+        release(layer, instances)
+
+
+def release(layer: Sdf.Layer, instances: list[Usd.Prim]) -> None:
+    """Make what instances hold editable, by opinions in ``layer``.
+
+    Raises:
+        InputError: One would change by that.
+    """
+    for finding in instance_findings(instances):
+        raise InputError(str(finding))
+    paths = [prim.GetPath() for prim in instances]
+    with Sdf.ChangeBlock():
+        for path in paths:
+            Sdf.CreatePrimInLayer(layer, path).instanceable = False
+
+
+def instances_around(prims: Iterable[Usd.Prim]) -> list[Usd.Prim]:
+    """Return the instances that prims are, or are in, each once."""
+    found = {}
+    for prim in prims:
+        while (prim.IsInstance() or prim.IsInstanceProxy()) and prim.GetPath() not in found:
+            found[prim.GetPath()] = prim
+            prim = prim.GetParent()
+    return [prim for prim in found.values() if prim.IsInstance()]
+
+
+def instance_findings(instances: Iterable[Usd.Prim]) -> Iterator[Finding]:
+    """Yield which instances say something about what they hold: USD passes over that until they are editable."""
+    for prim in instances:
+        if spec := _passed_over(prim):
+            message = (
+                f"USD passes over {spec.path}, for it is in an instance, and a run, which edits what is in it, cannot"
+            )
+            yield Finding(str(prim.GetPath()), f"{message}: remove that, or set instanceable = false")
+
+
+def _passed_over(prim: Usd.Prim) -> Sdf.PrimSpec | None:
+    """Return what an instance says of a prim below it, itself or as a part of what it was referred to in."""
+    stage = prim.GetStage()
+    own = stage.GetLayerStack(includeSessionLayers=False)
+    added = [layer for layer in stage.GetLayerStack() if layer not in own]
+    waiting = [(prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPrimIndex().rootNode]
+    root = waiting[0]
+    while waiting:
+        node = waiting.pop()
+        waiting += node.children
+        if node != root and not node.IsDueToAncestor():  # all instances share what it brings
+            continue
+        for layer in node.layerStack.layers:
+            spec = layer.GetPrimAtPath(node.path) if layer not in added else None
+            if found := next((one for child in spec.nameChildren if (one := _opinion(child))), None) if spec else None:
+                return found
+    return None
+
+
+def _opinion(spec: Sdf.PrimSpec) -> Sdf.PrimSpec | None:
+    """Return the first prim of a tree of which something is said."""
+    says = spec.specifier != Sdf.SpecifierOver or spec.properties or set(spec.ListInfoKeys()) > {"specifier"}
+    return spec if says else next((one for child in spec.nameChildren if (one := _opinion(child))), None)
+
+
+def unsaved_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
+    """Return the layers with files, of those a stage is made of, that this process has edited and not saved."""
+    return [layer for layer in stage.GetUsedLayers() if layer.realPath and layer.dirty]
 
 
 def without_held(stage: Usd.Stage) -> Usd.Stage:

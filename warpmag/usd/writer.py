@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import os
 import time as clock_time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,7 +30,7 @@ from warpmag.usd.placements import Placements
 from warpmag.usd.reader import copied_metadata
 from warpmag.usd.samples import SampleFile
 from warpmag.usd.scene_copy import copy_scene, file_with
-from warpmag.usd.session import INSTANCES, added_layer, as_written
+from warpmag.usd.session import INSTANCES, added_layer, as_written, instances_around, unsaved_layers
 from warpmag.usd.swarms import Swarm
 from warpmag.usd.units import units_of
 
@@ -107,7 +107,7 @@ class CacheWriter:
             magnet_paths: Prims of the magnets, in the order of the frames' moments.
             swarms: Instancers that hold some of the bodies and stay instancers.
             copy_scene: Copy the scene beside the root, as is right for a bundled one, instead of pointing to it. A
-                scene that is no file is always copied.
+                scene that is no file, or has edits that are not saved, is always copied.
             frames: Frames that are expected; without it the file may become longer than it has to be.
             options: What a run that goes on from this one must have in common with it, besides the scene.
 
@@ -116,7 +116,7 @@ class CacheWriter:
         """
         self._stage, self._units = stage, units_of(stage)
         self._clock = stage_clock(stage)
-        self._copy_scene = copy_scene or stage.GetRootLayer().anonymous
+        self._copy_scene = copy_scene or stage.GetRootLayer().anonymous or bool(unsaved_layers(stage))
         scene = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
         self._output = Output(path, scene, copy_scene=self._copy_scene)
         self._rows = _Rows(body_paths, magnet_paths, swarms)
@@ -413,21 +413,10 @@ class CacheWriter:
             orders.setdefault(order, []).append(path)
         for order, paths in orders.items():
             cache.add_tokens(paths, "xformOpOrder", order)
-        for path in _instances(as_written(self._stage), {path for one in self._columns for path in one.paths}):
-            cache.make_editable(path)
+        stage, above = as_written(self._stage), {path.rpartition("/")[0] for one in self._columns for path in one.paths}
+        for prim in instances_around(stage.GetPrimAtPath(path or "/") for path in above):
+            cache.make_editable(str(prim.GetPath()))  # opinions in it have no effect before
         return cache
-
-
-def _instances(stage: Usd.Stage, paths: Iterable[str]) -> list[str]:
-    """Return the instances that prims are in: opinions there have no effect until these are made editable."""
-    found = []
-    for path in {path.rpartition("/")[0] or "/" for path in paths}:
-        prim = stage.GetPrimAtPath(path)
-        while prim.IsInstance() or prim.IsInstanceProxy():
-            if prim.IsInstance():
-                found.append(str(prim.GetPath()))
-            prim = prim.GetParent()
-    return found
 
 
 def _digest(stage: Usd.Stage) -> str:
