@@ -79,10 +79,14 @@ def look_like_cuda(put=setattr, arch: int = 80):
     put(cpu, "pinned_allocator", cpu.default_allocator)
     put(context.Device, "is_cuda", property(lambda _: not asked_by_warp()))
     put(context.Device, "is_cpu", property(lambda _: asked_by_warp()))
+    put(context.Device, "stream", property(Stream))
+    put(wp, "synchronize_stream", lambda _: None)
+    put(wp, "synchronize_event", lambda _: None)
     put(wp, "Stream", Stream)
     put(wp, "Event", Stream)
     put(wp, "get_stream", Stream)
-    put(wp, "ScopedStream", lambda *_, **__: nullcontext())
+    for name in ("ScopedStream", "ScopedAllocator"):
+        put(wp, name, lambda *_, **__: nullcontext())
     launch_in_blocks(put)
 
 

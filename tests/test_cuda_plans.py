@@ -2,6 +2,7 @@
 
 import ctypes
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import cuda_on_cpu
@@ -9,15 +10,18 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from small_builders import add_ball, new_builder
 from warp._src import context
 
+import warpmag
 from warpmag import demagnetization, lattice, polyhedra
+from warpmag.engine.simulation import Simulation
 from warpmag.engine.xpbd import PileXPBD
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.fmm import expansions
 from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
-from warpmag.kernels.pairs import evaluate, fused_cuda, sums_cuda
+from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
@@ -160,11 +164,10 @@ def finish_of(sums, launch, parts: int):
     assert tuple(launch.arguments[-1].partial.shape[:3]) == sums.partial.shape
 
 
-@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("which", SEGMENTS)
-def test_few_moments_take_one_kernel(quantity, which, dtype, launches):
-    sums = evaluation(quantity, 300, SEGMENTS[which], dtype=dtype)
+def test_few_moments_take_one_kernel(quantity, which, launches):
+    sums = evaluation(quantity, 300, SEGMENTS[which])
     sums.launch()
     (one,), tiles = launches, sums._arrays.tiles.numpy()
     assert sums.form == FUSED
@@ -174,12 +177,11 @@ def test_few_moments_take_one_kernel(quantity, which, dtype, launches):
     assert shape.shares * shape.targets <= shape.correcting
 
 
-@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("which", SEGMENTS)
 @pytest.mark.parametrize("extra", [0, 1])
-def test_tiles_of_the_loop(quantity, which, extra, dtype, launches):
-    sums = evaluation(quantity, 300, SEGMENTS[which], among=False, dtype=dtype, form=LOOP, extra_parts=extra)
+def test_tiles_of_the_loop(quantity, which, extra, launches):
+    sums = evaluation(quantity, 300, SEGMENTS[which], among=False, form=LOOP, extra_parts=extra)
     sums.launch()
     (one, finish), tiles = launches, sums._arrays.tiles.numpy()
     shape = sums_cuda.choose_loop_shape(sums._finished, sums.count)
@@ -190,13 +192,16 @@ def test_tiles_of_the_loop(quantity, which, extra, dtype, launches):
 
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
 @pytest.mark.parametrize("quantity", [Quantity.FIELD, Quantity.MUTUAL_FORCE])
-@pytest.mark.parametrize("count", [5500, 200_000])
-def test_mirrored_walk(quantity, count, dtype, launches):
+@pytest.mark.parametrize("memory", [2**28, 2**19])
+def test_mirrored_walk(quantity, memory, dtype, launches, monkeypatch):
     """Each distance between tiles once in each home tile, in passes whose slabs fit into the partial sums."""
+    count = 5500
+    monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", memory)
     sums = evaluation(quantity, count, dtype=dtype)
     sums.launch()
     assert sums.form == MIRRORED
     *passes, finish = launches
+    assert len(passes) == 1 if memory > 2**20 else len(passes) > 1
     walk = passes[0].arguments[1]
     blocks, edges = integers(walk.blocks), integers(walk.edges)
     tiles, stages = len(edges) - 1, walk.stages
@@ -293,21 +298,23 @@ EXPECTED = {
 """Kernels without which a system has not taken the way of a GPU."""
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("which", SYSTEMS)
-def test_systems(which, dtype, launches):
-    """Induction, forces and fields at points, with eddy currents where there are balls alone."""
+def drive(which: str, dtype: str) -> MomentSystem:
+    """Launch induction, forces and fields at points, with eddy currents where there are balls alone."""
     system = MomentSystem(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
     if which in ("balls", "coils", "solids"):
         system.conduct(np.full(system.count, 1e7), 1e-3)
-    for _ in range(2):
-        system.solve()
-        system.evaluate()
-        system.apply_forces()
+    system.solve()
+    system.evaluate()
+    system.apply_forces()
     system.forget()
     system.start_from(wp.zeros_like(system.moments))
-    probe = FieldProbe(system, 70, gradients=True)
-    probe.measure()
+    FieldProbe(system, 70, gradients=True).measure()
+    return system
+
+
+@pytest.mark.parametrize("which", SYSTEMS)
+def test_systems(which, launches):
+    system = drive(which, "float32")
     threads = {}
     for launch in launches:
         threads.setdefault(launch.name, set()).add(launch.threads)
@@ -319,6 +326,30 @@ def test_systems(which, dtype, launches):
         assert threads["advance"] == {induced}
     chunks = sum(-(-(middle - first) // BLOCK_CHUNK) for first, middle, _ in system.world_ranges)
     assert threads["check_convergence"] == {BLOCK_CHUNK * chunks}
+
+
+def test_simulation(launches):
+    """A step of balls on the ground below a magnet."""
+    advance(magnets())
+    threads = {launch.name: launch.threads for launch in launches}
+    assert threads["advance"] == threads["_move"] == 2
+    assert {"_watch", "_judge", "solve_contacts", "find_neighbors", "sum_and_finish", "push"} <= threads.keys()
+
+
+def magnets() -> newton.ModelBuilder:
+    """Two iron balls on the ground below a fixed magnet."""
+    builder = new_builder()
+    builder.add_ground_plane()
+    for k in range(2):
+        add_ball(builder, (0.02 * k, 0.0, 0.005))
+    magnet = builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, 0.045)), hx=0.01, hy=0.01, hz=0.01)
+    warpmag.add_permanent(builder, shape=magnet, magnetization=(0.0, 0.0, 1e6), moment_spacing=0.01)
+    return builder
+
+
+def advance(builder, **settings):
+    """Launch a step, and what a graph of it would hold."""
+    Simulation(builder, device="cpu", **settings)._stepper._launch()
 
 
 def pile(worlds: int, contact_max: int, bodies: int = 3) -> tuple:
@@ -363,3 +394,24 @@ def test_contact_solve(worlds, contact_max, launches):
         in_cluster, block = kernel(contact_solve.SOLVE, cluster=16)
         expected.insert(0, (in_cluster, 16 * block))
     assert found == expected
+
+
+@pytest.mark.long
+def test_every_kernel_compiles(launches, tmp_path):
+    """By NVRTC, which needs no GPU, for the one that the shapes of blocks were measured on."""
+    for which, dtype in itertools.product(SYSTEMS, ("float32", "float64")):
+        drive(which, dtype)
+    for quantity, dtype in itertools.product(QUANTITIES, (wp.float32, wp.float64)):
+        for most, _ in (*fused_cuda._SHAPES.get(quantity, ()), *mirror_cuda._SHAPES.get(quantity, ())):
+            evaluation(quantity, most or 100_000, dtype=dtype).launch()
+        for most, _ in sums_cuda._SHAPES.get(quantity, ()):
+            evaluation(quantity, most or 100_000, dtype=dtype, form=LOOP).launch()
+    for worlds, contact_max, bodies in ((1, 1000, 3), (1, 60_000, 3), (20, 1000, 3), (20, 1000, 60), (1, 1000, 150)):
+        solver, model, contacts = pile(worlds, contact_max, bodies)
+        solver.step(model.state(), model.state(), None, contacts, 1e-3)
+    advance(magnets(), contact_model="multipole", solver="mujoco")
+    compiled = {(launch.kernel.module, launch.block) for launch in launches}
+    for module, block in compiled:
+        module.options["block_dim"] = block
+        wp.compile_aot_module(module, device=None, arch=90, module_dir=tmp_path, use_ptx=False)
+    assert len(list(tmp_path.glob("*.cubin"))) == len(compiled) > 150
