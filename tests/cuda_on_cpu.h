@@ -106,8 +106,8 @@ template <> inline void wp::tile_sync<WP_TILE_BLOCK_DIM>() { __syncthreads(); }
 inline void __syncwarp(unsigned mask = ~0u) { cuda_on_cpu::meet_warp(mask); }
 inline void __threadfence() {}
 inline void __nanosleep(unsigned) { cuda_on_cpu::pause(); }
-template <class T> inline T __shfl_sync(unsigned mask, T mine, int from) {
-    return cuda_on_cpu::from_lane(mask, mine, from & 31);
+template <class T> inline T __shfl_sync(unsigned mask, T mine, int from, int width = 32) {
+    return cuda_on_cpu::from_lane(mask, mine, (cuda_on_cpu::lane() & -width) + (from & (width - 1)));
 }
 template <class T> inline T __shfl_xor_sync(unsigned mask, T mine, int step) {
     return cuda_on_cpu::from_lane(mask, mine, cuda_on_cpu::lane() ^ step);

@@ -31,6 +31,8 @@ INSTRUCTIONS = {
 LANE = "const cuda_on_cpu::Lane running(block_id, lane, dim->size - payload->block_first);"
 """What a thread begins with."""
 SM_COUNT = 132
+OTHERS = "warp", "newton", "mujoco_warp"
+"""Packages that see the CPU that the device is."""
 
 
 def without_instructions(source: str) -> str:
@@ -44,12 +46,12 @@ def without_instructions(source: str) -> str:
 
 def ours(kernel) -> bool:
     """Whether a kernel is the project's."""
-    return kernel.func.__module__.partition(".")[0] not in ("warp", "newton")
+    return kernel.func.__module__.partition(".")[0] not in OTHERS
 
 
 def asked_by_warp() -> bool:
     """Whether Warp or Newton asks what the device is, not the project."""
-    return sys._getframe(2).f_globals.get("__name__", "").partition(".")[0] in ("warp", "newton")
+    return sys._getframe(2).f_globals.get("__name__", "").partition(".")[0] in OTHERS
 
 
 class Stream:

@@ -14,12 +14,12 @@ from small_builders import add_ball, new_builder
 from warp._src import context
 
 import warpmag
-from warpmag import demagnetization, lattice, polyhedra
+from warpmag import demagnetization, fmm, lattice, polyhedra, system
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.xpbd import PileXPBD
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
-from warpmag.kernels.fmm import expansions
+from warpmag.kernels.fmm import expansions, sharing
 from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
 from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, PairEvaluation
@@ -300,32 +300,45 @@ EXPECTED = {
 
 def drive(which: str, dtype: str) -> MomentSystem:
     """Launch induction, forces and fields at points, with eddy currents where there are balls alone."""
-    system = MomentSystem(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
+    magnets = MomentSystem(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
     if which in ("balls", "coils", "solids"):
-        system.conduct(np.full(system.count, 1e7), 1e-3)
-    system.solve()
-    system.evaluate()
-    system.apply_forces()
-    system.forget()
-    system.start_from(wp.zeros_like(system.moments))
-    FieldProbe(system, 70, gradients=True).measure()
-    return system
+        magnets.conduct(np.full(magnets.count, 1e7), 1e-3)
+    for step in (magnets.solve, magnets.evaluate, magnets.apply_forces, magnets.forget):
+        step()
+    magnets.start_from(wp.zeros_like(magnets.moments))
+    FieldProbe(magnets, 70, gradients=True).measure()
+    return magnets
 
 
 @pytest.mark.parametrize("which", SYSTEMS)
 def test_systems(which, launches):
-    system = drive(which, "float32")
+    ranges = drive(which, "float32").world_ranges
     threads = {}
     for launch in launches:
         threads.setdefault(launch.name, set()).add(launch.threads)
     assert EXPECTED[which] <= threads.keys()
-    induced = sum(middle - first for first, middle, _ in system.world_ranges)
+    induced = sum(middle - first for first, middle, _ in ranges)
     if "sweep" in threads:
         assert threads["sweep"] == {8 * induced}  # a group for each
     if "advance" in threads:
         assert threads["advance"] == {induced}
-    chunks = sum(-(-(middle - first) // BLOCK_CHUNK) for first, middle, _ in system.world_ranges)
+    chunks = sum(-(-(middle - first) // BLOCK_CHUNK) for first, middle, _ in ranges)
     assert threads["check_convergence"] == {BLOCK_CHUNK * chunks}
+
+
+@pytest.mark.parametrize("which", ["fast", "most"])
+def test_systems_of_two_processes(which, launches, monkeypatch):
+    """Each has half of the cells; or of the blocks of each pass, which is a run of whole splits."""
+    ranks = Half()
+    for module in (system, fmm):
+        monkeypatch.setattr(module, "ranks", lambda: ranks)
+    monkeypatch.setattr(sharing, "_LEAST_CELLS", {"cuda": 1})
+    monkeypatch.setattr(evaluate, "_LEAST_SHARED", {"cuda": 1})
+    monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", 2**20)
+    drive(which, "float64")
+    names = {launch.name for launch in launches}
+    assert "_choose_cells" in names if which == "fast" else "pair_loop_mirrored" in names
+    assert len(ranks.merged) > 2
 
 
 def test_simulation(launches):
@@ -409,7 +422,7 @@ def test_every_kernel_compiles(launches, tmp_path):
     for worlds, contact_max, bodies in ((1, 1000, 3), (1, 60_000, 3), (20, 1000, 3), (20, 1000, 60), (1, 1000, 150)):
         solver, model, contacts = pile(worlds, contact_max, bodies)
         solver.step(model.state(), model.state(), None, contacts, 1e-3)
-    advance(magnets(), contact_model="multipole", solver="mujoco")
+    advance(magnets(), contact_model="multipole")
     compiled = {(launch.kernel.module, launch.block) for launch in launches}
     for module, block in compiled:
         module.options["block_dim"] = block
