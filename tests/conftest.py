@@ -25,7 +25,11 @@ SANITIZERS = {
 
 
 def pytest_addoption(parser):
-    parser.addoption("--device", default="cpu", help="Warp device that tests run on: cpu (default), cuda:0, ...")
+    parser.addoption(
+        "--device",
+        default="cpu",
+        help="Warp device that tests run on: cpu (default), cuda:0, ...; or emulated, CUDA's kernels on a CPU",
+    )
     parser.addoption("--long", action="store_true", help="also run the tests marked 'long' (minutes)")
     parser.addoption("--wild", type=int, default=150, metavar="N", help="wild calls of a function (default: 150)")
     parser.addoption("--sanitize", choices=tuple(SANITIZERS), help="instrument native code; what .ci/sanitize uses")
@@ -37,6 +41,10 @@ def pytest_configure(config):
         "wild", max_examples=config.getoption("--wild"), deadline=None, suppress_health_check=slow
     )
     settings.load_profile("wild")
+    if config.getoption("--device") == "emulated":
+        import cuda_on_cpu  # noqa: PLC0415 - takes a while, and changes Warp for good
+
+        cuda_on_cpu.start()
     if kind := config.getoption("--sanitize"):
         import warp as wp  # noqa: PLC0415 - kernels take the flags when they are imported
 
@@ -62,7 +70,7 @@ def pytest_collection_modifyitems(config, items):
     skips = {}
     if not config.getoption("--long"):
         skips["long"] = pytest.mark.skip(reason="takes minutes: runs with --long")
-    if not config.getoption("--device").startswith("cuda"):
+    if not config.getoption("--device").startswith(("cuda", "emulated")):
         skips["cuda"] = pytest.mark.skip(reason="needs a CUDA device: runs with --device cuda:0")
     for item in items:
         for marker, skip in skips.items():
@@ -77,4 +85,5 @@ def device(request):
 
     wp.config.log_level = wp.LOG_WARNING
     wp.config.verbose_warnings = False
-    return str(wp.get_device(request.config.getoption("--device")))
+    name = request.config.getoption("--device")
+    return str(wp.get_device("cpu" if name == "emulated" else name))

@@ -1,0 +1,430 @@
+"""The host's side of every launch on a GPU, run without one: what is launched, on how many threads, with what."""
+
+import ctypes
+import dataclasses
+import itertools
+from types import SimpleNamespace
+
+import cuda_on_cpu
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from small_builders import add_ball, new_builder
+from warp._src import context
+
+import warpmag
+from warpmag import demagnetization, fmm, lattice, polyhedra, system
+from warpmag.engine.simulation import Simulation
+from warpmag.engine.xpbd import PileXPBD
+from warpmag.kernels.applied.solids import SolidMagnet
+from warpmag.kernels.applied.sources import AppliedSource, SourceKind
+from warpmag.kernels.fmm import expansions, sharing
+from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
+from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
+from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, PairEvaluation
+from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+from warpmag.kernels.rigid import contact_solve
+from warpmag.probe import FieldProbe
+from warpmag.system import MomentSystem
+
+pytestmark = pytest.mark.skipif("not config.getoption('--device') == 'cpu'")
+
+
+@dataclasses.dataclass
+class Launch:
+    """A kernel that was launched: its threads, those of a block, and its arguments as Warp packed them."""
+
+    kernel: wp.Kernel
+    threads: int
+    block: int
+    arguments: tuple
+
+    @property
+    def name(self) -> str:
+        """Name of the kernel's function."""
+        return self.kernel.func.__name__
+
+
+@pytest.fixture
+def launches(monkeypatch):
+    """Launches on a device that looks like CUDA's, recorded where they would run."""
+    found = []
+
+    def record(kernel, hooks, params, _):
+        assert params[0].size % hooks.block_dim == 0 or kernel.grid_stride, kernel.key
+        assert hooks.block_dim <= np.ravel(kernel.options.get("launch_bounds") or 1024)[0], kernel.key
+        assert -(-params[0].size // hooks.block_dim) % hooks.cluster_dim == 0, kernel.key
+        found.append(Launch(kernel, params[0].size, hooks.block_dim, tuple(params[1:])))
+
+    real = context.Module.load
+
+    def load(module, device, block_dim=None):
+        if not all(map(cuda_on_cpu.ours, module._get_live_kernels())):
+            return real(module, device, block_dim)
+        module.get_module_hash(block_dim)  # which looks into kernels that share a module
+        hooks = SimpleNamespace(forward=1, backward=None, det_launch_meta=None, block_dim=block_dim)
+        hooks.cluster_dim = module.options.get("cluster_dim") or 1
+        return SimpleNamespace(get_kernel_hooks=lambda _: hooks)
+
+    class Capture:
+        graph = None
+
+        def __init__(self, *_):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    for one in (expansions._translation, expansions._device_tables):
+        one.cache_clear()
+    with monkeypatch.context() as patch:
+        cuda_on_cpu.look_like_cuda(patch.setattr, arch=90)
+        patch.setattr(context, "invoke_cpu_blocks", record)
+        patch.setattr(context.Module, "load", load)
+        patch.setattr(context.Device, "get_cuda_compile_arch", lambda device: device.arch)
+        patch.setattr(wp, "get_cuda_max_cluster_dim", lambda kernel, device, block_dim: 16)
+        patch.setattr(wp, "capture_if", lambda _, body, **arguments: body(**arguments))
+        patch.setattr(wp, "capture_while", lambda _, body, **arguments: body(**arguments))
+        patch.setattr(wp, "ScopedCapture", Capture)
+        patch.setattr(wp, "capture_launch", lambda _: None)
+        yield found
+    for one in (expansions._translation, expansions._device_tables):
+        one.cache_clear()
+
+
+def packed(count: int, dtype=wp.float32) -> PackedMoments:
+    return PackedMoments(wp.zeros(count, dtype=dtype, device="cpu"), largest_radius=0.0, moving=False)
+
+
+def evaluation(quantity, count, segments=None, *, among=True, dtype=wp.float32, **settings) -> PairEvaluation:
+    """Sums of ``count`` moments, over all pairs or those of segments."""
+    moments = packed(count, dtype)
+    vectors = (wp.zeros(count, dtype=wp.types.vector(3, dtype), device="cpu") for _ in range(3))
+    base, out, torques = vectors
+    segments = [(0, count, 0, count)] if segments is None else segments
+    targets = moments if among else packed(count, dtype)
+    turned = wp.ones(count, dtype=int, device="cpu")
+    arrays = targets, moments, base, out
+    return PairEvaluation(quantity, segments, *arrays, turned=turned, torques=torques, **settings)
+
+
+def integers(array) -> np.ndarray:
+    """Integers of an array as it was packed."""
+    shape = array.shape[: array.ndim]
+    return np.ctypeslib.as_array((ctypes.c_int * int(np.prod(shape))).from_address(array.data)).reshape(shape)
+
+
+class Half:
+    """The second of two processes, as ``warpmag.ranks.Ranks``."""
+
+    rank, size = 1, 2
+
+    def __init__(self):
+        self.merged = []
+
+    def share(self, count):
+        return count // 2, count
+
+    def merge(self, array):
+        self.merged.append(array.shape)
+
+
+def assert_each_pair_once(sums, segments, tiles, width):
+    """Each target row with each of its sources, in tiles of so many targets, and no partial sum written twice."""
+    count = sums.count
+    expected, found = np.zeros((2, count, 1 + max(s[3] for s in segments)), int)
+    row = 0
+    for t0, t1, s0, s1 in segments:
+        expected[row : row + t1 - t0, s0:s1] += 1
+        row += t1 - t0
+    written = np.zeros((max(1, tiles[:, 5].max() + 1), count), int)
+    for begin, end, column, first, last, part, *_ in tiles:
+        assert 0 < end - begin <= width
+        assert column == sums.target.numpy()[begin]
+        found[begin:end, first:last] += 1
+        written[part, begin:end] += 1
+    assert (found == expected).all()
+    assert (written == 1).all()
+
+
+SEGMENTS = {"all": [(0, 300, 0, 300)], "parts": [(0, 40, 3, 90), (40, 41, 0, 100), (60, 100, 50, 70)]}
+QUANTITIES = Quantity.FIELD, Quantity.FORCE, Quantity.MUTUAL_FORCE, Quantity.WRENCH
+
+
+def finish_of(sums, launch, parts: int):
+    """Check the kernel that adds up so many partial sums: a group of threads for each target row."""
+    assert launch.name == "passes"
+    assert launch.threads == 8 * sums.count
+    assert sums.partial.shape == (parts, sums.count, WIDTHS[sums._finished])
+    assert tuple(launch.arguments[-1].partial.shape[:3]) == sums.partial.shape
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("which", SEGMENTS)
+def test_few_moments_take_one_kernel(quantity, which, launches):
+    sums = evaluation(quantity, 300, SEGMENTS[which])
+    sums.launch()
+    (one,), tiles = launches, sums._arrays.tiles.numpy()
+    assert sums.form == FUSED
+    shape = fused_cuda.choose_fused_shape(sums._finished, sums.count)
+    assert_each_pair_once(sums, SEGMENTS[which], tiles, shape.targets)
+    assert (one.threads, one.block) == (len(tiles) * shape.threads, shape.threads)
+    assert shape.shares * shape.targets <= shape.correcting
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("which", SEGMENTS)
+@pytest.mark.parametrize("extra", [0, 1])
+def test_tiles_of_the_loop(quantity, which, extra, launches):
+    sums = evaluation(quantity, 300, SEGMENTS[which], among=False, form=LOOP, extra_parts=extra)
+    sums.launch()
+    (one, finish), tiles = launches, sums._arrays.tiles.numpy()
+    shape = sums_cuda.choose_loop_shape(sums._finished, sums.count)
+    assert_each_pair_once(sums, SEGMENTS[which], tiles, 32 * shape.targets)
+    assert (one.threads, one.block) == (len(tiles) * 32 * shape.warps, 32 * shape.warps)
+    finish_of(sums, finish, 1 + tiles[:, 5].max() + extra)
+
+
+@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
+@pytest.mark.parametrize("quantity", [Quantity.FIELD, Quantity.MUTUAL_FORCE])
+@pytest.mark.parametrize("memory", [2**28, 2**19])
+def test_mirrored_walk(quantity, memory, dtype, launches, monkeypatch):
+    """Each distance between tiles once in each home tile, in passes whose slabs fit into the partial sums."""
+    count = 5500
+    monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", memory)
+    sums = evaluation(quantity, count, dtype=dtype)
+    sums.launch()
+    assert sums.form == MIRRORED
+    *passes, finish = launches
+    assert len(passes) == 1 if memory > 2**20 else len(passes) > 1
+    walk = passes[0].arguments[1]
+    blocks, edges = integers(walk.blocks), integers(walk.edges)
+    tiles, stages = len(edges) - 1, walk.stages
+    assert edges[0] == 0 and edges[-1] == count and (np.diff(edges) <= 32 * stages).all()
+    finish_of(sums, finish, walk.slabs + 1 + blocks[:, 3].max())
+    done = np.zeros((tiles, stages * (tiles // 2 + 1)), int)
+    for one in passes:
+        first, nearest = one.arguments[2].value, one.arguments[3].value
+        assert one.threads == one.block * tiles * (1 + blocks[:, 3].max())
+        for tile, begin, end, _ in blocks[first : first + one.threads // one.block]:
+            assert begin // stages == 0 or begin // stages >= nearest
+            assert -(-end // stages) - nearest <= walk.slabs
+            done[tile, begin:end] += 1
+    assert (done == 1).all()
+
+
+def test_given_and_plain_sums(launches):
+    """The caller's sums, and those of a plain loop, have one partial sum."""
+    called = []
+    for settings in ({"sums": lambda *arguments: called.append(arguments)}, {"form": REFERENCE, "smoothing": 0.1}):
+        launches.clear()
+        sums = evaluation(Quantity.WRENCH, 300, **settings)
+        sums.launch(wait=lambda: called.append("waited"))
+        finish_of(sums, launches[-1], 1)
+        assert len(launches) == (1 if sums.form == GIVEN else 2)
+    assert [arguments if arguments == "waited" else len(arguments) for arguments in called] == [3, "waited", "waited"]
+    evaluation(Quantity.FIELD, 0).launch()
+
+
+@pytest.mark.parametrize(("form", "count"), [(LOOP, 300), (MIRRORED, 5500), (FUSED, 300)])
+def test_processes_share_out_the_sums(form, count, launches, monkeypatch):
+    """A process has its half of the work and merges the partial sums, but not those that it has none of."""
+    whole = evaluation(Quantity.FIELD, count, form=form)
+    whole.launch()
+    alone = launches[0].threads
+    launches.clear()
+    monkeypatch.setitem(evaluate._LEAST_SHARED, "cuda", 1)
+    half = evaluation(Quantity.FIELD, count, form=form, extra_parts=form == LOOP, ranks=(ranks := Half()))
+    half.launch()
+    if form == FUSED:
+        assert launches[0].threads == alone and not ranks.merged
+    else:
+        assert abs(2 * launches[0].threads - alone) <= launches[0].block
+        assert ranks.merged == [(len(half.partial) - (form == LOOP), *half.partial.shape[1:])]
+
+
+BOX, COIL = [0.01, 0.01, 0.02], AppliedSource(SourceKind.LOOP, (0.02,), pushed=True)
+LINES = AppliedSource(SourceKind.POLYLINE, (1e-4,), 0.05 * np.eye(3))
+
+
+def solid(first: int, **settings) -> SolidMagnet:
+    """A box that is one moment."""
+    return SolidMagnet(first, 1, 8e-6, 0, 0.1, polyhedra.box(BOX), True, **settings)
+
+
+def cells(spacing: float) -> dict:
+    """What a system of one body of cells takes."""
+    body = lattice.fill([lattice.box(BOX).posed((0.0,) * 3, (0.0, 0.0, 0.0, 1.0))], spacing, 3, together=True)
+    coupling = demagnetization.coupling(body, body.radii)
+    return {"radii": body.radii, "bodies": np.zeros(len(body.radii), int), "couplings": [(0, coupling)]}
+
+
+MANY = {"radii": np.full(40, 0.005), "worlds": np.repeat([0, 1], 20), "permanent": np.arange(40) % 20 > 16}
+SYSTEMS = {
+    "balls": MANY,
+    "paper": MANY | {"dynamics": "theta-euler", "force": "zeeman"},
+    "gilbert": MANY | {"dynamics": "llg"},
+    "near": MANY | {"contact_model": "multipole"},
+    "turned": MANY | {"contact_model": "multipole", "lone_torque": True},
+    "yielding": MANY | {"contact_model": "multipole", "curve": ["linear"] * 40},
+    "cells": cells(0.005),
+    "whole": cells(0.02),
+    "coils": MANY | {"applied": [COIL, LINES], "contact_model": "multipole"},
+    "solids": MANY | {"solids": [solid(18)], "applied": [COIL]},
+    "fast": MANY | {"method": "fmm"},
+    "most": {"radii": np.full(7001, 0.005)},
+}
+
+
+EXPECTED = {
+    "balls": {"sum_and_finish", "begin_flow", "sweep", "check_convergence", "advance", "brake", "passes"},
+    "paper": {"sum_and_finish", "begin_worlds", "step_pairs", "check_convergence", "zeeman_moments"},
+    "gilbert": {"sum_and_finish", "begin_worlds", "step_pairs", "check_convergence"},
+    "near": {"pair_loop_cuda", "passes", "begin_flow"},
+    "turned": {"pair_loop_cuda", "passes", "begin_flow"},
+    "yielding": {"pair_loop_cuda", "passes", "begin_flow", "add_bias"},
+    "cells": {"sum_and_finish", "passes", "sweep"},
+    "whole": {"sum_and_finish", "passes", "respond"},
+    "coils": {"pair_loop_cuda", "passes", "push", "add_to_probe", "brake"},
+    "solids": {"sum_and_finish", "passes", "push", "add_to_probe", "brake"},
+    "fast": {"build_cells", "near_sums_cuda", "translate_cuda", "add_parts", "expand", "return_sums"},
+    "most": {"pair_loop_mirrored", "passes", "sweep", "find_neighbors"},
+}
+"""Kernels without which a system has not taken the way of a GPU."""
+
+
+def drive(which: str, dtype: str) -> MomentSystem:
+    """Launch induction, forces and fields at points, with eddy currents where there are balls alone."""
+    magnets = MomentSystem(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
+    if which in ("balls", "coils", "solids"):
+        magnets.conduct(np.full(magnets.count, 1e7), 1e-3)
+    for step in (magnets.solve, magnets.evaluate, magnets.apply_forces, magnets.forget):
+        step()
+    magnets.start_from(wp.zeros_like(magnets.moments))
+    FieldProbe(magnets, 70, gradients=True).measure()
+    return magnets
+
+
+@pytest.mark.parametrize("which", SYSTEMS)
+def test_systems(which, launches):
+    ranges = drive(which, "float32").world_ranges
+    threads = {}
+    for launch in launches:
+        threads.setdefault(launch.name, set()).add(launch.threads)
+    assert EXPECTED[which] <= threads.keys()
+    induced = sum(middle - first for first, middle, _ in ranges)
+    if "sweep" in threads:
+        assert threads["sweep"] == {8 * induced}  # a group for each
+    if "advance" in threads:
+        assert threads["advance"] == {induced}
+    chunks = sum(-(-(middle - first) // BLOCK_CHUNK) for first, middle, _ in ranges)
+    assert threads["check_convergence"] == {BLOCK_CHUNK * chunks}
+
+
+@pytest.mark.parametrize("which", ["fast", "most"])
+def test_systems_of_two_processes(which, launches, monkeypatch):
+    """Each has half of the cells; or of the blocks of each pass, which is a run of whole splits."""
+    ranks = Half()
+    for module in (system, fmm):
+        monkeypatch.setattr(module, "ranks", lambda: ranks)
+    monkeypatch.setattr(sharing, "_LEAST_CELLS", {"cuda": 1})
+    monkeypatch.setattr(evaluate, "_LEAST_SHARED", {"cuda": 1})
+    monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", 2**20)
+    drive(which, "float64")
+    names = {launch.name for launch in launches}
+    assert "_choose_cells" in names if which == "fast" else "pair_loop_mirrored" in names
+    assert len(ranks.merged) > 2
+
+
+def test_simulation(launches):
+    """A step of balls on the ground below a magnet."""
+    advance(magnets())
+    threads = {launch.name: launch.threads for launch in launches}
+    assert threads["advance"] == threads["_move"] == 2
+    assert {"_watch", "_judge", "solve_contacts", "find_neighbors", "sum_and_finish", "push"} <= threads.keys()
+
+
+def magnets() -> newton.ModelBuilder:
+    """Two iron balls on the ground below a fixed magnet."""
+    builder = new_builder()
+    builder.add_ground_plane()
+    for k in range(2):
+        add_ball(builder, (0.02 * k, 0.0, 0.005))
+    magnet = builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, 0.045)), hx=0.01, hy=0.01, hz=0.01)
+    warpmag.add_permanent(builder, shape=magnet, magnetization=(0.0, 0.0, 1e6), moment_spacing=0.01)
+    return builder
+
+
+def advance(builder, **settings):
+    """Launch a step, and what a graph of it would hold."""
+    Simulation(builder, device="cpu", **settings)._stepper._launch()
+
+
+def pile(worlds: int, contact_max: int, bodies: int = 3) -> tuple:
+    """A solver of balls in some worlds, a state, and room for contacts."""
+    builder = newton.ModelBuilder()
+    for _ in range(worlds):
+        part = newton.ModelBuilder()
+        for k in range(bodies):
+            body = part.add_body(xform=wp.transform((0.0, 0.0, 0.02 * k)))
+            part.add_shape_sphere(body, radius=0.005)
+        builder.add_world(part)
+    model = builder.finalize(device="cpu")
+    model.joint_count = 0
+    contacts = newton.CollisionPipeline(model, rigid_contact_max=contact_max).contacts()
+    solver = PileXPBD(model, contact_max, iterations=3, rigid_contact_con_weighting=False)
+    return solver, model, contacts
+
+
+@pytest.mark.parametrize(("worlds", "contact_max"), [(1, 1000), (1, 6000), (1, 60_000), (20, 1000)])
+def test_contact_solve(worlds, contact_max, launches):
+    """By a cluster, which leaves what it may not fit to launches; by launches alone; and by a block for each world."""
+    solver, model, contacts = pile(worlds, contact_max)
+    solver.step(model.state(), model.state(), None, contacts, 1e-3)
+    bodies, solve = model.body_count, solver._solve
+    found = [(launch.kernel, launch.threads) for launch in launches if launch.name == "solve_contacts"]
+
+    def kernel(call, **form):
+        return contact_solve.solve_kernel(call, True, solve.group, **form)
+
+    lists = [(contact_solve.COUNT, contact_max), (contact_solve.PLACE, -(-(bodies + 1) // 32) * 32)]
+    lists += [(contact_solve.LIST, contact_max), (contact_solve.WRITE, 2 * contact_max)]
+    threads = contact_solve._WIDE_BLOCKS * contact_solve._BLOCK + solve.group * bodies
+    iterations = [(contact_solve.ITERATE, threads)] * 3 + [(contact_solve.FINISH, threads)]
+    expected = lists if contact_max > 50_000 or worlds > 1 else []
+    if worlds == 1 and contact_max > 3000:
+        expected = expected + iterations
+    expected = [(kernel(call)[0], count) for call, count in expected]
+    if worlds > 1:
+        of_world, block = kernel(contact_solve.SOLVE_WORLD, cluster=1, lines=32)
+        expected.append((of_world, worlds * block))
+    elif contact_max <= 50_000:
+        in_cluster, block = kernel(contact_solve.SOLVE, cluster=16)
+        expected.insert(0, (in_cluster, 16 * block))
+    assert found == expected
+
+
+@pytest.mark.long
+def test_every_kernel_compiles(launches, tmp_path):
+    """By NVRTC, which needs no GPU, for the one that the shapes of blocks were measured on."""
+    for which, dtype in itertools.product(SYSTEMS, ("float32", "float64")):
+        drive(which, dtype)
+    for quantity, dtype in itertools.product(QUANTITIES, (wp.float32, wp.float64)):
+        for most, _ in (*fused_cuda._SHAPES.get(quantity, ()), *mirror_cuda._SHAPES.get(quantity, ())):
+            evaluation(quantity, most or 100_000, dtype=dtype).launch()
+        for most, _ in sums_cuda._SHAPES.get(quantity, ()):
+            evaluation(quantity, most or 100_000, dtype=dtype, form=LOOP).launch()
+    for worlds, contact_max, bodies in ((1, 1000, 3), (1, 60_000, 3), (20, 1000, 3), (20, 1000, 60), (1, 1000, 150)):
+        solver, model, contacts = pile(worlds, contact_max, bodies)
+        solver.step(model.state(), model.state(), None, contacts, 1e-3)
+    advance(magnets(), contact_model="multipole")
+    compiled = {(launch.kernel.module, launch.block) for launch in launches}
+    for module, block in compiled:
+        module.options["block_dim"] = block
+        wp.compile_aot_module(module, device=None, arch=90, module_dir=tmp_path, use_ptx=False)
+    assert len(list(tmp_path.glob("*.cubin"))) == len(compiled) > 150
