@@ -1,44 +1,64 @@
-"""What the ranks of ``test_ranks.py`` compute: results by name, and how often sums were merged, in a file each."""
+"""What the ranks of ``test_ranks.py`` do: ``calls PATH DEVICE``, or ``run`` and arguments of the command."""
 
 import sys
 
+import newton
 import numpy as np
 import warp as wp
 
 import warpmag
-from warpmag.ranks import ranks
+from warpmag import cli
+from warpmag.kernels.pairs import evaluate
+from warpmag.ranks import by_first, ranks
 from warpmag.system import MomentSystem
 
 
-def main(path: str, device: str | None) -> None:
-    """Write what this rank ends with to ``path``, ``_``, the rank and ``.npz``."""
+def main(what: str, *arguments: str) -> int:
+    """Do it, with all sums shared out, and say on stderr how often they were merged; return the exit code."""
     wp.config.enable_backward = False  # as the tests do, so that both find the same compiled kernels
+    evaluate._LEAST_SHARED = dict.fromkeys(evaluate._LEAST_SHARED, 1)
     all_ranks, merged = ranks(), []
     if all_ranks is not None:
         merge = all_ranks.merge
         all_ranks.merge = lambda array: (merged.append(1), merge(array))
+    code = cli.main(["run", *arguments]) if what == "run" else calls(*arguments)
+    print(f"merged {len(merged)}", file=sys.stderr)
+    return code
+
+
+def calls(path: str, device: str) -> int:
+    """Write results by name to ``path``, ``_``, the rank and ``.npz``; of several ranks print what errors they get."""
+    place = None if device == "cuda" else device  # each rank has a GPU of its own
+    results = sums(place) | {"worlds": several_worlds([3, 700, 641, 800], place)} | sweeps(place)
+    np.savez(f"{path}_{0 if ranks() is None else ranks().rank}.npz", **results)
+    if ranks() is not None:
+        differ()
+    return 0
+
+
+def sums(place: str | None) -> dict[str, np.ndarray]:
+    """Return what calls on arrays do, by name."""
     results = {}
     for n in (1, 7, 1001):
         random = np.random.default_rng(n)
         x, m = random.normal(size=(n, 3)) * n ** (1 / 3), random.normal(size=(n, 3))
-        results[f"h {n}"] = warpmag.h_field(x, m, device=device)
-        results[f"h double {n}"] = warpmag.h_field(x, m, dtype="float64", device=device)
-        results[f"h elsewhere {n}"] = warpmag.h_field(x, m, x + 0.1, device=device)
-        results[f"force {n}"], results[f"torque {n}"] = warpmag.wrench(x, m, radii=0.4, device=device)
+        results[f"h {n}"] = warpmag.h_field(x, m, device=place)
+        results[f"h double {n}"] = warpmag.h_field(x, m, dtype="float64", device=place)
+        results[f"h elsewhere {n}"] = warpmag.h_field(x, m, x + 0.1, device=place)
+        results[f"force {n}"], results[f"torque {n}"] = warpmag.wrench(x, m, radii=0.4, device=place)
         solved = warpmag.solve_induction(
-            x, 0.4, saturation=1e6, external_field=(0, 0, 1e5), contact_model="multipole", device=device
+            x, 0.4, saturation=1e6, external_field=(0, 0, 1e5), contact_model="multipole", device=place
         )
         results[f"magnetization {n}"], results[f"field {n}"] = solved.magnetizations, solved.h_field
         results[f"pull {n}"] = solved.wrench()[0]
-        results[f"multipoles {n}"] = warpmag.h_field(x, m, x[::2] + 0.1, method="fmm", device=device)
-        results[f"multipole force {n}"] = warpmag.wrench(x, m, method="fmm", device=device)[0]
-    results["worlds"] = several_worlds(device)
-    np.savez(f"{path}_{0 if all_ranks is None else all_ranks.rank}.npz", merged=len(merged), **results)
+        results[f"multipoles {n}"] = warpmag.h_field(x, m, x[::2] + 0.1, method="fmm", device=place)
+        results[f"multipole force {n}"] = warpmag.wrench(x, m, method="fmm", device=place)[0]
+    return results
 
 
-def several_worlds(device: str | None) -> np.ndarray:
-    """Magnetizations of worlds of different sizes."""
-    worlds, random = np.repeat([0, 1, 2, 3], [3, 700, 641, 800]), np.random.default_rng(0)
+def several_worlds(sizes: list[int], device: str | None) -> np.ndarray:
+    """Magnetizations of worlds of some sizes."""
+    worlds, random = np.repeat(range(len(sizes)), sizes), np.random.default_rng(0)
     system = MomentSystem(
         radii=np.full(len(worlds), 0.4), worlds=worlds, saturation=1e6, external_field=(0, 0, 1e5), device=device
     )
@@ -47,5 +67,59 @@ def several_worlds(device: str | None) -> np.ndarray:
     return system.magnetizations().numpy()
 
 
+def differ() -> None:
+    """Print the errors that this rank gets where ranks are told different things, a line each."""
+    rank, x = ranks().rank, np.eye(3)
+    model = small_scene(1e6 + rank).finalize(device="cpu")
+    tries = {
+        "h_field": lambda: warpmag.h_field(x * (1 + rank), x, device="cpu"),
+        "not finite": lambda: warpmag.h_field(x, x * (1.0 if rank == 0 else np.nan), device="cpu"),
+        "wrench": lambda: warpmag.wrench(x, x, radii=[0.1 + rank, 0.1, 0.1], device="cpu"),
+        "solve_induction": lambda: warpmag.solve_induction(x, 0.1, saturation=1e6 + rank, device="cpu"),
+        "sources": lambda: warpmag.solve_induction(x, 0.1, saturation=1e6, sources=(x + 2, x + rank), device="cpu"),
+        "Magnetics": lambda: warpmag.Magnetics(model),
+        "rtol": lambda: warpmag.Magnetics(small_scene().finalize(device="cpu"), rtol=1e-3 * (1 + rank)),
+        "Simulation": lambda: warpmag.Simulation(small_scene(), step=1e-3 * (1 + rank), device="cpu"),
+        "one only": lambda: warpmag.Simulation("no.usda" if rank else small_scene(), device="cpu"),
+        "by_first": lambda: by_first(lambda: 1 // 0, ranks()),
+        "sweep": lambda: warpmag.sweep(lambda worlds: 1 // (1 - worlds[0]), 4, together=1),
+    }
+    for name, given in tries.items():
+        try:
+            given()
+        except (warpmag.InputError, RuntimeError) as error:
+            print(f"{rank} {name}: {error}", flush=True)
+
+
+def sweeps(place: str | None) -> dict[str, np.ndarray]:
+    """Return what sweeps find, of 5 worlds that move, two of them together, and of worlds of arrays."""
+    fields = np.linspace(1e5, 3e5, 5)
+
+    def poses(worlds: range) -> np.ndarray:
+        simulation = warpmag.Simulation(small_scene(worlds=len(worlds)), device=place)
+        simulation.magnetics.set_external_field(np.outer(fields[worlds], (0.0, 0.0, 1.0)))
+        for _ in range(5):
+            simulation.step()
+        return simulation.state.body_q.numpy().reshape(len(worlds), -1, 7)
+
+    found = warpmag.sweep(poses, len(fields), together=2)
+    assert [len(one) for one in found] == [2, 2, 1]
+    sizes = warpmag.sweep(lambda worlds: several_worlds([40 + world for world in worlds], place), 3, together=1)
+    return {"sweep": np.concatenate(found), "sweep of arrays": np.concatenate(sizes)}
+
+
+def small_scene(saturation: float = 1e6, worlds: int = 1) -> newton.ModelBuilder:
+    """Two iron balls, one above the other, in each of several worlds."""
+    world = newton.ModelBuilder()
+    warpmag.register_custom_attributes(world)
+    for k in range(2):
+        ball = world.add_body(xform=wp.transform((0.0, 0.0, 0.0102 * k), wp.quat_identity()))
+        world.add_shape_sphere(ball, radius=0.005)
+        warpmag.add_inducible(world, ball, saturation=saturation)
+    builder = newton.ModelBuilder()
+    builder.replicate(world, worlds)
+    return builder
+
+
 if __name__ == "__main__":
-    main(sys.argv[1], None if sys.argv[2] == "cuda" else sys.argv[2])  # each rank has a GPU of its own
+    sys.exit(main(*sys.argv[1:]))

@@ -32,24 +32,64 @@ def start(ranks: int, *command):
     )  # fmt: skip
 
 
-def test_two_ranks_end_with_the_bits_of_one(tmp_path, device):
-    results = []
+def merged(done) -> list[int]:
+    """How often the sums of each rank were merged."""
+    return [int(line.split()[1]) for line in done.stderr.splitlines() if line.startswith("merged ")]
+
+
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory, device):
+    """What came of one process and of two that call functions, and the results of each of the three."""
+    folder, done, results = tmp_path_factory.mktemp("calls"), [], []
     for ranks in (1, 2):
-        done = start(ranks, "-m", "mpi4py", SCRIPT, tmp_path / f"of_{ranks}", device[:4])
-        assert done.returncode == 0, done.stderr
+        done.append(start(ranks, "-m", "mpi4py", SCRIPT, "calls", folder / f"of_{ranks}", device[:4]))
+        assert done[-1].returncode == 0, done[-1].stderr
         for rank in range(ranks):
-            with np.load(tmp_path / f"of_{ranks}_{rank}.npz") as saved:
+            with np.load(folder / f"of_{ranks}_{rank}.npz") as saved:
                 results.append(dict(saved))
-    one, *two = results
-    assert one["merged"] == 0
+    return done, results
+
+
+def test_two_ranks_end_with_the_bits_of_one(calls):
+    done, (one, *two) = calls
+    assert merged(done[0]) == [0]
+    first, second = merged(done[1])
+    assert first == second > 40  # of 3 sizes some 14 sums, and those of the worlds
     for other in two:
-        assert other.pop("merged") > 10  # so many sums were shared out
+        assert other.keys() == one.keys() >= {"sweep", "worlds", "multipole force 1001"}
         for name, bits in other.items():
             assert np.isfinite(bits).all(), name
             assert one[name].tobytes() == bits.tobytes(), name
 
 
-def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device):
+def test_worlds_of_a_sweep_are_each_its_own(calls):
+    poses = calls[1][0]["sweep"]
+    assert poses.shape == (5, 2, 7)
+    assert (poses[:, 0, 2] != poses[0, 0, 2]).sum() == 4  # in another field a ball is pulled otherwise
+
+
+def test_a_difference_is_told_in_one_line_on_all_ranks(calls):
+    given = "rank 1 was given another value than rank 0; ranks share out one calculation"
+    lines = {
+        "h_field": f"positions: {given}",
+        "not finite": f"moments: {given}",
+        "wrench": f"radii: {given}",
+        "solve_induction": f"saturation: {given}",
+        "sources": f"sources: {given}",
+        "Magnetics": f"Magnetics: model.warpmag.saturation: {given}",
+        "rtol": f"Magnetics: rtol: {given}",
+        "Simulation": f"step: {given}",
+        "one only": "rank 1: no.usda: no such file",
+        "by_first": "rank 0: ZeroDivisionError: integer division or modulo by zero",
+        "sweep": "rank 1: ZeroDivisionError: integer division or modulo by zero",
+    }
+    printed = calls[0][1].stdout.splitlines()
+    for name, line in lines.items():
+        assert {f"{rank} {name}: {line}" for rank in range(2)} <= set(printed), name
+
+
+@pytest.mark.parametrize("sums", ["vectorized", pytest.param("fmm", marks=pytest.mark.long)])
+def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
     scene = tmp_path / "scene.usdc"
     from warpmag.scenes_usd import bundled  # noqa: PLC0415
 
@@ -57,10 +97,11 @@ def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device):
     told = []
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}" / "out.usda"
-        command = ["-m", "warpmag.cli", "run", scene, "-o", out, "--frames", 1]
+        command = [SCRIPT, "run", scene, "-o", out, "--frames", 1, "--sums", sums]
         done = start(ranks, *command, *([] if "cuda" in device else ["--device", device]))
         assert done.returncode == 0, done.stderr
         told.append(done)
+    assert merged(told[0]) == [0] and min(merged(told[1])) > 30  # fields and forces of substeps
     assert told[0].stdout.count("\n") == told[1].stdout.count("\n")  # rank 0 alone tells of it
     first, second = ((tmp_path / f"{ranks}" / "out.cache.usdc").read_bytes() for ranks in (1, 2))
     assert first == second
@@ -70,17 +111,6 @@ def test_a_graph_of_a_cpu_that_would_not_merge_sums_is_refused():
     sums = wp.zeros(3, dtype=float, device="cpu")
     with wp.ScopedCapture("cpu"), pytest.raises(InputError, match="no graph of a CPU"):
         Ranks.merge(object.__new__(Ranks), sums)
-
-
-def test_ranks_with_other_input_are_told_so():
-    program = (
-        "import numpy as np, warpmag, warpmag.ranks as r\n"
-        "x = np.eye(3) * (1 + r.ranks().rank)\n"
-        "try: warpmag.h_field(x, x, device='cpu')\n"
-        "except warpmag.InputError as error: print(error)\n"
-    )
-    done = start(2, "-c", program)
-    assert done.stdout.count("rank 1 was given others than rank 0") == 2, done.stderr
 
 
 @pytest.mark.parametrize(

@@ -22,5 +22,6 @@ from warpmag.fields import wrench as wrench
 from warpmag.induction import InductionResult as InductionResult
 from warpmag.induction import solve_induction as solve_induction
 from warpmag.materials import material as material
+from warpmag.ranks import sweep as sweep
 
 __version__: str

@@ -11,7 +11,7 @@ import warp as wp
 
 from warpmag.errors import InputError
 from warpmag.magnets import MATERIAL_RANGE, check_token, shown
-from warpmag.ranks import ranks
+from warpmag.ranks import launched
 
 Numbers = npt.ArrayLike | wp.array
 """What arguments take: numbers, lists of them and NumPy arrays, or a Warp array."""
@@ -86,7 +86,7 @@ def resolve_device(device):
     Raises:
         InputError: There is no such device.
     """
-    if device is None and wp.is_cuda_available() and (all_ranks := ranks()) is not None:
+    if device is None and wp.is_cuda_available() and (all_ranks := launched()) is not None:
         wp.set_device(f"cuda:{all_ranks.local_rank % wp.get_cuda_device_count()}")
     try:
         return wp.get_device(device)

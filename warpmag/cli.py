@@ -15,7 +15,7 @@ from warpmag import __version__
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
 from warpmag.progress import Progress, silence
-from warpmag.ranks import Ranks, by_first, ranks
+from warpmag.ranks import Ranks, alone, by_first, ranks
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes; 0 where all went well, ``STOPPED`` and the signal's number where a signal ended it."""
@@ -67,7 +67,8 @@ def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]
                 if options.command is not _run:
                     return 0, ""  # only a run is shared out
                 silence(1)
-            code = options.command(options)
+            with contextlib.nullcontext() if options.command is _run else alone():
+                code = options.command(options)
             sys.stdout.flush()
             return code, ""
     except InputError as error:
@@ -240,7 +241,7 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
     if name in (*scenes, *MADE) and not os.path.isfile(path):
         if balls is None and name in scenes:
             return scenes[name], True
-        made = by_first(lambda: make(name, folder, balls))
+        made = by_first(lambda: make(name, folder, balls), ranks())
         if _is_first():
             _tell(f"scene: {made}")
         return made, False
@@ -419,7 +420,8 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     if options.purpose:
         from warpmag.export import export  # noqa: PLC0415
 
-        export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
+        with alone():
+            export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
         print(f"to render      {rendered}")
     _warn([line for line in simulation.warnings() if line not in known])
     if simulation.capture_failure:

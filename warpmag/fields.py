@@ -24,12 +24,14 @@ from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.magnets import check_not_negative, check_rtol, check_token
 from warpmag.pair_sums import SumsShape, pair_sums
+from warpmag.ranks import alike
 
 _METHODS = ("auto", "vectorized", "reference", "fmm")
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
 """Least of the largest component of moments [A·m²]: fields of smaller ones have no digits left."""
 
 
+@alike
 def h_field(
     positions: Numbers,
     moments: Numbers,
@@ -93,6 +95,7 @@ def h_field(
         return kind.finish(sums.out, points.shape[0])
 
 
+@alike
 def wrench(
     positions: Numbers,
     moments: Numbers,

@@ -28,6 +28,7 @@ from warpmag.curves import MagnetizationCurve
 from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.magnets import shown
 from warpmag.materials import measured
+from warpmag.ranks import alike
 from warpmag.system import MomentSystem
 
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
@@ -90,6 +91,7 @@ class InductionResult:
         return forces, torques
 
 
+@alike
 def solve_induction(
     positions: Numbers,
     radii: Numbers,

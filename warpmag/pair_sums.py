@@ -88,9 +88,6 @@ class PairSums:
             fmm_rtol: Relative error to sum by the fast multipole method; None means over all pairs.
         """
         others = None if self.targets is self.moments else self.targets
-        if (all_ranks := ranks()) is not None:
-            arrays = self.moments.packed, self.targets.packed, self.base
-            all_ranks.check_alike("positions, moments, options", repr((self._shape, fmm_rtol)), *arrays)
         if not self._shape.reference:
             self.targets.find_overlaps(None if others is None else self.moments)
         if fmm_rtol is not None:  # its cells are of these places

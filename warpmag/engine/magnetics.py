@@ -14,7 +14,7 @@ from warpmag.engine.applied import ModelSources
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.eddy import BodyEddies
 from warpmag.engine.grouping import BodyMagnet, find_magnets
-from warpmag.engine.model_values import ModelValues
+from warpmag.engine.model_values import ModelValues, contents
 from warpmag.engine.moments import KINEMATIC, make_system
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import (
@@ -30,6 +30,7 @@ from warpmag.kernels.rigid.bodies import (
 )
 from warpmag.magnets import MagneticSettings, check_positive
 from warpmag.probe import FieldProbe
+from warpmag.ranks import ranks
 
 
 class Magnetics:
@@ -85,6 +86,9 @@ class Magnetics:
                 felt in several.
         """
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
+        if (all_ranks := ranks()) is not None:
+            more = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "step": step}
+            all_ranks.check_alike(vars(settings) | more | contents(model), "Magnetics: ")
         settings.check("Magnetics")
         check_positive("Magnetics: step", step)
         if curve is not None:

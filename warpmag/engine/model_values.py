@@ -19,6 +19,20 @@ from warpmag.magnets import CURVES, check_material
 _MATERIAL = ("saturation", "susceptibility")
 """What can be taken over; the others decide which moments there are, and what they are computed by."""
 _NAMES = ("kind", *_MATERIAL, "curve", "recoil_permeability", "moment_spacing", "conductivity")
+_PLACES = (
+    *("body_q", "body_com", "body_flags"),
+    *("shape_body", "shape_type", "shape_transform", "shape_scale", "shape_world"),
+)
+"""What else of a model decides about its magnets, besides meshes."""
+
+
+def contents(model: newton.Model) -> dict[str, Any]:
+    """Return what decides about the magnets of ``model`` and the forces on them, by names that messages have for it."""
+    own = {name: one for name, one in vars(getattr(model, NAMESPACE)).items() if isinstance(one, wp.array)}
+    meshes = [getattr(one, "vertices", None) for one in model.shape_source]
+    values = {name: getattr(model, name) for name in _PLACES} | {"shape_source": meshes}
+    values |= {f"{NAMESPACE}.{name}": one for name, one in own.items()}
+    return {f"model.{name}": one for name, one in values.items()}
 
 
 class ModelValues:

@@ -15,7 +15,7 @@ from warpmag.engine.scene import ImportedScene
 from warpmag.engine.statistics import Statistics
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError
-from warpmag.ranks import by_first, ranks
+from warpmag.ranks import Ranks, agreed, by_first
 from warpmag.usd import CacheWriter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -41,6 +41,7 @@ class Recorder:
         frames: int,
         options: dict[str, str],
         resumable: bool,
+        ranks: Ranks | None,
     ):
         """Prepare to write; see :class:`warpmag.usd.CacheWriter`.
 
@@ -54,6 +55,7 @@ class Recorder:
             frames: Frames that are expected.
             options: What a run that goes on from this one must have in common with it.
             resumable: Whether one can.
+            ranks: Processes of which the first writes; None means that there is but this one.
         """
         shapes = list(scene.magnet_shapes.values())
         row = {shape: index for index, shape in enumerate(magnetics.shapes.tolist())}
@@ -67,19 +69,20 @@ class Recorder:
         self._bodies = np.array(list(own.values()), dtype=int)
         self._shapes = np.array([row[shape] for of_prim in shapes for shape in of_prim], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
-        all_ranks = ranks()
+        self._ranks = ranks
         self._writer: CacheWriter | _NoWriter = _NoWriter()
-        if all_ranks is None or all_ranks.rank == 0:
-            self._writer = CacheWriter(
-                scene.stage,
-                output,
-                list(own),
-                list(scene.magnet_shapes),
-                swarms=scene.swarms,
-                copy_scene=copy_scene,
-                frames=frames,
-                options=options,
-            )
+        with agreed(ranks):
+            if ranks is None or ranks.rank == 0:
+                self._writer = CacheWriter(
+                    scene.stage,
+                    output,
+                    list(own),
+                    list(scene.magnet_shapes),
+                    swarms=scene.swarms,
+                    copy_scene=copy_scene,
+                    frames=frames,
+                    options=options,
+                )
 
     def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
         """Go on with the run at the output.
@@ -96,7 +99,7 @@ class Recorder:
             InputError: What is there cannot be resumed.
         """
         with _interrupts_held():
-            found = by_first(self._writer.resume)
+            found = by_first(self._writer.resume, self._ranks)
         if found is None or (found.state is None and found.time <= 0.0):
             return False, False  # nothing there, or no more than the first frame
         done, output = round(found.time / step_size), Path(self._output)

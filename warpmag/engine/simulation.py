@@ -22,7 +22,7 @@ from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError, SimulationError
 from warpmag.magnets import MagneticSettings, check_flag, check_positive, shown
-from warpmag.ranks import ranks
+from warpmag.ranks import agreed, ranks
 
 DEFAULT_STEP = 1e-3
 """Time step [s] where neither the user nor the stage gives one: the paper's."""
@@ -92,22 +92,21 @@ class Simulation:
         check_solver(solver)
         for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
-        self.device = resolve_device(device)
-        builder, settings, own_step = self._open(scene, visuals=visuals, articulations=solver not in MAXIMAL)
-        self.step_size = _time_step(step, own_step)
-        self.model = self._finalize(builder, solver, scene)
-        settings = settings.replaced(
-            force=force, dynamics=dynamics, contact_model=contact_model, rtol=rtol, external_field=external_field
-        )
+        self.device, self._ranks = resolve_device(device), ranks()
+        graphs &= self._ranks is None  # what merges the sums of ranks is in no graph of a step
+        own = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
         how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
-        self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
-        check_places(self.model, self._magnetics.magnets, solver)
-        all_ranks = ranks()
-        graphs &= all_ranks is None  # what merges the sums of ranks is in no graph of a step
-        self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
-        self._options = self._options_of(settings, solver, **how)
-        if all_ranks is not None:
-            all_ranks.check_alike("scene, options", repr(self._options), *self._stepper.save().values())
+        with agreed(self._ranks):
+            builder, settings, own_step = self._open(scene, visuals=visuals, articulations=solver not in MAXIMAL)
+            self.step_size = _time_step(step, own_step)
+            self.model = self._finalize(builder, solver, scene)
+            settings = settings.replaced(external_field=external_field, **own)
+            self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
+            check_places(self.model, self._magnetics.magnets, solver)
+            self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
+            self._options = self._options_of(settings, solver, **how)
+            if self._ranks is not None:
+                self._ranks.check_alike(self._options | {"scene": list(self._stepper.save().values())})
 
     def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
@@ -405,6 +404,7 @@ class Simulation:
             frames=frames + 1,
             options=self._options,
             resumable=self._options["solver"] not in UNRESUMABLE,
+            ranks=self._ranks,
         )
 
     def _steps_at(self, frame: int) -> int:
