@@ -33,13 +33,15 @@ class CellShares:
 
     Attributes:
         leaves: First leaf of this process, and the end after its last, shape [2].
+        order: Its cells by height and octant, as those of the grid.
+        octant_begin: Where those of each octant begin and end in ``order``.
     """
 
     def __init__(self, grid: MomentGrid, ranks):
         """Allocate the lists."""
         self._grid, self.ranks = grid, ranks
         self.leaves = wp.zeros(2, dtype=int, device=grid.device)
-        self._order, self._octant_begin = wp.zeros_like(grid.order), wp.zeros_like(grid.octant_begin)
+        self.order, self.octant_begin = wp.zeros_like(grid.order), wp.zeros_like(grid.octant_begin)
 
     def find(self):
         """Launch the choice of cells of a grid that has been built."""
@@ -48,15 +50,15 @@ class CellShares:
             _choose_cells,
             dim=(OCTANTS * grid.octant_begin.shape[0], lanes),
             inputs=[self.ranks.rank, self.ranks.size, lanes, grid.level_begin, grid.octant_begin, grid.order],
-            outputs=[self.leaves, self._octant_begin, self._order],
+            outputs=[self.leaves, self.octant_begin, self.order],
             device=grid.device,
         )
 
-    def translate(self, translation: Translation, multipoles, local, children, parent):
-        """Launch the translation to the cells of all processes, as ``Translation.launch`` does."""
-        local.zero_()
-        translation.launch(multipoles, local, self._grid.neighbors, children, parent, self._order, self._octant_begin)
-        self.ranks.merge(local)
+    def translate(self, translation: Translation, arrays):
+        """Launch the translation to the cells of all processes, of arrays that are bound to those of this one."""
+        arrays.locals.zero_()
+        translation.launch(arrays)
+        self.ranks.merge(arrays.locals)
 
 
 @wp.func
