@@ -1,11 +1,13 @@
 """The fast multipole method: its cells, and fields and forces against sums over all pairs in float64."""
 
+import gc
+
 import numpy as np
 import pytest
 import warp as wp
 
 import warpmag
-from warpmag import fmm
+from warpmag import fmm, pair_sums
 from warpmag.arrays import resolve_dtype, vec3_type
 from warpmag.kernels.fmm.grid import MomentGrid
 from warpmag.kernels.pairs.packing import PackedMoments
@@ -153,6 +155,22 @@ def test_kinds_of_arrays_and_bad_arguments(device):
     with pytest.raises(warpmag.InputError, match="smoothing"):
         warpmag.h_field(places, moments, method="fmm", smoothing=0.1, device=device)
     assert warpmag.h_field(np.zeros((0, 3)), np.zeros((0, 3)), method="fmm", device=device).shape == (0, 3)
+
+
+def test_nothing_stays_of_a_call(device):
+    """But tables, which are those of any number of moments: not its cells, or another thread's call would have them."""
+
+    def arrays():
+        pair_sums._kept.clear()
+        gc.collect()
+        return {id(one): one for one in gc.get_objects() if isinstance(one, wp.array)}
+
+    known = {}
+    for count in (300, 500):
+        places, known = jittered(count), arrays()
+        for function in (warpmag.h_field, warpmag.wrench):
+            function(places, moments_of(len(places)), method="fmm", device=device)
+    assert not [one.shape for key, one in arrays().items() if key not in known]
 
 
 def test_auto_is_exact_unless_an_error_is_allowed(device, monkeypatch):

@@ -74,7 +74,8 @@ def translate(grid: Grid, multipoles, degree: int, dtype, device) -> np.ndarray:
     lists = grid.neighbors, grid.children, grid.parent, grid.order, grid.octant_begin
     translation = Translation(matrices(degree), harmonics.parity(degree), dtype, device)
     parts = translation.parts(padded.shape)
-    translation.launch(wp.array(padded, dtype=dtype, device=device), local, *map(integers, lists), parts=parts)
+    given = wp.array(padded, dtype=dtype, device=device)
+    translation.launch(translation.bind(given, local, *map(integers, lists), parts=parts))
     return local.numpy()[:cells, :count]
 
 

@@ -125,7 +125,11 @@ class Expansions:
 
         Where several processes share out the cells, ``shares`` has those of this one (``sharing.CellShares``).
         """
-        self._arrays.leaves, self._shares = leaves, shares
+        a, grid, cells = self._arrays, self._grid, shares or self._grid
+        a.leaves, self._shares = leaves, shares
+        parts = None if shares else self._parts
+        lists = grid.neighbors, a.children, a.parent, cells.order, cells.octant_begin
+        self._across = self._translation.bind(a.multipoles, a.locals, *lists, parts=parts)
 
     def gather(self):
         """Launch the multipoles of all cells."""
@@ -133,14 +137,10 @@ class Expansions:
 
     def translate(self):
         """Launch the local expansions of all cells: across, and down."""
-        a, grid = self._arrays, self._grid
         if self._shares is not None:
-            self._shares.translate(self._translation, a.multipoles, a.locals, a.children, a.parent)
+            self._shares.translate(self._translation, self._across)
         else:
-            self._translation.launch(
-                *(a.multipoles, a.locals, grid.neighbors, a.children, a.parent, grid.order, grid.octant_begin),
-                parts=self._parts,
-            )
+            self._translation.launch(self._across)
         self._launch(_Step.FALL)
 
     def add_fields(self):

@@ -30,6 +30,8 @@ class CellShares:
 
     Attributes:
         leaves: First leaf of this process, and the end after its last, shape [2].
+        order: Its cells by height and octant, as those of the grid.
+        octant_begin: Where those of each octant begin and end in ``order``.
     """
 
     def __init__(self, grid: MomentGrid, ranks):
@@ -37,7 +39,7 @@ class CellShares:
         self._grid, self.ranks = grid, ranks
         self.leaves = wp.zeros(2, dtype=int, device=grid.device)
         self._own, self._before = (wp.zeros(grid.capacity, dtype=int, device=grid.device) for _ in range(2))
-        self._order, self._octant_begin = wp.zeros_like(grid.order), wp.zeros_like(grid.octant_begin)
+        self.order, self.octant_begin = wp.zeros_like(grid.order), wp.zeros_like(grid.octant_begin)
 
     def find(self):
         """Launch the choice of cells of a grid that has been built."""
@@ -49,13 +51,13 @@ class CellShares:
         wp.launch(_list_marks, count, inputs, [self._before], device=device)
         wp.utils.array_scan(self._before, self._before, inclusive=True)
         inputs += [self._before]
-        outputs = [self._order, self._octant_begin]
+        outputs = [self.order, self.octant_begin]
         wp.launch(_choose_cells, max(count, grid.octant_begin.size), inputs, outputs, device=device)
 
-    def translate(self, translation: Translation, multipoles, local, children, parent):
-        """Launch the translation to the cells of this process, as ``Translation.launch`` does."""
-        local.zero_()  # others get what their parents have, again and again
-        translation.launch(multipoles, local, self._grid.neighbors, children, parent, self._order, self._octant_begin)
+    def translate(self, translation: Translation, arrays):
+        """Launch the translation to the cells of this process, of arrays that are bound to its lists."""
+        arrays.locals.zero_()  # others get what their parents have, again and again
+        translation.launch(arrays)
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -96,19 +96,21 @@ class Translation:
 
         self._device, self._dtype = device, dtype
         self._constants = {"HARMONICS": harmonics, "PITCH": width, "ROWS": len(rows), "GROUP_ROWS": used}
-        self._arrays = a = translation_arrays(dtype)()
-        a.matrices = wp.array(table.ravel(), dtype=dtype, device=device)
-        a.signs = wp.array(signs, dtype=dtype, device=device)
-        a.parity = integers(np.pad(classes, (0, width - harmonics)))
-        a.row_parity, a.row_harmonic = integers(np.repeat(classes[rows[::group]], group)), integers(rows)
+        self._tables = {
+            "matrices": wp.array(table.ravel(), dtype=dtype, device=device),
+            "signs": wp.array(signs, dtype=dtype, device=device),
+            "parity": integers(np.pad(classes, (0, width - harmonics))),
+            "row_parity": integers(np.repeat(classes[rows[::group]], group)),
+            "row_harmonic": integers(rows),
+        }
 
     def parts(self, shape) -> wp.array | None:
         """Partial sums for local expansions of a shape, which blocks of a GPU share where cells are few; else None."""
         splits = _splits(self._constants["ROWS"]) if self._device.is_cuda and shape[0] <= _MOST_SPLIT else 1
         return wp.zeros((splits, *shape), dtype=self._dtype, device=self._device) if splits > 1 else None
 
-    def launch(self, multipoles, local, neighbors, children, parent, order, octant_begin, parts=None):
-        """Set the far part of the local expansions of all cells, with what their parents do not have.
+    def bind(self, multipoles, local, neighbors, children, parent, order, octant_begin, parts=None):
+        """Return what :meth:`launch` works on; all evaluations have the same tables, and arrays of their own.
 
         Args:
             multipoles: Multipoles of c cells, and a row of zeros, shape [c + 1, pitch].
@@ -120,27 +122,33 @@ class Translation:
             octant_begin: Where those of each octant begin and end in ``order``, shape [levels, 9].
             parts: What :meth:`parts` returned for these local expansions.
         """
-        a = self._arrays
+        a = translation_arrays(self._dtype)()
+        for name, table in self._tables.items():
+            setattr(a, name, table)
         a.multipoles, a.locals, a.neighbors, a.children = multipoles, local, neighbors, children
         a.parent, a.order, a.octant_begin = parent, order, octant_begin
-        cells = multipoles.shape[0] - 1
+        if parts is not None:
+            a.parts = parts
+        return a
+
+    def launch(self, arrays):
+        """Set the far part of the local expansions of all cells, with what their parents do not have."""
+        cells = arrays.multipoles.shape[0] - 1
         if self._device.is_cuda:
-            self._launch_cuda(cells, parts)
+            self._launch_cuda(arrays, cells)
             return
         kernel = _cpu_kernel(self._dtype, tuple(self._constants.items()))
         threads = threads_for(cells, _CELLS_PER_THREAD)
-        wp.launch(kernel, dim=1, inputs=[0, 1, threads, team(), a], device=self._device)
+        wp.launch(kernel, dim=1, inputs=[0, 1, threads, team(), arrays], device=self._device)
 
-    def _launch_cuda(self, cells: int, parts):
+    def _launch_cuda(self, a, cells: int):
         """Launch the translation of arrays for so many cells on a GPU."""
-        a, splits = self._arrays, 1 if parts is None else parts.shape[0]
-        if parts is not None:
-            a.parts = parts
+        splits = 1 if a.parts is None else a.parts.shape[0]
         kernel, threads = _cuda_kernel(self._dtype, splits, tuple(self._constants.items()))
         blocks = splits * (-(-cells // _CELLS) + OCTANTS * a.octant_begin.shape[0])
         wp.launch(kernel, dim=blocks * threads, inputs=[a], device=self._device, block_dim=threads)
         if splits > 1:
-            inputs = [a.octant_begin, a.locals.shape[1], parts.reshape((splits, -1)), a.locals.flatten()]
+            inputs = [a.octant_begin, a.locals.shape[1], a.parts.reshape((splits, -1)), a.locals.flatten()]
             wp.launch(_add_kernel(self._dtype), dim=a.locals.size, inputs=inputs, device=self._device)
 
 
