@@ -14,6 +14,7 @@ from warpmag.arrays import host_array, host_radii, host_scalars, shape_message
 from warpmag.curves import MagnetizationCurve
 from warpmag.engine.attributes import check_registered, mark_shapes
 from warpmag.errors import InputError
+from warpmag.garbage import collection_paused
 from warpmag.magnets import Magnet, check_finite, check_not_negative, check_positive
 
 _SUFFIXES = {"body": "", "joint": "_free_joint", "articulation": "_articulation", "shape": "_shape"}
@@ -35,6 +36,7 @@ class Balls:
     shapes: range
 
 
+@collection_paused()
 def add_balls(
     builder: newton.ModelBuilder,
     positions: npt.ArrayLike,
