@@ -61,6 +61,11 @@ CASES = {
             "runs of Balls Up with and without output, in turns; memory",
             {"cpu": (243,), "cuda": (2500,)},
         ),
+        Case(
+            "swarm",
+            "Sakura Tree of very many balls: seconds to the first step, and to write them without physics; memory",
+            {"cpu": (100_000,), "cuda": (100_000,)},
+        ),
     )
 }
 

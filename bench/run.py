@@ -1,8 +1,9 @@
 """Check, then time: ``python -m bench.run CASE [--device cuda:0] [--sizes 243 2560]``.
 
 Each size is compared with the float64 oracle on some targets before it is timed; induction and scenes give the error
-of the solve itself, and ``writing`` compares runs with and without output. One JSON line a measurement, with machine,
-commit, error and the time of the first call, which compiles.
+of the solve itself, ``writing`` compares runs with and without output, and ``swarm`` measures what very many balls take
+to start and to be written. One JSON line a measurement, with machine, commit, error and the time of the first call,
+which compiles.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import warp as wp
 from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
 from bench.machine import describe
 from bench.scene import run_scene
+from bench.swarm import run_swarm
 from bench.timing import measure
 from bench.writing import run_writing
 from warpmag import oracle
@@ -163,6 +165,8 @@ def run_case(case: Case, device, sizes, frames: int | None) -> None:
                 result = run_system(case, count, dtype, device)
             elif case.name == "writing":
                 result = run_writing(count, device, frames)
+            elif case.name == "swarm":
+                result = run_swarm(count, device, frames)
             else:
                 result = (run_worlds if case.name == "worlds" else run_scene)(count, device)
             print(json.dumps({"case": case.name, "dtype": dtype, "count": count, **result, **machine}), flush=True)
@@ -174,7 +178,7 @@ def main() -> None:
     parser.add_argument("case", choices=sorted(CASES), help="; ".join(f"{c.name}: {c.summary}" for c in CASES.values()))
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--sizes", type=int, nargs="+")
-    parser.add_argument("--frames", type=int, help="frames of a run, for writing")
+    parser.add_argument("--frames", type=int, help="frames, for writing and swarm")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     run_case(CASES[options.case], wp.get_device(options.device), options.sizes, options.frames)

@@ -49,10 +49,10 @@ def _run(stage: Path, device, frames: int, output: Path | None) -> tuple[float, 
     memory = []
     simulation = Simulation(stage, device=str(device))
     began = time.perf_counter()
-    simulation.run(frames, output=output, on_frame=lambda _: memory.append(_resident()))
+    simulation.run(frames, output=output, on_frame=lambda _: memory.append(resident()))
     return time.perf_counter() - began, memory
 
 
-def _resident() -> float:
+def resident() -> float:
     """Return the memory that this process has of the machine [MB], as Linux tells it."""
     return 1e-6 * os.sysconf("SC_PAGE_SIZE") * int(Path("/proc/self/statm").read_text().split()[1])

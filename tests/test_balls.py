@@ -1,5 +1,6 @@
-"""Balls added in bulk, against Newton's own calls for each of them."""
+"""Balls added in bulk, against Newton's own calls for each of them, and what very many bodies are made of."""
 
+import gc
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,7 +10,10 @@ import pytest
 import warp as wp
 
 import warpmag
+from warpmag.engine.contacts import body_sizes
+from warpmag.engine.simulation import Simulation
 from warpmag.errors import InputError
+from warpmag.garbage import collection_paused
 from warpmag.layout import MomentLayout
 
 COUNT = 7  # two rows of two and three alone: every way in which copies come about
@@ -159,3 +163,76 @@ def test_runs_of_moments_are_those_of_each_world_by_itself():
         layout = MomentLayout(np.zeros(count), worlds, permanent, worlds, wanted, wanted, wanted)
         assert layout.ranges() == ranges
         assert layout.runs(wanted) == runs
+
+
+def _size_of(kind, scale, source):
+    """Half of the smallest dimension of a shape [m]."""
+    name = newton.GeoType(kind).name
+    if name in ("MESH", "CONVEX_MESH"):
+        return 0.5 * np.ptp(np.asarray(source.vertices) * scale, axis=0).min()
+    used = {"SPHERE": 1, "CAPSULE": 1, "CYLINDER": 2, "CONE": 2, "BOX": 3, "ELLIPSOID": 3}
+    return min(scale[: used[name]]) if name in used else np.inf
+
+
+def test_sizes_of_bodies_are_those_of_their_shapes():
+    """Of all kinds of shapes, several on a body, with the largest and the smallest of them anywhere."""
+    rng, builder = np.random.default_rng(5), newton.ModelBuilder()
+    tetrahedron = newton.Mesh(np.eye(4, 3), np.array([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]))
+    for number in range(20):
+        body = builder.add_body(
+            xform=wp.transform(rng.uniform(-1.0, 1.0, 3), wp.quat_identity()), is_kinematic=number % 7 == 3
+        )
+        for _ in range(int(rng.integers(0, 4))):
+            a, b, c = rng.uniform(0.1, 0.5, 3).tolist()
+            where = wp.transform(rng.uniform(-1.0, 1.0, 3), wp.quat_identity())
+            passive = newton.ModelBuilder.ShapeConfig(has_shape_collision=bool(rng.random() < 0.8))
+            for add, given in (
+                (builder.add_shape_sphere, {"radius": a}),
+                (builder.add_shape_capsule, {"radius": a, "half_height": b}),
+                (builder.add_shape_cylinder, {"radius": a, "half_height": b}),
+                (builder.add_shape_cone, {"radius": a, "half_height": b}),
+                (builder.add_shape_box, {"hx": a, "hy": b, "hz": c}),
+                (builder.add_shape_ellipsoid, {"rx": a, "ry": b, "rz": c}),
+                (builder.add_shape_mesh, {"mesh": tetrahedron, "scale": (a, b, c)}),
+            ):
+                if rng.random() < 0.3:
+                    add(body, xform=where, cfg=passive, **given)
+    builder.add_shape_sphere(builder.add_body(), radius=0.2)
+    builder.add_ground_plane()
+    model = builder.finalize(device="cpu")
+    found = body_sizes(model)
+    scales, middles = model.shape_scale.numpy(), model.shape_transform.numpy()[:, :3]
+    sizes = [_size_of(*one) for one in zip(model.shape_type.numpy(), scales, model.shape_source, strict=True)]
+    np.testing.assert_array_equal(found.shape_thickness, sizes)
+    thickness, reach = np.full(model.body_count, np.inf), np.zeros(model.body_count)
+    for shape, body in enumerate(model.shape_body.numpy()):
+        kinematic = model.body_flags.numpy()[body] & newton.BodyFlags.KINEMATIC
+        if body >= 0 and not kinematic and model.shape_flags.numpy()[shape] & newton.ShapeFlags.COLLIDE_SHAPES:
+            thickness[body] = min(thickness[body], sizes[shape])
+            far = np.linalg.norm(middles[shape].astype(float) - model.body_com.numpy()[body])
+            radius = model.shape_collision_radius.numpy()[shape]
+            if far > 1e-3 * radius or model.shape_type.numpy()[shape] != newton.GeoType.SPHERE:
+                reach[body] = max(reach[body], far + radius)
+    np.testing.assert_array_equal(found.thickness, thickness)
+    np.testing.assert_allclose(found.reach, reach, rtol=1e-6)  # single precision
+    assert np.isfinite(thickness).sum() > 10 and model.shape_count > 40
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_garbage_is_collected_afterwards_as_before(enabled):
+    """Whatever building a scene ends with."""
+    before = gc.isenabled()
+    (gc.enable if enabled else gc.disable)()
+    try:
+        builder = _builder()
+        warpmag.add_balls(builder, np.eye(3), 0.005)
+        Simulation(builder, device="cpu")
+        assert gc.isenabled() == enabled
+        with pytest.raises(warpmag.InputError):
+            Simulation(builder, device="cpu", rtol=-1.0)
+        assert gc.isenabled() == enabled
+        with collection_paused(), collection_paused():
+            assert not gc.isenabled()
+        assert gc.isenabled() == enabled
+    finally:
+        (gc.enable if before else gc.disable)()

@@ -7,6 +7,7 @@ import warp as wp
 
 from warpmag.engine.broad_phase import NeighborBroadPhase
 from warpmag.engine.contacts import RigidSolver, body_sizes
+from warpmag.kernels.rigid.broad_phase import allocate
 
 FARTHEST = 0.02
 """How far ahead contacts are sought [m]: twice the radius of the balls."""
@@ -113,6 +114,16 @@ def test_many_other_shapes_are_swept(device, monkeypatch):
     pairs, contacts = Search(model).find(model.state())
     found, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())
     assert (found, own_contacts) == (pairs, contacts)
+
+
+@pytest.mark.parametrize(("balls", "others", "swept"), [(50_000, 600, False), (2_000, 9_000, True)])
+def test_very_many_balls_find_each_other_among_some_hundred_others(balls, others, swept, device):
+    """More comparisons than of fewer shapes, and still a small part of what a sort of all boxes compares."""
+    count = balls + others
+    radius = np.where(np.arange(count) < balls, 0.005, np.nan)
+    world, body, all_of_them = np.zeros(count, int), np.arange(count), np.ones(count, bool)
+    search = allocate(world, body, all_of_them, radius, farthest=FARTHEST, device=wp.get_device(device))
+    assert (search is None) == swept
 
 
 def test_nothing_collides(device):

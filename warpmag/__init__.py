@@ -10,6 +10,8 @@ import ast
 from importlib import import_module
 from pathlib import Path
 
+from warpmag.garbage import collection_paused
+
 __version__ = "0.1.0"
 
 _FOLDER = Path(__file__).resolve().parent
@@ -33,7 +35,8 @@ __all__ = sorted(_HOMES)
 def __getattr__(name):
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    with collection_paused():  # Newton and Warp make very many objects
+        return getattr(import_module(_HOMES[name]), name)
 
 
 def __dir__():

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from warpmag import __version__
 from warpmag.errors import InputError, SimulationError, one_line
+from warpmag.garbage import collection_paused
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
 from warpmag.progress import Progress, silence
 from warpmag.ranks import Ranks, alone, by_first, ranks
@@ -293,6 +294,7 @@ def _check(options) -> int:
     return BAD_INPUT if errors else 0
 
 
+@collection_paused()
 def _load(path: Path, **options):
     """Return the simulation of a stage, ready to step."""
     _quiet_warp()

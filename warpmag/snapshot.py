@@ -13,9 +13,15 @@ def _bytes_of(array: wp.array) -> wp.array:
     return wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device)
 
 
+def contents(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
+    """Return the contents of arrays, bytes by name; on a CPU their memory itself, as long as it is theirs."""
+    return {name: _bytes_of(array).numpy() for name, array in arrays.items() if array.size}
+
+
 def save(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
-    """Return the contents of arrays, bytes by name."""
-    return {name: _bytes_of(array).numpy().copy() for name, array in arrays.items() if array.size}
+    """Return the contents of arrays as they are now, bytes by name."""
+    found = contents(arrays)
+    return {name: one.copy() if arrays[name].device.is_cpu else one for name, one in found.items()}
 
 
 def load(arrays: dict[str, wp.array], saved: dict[str, np.ndarray]) -> None:

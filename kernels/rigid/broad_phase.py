@@ -41,6 +41,8 @@ _TARGETS_AT_ONCE = 64
 """Targets that a thread of a CPU takes at a time."""
 _MOST_COMPARISONS = 2e7
 """With other shapes; more take longer than to sort all boxes."""
+_FEW = 25_000
+"""Shapes beyond which the sort, too, compares more than that, N^(5/3), and each pair by itself."""
 _MANY = 64
 """Other shapes from which a warp of a GPU shares a target, in place of a group of threads."""
 _BLOCK = 128
@@ -158,7 +160,8 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
     limits = [np.searchsorted(worlds[others], worlds[shape], side) for side in ("left", "right")]
     ranges = np.where(worlds[shape] >= 0, limits, 0).T.astype(np.int32)
     shared = int(np.count_nonzero(worlds[others] < 0))
-    if len(shape) * shared + np.sum(ranges[:, 1] - ranges[:, 0]) > _MOST_COMPARISONS:
+    comparisons = len(shape) * shared + np.sum(ranges[:, 1] - ranges[:, 0])
+    if comparisons > _MOST_COMPARISONS * max(1.0, len(shape) / _FEW) ** (5 / 3):
         return None
 
     def integers(values, dtype=wp.int32):

@@ -14,6 +14,7 @@ from warpmag.arrays import host_array, host_radii, host_scalars, shape_message
 from warpmag.curves import MagnetizationCurve
 from warpmag.engine.attributes import check_registered, mark_shapes
 from warpmag.errors import InputError
+from warpmag.garbage import collection_paused
 from warpmag.magnets import Magnet, check_finite, check_not_negative, check_positive
 
 _SUFFIXES = {"body": "", "joint": "_free_joint", "articulation": "_articulation", "shape": "_shape"}
@@ -35,6 +36,7 @@ class Balls:
     shapes: range
 
 
+@collection_paused()
 def add_balls(
     builder: newton.ModelBuilder,
     positions: npt.ArrayLike,
@@ -94,12 +96,10 @@ def add_balls(
     shapes = range(builder.shape_count, builder.shape_count + count)
     if count:
         config = _config(builder, density, friction)
-        template = _template(builder, radii[0], config, color)
-        added = _copies(template, count)
-        _place(added, poses)
-        _resize(added, radii, config)
-        _name(added, builder, label)
-        builder.replicate(added, 1, separate_worlds=False)
+        _add_copies(builder, _template(builder, radii[0], config, color), count)
+        _place(builder, poses)
+        _resize(builder, radii, config)
+        _name(builder, count, label)
         mark_shapes(builder, shapes, magnet)
     return Balls(bodies, shapes)
 
@@ -124,20 +124,21 @@ def copy_ball(
         kind = name.partition("_")[0]
         if kind in rows and name not in _OWN and isinstance(values, list) and len(values) == 1:
             values[0] = getattr(builder, name)[rows[kind]]
-    added = _copies(template, count)
-    _place(added, poses)
-    added.body_qd = list(map(wp.spatial_vector, *np.asarray(velocities, np.float32).T.tolist()))
-    added.joint_qd = np.asarray(velocities, np.float32).ravel().tolist()
-    _name(added, builder, None)
-    for kind, row in rows.items():
-        label = getattr(builder, f"{kind}_label")[row]
-        setattr(added, f"{kind}_label", [f"{one}{label.removeprefix(first)}" for one in others])
-    added.articulation_label = list(added.body_label)  # as in an import
     new = {
         "body": range(builder.body_count, builder.body_count + count),
         "shape": range(builder.shape_count, builder.shape_count + count),
     }
-    builder.replicate(added, 1, separate_worlds=False)
+    _add_copies(builder, template, count)
+    _place(builder, poses)
+    velocities = np.ascontiguousarray(velocities, np.float32)
+    builder.body_qd[-count:] = map(wp.spatial_vector.from_buffer_copy, velocities)
+    builder.joint_qd[-velocities.size :] = velocities.ravel().tolist()
+    _name(builder, count, None)
+    for kind, row in rows.items():
+        labels = getattr(builder, f"{kind}_label")
+        end = labels[row].removeprefix(first)
+        labels[-count:] = [f"{one}{end}" for one in others]
+    builder.articulation_label[-count:] = builder.body_label[-count:]  # as in an import
     for attribute in builder.custom_attributes.values():
         kind = getattr(attribute.frequency, "name", "").lower()
         values: Any = attribute.values
@@ -219,26 +220,25 @@ def _template(builder: newton.ModelBuilder, radius: float, config, color) -> new
     return template
 
 
-def _copies(template: newton.ModelBuilder, count: int) -> newton.ModelBuilder:
-    """A builder with copies of one with one ball: a row of them, and that row many times, since Newton loops over
-    copies but not over what is in one."""
+def _add_copies(builder: newton.ModelBuilder, template: newton.ModelBuilder, count: int) -> None:
+    """Add copies of a builder with one ball: a row of them, and that row many times, since Newton loops over copies but
+    not over what is in one."""
     row_length = math.isqrt(count)
-    row, whole = _empty_like(template), _empty_like(template)
+    row = _empty_like(template)
     row.replicate(template, row_length, separate_worlds=False)
-    whole.replicate(row, count // row_length, separate_worlds=False)
-    whole.replicate(template, count % row_length, separate_worlds=False)
-    return whole
+    builder.replicate(row, count // row_length, separate_worlds=False)
+    builder.replicate(template, count % row_length, separate_worlds=False)
 
 
-def _place(added: newton.ModelBuilder, poses: np.ndarray) -> None:
-    """Put bodies, and the free joints that hold them, where they are."""
+def _place(builder: newton.ModelBuilder, poses: np.ndarray) -> None:
+    """Put the last bodies, and the free joints that hold them, where they are."""
     poses = np.ascontiguousarray(poses, np.float32)
-    added.body_q = list(map(wp.transform.from_buffer_copy, poses))
-    added.joint_q = poses.ravel().tolist()
+    builder.body_q[-len(poses) :] = map(wp.transform.from_buffer_copy, poses)
+    builder.joint_q[-poses.size :] = poses.ravel().tolist()
 
 
-def _resize(added: newton.ModelBuilder, radii: np.ndarray, config: Any) -> None:
-    """Give balls of several sizes what Newton computes from each radius, once for each that there is."""
+def _resize(builder: newton.ModelBuilder, radii: np.ndarray, config: Any) -> None:
+    """Give the last balls, of several sizes, what Newton computes from each radius, once for each that there is."""
     sizes, which = np.unique(radii, return_inverse=True)
     if len(sizes) == 1:
         return
@@ -257,17 +257,16 @@ def _resize(added: newton.ModelBuilder, radii: np.ndarray, config: Any) -> None:
         ("shape_scale", scales),
         ("shape_collision_radius", [scale[0] for scale in scales]),
     ):
-        setattr(added, name, [values[size] for size in which])
+        getattr(builder, name)[-len(which) :] = [values[size] for size in which]
 
 
-def _name(added: newton.ModelBuilder, builder: newton.ModelBuilder, label: str | None) -> None:
-    """Give everything the label that it would have if it were added alone."""
+def _name(builder: newton.ModelBuilder, count: int, label: str | None) -> None:
+    """Give the last balls, and all that belongs to them, the labels that they would have if each were added alone."""
     for kind, suffix in _SUFFIXES.items():
-        name = f"{kind}_label"
-        copied = getattr(added, name)
+        labels = getattr(builder, f"{kind}_label")
+        before = len(labels) - count
         if label is None:
-            start = int(copied[0].removeprefix(f"{kind}_"))  # Newton counts some from 0, some from 1
-            first = len(getattr(builder, name)) + start
-            setattr(added, name, [f"{kind}_{number}" for number in range(first, first + len(copied))])
+            first = before + int(labels[-1].removeprefix(f"{kind}_"))  # Newton counts some from 0, some from 1
+            labels[before:] = [f"{kind}_{number}" for number in range(first, first + count)]
         else:
-            setattr(added, name, [f"{label}_{number}{suffix}" for number in range(len(copied))])
+            labels[before:] = [f"{label}_{number}{suffix}" for number in range(count)]

@@ -53,38 +53,39 @@ class BodySizes:
 
 def body_sizes(model: newton.Model) -> BodySizes:
     """Measure the colliding shapes of every body."""
-    shape_body, colliding = model.shape_body.numpy(), model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES
+    shape_body: np.ndarray = model.shape_body.numpy()
+    colliding = model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES
     types, scales, radii = model.shape_type.numpy(), model.shape_scale.numpy(), model.shape_collision_radius.numpy()
-    shape_thickness = np.array(
-        [_thickness(kind, scale, source) for kind, scale, source in zip(types, scales, model.shape_source, strict=True)]
-    )
+    shape_thickness = _thicknesses(types, scales, model.shape_source)
     thickness, reach = np.full(model.body_count, np.inf), np.zeros(model.body_count)
     moving = model.body_inv_mass.numpy() > 0.0
     moving &= (model.body_flags.numpy() & newton.BodyFlags.KINEMATIC) == 0
     centers, frames = model.body_com.numpy(), model.shape_transform.numpy()
-    for shape in np.flatnonzero((shape_body >= 0) & (colliding != 0)):
-        body = shape_body[shape]
-        if moving[body]:
-            arm = np.linalg.norm(frames[shape, :3] - centers[body])
-            thickness[body] = min(thickness[body], shape_thickness[shape])
-            if arm > 1e-3 * radii[shape] or types[shape] != newton.GeoType.SPHERE:
-                reach[body] = max(reach[body], arm + radii[shape])
+    shapes = np.flatnonzero((shape_body >= 0) & (colliding != 0))
+    shapes = shapes[moving[shape_body[shapes]]]
+    bodies = shape_body[shapes]
+    np.minimum.at(thickness, bodies, shape_thickness[shapes])
+    arms = np.linalg.norm(frames[shapes, :3] - centers[bodies], axis=1)
+    reaching = (arms > 1e-3 * radii[shapes]) | (types[shapes] != newton.GeoType.SPHERE)
+    np.maximum.at(reach, bodies[reaching], (arms + radii[shapes])[reaching])
     return BodySizes(thickness, reach, shape_thickness)
 
 
-def _thickness(kind: int, scale: np.ndarray, source) -> float:
-    """Return half of the smallest dimension [m] of one shape."""
+def _thicknesses(types: np.ndarray, scales: np.ndarray, sources: list) -> np.ndarray:
+    """Return half of the smallest dimension [m] of each shape, shape [n]."""
     kinds = newton.GeoType
-    if kind in (kinds.SPHERE, kinds.CAPSULE):
-        return float(scale[0])
-    if kind in (kinds.CYLINDER, kinds.CONE):
-        return float(min(scale[0], scale[1]))
-    if kind in (kinds.BOX, kinds.ELLIPSOID):
-        return float(scale.min())
-    if kind in (kinds.MESH, kinds.CONVEX_MESH):
-        vertices = np.asarray(source.vertices) * scale
-        return float(0.5 * np.ptp(vertices, axis=0).min())
-    return float("inf")
+    found = np.full(len(types), np.inf)
+    for of, columns in (
+        ((kinds.SPHERE, kinds.CAPSULE), 1),
+        ((kinds.CYLINDER, kinds.CONE), 2),
+        ((kinds.BOX, kinds.ELLIPSOID), 3),
+    ):
+        chosen = np.isin(types, of)
+        found[chosen] = scales[chosen, :columns].min(axis=1)
+    for shape in np.flatnonzero(np.isin(types, (kinds.MESH, kinds.CONVEX_MESH))).tolist():
+        vertices = np.asarray(sources[shape].vertices) * scales[shape]
+        found[shape] = 0.5 * np.ptp(vertices, axis=0).min()
+    return found
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from warpmag.engine.grouping import BodyMagnet, find_magnets
 from warpmag.engine.model_values import ModelValues, contents
 from warpmag.engine.moments import KINEMATIC, make_system
 from warpmag.errors import InputError
+from warpmag.garbage import collection_paused
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
@@ -50,6 +51,7 @@ class Magnetics:
         shape_volumes: Magnetic volume of each of them [m³], what it shares with an earlier one left out, [n].
     """
 
+    @collection_paused()
     def __init__(
         self,
         model: newton.Model,

@@ -21,6 +21,7 @@ from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError, SimulationError
+from warpmag.garbage import collection_paused
 from warpmag.magnets import MagneticSettings, check_flag, check_positive, shown
 from warpmag.ranks import agreed, ranks
 
@@ -50,6 +51,7 @@ class Simulation:
         frame_count: Output frames that the stage asks for, the first excluded; None where it has no time range.
     """
 
+    @collection_paused()
     def __init__(
         self,
         scene: str | os.PathLike | newton.ModelBuilder,

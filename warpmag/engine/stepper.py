@@ -288,9 +288,9 @@ class Stepper:
         self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return all that the next step depends on; :meth:`look` first."""
+        """Return all that the next step depends on, on a CPU valid until then; :meth:`look` first."""
         numbers = {"steps": np.array(self.steps), "buffers": self._solver.limits()}
-        return numbers | snapshot.save(self._carried())
+        return numbers | snapshot.contents(self._carried())
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
         """Go on from where :meth:`save` was called, in another run of the same model.

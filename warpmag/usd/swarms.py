@@ -13,8 +13,11 @@ from pxr import Sdf, Usd, UsdGeom
 
 from warpmag.usd.alike import ARRAYS, MOMENTS, AlikeBalls, BallFrames
 from warpmag.usd.columns import SWARM, Column
-from warpmag.usd.placements import rotate
+from warpmag.usd.placements import dot, rotate
 from warpmag.usd.schemas import MAGNET_API, has_api
+
+_BLOCK = 8192
+"""Balls that are placed at a time, so that what is computed of them stays in the processor's cache."""
 
 
 class Swarm:
@@ -92,16 +95,17 @@ class Swarm:
         values = {name: np.empty((len(self.bodies), width), np.float32) for name, width in ARRAYS.items()}
         values[MOMENTS] = moments
         box = np.array([[np.inf] * 3, [-np.inf] * 3])
-        for (frames, rows), (middle, radius) in zip(self._groups, self._spheres, strict=True):
-            own = frames.instances(body_q[rows], body_qd[rows])
-            for name, one in own.items():
-                values[name][rows] = one
-            places = own["positions"] + rotate(own["orientations"], np.broadcast_to(middle, (len(rows), 3)))
-            box[0] = np.minimum(box[0], places.min(axis=0) - radius)
-            box[1] = np.maximum(box[1], places.max(axis=0) + radius)
+        for (frames, whole), (middle, radius) in zip(self._groups, self._spheres, strict=True):
+            for rows in np.array_split(whole, -(-len(whole) // _BLOCK)):
+                own = frames.instances(body_q[rows], body_qd[rows])
+                for name, one in own.items():
+                    values[name][rows] = one
+                places = own["positions"] + rotate(own["orientations"], np.broadcast_to(middle, (len(rows), 3)))
+                box[0] = np.minimum(box[0], places.min(axis=0) - radius)
+                box[1] = np.maximum(box[1], places.max(axis=0) + radius)
         turns = values["orientations"]
         if last_turns is not None:
-            turns *= np.where((turns * last_turns.reshape(-1, 4)).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+            turns *= np.where(dot(turns, last_turns.reshape(-1, 4)) < 0.0, -1.0, 1.0)
         return [one.reshape(1, -1) for one in (*values.values(), box.astype(np.float32))]
 
     def arrays(self, time: Usd.TimeCode) -> dict[str, np.ndarray]:
