@@ -156,7 +156,7 @@ def test_long_bodies_are_right_and_not_chosen(device, monkeypatch):
     warpmag.add_balls(builder, [[0.0, 0.1, 0.1]], RADIUS, magnetization=(0.0, 0.0, 1e6))
     model = builder.finalize(device=device)
     forces, torques = applied(warpmag.Magnetics(model, method="fmm"), model)
-    monkeypatch.setattr(fmm, "_COSTS", dict.fromkeys(fmm._COSTS, (3e4, 0.0, 0.0)))
+    monkeypatch.setattr(fmm, "_COSTS", dict.fromkeys(fmm._COSTS, (3e4, 0.0)))
     chosen = warpmag.Magnetics(model)
     assert not chosen.system.is_fast
     expected = applied(chosen, model)
@@ -236,7 +236,7 @@ def test_auto_and_bad_arguments(device, monkeypatch):
     warpmag.add_balls(builder, places_of(300), RADIUS)
     model = builder.finalize(device=device)
     assert not warpmag.Magnetics(model).system.is_fast
-    monkeypatch.setattr(fmm, "_COSTS", dict.fromkeys(fmm._COSTS, (3e4, 0.0, 0.0)))
+    monkeypatch.setattr(fmm, "_COSTS", dict.fromkeys(fmm._COSTS, (3e4, 0.0)))
     assert warpmag.Magnetics(model).system.is_fast
     assert not warpmag.Magnetics(model, rtol=1e-5).system.is_fast
     with pytest.raises(warpmag.InputError, match="method: 'multipole' is not one of"):

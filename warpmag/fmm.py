@@ -54,14 +54,15 @@ _SLACK = 1.001
 _LARGE_PART = 0.1
 """Part of all pairs from which on the method sums them where it is asked for."""
 _COSTS = {
-    ("cpu", Quantity.FIELD): (2.8e7, 0.0, 55.0),
-    ("cpu", Quantity.WRENCH): (1.0e7, 0.0, 30.0),
-    ("cuda", Quantity.FIELD): (6.7e8, 1.7e6, 60.0),
-    ("cuda", Quantity.WRENCH): (4.5e7, 0.0, 0.0),
+    ("cpu", Quantity.FIELD): (2.8e7, 55.0),
+    ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
+    ("cuda", Quantity.FIELD): (9.8e8, 96.0),
+    ("cuda", Quantity.WRENCH): (1.24e8, 128.0),
 }
-"""What the method takes, in pairs that are summed in the same time: at all, for each harmonic, and for each harmonic of
-each moment. On two cores both ways are as fast with 8,000 moments at 1e-3 and 13,500 at 1e-5, forces with 4,600 and
-8,000. Those of a GPU change ways at 31,000 and 40,000, and for forces, of which only whole calls ask, at 6,700."""
+"""What the method takes, in pairs that are summed in the same time: at all, and for each harmonic of each moment.
+
+Both ways are as fast with 8,000 moments at 1e-3 and 13,500 at 1e-5, forces with 4,600 and 8,000, on two cores; on an
+H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 33,000."""
 
 
 def check_fast(rtol: float):
@@ -74,8 +75,8 @@ def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device) -
     """Whether the method reaches a relative error, and sooner than the sums over so many pairs of ``count`` moments."""
     if rtol < LEAST_RTOL:
         return False
-    alone, harmonic, each = _COSTS["cuda" if device.is_cuda else "cpu", quantity]
-    return pairs >= alone + (choose_degree(rtol)[0] + 1) ** 2 * (harmonic + each * count)
+    alone, each = _COSTS["cuda" if device.is_cuda else "cpu", quantity]
+    return pairs >= alone + (choose_degree(rtol)[0] + 1) ** 2 * each * count
 
 
 def choose_degree(rtol: float) -> tuple[int, int]:
