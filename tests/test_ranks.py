@@ -113,6 +113,23 @@ def test_a_graph_of_a_cpu_that_would_not_merge_sums_is_refused():
         Ranks.merge(object.__new__(Ranks), sums)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "end, line",
+    [("os.kill(os.getpid(), 9)", "signal 9"), ("raise warpmag.InputError('bad: here')", "Error: bad: here")],
+)
+def test_a_rank_that_ends_leaves_none_waiting(end, line):
+    lines = (
+        "import os, numpy as np, warpmag",
+        "from warpmag.ranks import ranks",
+        f"if ranks().rank: {end}",
+        "warpmag.h_field(np.eye(3), np.eye(3), device='cpu')",
+    )
+    done = start(2, "-c", "\n".join(lines))
+    assert done.returncode != 0
+    assert done.stderr.count(line) == 1, done.stderr
+
+
 @pytest.mark.parametrize(
     "output, line",
     [("", "no such file"), pytest.param("/proc/out.usda", "rank 0: /proc/out.usda", marks=pytest.mark.long)],
