@@ -16,7 +16,7 @@ from warpmag.arrays import resolve_device
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
-from warpmag.engine.fitness import articulate, check_control, check_model, check_places, solver_warnings
+from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -101,7 +101,6 @@ class Simulation:
         )
         how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
         self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
-        check_places(self.model, self._magnetics.magnets, solver)
         all_ranks = ranks()
         graphs &= all_ranks is None  # what merges the sums of ranks is in no graph of a step
         self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
