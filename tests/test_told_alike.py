@@ -145,6 +145,17 @@ def test_so_is_what_an_instance_in_an_instance_says(tmp_path, device, capsys):
     assert error.startswith("/World/Outer/Copy: USD passes over /World/Inner/Copy/Ball, for it is in an instance")
 
 
+def test_in_what_is_only_seen_it_does_not_matter(tmp_path):
+    """Not even where units are converted; a body of its own there would be one more."""
+    for text, bodies in (('over "Ball" {\n double radius = 0.02\n}\n', ["/World/A"]), (IN_INSTANCE["a prim"][0], [])):
+        path = write(tmp_path, A, KINDS.replace("Physics", "Nothing").replace("Warpmag", "Nothing"), COPY.format(text))
+        path.write_text(path.read_text().replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
+        try:
+            assert check(path).contents.bodies == bodies
+        except InputError as error:
+            assert not bodies and "USD passes over /World/Copy/Extra" in str(error)
+
+
 def test_an_instance_that_says_nothing_runs(tmp_path, device, capsys):
     """Nor does one that is only seen, or that says of itself where it is, or in a variant, which instances share."""
     seen = KINDS.replace("Kinds", "Seen").replace("Physics", "Nothing").replace("WarpmagMagnetAPI", "NothingAPI")

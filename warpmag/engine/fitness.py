@@ -1,23 +1,15 @@
 """Refuses, in one line each, what a solver cannot take and what does not fit a model."""
 
-from collections.abc import Sequence
-
 import newton
 import numpy as np
 import warp as wp
 
 from warpmag.engine.contacts import MAXIMAL
-from warpmag.engine.grouping import BodyMagnet
-from warpmag.engine.sampling import BodyLattice
 from warpmag.errors import InputError
 from warpmag.magnets import shown
 
 SPRING_STIFFNESS = 1e4
 """Stiffness of the semi-implicit solver's joints as Newton sets it [N/m and N·m/rad]."""
-_SAME = 1e-3
-"""Magnets whose centres are nearer than this part of the smaller one's radius are at the same place."""
-_DIRECTION = np.array((0.6180, 0.5257, 0.5845))
-"""A direction that no lattice of magnets is likely to have planes across."""
 _WEAKNESSES = {
     "kamino": "solver kamino: hundreds of bodies that touch take it seconds a step, and drives of joints hold far "
     "stiffer than their gains; not so with xpbd",
@@ -72,80 +64,6 @@ def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
                 f"{model.joint_label[joint]}: a joint of a body that is too light for the solver {solver}, "
                 f"whose joints are springs of {SPRING_STIFFNESS:g} N/m and N·m/rad; take another solver"
             )
-
-
-def check_places(model: newton.Model, magnets: Sequence[BodyMagnet], solver: str) -> None:
-    """Refuse magnets of two moving bodies whose centres are at the same place, as a copy left where it was made is.
-
-    The centre has to be inside of both: a rotor may be in the middle of a ring. Magnets of different worlds never meet.
-
-    Args:
-        model: The model, with its bodies where they start.
-        magnets: Its magnets.
-        solver: What moves them: those of generalized coordinates take poses from joints.
-    """
-    _, first, kinds = np.unique([id(one.lattice) for one in magnets], return_index=True, return_inverse=True)
-    alike = np.array([_middle(magnets[one].lattice) for one in first])[kinds]
-    bodies, worlds = (np.array([getattr(one, name) for one in magnets]) for name in ("body", "world"))
-    rows = np.flatnonzero((bodies >= 0) & (alike[:, 3] > 0.0))
-    if len(rows):  # a model without bodies has no flags of them
-        moving = (model.body_inv_mass.numpy() > 0.0) & ~(model.body_flags.numpy() & newton.BodyFlags.KINEMATIC > 0)
-        rows = rows[moving[bodies[rows]]]
-    if len(rows) < 2:
-        return
-    state = model.state()
-    if solver not in MAXIMAL:
-        newton.eval_fk(model, state.joint_q, state.joint_qd, state)
-    poses, middles, bodies = state.body_q.numpy()[bodies[rows]].astype(float), alike[rows, :3], bodies[rows]
-    axes = poses[:, 3:6]
-    turned = middles + 2.0 * np.cross(axes, np.cross(axes, middles) + poses[:, 6:] * middles)
-    if pair := _at_one_place(poses[:, :3] + turned, _SAME * alike[rows, 3], bodies, worlds[rows]):
-        first, second = (model.body_label[body] for body in sorted(bodies[list(pair)].tolist()))
-        raise InputError(f"{first} and {second}: magnets of different bodies at the same place; move or remove one")
-
-
-def _middle(lattice: BodyLattice) -> tuple[float, ...]:
-    """Return the centre of a magnet and the radius of a ball of its volume [m], 0 where the centre is in a hole."""
-    volumes = lattice.volumes
-    total = volumes.sum()
-    middle = volumes @ lattice.positions / total
-    gaps = np.linalg.norm(lattice.positions - middle, axis=1)
-    near = int(np.argmin(gaps))
-    radii = np.cbrt(0.75 / np.pi * np.array([volumes[near], total]))
-    # From the corner that eight cubes share to a centre are 1.4 radii; a hole cuts volume off the cells around it.
-    solid = gaps[near] <= 1.5 * radii[0] and volumes[near] >= 0.99 * volumes.max()
-    return (*middle.tolist(), float(radii[1]) if solid else 0.0)
-
-
-def _at_one_place(
-    centres: np.ndarray, reaches: np.ndarray, bodies: np.ndarray, worlds: np.ndarray
-) -> tuple[int, int] | None:
-    """Return two rows of different bodies in one world that are nearer to each other than the smaller reach.
-
-    They are sorted along a direction, the worlds one behind the other, and compared with those that follow.
-
-    Args:
-        centres: Places [m], shape [n, 3].
-        reaches: Distances that count as none [m], shape [n].
-        bodies: Body of each, shape [n].
-        worlds: World of each, shape [n].
-    """
-    along = centres @ _DIRECTION
-    along += worlds * (2.0 * np.ptp(along) + 2.0 * reaches.max())
-    order = np.argsort(along, kind="stable")
-    along, centres, reaches, bodies = along[order], centres[order], reaches[order], bodies[order]
-    lead, step = np.arange(len(order)), 1
-    while len(lead):
-        lead = lead[lead + step < len(order)]
-        lead = lead[along[lead + step] - along[lead] <= reaches[lead]]  # the farther ones are beyond reach, too
-        other = lead + step
-        same = np.linalg.norm(centres[other] - centres[lead], axis=1) < np.minimum(reaches[lead], reaches[other])
-        same &= bodies[other] != bodies[lead]
-        if same.any():
-            found = int(np.argmax(same))
-            return int(order[lead[found]]), int(order[other[found]])
-        step += 1
-    return None
 
 
 def solver_warnings(solver: str) -> list[str]:

@@ -16,7 +16,7 @@ from warpmag.arrays import resolve_device
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
-from warpmag.engine.fitness import articulate, check_control, check_model, check_places, solver_warnings
+from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -104,7 +104,6 @@ class Simulation:
             self.model = self._finalize(builder, solver, scene)
             settings = settings.replaced(external_field=external_field, **own)
             self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
-            check_places(self.model, self._magnetics.magnets, solver)
             self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
             self._options = self._options_of(settings, solver, **how)
             if self._ranks is not None:

@@ -17,7 +17,7 @@ from warpmag.errors import InputError
 from warpmag.usd.alike import ARRAYS, MOMENTS, AlikeBalls, alike, ball_in, may_be_alike, may_stay_whole
 from warpmag.usd.first_reading import MOST_PRIMS
 from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
-from warpmag.usd.session import INSTANCES, add_layer, new_layer, release, release_instances
+from warpmag.usd.session import INSTANCES, add_layer, is_physical, new_layer, release, release_instances
 from warpmag.usd.transforms import is_body, is_collider
 from warpmag.usd.units import units_of
 
@@ -64,11 +64,6 @@ def complete_instances(apart: list[AlikeBalls]) -> None:
         balls.write()
 
 
-def _is_physical(prim: Usd.Prim) -> bool:
-    schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
-    return any(one.startswith(("PhysicsRigidBody", "PhysicsCollision", "Warpmag")) for one in schemas)
-
-
 @dataclass(frozen=True)
 class _Prototype:
     """What instances are made of.
@@ -110,7 +105,7 @@ class _Expansion:
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         roots = [self._prototype_prim(path, target) for target in targets]
         held = [one for root in (instancer.GetPrim(), *roots) for one in _all_below(root)]
-        if not any(map(_is_physical, held)):
+        if not any(map(is_physical, held)):
             return
         inner = [one.GetPath() for root in roots for one in _all_below(root) if one.IsA(UsdGeom.PointInstancer)]
         for one in inner:
@@ -128,11 +123,11 @@ class _Expansion:
     def _editable(self, path: Sdf.Path) -> Usd.Prim:
         """Return the prim at a path, no longer in an instance."""
         while (prim := self._stage.GetPrimAtPath(path)) and prim.IsInstanceProxy():
-            if not any(_is_physical(one) for one in _all_below(prim)):
+            if not any(is_physical(one) for one in _all_below(prim)):
                 break  # only seen, or what it has is elsewhere, which must not be in an instance
             while not prim.IsInstance():
                 prim = prim.GetParent()
-            release(self._layer_of_prims(), [prim])
+            release(self._stage, self._layer_of_prims(), [prim.GetPath()])
         return prim
 
     def _prototype_prim(self, instancer: Sdf.Path, target: Sdf.Path) -> Usd.Prim:

@@ -43,24 +43,34 @@ def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> N
     """
     while True:
         prims = Usd.PrimRange(stage.GetPrimAtPath(within), Usd.PrimAllPrimsPredicate)
-        instances = [prim for prim in prims if prim.IsInstance()]
+        instances = [prim.GetPath() for prim in prims if prim.IsInstance()]
         if not instances:
             return
-        release(layer, instances)
+        release(stage, layer, instances)
 
 
-def release(layer: Sdf.Layer, instances: list[Usd.Prim]) -> None:
+def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> None:
     """Make what instances hold editable, by opinions in ``layer``.
 
     Raises:
-        InputError: One would change by that.
+        InputError: What they hold that is physical may change by that.
     """
-    for finding in instance_findings(instances):
-        raise InputError(str(finding))
-    paths = [prim.GetPath() for prim in instances]
     with Sdf.ChangeBlock():
-        for path in paths:
+        for path in instances:
             Sdf.CreatePrimInLayer(layer, path).instanceable = False
+    everywhere = Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)
+    for finding in instance_findings(
+        prim
+        for prim in map(stage.GetPrimAtPath, instances)
+        if any(is_physical(one) or one.GetTypeName().startswith("Physics") for one in Usd.PrimRange(prim, everywhere))
+    ):
+        raise InputError(str(finding))
+
+
+def is_physical(prim: Usd.Prim) -> bool:
+    """Whether a prim is a body, a collider, a magnet or a source, by the schemas applied."""
+    schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
+    return any(one.startswith(("PhysicsRigidBody", "PhysicsCollision", "Warpmag")) for one in schemas)
 
 
 def instances_around(prims: Iterable[Usd.Prim]) -> list[Usd.Prim]:
