@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpmag.errors import InputError
+from warpmag.errors import InputError, extra
 
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")
 """What launchers tell their processes: how many they are."""
@@ -43,7 +43,7 @@ def ranks() -> "Ranks | None":
     try:
         from mpi4py import MPI  # noqa: PLC0415 - initializes MPI, which only processes of a launcher may
     except ImportError as error:
-        raise InputError(f"mpirun: ranks need the extra 'ranks', pip install 'warpmag[ranks]' ({error})") from None
+        raise InputError(f"mpirun: ranks need {extra('ranks')}: {error}") from None
     return Ranks(MPI) if MPI.COMM_WORLD.size > 1 else None
 
 
