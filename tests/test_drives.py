@@ -274,7 +274,7 @@ def test_a_weak_pull_moves_a_body_that_rebounds(device):
 def test_a_solver_that_is_not_installed_names_what_installs_it(device, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     monkeypatch.setattr(newton.solvers.SolverMuJoCo, "_mujoco_warp", None)
-    with pytest.raises(InputError, match=r"^solver mujoco: needs what `pip install 'warpmag\[sim\]'` installs \("):
+    with pytest.raises(InputError, match=r"^solver mujoco: needs the extra 'sim' \(pip install 'warpmag\[sim\]', "):
         Simulation(servo()[0], solver="mujoco", device=device)
 
 

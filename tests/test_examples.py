@@ -2,6 +2,8 @@
 
 import importlib
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import newton
@@ -9,6 +11,7 @@ import pytest
 import warp as wp
 
 from warpmag import examples
+from warpmag.errors import extra
 
 FOLDER = Path(examples.__file__).parent
 SMALL = {
@@ -83,5 +86,15 @@ def test_a_viewer_that_cannot_open_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["examples", "worlds"])
     assert examples.main() == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("warpmag: viewer: gl cannot open, it needs the extra 'viewers' and a display, ")
-    assert line.endswith(" (no display)")
+    assert line.startswith("warpmag: viewer: gl cannot open, it needs a display, without ")
+    assert line.endswith(", in a checkout uv run --extra viewers ...): no display")
+
+
+def test_an_example_without_its_solver_is_one_line():
+    """In a process of its own, where Warp starts: what it says of a missing GPU is no second line."""
+    hide = "import sys; sys.modules |= {'mujoco': None, 'mujoco_warp': None}; sys.argv[1:] = ['arm', '--headless']"
+    code = f"{hide}; from warpmag.examples import main; sys.exit(main())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    (line,) = done.stderr.splitlines()
+    assert (done.returncode, done.stdout) == (2, "")
+    assert line.startswith(f"warpmag: arm needs {extra('sim')}: ")

@@ -31,7 +31,9 @@ PYTHONS = ("3.11", "3.12", "3.13")
 
 
 def run(command, cwd, **environment):
-    return subprocess.run(command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True, timeout=300)
+    timeout = 1800  # ends what hangs; kernels compile for minutes where other work shares the cores
+    environment = os.environ | environment
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout)
 
 
 def printed(command, cwd, **environment):

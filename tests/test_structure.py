@@ -29,7 +29,7 @@ OWNERS = {
     "warp": (
         "warpmag/engine",
         "warpmag/examples",
-        "warpmag/cli.py",
+        "warpmag/progress.py",  # keeps Warp quiet for commands
         *(
             f"warpmag/{name}.py"
             for name in "arrays dynamics energies fields induction layout pair_sums probe ranks snapshot system".split()

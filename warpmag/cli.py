@@ -5,7 +5,6 @@ import contextlib
 import os
 import signal
 import sys
-import tempfile
 import threading
 import traceback
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ from warpmag import __version__
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.garbage import collection_paused
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
-from warpmag.progress import Progress, silence
+from warpmag.progress import Progress, quiet_warp, silence
 from warpmag.ranks import Ranks, alone, by_first, ranks
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
@@ -297,17 +296,22 @@ def _check(options) -> int:
 @collection_paused()
 def _load(path: Path, **options):
     """Return the simulation of a stage, ready to step."""
-    _quiet_warp()
+    _start_warp(path)
     from warpmag.engine.simulation import Simulation  # noqa: PLC0415
 
+    return Simulation(path, **options)
+
+
+def _start_warp(path: Path) -> None:
+    """Start Warp and tell who waits what for; must come before the first import of the engine."""
+    quiet_warp()
     if sys.stderr.isatty():
         print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
-    return Simulation(path, **options)
 
 
 def _render(options) -> int:
     path, _ = _find_scene(options.stage)
-    _quiet_warp()
+    _start_warp(path)
     if options.quality == "final":
         from warpmag.final import render_final  # noqa: PLC0415
 
@@ -342,7 +346,7 @@ def _two(name: str, text: str, between: str) -> tuple[int, int]:
 
 def _export(options) -> int:
     path, _ = _find_scene(options.stage)
-    _quiet_warp()
+    _start_warp(path)
     from warpmag.export import export  # noqa: PLC0415
 
     names = ("rate", "color", "arrows", "field_lines", "materialx", "device")
@@ -452,34 +456,6 @@ def _open_display(name: str, simulation):
     display = Display(viewer, simulation.model, simulation.magnetics)
     display.allow_restart()
     return display
-
-
-def _quiet_warp() -> None:
-    """Keep Warp's start-up talk off the terminal; must come before the first import of the engine."""
-    import warp  # noqa: PLC0415
-
-    warp.config.log_level = warp.LOG_ERROR
-    warp.config.enable_backward = False  # nothing here is differentiated, and it doubles the time to compile
-    with _without_lines("Could not find or load the NVIDIA CUDA driver", "no CUDA-capable device is detected"):
-        warp.init()
-
-
-@contextlib.contextmanager
-def _without_lines(*texts: str) -> Iterator[None]:
-    """Drop the lines with one of ``texts`` from what native code writes to stderr."""
-    sys.stderr.flush()
-    saved = os.dup(2)
-    with tempfile.TemporaryFile() as caught:
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
-            caught.seek(0)
-            for line in caught.read().decode(errors="replace").splitlines():
-                if not any(text in line for text in texts):
-                    print(line, file=sys.stderr)
 
 
 if __name__ == "__main__":

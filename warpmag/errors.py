@@ -11,6 +11,11 @@ def one_line(text: str) -> str:
     return "".join(one if one.isprintable() else " " for one in text)
 
 
+def extra(name: str) -> str:
+    """Return the extra of that name with the commands that bring it, for a line about what is missing."""
+    return f"the extra '{name}' (pip install 'warpmag[{name}]', in a checkout uv run --extra {name} ...)"
+
+
 class InputError(ValueError):
     """Bad input from the user: one line that names the prim or the argument.
 

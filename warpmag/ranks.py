@@ -29,7 +29,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from warpmag.errors import InputError, SimulationError, one_line
+from warpmag.errors import InputError, SimulationError, extra, one_line
 from warpmag.magnets import check_count
 
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")
@@ -58,7 +58,7 @@ def launched() -> "Ranks | None":
     try:
         from mpi4py import MPI  # noqa: PLC0415 - initializes MPI, which only processes of a launcher may
     except ImportError as error:
-        raise InputError(f"mpirun: ranks need the extra 'ranks', pip install 'warpmag[ranks]' ({error})") from None
+        raise InputError(f"mpirun: ranks need {extra('ranks')}: {error}") from None
     return Ranks(MPI) if MPI.COMM_WORLD.size > 1 else None
 
 

@@ -15,7 +15,7 @@ import warp as wp
 
 from warpmag.engine.broad_phase import NeighborBroadPhase
 from warpmag.engine.xpbd import PileXPBD
-from warpmag.errors import InputError
+from warpmag.errors import InputError, extra
 from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, Watched, watch, watch_flags
 from warpmag.kernels.rigid.newton_views import view_bodies, view_contacts
 from warpmag.magnets import check_token
@@ -247,7 +247,7 @@ class RigidSolver:
             try:
                 self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
             except ImportError as error:
-                reason = f"needs what `pip install 'warpmag[sim]'` installs ({error.__cause__ or error})"
+                reason = f"needs {extra('sim')}: {error.__cause__ or error}"
                 raise InputError(f"solver {self._name}: {reason}") from None
             except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
                 raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.engine.magnetics import Magnetics
-from warpmag.errors import InputError
+from warpmag.errors import InputError, extra
 
 _DIRECTION = np.array((0.55, -0.75, 0.45))
 """From the scene to the camera, along east, north and up."""
@@ -25,8 +25,8 @@ _PAUSE = 1.0 / 60.0
 def no_viewer(name: str, error: Exception) -> InputError:
     """Return the one line about a viewer that could not open; each fails in its own way without what it needs."""
     reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    needed = "the extra 'viewers'" + (" and a display, without one take viser or rerun" if name == "gl" else "")
-    return InputError(f"viewer: {name} cannot open, it needs {needed} ({reason})")
+    display = "a display, without one take viser or rerun, and " if name == "gl" else ""
+    return InputError(f"viewer: {name} cannot open, it needs {display}{extra('viewers')}: {reason}")
 
 
 class Display:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warpmag.errors import InputError
+from warpmag.errors import InputError, extra
 
 FILMS = (".mp4", ".gif")
 SUFFIXES = (".png", *FILMS)
@@ -84,9 +84,7 @@ def _ffmpeg():
     try:
         import imageio_ffmpeg  # noqa: PLC0415 - an extra
     except ImportError:
-        raise InputError(
-            "a film as .mp4 needs imageio-ffmpeg: pip install 'warpmag[video]'; .gif needs nothing"
-        ) from None
+        raise InputError(f"a film as .mp4 needs {extra('video')}; .gif needs nothing") from None
     return imageio_ffmpeg
 
 

@@ -15,7 +15,8 @@ import newton.examples
 import warp as wp
 
 from warpmag.engine.display import no_viewer
-from warpmag.errors import InputError
+from warpmag.errors import InputError, extra
+from warpmag.progress import quiet_warp
 
 __all__ = ["create_parser", "get_examples", "init", "main", "run"]
 
@@ -46,8 +47,9 @@ def init(parser: argparse.ArgumentParser):
     options = parser.parse_args()
     if options.headless:
         sys.argv += ["--viewer", "null"]
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    wp.config.enable_backward = False  # nothing here is differentiated, and it doubles the time to compile
+    level = max(wp.config.log_level, wp.LOG_WARNING)
+    quiet_warp()
+    wp.config.log_level = level  # what Warp warns of is worth reading where one learns
     try:
         return newton.examples.init(parser)
     except Exception as error:  # each viewer fails in its own way
@@ -89,7 +91,7 @@ def main() -> int:
             return 2
         except ImportError as error:  # of Newton's solvers, which name it
             reason = " ".join(str(error.__cause__ or error).split())
-            print(f"warpmag: {name} needs what `pip install 'warpmag[sim]'` installs ({reason})", file=sys.stderr)
+            print(f"warpmag: {name} needs {extra('sim')}: {reason}", file=sys.stderr)
             return 2
         return 0
     known = name in (None, "-h", "--help", "--list")

@@ -108,8 +108,11 @@ class Example:
         """What it shows."""
         behind, speeds = self.follow()
         follows = speeds > 0.9 * SPEED
-        angles, parts = np.degrees(behind[follows]).round(1), (speeds[~follows] / SPEED).round(2)
-        return f"{len(angles)} rows follow the field at {angles} degrees, {len(parts)} turn at {parts} of its speed"
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(behind[follows]))
+        parts = ", ".join(f"{part:.2f}" for part in speeds[~follows] / SPEED)
+        told = [f"{follows.sum()} rows follow the field, {angles} degrees behind it"] if angles else []
+        told += [f"{(~follows).sum()} slip and turn at {parts} of its speed"] if parts else []
+        return ", ".join(told)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom, UsdShade, Vt
 
-from warpmag.errors import InputError
+from warpmag.errors import InputError, extra
 from warpmag.usd.glb import glb
 from warpmag.usd.meshes import corner_normals, shape_of
 from warpmag.usd.placements import rigid, turn_of
@@ -77,7 +77,7 @@ def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
     try:
         import viser  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise InputError(f"a web page needs the extra 'viewers' ({error})") from None
+        raise InputError(f"a web page needs {extra('viewers')}: {error}") from None
     batches = [*_instances(stage, codes), *_meshes(stage, codes)]
     curves = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves)]
     with contextlib.redirect_stdout(io.StringIO()):  # it talks of its address

@@ -314,7 +314,7 @@ class RenderLayer:
         """
         path = usable_path(output)
         if path.suffix not in _SUFFIXES:
-            raise InputError(f"{path}: a stage must end in {', '.join(_SUFFIXES)}")
+            raise InputError(f"{path}: a stage must end in {', '.join(_SUFFIXES)}, numbers in .npz or .csv")
         if path.resolve() in self._files:
             raise InputError(f"{path}: would overwrite what is exported")
         if materialx:
