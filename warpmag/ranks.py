@@ -47,12 +47,17 @@ def ranks() -> "Ranks | None":
     return Ranks(MPI) if MPI.COMM_WORLD.size > 1 else None
 
 
+def is_first(all_ranks: "Ranks | None") -> bool:
+    """Whether this process is the one that writes and prints: the first rank, or one by itself."""
+    return all_ranks is None or all_ranks.rank == 0
+
+
 def by_first(do: Callable):
     """Return what ``do`` returns; of several ranks the first does it for all."""
     all_ranks = ranks()
     if all_ranks is None:
         return do()
-    return all_ranks.broadcast(do() if all_ranks.rank == 0 else None)
+    return all_ranks.broadcast(do() if is_first(all_ranks) else None)
 
 
 class Ranks:

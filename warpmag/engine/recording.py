@@ -15,7 +15,7 @@ from warpmag.engine.scene import ImportedScene
 from warpmag.engine.statistics import Statistics
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError
-from warpmag.ranks import by_first, ranks
+from warpmag.ranks import by_first, is_first, ranks
 from warpmag.usd import CacheWriter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -67,9 +67,8 @@ class Recorder:
         self._bodies = np.array(list(own.values()), dtype=int)
         self._shapes = np.array([row[shape] for of_prim in shapes for shape in of_prim], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
-        all_ranks = ranks()
         self._writer: CacheWriter | _NoWriter = _NoWriter()
-        if all_ranks is None or all_ranks.rank == 0:
+        if is_first(ranks()):
             self._writer = CacheWriter(
                 scene.stage,
                 output,
