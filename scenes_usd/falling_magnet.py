@@ -51,6 +51,29 @@ def author(
         seconds=5.0,
     )
     authoring.add_scene(stage, MagneticSettings())
+    iron, magnet = _add_materials(stage, magnet_density, friction)
+    positions = stack(balls, layers, radius)
+    UsdGeom.Scope.Define(stage, "/World/Balls")
+    ball_magnet = Magnet(saturation=saturation)
+    for number, position in enumerate(positions):
+        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
+    top = float(positions[:, 2].max()) + radius
+    authoring.add_ball(
+        stage,
+        "/World/Magnet",
+        (0.0, 0.0, top + drop + magnet_radius),
+        magnet_radius,
+        magnet,
+        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
+        color=authoring.MAGNET_COLOR,
+    )
+    reach = max(float(np.ptp(positions[:, 0])), top + drop + 2.0 * magnet_radius)
+    authoring.add_camera(stage, (1.2 * reach, -3.2 * reach, 1.2 * reach), (0.0, 0.0, 0.46 * reach))
+    authoring.save(stage, path)
+
+
+def _add_materials(stage, magnet_density: float, friction: float) -> tuple:
+    """Add all materials, and the ground of its own; return those of the balls and of the magnet."""
     iron = authoring.add_material(
         stage,
         "Iron",
@@ -71,24 +94,7 @@ def author(
     )
     ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8, friction=friction)
     authoring.add_ground(stage, ground, size=2.0)
-    positions = stack(balls, layers, radius)
-    UsdGeom.Scope.Define(stage, "/World/Balls")
-    ball_magnet = Magnet(saturation=saturation)
-    for number, position in enumerate(positions):
-        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
-    top = float(positions[:, 2].max()) + radius
-    authoring.add_ball(
-        stage,
-        "/World/Magnet",
-        (0.0, 0.0, top + drop + magnet_radius),
-        magnet_radius,
-        magnet,
-        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
-        color=authoring.MAGNET_COLOR,
-    )
-    reach = max(float(np.ptp(positions[:, 0])), top + drop + 2.0 * magnet_radius)
-    authoring.add_camera(stage, (1.2 * reach, -3.2 * reach, 1.2 * reach), (0.0, 0.0, 0.46 * reach))
-    authoring.save(stage, path)
+    return iron, magnet
 
 
 def stack(count: int, layers: int, radius: float) -> np.ndarray:

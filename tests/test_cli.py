@@ -244,7 +244,7 @@ int cuGetProcAddress(const char *name, void **found, int version_, uint64_t flag
 def test_a_hidden_gpu_is_no_news(tmp_path):
     (tmp_path / "driver.c").write_text(DRIVER)
     subprocess.run(["gcc", "-shared", "-fPIC", "-o", "libcuda.so", "driver.c"], cwd=tmp_path, check=True)
-    quiet = "from warpmag.progress import quiet_warp; quiet_warp(); import warp; assert not warp.get_cuda_devices()"
+    quiet = "from warpmag.terminal import quiet_warp; quiet_warp(); import warp; assert not warp.get_cuda_devices()"
     environment = os.environ | {"LD_LIBRARY_PATH": f"{tmp_path}:{os.environ.get('LD_LIBRARY_PATH', '')}"}
     loud = subprocess.run(
         [sys.executable, "-c", "import warp; warp.init()"], env=environment, capture_output=True, text=True

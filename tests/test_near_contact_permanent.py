@@ -11,7 +11,7 @@ import warp as wp
 from arrangements import relative
 
 import warpmag
-from warpmag import contact_oracle
+from warpmag import uneven_oracle
 from warpmag.kernels.near_contact import contact_table, near_pairs
 from warpmag.system import MomentSystem
 
@@ -91,9 +91,7 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
 
     def energy(x, m):
         return sum(
-            contact_oracle.uneven_energy(
-                x[i], radii[i], SUSCEPTIBILITY[i], x[2:], radii[2:], m[2:], np.full(3, not cells)
-            )
+            uneven_oracle.energy(x[i], radii[i], SUSCEPTIBILITY[i], x[2:], radii[2:], m[2:], np.full(3, not cells))
             for i in (0, 1)
         )
 

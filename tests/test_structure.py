@@ -29,7 +29,7 @@ OWNERS = {
     "warp": (
         "warpmag/engine",
         "warpmag/examples",
-        "warpmag/progress.py",  # keeps Warp quiet for commands
+        "warpmag/terminal.py",  # keeps Warp quiet for commands
         *(
             f"warpmag/{name}.py"
             for name in "arrays dynamics energies fields induction layout pair_sums probe ranks snapshot system".split()
@@ -45,6 +45,12 @@ HOST_TREES = {
     path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"))
     for path in sorted((ROOT / "warpmag").rglob("*.py"))
 }
+OUTSIDE_TREES = {
+    path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"))
+    for folder in ("bench", "scenes_usd")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+}
+"""Benchmarks, and what authors the bundled scenes."""
 MODULES = {".".join(("warpmag.kernels", *path.with_suffix("").parts)): path for path in SOURCES}
 
 
@@ -68,6 +74,11 @@ def line_count(node) -> int:
     """Lines of a node, decorators included."""
     decorators = getattr(node, "decorator_list", [])
     return node.end_lineno - min([node.lineno, *(one.lineno for one in decorators)]) + 1
+
+
+def docstring_lines(node) -> int:
+    """Lines of the docstring of a function, a class or a module."""
+    return line_count(node.body[0]) if ast.get_docstring(node) is not None else 0
 
 
 def strings(path):
@@ -167,6 +178,21 @@ def test_functions_files_and_strings_are_short():
             if line_count(f) > LONGEST_FUNCTION
         ]
         long += [f"{path}:{line} string: {lines} lines" for line, lines in strings(path) if lines > LONGEST_STRING]
+    assert not long, "\n".join(long)
+
+
+def test_host_functions_and_files_are_short():
+    """Without docstrings: those of host code are what a user reads of it, arguments, units and errors."""
+    documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module
+    long = []
+    for path, tree in (HOST_TREES | OUTSIDE_TREES).items():
+        text = (ROOT / path).read_text(encoding="utf-8")
+        lines = text.count("\n") - sum(docstring_lines(n) for n in ast.walk(tree) if isinstance(n, documented))
+        if lines > LONGEST_FILE:
+            long.append(f"{path}: {lines} lines")
+        for f in functions(tree):
+            if (lines := line_count(f) - docstring_lines(f)) > LONGEST_FUNCTION:
+                long.append(f"{path}:{f.lineno} {f.name}: {lines} lines")
     assert not long, "\n".join(long)
 
 

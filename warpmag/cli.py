@@ -5,17 +5,16 @@ import contextlib
 import os
 import signal
 import sys
-import threading
 import traceback
-from collections.abc import Iterator
 from pathlib import Path
 
 from warpmag import __version__
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.garbage import collection_paused
 from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
-from warpmag.progress import Progress, quiet_warp, silence
-from warpmag.ranks import Ranks, alone, by_first, ranks
+from warpmag.progress import Progress
+from warpmag.ranks import Ranks, alone, by_first, is_first, ranks
+from warpmag.terminal import Stopped, open_standard_files, quiet_warp, signals_raised, silence, tell
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes; 0 where all went well, ``STOPPED`` and the signal's number where a signal ended it."""
@@ -34,36 +33,28 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
-class _Stopped(KeyboardInterrupt):
-    """A signal that ends the command."""
-
-    def __init__(self, number: int):
-        self.number = number
-        super().__init__("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    _open_standard_files()
+    open_standard_files()
     try:
         all_ranks = ranks()
     except InputError as error:
-        _tell(error)
+        tell(error)
         return BAD_INPUT
     code, line = _do(arguments, all_ranks)
     if line and all_ranks is not None:
-        all_ranks.fail(line, code, _tell)
+        all_ranks.fail(line, code, tell)
     elif line:
-        _tell(line)
+        tell(line)
     return code
 
 
 def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]:
     """Do what the arguments say; return the exit code, and a line of what went wrong."""
     try:
-        with _signals_raised():
+        with signals_raised():
             options = _parser().parse_args(arguments)
-            if all_ranks is not None and all_ranks.rank > 0:
+            if not is_first(all_ranks):
                 if options.command is not _run:
                     return 0, ""  # only a run is shared out
                 silence(1)
@@ -75,7 +66,7 @@ def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]
         return BAD_INPUT, str(error)
     except SimulationError as error:
         return FAILED, str(error)
-    except _Stopped as stopped:
+    except Stopped as stopped:
         return STOPPED + stopped.number, str(stopped)
     except MemoryError as error:
         return FAILED, one_line(f"not enough memory ({error})" if str(error) else "not enough memory")
@@ -89,50 +80,24 @@ def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]
         return FAILED, f"{type(error).__name__}: {error}"
 
 
-def _open_standard_files() -> None:
-    """Put something in the place of standard files that are closed, or files of a run would take their numbers."""
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w" if number else "r", encoding="utf-8"))
-
-
-@contextlib.contextmanager
-def _signals_raised() -> Iterator[None]:
-    """Raise :class:`_Stopped` for signals that would end the process; those that are ignored stay so."""
-
-    def stop(number, _):
-        raise _Stopped(number)
-
-    ends = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        before = {number: handler for number, handler in ends.items() if signal.getsignal(number) == handler}
-    for number in before:
-        signal.signal(number, stop)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _tell(what) -> None:
-    """Print a line on stderr, if somebody reads it."""
-    try:
-        print(f"warpmag: {what}", file=sys.stderr, flush=True)
-    except OSError:
-        silence(2)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="warpmag", description="Magnets for the Newton physics engine.")
     parser.add_argument("--version", action="version", version=f"warpmag {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_run(commands)
+    scenes = commands.add_parser("scenes", help="list the bundled scenes")
+    scenes.set_defaults(command=_scenes)
 
+    check = commands.add_parser("check", help="tell what a stage holds and what is wrong with it")
+    check.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
+    check.set_defaults(command=_check)
+
+    _add_render(commands)
+    _add_export(commands)
+    return parser
+
+
+def _add_run(commands) -> None:
     run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")
     run.add_argument("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
     run.add_argument("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
@@ -167,13 +132,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.set_defaults(command=_run)
 
-    scenes = commands.add_parser("scenes", help="list the bundled scenes")
-    scenes.set_defaults(command=_scenes)
 
-    check = commands.add_parser("check", help="tell what a stage holds and what is wrong with it")
-    check.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
-    check.set_defaults(command=_check)
-
+def _add_render(commands) -> None:
     render = commands.add_parser("render", help="draw frames of a stage, of a finished run for example")
     render.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     render.add_argument("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
@@ -187,8 +147,6 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--moments", action="store_true", help="show the moments of a finished run as arrows")
     render.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     render.set_defaults(command=_render)
-    _add_export(commands)
-    return parser
 
 
 def _add_export(commands) -> None:
@@ -225,12 +183,6 @@ def _scenes(options) -> int:
     return 0
 
 
-def _is_first() -> bool:
-    """Whether this process is the one that writes and prints."""
-    all_ranks = ranks()
-    return all_ranks is None or all_ranks.rank == 0
-
-
 def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLDER) -> tuple[Path, bool]:
     """Return the file of a scene, and whether it is a bundled one; one that has to be made is written to ``folder``."""
     from warpmag.scenes_usd import MADE, bundled, make  # noqa: PLC0415
@@ -242,8 +194,8 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
         if balls is None and name in scenes:
             return scenes[name], True
         made = by_first(lambda: make(name, folder, balls), ranks())
-        if _is_first():
-            _tell(f"scene: {made}")
+        if is_first(ranks()):
+            tell(f"scene: {made}")
         return made, False
     if not os.path.exists(path) and not path.suffix:
         raise InputError(f"{name}: no such file and no bundled scene (there are {', '.join((*scenes, *MADE))})")
@@ -403,7 +355,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     progress = Progress(simulation.frames_of(options.frames))
 
     def show(frame: int) -> bool:
-        if _is_first():
+        if is_first(ranks()):
             progress.show(frame)
         return display is None or display.follow(simulation.time, simulation.state)
 
@@ -415,7 +367,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
         raise
     finally:
         progress.close()
-    if (display and display.restarted) or not _is_first():
+    if (display and display.restarted) or not is_first(ranks()):
         return
     if progress.done is None:
         print(f"complete       {output} has all {progress.frames} frames already")
@@ -433,13 +385,13 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
     if display is not None and options.viewer in _STAYING and display.viewer.is_running():
-        _tell(f"the {options.viewer} viewer keeps the last frame, Ctrl-C leaves")
+        tell(f"the {options.viewer} viewer keeps the last frame, Ctrl-C leaves")
         display.stay()
 
 
 def _warn(lines: list[str]) -> None:
-    for line in lines if _is_first() else ():
-        _tell(f"warning: {line}")
+    for line in lines if is_first(ranks()) else ():
+        tell(f"warning: {line}")
 
 
 def _open_display(name: str, simulation):

@@ -7,16 +7,11 @@ import numpy as np
 
 from warpmag import oracle
 from warpmag.kernels.near_contact.contact_table import (
-    CELL_DEPTH,
-    CELL_SIZE,
     CONTACT_GAP,
     DEEPEST,
     FUNCTIONS,
-    LEAST_MAGNET,
     LEAST_RATIO,
     LOG_GAPS,
-    MAGNET_OVERLAP,
-    MAGNET_REACH,
     MOST_SHARED,
     QUADRUPOLE_OVERLAP,
     QUADRUPOLE_REACH,
@@ -38,15 +33,16 @@ def log_gap(gap):
     return value, (1.0 + depth**2) ** -1.5 / outside
 
 
-def _smoothstep(x):
+def smoothstep(x):
+    """Cubic step from 0 at x = 0 to 1 at x = 1, and its derivative."""
     x = np.clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x)
 
 
 def window(gap, far=CONTACT_GAP, deep=DEEPEST):
     """Factor that fades from a gap ``far[0]`` to ``far[1]`` and in an overlap from ``deep[0]`` on, its derivative."""
-    outer, outer_slope = _smoothstep((far[1] - gap) / (far[1] - far[0]))
-    inner, inner_slope = _smoothstep((deep[1] + gap) / (deep[1] - deep[0]))
+    outer, outer_slope = smoothstep((far[1] - gap) / (far[1] - far[0]))
+    inner, inner_slope = smoothstep((deep[1] + gap) / (deep[1] - deep[0]))
     return outer * inner, outer * inner_slope / (deep[1] - deep[0]) - inner * outer_slope / (far[1] - far[0])
 
 
@@ -85,7 +81,7 @@ def conductances(gap, own, other):
 def similarity(radius_i, radius_j):
     """Factor that fades the pair's part of balls of unlike size, for which the table of equal ones is no guide."""
     ratio = np.minimum(radius_i, radius_j) / np.maximum(radius_i, radius_j)
-    return _smoothstep((ratio - LEAST_RATIO[0]) / (LEAST_RATIO[1] - LEAST_RATIO[0]))[0]
+    return smoothstep((ratio - LEAST_RATIO[0]) / (LEAST_RATIO[1] - LEAST_RATIO[0]))[0]
 
 
 def shared_volume(distance, a, b):
@@ -97,7 +93,7 @@ def shared_volume(distance, a, b):
 
 def crowding_weight(shared):
     """Factor that takes balls out of the model that share the volume ``shared`` with others."""
-    return 1.0 - _smoothstep((shared - MOST_SHARED[0]) / (MOST_SHARED[1] - MOST_SHARED[0]))[0]
+    return 1.0 - smoothstep((shared - MOST_SHARED[0]) / (MOST_SHARED[1] - MOST_SHARED[0]))[0]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -402,56 +398,3 @@ def equilibrium(positions, radii, h0, *, saturation, susceptibility=np.inf, curv
     moments = volumes[:, None] * found.magnetizations
     gradients = oracle.field_gradient(positions, moments, radii=radii)
     return found, oracle.kelvin_force(moments, gradients) + near.forces(moments)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# A ball in the uneven field of permanent moments
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def uneven_weight(distance, radius, its_radius, alone):
-    """Factor by which permanent moments take part in the multipoles of a ball, at distances [m], shape [n]."""
-    rho, its = distance / radius, its_radius / radius
-    depth = np.maximum(np.where(alone, its, CELL_DEPTH * its), LEAST_MAGNET)
-    far = _smoothstep((MAGNET_REACH[1] - rho) / (MAGNET_REACH[1] - MAGNET_REACH[0]))[0]
-    shallow, deep = MAGNET_OVERLAP
-    near = _smoothstep((rho - 1.0 - (1.0 - deep) * depth) / ((deep - shallow) * depth))[0]
-    coarse = _smoothstep((its - CELL_SIZE[0]) / (CELL_SIZE[1] - CELL_SIZE[0]))[0]
-    return far * near * np.where(alone, 1.0, 1.0 - coarse)
-
-
-def uneven_energy(center, radius, susceptibility, positions, radii, moments, alone):
-    """Energy [J] of what the multipoles of degree 2 and more of an inducible ball add, by Legendre's polynomials.
-
-    Args:
-        center: The ball's centre [m], shape [3].
-        radius: Its radius [m].
-        susceptibility: Its χ, may be infinite.
-        positions: Places of the permanent moments [m], shape [n, 3].
-        radii: Radii of their balls [m], shape [n].
-        moments: Moments [A·m²], shape [n, 3].
-        alone: Whether each is alone on its body, shape [n].
-    """
-    s = (np.asarray(positions, float) - center) / radius
-    d = np.linalg.norm(s, axis=1)
-    w = uneven_weight(d * radius, radius, np.asarray(radii, float), np.asarray(alone, bool))
-    u, m = s / d[:, None], w[:, None] * np.asarray(moments, float) / radius**3
-    c, among = u @ u.T, m @ m.T
-    a, b = np.sum(u * m, axis=1), u @ m.T  # b[i, j] = u_i·m_j
-    q = b.T - c * a[:, None]  # what moment i has across u_i along u_j
-    total = 0.0
-
-    def response(degree):
-        return degree / (degree + (2.0 * degree + 1.0) / susceptibility)
-
-    for degree in (2, 3, 4):
-        p, slope, curve = (np.polynomial.legendre.Legendre.basis(degree).deriv(k)(c) for k in (0, 1, 2))
-        k = degree + 1.0
-        # (m_i·∇_i)(m_j·∇_j) P(c)/(d_i d_j)^(l+1)
-        mixed = k * k * np.outer(a, a) * p - k * (a[None] * q + a[:, None] * q.T) * slope + q * q.T * curve
-        mixed += (among - a[:, None] * b - q * a[None]) * slope
-        total += response(degree) * np.sum(mixed / np.outer(d, d) ** (degree + 2.0))
-    degree = np.arange(5, 400)[:, None]
-    own = (degree + 1.0) ** 2 * a**2 + 0.5 * degree * (degree + 1.0) * (np.sum(m * m, axis=1) - a**2)
-    total += response(6.0) * np.sum((own * d ** (-2.0 * degree - 4.0))[:, alone])
-    return -0.5 * oracle.MU0 / (4.0 * np.pi) * radius**3 * total

@@ -1,45 +1,8 @@
-"""What a command shows on the standard error, which nobody may read any more."""
+"""The progress bar of a run."""
 
-import contextlib
-import os
 import sys
-import tempfile
-from collections.abc import Iterator
 
-
-def silence(descriptor: int) -> None:
-    """Drop what goes to a standard file, also what Python writes there when it ends."""
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, descriptor)
-    os.close(nothing)
-
-
-def quiet_warp() -> None:
-    """Keep Warp's start-up talk off the terminal; must come before the first import of the engine."""
-    import warp  # noqa: PLC0415
-
-    warp.config.log_level = warp.LOG_ERROR
-    warp.config.enable_backward = False  # nothing here is differentiated, and it doubles the time to compile
-    with _without_lines("Could not find or load the NVIDIA CUDA driver", "no CUDA-capable device is detected"):
-        warp.init()
-
-
-@contextlib.contextmanager
-def _without_lines(*texts: str) -> Iterator[None]:
-    """Drop the lines with one of ``texts`` from what native code writes to stderr."""
-    sys.stderr.flush()
-    saved = os.dup(2)
-    with tempfile.TemporaryFile() as caught:
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
-            caught.seek(0)
-            for line in caught.read().decode(errors="replace").splitlines():
-                if not any(text in line for text in texts):
-                    print(line, file=sys.stderr)
+from warpmag.terminal import silence
 
 
 class Progress:

@@ -93,12 +93,17 @@ def agreed(all_ranks: "Ranks | None") -> Iterator[None]:
     all_ranks.exchange(None)
 
 
+def is_first(all_ranks: "Ranks | None") -> bool:
+    """Whether this process is the one that writes and prints: the first rank, or one by itself."""
+    return all_ranks is None or all_ranks.rank == 0
+
+
 def by_first(do: Callable[[], Any], all_ranks: "Ranks | None") -> Any:
     """Return what ``do`` returns; of several ranks the first does it for all, and all raise what it raises."""
     if all_ranks is None:
         return do()
     with agreed(all_ranks):
-        return all_ranks.exchange(do() if all_ranks.rank == 0 else None)[0]
+        return all_ranks.exchange(do() if is_first(all_ranks) else None)[0]
 
 
 def alike(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -15,7 +15,7 @@ from warpmag.engine.scene import ImportedScene
 from warpmag.engine.statistics import Statistics
 from warpmag.engine.stepper import Stepper
 from warpmag.errors import InputError
-from warpmag.ranks import Ranks, agreed, by_first
+from warpmag.ranks import Ranks, agreed, by_first, is_first
 from warpmag.usd import CacheWriter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -72,7 +72,7 @@ class Recorder:
         self._ranks = ranks
         self._writer: CacheWriter | _NoWriter = _NoWriter()
         with agreed(ranks):
-            if ranks is None or ranks.rank == 0:
+            if is_first(ranks):
                 self._writer = CacheWriter(
                     scene.stage,
                     output,

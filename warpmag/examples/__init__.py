@@ -16,7 +16,7 @@ import warp as wp
 
 from warpmag.engine.display import no_viewer
 from warpmag.errors import InputError, extra
-from warpmag.progress import quiet_warp
+from warpmag.terminal import quiet_warp
 
 __all__ = ["create_parser", "get_examples", "init", "main", "run"]
 
