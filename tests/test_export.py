@@ -259,6 +259,13 @@ def test_a_scene_that_has_not_run_is_a_still(tmp_path, device):
         export(tmp_path / "scene.usda", tmp_path / "two.usdc", arrows=True)
 
 
+def test_a_kinematic_body_that_has_not_moved_stays(tmp_path):
+    balls_up.author(tmp_path / "scene.usda", columns=2, rows=2, layers=1)
+    export(tmp_path / "scene.usda", tmp_path / "out.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    assert stage.GetPrimAtPath("/World/Magnet").IsA(UsdGeom.Mesh)
+
+
 @pytest.mark.parametrize(
     "output,options,message",
     [

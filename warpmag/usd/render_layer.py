@@ -7,7 +7,7 @@ second that players keep, and its samples stand where the simulation put them.
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -118,7 +118,7 @@ class RenderLayer:
         keep = [one for one in self.shapes if one.drawn and one.path not in moved]
         kept = {one.path for one in keep}
         with Sdf.ChangeBlock():
-            _strip(layer, [Sdf.Path(one.path) for one in self.shapes if one.path not in kept])
+            _strip(layer, [Sdf.Path(one.path) for one in self.shapes if one.path not in kept], kept)
         for one in keep:
             if not stage.GetPrimAtPath(one.path).IsA(UsdGeom.Mesh):
                 self._turn_into_mesh(one)
@@ -365,10 +365,12 @@ def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.La
     return stage.Flatten(addSourceFileComment=False)
 
 
-def _strip(layer: Sdf.Layer, dropped: Sequence[Sdf.Path], below: Sdf.Path = Sdf.Path.absoluteRootPath) -> None:
-    """Take prims out of a layer, and all that is about simulations; prims that are empty then go, too."""
+def _strip(
+    layer: Sdf.Layer, dropped: Sequence[Sdf.Path], drawn: Collection[str] = (), below: Sdf.Path | str = "/"
+) -> None:
+    """Take prims out of a layer, and all that is about simulations; what is then empty and not ``drawn`` goes, too."""
     paths: list[Sdf.Path] = []
-    layer.Traverse(below, lambda path: paths.append(path) if path.IsPrimPath() else None)
+    layer.Traverse(Sdf.Path(below), lambda path: paths.append(path) if path.IsPrimPath() else None)
     gone = set(dropped)
     for path in paths:  # what is below comes first
         spec = layer.GetPrimAtPath(path)
@@ -377,7 +379,7 @@ def _strip(layer: Sdf.Layer, dropped: Sequence[Sdf.Path], below: Sdf.Path = Sdf.
         physical = spec.typeName.startswith(("Physics", "Newton")) or spec.specifier == Sdf.SpecifierClass
         schemas = spec.GetInfo("apiSchemas")
         body = schemas and "PhysicsRigidBodyAPI" in schemas.GetAddedOrExplicitItems()
-        if physical or path in gone or (body and not spec.nameChildren):
+        if physical or path in gone or (body and not spec.nameChildren and str(path) not in drawn):
             parent = spec.nameParent or layer.pseudoRoot
             del parent.nameChildren[spec.name]
             continue
