@@ -25,6 +25,7 @@ from warpmag.fmm import FastSums
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.ranks import ranks
 
 SIZES = {
     "cpu": (1_000, 2_197, 4_913, 10_648, 21_952, 50_653, 97_336),
@@ -63,21 +64,33 @@ class Moments:
         segments = [(0, n, 0, n)] if rows is None else [(row, row + 1, 0, n) for row in rows]
         return PairEvaluation(
             quantity, segments, self.packed, self.packed, self._base, self.out, turned=self._turned,
-            torques=self._torques, sums=sums,
+            torques=self._torques, sums=sums, ranks=ranks(),
         )  # fmt: skip
+
+    def parts(self, quantity: Quantity, rtol: float | None) -> tuple[Callable[[], None], Callable[[], None]]:
+        """What makes cells of moments that have moved, and what evaluates a quantity to ``out`` by them.
+
+        Where ``rtol`` is None, no cells, and all pairs.
+        """
+        if rtol is None:
+            return (lambda: None), self.evaluation(quantity).launch
+        fast = FastSums(self.packed, rtol)
+        return fast.build, self.evaluation(quantity, sums=fast.sums(quantity)).launch
 
     def work(self, quantity: Quantity, rtol: float | None) -> Callable[[], None]:
         """What evaluates a quantity to ``out``, for moments that have moved; by all pairs where ``rtol`` is None."""
-        if rtol is None:
-            return self.evaluation(quantity).launch
-        fast = FastSums(self.packed, rtol)
-        evaluation = self.evaluation(quantity, sums=fast.sums(quantity))
+        build, evaluate = self.parts(quantity, rtol)
 
         def build_and_evaluate():
-            fast.build()
-            evaluation.launch()
+            build()
+            evaluate()
 
         return build_and_evaluate
+
+
+def repetitions(count: int) -> dict:
+    """How often work on so many moments is repeated: few times where a graph's own launch does not show."""
+    return {"repeats": 2, "chained": 1} if count > 200_000 else {}
 
 
 def lattice(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -120,10 +133,7 @@ def run_size(count: int, device, slowest: float, seconds: dict):
             work()
             wp.synchronize_device(device)
             first = time.perf_counter() - began
-            few = (
-                {"repeats": 2, "chained": 1} if count > 200_000 else {}
-            )  # as far as a graph's own launch does not show
-            taken = measure(work, device, **few)
+            taken = measure(work, device, **repetitions(count))
             if rtol is None:
                 seconds[quantity, count] = taken
             line = {"quantity": quantity.name.lower(), "method": "direct" if rtol is None else "fmm", "rtol": rtol}
