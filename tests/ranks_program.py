@@ -13,6 +13,12 @@ from warpmag.ranks import by_first, ranks
 from warpmag.system import MomentSystem
 
 
+SIZES = {"cpu": (1, 7, 1001), "cuda": (1, 7, 6001)}
+"""Numbers of moments; the last is shared out by all forms of the sums, which a GPU takes for thousands of them."""
+MANY = {"cpu": 1001, "cuda": 400_000}
+"""Those of the fast multipole method: a GPU has to have thousands of cells."""
+
+
 def main(what: str, *arguments: str) -> int:
     """Do it, with all sums shared out, and say on stderr how often they were merged; return the exit code."""
     wp.config.enable_backward = False  # as the tests do, so that both find the same compiled kernels
@@ -38,10 +44,9 @@ def calls(path: str, device: str) -> int:
 
 def sums(place: str | None) -> dict[str, np.ndarray]:
     """Return what calls on arrays do, by name."""
-    results = {}
-    for n in (1, 7, 1001):
-        random = np.random.default_rng(n)
-        x, m = random.normal(size=(n, 3)) * n ** (1 / 3), random.normal(size=(n, 3))
+    results, kind = {}, "cuda" if place is None else "cpu"
+    for n in SIZES[kind]:
+        x, m = moments(n)
         results[f"h {n}"] = warpmag.h_field(x, m, device=place)
         results[f"h double {n}"] = warpmag.h_field(x, m, dtype="float64", device=place)
         results[f"h elsewhere {n}"] = warpmag.h_field(x, m, x + 0.1, device=place)
@@ -51,9 +56,16 @@ def sums(place: str | None) -> dict[str, np.ndarray]:
         )
         results[f"magnetization {n}"], results[f"field {n}"] = solved.magnetizations, solved.h_field
         results[f"pull {n}"] = solved.wrench()[0]
-        results[f"multipoles {n}"] = warpmag.h_field(x, m, x[::2] + 0.1, method="fmm", device=place)
-        results[f"multipole force {n}"] = warpmag.wrench(x, m, method="fmm", device=place)[0]
+    x, m = moments(MANY[kind])
+    results["multipoles"] = warpmag.h_field(x, m, x[::2] + 0.1, method="fmm", device=place)
+    results["multipole force"] = warpmag.wrench(x, m, method="fmm", device=place)[0]
     return results
+
+
+def moments(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and moments, shape [n, 3] both."""
+    random = np.random.default_rng(n)
+    return random.normal(size=(n, 3)) * n ** (1 / 3), random.normal(size=(n, 3))
 
 
 def several_worlds(sizes: list[int], device: str | None) -> np.ndarray:

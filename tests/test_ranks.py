@@ -22,6 +22,12 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_gpu_each(device):
+    if "cuda" in device and wp.get_cuda_device_count() < 2:
+        pytest.skip("NCCL wants a GPU for each of two ranks")
+
+
 def start(ranks: int, *command):
     """Run a program of Python's in so many processes, and return what came of it."""
     root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
@@ -50,13 +56,14 @@ def calls(tmp_path_factory, device):
     return done, results
 
 
-def test_two_ranks_end_with_the_bits_of_one(calls):
+def test_two_ranks_end_with_the_bits_of_one(calls, device):
     done, (one, *two) = calls
     assert merged(done[0]) == [0]
     first, second = merged(done[1])
-    assert first == second > 40  # of 3 sizes some 14 sums, and those of the worlds
+    # on a CPU some 14 sums of 3 sizes, and those of the worlds; a GPU shares out those of thousands of moments only
+    assert first == second > (40 if device == "cpu" else 4)
     for other in two:
-        assert other.keys() == one.keys() >= {"sweep", "worlds", "multipole force 1001"}
+        assert other.keys() == one.keys() >= {"sweep", "worlds", "multipole force"}
         for name, bits in other.items():
             assert np.isfinite(bits).all(), name
             assert one[name].tobytes() == bits.tobytes(), name
@@ -90,18 +97,21 @@ def test_a_difference_is_told_in_one_line_on_all_ranks(calls):
 
 @pytest.mark.parametrize("sums", ["vectorized", pytest.param("fmm", marks=pytest.mark.long)])
 def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
-    scene = tmp_path / "scene.usdc"
-    from warpmag.scenes_usd import bundled  # noqa: PLC0415
+    from warpmag.scenes_usd import bundled, sakura_tree  # noqa: PLC0415
 
-    shutil.copyfile(bundled()["balls_up"], scene)
-    told = []
+    scene, told = tmp_path / "scene.usdc", []
+    if device == "cpu":
+        shutil.copyfile(bundled()["balls_up"], scene)
+    else:  # as many as a GPU shares out
+        sakura_tree.author(scene, balls=6000 if sums == "vectorized" else 400_000)
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}" / "out.usda"
         command = [SCRIPT, "run", scene, "-o", out, "--frames", 1, "--sums", sums]
         done = start(ranks, *command, *([] if "cuda" in device else ["--device", device]))
         assert done.returncode == 0, done.stderr
         told.append(done)
-    assert merged(told[0]) == [0] and min(merged(told[1])) > 30  # fields and forces of substeps
+    # fields and forces of substeps; of a GPU those that are captured
+    assert merged(told[0]) == [0] and min(merged(told[1])) > (30 if device == "cpu" else 0)
     assert told[0].stdout.count("\n") == told[1].stdout.count("\n")  # rank 0 alone tells of it
     first, second = ((tmp_path / f"{ranks}" / "out.cache.usdc").read_bytes() for ranks in (1, 2))
     assert first == second
