@@ -12,7 +12,6 @@ from warpmag.kernels.pairs import evaluate
 from warpmag.ranks import by_first, ranks
 from warpmag.system import MomentSystem
 
-
 SIZES = {"cpu": (1, 7, 1001), "cuda": (1, 7, 6001)}
 """Numbers of moments; the last is shared out by all forms of the sums, which a GPU takes for thousands of them."""
 MANY = {"cpu": 1001, "cuda": 400_000}
