@@ -385,6 +385,7 @@ def test_a_run_that_ends_names_a_strength_beyond_all_measure(device, tmp_path, m
     monkeypatch.setattr(simulation._stepper, "look", end)
     with pytest.raises(SimulationError, match=rf"/Ball has left; {told} moves magnets too fast"):
         simulation.step()
+        assert simulation.state  # waits for a GPU
 
 
 def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
@@ -396,6 +397,7 @@ def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
     monkeypatch.setattr(simulation._stepper, "look", end)
     with pytest.raises(SimulationError, match="/Ball has left; the ends of the joint /Joint were apart at the start"):
         simulation.step()
+        assert simulation.state
 
 
 def test_a_point_instancer_as_a_collider_of_a_magnet(tmp_path):

@@ -361,10 +361,6 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
 
     try:
         statistics = simulation.run(progress.frames, output=output, copy_scene=copy_scene, resume=resume, on_frame=show)
-    except (KeyboardInterrupt, InputError, SimulationError) as end:
-        if progress.done is not None:
-            end.args = (f"{end}, {output} has the frames up to {progress.done}",)
-        raise
     finally:
         progress.close()
     if (display and display.restarted) or not is_first(ranks()):

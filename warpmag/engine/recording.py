@@ -27,6 +27,9 @@ class Recorder:
 
     Frames are written as they come, on a GPU during the steps that follow, and the host does not wait for them. What
     interrupts a run waits until the frame that is being written is whole.
+
+    Attributes:
+        written: Time of the last frame that stands on the stage since its start [s]; None without any.
     """
 
     def __init__(
@@ -69,7 +72,7 @@ class Recorder:
         self._bodies = np.array(list(own.values()), dtype=int)
         self._shapes = np.array([row[shape] for of_prim in shapes for shape in of_prim], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
-        self._ranks = ranks
+        self._ranks, self.written = ranks, None
         self._writer: CacheWriter | _NoWriter = _NoWriter()
         with agreed(ranks):
             if is_first(ranks):
@@ -116,6 +119,7 @@ class Recorder:
                 raise InputError(f"{output}: cannot resume, {error}") from None
         elif done < steps:
             raise InputError(f"frames: the run of {output} ended at {found.time:g} s, there is nothing to resume")
+        self.written = found.time
         return True, found.state is None
 
     def add_frame(self, time: float, state) -> None:
@@ -153,6 +157,7 @@ class Recorder:
             moments = moments[self._shapes]
             totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
             self._writer.add_frame(time, body_q[self._bodies], body_qd[self._bodies], totals)
+            self.written = time
             if due:
                 self._writer.save(saved)
 

@@ -348,13 +348,19 @@ class Simulation:
             raise InputError(f"resume: runs of the solver {self._options['solver']} cannot be resumed")
         resumed = complete = False
         try:
-            if resume:
-                resumed, complete = recorder.resume(frames, self._steps_at(frames), self.step_size)
-            if not complete:
-                complete = self._run_frames(frames, recorder, on_frame, resumed)
-        finally:
-            if recorder:
-                recorder.close(complete)
+            try:
+                if resume:
+                    resumed, complete = recorder.resume(frames, self._steps_at(frames), self.step_size)
+                if not complete:
+                    complete = self._run_frames(frames, recorder, on_frame, resumed)
+            finally:
+                if recorder:
+                    recorder.close(complete)
+        except (KeyboardInterrupt, InputError, SimulationError) as end:
+            if recorder and recorder.written is not None:
+                known = f"{output} has the frames up to {round(recorder.written * self.frame_rate)}"
+                end.args = (", ".join(filter(None, (str(end), known))),)
+            raise
         return self.finish()
 
     def _run_frames(self, frames: int, recorder, on_frame: Callable[[int], bool | None] | None, resumed: bool) -> bool:
