@@ -235,6 +235,21 @@ def test_rates_that_usd_loops_over(tmp_path, layer, rate):
     assert f"InputError: {named}: timeCodesPerSecond must be " in last
 
 
+def test_a_tiny_hull_without_mass(tmp_path):
+    """Newton finds none for the hull of an open mesh of 0.1 mm; that of a kinematic body counts for nothing."""
+    points = TETRAHEDRON.replace("1", "0.0001")
+    hull = 'uniform token physics:approximation = "convexHull"\n'
+    bodies = [
+        mesh([0, 2, 1, 0, 1, 3, 0, 3, 2], (3, 3, 3), points, more=hull + more).replace(
+            '"PhysicsMassAPI"', '"PhysicsMeshCollisionAPI"'
+        )
+        for more in ("", "bool physics:kinematicEnabled = 1")
+    ]
+    with pytest.raises(InputError, match=r"^/Ball: Newton finds no mass"):
+        import_scene(write(tmp_path, bodies[0]))
+    import_scene(write(tmp_path, bodies[1]))
+
+
 @pytest.mark.parametrize("unit", ["metersPerUnit", "kilogramsPerUnit"])
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "5e-324"])
 def test_units(tmp_path, unit, value):

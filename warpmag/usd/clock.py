@@ -61,7 +61,7 @@ def stage_clock(stage: Usd.Stage) -> StageClock:
 
 
 def check_rates(stage: Usd.Stage) -> None:
-    """Raise :class:`InputError` for a layer whose time codes have no rate: USD takes its samples for unsorted, or hangs.
+    """Raise :class:`InputError` for a layer whose time codes have no rate: USD loops over its samples.
 
     It divides the rates of layers where they differ, and takes two NaN for different.
     """
