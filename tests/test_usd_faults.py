@@ -2,6 +2,8 @@
 
 import logging
 import os
+import subprocess
+import sys
 import warnings
 
 import newton
@@ -198,6 +200,54 @@ def test_times(tmp_path, times, message):
     with pytest.raises(InputError) as caught:
         stage_clock(open_stage(path))
     assert str(caught.value).startswith(f"{path}: ") and message in str(caught.value)
+
+
+LAYERS = {
+    "root": "",
+    "sublayer": "subLayers = [@moving.usda@]\ntimeCodesPerSecond = 24\n",
+    "reference": "timeCodesPerSecond = 24\n",
+}
+MOVING = """def Xform "Moving"
+{
+    double3 xformOp:translate.timeSamples = { 0: (0, 0, 0), 24: (0, 1, 0) }
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+"""
+READ_WITHIN = (
+    "import sys, resource as r; r.setrlimit(r.RLIMIT_CPU, (10, 10)); from warpmag.usd import open_stage as o; "
+)
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+@pytest.mark.parametrize("rate", ["0", "-1", "nan", "inf", "5e-324"])
+def test_rates_that_usd_loops_over(tmp_path, layer, rate):
+    """In a process of its own, for none of these ends otherwise but the negative one, whose samples come unsorted."""
+    own = f"timeCodesPerSecond = {rate}\n"
+    units = 'metersPerUnit = 0.01\nkilogramsPerUnit = 1\nupAxis = "Y"\n'
+    moving = tmp_path / "moving.usda"
+    moving.write_text(f"#usda 1.0\n(\n{own})\n{MOVING}")
+    body = {"root": MOVING, "sublayer": "", "reference": 'def "Here" (references = @moving.usda@</Moving>) {}'}[layer]
+    path = write(tmp_path, body, units + (LAYERS[layer] or own))
+    command = [sys.executable, "-c", READ_WITHIN + "o(sys.argv[1])", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    last = done.stderr.splitlines()[-1] if done.stderr else f"ended with {done.returncode}"
+    named = path if layer == "root" else moving
+    assert f"InputError: {named}: timeCodesPerSecond must be " in last
+
+
+def test_a_tiny_hull_without_mass(tmp_path):
+    """Newton finds none for the hull of an open mesh of 0.1 mm; that of a kinematic body counts for nothing."""
+    points = TETRAHEDRON.replace("1", "0.0001")
+    hull = 'uniform token physics:approximation = "convexHull"\n'
+    bodies = [
+        mesh([0, 2, 1, 0, 1, 3, 0, 3, 2], (3, 3, 3), points, more=hull + more).replace(
+            '"PhysicsMassAPI"', '"PhysicsMeshCollisionAPI"'
+        )
+        for more in ("", "bool physics:kinematicEnabled = 1")
+    ]
+    with pytest.raises(InputError, match=r"^/Ball: Newton finds no mass"):
+        import_scene(write(tmp_path, bodies[0]))
+    import_scene(write(tmp_path, bodies[1]))
 
 
 @pytest.mark.parametrize("unit", ["metersPerUnit", "kilogramsPerUnit"])

@@ -191,7 +191,7 @@ def test_all_problems_are_found(tmp_path):
     body = ball(translated("(0, nan, 0)"), "float warpmag:saturationMagnetization = -1") + ball(name="Small").replace(
         "0.005", "0"
     )
-    report = check(write(tmp_path, body, 'metersPerUnit = 0\nupAxis = "Z"\ntimeCodesPerSecond = -1'))
+    report = check(write(tmp_path, body, 'metersPerUnit = 0\nupAxis = "Z"\nstartTimeCode = 5\nendTimeCode = 1'))
     assert {finding.where.rpartition("/")[2] for finding in report.errors} >= {"stage.usda", "Ball", "Small"}
     messages = [finding.message for finding in report.errors if finding.where == "/Ball"]
     assert "transform is not finite (xformOp:translate)" in messages and any(

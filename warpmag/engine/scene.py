@@ -27,6 +27,7 @@ from warpmag.usd import (
     complete_instances,
     enabled_joints,
     give_densities,
+    has_volume,
     inspect,
     open_apart,
     prepare_joints,
@@ -116,6 +117,7 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     for prim in contents.bodies:
         if prim not in bodies:
             raise InputError(f"{prim}: Newton imports no body from it")
+    _check_masses(builder, stage, contents, bodies)
     for joint in enabled_joints(stage):
         if str(joint.GetPath()) not in joints:
             raise InputError(f"{joint.GetPath()}: Newton imports no joint from it")
@@ -139,6 +141,14 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
         strained=strained,
         warnings=tuple(map(str, report.warnings)),
     )
+
+
+def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[str, int]) -> None:
+    """Refuse free bodies with a volume that Newton gives no mass, of a tiny open mesh say: they would stand still."""
+    for path in contents.bodies:
+        free = path not in contents.kinematic
+        if free and not builder.body_mass[bodies[path]] > 0.0 and has_volume(stage, path):
+            raise InputError(f"{path}: Newton finds no mass of its colliders: give physics:mass")
 
 
 def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from warpmag.usd.alike import MOMENTS, AlikeBalls, BallFrames
 from warpmag.usd.check import StageReport, check, inspect
 from warpmag.usd.clock import StageClock, stage_clock
 from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_sources
-from warpmag.usd.densities import give_densities
+from warpmag.usd.densities import give_densities, has_volume
 from warpmag.usd.guard import readable, refusals
 from warpmag.usd.instancers import complete_instances
 from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
@@ -62,6 +62,7 @@ __all__ = [
     "enabled_joints",
     "first_camera",
     "give_densities",
+    "has_volume",
     "hold",
     "inspect",
     "is_source",

@@ -50,10 +50,7 @@ def stage_clock(stage: Usd.Stage) -> StageClock:
     codes = stage.GetTimeCodesPerSecond()
     frames = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else codes
     for what, rate in (("timeCodesPerSecond", codes), ("framesPerSecond", frames)):
-        if not (rate > 0.0 and math.isfinite(rate)):
-            raise InputError(f"{name}: {what} must be positive and finite, got {rate}")
-        if not _RATES[0] <= rate <= _RATES[1]:
-            raise InputError(f"{name}: {what} must be from {_RATES[0]:g} to {_RATES[1]:g}, got {rate}")
+        _check_rate(name, what, rate)
     start, end = start_of(stage), _time_code(stage, "endTimeCode", stage.GetEndTimeCode())
     if end < start and stage.HasAuthoredMetadata("endTimeCode"):
         raise InputError(f"{name}: endTimeCode {end:g} is before startTimeCode {start:g}")
@@ -61,6 +58,16 @@ def stage_clock(stage: Usd.Stage) -> StageClock:
     if (end - start) / codes * frames > _MOST_FRAMES:
         raise InputError(f"{name}: {(end - start) / codes * frames:g} frames from startTimeCode to endTimeCode")
     return StageClock(start, end, codes, frames, _step(stage))
+
+
+def check_rates(stage: Usd.Stage) -> None:
+    """Raise :class:`InputError` for a layer whose time codes have no rate: USD loops over its samples.
+
+    It divides the rates of layers where they differ, and takes two NaN for different.
+    """
+    for layer in stage.GetUsedLayers():
+        what = "timeCodesPerSecond" if layer.HasTimeCodesPerSecond() else "framesPerSecond"
+        _check_rate(layer.realPath or layer.identifier, what, layer.timeCodesPerSecond)
 
 
 def scenes(stage: Usd.Stage) -> list[Usd.Prim]:
@@ -79,6 +86,13 @@ def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
     if not stage.GetRootLayer().pseudoRoot.HasInfo("metersPerUnit"):
         message = f"metersPerUnit is not set, which in USD means {units.metres:g}: lengths are taken for so many metres"
         yield Finding(name, message, "warning")
+
+
+def _check_rate(name, what, rate) -> None:
+    if not (rate > 0.0 and math.isfinite(rate)):
+        raise InputError(f"{name}: {what} must be positive and finite, got {rate}")
+    if not _RATES[0] <= rate <= _RATES[1]:
+        raise InputError(f"{name}: {what} must be from {_RATES[0]:g} to {_RATES[1]:g}, got {rate}")
 
 
 def _step(stage) -> float | None:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pxr import Usd, UsdPhysics, UsdShade
 
 from warpmag.materials import material
+from warpmag.usd.geometry import is_solid
 from warpmag.usd.reader import prims_of_magnet
 from warpmag.usd.schemas import MATERIAL
 from warpmag.usd.transforms import is_body, is_collider
@@ -32,6 +33,11 @@ def give_densities(stage: Usd.Stage, magnets: Iterable[str]) -> None:
                     # what an instance holds cannot be edited, and what has it can
                     owner = body if collider.IsInstanceProxy() else collider
                     UsdPhysics.MassAPI.Apply(owner).CreateDensityAttr(material(name).density)
+
+
+def has_volume(stage: Usd.Stage, body: str) -> bool:
+    """Return whether a rigid body has a collider of a type that has a volume."""
+    return any(is_collider(one) and is_solid(one) for one in prims_of_magnet(stage.GetPrimAtPath(body)))
 
 
 def _body_of(prim) -> Usd.Prim | None:

@@ -18,7 +18,7 @@ from warpmag.keyed import Keys, Motion
 from warpmag.magnets import Magnet, MagneticSettings, StageMagnets
 from warpmag.usd.addresses import cut_off
 from warpmag.usd.alike import AlikeBalls
-from warpmag.usd.clock import scenes, stage_name, start_of, unit_findings
+from warpmag.usd.clock import check_rates, scenes, stage_name, start_of, unit_findings
 from warpmag.usd.coils import PlacedSource, is_source, sources_of
 from warpmag.usd.first_reading import NOT_USD, failure, first_reading
 from warpmag.usd.geometry import is_solid, magnet_findings, mesh_findings, shape_findings, spacing_findings
@@ -158,6 +158,7 @@ def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
         broken = [str(error) for error in stage.GetCompositionErrors()]
     if broken:
         raise InputError(f"{path}: {line_of(broken[0])}")
+    check_rates(stage)
     return stage
 
 
