@@ -144,11 +144,11 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
 
 
 def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[str, int]) -> None:
-    """Refuse free bodies with a volume that Newton gives no mass, of a tiny open mesh say: they would stand still."""
+    """Refuse free bodies with a volume that Newton gives no mass, of an open mesh, say: they would stand still."""
     for path in contents.bodies:
         free = path not in contents.kinematic
         if free and not builder.body_mass[bodies[path]] > 0.0 and has_volume(stage, path):
-            raise InputError(f"{path}: Newton finds no mass of its colliders: give physics:mass")
+            raise InputError(f"{path}: Newton finds no mass of its colliders: close their meshes, or give physics:mass")
 
 
 def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:
