@@ -15,7 +15,7 @@ import warp as wp
 
 from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
 from bench.machine import describe
-from bench.scene import run_scene
+from bench.scene import run_bundled, run_scene
 from bench.swarm import run_swarm
 from bench.timing import measure
 from bench.writing import run_writing
@@ -156,9 +156,13 @@ def _relative(found, expected) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def run_case(case: Case, device, sizes, frames: int | None) -> None:
-    """Print a JSON line for each size and precision of a case."""
+def run_case(case: Case, device, sizes, frames: int | None, scenes=()) -> None:
+    """Print a JSON line for each size and precision of a case, or for each of the bundled scenes."""
     machine = describe(device)
+    for name in scenes:
+        print(json.dumps({"case": case.name, "scene": name, **run_bundled(name, device), **machine}), flush=True)
+    if scenes:
+        return
     for dtype in case.dtypes:
         for count in sizes or case.sizes["cpu" if device.is_cpu else "cuda"]:
             if case.name in RUNNERS:
@@ -179,9 +183,12 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--sizes", type=int, nargs="+")
     parser.add_argument("--frames", type=int, help="frames, for writing and swarm")
+    parser.add_argument(
+        "--scenes", nargs="+", default=(), help="bundled scenes, for scene, in place of Balls Up by size"
+    )
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    run_case(CASES[options.case], wp.get_device(options.device), options.sizes, options.frames)
+    run_case(CASES[options.case], wp.get_device(options.device), options.sizes, options.frames, options.scenes)
 
 
 if __name__ == "__main__":
