@@ -30,6 +30,7 @@ def pytest_addoption(parser):
         default="cpu",
         help="Warp device that tests run on: cpu (default), cuda:0, ...; or emulated, CUDA's kernels on a CPU",
     )
+    parser.addoption("--only-device", action="store_true", help="leave out tests that do the same whatever the device")
     parser.addoption("--long", action="store_true", help="also run the tests marked 'long' (minutes)")
     parser.addoption("--wild", type=int, default=150, metavar="N", help="wild calls of a function (default: 150)")
     parser.addoption("--sanitize", choices=tuple(SANITIZERS), help="instrument native code; what .ci/sanitize uses")
@@ -67,6 +68,10 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(config, items):
+    if config.getoption("--only-device"):
+        on_it = [x for x in items if "device" in x.fixturenames or x.get_closest_marker("cuda")]
+        config.hook.pytest_deselected(items=[x for x in items if x not in on_it])
+        items[:] = on_it
     skips = {}
     if not config.getoption("--long"):
         skips["long"] = pytest.mark.skip(reason="takes minutes: runs with --long")
