@@ -5,6 +5,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import warp as wp
+
 from bench.paper.output import ORDER, Output
 from warpmag.errors import InputError
 
@@ -18,8 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, default=Path("bench_out/paper"), metavar="DIR")
     options = parser.parse_args(arguments)
 
-    import matplotlib  # noqa: PLC0415 - both are slow to import, and --help needs neither
-    import warp as wp  # noqa: PLC0415
+    import matplotlib  # noqa: PLC0415 - slow to import, and --help goes without it
 
     from warpmag.arrays import resolve_device  # noqa: PLC0415
 
