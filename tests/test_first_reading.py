@@ -270,3 +270,14 @@ def test_text_that_is_not_utf8_is_refused(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"inducible", b"inducibl\x94"))
     with pytest.raises(InputError, match=r"stage.usdc: damaged: text that is not UTF-8"):
         open_stage(path)
+
+
+def test_offsets_of_layers_that_overflow_together(tmp_path, monkeypatch):
+    """Each is a number, and USD never ends to look for the times of what both are of."""
+    monkeypatch.setattr(first_reading, "_SECONDS", 1.0)
+    arc = "(subLayers = [@{}@ (scale = 1e200)])\n"
+    for name, below in (("one", "two"), ("two", "three")):
+        (tmp_path / f"{name}.usda").write_text(HEAD + arc.format(f"{below}.usda"))
+    (tmp_path / "three.usda").write_text(HEAD + 'def "x" {\n double a.timeSamples = { 0: 0, 24: 1 }\n}\n')
+    with pytest.raises(InputError, match=r"one\.usda: USD did not read it within 1 s$"):
+        open_stage(tmp_path / "one.usda")

@@ -134,6 +134,7 @@ def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, whic
                 return f"holds more than {most} prims"
             for attribute in prim.GetAuthoredAttributes():
                 attribute.Get()
+                attribute.GetTimeSamples()  # which USD never finds where offsets of layers overflow
         for layer in stage.GetUsedLayers():
             if layer.GetFileFormat().formatId == "usda":  # all of a text is read at once
                 continue
