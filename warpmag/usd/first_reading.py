@@ -128,13 +128,15 @@ def _read(path: str, most: int) -> str:  # pragma: no cover - in the child, whic
     _fill_memory(_FILLS[0])
     try:
         stage = Usd.Stage.Open(path)
+        sound = all(1e-6 < layer.timeCodesPerSecond < 1e9 for layer in stage.GetUsedLayers())  # else they are refused
         prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
         for count, prim in enumerate(islice(prims, most + 1), 1):
             if count > most:
                 return f"holds more than {most} prims"
             for attribute in prim.GetAuthoredAttributes():
                 attribute.Get()
-                attribute.GetTimeSamples()  # which USD never finds where offsets of layers overflow
+                if sound:
+                    attribute.GetTimeSamples()  # which USD never finds where offsets of layers overflow
         for layer in stage.GetUsedLayers():
             if layer.GetFileFormat().formatId == "usda":  # all of a text is read at once
                 continue
