@@ -20,6 +20,7 @@ from bench.swarm import run_swarm
 from bench.timing import measure
 from bench.writing import run_writing
 from warpmag import oracle
+from warpmag.scenes_usd import bundled
 from warpmag.system import MomentSystem
 
 _WORLDS = {"cpu": 32, "cuda": 1024}
@@ -184,9 +185,15 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+")
     parser.add_argument("--frames", type=int, help="frames, for writing and swarm")
     parser.add_argument(
-        "--scenes", nargs="+", default=(), help="bundled scenes, for scene, in place of Balls Up by size"
+        "--scenes",
+        nargs="+",
+        default=(),
+        choices=sorted(bundled()),
+        help="bundled scenes, for scene, in place of Balls Up by size",
     )
     options = parser.parse_args()
+    if options.scenes and options.case != "scene":
+        parser.error("--scenes is for scene")
     wp.config.log_level = wp.LOG_WARNING
     run_case(CASES[options.case], wp.get_device(options.device), options.sizes, options.frames, options.scenes)
 

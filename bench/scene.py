@@ -36,18 +36,10 @@ def run_scene(count: int, device) -> dict:
         simulation.step()
     before = copy.deepcopy(simulation.statistics)
 
-    host, reports = [], []
+    reports = []
     with wp.ScopedMemoryTracker("steps", report_func=reports.append) as tracker:
         tracker.clear()
-        began = time.perf_counter()
-        for step in range(_STEPS):
-            if step % _AHEAD == 0:
-                wp.synchronize_device(device)
-            called = time.perf_counter()
-            simulation.step()
-            host.append(time.perf_counter() - called)
-        wp.synchronize_device(device)
-        seconds = (time.perf_counter() - began) / _STEPS
+        seconds, host = _time_steps(simulation, _STEPS, device)
     after = simulation.statistics
     induction, force, rigid = after.milliseconds_since(before.steps)
     return {
@@ -85,13 +77,9 @@ def run_bundled(name: str, device) -> dict:
     simulation.step()
     wp.synchronize_device(device)
     before = copy.deepcopy(simulation.statistics)
-    began, steps = time.perf_counter(), round(1.0 / simulation.step_size)
-    for step in range(steps):
-        if step % _AHEAD == 0:
-            wp.synchronize_device(device)
-        simulation.step()
-    wp.synchronize_device(device)
-    seconds, after = (time.perf_counter() - began) / steps, simulation.statistics
+    steps = round(1.0 / simulation.step_size)
+    seconds, _ = _time_steps(simulation, steps, device)
+    after = simulation.statistics
     induction, force, rigid = after.milliseconds_since(before.steps)
     return {
         "seconds": seconds,
@@ -104,6 +92,19 @@ def run_bundled(name: str, device) -> dict:
         "evaluations": sum(after.evaluations[before.steps :]) / steps,
         "overlap": after.overlap,
     }
+
+
+def _time_steps(simulation: Simulation, steps: int, device) -> tuple[float, list[float]]:
+    """Return the seconds of a step, and what the host took for each of them."""
+    host, began = [], time.perf_counter()
+    for step in range(steps):
+        if step % _AHEAD == 0:
+            wp.synchronize_device(device)
+        called = time.perf_counter()
+        simulation.step()
+        host.append(time.perf_counter() - called)
+    wp.synchronize_device(device)
+    return (time.perf_counter() - began) / steps, host
 
 
 def parts_of_a_substep(simulation: Simulation) -> dict:
