@@ -28,7 +28,7 @@ def touching():
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("method", ["vectorized", "reference"])
+@pytest.mark.parametrize("method", ["direct", "reference"])
 def test_touching_balls(touching, dtype, method, device):
     x, radii, m, h, force, torque = touching
     found = warpmag.h_field(x, m, radii=radii, method=method, dtype=dtype, device=device)

@@ -176,7 +176,7 @@ def test_nothing_stays_of_a_call(device):
 def test_auto_is_exact_unless_an_error_is_allowed(device, monkeypatch):
     places = jittered(9261 if device == "cpu" else 64000)
     moments = moments_of(len(places))
-    exact = warpmag.h_field(places, moments, method="vectorized", device=device)
+    exact = warpmag.h_field(places, moments, method="direct", device=device)
     assert (warpmag.h_field(places, moments, device=device) == exact).all()
     assert (warpmag.h_field(places, moments, rtol=5e-6, device=device) == exact).all()
     assert 0.0 < apart(warpmag.h_field(places, moments, rtol=1e-3, device=device), exact) <= 1e-3
@@ -206,7 +206,7 @@ def test_induction_has_the_solution_of_all_pairs(name, device):
     places = 0.005 * BALLS[name]
     magnet = np.array([[-0.02, 0.01, 0.0]]), np.array([[3.0, 1.0, 0.0]])
     given = {"saturation": 1.7e6, "external_field": (0.0, 1e4, 2e4), "sources": magnet, "device": device}
-    exact = warpmag.solve_induction(places, 0.0015, method="vectorized", rtol=1e-5, **given)
+    exact = warpmag.solve_induction(places, 0.0015, method="direct", rtol=1e-5, **given)
     result = warpmag.solve_induction(places, 0.0015, method="fmm", rtol=1e-3, **given)
     assert result.converged
     assert result.field_error <= 1e-3
@@ -248,7 +248,7 @@ def test_worlds_do_not_see_each_other(device):
     solved = system.magnetizations().numpy().reshape(count, n, 3)
     for world, strength in enumerate(np.linspace(1e4, 2e6, count)):
         lone = warpmag.solve_induction(
-            places, 0.0015, saturation=1.7e6, external_field=(0.0, 0.0, strength), method="vectorized", device=device
+            places, 0.0015, saturation=1.7e6, external_field=(0.0, 0.0, strength), method="direct", device=device
         )
         assert apart(solved[world], lone.magnetizations) <= 2e-3  # of two solves
 

@@ -73,7 +73,7 @@ def test_moments_and_forces_are_those_of_all_pairs(device):
     assert 0.0 < magnetics.system.field_error() <= RTOL
     exact = warpmag.solve_induction(
         x, RADIUS, saturation=warpmag.magnets.SATURATION_OF_IRON, external_field=FIELD, sources=magnet,
-        method="vectorized", rtol=1e-6, dtype="float64", device="cpu",
+        method="direct", rtol=1e-6, dtype="float64", device="cpu",
     )  # fmt: skip
     moments = magnetics.system.moments.numpy().astype(float)
     assert apart(moments[:-1], exact.magnetizations * 4.0 / 3.0 * np.pi * RADIUS**3) <= RTOL
@@ -114,7 +114,7 @@ def test_worlds_are_as_if_alone(device):
     assert far_cells(magnetics)
     alone = clump.finalize(device=device)
     for own, field in zip(np.split(forces, 3), strengths, strict=True):
-        expected, _ = applied(warpmag.Magnetics(alone, method="vectorized", external_field=tuple(field)), alone)
+        expected, _ = applied(warpmag.Magnetics(alone, method="direct", external_field=tuple(field)), alone)
         # a force has the errors of two magnetizations, each of two solves
         assert apart(own, expected) <= 4.0 * RTOL
 
@@ -138,9 +138,7 @@ def rods():
 def test_bodies_of_several_moments_do_not_turn_themselves(rods, device):
     model = rods.finalize(device=device)
     magnetics = warpmag.Magnetics(model, method="fmm")
-    found, expected = (
-        applied(one, model) for one in (magnetics, warpmag.Magnetics(model, method="vectorized", rtol=1e-5))
-    )
+    found, expected = (applied(one, model) for one in (magnetics, warpmag.Magnetics(model, method="direct", rtol=1e-5)))
     assert far_cells(magnetics)
     for own, exact in zip(found, expected, strict=True):
         assert apart(own, exact) <= 3.0 * RTOL
@@ -197,7 +195,7 @@ def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     written = Usd.Stage.Open(str(out))
     balls = [written.GetPrimAtPath(f"/World/Balls/Ball_{number:05d}") for number in range(150)]
     moments = [ball.GetAttribute("warpmag:moment").Get(written.GetEndTimeCode()) for ball in balls]
-    simulation = warpmag.Simulation(scene, method="vectorized", device=device)
+    simulation = warpmag.Simulation(scene, method="direct", device=device)
     assert simulation.run(1).field_error == 0.0
     # of two solves, at places that differ by a hundredth of a ball
     assert apart(np.array(moments), simulation.magnetics.shape_moments()[:150]) <= 3.0 * RTOL

@@ -95,7 +95,7 @@ def test_a_difference_is_told_in_one_line_on_all_ranks(calls):
         assert {f"{rank} {name}: {line}" for rank in range(2)} <= set(printed), name
 
 
-@pytest.mark.parametrize("sums", ["vectorized", pytest.param("fmm", marks=pytest.mark.long)])
+@pytest.mark.parametrize("sums", ["direct", pytest.param("fmm", marks=pytest.mark.long)])
 def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
     from warpmag.scenes_usd import bundled, sakura_tree  # noqa: PLC0415
 
@@ -103,7 +103,7 @@ def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
     if device == "cpu":
         shutil.copyfile(bundled()["balls_up"], scene)
     else:  # as many as a GPU shares out
-        sakura_tree.author(scene, balls=6000 if sums == "vectorized" else 400_000)
+        sakura_tree.author(scene, balls=6000 if sums == "direct" else 400_000)
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}" / "out.usda"
         command = [SCRIPT, "run", scene, "-o", out, "--frames", 1, "--sums", sums]

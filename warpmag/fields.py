@@ -26,7 +26,7 @@ from warpmag.magnets import check_not_negative, check_rtol, check_token
 from warpmag.pair_sums import SumsShape, pair_sums
 from warpmag.ranks import alike
 
-_METHODS = ("auto", "vectorized", "reference", "fmm")
+_METHODS = ("auto", "direct", "reference", "fmm")
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
 """Least of the largest component of moments [A·m²]: fields of smaller ones have no digits left."""
 
@@ -58,7 +58,7 @@ def h_field(
         radii: Ball radii [m], scalar or [n]; None means point dipoles.
         target_radii: Radii of the balls over which to average at the targets [m], scalar or [t]; None means points.
         smoothing: Length ℓ [m] of the paper's smoothing, ε² = ℓ⁵ added to r⁵ (section 5); point dipoles only.
-        method: ``vectorized`` (native loops over all pairs), ``reference`` (the plain Warp loop), ``fmm`` (the fast
+        method: ``direct`` (native loops over all pairs), ``reference`` (the plain Warp loop), ``fmm`` (the fast
             multipole method) or ``auto``: the fastest that is exact to rounding, or as ``rtol`` allows.
         rtol: Relative error allowed, ‖H − H_exact‖/‖H_exact‖ over all targets. None means 1e-3 with ``fmm``, and none
             otherwise.

@@ -68,7 +68,7 @@ H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 33,000."""
 def check_fast(rtol: float):
     """Raise ``InputError`` where expansions are not made for a relative error."""
     if rtol < LEAST_RTOL:
-        raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'vectorized'")
+        raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'direct'")
 
 
 def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device) -> bool:
@@ -200,7 +200,7 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
         is_fast(which / crowding, moments.count, quantity, rtol, moments.device)
         for which, quantity in (of_fields, (forces, Quantity.WRENCH))
     )
-    if not moments.count or method == "vectorized" or (method == "auto" and not (known and better)):
+    if not moments.count or method == "direct" or (method == "auto" and not (known and better)):
         return NoFastSums()
     always_from = _LARGE_PART * pairs if method == "fmm" else math.inf
     return SystemSums(moments, rtol, len(worlds), extent, crowding, always_from)

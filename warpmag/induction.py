@@ -128,7 +128,7 @@ def solve_induction(
             ``llg``, ``llg-damping``: Eq. 6 with and without precession.
         contact_model: ``dipole``; or ``multipole``, which adds what balls lack where they nearly touch, from the exact
             solution of two balls (see ``warpmag.kernels.near_contact``).
-        method: How fields are summed: ``vectorized``, over all pairs; ``fmm``, by the fast multipole method, to an
+        method: How fields are summed: ``direct``, over all pairs; ``fmm``, by the fast multipole method, to an
             error that ``rtol`` allows; or ``auto``, the faster one.
         rtol: Relative error of the magnetizations to reach.
         max_evaluations: Field evaluations after which to give up; ``converged`` tells.
@@ -296,7 +296,7 @@ def _read_result(kind: Kind, system: MomentSystem, balls: _Balls, given: dict) -
         warnings.warn(f"solve_induction: did not converge, {reached}", ConvergenceWarning, stacklevel=3)
     field_error = system.field_error()
     if field_error > system.rtol:
-        text = f"solve_induction: fields have an error of {field_error:.2g} > rtol {system.rtol:g}; use vectorized"
+        text = f"solve_induction: fields have an error of {field_error:.2g} > rtol {system.rtol:g}; use method direct"
         warnings.warn(text, ConvergenceWarning, stacklevel=3)
     return InductionResult(
         magnetizations=m,

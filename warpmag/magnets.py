@@ -19,7 +19,7 @@ CURVES = ("tanh", "langevin", "clamped", "frohlich")
 """Magnetization curves, see ``kernels.material.curves``; a model has the place in this list."""
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")
-SUMS = ("auto", "vectorized", "fmm")
+SUMS = ("auto", "direct", "fmm")
 """How pairs of moments are summed: over all of them, by the fast multipole method, or as is faster."""
 DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 

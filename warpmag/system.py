@@ -56,7 +56,7 @@ class MomentSystem:
             submagnetizations: ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.submagnetization``).
         contact_model: ``dipole``; or ``multipole``, which adds what inducible bodies of one moment lack where they
             nearly touch (see ``warpmag.kernels.near_contact``).
-        method: How pairs are summed: ``vectorized``, all of them; ``fmm``, the fast multipole method, with fields as
+        method: How pairs are summed: ``direct``, all of them; ``fmm``, the fast multipole method, with fields as
             exact as ``rtol`` asks for; or ``auto``, the faster one.
         body_extent: Largest distance between two moments of a body that may move [m], which the method ``fmm`` needs
             to know: it sums such pairs one by one. None means not known.
@@ -125,7 +125,7 @@ class MomentSystem:
         force="kelvin",
         dynamics="theta",
         contact_model="dipole",
-        method="vectorized",
+        method="direct",
         body_extent=None,
         rtol=1e-3,
         max_evaluations=1000,

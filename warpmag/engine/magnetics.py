@@ -75,7 +75,7 @@ class Magnetics:
                 ``llg-damping`` (Eq. 6, with and without precession).
             contact_model: ``dipole``, or ``multipole``, which adds what balls of one moment lack where they nearly
                 touch.
-            method: How fields and forces are summed: ``vectorized``, over all pairs; ``fmm``, by the fast multipole
+            method: How fields and forces are summed: ``direct``, over all pairs; ``fmm``, by the fast multipole
                 method, to an error that ``rtol`` allows; or ``auto``, the faster one.
             rtol: Relative magnetization error at which induction ends.
             external_field: Uniform applied field H0 [A/m], world frame.

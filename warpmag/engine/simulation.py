@@ -79,7 +79,7 @@ class Simulation:
             force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
-            method: How pairs are summed: ``vectorized``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
+            method: How pairs are summed: ``direct``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
             max_evaluations: Field evaluations after which induction gives up.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
@@ -253,7 +253,9 @@ class Simulation:
         known = *(self._scene.warnings if self._scene else ()), *solver_warnings(self._options["solver"])
         lines, figures, rtol = [], self.statistics, self._magnetics.system.rtol
         if figures.field_error > rtol:
-            lines = [f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; sum vectorized"]
+            lines = [
+                f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; sum by method direct"
+            ]
         return [*known, *figures.warnings(), *lines]
 
     @property
