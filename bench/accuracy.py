@@ -280,13 +280,27 @@ def draw(results: dict[str, list[dict]], path: Path) -> None:
     import matplotlib.pyplot as plt  # noqa: PLC0415 - slow to import, and --help does without it
 
     panels = (_draw_rounding, _draw_iteration, _draw_model, _draw_clusters, _draw_drift)
-    figure, axes = plt.subplots(1, len(panels), figsize=(4.8 * len(panels), 4.5))
-    for axis, panel, (name, rows) in zip(axes, panels, results.items(), strict=False):
+    figure, axes = plt.subplots(2, 3, figsize=(14.0, 8.0), layout="constrained")
+    for axis, panel, (name, rows) in zip(axes.flat, panels, results.items(), strict=False):
         axis.set_title(f"{name} error")
         axis.grid(alpha=0.3)
         panel(axis, rows)
+        _label_part_of_a_decade(axis.xaxis)
         axis.legend(fontsize=7)
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    for axis in axes.flat[len(panels) :]:
+        axis.set_axis_off()
+    figure.savefig(path, dpi=110)
+
+
+def _label_part_of_a_decade(axis) -> None:
+    """Label 1, 2 and 5 on a logarithmic axis that has few powers of ten, whose own labels touch each other."""
+    from matplotlib import ticker  # noqa: PLC0415 - as above
+
+    low, high = axis.get_view_interval()
+    axis.set_minor_formatter(ticker.NullFormatter())
+    if high < 30.0 * low:
+        axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
 
 
 def main() -> None:

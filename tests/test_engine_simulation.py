@@ -263,6 +263,49 @@ def test_a_state_that_is_not_finite_stops_the_run(device):
     np.testing.assert_array_equal(simulation.state.body_q.numpy(), held)
 
 
+def test_a_state_that_is_mended_goes_on(device):
+    broken, whole = (Simulation(pile(), device=device) for _ in range(2))
+    start = [array.numpy().copy() for array in (broken.state.body_q, broken.state.body_qd)]
+    broken.state.body_qd.fill_(math.nan)
+    with pytest.raises(warpmag.SimulationError):
+        run(broken, 2)
+    for array, values in zip((broken.state.body_q, broken.state.body_qd), start, strict=True):
+        array.assign(values)
+    ends = [run(one, 20) for one in (broken, whole)]
+    # induction starts from other moments, and ends within its error of the same ones
+    np.testing.assert_allclose(*ends, atol=0.01 * R)
+    assert broken.statistics.steps == 20
+
+
+def test_what_finish_measures_changes_nothing(device):
+    ends = []
+    for measured in (False, True):
+        simulation = Simulation(pile(), device=device)
+        for _ in range(20):
+            simulation.step()
+            if measured:
+                simulation.finish()
+        ends.append(run(simulation, 0))
+    np.testing.assert_array_equal(*ends)
+
+
+def test_forces_of_free_joints_move_bodies(device):
+    """v = F t/m and ω = τ t/I of a ball, I = 2/5 m R²; a kinematic one stays."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_attributes(builder)
+    ball, still = add_ball(builder, (0.0, 0.0, 1.0)), add_ball(builder, (1.0, 0.0, 1.0), is_kinematic=True)
+    simulation = Simulation(builder, device=device)
+    mass = builder.body_mass[ball]
+    force, torque = np.array([1e-3, 0.0, 2e-3]), np.array([0.0, 3e-7, 0.0])
+    simulation.control.joint_f.assign(np.tile(np.concatenate([force, torque]), 2))
+    run(simulation, 20)
+    velocities = simulation.state.body_qd.numpy()
+    # float32 rounds in each of 40 substeps
+    np.testing.assert_allclose(velocities[ball, :3], force * 0.02 / mass, rtol=5e-5, atol=1e-9)
+    np.testing.assert_allclose(velocities[ball, 3:], torque * 0.02 / (0.4 * mass * R**2), rtol=5e-5, atol=1e-6)
+    assert not velocities[still].any()
+
+
 @pytest.mark.parametrize("how", ["raises", "fails later"])
 def test_steps_that_cannot_be_captured_are_launched(device, how):
     ends = []

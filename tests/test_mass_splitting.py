@@ -89,6 +89,35 @@ def test_all_contacts_together_overshoot_less_than_momentum_bears(friction, devi
     assert largest > 0.3 * STABLE  # and not by splitting for nothing
 
 
+def test_a_hinge_elsewhere_changes_no_shares(device):
+    """Contacts that forces close within the substep count in scenes with joints, too."""
+    shares = []
+    for hinged in (False, True):
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        light, heavy = (newton.ModelBuilder.ShapeConfig(density=rho, mu=0.0, gap=1e-3) for rho in (100.0, 7874.0))
+        builder.add_shape_sphere(builder.add_body(), radius=4.0 * R, cfg=light)
+        for x, y in np.ndindex(5, 5):
+            at = np.array([0.3 * (x - 2), 0.3 * (y - 2), -1.0])
+            body = builder.add_body(xform=wp.transform(at / np.linalg.norm(at) * (4.4 * R + 5e-4)))
+            builder.add_shape_sphere(body, radius=0.4 * R, cfg=heavy)
+        if hinged:
+            arm = builder.add_link(xform=wp.transform((1.0, 0.0, 0.0)))
+            builder.add_shape_sphere(arm, radius=R)
+            builder.add_articulation([builder.add_joint_revolute(-1, arm, axis=(0.0, 0.0, 1.0))])
+        model = builder.finalize(device=device)
+        pipeline, state = newton.CollisionPipeline(model), model.state()
+        contacts = pipeline.contacts()
+        pipeline.collide(state, contacts)
+        pull = np.zeros((model.body_count, 6), np.float32)
+        pull[0, 2] = -2.0 * 5e-4 / DT**2 * model.body_mass.numpy()[0]  # closes the gaps twice over
+        state.body_f.assign(pull)
+        solver = PileXPBD(model, 1000, rigid_contact_relaxation=RELAXATION, rigid_contact_con_weighting=False)
+        solver.step(state, model.state(), None, contacts, DT)
+        shares.append(solver._shares.numpy()[:26])
+    assert shares[0][0] > 2.0
+    np.testing.assert_array_equal(*shares)
+
+
 def test_small_balls_that_hit_a_light_large_one_are_stopped(device):
     """Eighty of them at once, from all sides; nothing is faster afterwards than what came."""
     builder, speed, far = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0)), 0.3, 4.0 * R

@@ -109,6 +109,16 @@ def test_what_cannot_be_taken_over_is_refused(device, name):
         magnetics.notify_model_changed()
 
 
+def test_a_measured_curve_of_all_magnets_is_not_bent(device):
+    model = model_of(device)
+    magnetics = warpmag.Magnetics(model, curve="M-19")
+    write(model, "saturation", 0, 3e5)
+    with pytest.raises(
+        warpmag.InputError, match=r"^shape0: warpmag\.saturation was changed, and a measured curve says"
+    ):
+        magnetics.notify_model_changed()
+
+
 @pytest.mark.parametrize(("name", "value"), [("saturation", -1.0), ("saturation", math.nan), ("susceptibility", 0.0)])
 def test_a_material_out_of_range_is_refused(device, name, value):
     model = model_of(device)

@@ -202,6 +202,32 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, device, always, 
     assert sorted(os.listdir(tmp_path / "parts")) == ["out.cache.usdc", "out.usda"]
 
 
+def test_a_resumed_run_keeps_what_was_set(scene, tmp_path, device, always):
+    """Fields, magnetizations and materials that a program set before the checkpoint."""
+
+    def run(name, last, resume):
+        simulation = Simulation(scene, device=device)
+        magnetics, output = simulation.magnetics, tmp_path / name / "out.usda"
+
+        def on_frame(frame):
+            if frame == 1:
+                magnetics.set_external_field((0.0, 2e4, 0.0))
+                magnet = next(one for one in magnetics.magnets if one.magnet.kind == "permanent")
+                magnetics.set_magnetization((0.0, 0.0, 7e5), body=magnet.body, shape=int(magnet.shapes[0]))
+                simulation.model.warpmag.saturation.fill_(5e5)
+                magnetics.notify_model_changed()
+            return frame < last
+
+        figures = simulation.run(5, output=output, resume=resume, on_frame=on_frame)
+        return figures.evaluations, figures.substeps, samples(output)
+
+    expected = run("whole", 5, False)
+    run("parts", 3, False)
+    found = run("parts", 5, True)
+    same = found == expected
+    assert same, first_difference(found, expected)
+
+
 def test_a_scene_edited_in_memory_is_another_scene(scene, tmp_path, device, always):
     """A process reads its own edits where it has not saved them, and who resumes without them has another scene."""
     own, output = tmp_path / "own.usda", tmp_path / "out.usda"

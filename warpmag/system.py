@@ -329,7 +329,8 @@ class MomentSystem:
         if self._near is not None:
             parts["near"] = self._near.carried()
         inner = {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
-        return {"moments": self.moments, **inner}
+        material = {"saturation": self._material.saturation, "slope": self._material.slope}
+        return {"moments": self.moments, **material, **inner}
 
     def solve(self):
         """Launch the induction solve: inducible ``moments`` in equilibrium with the field at ``positions``."""

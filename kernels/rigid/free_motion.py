@@ -29,6 +29,8 @@ def _accelerate(
     # inputs:
     bodies: BodyView,
     gravity_in: wp.array[wp.vec3],
+    free_dof_in: wp.array[wp.int32],
+    joint_f_in: wp.array[float],
     kinematic_flag: int,
     dt: float,
     # outputs:
@@ -40,6 +42,9 @@ def _accelerate(
     qd_out[body] = bodies.qd[body]
     if (bodies.flags[body] & kinematic_flag) == 0:
         velocity, force, inv_mass = bodies.qd[body], bodies.f[body], bodies.inv_mass[body]
+        if free_dof_in and free_dof_in[body] >= 0:
+            for k in range(6):
+                force[k] += joint_f_in[free_dof_in[body] + k]
         gravity = gravity_in[bodies.world[body]] * wp.nonzero(inv_mass)
         gain = _about(wp.transform_get_rotation(bodies.q[body]), bodies.inv_inertia[body], wp.spatial_bottom(force))
         v = wp.spatial_top(velocity) + dt * (inv_mass * wp.spatial_top(force) + gravity)
@@ -73,9 +78,20 @@ def _move(
     qd_out[body] = wp.spatial_vector(v, spin)
 
 
-def launch_accelerate(bodies: BodyView, gravity, kinematic_flag: int, dt: float, q, qd):
-    """Write the poses of bodies as they are and the velocities that forces and torques lend them in ``dt`` [s]."""
-    inputs = [bodies, gravity, kinematic_flag, dt]
+def launch_accelerate(bodies: BodyView, gravity, kinematic_flag: int, dt: float, q, qd, free_dof=None, joint_f=None):
+    """Write the poses of bodies as they are and the velocities that forces and torques lend them in ``dt`` [s].
+
+    Args:
+        bodies: The bodies.
+        gravity: Acceleration in each world [m/s²], shape [worlds].
+        kinematic_flag: Newton's flag of kinematic bodies.
+        dt: Length of the substep [s].
+        q, qd: Out, poses and velocities, shape [bodies].
+        free_dof: First degree of freedom of each body's free joint, -1 without, shape [bodies]; None if forces of
+            joints are none, or in the bodies' own.
+        joint_f: Forces of degrees of freedom, those of a free joint about the centre of mass [N, N·m], shape [dofs].
+    """
+    inputs = [bodies, gravity, free_dof, joint_f, kinematic_flag, dt]
     wp.launch(_accelerate, dim=len(q), inputs=inputs, outputs=[q, qd], device=q.device)
 
 

@@ -4,7 +4,6 @@ Newton's defaults are for bodies of a metre. Here contact gaps follow the size o
 have a fixed size that is checked and grown, and XPBD runs with the settings that let a magnetic pile come to rest.
 """
 
-import copy
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -121,17 +120,6 @@ def scale_gaps(model: newton.Model, sizes: BodySizes) -> None:
     model.shape_gap.assign(np.where(unchosen, np.minimum(gaps, _GAP * scale), gaps).astype(np.float32))
 
 
-def _without_free_joints(model: newton.Model) -> newton.Model:
-    """Return a view of ``model`` without its joints, if all of them are free ones, which constrain nothing.
-
-    XPBD solves maximal coordinates: a free joint only costs it a third of its time, or half on a GPU.
-    """
-    if model.joint_count and (model.joint_type.numpy() == newton.JointType.FREE).all():
-        model = copy.copy(model)
-        model.joint_count = 0
-    return model
-
-
 def _xpbd(model: newton.Model, contact_max: int):
     # Contacts are relaxed all at once: beyond a third of each correction the many contacts of a ball in a pile
     # together overshoot, which keeps the pile hot for good (RMS speed on Balls Up after 1.5 s of 0.15 cm/s at 0.35,
@@ -143,7 +131,7 @@ def _xpbd(model: newton.Model, contact_max: int):
     # Joints are relaxed alike along and about their axes, or hinged bodies swing as if they were heavier (a quarter
     # swing ends at 84.9 instead of 90 degrees with Newton's 0.7 and 0.4). Two at one place are stable up to 0.5 each.
     settings |= {"joint_linear_relaxation": 0.4, "joint_angular_relaxation": 0.4}
-    return PileXPBD(_without_free_joints(model), contact_max, **settings)
+    return PileXPBD(model, contact_max, **settings)
 
 
 def _steel(model: newton.Model, contact_max: int):

@@ -5,6 +5,7 @@ Newton's kernels say how far joints and contacts are off at the poses that veloc
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import newton
@@ -69,13 +70,14 @@ class JointSolve:
         view.row_joint, view.row_dof, view.row_target, view.row_turns = self._rows
         return view
 
-    def step(self, before: BodyView, after: BodyView, masses, control, contacts, dt: float) -> None:
+    def step(self, before: BodyView, after: BodyView, contact_masses: Callable, control, contacts, dt: float) -> None:
         """Advance by ``dt`` [s].
 
         Args:
             before: The bodies as they are, with their whole masses.
             after: Out, the bodies afterwards.
-            masses: Inverse masses and inertias that a contact acts on.
+            contact_masses: Called once ``after`` has the velocities without contacts and joints; returns the inverse
+                masses and inertias that a contact acts on.
             control: Forces and targets of the joints.
             contacts: Newton's contacts.
             dt: Length of the substep [s].
@@ -85,6 +87,7 @@ class JointSolve:
         self._add_joint_forces(before.q, control.joint_f, dt)
         before.f = self._forces
         launch_accelerate(before, model.gravity, _KINEMATIC, dt, after.q, after.qd)
+        masses = contact_masses()
         kernels.launch_align(joints, model.joint_qd_start, self._one_axis, *self._frames)
         wp.copy(self._q, after.q)
         wp.copy(self._qd, after.qd)

@@ -96,7 +96,7 @@ class Magnetics:
         if curve is not None:
             curve = materials.measured("Magnetics: curve", curve)
         self.magnets, self._worlds = find_magnets(model)
-        self._model, self._values = model, ModelValues(model)
+        self._model, self._values = model, ModelValues(model, measured=isinstance(curve, MagnetizationCurve))
         self._sources = ModelSources(model, self._worlds)
         self._induced = False
         self.system, celled, solid = make_system(
@@ -226,6 +226,12 @@ class Magnetics:
         (saturation,), (susceptibility,) = self._values.material(list(one.shapes[:1]))
         magnet = replace(one.magnet, saturation=float(saturation), susceptibility=float(susceptibility))
         return replace(one, magnet=magnet)
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays by which a later step goes on as it would, by name: what was set, and what a solve left."""
+        given, system = getattr(self._model, NAMESPACE), self.system
+        values = {"magnetization": given.magnetization, "strength": given.strength, "field": system.external_field}
+        return values | self._values.carried() | system.carried()
 
     def check_model(self) -> None:
         """Raise :class:`InputError` if ``model.warpmag`` has changed meanwhile; waits for the device."""

@@ -43,9 +43,9 @@ class ModelValues:
         changed: A shape that has changed, plus one, or 0, on the device, shape [1].
     """
 
-    def __init__(self, model: newton.Model):
-        """Take the values of ``model``."""
-        self._model = model
+    def __init__(self, model: newton.Model, *, measured: bool):
+        """Take the values of ``model``; ``measured`` tells whether one measured curve is that of all magnets."""
+        self._model, self._measured = model, measured
         self.now, self.then = ShapeMagnets(), ShapeMagnets()
         for name in _NAMES:
             setattr(self.now, name, self._array(name))
@@ -101,7 +101,7 @@ class ModelValues:
                     raise InputError(
                         f"{where} was changed, and this Magnetics keeps what it was made with: make another"
                     )
-                if self.now.curve.numpy()[shape] >= len(CURVES):
+                if self._measured or self.now.curve.numpy()[shape] >= len(CURVES):
                     raise InputError(f"{where} was changed, and a measured curve says what it is")
                 value = float(getattr(self.now, name).numpy()[shape])
                 check_material(where, value, infinite=name == "susceptibility")
@@ -111,6 +111,10 @@ class ModelValues:
         """Return saturations [A/m] and susceptibilities of shapes as the model has them now."""
         saturation, susceptibility = (getattr(self.now, name).numpy()[shapes].astype(float) for name in _MATERIAL)
         return saturation, susceptibility
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays of what can be changed, by name."""
+        return {f"{when}.{name}": getattr(getattr(self, when), name) for when in ("now", "then") for name in _MATERIAL}
 
     def take(self) -> None:
         """Take the values that the model has now."""

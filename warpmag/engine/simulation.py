@@ -177,7 +177,8 @@ class Simulation:
         if self._scene:
             self._start_from_stage()
         self._center = self._positions(self.state).mean(axis=0) if len(self._moving) else np.zeros(3)
-        self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)[2]
+        overlap, _, self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)
+        self._stepper.begin_from(overlap)
         self._statistics.coarseness = self._coarseness()
 
     def _refusals(self, scene):

@@ -246,6 +246,9 @@ class Stepper:
     def _give_up(self) -> None:
         body = int(self._read("counts")[monitor.COUNT_BAD_BODY]) % self._model.body_count
         self.steps, number = self._reported, self._reported + 1
+        for status in (stepping.STATUS_LEVEL, stepping.STATUS_ATTEMPTS):
+            self._machine.set_status(status, 0)
+        self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)  # the state may be mended
         raise SimulationError(
             f"step {number} ({number * self._step:g} s): {self._model.body_label[body]} has left all finite numbers"
         )
@@ -308,7 +311,7 @@ class Stepper:
         machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
         parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
         parts["control"] = dict(enumerate(_arrays(self._control)))
-        parts |= {"magnetics": self._magnetics.system.carried(), "solver": self._solver.carried()}
+        parts |= {"magnetics": self._magnetics.carried(), "solver": self._solver.carried()}
         return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
@@ -328,10 +331,13 @@ class Stepper:
                 break
             self._prepare()
         peaks, counts = self._read("peaks"), self._read("counts")
-        overlap = float(peaks[monitor.PEAK_OVERLAP])
-        a.last_overlap.assign(np.array([overlap, math.inf], np.float32))
         self._machine.forget_contacts()
-        return overlap, float(peaks[monitor.PEAK_DEPTH]), int(counts[monitor.COUNT_OVERLAPS])
+        depths = float(peaks[monitor.PEAK_OVERLAP]), float(peaks[monitor.PEAK_DEPTH])
+        return *depths, int(counts[monitor.COUNT_OVERLAPS])
+
+    def begin_from(self, overlap: float) -> None:
+        """Say how deep the first state has bodies in each other, over their thickness: steps press them no deeper."""
+        self._arrays.last_overlap.assign(np.array([overlap, math.inf], np.float32))
 
     # -----------------------------------------------------------------------------------------------------------------
     # What the device does: all of the following only launches kernels

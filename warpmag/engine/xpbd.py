@@ -35,8 +35,8 @@ _ALIKE = 0.1
 class PileXPBD(newton.solvers.SolverXPBD):
     """Newton's XPBD with masses split among contacts, whose impulses keep momentum and angular momentum.
 
-    Models with joints take the steps of :mod:`warpmag.engine.joints`, and those with particles, tendons, restitution,
-    moving surfaces or joints that mimic others Newton's own, with split masses.
+    Models with joints, free ones apart, take the steps of :mod:`warpmag.engine.joints`, and those with particles,
+    tendons, restitution, moving surfaces or joints that mimic others Newton's own, with split masses.
     """
 
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
@@ -50,17 +50,21 @@ class PileXPBD(newton.solvers.SolverXPBD):
         """
         super().__init__(model, **settings)
         splits = _splits(model, self.body_inv_mass_effective.numpy())
-        self._splits = wp.array(splits, dtype=wp.int32, device=model.device) if splits.any() else None
+        self._splits = None
+        if splits.any():
+            self._splits = wp.array(splits, dtype=wp.int32, device=model.device)
+            self._entries = wp.zeros((ENTRIES, model.body_count), dtype=wp.int32, device=model.device)
+            self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
+            self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         self._contact_iterations = contact_iterations or self.iterations
-        self._entries = wp.zeros((ENTRIES, model.body_count), dtype=wp.int32, device=model.device)
-        self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
-        self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         others = model.particle_count, model.tendon_segment_count, self.enable_restitution
-        self._solve = self._joints = None
+        self._solve = self._joints = self._free_dofs = None
         plain = not any(others) and not self.rigid_contact_con_weighting
-        if plain and not model.joint_count:
+        if plain and (free_dofs := _free_dofs(model)) is not None:
             bodies = self._view_bodies(model.state())
             self._solve = contact_solve.allocate(contact_max, bodies, kinematic_flag=_KINEMATIC)
+            if model.joint_count:
+                self._free_dofs = wp.array(free_dofs, dtype=wp.int32, device=model.device)
         elif plain and not self._has_joint_mimics:
             self._joints = JointSolve(
                 model,
@@ -72,12 +76,12 @@ class PileXPBD(newton.solvers.SolverXPBD):
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; as Newton's."""
         if self._solve is not None and contacts.rigid_contact_surface_velocity is None:
-            self._step_bodies(state_in, state_out, contacts, dt)
+            self._step_bodies(state_in, state_out, control, contacts, dt)
             return
-        self._find_shares(self._view_bodies(state_in), contacts, dt)
         if self._joints is not None:
             self._step_joints(state_in, state_out, control, contacts, dt)
             return
+        self._find_shares(self._view_bodies(state_in), contacts, dt)
         with self._splitting():
             super().step(state_in, state_out, control, contacts, dt, observables=observables)
 
@@ -85,10 +89,11 @@ class PileXPBD(newton.solvers.SolverXPBD):
         """Return the arrays that one substep hands on to the next one, by name."""
         return {} if self._solve is None else self._solve.carried()
 
-    def _step_bodies(self, state_in, state_out, contacts, dt) -> None:
+    def _step_bodies(self, state_in, state_out, control, contacts, dt) -> None:
         assert self._solve is not None
         before, after = self._view_bodies(state_in), self._view_bodies(state_out)
-        launch_accelerate(before, self.model.gravity, _KINEMATIC, dt, state_out.body_q, state_out.body_qd)
+        forces = () if control is None or self._free_dofs is None else (self._free_dofs, control.joint_f)
+        launch_accelerate(before, self.model.gravity, _KINEMATIC, dt, after.q, after.qd, *forces)
         self._find_shares(after, contacts, dt)
         contact_solve.launch_solve_contacts(
             self._solve,
@@ -118,7 +123,12 @@ class PileXPBD(newton.solvers.SolverXPBD):
         assert self._joints is not None
         before, after = self._view_bodies(state_in), self._view_bodies(state_out)
         control = control or self.model.control(clone_variables=False)
-        self._joints.step(before, after, self._contact_masses(), control, contacts, dt)
+
+        def contact_masses():
+            self._find_shares(after, contacts, dt)
+            return self._contact_masses()
+
+        self._joints.step(before, after, contact_masses, control, contacts, dt)
 
     def _view_bodies(self, state) -> BodyView:
         """Return the bodies, of which forces and contacts do not move the kinematic ones."""
@@ -152,6 +162,20 @@ class PileXPBD(newton.solvers.SolverXPBD):
         bodies.inv_mass, bodies.inv_inertia = self._whole
         launch_move_by(bodies, body_deltas, rigid_contact_inv_weight, dt, then.body_q, then.body_qd)
         return then.body_q, then.body_qd
+
+
+def _free_dofs(model: newton.Model) -> np.ndarray | None:
+    """Return the first degree of freedom of each body's free joint, -1 without one, shape [body_count].
+
+    None where there are joints that constrain something, or free ones between two bodies.
+    """
+    dofs, joints = np.full(model.body_count, -1), model.joint_count
+    if joints:
+        if (model.joint_type.numpy() != newton.JointType.FREE).any() or (model.joint_parent.numpy() >= 0).any():
+            return None
+        first = np.where(model.joint_enabled.numpy(), model.joint_qd_start.numpy()[:joints], -1)
+        np.put(dofs, model.joint_child.numpy(), first)
+    return dofs
 
 
 def _splits(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ from warpmag.usd.values import quiet
 _SUFFIXES = (".usd", ".usda", ".usdc")
 _SCENES = (".usdc", ".usdz")
 _ABOUT = "about"
-_FORMAT = 1
+_FORMAT = 2
 """What a checkpoint is like. Another number for each change of what is in one, here or in what the engine carries."""
 _UNLOCKABLE = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
 """What file systems say that know no locks."""

@@ -13,7 +13,6 @@ from warpmag.usd.values import Finding
 
 _NAMES = {MAGNET_API: MAGNET_NAMES, SCENE_API: SCENE_NAMES, COIL_API: COIL_NAMES, MAP_API: MAP_NAMES}
 _SCHEMA_OF = {name: schema for schema, names in _NAMES.items() for name in names}
-_APIS = tuple(_NAMES)
 _NAMESPACE = "warpmag"
 _LIKE = 0.85
 """How much a slip is like what is meant; one letter of seven, or two that changed places."""
@@ -23,7 +22,7 @@ def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
     """Yield which schemas and attributes in warpmag's name a prim has for nothing."""
     path = str(prim.GetPath())
     for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
-        if api not in _NAMES and (api.lower().startswith(_NAMESPACE) or _like(api, _APIS)):
+        if api not in _NAMES and _like(api[: len(_NAMESPACE)], (_NAMESPACE,)):
             yield Finding(path, f"{api} has no effect: there is no such schema{_nearest(api, list(_NAMES))}", "warning")
     for name in prim.GetAuthoredPropertyNames():
         if not _like(name.partition(":")[0], (_NAMESPACE,)):
