@@ -109,6 +109,33 @@ def test_a_compass_needle_swings_about_north(solver, device):
     compare(angles(simulation, needle, axis, steps), swing(rate, wide, 0.0, steps), 0.0, wide)
 
 
+def test_a_joint_outside_of_its_limits_goes_back_slowly(device):
+    """As those of robots whose stages say where joints may be, and not where they start: no jump in one substep."""
+    builder = scene()
+    bar, _ = hinge(builder, 0.0, limit_lower=0.5, limit_upper=1.5)
+    simulation = Simulation(builder, device=device, step=STEP)
+    path = angles(simulation, bar, (0.0, 1.0, 0.0), 300)
+    assert np.diff(path).max() < 1.05 * 10.0 * STEP  # rad, _TURNING of kernels.rigid.joints
+    assert path[100] > 0.499 and path[100:].min() > 0.499 and path.max() < 1.501
+    assert simulation.statistics.substeps == 600
+
+
+def test_ends_of_a_joint_that_are_apart_close_slowly(device):
+    builder = scene()
+    bar, _ = hinge(builder, 0.0, arm=EXTENT[0])
+    builder.body_q[bar] = wp.transform((0.3, 0.0, 0.2), wp.quat_identity())
+    simulation = Simulation(builder, device=device, step=STEP)
+    apart, spins = [], []
+    for _ in range(400):
+        simulation.step()
+        pose = wp.transform(*simulation.state.body_q.numpy()[bar].tolist())
+        apart.append(wp.length(wp.transform_point(pose, wp.vec3(-EXTENT[0], 0.0, 0.0))))
+        spins.append(simulation.state.body_qd.numpy()[bar, 3:])
+    assert np.abs(np.diff(apart)).max() < 1.05 * 2.0 * STEP  # m, _CLOSING
+    assert max(apart[-50:]) < 1e-3
+    assert np.isfinite(spins).all()
+
+
 @pytest.mark.parametrize("solver", DRIVEN, indirect=True)
 def test_a_drive_is_a_spring_of_its_gain(solver, device):
     if solver == "kamino":
@@ -274,7 +301,9 @@ def test_a_weak_pull_moves_a_body_that_rebounds(device):
 def test_a_solver_that_is_not_installed_names_what_installs_it(device, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     monkeypatch.setattr(newton.solvers.SolverMuJoCo, "_mujoco_warp", None)
-    with pytest.raises(InputError, match=r"^solver mujoco: needs the extra 'sim' \(pip install 'warpmag\[sim\]', "):
+    with pytest.raises(
+        InputError, match=r"^solver mujoco: needs the extra 'sim' \(in a checkout pip install '\.\[sim\]', "
+    ):
         Simulation(servo()[0], solver="mujoco", device=device)
 
 

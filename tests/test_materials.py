@@ -1,6 +1,7 @@
 """Materials by name: their numbers, in Python and on a stage."""
 
 import math
+from pathlib import Path
 
 import newton
 import numpy as np
@@ -23,6 +24,13 @@ def test_grades_are_named_after_their_energy_product(name):
     """An ideal magnet's is Br²/(4 μ0); grades go by whole MGOe, and their range of remanence is 3 to 4 % wide."""
     magnetization = warpmag.material(name).magnetization
     assert MU0 * magnetization**2 / 4.0 / MGOE == pytest.approx(float(name[1:]), rel=0.04)
+
+
+def test_the_page_of_materials_has_all_of_them():
+    page = (Path(__file__).parents[1] / "docs" / "materials.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")][1:]
+    assert {row[0]: row[2] for row in rows} == {name: f"{one.polarization:.4g}" for name, one in MATERIALS.items()}
+    assert {row[0]: float(row[4]) for row in rows} == {name: one.density for name, one in MATERIALS.items()}
 
 
 def test_materials_are_within_what_matter_does():

@@ -101,7 +101,7 @@ def _add_run(commands) -> None:
     run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")
     run.add_argument("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
     run.add_argument("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
-    run.add_argument("--balls", type=int, metavar="N", help="balls of a bundled scene (default: its own number)")
+    run.add_argument("--balls", type=int, metavar="N", help="balls of falling_magnet, sakura_tree or million")
     run.add_argument("--frames", type=int, metavar="N", help="output frames to simulate (default: those of the stage)")
     run.add_argument("--resume", action="store_true", help="go on with the run at the output, if there is one")
     run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
@@ -109,7 +109,7 @@ def _add_run(commands) -> None:
     run.add_argument(
         "--method",
         choices=METHODS,
-        help="preset of force law, dynamics and curve: this library's, Kim and Han 2022, Kim et al. 2018",
+        help="preset of force law, dynamics and curve of all magnets: this library's, Kim and Han 2022, Kim et al. 2018",
     )
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
@@ -118,9 +118,11 @@ def _add_run(commands) -> None:
         "--sums",
         choices=SUMS,
         default=SUMS[0],
-        help="sums over pairs: all, or multipoles (default: %(default)s)",
+        help="sums: over all pairs, by the fast multipole method, or the faster one (default: %(default)s)",
     )
-    run.add_argument("--rtol", type=float, metavar="X", help="magnetization error to reach (default: the stage's)")
+    run.add_argument(
+        "--rtol", type=float, metavar="X", help="magnetization error to reach, at least 2e-6 (default: the stage's)"
+    )
     run.add_argument(
         "--viewer", choices=("none", *_VIEWERS), default="none", help="watch the run (default: %(default)s)"
     )

@@ -13,7 +13,7 @@ def one_line(text: str) -> str:
 
 def extra(name: str) -> str:
     """Return the extra of that name with the commands that bring it, for a line about what is missing."""
-    return f"the extra '{name}' (pip install 'warpmag[{name}]', in a checkout uv run --extra {name} ...)"
+    return f"the extra '{name}' (in a checkout pip install '.[{name}]', or uv run --extra {name} ...)"
 
 
 class InputError(ValueError):

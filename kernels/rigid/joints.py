@@ -17,6 +17,12 @@ from warpmag.kernels.rigid.newton_views import BodyView
 
 wp.set_module_options({"enable_backward": False})
 
+_CLOSING = wp.constant(2.0)
+"""Most speed at which ends that are apart as a substep begins are pulled together, and slides into their limits [m/s]:
+bodies keep it, and the shorter the substep, the faster would be what closes the whole of it."""
+_TURNING = wp.constant(10.0)
+"""The same of an angle that is outside of its limits [rad/s]."""
+
 
 @wp.struct
 class JointView:
@@ -29,6 +35,10 @@ class JointView:
         child_frame: Frame of the joint in that of the child, shape [joints].
         enabled: Whether the joint does anything, shape [joints].
         slides: Whether the ends may be at two places, shape [joints].
+        pins: Whether the ends are to be at one place, shape [joints].
+        one_axis: Whether the joint turns about or slides along one axis, shape [joints].
+        dof_start: First degree of freedom, and the one after the last, shape [joints + 1].
+        lower, upper: Limits of each degree of freedom [m or rad], shape [dofs].
         axis: Direction of each degree of freedom in the frame of the joint, shape [dofs].
         stiffness: Gain of the position [N/m or N·m/rad], shape [dofs].
         damping: Gain of the velocity [N·s/m or N·m·s/rad], shape [dofs].
@@ -45,6 +55,11 @@ class JointView:
     child_frame: wp.array[wp.transform]
     enabled: wp.array[wp.bool]
     slides: wp.array[wp.bool]
+    pins: wp.array[wp.bool]
+    one_axis: wp.array[wp.bool]
+    dof_start: wp.array[wp.int32]
+    lower: wp.array[float]
+    upper: wp.array[float]
     axis: wp.array[wp.vec3]
     stiffness: wp.array[float]
     damping: wp.array[float]
@@ -195,29 +210,55 @@ def _drive(
         wp.atomic_sub(deltas_io, parent, change * wp.spatial_vector(linear, angular0))
 
 
+@wp.func
+def _left_apart(joints: JointView, bodies: BodyView, joint: int, dt: float) -> wp.vec3:
+    """How far the ends of a joint may still be apart at the end of a substep, in the parent's frame [m]."""
+    pose0, pose1 = _pose(bodies.q, joints.parent[joint]), bodies.q[joints.child[joint]]
+    end0 = wp.transform_get_translation(pose0 * joints.parent_frame[joint])
+    end1 = wp.transform_get_translation(pose1 * joints.child_frame[joint])
+    apart = wp.length(end1 - end0)
+    if apart <= _CLOSING * dt:
+        return wp.vec3(0.0)
+    return (1.0 - _CLOSING * dt / apart) * wp.quat_rotate_inv(wp.transform_get_rotation(pose0), end1 - end0)
+
+
 @wp.kernel
 def _align(
     # inputs:
     joints: JointView,
-    dof_start_in: wp.array[wp.int32],
-    one_axis_in: wp.array[wp.bool],
+    bodies: BodyView,
+    dt: float,
     # outputs:
     parent_frame_out: wp.array[wp.transform],
     child_frame_out: wp.array[wp.transform],
     axis_out: wp.array[wp.vec3],
+    lower_out: wp.array[float],
+    upper_out: wp.array[float],
 ):
     joint = wp.tid()
-    turn = wp.quat_identity()
-    if one_axis_in[joint]:
-        x, axis = wp.vec3(1.0, 0.0, 0.0), wp.normalize(joints.axis[dof_start_in[joint]])
+    first = joints.dof_start[joint]
+    for dof in range(first, joints.dof_start[joint + 1]):
+        lower_out[dof] = joints.lower[dof]
+        upper_out[dof] = joints.upper[dof]
+    turn, apart = wp.quat_identity(), wp.vec3(0.0)
+    if joints.one_axis[joint]:
+        x, axis = wp.vec3(1.0, 0.0, 0.0), wp.normalize(joints.axis[first])
         middle = x + axis
         turn = wp.quat(0.0, 0.0, 1.0, 0.0)
         if wp.length_sq(middle) > 1.0e-6:
             half = wp.normalize(middle)
             turn = wp.quat(wp.cross(x, half), wp.dot(x, half))
-        axis_out[dof_start_in[joint]] = x
-    parent_frame_out[joint] = joints.parent_frame[joint] * wp.transform(wp.vec3(0.0), turn)
-    child_frame_out[joint] = joints.child_frame[joint] * wp.transform(wp.vec3(0.0), turn)
+        axis_out[first] = x
+        place, step = _angle(joints, bodies, joint, axis), _TURNING * dt
+        if joints.slides[joint]:
+            place, step = wp.dot(_offset(joints, bodies.q, joint), axis), _CLOSING * dt
+        lower_out[first] = wp.min(joints.lower[first], place + step)
+        upper_out[first] = wp.max(joints.upper[first], place - step)
+    if joints.pins[joint]:
+        apart = _left_apart(joints, bodies, joint, dt)
+    aligned = wp.transform(wp.vec3(0.0), turn)
+    parent_frame_out[joint] = wp.transform(apart, wp.quat_identity()) * joints.parent_frame[joint] * aligned
+    child_frame_out[joint] = joints.child_frame[joint] * aligned
 
 
 @wp.kernel
@@ -272,19 +313,22 @@ def launch_count_down(left):
     wp.launch(_count_down, dim=1, outputs=[left], device=left.device)
 
 
-def launch_align(joints: JointView, dof_start, one_axis, parent_frames, child_frames, axes):
-    """Write frames of joints whose x axis is that of the joint, where it has one: Newton's limits know no other.
+def launch_align(joints: JointView, bodies: BodyView, dt: float, frames, axes, limits):
+    """Write joints as Newton's kernel is to solve them in a substep.
+
+    Frames have the axis of the joint as their x axis, where it has one: Newton's limits know no other. Ends that are
+    apart come together, and joints outside of their limits go back, no faster than ``_CLOSING`` and ``_TURNING``.
 
     Args:
         joints: The joints.
-        dof_start: First degree of freedom of each joint, shape [joints].
-        one_axis: Whether a joint turns about or slides along one axis, shape [joints].
-        parent_frames: Out, frames in the parents, shape [joints].
-        child_frames: Out, frames in the children, shape [joints].
+        bodies: The bodies at the start of the substep.
+        dt: Length of the substep [s].
+        frames: Out, frames in the parents and in the children, shape [joints].
         axes: In and out, axes of the degrees of freedom in those frames, shape [dofs].
+        limits: Out, lower and upper limits that can be reached, shape [dofs].
     """
-    outputs = [parent_frames, child_frames, axes]
-    wp.launch(_align, dim=len(joints.parent), inputs=[joints, dof_start, one_axis], outputs=outputs, device=axes.device)
+    outputs = [*frames, axes, *limits]
+    wp.launch(_align, dim=len(joints.parent), inputs=[joints, bodies, dt], outputs=outputs, device=axes.device)
 
 
 def launch_turn_levers(joints: JointView, bodies: BodyView, q_now, impulses, deltas):

@@ -19,6 +19,8 @@ from warpmag.kernels.rigid.newton_views import BodyView
 
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 _ONE_AXIS = (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC)
+_PINS = (newton.JointType.REVOLUTE, newton.JointType.BALL, newton.JointType.FIXED, newton.JointType.D6)
+"""Joints whose ends are at one place, unless they slide."""
 _ROWS_OF_FREE = (newton.JointType.FREE, newton.JointType.DISTANCE, newton.JointType.BALL, newton.JointType.FIXED)
 """Joints whose degrees of freedom have no drive here."""
 _AT_ONCE = 6
@@ -44,8 +46,12 @@ class JointSolve:
         self._impulses = wp.zeros(model.joint_count, dtype=wp.spatial_vector, device=device)
         self._forces = wp.zeros_like(self._deltas)
         self._q, self._qd = wp.empty_like(model.body_q), wp.empty_like(model.body_qd)
-        self._frames = wp.empty_like(model.joint_X_p), wp.empty_like(model.joint_X_c), wp.clone(model.joint_axis)
+        self._frames = wp.empty_like(model.joint_X_p), wp.empty_like(model.joint_X_c)
+        self._axes = wp.clone(model.joint_axis)
+        self._limits = wp.empty_like(model.joint_limit_lower), wp.empty_like(model.joint_limit_upper)
         types, counts = model.joint_type.numpy(), _axis_counts(model)
+        pins = np.isin(types, _PINS) & (counts[:, 0] == 0)
+        self._pins = wp.array(pins, dtype=wp.bool, device=device)
         self._one_axis = wp.array(np.isin(types, _ONE_AXIS), dtype=wp.bool, device=device)
         slides = (counts[:, 0] > 0) & ~np.isin(types, _ROWS_OF_FREE)
         self._slides = wp.array(slides, dtype=wp.bool, device=device)
@@ -66,7 +72,9 @@ class JointSolve:
         view.parent, view.child, view.enabled = model.joint_parent, model.joint_child, model.joint_enabled
         view.parent_frame, view.child_frame, view.axis = model.joint_X_p, model.joint_X_c, model.joint_axis
         view.stiffness, view.damping = model.joint_target_ke, model.joint_target_kd
-        view.effort, view.slides = model.joint_effort_limit, self._slides
+        view.effort, view.dof_start = model.joint_effort_limit, model.joint_qd_start
+        view.lower, view.upper = model.joint_limit_lower, model.joint_limit_upper
+        view.slides, view.pins, view.one_axis = self._slides, self._pins, self._one_axis
         view.row_joint, view.row_dof, view.row_target, view.row_turns = self._rows
         return view
 
@@ -88,7 +96,7 @@ class JointSolve:
         before.f = self._forces
         launch_accelerate(before, model.gravity, _KINEMATIC, dt, after.q, after.qd)
         masses = contact_masses()
-        kernels.launch_align(joints, model.joint_qd_start, self._one_axis, *self._frames)
+        kernels.launch_align(joints, before, dt, self._frames, self._axes, self._limits)
         wp.copy(self._q, after.q)
         wp.copy(self._qd, after.qd)
         self._given.zero_()
@@ -135,9 +143,9 @@ class JointSolve:
     def _solve_joints(self, bodies: BodyView, control, dt: float) -> None:
         model, relaxation = self._model, self._relaxations[1]
         inputs = [self._q, self._qd, model.body_com, bodies.inv_mass, bodies.inv_inertia, model.joint_type]
-        inputs += [model.joint_enabled, model.joint_parent, model.joint_child, *self._frames[:2]]
-        inputs += [model.joint_limit_lower, model.joint_limit_upper, model.joint_qd_start, model.joint_target_q_start]
-        inputs += [model.joint_dof_dim, self._frames[2], control.joint_target_q, control.joint_target_qd, *self._gains]
+        inputs += [model.joint_enabled, model.joint_parent, model.joint_child, *self._frames]
+        inputs += [*self._limits, model.joint_qd_start, model.joint_target_q_start]
+        inputs += [model.joint_dof_dim, self._axes, control.joint_target_q, control.joint_target_qd, *self._gains]
         inputs += [0.0, 0.0, relaxation, relaxation, dt]
         self._launch(newtons.solve_body_joints, model.joint_count, inputs, [self._deltas, self._impulses])
 

@@ -41,7 +41,7 @@ class Example:
         """Build the scene."""
         builder = newton.ModelBuilder()
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-        warpmag.register_attributes(builder)
+        warpmag.register_custom_attributes(builder)
         hard = newton.ModelBuilder.ShapeConfig(density=7870.0, mu=0.5, mu_rolling=5e-4, **HARD)
         builder.add_ground_plane(cfg=hard)
         self.gripper = self.add_arm(builder)

@@ -22,7 +22,7 @@ class Example:
     def __init__(self, viewer, args):
         """Build the scene."""
         builder = newton.ModelBuilder()
-        warpmag.register_attributes(builder)
+        warpmag.register_custom_attributes(builder)
         iron = newton.ModelBuilder.ShapeConfig(density=7870.0, mu=0.0)
         builder.add_ground_plane(cfg=iron)
         for x, y, z in np.ndindex(args.columns, args.columns, args.layers):

@@ -21,7 +21,7 @@ class Example:
     def __init__(self, viewer, args):
         """Build the scene."""
         builder = newton.ModelBuilder()
-        warpmag.register_attributes(builder)
+        warpmag.register_custom_attributes(builder)
         rough = newton.ModelBuilder.ShapeConfig(mu=2.0 * FRICTION, mu_rolling=0.0, mu_torsional=0.0)
         smooth = newton.ModelBuilder.ShapeConfig(density=DENSITY, mu=0.0, mu_rolling=0.0, mu_torsional=0.0)
         builder.add_ground_plane(cfg=rough)  # Newton takes the mean of two shapes: there is friction on the table alone

@@ -28,7 +28,7 @@ class Example:
     def __init__(self, viewer, args):
         """Build the scene."""
         row = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        warpmag.register_attributes(row)
+        warpmag.register_custom_attributes(row)
         self.fields = np.linspace(500.0, 2000.0, args.rows)  # A/m
         self.damping = MU0 * MOMENT * 1000.0 / SPEED  # N·m·s: in 1000 A/m needles are about to slip
         for column in range(args.columns):

@@ -25,7 +25,7 @@ class Example:
     def __init__(self, viewer, args):
         """Build the scene."""
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        warpmag.register_attributes(builder)
+        warpmag.register_custom_attributes(builder)
         twist = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), math.radians(args.twist))
         yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), math.radians(15.0))
         self.add_connector(builder, wp.transform_identity(), face=1.0)

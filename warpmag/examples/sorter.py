@@ -24,7 +24,7 @@ class Example:
     def __init__(self, viewer, args):
         """Build the scene."""
         builder = newton.ModelBuilder()
-        warpmag.register_attributes(builder)
+        warpmag.register_custom_attributes(builder)
         builder.add_ground_plane()
         plate = wp.transform((0.5 * (args.coils - 1) * PITCH, 0.0, CEILING + 0.0005), wp.quat_identity())
         slippery = newton.ModelBuilder.ShapeConfig(mu=0.1)

@@ -37,7 +37,7 @@ class Example:
     def __init__(self, viewer, args):
         """Build the scene."""
         world = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
-        warpmag.register_attributes(world)
+        warpmag.register_custom_attributes(world)
         iron = newton.ModelBuilder.ShapeConfig(density=DENSITY)
         ball = world.add_body(xform=wp.transform((0.0, 0.0, RADIUS), wp.quat_identity()))
         world.add_shape_sphere(ball, radius=RADIUS, cfg=iron)
