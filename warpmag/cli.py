@@ -109,7 +109,7 @@ def _add_run(commands) -> None:
     run.add_argument(
         "--method",
         choices=METHODS,
-        help="preset of force law, dynamics and curve of all magnets: this library's, Kim and Han 2022, Kim et al. 2018",
+        help="preset of force law, dynamics and all curves: this library's, Kim and Han 2022, Kim et al. 2018",
     )
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")

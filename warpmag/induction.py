@@ -112,7 +112,7 @@ def solve_induction(
 ) -> InductionResult:
     """Bring inducible balls to magnetic equilibrium, M = f(H), with one another and an applied field.
 
-    Balls may overlap at will: with the contact model ``dipole``, and sums over all pairs, the solution is unique for any
+    Balls may overlap at will: with the contact model ``dipole`` and sums over all pairs, the solution is unique for any
     arrangement. The iteration is safeguarded, and warns where it ends early.
 
     Args:
