@@ -23,8 +23,9 @@ _NEWTON_GAP = 0.1
 """``ModelBuilder.rigid_gap`` [m] as Newton sets it: the gap of a shape for which nobody chose one."""
 _GAP = 0.1
 """Contact gap of a shape over the thickness of its body: contacts are known a tenth of a radius ahead."""
-_CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 12, 40
-"""First sizes of the buffers: a ball in the densest packing has 12 neighbours, each pair is counted once."""
+_CONTACTS_PER_BALL, _CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 8, 12, 40
+"""First sizes of the buffers: in the densest packing there are 6 contacts for each ball, in a wall of boxes 12 a box; a
+contact takes some 600 bytes of a GPU."""
 _GROWTH = 1.5
 _NUMBERED = 2**20
 """Triangle pairs that Newton can put into an order."""
@@ -201,10 +202,11 @@ class RigidSolver:
         scale_gaps(model, sizes)
         finite = sizes.thickness[np.isfinite(sizes.thickness)]
         self._speculation = float(2.0 * finite.max()) if len(finite) else 0.0
-        shapes = int(np.count_nonzero(model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES))
+        types = model.shape_type.numpy()[(model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0]
+        contacts = np.where(types == newton.GeoType.SPHERE, _CONTACTS_PER_BALL, _CONTACTS_PER_SHAPE).sum()
         self._limits = {
-            "contact": max(16, int(capacity * _CONTACTS_PER_SHAPE * shapes)),
-            "pair": max(16, int(capacity * _PAIRS_PER_SHAPE * shapes)),
+            "contact": max(16, int(capacity * contacts)),
+            "pair": max(16, int(capacity * _PAIRS_PER_SHAPE * len(types))),
             "triangle": None,  # Newton's estimate
         }
         self._allocate()

@@ -73,7 +73,8 @@ class Simulation:
         """Import the scene and get ready to step.
 
         Args:
-            scene: USD file, or a builder with magnets added to it.
+            scene: USD file, or a builder with magnets added to it, which gets the articulations and colours that
+                ``solver`` asks for.
             step: Time step [s]; by default the stage's, else 1 ms. It is split into substeps as motion demands.
             solver: Newton's solver: ``xpbd``, ``steel``, ...
             force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
