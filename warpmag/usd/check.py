@@ -136,7 +136,7 @@ def validate(stage: Usd.Stage) -> list[Finding]:
         if severity and error.GetName() != "RigidBodyOrientationScale":
             message = f"{' '.join(error.GetMessage().split())} [{error.GetIdentifier()}]"
             findings.append(Finding(_place(error, stage), message, severity))
-    return findings
+    return sorted(findings, key=lambda one: (one.where, one.message))  # its threads have found them in any order
 
 
 def _place(error, stage) -> str:
