@@ -120,12 +120,13 @@ def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, rank
         if several:
             cuts = np.minimum(stages * (nearest + slabs * np.arange(splits + 1) // splits), end)
             cuts[0] = begin
-        passes.append((len(blocks) + own[0], own[1] - own[0], nearest))
-        blocks += [(tile, cuts[k], cuts[k + 1], k) for k in range(splits) for tile in range(tiles)]
+        passes.append((len(passes) * tiles * splits + own[0], own[1] - own[0], nearest))
+        split, tile = np.divmod(np.arange(tiles * splits), tiles)
+        blocks.append(np.stack((tile, cuts[split], cuts[split + 1], split), axis=1))
     walk = MirrorTiles()
     walk.origin, walk.stages, walk.slabs = origin, stages, slabs
     walk.edges = wp.array(count * np.arange(tiles + 1) // tiles, dtype=wp.int32, device=device)
-    walk.blocks = wp.array(np.array(blocks), dtype=wp.int32, device=device)
+    walk.blocks = wp.array(np.concatenate(blocks), dtype=wp.int32, device=device)
     return Mirror(quantity, shape, walk, tuple(passes), slabs, splits)
 
 

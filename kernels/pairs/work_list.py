@@ -48,13 +48,16 @@ def row_starts(segments):
 def block_tiles(segments, width: int, splits: int = 1):
     """Tiles of at most ``width`` targets, each for every one of ``splits`` parts of the sources."""
     starts = row_starts(segments)
-    tiles = [
-        (row, min(row + width, starts[k + 1]), t0 + row - starts[k], *source, split, 0, 0)
-        for k, (t0, _, s0, s1) in enumerate(segments)
-        for row in range(starts[k], starts[k + 1], width)
-        for split, source in enumerate(pairwise(s0 + (s1 - s0) * np.arange(splits + 1) // splits))
-    ]
-    return np.array(tiles, np.int64)
+    counts = -(-np.diff(starts) // width)
+    of = np.repeat(np.arange(len(segments)), counts)
+    within = width * (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts))
+    first, _, begin, end = segments[of].T[:, :, None]
+    cuts = begin + (end - begin) * np.arange(splits + 1) // splits
+    tiles = np.zeros((len(of), splits, TILE_COLUMNS), np.int64)
+    columns = (starts[of] + within, np.minimum(starts[of] + within + width, starts[of + 1]), first[:, 0] + within)
+    for column, values in enumerate((*(one[:, None] for one in columns), cuts[:, :-1], cuts[:, 1:], np.arange(splits))):
+        tiles[..., column] = values
+    return tiles.reshape(-1, TILE_COLUMNS)
 
 
 def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
