@@ -24,7 +24,7 @@ from scipy.integrate import quad
 
 import warpmag
 from bench.reference import boxes, cylinders, plate, susceptible
-from warpmag import demagnetization, lattice, oracle
+from warpmag import demagnetization, even_field, lattice, oracle
 from warpmag.system import MomentSystem
 
 SIDES = np.array([1.0, 0.7, 0.4])
@@ -47,6 +47,15 @@ def test_tensors_of_cuboids_are_their_exact_fields_averaged():
         for axis in np.eye(3):
             field = magpylib.magnet.Cuboid(dimension=SIDES, magnetization=axis).getH(points + offset * SIDES)
             np.testing.assert_allclose(-found @ axis, weight @ field, atol=1e-8)
+
+
+def test_the_potential_of_a_tiny_facet_beside_a_large_one():
+    """In the middle of a square of edge a it is 4 a ln(1 + √2) / 4π."""
+    square = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    tiny = np.array([1.0, 0.3, 0.2])
+    found = even_field.potentials(tiny[None], np.stack([square, 1e-9 * square + tiny]))
+    # coordinates of order one place the corners of the tiny facet to 1e-7 of its edge
+    assert found[0, 1] == pytest.approx(1e-9 * math.log(1.0 + math.sqrt(2.0)) / math.pi, rel=1e-6)
 
 
 def test_tensors_of_cuboids_add_up_to_that_of_the_block_they_fill():

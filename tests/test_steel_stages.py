@@ -101,6 +101,15 @@ def test_what_a_stage_says_of_its_weight_counts(tmp_path, edit):
     assert mass_of(tmp_path, "1010-steel", edit) == pytest.approx(0.25, rel=1e-5)
 
 
+def _mass_without_its_schema(stage):
+    stage.GetPrimAtPath("/Ball").CreateAttribute("physics:mass", FLOAT).Set(0.25)
+
+
+def test_a_mass_without_its_schema_goes_on_having_no_effect(tmp_path):
+    density = MATERIALS["1010-steel"].density
+    assert mass_of(tmp_path, "1010-steel", _mass_without_its_schema) == pytest.approx(density * VOLUME, rel=1e-5)
+
+
 def test_a_body_of_several_parts_weighs_what_each_is_made_of(tmp_path):
     def with_lid(stage):
         lid = UsdGeom.Cube.Define(stage, "/Ball/Lid")

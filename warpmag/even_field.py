@@ -143,7 +143,7 @@ def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
     From afar, where that differs by less than 0.3 %, that of its area in its middle.
     """
-    origin = surface.mean(axis=(0, 1))  # about which squares of distances keep their digits
+    origin = surface.mean(axis=(0, 1))  # about which heights keep their digits
     points, surface = points - origin, surface - origin
     middles, (_, areas) = facets.middles(surface), facets.measures(surface)
     square = _squares(points, middles)
@@ -157,8 +157,8 @@ def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
 def _squares(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Squares of the distances between points, shape [points, others]."""
-    squares = (points * points).sum(axis=1)[:, None] + (others * others).sum(axis=1) - 2.0 * points @ others.T
-    return np.maximum(squares, 0.0)
+    apart = points[:, None] - others  # the squares of places would lose the digits of small facets far out
+    return np.einsum("nmk,nmk->nm", apart, apart)
 
 
 def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -169,7 +169,7 @@ def _fmm_rtol(method, rtol, shape: SumsShape) -> float | None:
     better = (
         rtol is not None
         and not shape.reference  # the plain loop alone has the smoothed law
-        and is_fast(pairs, count, shape.quantity, rtol, wp.get_device(shape.device))
+        and is_fast(pairs, count, shape.quantity, rtol, wp.get_device(shape.device), launched=True)
     )
     wanted = method == "fmm" or (method == "auto" and better)
     return (rtol or USUAL_RTOL) if wanted and shape.count and shape.target_count != 0 else None

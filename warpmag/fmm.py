@@ -57,12 +57,15 @@ _COSTS = {
     ("cpu", Quantity.FIELD): (2.8e7, 55.0),
     ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
     ("cuda", Quantity.FIELD): (9.8e8, 96.0),
-    ("cuda", Quantity.WRENCH): (1.24e8, 128.0),
+    ("cuda", Quantity.WRENCH): (1.36e8, 120.0),
 }
 """What the method takes, in pairs that are summed in the same time: at all, and for each harmonic of each moment.
 
 Both ways are as fast with 8,000 moments at 1e-3 and 13,500 at 1e-5, forces with 4,600 and 8,000, on two cores; on an
-H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 33,000."""
+H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 31,000."""
+_LAUNCH_COSTS = {("cuda", Quantity.FIELD): 1.5e9, ("cuda", Quantity.WRENCH): 3.4e8}
+"""What it takes more where its many kernels are launched from Python, in pairs, too: on an H200 both ways are as fast
+with 54,000 moments at 1e-3 and 62,000 at 1e-5 then, forces with 27,000 and 39,000."""
 
 
 def check_fast(rtol: float):
@@ -71,11 +74,17 @@ def check_fast(rtol: float):
         raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'direct'")
 
 
-def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device) -> bool:
-    """Whether the method reaches a relative error, and sooner than the sums over so many pairs of ``count`` moments."""
+def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device, launched: bool = False) -> bool:
+    """Whether the method reaches a relative error, and sooner than the sums over so many pairs of ``count`` moments.
+
+    On a GPU that depends on whether kernels are ``launched`` from Python or by a graph.
+    """
     if rtol < LEAST_RTOL:
         return False
-    alone, each = _COSTS["cuda" if device.is_cuda else "cpu", quantity]
+    case = "cuda" if device.is_cuda else "cpu", quantity
+    alone, each = _COSTS[case]
+    if launched:
+        alone += _LAUNCH_COSTS.get(case, 0.0)
     return pairs >= alone + (choose_degree(rtol)[0] + 1) ** 2 * each * count
 
 

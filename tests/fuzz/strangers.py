@@ -206,7 +206,8 @@ def scale(layer, prims, chance) -> str:
     )
     if order is None:
         order = Sdf.AttributeSpec(prim, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
-    order.default = Vt.TokenArray([*(order.default or ()), "xformOp:scale:fuzz"])
+    given = order.default if isinstance(order.default, Vt.TokenArray) else ()  # it may have another type
+    order.default = Vt.TokenArray([*given, "xformOp:scale:fuzz"])
     return f"{prim.path} scaled by {factor}"
 
 

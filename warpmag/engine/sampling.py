@@ -5,8 +5,10 @@ from typing import Any
 
 import newton
 import numpy as np
+import warp as wp
 
 from warpmag import lattice, polyhedra
+from warpmag.arrays import RADIUS_RANGE
 from warpmag.demagnetization import Coupling, coupling
 from warpmag.engine.attributes import unique_rows
 from warpmag.errors import InputError
@@ -84,7 +86,7 @@ class ShapeSampler:
         key = (spacing, permanent, closed, *self.kinds[shapes].tolist())
         if key not in self._known:
             try:
-                self._known[key] = self._sample(shapes, spacing, permanent, closed)
+                self._known[key] = _of_sizes(self._sample(shapes, spacing, permanent, closed))
             except InputError as error:
                 raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
         return self._known[key]
@@ -168,3 +170,12 @@ class ShapeSampler:
             source: Any = self._sources[shape]
             return lattice.mesh(np.asarray(source.vertices, float) * scale, np.asarray(source.indices).reshape(-1, 3))
         raise InputError("a cylinder with a barrel side cannot be magnetized")
+
+
+def _of_sizes(sampled: BodyLattice) -> BodyLattice:
+    """Return moments, which a simulation has in single precision; ``InputError`` if they are out of its range."""
+    (least, most), radii = RADIUS_RANGE[wp.float32], sampled.radii
+    if not ((radii >= least) & (radii <= most)).all():
+        found = f"{radii.min():.3g} to {radii.max():.3g} m"
+        raise InputError(f"its moments have radii of {found}, not of {least:g} to {most:g}")
+    return sampled

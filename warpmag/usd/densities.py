@@ -32,7 +32,16 @@ def give_densities(stage: Usd.Stage, magnets: Iterable[str]) -> None:
                 if is_collider(collider) and not _weighs(collider) and not _bound_density(collider):
                     # what an instance holds cannot be edited, and what has it can
                     owner = body if collider.IsInstanceProxy() else collider
-                    UsdPhysics.MassAPI.Apply(owner).CreateDensityAttr(material(name).density)
+                    _apply_mass(owner).CreateDensityAttr(material(name).density)
+
+
+def _apply_mass(prim) -> UsdPhysics.MassAPI:
+    """Apply the schema to a prim; values that it has without the schema go on having no effect."""
+    if not prim.HasAPI(UsdPhysics.MassAPI):
+        for name in UsdPhysics.MassAPI.GetSchemaAttributeNames(False):
+            if stray := prim.GetAttribute(name):
+                stray.Block()
+    return UsdPhysics.MassAPI.Apply(prim)
 
 
 def has_volume(stage: Usd.Stage, body: str) -> bool:
