@@ -58,14 +58,15 @@ _COSTS = {
     ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
     ("cuda", Quantity.FIELD): (9.8e8, 96.0),
     ("cuda", Quantity.WRENCH): (1.36e8, 120.0),
+    ("cuda, launched", Quantity.FIELD): (2.5e9, 96.0),
+    ("cuda, launched", Quantity.WRENCH): (6.8e8, 90.0),
 }
-"""What the method takes, in pairs that are summed in the same time: at all, and for each harmonic of each moment.
+"""What the method takes, in pairs that are summed in the same time: at all, and for each harmonic of each moment; on a
+GPU in a graph, and where its many kernels are launched from Python.
 
 Both ways are as fast with 8,000 moments at 1e-3 and 13,500 at 1e-5, forces with 4,600 and 8,000, on two cores; on an
-H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 31,000."""
-_LAUNCH_COSTS = {("cuda", Quantity.FIELD): 1.5e9, ("cuda", Quantity.WRENCH): 3.4e8}
-"""What it takes more where its many kernels are launched from Python, in pairs, too: on an H200 both ways are as fast
-with 54,000 moments at 1e-3 and 62,000 at 1e-5 then, forces with 27,000 and 39,000."""
+H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 31,000; launched, with 54,000 and 62,000, forces with
+30,000 and 38,000."""
 
 
 def check_fast(rtol: float):
@@ -81,10 +82,8 @@ def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device, l
     """
     if rtol < LEAST_RTOL:
         return False
-    case = "cuda" if device.is_cuda else "cpu", quantity
-    alone, each = _COSTS[case]
-    if launched:
-        alone += _LAUNCH_COSTS.get(case, 0.0)
+    on_gpu = "cuda, launched" if launched else "cuda"
+    alone, each = _COSTS[on_gpu if device.is_cuda else "cpu", quantity]
     return pairs >= alone + (choose_degree(rtol)[0] + 1) ** 2 * each * count
 
 
