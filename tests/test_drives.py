@@ -10,6 +10,7 @@ import warp as wp
 from scipy.integrate import solve_ivp
 
 import warpmag
+from warpmag.engine.joints import strained_joints
 from warpmag.engine.simulation import Simulation
 from warpmag.engine.xpbd import PileXPBD
 from warpmag.errors import InputError
@@ -125,6 +126,9 @@ def test_ends_of_a_joint_that_are_apart_close_slowly(device):
     bar, _ = hinge(builder, 0.0, arm=EXTENT[0])
     builder.body_q[bar] = wp.transform((0.3, 0.0, 0.2), wp.quat_identity())
     simulation = Simulation(builder, device=device, step=STEP)
+    gap = math.hypot(0.3 - EXTENT[0], 0.2)
+    (told,) = simulation.warnings()
+    assert told.startswith(f"{builder.joint_label[-1]}: its ends are {gap:.3g} m apart at the start")
     apart, spins = [], []
     for _ in range(400):
         simulation.step()
@@ -134,6 +138,32 @@ def test_ends_of_a_joint_that_are_apart_close_slowly(device):
     assert np.abs(np.diff(apart)).max() < 1.05 * 2.0 * STEP  # m, _CLOSING
     assert max(apart[-50:]) < 1e-3
     assert np.isfinite(spins).all()
+
+
+def test_ends_of_joints_that_newton_places_are_not_apart():
+    """All kinds at odd places, of bodies that hang from others, against Newton's forward kinematics."""
+    builder, parent, random = scene(), -1, np.random.default_rng(3)
+    kinds = {"revolute": 1, "prismatic": 1, "ball": 4, "fixed": 0, "free": 7}
+    for kind in kinds:
+        frames = {
+            f"{end}_xform": wp.transform(random.normal(size=3), wp.normalize(wp.quat(*random.normal(size=4))))
+            for end in ("parent", "child")
+        }
+        body = builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)))
+        axis = {"axis": wp.normalize(wp.vec3(*random.normal(size=3)))} if kinds[kind] == 1 else {}
+        joint = getattr(builder, f"add_joint_{kind}")(parent=parent, child=body, **frames, **axis, label=kind)
+        start = builder.joint_q_start[joint]
+        values = random.normal(size=kinds[kind])
+        values[-4:] /= np.linalg.norm(values[-4:]) if len(values) >= 4 else 1.0  # a quaternion
+        builder.joint_q[start : start + kinds[kind]] = values.tolist()
+        parent = body
+    builder.add_articulation(list(range(len(kinds))))
+    model = builder.finalize(device="cpu")
+    assert list(strained_joints(model)) == ["revolute", "prismatic", "ball", "fixed"]
+    state = model.state()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    model.body_q.assign(state.body_q)
+    assert not strained_joints(model)
 
 
 @pytest.mark.parametrize("solver", DRIVEN, indirect=True)

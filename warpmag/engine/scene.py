@@ -33,7 +33,6 @@ from warpmag.usd import (
     prepare_joints,
     readable,
     refusals,
-    strained_joints,
     swarms_of,
 )
 
@@ -51,7 +50,6 @@ class ImportedScene:
         bodies: Body of each rigid-body prim.
         magnet_shapes: Shapes of each magnet prim.
         keys: What follows time samples.
-        strained: Joints whose ends should be at one place and are not.
         warnings: What the user should know about the stage, a line each.
     """
 
@@ -63,7 +61,6 @@ class ImportedScene:
     bodies: dict[str, int]
     magnet_shapes: dict[str, list[int]]
     keys: SceneKeys
-    strained: tuple[str, ...]
     warnings: tuple[str, ...]
 
     @cached_property
@@ -107,7 +104,7 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
         raise InputError(str(report.errors[0]))
     clock, contents = report.clock, report.contents
     assert clock is not None, "a clock that is wrong is a reason to refuse"
-    strained, grounded = tuple(strained_joints(stage)), prepare_joints(stage, articulations=articulations)
+    grounded = prepare_joints(stage, articulations=articulations)
     give_densities(stage, contents.magnets)
     builder = StageBuilder()
     declare_attributes(builder)
@@ -138,7 +135,6 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
         bodies=bodies,
         magnet_shapes=covered,
         keys=keys,
-        strained=strained,
         warnings=tuple(map(str, report.warnings)),
     )
 

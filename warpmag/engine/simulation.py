@@ -16,7 +16,8 @@ from warpmag.arrays import resolve_device
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
-from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings
+from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings, strain_warnings
+from warpmag.engine.joints import strained_joints
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
@@ -146,6 +147,7 @@ class Simulation:
         with wp.ScopedDevice(self.device), self._refusals(scene):
             model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
         check_model(model, solver, LONGEST_SUBSTEP)
+        self._strained = strained_joints(model) if solver in MAXIMAL else {}
         return model
 
     def _drive(self, solver: str, own_field: bool) -> Drive | None:
@@ -252,7 +254,8 @@ class Simulation:
 
     def warnings(self) -> list[str]:
         """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
-        known = *(self._scene.warnings if self._scene else ()), *solver_warnings(self._options["solver"])
+        known = self._scene.warnings if self._scene else tuple(strain_warnings(self._strained))
+        known += tuple(solver_warnings(self._options["solver"]))
         lines, figures, rtol = [], self.statistics, self._magnetics.system.rtol
         if figures.field_error > rtol:
             lines = [
@@ -294,8 +297,8 @@ class Simulation:
         """Return why the state may have left all finite numbers, as far as the start and the run so far tell."""
         if self._statistics.overlapping:
             return "bodies overlapped at the start, and pushing them apart may turn them faster and faster"
-        if self._scene and self._scene.strained:
-            return f"the ends of the joint {self._scene.strained[0]} were apart at the start, and it pulls at them"
+        if self._strained:
+            return f"the ends of the joint {next(iter(self._strained))} were apart at the start, and it pulls at them"
         if self._statistics.capped:
             return "bodies were moving too fast for the shortest substep before"
         given = getattr(self.model, NAMESPACE)

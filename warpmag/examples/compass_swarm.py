@@ -32,11 +32,11 @@ class Example:
         self.fields = np.linspace(500.0, 2000.0, args.rows)  # A/m
         self.damping = MU0 * MOMENT * 1000.0 / SPEED  # N·m·s: in 1000 A/m needles are about to slip
         for column in range(args.columns):
-            needle = row.add_link()
+            place = wp.transform((column * PITCH, 0.0, 0.0), wp.quat_identity())
+            needle = row.add_link(xform=place)
             row.add_shape_box(needle, hx=EXTENT[0], hy=EXTENT[1], hz=EXTENT[2])
             # one moment is all that others feel of a needle so far away; by default it would be 252
             warpmag.add_permanent(row, needle, magnetization=(MAGNETIZATION, 0.0, 0.0), moment_spacing=2.0 * EXTENT[0])
-            place = wp.transform((column * PITCH, 0.0, 0.0), wp.quat_identity())
             hinge = row.add_joint_revolute(
                 -1, needle, parent_xform=place, axis=(0.0, 0.0, 1.0), target_kd=self.damping,
                 actuator_mode=newton.JointTargetMode.VELOCITY,

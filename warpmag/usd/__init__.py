@@ -13,7 +13,7 @@ from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_s
 from warpmag.usd.densities import give_densities, has_volume
 from warpmag.usd.guard import readable, refusals
 from warpmag.usd.instancers import complete_instances
-from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints, strained_joints
+from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints
 from warpmag.usd.looks import author_surface, metalness
 from warpmag.usd.meshes import author_mesh
 from warpmag.usd.motion import Recording, read_recording
@@ -79,7 +79,6 @@ __all__ = [
     "readable",
     "refusals",
     "stage_clock",
-    "strained_joints",
     "survey",
     "swarms_of",
     "usable_path",

@@ -72,7 +72,7 @@ def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Fin
             yield Finding(path, f"hangs on {carrier}, which keys move, {message}")
         elif not any(end.moves for end in _ends(stage, joint)):
             yield Finding(path, "joins things that do not move, and is left out", "warning")
-    for path, gap in strained_joints(stage).items():
+    for path, gap in _strained_joints(stage).items():
         yield Finding(path, f"its ends are {gap:.3g} m apart at the start, and a run begins by pulling", "warning")
 
 
@@ -82,7 +82,7 @@ def _hung_on(stage, joint) -> str:
     return str(other.body.GetPath()) if one.moves and other.body else ""
 
 
-def strained_joints(stage: Usd.Stage) -> dict[str, float]:
+def _strained_joints(stage: Usd.Stage) -> dict[str, float]:
     """Return how far the ends of joints are apart at the start [m], in ways that the joint does not leave free."""
     places, found = UsdGeom.XformCache(Usd.TimeCode.Default()), {}
     for joint in enabled_joints(stage):
