@@ -63,14 +63,21 @@ def outcome(name, device, /, **arguments):
 
 
 def scales(x, m, radii):
-    """Sizes that sums over pairs are rounded at: of m/d³ and μ0 m m'/d⁴; None where balls all but coincide."""
+    """Sizes that sums over pairs are rounded at: of m/d³ and μ0 m m'/d⁴; None where balls all but coincide.
+
+    Where balls overlap in part, both change over the radius of the smaller one, which rounding of d is then part of.
+    """
     d, size, reach = np.linalg.norm(x[:, None] - x, axis=2), np.linalg.norm(m, axis=1), np.add.outer(radii, radii)
     if ((d > 0.0) & (d < NEAREST * reach)).any():
         return None
+    least = np.minimum.outer(radii, radii)
+    partly = (least > 0.0) & (np.abs(d - reach + least) <= 1.001 * least)
+    steep = np.maximum(1.0, np.where(partly, d / np.where(least > 0.0, least, 1.0), 1.0))
     d = np.maximum(d, reach)
     np.fill_diagonal(d, 0.0)
     near = np.where(d > 0.0, 1.0 / np.where(d > 0.0, d, 1.0), 0.0)
-    return (near**3 @ size).max(initial=0.0), 1e-6 * (size * (near**4 @ size)).max(initial=0.0), size.max(initial=0.0)
+    fields, forces = (steep * near**3) @ size, 1e-6 * size * ((steep**2 * near**4) @ size)
+    return fields.max(initial=0.0), forces.max(initial=0.0), size.max(initial=0.0)
 
 
 @given(arrangements(), SCALES, st.integers(0, 99), GUISE, st.sampled_from(["float32", "float64"]), st.booleans())
