@@ -66,8 +66,8 @@ class Statistics:
     overlapping: int = 0
     coarseness: float = 0.0
     wall_seconds: float = 0.0
-    _evaluations: array = field(default_factory=lambda: array("i"))
-    _seconds: array = field(default_factory=lambda: array("f"))
+    _evaluations: array = field(default_factory=lambda: array("i"), repr=False)
+    _seconds: array = field(default_factory=lambda: array("f"), repr=False)
 
     def add_step(self, report: StepReport) -> None:
         """Take in one step."""
