@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -60,10 +60,10 @@ class InductionResult:
     evaluations: int
     converged: bool
     field_error: float
-    _system: MomentSystem
-    _kind: Kind
-    _given: dict
-    _count: int
+    _system: MomentSystem = field(repr=False)
+    _kind: Kind = field(repr=False)
+    _given: dict = field(repr=False)
+    _count: int = field(repr=False)
 
     def wrench(self, force: str = "kelvin") -> tuple[Any, Any]:
         """Force and torque on each ball from the other balls, the sources and the external field.
