@@ -10,8 +10,8 @@ import warp as wp
 from scipy.integrate import solve_ivp
 
 import warpmag
-from warpmag.engine.joints import strained_joints
 from warpmag.engine.simulation import Simulation
+from warpmag.engine.strained import strained_joints
 from warpmag.engine.xpbd import PileXPBD
 from warpmag.errors import InputError
 

@@ -1,6 +1,7 @@
 """The fast multipole method: its cells, and fields and forces against sums over all pairs in float64."""
 
 import gc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -269,3 +270,11 @@ def test_small_worlds_are_summed_over_all_pairs(device):
 def test_bodies_of_several_moments_are_refused():
     with pytest.raises(warpmag.InputError, match="several moments"):
         MomentSystem(radii=[0.1, 0.1], bodies=[0, 0], method="fmm", device="cpu")
+
+
+@pytest.mark.parametrize(("quantity", "count"), [(Quantity.FIELD, 45_000), (Quantity.WRENCH, 25_000)])
+def test_the_method_is_chosen_later_where_python_launches_its_kernels(quantity, count):
+    gpu = SimpleNamespace(is_cuda=True)
+    assert fmm.is_fast(count**2, count, quantity, 1e-3, gpu)
+    assert not fmm.is_fast(count**2, count, quantity, 1e-3, gpu, launched=True)
+    assert fmm.is_fast(4 * count**2, 2 * count, quantity, 1e-3, gpu, launched=True)

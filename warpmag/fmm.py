@@ -57,15 +57,15 @@ _COSTS = {
     ("cpu", Quantity.FIELD): (2.8e7, 55.0),
     ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
     ("cuda", Quantity.FIELD): (9.8e8, 96.0),
-    ("cuda", Quantity.WRENCH): (1.36e8, 120.0),
-    ("cuda, launched", Quantity.FIELD): (2.5e9, 96.0),
+    ("cuda", Quantity.WRENCH): (1.24e8, 128.0),
+    ("cuda, launched", Quantity.FIELD): (2.32e9, 137.0),
     ("cuda, launched", Quantity.WRENCH): (6.8e8, 90.0),
 }
 """What the method takes, in pairs that are summed in the same time: at all, and for each harmonic of each moment; on a
 GPU in a graph, and where its many kernels are launched from Python.
 
 Both ways are as fast with 8,000 moments at 1e-3 and 13,500 at 1e-5, forces with 4,600 and 8,000, on two cores; on an
-H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 31,000; launched, with 54,000 and 62,000, forces with
+H200, in a graph, with 35,500 and 44,000, forces with 17,500 and 33,000; launched, with 54,000 and 66,000, forces with
 30,000 and 38,000."""
 
 

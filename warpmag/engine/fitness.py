@@ -71,21 +71,6 @@ def solver_warnings(solver: str) -> list[str]:
     return [_WEAKNESSES[solver]] if solver in _WEAKNESSES else []
 
 
-def strain_warnings(strained: dict[str, float]) -> list[str]:
-    """Return what a user should know of joints whose ends are so far apart at the start [m], by label; a line at most.
-
-    Stages have findings of their own, of their prims.
-    """
-    if not strained:
-        return []
-    label, more = next(iter(strained)), len(strained) - 1
-    whose = f"{label} and {more} other joints: their ends are up to" if more else f"{label}: its ends are"
-    return [
-        f"{whose} {max(strained.values()):.3g} m apart at the start, and a run begins by pulling; place the bodies, "
-        "with newton.eval_fk say"
-    ]
-
-
 def check_control(control: newton.Control, model: newton.Model) -> None:
     """Refuse what is no control of ``model``."""
     if not isinstance(control, newton.Control):

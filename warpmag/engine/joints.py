@@ -23,8 +23,6 @@ _PINS = (newton.JointType.REVOLUTE, newton.JointType.BALL, newton.JointType.FIXE
 """Joints whose ends are at one place, unless they slide."""
 _ROWS_OF_FREE = (newton.JointType.FREE, newton.JointType.DISTANCE, newton.JointType.BALL, newton.JointType.FIXED)
 """Joints whose degrees of freedom have no drive here."""
-_APART, _ROUNDING = 1e-4, 1e-5
-"""How far apart ends of joints may start [m], and in parts of their coordinates: poses are single precision."""
 _AT_ONCE = 6
 """Iterations between two looks at whether there are more: a graph that holds all of them takes seconds to make."""
 
@@ -52,7 +50,7 @@ class JointSolve:
         self._axes = wp.clone(model.joint_axis)
         self._limits = wp.empty_like(model.joint_limit_lower), wp.empty_like(model.joint_limit_upper)
         types, counts = model.joint_type.numpy(), _axis_counts(model)
-        self._pins = wp.array(_are_pins(model), dtype=wp.bool, device=device)
+        self._pins = wp.array(are_pins(model), dtype=wp.bool, device=device)
         self._one_axis = wp.array(np.isin(types, _ONE_AXIS), dtype=wp.bool, device=device)
         slides = (counts[:, 0] > 0) & ~np.isin(types, _ROWS_OF_FREE)
         self._slides = wp.array(slides, dtype=wp.bool, device=device)
@@ -156,50 +154,13 @@ class JointSolve:
 
 def _axis_counts(model: newton.Model) -> np.ndarray:
     """Return how many axes each joint slides along, and turns about, shape [joints, 2]."""
-    return _host(model.joint_dof_dim)
+    counts: Any = model.joint_dof_dim  # Newton's declaration hides that it is an array
+    return counts.numpy()
 
 
-def _host(array: Any) -> np.ndarray:  # Newton's declarations hide what is an array
-    return array.numpy()
-
-
-def _are_pins(model: newton.Model) -> np.ndarray:
+def are_pins(model: newton.Model) -> np.ndarray:
+    """Whether the ends of each joint are at one place, shape [joints]."""
     return np.isin(model.joint_type.numpy(), _PINS) & (_axis_counts(model)[:, 0] == 0)
-
-
-def strained_joints(model: newton.Model) -> dict[str, float]:
-    """Return how far the ends of joints are apart where a model starts [m], in ways that the joint does not leave free.
-
-    Newton places no bodies by their joints; ``newton.eval_fk`` does that, or ``xform`` where bodies are added.
-
-    Returns:
-        The distances of those that are apart, by the label of the joint.
-    """
-    if not model.joint_count:
-        return {}
-    poses = np.append(_host(model.body_q), [[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]], axis=0)  # body -1 is the world
-    parents, frames = poses[_host(model.joint_parent)], _host(model.joint_X_p)
-    one = _placed(parents, frames[:, :3])
-    gaps = one - _placed(poses[_host(model.joint_child)], _host(model.joint_X_c)[:, :3])
-    slides = _host(model.joint_type) == newton.JointType.PRISMATIC
-    axes = _host(model.joint_axis)[_host(model.joint_qd_start)[:-1][slides]]
-    axes = _turned(parents[slides], _turned(frames[slides], axes))
-    gaps[slides] -= axes * (axes * gaps[slides]).sum(axis=1, keepdims=True)
-    lengths = np.linalg.norm(gaps, axis=1)
-    found = (_are_pins(model) | slides) & _host(model.joint_enabled)
-    found &= lengths > _APART + _ROUNDING * np.linalg.norm(one, axis=1)
-    return {model.joint_label[joint]: float(lengths[joint]) for joint in np.flatnonzero(found)}
-
-
-def _placed(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points of frames in the world, shape [n, 3], of poses of shape [n, 7]."""
-    return poses[:, :3] + _turned(poses, points)
-
-
-def _turned(poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return vectors of frames in the world, shape [n, 3], of poses of shape [n, 7]."""
-    axes = poses[:, 3:6]
-    return vectors + 2.0 * np.cross(axes, np.cross(axes, vectors) + poses[:, 6:] * vectors)
 
 
 def _rows(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:

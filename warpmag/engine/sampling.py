@@ -86,7 +86,7 @@ class ShapeSampler:
         key = (spacing, permanent, closed, *self.kinds[shapes].tolist())
         if key not in self._known:
             try:
-                self._known[key] = _of_sizes(self._sample(shapes, spacing, permanent, closed))
+                self._known[key] = _within_range(self._sample(shapes, spacing, permanent, closed))
             except InputError as error:
                 raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
         return self._known[key]
@@ -172,7 +172,7 @@ class ShapeSampler:
         raise InputError("a cylinder with a barrel side cannot be magnetized")
 
 
-def _of_sizes(sampled: BodyLattice) -> BodyLattice:
+def _within_range(sampled: BodyLattice) -> BodyLattice:
     """Return moments, which a simulation has in single precision; ``InputError`` if they are out of its range."""
     (least, most), radii = RADIUS_RANGE[wp.float32], sampled.radii
     if not ((radii >= least) & (radii <= most)).all():

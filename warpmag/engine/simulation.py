@@ -16,11 +16,11 @@ from warpmag.arrays import resolve_device
 from warpmag.engine.attributes import NAMESPACE
 from warpmag.engine.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
 from warpmag.engine.drive import Drive
-from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings, strain_warnings
-from warpmag.engine.joints import strained_joints
+from warpmag.engine.fitness import articulate, check_control, check_model, solver_warnings
 from warpmag.engine.magnetics import Magnetics
 from warpmag.engine.statistics import Statistics, find_held
 from warpmag.engine.stepper import Stepper
+from warpmag.engine.strained import strain_warnings, strained_joints
 from warpmag.errors import InputError, SimulationError
 from warpmag.garbage import collection_paused
 from warpmag.magnets import MagneticSettings, check_flag, check_positive, shown

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.errors import InputError
+from warpmag.strain import are_apart, told
 from warpmag.usd.transforms import TransformCheck
 from warpmag.usd.values import Finding, value_of
 
@@ -21,8 +22,6 @@ _PLACES = ("physics:localPos0", "physics:localPos1")
 _ROOTS = ("PhysicsArticulationRootAPI", "NewtonArticulationRootAPI")
 """What makes a prim the root of an articulation; the second brings the first along."""
 _SELF_COLLISION = "newton:selfCollisionEnabled"
-_APART, _ROUNDING = 1e-4, 1e-5
-"""How far apart ends may start [m], and in parts of their coordinates: poses are often single precision."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Fin
         elif not any(end.moves for end in _ends(stage, joint)):
             yield Finding(path, "joins things that do not move, and is left out", "warning")
     for path, gap in _strained_joints(stage).items():
-        yield Finding(path, f"its ends are {gap:.3g} m apart at the start, and a run begins by pulling", "warning")
+        yield Finding(path, f"its ends are {told(gap)}", "warning")
 
 
 def _hung_on(stage, joint) -> str:
@@ -99,7 +98,7 @@ def _strained_joints(stage: Usd.Stage) -> dict[str, float]:
         except (InputError, Tf.ErrorException):  # among the findings of the attributes and ends
             continue
         gap = (one - other - axis * ((one - other) * axis)).GetLength()
-        if any(end.moves for end in ends) and gap > _APART + _ROUNDING * one.GetLength():
+        if any(end.moves for end in ends) and are_apart(gap, one.GetLength()):
             found[str(joint.GetPath())] = gap
     return found
 
