@@ -66,7 +66,7 @@ def demagnetizing_matrix(body, coupling=None):
     t[np.arange(n), np.arange(n)] = -np.eye(3) / (3.0 * body.volumes[:, None, None])
     i = np.repeat(np.arange(n), np.diff(coupling.start))
     t[i, coupling.other] += full(coupling.tensor)
-    fields = even_field.common_fields(coupling.places)
+    fields = demagnetization.common_fields(coupling.places)
     t += np.einsum("ipk,kl,jql->ijpq", fields, coupling.common, fields)
     t *= -np.sqrt(body.volumes[:, None] * body.volumes)[..., None, None]
     return t.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)

@@ -6,7 +6,6 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from warpmag import demagnetization, lattice, oracle
-from warpmag.kernels.cells.couplings import HARDENING
 from warpmag.kernels.induction import body_response
 from warpmag.kernels.shared import team
 from warpmag.system import MomentSystem
@@ -70,7 +69,10 @@ class Scene:
             i = first + np.repeat(np.arange(len(one.start) - 1), np.diff(one.start))
             extra[i, :, first + one.other] += turn.as_matrix() @ tensors @ turn.as_matrix().T
         extra *= volumes[:, None]
-        hardness = np.where(self.settings["bodies"] < len(self.bodies), HARDENING * self.overlaps(x), 0.0)
+        hardness = np.zeros(n)
+        for first, one in self.couplings:
+            own = slice(first, first + len(one.radii))
+            hardness[own] = one.hardening * self.overlaps(x)[own]
         extra[np.arange(n), :, np.arange(n)] -= hardness[:, None, None] * np.eye(3)
         found = oracle.equilibrium(
             x, self.radii, field, saturation=MS, extra_coupling=extra.reshape(3 * n, 3 * n), tolerance=1e-12

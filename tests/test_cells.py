@@ -21,6 +21,7 @@ from cell_bodies import (
     posed,
 )
 from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
 
 import warpmag
 from bench.reference import boxes, cylinders, plate, susceptible
@@ -244,6 +245,68 @@ def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
         found.append(system.moments.numpy())
     for other in found[1:]:
         assert np.linalg.norm(other - found[0]) < 1e-6 * np.linalg.norm(found[0])  # rtol, and what slowness makes of it
+
+
+def intersecting(body, coupling, places, turns, device):
+    """A system of equal bodies, and their operator H = −D M symmetrized by volumes, by one field for each moment."""
+    n, count = len(body.volumes), len(places)
+    system = MomentSystem(
+        radii=np.tile(body.radii, count), bodies=np.repeat(np.arange(count), n), saturation=FAINT,
+        susceptibility=math.inf, external_field=(0.0, 0.0, 1e3), dtype="float64", device=device,
+        couplings=[(n * k, coupling) for k in range(count)],
+    )  # fmt: skip
+    positions = [turn.apply(body.positions) + place for turn, place in zip(turns, places, strict=True)]
+    system.positions.assign(np.concatenate(positions))
+    system.rotations.assign(np.array([turn.as_quat() for turn in turns]))
+    system.begin()
+    size, fields = 3 * n * count, []
+    for moment in np.vstack([np.zeros(size), np.eye(size)]):
+        system.moments.assign(moment.reshape(-1, 3))
+        system._packed.pack(system.positions, system.moments)
+        system.evaluate()
+        fields.append(system.h.numpy().flatten())
+    root = np.repeat(np.sqrt(np.tile(body.volumes, count)), 3)
+    found = np.eye(size) / 3.0 - root * (np.array(fields[1:]) - fields[0]).T * root[:, None]
+    np.testing.assert_allclose(found, found.T, atol=1e-6)  # places in float64 are rounded to float32 where packed
+    system.start_from(wp.zeros(n * count, dtype=wp.vec3d, device=device))
+    return system, found
+
+
+@pytest.mark.parametrize(
+    ("solid", "spacing"),
+    [
+        (lattice.box([0.01] * 3), 0.007),
+        (lattice.box([0.02, 0.02, 0.0025]), 0.01),
+        (lattice.box([0.003, 0.003, 0.03]), 0.006),
+        (lattice.cylinder(0.01, 0.01), 0.007),
+        (lattice.cone(0.01, 0.02), 0.005),
+        (lattice.ellipsoid([0.01, 0.006, 0.015]), 0.006),
+    ],
+    ids=["cube", "plate", "rod", "cylinder", "cone", "ellipsoid"],
+)
+def test_operator_of_bodies_that_intersect_is_positive(solid, spacing, device):
+    """In one place, a little apart, and anyhow; so that induction converges, whatever was put into what."""
+    body = lattice.fill(solid, spacing, lattice.LEAST_ACROSS)
+    coupling = coupled(body, [solid])
+    rng = np.random.default_rng(0)
+    for count, spread, turn in ((2, 0.0, 0.0), (2, 1e-4, 0.01), (3, 0.3, 0.3), (4, 1.0, 1.0)):
+        places = spread * solid.upper.min() * rng.uniform(-1.0, 1.0, (count, 3))
+        turns = Rotation.from_rotvec(turn * rng.normal(size=(count, 3)))
+        system, operator = intersecting(body, coupling, places, list(turns), device)
+        assert np.linalg.eigvalsh(operator)[0] > -0.03 * coupling.hardening  # which is known to 3 %
+        system.solve()
+        assert system.converged.numpy().tolist() == [1]
+        assert system.evaluations.numpy()[0] < 50
+
+
+@pytest.mark.parametrize("solid", [lattice.box([0.02, 0.02, 0.0025]), lattice.cone(0.01, 0.02)], ids=["plate", "cone"])
+def test_hardening_is_what_balls_are_harder_by(solid):
+    body = lattice.fill(solid, (solid.volume / 150.0) ** (1 / 3))
+    coupling = coupled(body, [solid])
+    nothing = replace(coupling, tensor=np.zeros_like(coupling.tensor), common=np.zeros_like(coupling.common))
+    harder = demagnetizing_matrix(body, nothing) - demagnetizing_matrix(body, coupling)
+    truth = np.linalg.eigvalsh(0.5 * (harder + harder.T))[-1]
+    assert 0.97 * truth < coupling.hardening <= truth * (1.0 + 1e-9)  # from below, as 20 steps leave it
 
 
 def coenergy(system):

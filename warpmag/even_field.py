@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from warpmag import facets
-from warpmag.demagnetization import Coupling, full_tensors
+from warpmag.demagnetization import Coupling, common_fields, full_tensors
 from warpmag.lattice import Lattice
 from warpmag.oracle import radial_factors
 from warpmag.solid import Solid
@@ -92,18 +92,6 @@ def common_potentials(places: np.ndarray) -> np.ndarray:
     """Potentials x, y, z, (x² − z²)/2, (y² − z²)/2, xy, xz, yz at places in extents, shape [n, 8]."""
     x, y, z = places.T
     return np.stack([x, y, z, 0.5 * (x * x - z * z), 0.5 * (y * y - z * z), x * y, x * z, y * z], axis=1)
-
-
-def common_fields(places: np.ndarray) -> np.ndarray:
-    """Their gradients, fields that all cells of a body have in common, shape [n, 3, 8]."""
-    x, y, z = places.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    rows = (
-        (one, zero, zero, x, zero, y, z, zero),
-        (zero, one, zero, zero, y, x, zero, z),
-        (zero, zero, one, -z, -z, zero, x, y),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def extrapolated_moments(coupling: Coupling, coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 //
 // Three passes: moments are turned into the frame of their body, there they make the fields that all its cells have
 // in common, and sums are turned into the world; and one before, where cells of two bodies overlap. On a CPU a pass
-// works on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY, GROUP and HARDENING; ``Couplings``
+// works on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY and GROUP; ``Couplings``
 // is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
@@ -84,7 +84,8 @@ template <class Couplings> CUDA_CALLABLE inline Number hardness_of(const Couplin
     auto foreign = [=](Index a, Index b) { return mask_of(collect(labels, a) != collect(labels, b)); };
     const auto& world = c.world.data[chunk]; // its first inducible moment, and the end of them
     const Number volume = shared_volumes(c, i, held, world[0], world[1], foreign), radius = some(radii + i, held, 1);
-    return Real(HARDENING / 4.18879020478639) * volume / (radius * radius * radius);
+    const Real hardening = c.hardening.data[c.body.data[chunk]];
+    return hardening * Real(1 / 4.18879020478639) * volume / (radius * radius * radius);
 }
 
 // Makes a pass over the cells from ``row`` on.

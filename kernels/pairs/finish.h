@@ -92,7 +92,7 @@ CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arr
     const Columns targets(arrays.targets), sources(arrays.sources);
     const Vector x = targets.vector(0, at.i);
     const Number radius = targets.number(3, at.i), label = targets.number(7, at.i);
-    auto add = [&](Index j, Mask listed) {
+    auto add = [&](auto j, Mask listed) {
         const Vector r = less(x, sources.vector(0, j));
         const Number other = sources.number(3, j), contact = radius + other;
         Mask wanted = listed & (dot(r, r) < contact * contact);

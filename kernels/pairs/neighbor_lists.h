@@ -21,21 +21,28 @@ CUDA_CALLABLE inline void walk_lists(const int* lists, const int* counts, int i,
 #else
 template <class Visit>
 inline void walk_lists(const int* lists, const int* counts, Index i, int held, Index begin, Index end, Visit visit) {
-    Index first = 0, count = 0, full = 0;
-    int longest = 0;
+    Index own = i[0], first = 0, count = 0, full = 0;
+    int longest = 0, lowest = __INT_MAX__, highest = 0; // of the lists; of the sources of balls whose list is full
     for (int l = 0; l < held; ++l) {
         if (end[l] <= begin[l]) continue;
-        first[l] = begin[l];
+        own[l] = i[l], first[l] = begin[l];
         full[l] = counts[i[l]] > CAPACITY;
-        count[l] = full[l] ? end[l] - begin[l] : counts[i[l]];
-        longest = count[l] > longest ? count[l] : longest;
+        if (full[l]) {
+            lowest = begin[l] < lowest ? begin[l] : lowest;
+            highest = end[l] > highest ? end[l] : highest;
+        } else {
+            count[l] = counts[i[l]];
+            longest = count[l] > longest ? count[l] : longest;
+        }
     }
     for (int s = 0; s < longest; ++s) {
-        Index j = first;
-        for (int l = 0; l < held; ++l)
-            if (s < count[l]) j[l] = full[l] ? begin[l] + s : lists[(size_t)CAPACITY * i[l] + s];
-        visit(j, mask_of((count > s) & (j >= begin) & (j < end)));
+        Index j;
+        for (int l = 0; l < WIDTH; ++l) j[l] = lists[(size_t)CAPACITY * own[l] + s];
+        const auto listed = count > s;
+        j = listed ? j : first;
+        visit(j, mask_of(listed & (j >= begin) & (j < end)));
     }
+    for (int j = lowest; j < highest; ++j) visit(j, mask_of((full != 0) & (j >= begin) & (j < end)));
 }
 #endif
 }

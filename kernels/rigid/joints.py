@@ -4,6 +4,9 @@ Newton evaluates where a joint acts at the poses of each iteration, which is imp
 amplitude in half a swing of 0.28 s. Here velocities are solved at the poses that a substep starts from, and joints act
 where they are there, as in SHAKE (Ryckaert, Ciccotti and Berendsen 1977), which is symplectic: amplitudes stay.
 
+Bodies that overlap are moved apart no faster than in ``contact_law.h``: Newton's kernel undoes all of an overlap in a
+substep, and bodies keep the speed.
+
 Newton also forgets in each iteration what a drive did in those before, so that n of them make it some n times too
 stiff. A row of a drive here knows the impulse that it gave so far, and ends at a spring and a damper of the gains that
 were asked for. No speed is taken for rest, however small.
@@ -13,10 +16,12 @@ import math
 
 import warp as wp
 
-from warpmag.kernels.rigid.newton_views import BodyView
+from warpmag.kernels.rigid.contact_solve import PUSH_OUT
+from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bodies, contact_count, contact_depth
 
 wp.set_module_options({"enable_backward": False})
 
+_PUSH_OUT = wp.constant(PUSH_OUT)
 _CLOSING = wp.constant(2.0)
 """Most speed at which ends that are apart as a substep begins are pulled together, and slides into their limits [m/s]:
 bodies keep it, and the shorter the substep, the faster would be what closes the whole of it."""
@@ -261,6 +266,36 @@ def _align(
     child_frame_out[joint] = joints.child_frame[joint] * aligned
 
 
+@wp.func
+def _lent(bodies: BodyView, kinematic_flag: int, body: int, point: wp.vec3) -> wp.vec3:
+    """Velocity of a point of a body's frame if the body is kinematic, else zero [m/s]."""
+    if body < 0 or (bodies.flags[body] & kinematic_flag) == 0:
+        return wp.vec3(0.0)
+    arm = wp.transform_vector(bodies.q[body], point - bodies.com[body])
+    return wp.spatial_top(bodies.qd[body]) + wp.cross(wp.spatial_bottom(bodies.qd[body]), arm)
+
+
+@wp.kernel
+def _limit_push_out(
+    # inputs:
+    contacts: ContactView,
+    bodies: BodyView,
+    kinematic_flag: int,
+    dt: float,
+    # outputs:
+    margin_out: wp.array[float],
+):
+    i = wp.tid()
+    if i >= contact_count(contacts):
+        return
+    body0, body1 = contact_bodies(contacts, i)
+    # kinematic bodies stand where they do at the end already: what they come closer by is no overlap of the start
+    lent = _lent(bodies, kinematic_flag, body1, contacts.point1[i])
+    lent -= _lent(bodies, kinematic_flag, body0, contacts.point0[i])
+    overlap = contact_depth(contacts, bodies.q, i) + dt * wp.dot(contacts.normal[i], lent)
+    margin_out[i] = contacts.margin0[i] - wp.max(overlap - dt * _PUSH_OUT, 0.0)
+
+
 @wp.kernel
 def _apply(
     # inputs:
@@ -329,6 +364,20 @@ def launch_align(joints: JointView, bodies: BodyView, dt: float, frames, axes, l
     """
     outputs = [*frames, axes, *limits]
     wp.launch(_align, dim=len(joints.parent), inputs=[joints, bodies, dt], outputs=outputs, device=axes.device)
+
+
+def launch_limit_push_out(contacts: ContactView, bodies: BodyView, kinematic_flag: int, dt: float, margin):
+    """Write margins with which what overlaps is moved apart at no more than ``PUSH_OUT`` in a substep.
+
+    Args:
+        contacts: The contacts.
+        bodies: The bodies at the start of the substep, kinematic ones where they are at its end.
+        kinematic_flag: Newton's flag of kinematic bodies.
+        dt: Length of the substep [s].
+        margin: Out, what stands for ``contacts.margin0`` [m], shape [contact_max].
+    """
+    inputs = [contacts, bodies, kinematic_flag, dt]
+    wp.launch(_limit_push_out, dim=len(margin), inputs=inputs, outputs=[margin], device=margin.device)
 
 
 def launch_turn_levers(joints: JointView, bodies: BodyView, q_now, impulses, deltas):

@@ -113,6 +113,7 @@ inline Number gather(const Real* row, const int* j) {
     for (int l = 0; l < WIDTH; ++l) n[l] = row[j[l]];
     return n;
 }
+inline Number collect(const Real* row, int j) { return row[j]; }
 template <class Places> inline Number collect(const Real* row, Places j) {
 #if defined(__AVX512F__)
     if constexpr (WIDTH == 16) return __builtin_ia32_gathersiv16sf(Number(0), row, j, (unsigned short)-1, 4);

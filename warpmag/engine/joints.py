@@ -15,7 +15,7 @@ from newton._src.solvers.xpbd import kernels as newtons
 
 from warpmag.kernels.rigid import joints as kernels
 from warpmag.kernels.rigid.free_motion import launch_accelerate, launch_move
-from warpmag.kernels.rigid.newton_views import BodyView
+from warpmag.kernels.rigid.newton_views import BodyView, view_contacts
 
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 _ONE_AXIS = (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC)
@@ -30,11 +30,20 @@ _AT_ONCE = 6
 class JointSolve:
     """The substeps of one model with joints."""
 
-    def __init__(self, model: newton.Model, *, iterations: int, contact_relaxation: float, joint_relaxation: float):
+    def __init__(
+        self,
+        model: newton.Model,
+        contact_max: int,
+        *,
+        iterations: int,
+        contact_relaxation: float,
+        joint_relaxation: float,
+    ):
         """Allocate.
 
         Args:
             model: The model.
+            contact_max: Most contacts.
             iterations: Iterations over joints and contacts.
             contact_relaxation: Part of each correction of a contact that is done.
             joint_relaxation: The same of a joint.
@@ -45,6 +54,7 @@ class JointSolve:
         self._deltas = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         self._impulses = wp.zeros(model.joint_count, dtype=wp.spatial_vector, device=device)
         self._forces = wp.zeros_like(self._deltas)
+        self._margin = wp.zeros(contact_max, dtype=float, device=device)
         self._q, self._qd = wp.empty_like(model.body_q), wp.empty_like(model.body_qd)
         self._frames = wp.empty_like(model.joint_X_p), wp.empty_like(model.joint_X_c)
         self._axes = wp.clone(model.joint_axis)
@@ -96,6 +106,7 @@ class JointSolve:
         launch_accelerate(before, model.gravity, _KINEMATIC, dt, after.q, after.qd)
         masses = contact_masses()
         kernels.launch_align(joints, before, dt, self._frames, self._axes, self._limits)
+        kernels.launch_limit_push_out(view_contacts(model, contacts), after, _KINEMATIC, dt, self._margin)
         wp.copy(self._q, after.q)
         wp.copy(self._qd, after.qd)
         self._given.zero_()
@@ -132,8 +143,9 @@ class JointSolve:
         model = self._model
         inputs = [self._q, self._qd, model.body_flags, model.body_com, *masses, model.shape_body]
         names = ("count", "point0", "point1", "surface_velocity", "offset0", "offset1", "normal")
-        names += ("margin0", "margin1", "shape0", "shape1")
         inputs += [getattr(contacts, f"rigid_contact_{name}") for name in names]
+        inputs.append(self._margin)
+        inputs += [getattr(contacts, f"rigid_contact_{name}") for name in ("margin1", "shape0", "shape1")]
         inputs += [getattr(model, f"shape_material_{name}") for name in ("mu", "mu_torsional", "mu_rolling")]
         inputs += [self._relaxations[0], dt]
         outputs = [self._deltas, None, None]

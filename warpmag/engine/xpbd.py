@@ -68,6 +68,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
         elif plain and not self._has_joint_mimics:
             self._joints = JointSolve(
                 model,
+                contact_max,
                 iterations=self.iterations,
                 contact_relaxation=self.rigid_contact_relaxation,
                 joint_relaxation=self.joint_linear_relaxation,
