@@ -304,3 +304,18 @@ def test_every_solid_has_its_volume_as_moment(device, shape):
     magnetics = warpmag.Magnetics(builder.finalize(device=device))
     assert len(magnetics.system.positions) > 8
     np.testing.assert_allclose(magnetics.shape_volumes, [volume], rtol=1e-5)  # float32 sizes
+
+
+def test_meshes_of_the_same_triangles_are_sampled_once(device):
+    """As readers make a mesh of its own for each prim; one that differs in a corner is another."""
+    corners = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.01]])
+    faces = np.array([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3])
+    builder = new_builder()
+    for k, height in enumerate((1.0, 1.0, 1.5)):
+        body = builder.add_body(xform=wp.transform((0.05 * k, 0.0, 0.0)))
+        builder.add_shape_mesh(body, mesh=newton.Mesh(corners * [1.0, 1.0, height], faces))
+        warpmag.add_inducible(builder, body, moment_spacing=0.003)
+    magnetics = warpmag.Magnetics(builder.finalize(device=device))
+    one, other, longer = (magnet.lattice for magnet in magnetics.magnets)
+    assert one is other
+    assert longer.volumes.sum() == pytest.approx(1.5 * one.volumes.sum(), rel=1e-2)  # of what cells resolve

@@ -66,8 +66,7 @@ class ShapeSampler:
         self._bodies = model.shape_body.numpy()
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
         self._frames = model.shape_transform.numpy().astype(float)
-        sources = [0.0 if source is None else float(id(source)) for source in self._sources]
-        numbers = np.column_stack([self._types, sources, self._scales, self._frames])
+        numbers = np.column_stack([self._types, _number_sources(self._sources), self._scales, self._frames])
         self.kinds = unique_rows(numbers)[1]
         self._known: dict[tuple, BodyLattice] = {}
 
@@ -170,6 +169,19 @@ class ShapeSampler:
             source: Any = self._sources[shape]
             return lattice.mesh(np.asarray(source.vertices, float) * scale, np.asarray(source.indices).reshape(-1, 3))
         raise InputError("a cylinder with a barrel side cannot be magnetized")
+
+
+def _number_sources(sources: list) -> list[int]:
+    """Number what shapes are made of: 0 for nothing, and one number for all meshes of the same points and triangles."""
+    of_contents: dict[Any, int] = {}
+    of_object: dict[int, int] = {id(None): 0}
+    for source in sources:
+        if id(source) not in of_object:
+            contents = id(source)
+            if hasattr(source, "vertices"):
+                contents = tuple(np.asarray(array).tobytes() for array in (source.vertices, source.indices))
+            of_object[id(source)] = of_contents.setdefault(contents, 1 + len(of_contents))
+    return [of_object[id(source)] for source in sources]
 
 
 def _within_range(sampled: BodyLattice) -> BodyLattice:
