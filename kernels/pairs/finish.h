@@ -19,14 +19,14 @@ struct TargetRows {
     Index row, i, begin, end;
 };
 
-// Rows of a table that has a column for each moment.
+// Rows of a table that has a column for each moment; that of one moment is read once for all lanes.
 struct Columns {
     const Real* data;
     size_t pitch;
 
     CUDA_CALLABLE Columns(const wp::array_t<Real>& table) : data(table.data), pitch(table.strides[0] / sizeof(Real)) {}
-    CUDA_CALLABLE Number number(int row, Index i) const { return collect(data + row * pitch, i); }
-    CUDA_CALLABLE Vector vector(int row, Index i) const {
+    template <class Place> CUDA_CALLABLE Number number(int row, Place i) const { return collect(data + row * pitch, i); }
+    template <class Place> CUDA_CALLABLE Vector vector(int row, Place i) const {
         return {number(row, i), number(row + 1, i), number(row + 2, i)};
     }
 };
