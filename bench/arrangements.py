@@ -72,6 +72,13 @@ def _heap(count):
     return x[np.argsort(height, kind="stable")[:count]]
 
 
+def _heap_with_ten_in_one():
+    """A heap, the last balls of which are where another one is."""
+    x = _heap(120)
+    x[-10:] = x[20]
+    return x
+
+
 def _loose(count, extent, seed=0):
     """Balls thrown into a cube, with no regard for one another."""
     return extent * np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
@@ -121,6 +128,7 @@ ARRANGEMENTS: dict[str, Callable[[], Arrangement]] = {
     "pile under a strong dipole": lambda: _dipole(_grid(5, 5, 5), 900.0),
     "pile of a weak material": lambda: _dipole(_grid(5, 5, 5), 60.0, susceptibility=3.0),
     "bar": lambda: _uniform(_grid(14, 3, 3), 0.1),
+    "heap, ten balls in one": lambda: _uniform(_heap_with_ten_in_one(), 0.1),
     "materials side by side": _mixed,
     "loose balls": lambda: _uniform(_loose(120, 0.12), 0.1),
     "overlapping balls": lambda: _uniform(_loose(120, 0.05), 0.1),

@@ -8,20 +8,13 @@ namespace warpmag {
 constexpr int STEADY = 3; // solves in a row that make two changes to extrapolate from
 enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // what a world does next
 
-// Lets a world iterate; ``stiffness`` is that of some of its moments.
-template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w, double stiffness, bool first = true) {
+// Lets a world iterate.
+template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w) {
     auto& world = state.worlds.data[w];
-    // of positive numbers the larger has the larger bits
-#if defined(__CUDA_ARCH__)
-    atomicMax((long long*)&world.stiffness, __double_as_longlong(stiffness));
-#else
-    __atomic_fetch_max((long long*)&world.stiffness, __builtin_bit_cast(long long, stiffness), __ATOMIC_RELAXED);
-#endif
-    if (!first) return; // one thread of a CPU says what all of them know
     world.active = state.condition.data[0] = 1;
     world.evaluations = world.linked = world.plain_steps = 0;
     world.next = state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
-    world.best = -1.0;
+    world.best = -1.0, world.damping = 1.0;
     if (state.warm.data[w] == 0) world.kept = 0, world.slowness = 0.0;
 }
 
@@ -39,7 +32,6 @@ CUDA_CALLABLE inline bool check_convergence(State& state, int w, double residual
     auto& world = state.worlds.data[w];
     const bool converged = error <= state.rtol;
     world.evaluations += 1;
-    world.stiffness = 0.0;
     world.in_field = 0;
     state.residual.data[w] = residual;
     state.error.data[w] = error;

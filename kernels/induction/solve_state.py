@@ -23,6 +23,7 @@ The state of n moments, m of them inducible, in w worlds and c chunks:
     iterate_s, iterate_r: The last iterate, and its residual, shape [n].
     history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
     best_s, best_r: Those of the smallest merit, shape [n].
+    step: Step length of each moment, shape [n].
     mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
     mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
     past_field, past_g: Field of the inducible moments at the last two solutions [A/m], and the reduced whole field; the
@@ -50,7 +51,7 @@ from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5
 """Changes between iterates that are kept and mixed, see ``anderson.h``."""
-COLUMNS = 6 + DEPTH + DEPTH * (DEPTH + 1) // 2
+COLUMNS = 7 + DEPTH + DEPTH * (DEPTH + 1) // 2
 """Sums over the moments of a chunk or world; as in ``theta_step.h``."""
 BLOCK_CHUNK = 128
 """Moments in a chunk on a GPU, each of them for a thread of a block; on a CPU a chunk has ``passes.CHUNK``."""
@@ -71,8 +72,7 @@ class World:
         used: How many of them the next step mixes.
         improved: Whether the last iterate is the best so far.
         plain_steps: Steps to be taken without mixing.
-        stiffness: Largest k (2/3 + o_i) of its moments, until its first evaluation.
-        omega: Step length.
+        damping: Part of the moments' step lengths that is taken.
         ahead: Part of the last change from solve to solve that the next start adds.
         best: Smallest merit of this solve, negative before the first.
         alpha: Anderson coefficients.
@@ -90,8 +90,7 @@ class World:
     used: int
     improved: int
     plain_steps: int
-    stiffness: wp.float64
-    omega: wp.float64
+    damping: wp.float64
     ahead: wp.float64
     best: wp.float64
     alpha: wp.types.vector(DEPTH, wp.float64)
@@ -139,6 +138,7 @@ def state_type(dtype):
         mixed_moment: wp.array[vec3]
         past_field: wp.array2d[vec3]
         past_g: wp.array2d[vec3]
+        step: wp.array[dtype]
         past: wp.array2d[dtype]
         now: wp.array2d[dtype]
         swept: wp.array2d[dtype]
@@ -194,6 +194,7 @@ def allocate(worlds, inducible, dtype, device):
         **zeros("history_s history_r", (DEPTH, n), vec3),
         **zeros("past_field past_g", (2, n), vec3),
         **zeros("past now swept", (count * size if on_cpu else len(rows), LINE), dtype),
+        **zeros("step", n, dtype),
         **zeros("sums", (count * vectors, COLUMNS), wp.float64),
         **zeros("worlds", world_count, World),
         **zeros("residual error", world_count, wp.float64),

@@ -131,7 +131,7 @@ def pairs_type(dtype):
 def _begin_kernel(dtype):
     state_struct = state_type(dtype)
 
-    @wp.func_native("warpmag::begin_world(state, w, 0.0);")
+    @wp.func_native("warpmag::begin_world(state, w);")
     def begin_world(state: state_struct, w: int): ...
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype))

@@ -150,11 +150,18 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
 }
 #endif
 
+// Step lengths ω of moments.
+template <class State, class World>
+CUDA_CALLABLE inline Number step_of(const State& state, const Place& at, const World& world) {
+    return (Real)world.damping * some(entries(state.step, at), at.held, 1);
+}
+
 // Volume that balls share with other inducible ones, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
 //
 // Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
-// above 1/3 − (1 + max o_i), which is −2/3 without overlap: hence a step length that converges for any arrangement.
-// Cells of a body that responds as a whole do not overlap.
+// above 1/3 − (1 + max o_i), which is −2/3 without overlap, and in the metric of 2/3 + o_i above −1, as the matrix of
+// shared volumes is at most the diagonal one of its row sums: hence step lengths that converge for any arrangement, and
+// are short only where balls overlap. Cells of a body that responds as a whole do not overlap.
 template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Place& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
     const Mask whole = responding(state, at), each = mask_of(Index(0) == Index(0));
@@ -190,38 +197,35 @@ CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& 
     return group_sums(total);
 }
 
-// Starts a solve: first moments from the applied field and from what the last solves left. Returns the stiffness.
-template <class State> CUDA_CALLABLE inline Number start(State& state, const Place& at) {
+// Starts a solve: step lengths, and first moments from the applied field and from what the last solves left.
+template <class State> CUDA_CALLABLE inline void start(State& state, const Place& at) {
     auto& world = state.worlds.data[at.world];
     const int warm = state.warm.data[at.world];
     const Real ahead = (Real)world.ahead;
     const Four ball = balls_at(state, at);
     const Material material = material_of(state, at);
-    const Number stiffness = material.slope * (total_overlap(state, at) + Real(2.0 / 3.0));
+    const Number omega = step_length<Real>(material.slope * (total_overlap(state, at) + Real(2.0 / 3.0)));
     Vector near = {0, 0, 0};
     if (warm == STEADY) near = extrapolated_field(state, at, ball, ahead);
-    if (share() != 0) return stiffness;
+    if (share() != 0) return;
+    put_some(entries(state.step, at), at.held, omega);
     const Vector h0 = get(state.h0, at);
     if (any(mask_of(length(h0) > Real(0)))) raise_flag(world.in_field);
     Vector s = get(state.s, at);
     // the θ flow with κ = k from no magnetization: exact for a lone ball
-    if (warm == 0) {
-        const Number step = whole_step<Real>(step_length<Real>(stiffness));
-        s = scaled(step * material.slope / material.saturation, h0);
-    }
+    if (warm == 0) s = scaled(whole_step<Real>(omega) * material.slope / material.saturation, h0);
     if (warm == STEADY) s = sum(s, scaled(ahead, less(get(state.past_g, at), get(state.past_g, at, 1))));
     set(state.s, at, s);
     const Vector m = moments_of(material, ball.w, s);
     store_moments(state, at, m);
     put_four(state.now.data, 0, at.row, ball);
     put_four(state.swept.data, 0, at.row, ball);
-    if (warm != STEADY) return stiffness;
+    if (warm != STEADY) return;
     const Vector field = get(state.past_field, at), change = less(field, get(state.past_field, at, 1));
     const Vector far = less(sum(field, scaled(ahead, change)), scaled(INVERSE_4PI, near));
     set(state.mixed_g, at, scaled(material.slope / material.saturation, sum(h0, far)));
     set(state.mixed_moment, at, {0, 0, 0});
     put_four(state.now.data, 1, at.row, {m.x, m.y, m.z, 0});
-    return stiffness;
 }
 
 // Sweeps once over neighbours, whose changes stand in a cache line with their places; the last sweep stores moments.
@@ -241,8 +245,7 @@ template <class State> CUDA_CALLABLE inline void sweep(State& state, const Place
     const Material material = material_of(state, at);
     const Vector s = get(state.s, at);
     const Vector g = sum(get(state.mixed_g, at), scaled(INVERSE_4PI * material.slope / material.saturation, h));
-    const Real wanted = Real(SWEEP_STEP) * (Real)world.omega;
-    const Number step = wanted < 1 ? wanted : Real(1), none = step * 0;
+    const Number step = smaller(Real(SWEEP_STEP) * step_of(state, at, world), Number(Real(1))), none = step * 0;
     const Vector next = sum(s, scaled(responding(state, at) ? none : step, less(g, s)));
     set(state.s, at, next);
     const Vector m = moments_of(material, ball.w, next);
@@ -283,7 +286,9 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Wide merit = weight * wide(length(r));
     put(DEVIATION, deviation * deviation);
     put(GOAL, goal * goal);
+    const Wide left = merit * wide(2 - whole_step<Real>(step_of(state, at, world)));
     put(MERIT, merit * merit);
+    put(LEFT, left * left);
     put(CHANGE, square * wide_dot(step, step));
     const Vector past = get(state.past_g, at), earlier = less(past, get(state.past_g, at, 1));
     put(FOLLOWED, square * wide_dot(less(g, past), earlier));
@@ -336,13 +341,13 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
             r = less(r, scaled(alpha, get(state.history_r, at, old)));
         }
     }
-    const Number omega = (Real)world.omega, longer = whole_step<Real>((Real)world.omega);
+    const Number omega = step_of(state, at, world), longer = whole_step<Real>(omega);
     const Vector g = sum(mixed, r), next = sum(mixed, scaled(responding(state, at) ? longer : omega, r));
     const Material material = material_of(state, at);
     set(state.s, at, next);
     // what ends takes a whole step, where moments and field are the material's; s is the next solve's start
     const bool ended = !world.active;
-    const Vector shown = ended ? sum(mixed, scaled(whole_step<Real>((Real)world.omega), r)) : next;
+    const Vector shown = ended ? sum(mixed, scaled(longer, r)) : next;
     const Number radius = some(entries(state.packed, at, 3), at.held, 0);
     const Vector m = moments_of(material, radius, shown);
     store_moments(state, at, m);
@@ -392,10 +397,8 @@ template <class State> inline void make_pass(State& state, int pass, int row) {
     auto& world = state.worlds.data[at.world];
     if (pass == START) {
         if (state.searching.data[0]) list_neighbors(state, at);
-        const Number stiffness = start(state, at);
-        Real most = 0;
-        for (int l = 0; l < at.held; ++l) most = stiffness[l] > most ? stiffness[l] : most;
-        begin_world(state, at.world, most, row == CHUNK * state.chunk_begin.data[at.world]);
+        start(state, at);
+        if (row == CHUNK * state.chunk_begin.data[at.world]) begin_world(state, at.world);
     } else if (pass == FIRST_SWEEP || pass == LAST_SWEEP) {
         sweep(state, at, pass == LAST_SWEEP);
     } else if (pass == MEASURE) {

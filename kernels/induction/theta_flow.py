@@ -9,8 +9,9 @@ residual r = g − s. With the last few changes Δs_j, Δr_j from one evaluation
 
 weighted by φ = Ms c(a)/a, a = max(‖s‖, ‖g‖): what a residual is worth in magnetization, so that a saturated moment's
 huge s does not drown the rest. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, convex for the
-ball-averaged kernel: with L = 1 + k |λmin| it descends from anywhere for ω ≤ 1/L, and close to the solution converges
-for ω < 2/L; 1/3 − (1 + max o) ≤ λmin gives the bound (see ``total_overlap`` in ``theta_flow.h``).
+ball-averaged kernel: with L_i = 1 + k (2/3 + o_i) it descends from anywhere for ω_i ≤ 1/L_i, and close to the solution
+converges for ω_i < 2/L_i, o_i being the volume that a ball shares with others (``total_overlap`` in ``theta_flow.h``).
+Steps are short where balls overlap, and nowhere else.
 
 A step changes most the field at near neighbours, and their part is known without another evaluation of the whole field:
 with the coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
@@ -26,7 +27,7 @@ removes of r has a known worth in s: at most γ times itself, γ = max ‖φ Δs
 corrects, and as much error again is allowed for. Hence the estimate is an amplification of the residual (Eq. 12) of the
 last iterate,
 
-    error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [(2 − ω₁) ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖).
+    error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),   λ = ‖φ (2 − ω₁) r‖/‖φ r‖.
 
 With slow convergence many steps like the last one are to come: σ is their geometric series ρ/(1 − ρ), ρ being ‖φ r‖
 over the smallest before, and at least 1; half of a σ outlives an evaluation. An error below a hundredth of the last
@@ -58,7 +59,7 @@ from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
-from warpmag.kernels.shared.reductions import block_max, group_threads
+from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)
@@ -86,11 +87,11 @@ def _passes_kernel(dtype, responding: bool):
 def _begin_kernel(dtype, group: int, responding: bool):
     state_struct = state_type(dtype)
 
-    @wp.func_native("return warpmag::start(state, warpmag::place(state, row));")
-    def start(state: state_struct, row: int) -> dtype: ...
+    @wp.func_native("warpmag::start(state, warpmag::place(state, row));")
+    def start(state: state_struct, row: int): ...
 
-    @wp.func_native("warpmag::begin_world(state, w, stiffness);")
-    def begin_world(state: state_struct, w: int, stiffness: wp.float64): ...
+    @wp.func_native("warpmag::begin_world(state, w);")
+    def begin_world(state: state_struct, w: int): ...
 
     @wp.kernel(
         module="unique",
@@ -102,13 +103,11 @@ def _begin_kernel(dtype, group: int, responding: bool):
         block, lane = wp.tid()
         chunk = state.chunk[block // wp.static(_BEGINNERS)]
         at_once = wp.block_dim() // wp.static(group)
-        stiffest = dtype(0.0)
         begin = chunk[0] + at_once * (block % wp.static(_BEGINNERS)) + lane // wp.static(group)
         for row in range(begin, chunk[1], at_once * wp.static(_BEGINNERS)):
-            stiffest = wp.max(stiffest, start(state, row))
-        stiffest = block_max(stiffest)
-        if lane == 0:
-            begin_world(state, chunk[2], wp.float64(stiffest))
+            start(state, row)
+        if block == wp.static(_BEGINNERS) * state.chunk_begin[chunk[2]] and lane == 0:
+            begin_world(state, chunk[2])
 
     return begin_flow
 

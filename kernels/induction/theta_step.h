@@ -13,12 +13,12 @@ constexpr double LEAST = 0.01;         // part of the last change that an error 
 constexpr double REMEMBERED = 0.5;     // part of an earlier evaluation's slowness that is believed
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual that steps do not lessen
 
-// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φΔs‖² of the last change, ⟨φΔg, φΔg'⟩,
-// ‖φΔg'‖², and those of anderson.h.
-enum Column { DEVIATION, GOAL, MERIT, CHANGE, FOLLOWED, EARLIER, PRODUCTS };
+// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last change,
+// ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and those of anderson.h.
+enum Column { DEVIATION, GOAL, MERIT, LEFT, CHANGE, FOLLOWED, EARLIER, PRODUCTS };
 constexpr int COLUMNS = PRODUCTS + DEPTH + DEPTH * (DEPTH + 1) / 2; // as in solve_state.py
 
-// Step length ω = κ/k that converges at the largest stiffness k (2/3 + o_i) of a world, of scalars S.
+// Step length ω = κ/k of a moment of stiffness k (2/3 + o_i), with which all converge, of scalars S.
 template <class S, class N> CUDA_CALLABLE inline N step_length(N stiffness) {
     const N safe = S(2.0 * FLOW_STEP) / (1 + stiffness), longest = N(S(1));
     return safe < longest ? safe : longest;
@@ -90,7 +90,7 @@ CUDA_CALLABLE inline double amplification(const World& world, const double* sums
         gain = one > gain ? one : gain;
     }
     const double all = merit * merit, part = known > 0.0 ? known < all ? known / all : 1.0 : 0.0;
-    const double size = (2.0 - whole_step<double>(world.omega)) * wp::sqrt(1.0 - part) + gain * wp::sqrt(part);
+    const double size = merit > 0.0 ? wp::sqrt(sums[LEFT] * (1.0 - part)) / merit + gain * wp::sqrt(part) : 1.0;
     const double slow = world.slowness > 1.0 ? world.slowness * size : size;
     const double least = merit > 0.0 ? LEAST * wp::sqrt(sums[CHANGE]) / merit : 0.0;
     const double error = slow > least ? slow : least;
@@ -104,7 +104,6 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     const double merit = wp::sqrt(sums[MERIT]), residual = relative_residual(sums[DEVIATION], sums[GOAL]);
     const bool finite = wp::isfinite(merit), hopeless = world.best < 0.0 && !finite;
     const bool fieldless = world.evaluations == 0 && !world.in_field;
-    if (world.evaluations == 0) world.omega = step_length<double>(world.stiffness);
     learn(world, history, sums, merit);
     const bool mixed = mix(world, history, sums, merit, finite);
     const double factor = residual > ROUNDING ? amplification(world, sums, merit, mixed) : 1.0;
@@ -116,7 +115,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     int next = done || world.plain_steps > 0 ? STEP : STEP_AND_SWEEP;
     if (!mixed) next = STEP_FROM_BEST;
     // how strongly bodies that respond as wholes couple is not bounded beforehand
-    if (!mixed && RESPONDING) world.omega *= 0.5;
+    if (!mixed && RESPONDING) world.damping *= 0.5;
     if (done && !finite) next = NOTHING;
     if (fieldless && !done) next = DEMAGNETIZE;
     world.next = next;

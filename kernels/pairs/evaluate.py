@@ -29,6 +29,7 @@ from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
 from warpmag.kernels.pairs.sums_cpu import pair_loop_kernel
 from warpmag.kernels.pairs.work_list import (
+    PAIRS_PER_THREAD,
     arrays_type,
     block_tiles,
     cpu_tiles,
@@ -41,7 +42,7 @@ from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
 from warpmag.kernels.shared.reductions import group_threads
-from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
+from warpmag.kernels.shared.team import team, threads_for
 
 LOOP, FUSED, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "mirrored", "reference", "given"
 
@@ -167,7 +168,8 @@ class PairEvaluation:
             wait()
         if self.form != FUSED:
             finish = _finish_kernel(self.partial.dtype, self._finished, group_threads(self.partial.device))
-            self._launch_pass(finish, threads_for(self.count, MOMENTS_PER_THREAD))
+            # as many threads as summed: they are awake, and a row whose list is full goes through all its sources
+            self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD))
 
     def _launch_pass(self, kernel, threads):
         """Launch a pass over the target rows, recorded, which spares packing the struct each time."""

@@ -15,7 +15,7 @@ from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
-_PAIRS_PER_THREAD = 400_000
+PAIRS_PER_THREAD = 400_000
 """Pairs that make another thread worth waking, which takes 50 to 100 µs: in these a thread sums half of them."""
 _LEAST_SHARE = 50_000
 """Pairs of a share, of several blocks if they are few."""
@@ -87,7 +87,7 @@ def cpu_tiles(segments, mutual: bool, dtype):
         dtype: Warp scalar type of the sums.
     """
     tiles, begin, parts = _cut(tuple(map(tuple, segments.tolist())), mutual, tile_size(dtype))
-    threads = min(threads_for(pair_count(segments), _PAIRS_PER_THREAD), max(len(begin) - 1, 1))
+    threads = min(threads_for(pair_count(segments), PAIRS_PER_THREAD), max(len(begin) - 1, 1))
     return tiles, begin, parts, threads
 
 
@@ -128,7 +128,7 @@ def _cut_segment(segment, row, mutual, most):
     t0, t1, s0, s1 = segment
     count, shift, parts, blocks = t1 - t0, row - t0, 0, []
     pairs = count * (s1 - s0)
-    busy = min(pairs // _PAIRS_PER_THREAD, MOST_THREADS)
+    busy = min(pairs // PAIRS_PER_THREAD, MOST_THREADS)
     whole, grain = busy < 2, pairs / (2 * max(busy, 1))
     rest = [(s0, s1)]
     if mutual and s0 <= t0 and t1 <= s1:
