@@ -25,7 +25,9 @@ struct Columns {
     size_t pitch;
 
     CUDA_CALLABLE Columns(const wp::array_t<Real>& table) : data(table.data), pitch(table.strides[0] / sizeof(Real)) {}
-    template <class Place> CUDA_CALLABLE Number number(int row, Place i) const { return collect(data + row * pitch, i); }
+    template <class Place> CUDA_CALLABLE Number number(int row, Place i) const {
+        return collect(data + row * pitch, i);
+    }
     template <class Place> CUDA_CALLABLE Vector vector(int row, Place i) const {
         return {number(row, i), number(row + 1, i), number(row + 2, i)};
     }
