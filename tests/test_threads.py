@@ -24,8 +24,9 @@ MS = 1.7e6
 @pytest.fixture
 def assert_same_bits(monkeypatch):
     """Checks that what a function returns does not depend on the number of threads, which share small work, too."""
-    for module in (evaluate, neighbors, theta_flow):
+    for module in (neighbors, theta_flow):
         monkeypatch.setattr(module, "MOMENTS_PER_THREAD", 100)
+    monkeypatch.setattr(evaluate, "PAIRS_PER_THREAD", 10_000)
     monkeypatch.setattr(near_pairs, "_BALLS_PER_THREAD", 100)
 
     def check(work, counts=COUNTS):
