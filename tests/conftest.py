@@ -33,6 +33,11 @@ def pytest_addoption(parser):
     parser.addoption("--only-device", action="store_true", help="leave out tests that do the same whatever the device")
     parser.addoption("--long", action="store_true", help="also run the tests marked 'long' (minutes)")
     parser.addoption("--wild", type=int, default=150, metavar="N", help="wild calls of a function (default: 150)")
+    parser.addoption(
+        "--cpu",
+        metavar="NAME",
+        help="compile native code for this kind of processor, as Clang names it: haswell, znver3, x86-64-v3, ...",
+    )
     parser.addoption("--sanitize", choices=tuple(SANITIZERS), help="instrument native code; what .ci/sanitize uses")
 
 
@@ -46,6 +51,10 @@ def pytest_configure(config):
         import cuda_on_cpu  # noqa: PLC0415 - takes a while, and changes Warp for good
 
         cuda_on_cpu.start()
+    if name := config.getoption("--cpu"):
+        import warp as wp  # noqa: PLC0415 - kernels take the flags when they are imported
+
+        wp.config.cpu_compiler_flags = wp.config.cpu_compiler_flags.replace("-march=native", f"-target-cpu {name}")
     if kind := config.getoption("--sanitize"):
         import warp as wp  # noqa: PLC0415 - kernels take the flags when they are imported
 
