@@ -73,10 +73,10 @@ class Example:
     def test_final(self):
         """Assert that they sit face to face as they are made to, and that their common momentum is still zero.
 
-        Momentum is conserved to rounding. Contact impulses are opposite to the last bit. Forces are sums of 500 forces on
-        moments, rounded to float32, whose root sum of squares is ten times the resultant: 10 · 6e-8 of the force. At rest
-        this error repeats, so momentum grows in proportion to the impulse that the connectors exchange. The tolerance is
-        three such standard deviations.
+        Momentum is conserved to rounding. Contact impulses are opposite to the last bit. Forces are sums over 500
+        moments, each rounded to float32, and their root sum of squares is ten times the resultant: 10 · 6e-8 of it.
+        At rest this error repeats, so momentum grows in proportion to the impulse that the connectors exchange. The
+        tolerance is three such standard deviations.
         """
         place, angle = self.mating()
         np.testing.assert_allclose(place, (2 * HALF[0], 0.0, 0.0), atol=1e-4)
