@@ -30,13 +30,12 @@ import warpmag
 from bench.arrangements import ARRANGEMENTS, arranged, trace
 from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
-from bench.reference import clusters, cuboids, spheres
+from bench.reference import clusters, cuboids, oracle, spheres
 from bench.reference.fall import DURATION, fall
 from bench.run import RUNNERS, make_system
 from bench.timing import measure
-from warpmag import oracle
-from warpmag.magnets import CONTACT_MODELS
-from warpmag.system import MomentSystem
+from warpmag.declarations.magnets import CONTACT_MODELS
+from warpmag.moments.system import MomentSystem
 
 SIZES = (243, 1032, 2560, 10000)
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bench.cases import RADIUS, SATURATION
-from warpmag import oracle
-from warpmag.system import MomentSystem
+from bench.reference import oracle
+from warpmag.moments.system import MomentSystem
 
 TILTED = np.array([0.48, 0.6, 0.64])
 """Direction of uniform fields, along no axis of an arrangement."""

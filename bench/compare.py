@@ -20,7 +20,7 @@ import warp as wp
 from bench.cases import touching_pile
 from bench.machine import describe
 from bench.peers import PEERS, Peer
-from warpmag import oracle
+from bench.reference import oracle
 
 SIZES = {"cpu": (243, 1032, 2560, 10000, 20000), "cuda": (243, 1032, 2560, 10000, 32768, 131072, 262144)}
 _CHECKED = 32

@@ -21,11 +21,11 @@ from bench.machine import describe
 from bench.peers import PEERS, Peer
 from bench.report import machine_of, read
 from bench.timing import measure
-from warpmag.fmm import FastSums
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.ranks import ranks
+from warpmag.moments.fmm import FastSums
+from warpmag.moments.ranks import ranks
 
 SIZES = {
     "cpu": (1_000, 2_197, 4_913, 10_648, 21_952, 50_653, 97_336),

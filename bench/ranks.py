@@ -14,9 +14,9 @@ import warp as wp
 from bench.machine import describe
 from bench.many import Moments, lattice, repetitions
 from bench.timing import measure
-from warpmag.arrays import resolve_device
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.ranks import Ranks, alone, is_first, ranks
+from warpmag.moments.arrays import resolve_device
+from warpmag.moments.ranks import Ranks, alone, is_first, ranks
 
 CASES = ((131_072, None), (1_000_000, None), (1_000_000, 1e-3), (4_019_679, 1e-3), (4_019_679, 1e-5))
 """Numbers of moments, and relative errors asked for; None means all pairs."""

@@ -15,13 +15,13 @@ import warp as wp
 
 from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
 from bench.machine import describe
+from bench.reference import oracle
 from bench.scene import run_bundled, run_scene
 from bench.swarm import run_swarm
 from bench.timing import measure
 from bench.writing import run_writing
-from warpmag import oracle
+from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import bundled
-from warpmag.system import MomentSystem
 
 _WORLDS = {"cpu": 32, "cuda": 1024}
 _CHECKED = 64

@@ -13,7 +13,7 @@ import warp as wp
 from bench.cases import PILES
 from bench.timing import measure
 from warpmag import Simulation
-from warpmag.engine.capture import without_allocations
+from warpmag.engine.pile_xpbd.capture import without_allocations
 from warpmag.scenes_usd import balls_up, bundled
 
 _SETTLING, _STEPS = 32, 60

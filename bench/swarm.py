@@ -10,7 +10,7 @@ import warp as wp
 
 from bench.writing import resident
 from warpmag import Simulation
-from warpmag.engine.recording import Recorder
+from warpmag.engine.stepping.recording import Recorder
 from warpmag.scenes_usd import sakura_tree
 
 _FRAMES = 240

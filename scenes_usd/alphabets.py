@@ -11,9 +11,10 @@ import string
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, lettering
-from warpmag.usd import author_magnet, author_mesh
+from warpmag.show.meshes import author_mesh
+from warpmag.usd import author_magnet
 
 PAINTS = {
     "Coral": (0.86, 0.19, 0.13),

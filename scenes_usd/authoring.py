@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
-from warpmag.usd import author_magnet, author_settings, author_surface
-from warpmag.usd.output import Output
+from warpmag.show.looks import author_surface
+from warpmag.usd import author_magnet, author_settings
+from warpmag.usd.write.output import Output
 
 GRAVITY = 9.81
 """Acceleration of free fall [m/s²]."""

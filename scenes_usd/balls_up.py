@@ -7,8 +7,8 @@ import os
 
 from pxr import UsdGeom
 
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring
 
 

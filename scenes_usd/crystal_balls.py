@@ -9,8 +9,8 @@ import os
 
 from pxr import Gf, Usd, UsdGeom
 
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring
 from warpmag.usd import author_magnet
 

@@ -8,8 +8,8 @@ import os
 
 import numpy as np
 
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring
 
 _CELLS = 12

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import UsdGeom
 
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring
 
 BARK_COLOR = (0.14, 0.075, 0.055)

@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 
-from warpmag import demagnetization, even_field, lattice, oracle
-from warpmag.system import MomentSystem
+from bench.reference import oracle
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import demagnetization, lattice
+from warpmag.shapes import uniform_response as even_field
 
 FAINT = 1e12  # A/m, a saturation far above any field here
 TURN = np.array([0.2, -0.4, 0.1, 0.8]) / np.linalg.norm([0.2, -0.4, 0.1, 0.8])

@@ -9,8 +9,8 @@ import warp as wp
 import warpmag
 from warpmag import cli
 from warpmag.kernels.pairs import evaluate
-from warpmag.ranks import by_first, ranks
-from warpmag.system import MomentSystem
+from warpmag.moments.ranks import by_first, ranks
+from warpmag.moments.system import MomentSystem
 
 SIZES = {"cpu": (1, 7, 1001), "cuda": (1, 7, 6001)}
 """Numbers of moments; the last is shared out by all forms of the sums, which a GPU takes for thousands of them."""

@@ -7,11 +7,11 @@ import warp as wp
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 import warpmag
-from warpmag.coils import Coil, FieldMap
-from warpmag.engine.attributes import marked_shapes
-from warpmag.engine.scene import import_scene
+from warpmag.declarations.coils import Coil, FieldMap
+from warpmag.declarations.magnets import Magnet
+from warpmag.engine.magnets.attributes import marked_shapes
+from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet
 from warpmag.scenes_usd import bundled
 from warpmag.usd import author_coil, author_field_map, author_magnet
 

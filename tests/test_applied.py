@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from warpmag import oracle
+from bench.reference import oracle
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
-from warpmag.probe import FieldProbe
-from warpmag.system import MomentSystem
+from warpmag.moments.probe import FieldProbe
+from warpmag.moments.system import MomentSystem
 
 newton = pytest.importorskip("newton")
-from warpmag import coil_oracle  # noqa: E402
-from warpmag.coils import Coil, FieldMap  # noqa: E402
+from bench.reference import coils as coil_oracle  # noqa: E402
+from warpmag.declarations.coils import Coil, FieldMap  # noqa: E402
 
 A = 0.02  # m, radius of coils
 R = 0.005  # m

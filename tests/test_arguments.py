@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import warpmag
-from warpmag import oracle
-from warpmag.magnets import Magnet, MagneticSettings
+from bench.reference import oracle
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 
 MS = 1.7e6
 X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.012], [0.02, 0.0, 0.0]])
@@ -296,7 +296,7 @@ def test_sources_beside_near_contacts(gap, device):
     ],
 )
 def test_moment_system(arguments, message, device):
-    from warpmag.system import MomentSystem  # noqa: PLC0415 - imports Warp
+    from warpmag.moments.system import MomentSystem  # noqa: PLC0415 - imports Warp
 
     with pytest.raises(warpmag.InputError, match=f"^{message}"):
         MomentSystem(**{"radii": [0.1, 0.1], "device": device, **arguments})

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from test_arguments import GUISES, MS, Unreadable, X, call
 
 import warpmag
-from warpmag import oracle
+from bench.reference import oracle
 
 pytestmark = pytest.mark.no_cover  # what is drawn decides no line of the report
 STRANGE = st.sampled_from(

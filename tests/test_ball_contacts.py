@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from test_broad_phase import FARTHEST, SUBSTEP, random_scene, set_motion
 
-from warpmag.engine.broad_phase import NeighborBroadPhase
+from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase
 
 FIELDS = ("point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
 TOLERANCE = np.full(17, 1e-7)

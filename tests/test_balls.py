@@ -10,11 +10,11 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag.engine.contacts import body_sizes
-from warpmag.engine.simulation import Simulation
+from warpmag.engine.pile_xpbd.contacts import body_sizes
+from warpmag.engine.stepping.simulation import Simulation
 from warpmag.errors import InputError
 from warpmag.garbage import collection_paused
-from warpmag.layout import MomentLayout
+from warpmag.moments.layout import MomentLayout
 
 COUNT = 7  # two rows of two and three alone: every way in which copies come about
 

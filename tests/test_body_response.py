@@ -5,10 +5,11 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from warpmag import demagnetization, lattice, oracle
+from bench.reference import oracle
 from warpmag.kernels.induction import body_response
 from warpmag.kernels.shared import team
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import demagnetization, lattice
 
 MS = 1.7e6
 SPACING = 0.002

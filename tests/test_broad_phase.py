@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag.engine.broad_phase import NeighborBroadPhase
-from warpmag.engine.contacts import RigidSolver, body_sizes
-from warpmag.kernels.rigid.broad_phase import allocate
+from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase
+from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
+from warpmag.kernels.contacts.broad_phase import allocate
 
 FARTHEST = 0.02
 """How far ahead contacts are sought [m]: twice the radius of the balls."""
@@ -109,7 +109,7 @@ def test_crowded_balls_are_found(device):
 
 
 def test_many_other_shapes_are_swept(device, monkeypatch):
-    monkeypatch.setattr("warpmag.kernels.rigid.broad_phase._MOST_COMPARISONS", 100)
+    monkeypatch.setattr("warpmag.kernels.contacts.broad_phase._MOST_COMPARISONS", 100)
     model = random_scene(3, 2, device)
     pairs, contacts = Search(model).find(model.state())
     found, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())

@@ -24,9 +24,10 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 import warpmag
-from bench.reference import boxes, cylinders, plate, susceptible
-from warpmag import demagnetization, even_field, lattice, oracle
-from warpmag.system import MomentSystem
+from bench.reference import boxes, cylinders, oracle, plate, susceptible
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import demagnetization, lattice
+from warpmag.shapes import uniform_response as even_field
 
 SIDES = np.array([1.0, 0.7, 0.4])
 

@@ -10,7 +10,7 @@ from cell_bodies import FAINT, TURN, coupled, demagnetizing_matrix, filled, make
 
 import warpmag
 from bench.reference import boxes
-from warpmag import demagnetization, lattice
+from warpmag.shapes import demagnetization, lattice
 
 L_SHAPE = posed(([1.0, 1.0, 3.0], [0.0, 0.0, 3.0]), ([2.0, 1.0, 1.0], [3.0, 0.0, 1.0]))
 

@@ -12,7 +12,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from warpmag import cli
-from warpmag.magnets import Magnet, MagneticSettings
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import balls_up
 from warpmag.usd import author_magnet, author_settings
 

@@ -12,11 +12,11 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpmag
-from bench.reference import cuboids, discs, uneven
-from warpmag import oracle, polyhedra
+from bench.reference import cuboids, discs, oracle, uneven
 from warpmag.kernels.applied.solids import SolidMagnet
-from warpmag.probe import FieldProbe
-from warpmag.system import MomentSystem
+from warpmag.moments.probe import FieldProbe
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import polyhedra
 
 M = 1.05e6  # A/m, N42
 SIDE, GAP = 0.01, 5e-4  # m

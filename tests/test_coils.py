@@ -11,11 +11,11 @@ from small_builders import add_ball, new_builder
 from test_applied import CORNERS, HALF, LOOP, SINGLE, VOLUME, A, R, field_of
 from test_arguments_wild import STRANGE, chosen, refusals
 
-from warpmag import oracle
+from bench.reference import oracle
 
 newton = pytest.importorskip("newton")
 import warpmag  # noqa: E402
-from warpmag.coils import Coil, FieldMap, SourceRecord  # noqa: E402
+from warpmag.declarations.coils import Coil, FieldMap, SourceRecord  # noqa: E402
 
 
 def test_a_coil_on_a_body_feels_what_it_does(device):

@@ -12,8 +12,8 @@ import pytest
 import warp as wp
 
 from tests.test_engine_xpbd import CAPACITY, CONTACT, DT, NewtonsXPBD, heap, substep
-from warpmag.engine.xpbd import PileXPBD
-from warpmag.kernels.rigid.contact_solve import PUSH_OUT
+from warpmag.engine.pile_xpbd.xpbd import PileXPBD
+from warpmag.kernels.contacts.solve import PUSH_OUT
 from warpmag.kernels.shared.passes import CHUNK
 
 G = 9.81  # m/s²

@@ -14,20 +14,21 @@ from small_builders import add_ball, new_builder
 from warp._src import context
 
 import warpmag
-from warpmag import demagnetization, fmm, lattice, polyhedra, system
-from warpmag.engine.simulation import Simulation
-from warpmag.engine.xpbd import PileXPBD
+from warpmag.engine.pile_xpbd.xpbd import PileXPBD
+from warpmag.engine.stepping.simulation import Simulation
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
+from warpmag.kernels.contacts import solve as contact_solve
 from warpmag.kernels.fmm import expansions, sharing
 from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
 from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
-from warpmag.kernels.rigid import contact_solve
-from warpmag.probe import FieldProbe
-from warpmag.system import MomentSystem
+from warpmag.moments import fmm, system
+from warpmag.moments.probe import FieldProbe
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import demagnetization, lattice, polyhedra
 
 pytestmark = pytest.mark.skipif("not config.getoption('--device') == 'cpu'")
 
@@ -120,7 +121,7 @@ def integers(array) -> np.ndarray:
 
 
 class Half:
-    """The second of two processes, as ``warpmag.ranks.Ranks``."""
+    """The second of two processes, as ``warpmag.moments.ranks.Ranks``."""
 
     rank, size = 1, 2
 

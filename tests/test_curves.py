@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag import magnets, oracle
+from bench.reference import oracle
+from warpmag.declarations import magnets
 from warpmag.kernels.material.curves import CURVE_IDS, curve_ratio, curve_slope, inverse_curve_ratio
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import CHUNK

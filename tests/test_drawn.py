@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from warpmag import Magnetics
-from warpmag.engine.scene import import_scene
+from warpmag.engine.stepping.scene import import_scene
 
 STAGE = """#usda 1.0
 (

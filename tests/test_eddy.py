@@ -9,9 +9,9 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag import oracle
+from bench.reference import oracle
 from warpmag.errors import InputError
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
 
 RADIUS, COUNT, PERMANENT = 0.005, 12, 3
 MASS = 7870.0 * 4.0 / 3.0 * math.pi * RADIUS**3

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag.engine.attributes import marked_shapes
+from warpmag.engine.magnets.attributes import marked_shapes
 
 
 @pytest.fixture

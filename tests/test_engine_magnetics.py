@@ -9,8 +9,9 @@ import warp as wp
 from small_builders import R, add_ball, new_builder
 
 import warpmag
-import warpmag.magnets
-from warpmag import contact_oracle, oracle
+from bench.reference import near_contact as contact_oracle
+from bench.reference import oracle
+from warpmag.declarations.magnets import SATURATION_OF_IRON
 
 M = 1e6  # A/m
 VOLUME = 4.0 / 3.0 * math.pi * R**3
@@ -87,7 +88,7 @@ def test_balls_that_nearly_touch_pull_harder_than_dipoles(device):
     forces, _, magnetics = wrenches(model, external_field=tuple(field), contact_model="multipole", rtol=1e-5)
     dipoles, _, _ = wrenches(model, external_field=tuple(field), rtol=1e-5)
     applied = field + oracle.h_field([[0.0, 0.0, 0.1]], [[0.0, 0.0, M * VOLUME]], x)
-    exact, near = contact_oracle.equilibrium(x, R, applied, saturation=warpmag.magnets.SATURATION_OF_IRON)
+    exact, near = contact_oracle.equilibrium(x, R, applied, saturation=SATURATION_OF_IRON)
     pull = oracle.gradient_at([[0.0, 0.0, 0.1]], [[0.0, 0.0, M * VOLUME]], x)
     near += oracle.kelvin_force(VOLUME * exact.magnetizations, pull)
     np.testing.assert_allclose(forces[:3], near, atol=1e-3 * np.abs(near).max())  # of rtol, some ten times amplified

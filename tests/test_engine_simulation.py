@@ -10,13 +10,13 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag.engine.contacts import RigidSolver, body_sizes
-from warpmag.engine.simulation import Simulation
-from warpmag.engine.statistics import find_held
-from warpmag.engine.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
+from warpmag.declarations.magnets import Magnet, MagneticSettings
+from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
+from warpmag.engine.stepping.simulation import Simulation
+from warpmag.engine.stepping.statistics import find_held
+from warpmag.engine.stepping.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
 from warpmag.kernels.rigid.monitor import FREE
 from warpmag.kernels.shared.scan import launch_scan
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring
 
 R = 0.005  # m

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
-from warpmag import oracle
-from warpmag.engine.simulation import Simulation
-from warpmag.magnets import Magnet
+from bench.reference import oracle
+from warpmag.declarations.magnets import Magnet
+from warpmag.engine.stepping.simulation import Simulation
 from warpmag.scenes_usd import balls_up
 from warpmag.usd import author_magnet
 

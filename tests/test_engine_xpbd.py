@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag.engine.xpbd import PileXPBD
-from warpmag.kernels.rigid.contact_solve import PUSH_OUT
+from warpmag.engine.pile_xpbd.xpbd import PileXPBD
+from warpmag.kernels.contacts.solve import PUSH_OUT
 
 R, DT = 0.005, 5e-4  # m, s
 OVERLAP = 2e-4  # of balls over their radius, where friction should not depend on it

@@ -14,13 +14,14 @@ import pytest
 from matplotlib.image import imread
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
-from warpmag import cli, oracle
+from bench.reference import oracle
+from warpmag import cli
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.export import export
-from warpmag.field_lines import trace
-from warpmag.final import render_final
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import authoring, balls_up
+from warpmag.show.export import export
+from warpmag.show.field_lines import trace
+from warpmag.show.final import render_final
 from warpmag.usd import CacheWriter, open_stage
 
 R = 0.005  # m

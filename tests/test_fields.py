@@ -7,7 +7,7 @@ import warp as wp
 from arrangements import as_float32, overlapping, pile, relative
 
 import warpmag
-from warpmag import oracle
+from bench.reference import oracle
 from warpmag.kernels.pairs import fused_cuda, mirror_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments

@@ -13,7 +13,8 @@ from pxr import Sdf, Tf
 
 from warpmag import cli
 from warpmag.errors import InputError, one_line
-from warpmag.usd import first_reading, open_stage
+from warpmag.usd import open_stage
+from warpmag.usd.read import first_reading
 
 HEAD = "#usda 1.0\n"
 NESTED = {

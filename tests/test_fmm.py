@@ -8,12 +8,12 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag import fmm, pair_sums
-from warpmag.arrays import resolve_dtype, vec3_type
 from warpmag.kernels.fmm.grid import MomentGrid
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.system import MomentSystem
+from warpmag.moments import fmm, pair_sums
+from warpmag.moments.arrays import resolve_dtype, vec3_type
+from warpmag.moments.system import MomentSystem
 
 
 def apart(a, b) -> float:

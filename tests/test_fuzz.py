@@ -15,7 +15,7 @@ from fuzz.sources import author
 from pxr import Usd
 from small_stages import physics, write
 
-from warpmag.engine.scene import import_scene
+from warpmag.engine.stepping.scene import import_scene
 
 FEW, MANY, SEED = range(21), range(21, 140), 20
 """Mutants that are judged by default, and with ``--long``; sources take turns."""

@@ -12,7 +12,7 @@ import pytest
 from arrangements import fcc_block
 
 import warpmag
-from warpmag import oracle
+from bench.reference import oracle
 from warpmag.errors import InputError
 
 MS = 1.7e6

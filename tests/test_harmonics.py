@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from warpmag import harmonics
-from warpmag.oracle import h_field
+from bench.reference.oracle import h_field
+from warpmag.moments import harmonics
 
 EPSILON = np.finfo(np.float64).eps
 

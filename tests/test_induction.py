@@ -10,8 +10,9 @@ import warp as wp
 from arrangements import as_float32, fcc_block, overlapping, pile, relative
 
 import warpmag
-from warpmag import magnets, oracle
-from warpmag.system import MomentSystem
+from bench.reference import oracle
+from warpmag.declarations import magnets
+from warpmag.moments.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.arrangements import ARRANGEMENTS, arranged, trace

@@ -92,7 +92,7 @@ def test_a_magnet_that_is_switched(tmp_path, device, where):
     simulation = Simulation(path, device=device)
     times, values = np.array(list(samples)) / RATE, np.array(list(samples.values()), dtype=float)
     if where == "a named material":
-        from warpmag.materials import MATERIALS  # noqa: PLC0415
+        from warpmag.declarations.materials import MATERIALS  # noqa: PLC0415
 
         strength = MATERIALS["n42"].magnetization if "n42" in MATERIALS else MATERIALS["N42"].magnetization
         values = np.sign(values) * strength
@@ -181,8 +181,8 @@ def test_a_resumed_run_goes_on_along_the_keys(tmp_path, device, monkeypatch):
     """Killed and resumed, it ends with the bits of a run that nobody disturbed."""
     from test_run_survives import samples  # noqa: PLC0415
 
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SHARE", math.inf)
+    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SHARE", math.inf)
     scene = f"vector3f warpmag:externalField.timeSamples = {text(pulse(4e4))}"
     path = write(tmp_path, cube_on_arm(rotateZ={0: 0, 24: 180}), held_ball(0.0662), scene=scene)
 

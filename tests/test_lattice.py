@@ -4,8 +4,8 @@ import magpylib
 import numpy as np
 import pytest
 
-from warpmag import lattice
 from warpmag.errors import InputError
+from warpmag.shapes import lattice
 
 TILT = (0.3, -0.2, 0.5, 0.7)
 

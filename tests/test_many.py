@@ -7,12 +7,13 @@ import warp as wp
 from pxr import Usd
 
 import warpmag
-from warpmag import fmm, oracle
+from bench.reference import oracle
 from warpmag.cli import BAD_INPUT, main
-from warpmag.engine.scene import import_scene
+from warpmag.engine.stepping.scene import import_scene
+from warpmag.moments import fmm
+from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import make
-from warpmag.system import MomentSystem
-from warpmag.usd import alike, instancers
+from warpmag.usd.read import alike, instancers
 
 RADIUS = 0.0025  # m
 FIELD = (0.0, 1e4, 3e4)  # A/m
@@ -72,7 +73,7 @@ def test_moments_and_forces_are_those_of_all_pairs(device):
     assert far_cells(magnetics)
     assert 0.0 < magnetics.system.field_error() <= RTOL
     exact = warpmag.solve_induction(
-        x, RADIUS, saturation=warpmag.magnets.SATURATION_OF_IRON, external_field=FIELD, sources=magnet,
+        x, RADIUS, saturation=warpmag.declarations.magnets.SATURATION_OF_IRON, external_field=FIELD, sources=magnet,
         method="direct", rtol=1e-6, dtype="float64", device="cpu",
     )  # fmt: skip
     moments = magnetics.system.moments.numpy().astype(float)

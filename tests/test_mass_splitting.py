@@ -6,8 +6,8 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag.engine.xpbd import PileXPBD
-from warpmag.kernels.rigid.contact_solve import FRICTION, MOMENTUM
+from warpmag.engine.pile_xpbd.xpbd import PileXPBD
+from warpmag.kernels.contacts.solve import FRICTION, MOMENTUM
 from warpmag.scenes_usd import bundled
 
 R, DT, RELAXATION = 0.005, 5e-4, 0.35

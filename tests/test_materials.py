@@ -9,9 +9,9 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 import warpmag
-from warpmag.engine.attributes import marked_shapes
+from warpmag.declarations.materials import MATERIALS
+from warpmag.engine.magnets.attributes import marked_shapes
 from warpmag.errors import InputError
-from warpmag.materials import MATERIALS
 from warpmag.usd import author_magnet, read_magnets
 from warpmag.usd.schemas import MATERIAL
 

@@ -10,10 +10,11 @@ import warp as wp
 from arrangements import as_float32, fcc_block, relative
 
 import warpmag
-from warpmag import contact_oracle, oracle
-from warpmag.contact_oracle import NearContacts
+from bench.reference import near_contact as contact_oracle
+from bench.reference import oracle
+from bench.reference.near_contact import NearContacts
 from warpmag.kernels.near_contact import contact_table
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.reference import clusters

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warpmag import oracle, polyhedra
-from warpmag.coils import Coil, FieldMap
+from bench.reference import oracle
+from warpmag.declarations.coils import Coil, FieldMap
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.near_contact import contact_table
-from warpmag.probe import FieldProbe
-from warpmag.system import MomentSystem
+from warpmag.moments.probe import FieldProbe
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import polyhedra
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.reference import uneven

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag import oracle
+from bench.reference import oracle
 from warpmag.kernels.fmm.near import launch_near_sums
 from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag.arrays import vec3_type
 from warpmag.kernels.pairs.neighbors import CAPACITY, SKIN
 from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.moments.arrays import vec3_type
 
 
 def make(radii, device, dtype=wp.float32, groups=None):

@@ -8,9 +8,9 @@ import warp as wp
 from small_builders import R, add_ball, new_builder
 
 import warpmag
-from warpmag import oracle
-from warpmag.probe import FieldProbe
-from warpmag.system import MomentSystem
+from bench.reference import oracle
+from warpmag.moments.probe import FieldProbe
+from warpmag.moments.system import MomentSystem
 
 M = 1e6  # A/m
 VOLUME = 4.0 / 3.0 * math.pi * R**3

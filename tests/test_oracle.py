@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from warpmag import magnets, oracle
+from bench.reference import oracle
+from warpmag.declarations import magnets
 
 EYE = np.eye(3)
 

@@ -10,7 +10,7 @@ from browser import CHROMIUM, shown
 
 from warpmag import cli
 from warpmag.errors import InputError
-from warpmag.export import export
+from warpmag.show.export import export
 
 pytest.importorskip("viser", reason="needs viser, of the extra 'viewers'")
 PLACE, SIDE = 0.05, 0.02  # m

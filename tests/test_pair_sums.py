@@ -11,7 +11,7 @@ import warp as wp
 from arrangements import overlapping
 
 import warpmag
-from warpmag import pair_sums
+from warpmag.moments import pair_sums
 
 
 def _call(device, seed, *, radii=True, targets=False, moved=0.0):

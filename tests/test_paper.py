@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from arrangements import relative
 
-from warpmag import oracle
+from bench.reference import oracle
 from warpmag.kernels.material.curves import TANH
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed

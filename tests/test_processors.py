@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-CPU = Path("/proc/cpuinfo")
+CPU, FOLDER = Path("/proc/cpuinfo"), Path(__file__).resolve().parent
 PROGRAM = """
 import sys
-sys.path.append({folder!r})
+sys.path += [{folder!r}, {root!r}]
 import warp as wp, warpmag
 from arrangements import pile, relative
-from warpmag import oracle
+from bench.reference import oracle
 wp.config.cpu_compiler_flags, wp.config.kernel_cache_dir = "-target-cpu haswell", {cache!r}
 x, mixed, m = pile(count=700)
 for radii in (None, 0.0049, mixed):
@@ -29,7 +29,7 @@ def test_narrower_vectors(device, tmp_path):
     """As on a CPU without AVX-512: the compiler has nothing to say of them."""
     if device != "cpu":
         pytest.skip("of a CPU")
-    program = PROGRAM.format(folder=str(Path(__file__).parent), cache=str(tmp_path))
+    program = PROGRAM.format(folder=str(FOLDER), root=str(FOLDER.parent), cache=str(tmp_path))
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     errors = [float(line.split()[1]) for line in run.stdout.splitlines() if line.startswith("error")]
     assert len(errors) == 5

@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 from warpmag.errors import InputError
-from warpmag.ranks import Ranks
+from warpmag.moments.ranks import Ranks
 
 MPIRUN = Path(sysconfig.get_path("scripts"), "mpirun")
 SCRIPT = Path(__file__).with_name("ranks_program.py")
@@ -131,7 +131,7 @@ def test_a_graph_of_a_cpu_that_would_not_merge_sums_is_refused():
 def test_a_rank_that_ends_leaves_none_waiting(end, line):
     lines = (
         "import os, numpy as np, warpmag",
-        "from warpmag.ranks import ranks",
+        "from warpmag.moments.ranks import ranks",
         f"if ranks().rank: {end}",
         "warpmag.h_field(np.eye(3), np.eye(3), device='cpu')",
     )

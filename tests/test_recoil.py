@@ -10,10 +10,10 @@ from pxr import Gf, Sdf
 
 import warpmag
 from tests.test_materials import PERMANENT, stage_with
-from warpmag.engine.attributes import marked_shapes
+from warpmag.declarations.magnets import LINEAR_CURVE
+from warpmag.engine.magnets.attributes import marked_shapes
 from warpmag.errors import InputError
-from warpmag.magnets import LINEAR_CURVE
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
 from warpmag.usd import author_magnet, read_magnets
 
 MU0 = 4e-7 * math.pi

@@ -6,9 +6,9 @@ from PIL import Image
 from pxr import Usd
 
 from warpmag import cli
-from warpmag.engine.render import render
 from warpmag.errors import InputError
 from warpmag.scenes_usd import authoring, balls_up
+from warpmag.show.render import render
 
 pytest.importorskip("matplotlib")
 from matplotlib.image import imread

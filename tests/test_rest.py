@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag.kernels.rigid.contact_solve import PUSH_OUT
+from warpmag.kernels.contacts.solve import PUSH_OUT
 
 R = 0.005  # m
 

@@ -5,9 +5,10 @@ import pytest
 import warp as wp
 from arrangements import fcc_block, pile, relative
 
-from warpmag import magnets, oracle
+from bench.reference import oracle
+from warpmag.declarations import magnets
 from warpmag.errors import InputError
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
 
 MS = 1.7e6
 RIVALS = ("theta-euler", "llg", "llg-damping")

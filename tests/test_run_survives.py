@@ -21,7 +21,7 @@ from pxr import Sdf, Usd, UsdPhysics, UsdUtils
 from run_server import RunServer
 
 from warpmag import InputError, Simulation, cli
-from warpmag.engine import recording
+from warpmag.engine.stepping import recording
 from warpmag.scenes_usd import balls_up
 
 FRAMES = 60
@@ -168,8 +168,8 @@ class Survival:
 @pytest.fixture
 def always(monkeypatch):
     """A checkpoint after every frame."""
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SHARE", math.inf)
+    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SHARE", math.inf)
 
 
 @pytest.mark.parametrize(

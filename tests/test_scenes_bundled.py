@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux
 
+from warpmag.declarations.magnets import MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import MagneticSettings
 from warpmag.scenes_usd import (
     alphabets,
     authoring,
@@ -367,7 +367,7 @@ def test_newton_imports_the_crystal_balls():
 def test_scenes_run(name):
     """A few steps from the bundled stage: nothing overlaps at the start, all stays finite, induction converges."""
     pytest.importorskip("newton")
-    from warpmag.engine.simulation import Simulation  # noqa: PLC0415 - the other tests do without the engine
+    from warpmag.engine.stepping.simulation import Simulation  # noqa: PLC0415 - the other tests do without the engine
 
     simulation = Simulation(bundled()[name], device="cpu")
     assert simulation.statistics.overlapping == 0

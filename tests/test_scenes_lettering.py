@@ -6,10 +6,10 @@ import string
 import numpy as np
 import pytest
 
-from warpmag import lattice
 from warpmag.errors import InputError
 from warpmag.scenes_usd import lettering
-from warpmag.usd.meshes import corner_normals
+from warpmag.shapes import lattice
+from warpmag.show.meshes import corner_normals
 
 pytest.importorskip("matplotlib")
 

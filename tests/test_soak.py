@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag import oracle
-from warpmag.engine.simulation import Simulation
+from bench.reference import oracle
+from warpmag.engine.stepping.simulation import Simulation
 
 RADIUS, MASS, GRAVITY = 0.005, 4e-3, 9.81
 M = 2e5  # A/m: neighbours pull each other 4 times as hard as gravity does

@@ -13,14 +13,15 @@ from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.optimize import brentq
 
 import warpmag
-from warpmag import MagnetizationCurve, oracle
-from warpmag.engine.attributes import marked_shapes
+from bench.reference import oracle
+from warpmag import MagnetizationCurve
+from warpmag.declarations.materials import MATERIALS
+from warpmag.declarations.measured import MEASURED_CURVES
+from warpmag.engine.magnets.attributes import marked_shapes
 from warpmag.errors import InputError
 from warpmag.kernels.material import curves as kernel_curves
 from warpmag.kernels.shared.native import native_options
-from warpmag.materials import MATERIALS
-from warpmag.measured import MEASURED_CURVES
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
 
 MU0 = 4e-7 * math.pi
 NAMES = list(MEASURED_CURVES)

@@ -9,9 +9,9 @@ from pxr import Sdf, UsdGeom, UsdPhysics, UsdShade
 import warpmag
 from tests.test_materials import FLOAT, stage_with
 from warpmag import MagnetizationCurve
-from warpmag.engine.scene import import_scene
+from warpmag.declarations.materials import MATERIALS
+from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError
-from warpmag.materials import MATERIALS
 from warpmag.usd import author_magnet, read_magnets
 
 DOUBLE = Sdf.ValueTypeNames.DoubleArray
@@ -27,7 +27,7 @@ def test_curves_on_a_stage():
     assert curves == [MATERIALS["M-19"].curve, MagnetizationCurve.from_bh(h, b), MATERIALS["M-19"].curve]
     for curve in curves[:2]:
         stage = stage_with("")
-        author_magnet(stage.GetPrimAtPath("/Ball"), warpmag.magnets.Magnet(curve=curve))
+        author_magnet(stage.GetPrimAtPath("/Ball"), warpmag.declarations.magnets.Magnet(curve=curve))
         again = read_magnets(stage).magnets["/Ball"].curve
         np.testing.assert_allclose(again.magnetizations, curve.magnetizations, rtol=1e-9)
     assert UsdGeom.Sphere(stage.GetPrimAtPath("/Ball"))

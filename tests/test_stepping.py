@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag.engine.contacts import RigidSolver, body_sizes
+from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.newton_views import BodyView, view_bodies
 

@@ -6,7 +6,7 @@ import threading
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from warpmag.engine.scene import import_scene
+from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError
 from warpmag.scenes_usd import balls_up
 from warpmag.usd import check

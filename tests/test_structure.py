@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from warpmag import magnets
+from warpmag.declarations import magnets
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = ROOT / "kernels"

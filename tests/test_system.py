@@ -6,13 +6,14 @@ import warp as wp
 from arrangements import as_float32, fcc_block, overlapping, pile, relative
 
 import warpmag
-from warpmag import magnets, oracle
+from bench.reference import oracle
+from warpmag.declarations import magnets
 from warpmag.errors import InputError
 from warpmag.kernels.pairs import evaluate
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared import team
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
 
 MS = 1.7e6
 
@@ -341,7 +342,7 @@ def test_bodies_that_cannot_be_told_apart_are_refused(device, monkeypatch):
     with pytest.raises(InputError, match="bodies: numbers too large, at most 16777216 in float32; use float64"):
         MomentSystem(**given)
     assert MomentSystem(dtype="float64", **given).count == 2
-    monkeypatch.setattr("warpmag.arrays.MOST_BODIES", {wp.float32: 2, wp.float64: 3})
+    monkeypatch.setattr("warpmag.moments.arrays.MOST_BODIES", {wp.float32: 2, wp.float64: 3})
     places = np.eye(3)
     with pytest.raises(InputError, match="positions: 3 moments that act on each other, at most 2 in float32"):
         warpmag.wrench(places, places, device=device)

@@ -9,13 +9,13 @@ import pytest
 from arrangements import as_float32, overlapping, pile
 
 import warpmag
-from warpmag.engine.simulation import Simulation
+from warpmag.engine.stepping.simulation import Simulation
 from warpmag.kernels.induction import theta_flow
 from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs import evaluate, neighbors
 from warpmag.kernels.shared import cores, team
+from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import balls_up
-from warpmag.system import MomentSystem
 
 COUNTS = (1, 2, 3, 8, 64)
 MS = 1.7e6

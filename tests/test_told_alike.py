@@ -5,8 +5,8 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from small_stages import FIELD, LEFT, RIGHT, A, B, R, ball, joint, physics, told, write
 
 from warpmag import Simulation
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.usd import author_magnet, author_settings, check, refusals
 
 OPEN = """def Mesh "Open" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI",

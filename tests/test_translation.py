@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpmag import harmonics
 from warpmag.kernels.fmm.translate import OCTANTS, Translation, _grouped_rows, _used_rows, displacements, pitch
+from warpmag.moments import harmonics
 
 
 @dataclass

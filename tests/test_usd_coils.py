@@ -9,9 +9,10 @@ from pxr import Usd, UsdGeom
 
 import warpmag
 from warpmag import cli
-from warpmag.coils import Coil, FieldMap
+from warpmag.declarations.coils import Coil, FieldMap
 from warpmag.errors import InputError
-from warpmag.usd import author_coil, author_field_map, check, coils, open_stage, survey
+from warpmag.usd import author_coil, author_field_map, check, open_stage, survey
+from warpmag.usd.read import coils
 
 HEAD = '#usda 1.0\n(\n    metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"\n)\n'
 BALL = """

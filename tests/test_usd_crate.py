@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Vt
 
-from warpmag.usd import crate
-from warpmag.usd.samples import SampleFile
+from warpmag.usd.write import crate
+from warpmag.usd.write.samples import SampleFile
 
 SIZES = {"moment": 12, "turn": 16, "place": 24}
 TYPES = {

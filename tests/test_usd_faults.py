@@ -11,7 +11,7 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom
 
 from warpmag import Simulation
-from warpmag.engine.scene import import_scene
+from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError, SimulationError
 from warpmag.usd import check, open_stage, read_magnets, refusals, stage_clock, survey
 from warpmag.usd.values import _DECLARED

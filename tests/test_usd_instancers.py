@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
-from warpmag.engine import scene as scenes
-from warpmag.engine.scene import import_scene
-from warpmag.engine.simulation import Simulation
+from warpmag.engine.stepping import scene as scenes
+from warpmag.engine.stepping.scene import import_scene
+from warpmag.engine.stepping.simulation import Simulation
 from warpmag.errors import InputError
-from warpmag.export import export
+from warpmag.show.export import export
 from warpmag.usd import check, open_stage, survey
 
 HEAD = """#usda 1.0

@@ -16,7 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
 from warpmag.usd import CacheWriter, open_stage
-from warpmag.usd.output import Output
+from warpmag.usd.write.output import Output
 
 PATHS = [f"/World/Ball_{k}" for k in range(3)]
 NAMES = ("xformOp:translate:warpmag", "xformOp:orient:warpmag", "physics:velocity", "physics:angularVelocity")
@@ -202,8 +202,8 @@ def test_a_frame_that_found_no_room_can_be_added_again(tmp_path, stage, monkeypa
 
 def test_a_run_goes_on_where_it_was(tmp_path, stage, monkeypatch):
     """Frames that came after the checkpoint are dropped, and those that are added grow the file."""
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SHARE", 1e9)
+    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SHARE", 1e9)
     output, frames = tmp_path / "run.usda", make_frames(100)
     first = CacheWriter(stage, output, PATHS, PATHS, frames=20, options={"force": "kelvin"})
     add(first, frames, range(15), state=lambda: {"seed": np.arange(5)})
@@ -254,7 +254,7 @@ def test_a_checkpoint_that_is_none_is_refused_in_one_line(tmp_path, stage):
 @pytest.fixture
 def begun(tmp_path, stage, monkeypatch):
     """The checkpoint of a run that was ended."""
-    monkeypatch.setattr("warpmag.usd.writer._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SECONDS", 0.0)
     writer = CacheWriter(stage, tmp_path / "run.usda", PATHS, PATHS)
     add(writer, make_frames(3), range(3), state=lambda: {"seed": np.arange(5)})
     writer.close(complete=False)

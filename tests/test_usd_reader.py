@@ -5,8 +5,8 @@ import math
 import pytest
 from pxr import Usd
 
+from warpmag.declarations.magnets import Magnet
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet
 from warpmag.usd import check, describe, hold, open_stage, read_magnets, stage_clock, survey
 
 METRES = 'metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"'

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pxr import UsdGeom
 
+from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
 from warpmag.scenes_usd import balls_up, bundled
 from warpmag.usd import check, describe, open_stage, read_magnets
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from pxr import Plug, Usd, UsdGeom, UsdPhysics
 
-from warpmag import magnets
+from warpmag.declarations import magnets
+from warpmag.declarations.magnets import Magnet, MagneticSettings
+from warpmag.declarations.measured import MEASURED_CURVES
 from warpmag.errors import InputError
-from warpmag.magnets import Magnet, MagneticSettings
-from warpmag.measured import MEASURED_CURVES
 from warpmag.usd import author_magnet, author_settings, open_stage, read_magnets, schemas
 
 MAGNETS = {
@@ -127,7 +127,7 @@ def test_reading_works_even_where_registration_came_too_late(tmp_path):
 
 def test_import_of_warpmag_needs_no_usd():
     done = subprocess.run(
-        [sys.executable, "-c", "import sys, warpmag, warpmag.magnets; print('pxr' in sys.modules)"],
+        [sys.executable, "-c", "import sys, warpmag, warpmag.declarations.magnets; print('pxr' in sys.modules)"],
         capture_output=True,
         text=True,
         check=True,

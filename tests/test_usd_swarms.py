@@ -5,11 +5,12 @@ import pytest
 from pxr import Usd, UsdGeom
 from test_usd_instancers import BALL, MAGNET, instancer, write
 
-from warpmag.engine.scene import import_scene
-from warpmag.engine.simulation import Simulation
-from warpmag.export import export
-from warpmag.usd import Playback, alike, check, open_motion, read_recording, swarms
-from warpmag.usd.instancers import expand_instancers
+from warpmag.engine.stepping.scene import import_scene
+from warpmag.engine.stepping.simulation import Simulation
+from warpmag.show.export import export
+from warpmag.usd import Playback, open_motion, read_recording
+from warpmag.usd.read import alike, check, swarms
+from warpmag.usd.read.instancers import expand_instancers
 
 COUNT, FRAMES = 12, 3
 LAST = float(FRAMES)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 
-from warpmag.engine.scene import import_scene
-from warpmag.engine.simulation import Simulation
+from warpmag.engine.stepping.scene import import_scene
+from warpmag.engine.stepping.simulation import Simulation
 from warpmag.errors import InputError
 from warpmag.usd import check, open_stage, survey
-from warpmag.usd.units import _powers
+from warpmag.usd.read.units import _powers
 
 SI, ARTIST = (1.0, 1.0, "Z"), (0.01, 1.0, "Y")
 GRAMS = (0.01, 0.001, "Z")

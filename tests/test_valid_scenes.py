@@ -9,9 +9,9 @@ from pxr import Usd
 from small_stages import CHAIN, FIELD, IRON, LEFT, PERMANENT, RIGHT, A, B, C, G, R, ball, joint, physics, told, write
 
 import warpmag
-from warpmag.engine.simulation import Simulation
+from warpmag.engine.stepping.simulation import Simulation
 from warpmag.errors import SimulationError
-from warpmag.kernels.rigid.contact_solve import PUSH_OUT
+from warpmag.kernels.contacts.solve import PUSH_OUT
 
 
 def advance(simulation, seconds):

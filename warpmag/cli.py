@@ -9,11 +9,11 @@ import traceback
 from pathlib import Path
 
 from warpmag import __version__
+from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.garbage import collection_paused
-from warpmag.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
+from warpmag.moments.ranks import Ranks, alone, by_first, is_first, ranks
 from warpmag.progress import Progress
-from warpmag.ranks import Ranks, alone, by_first, is_first, ranks
 from warpmag.terminal import Stopped, open_standard_files, quiet_warp, signals_raised, silence, tell
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
@@ -251,7 +251,7 @@ def _check(options) -> int:
 def _load(path: Path, **options):
     """Return the simulation of a stage, ready to step."""
     _start_warp(path)
-    from warpmag.engine.simulation import Simulation  # noqa: PLC0415
+    from warpmag.engine.stepping.simulation import Simulation  # noqa: PLC0415
 
     return Simulation(path, **options)
 
@@ -267,7 +267,7 @@ def _render(options) -> int:
     path, _ = _find_scene(options.stage)
     _start_warp(path)
     if options.quality == "final":
-        from warpmag.final import render_final  # noqa: PLC0415
+        from warpmag.show.final import render_final  # noqa: PLC0415
 
         if options.frames or options.moments:
             raise InputError("quality: 'final' draws one frame, without moments; 'warpmag export' has arrows")
@@ -275,7 +275,7 @@ def _render(options) -> int:
             f"written {render_final(path, options.output, frame=options.frame, size=_two('size', options.size, 'x'))}"
         )
         return 0
-    from warpmag.engine.render import render  # noqa: PLC0415
+    from warpmag.show.render import render  # noqa: PLC0415
 
     written = render(
         path,
@@ -301,7 +301,7 @@ def _two(name: str, text: str, between: str) -> tuple[int, int]:
 def _export(options) -> int:
     path, _ = _find_scene(options.stage)
     _start_warp(path)
-    from warpmag.export import export  # noqa: PLC0415
+    from warpmag.show.export import export  # noqa: PLC0415
 
     names = ("rate", "color", "arrows", "field_lines", "materialx", "device")
     for line in export(path, options.output, **{name: getattr(options, name) for name in names}):
@@ -374,7 +374,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
         print(line)
     print(f"written        {output}")
     if options.purpose:
-        from warpmag.export import export  # noqa: PLC0415
+        from warpmag.show.export import export  # noqa: PLC0415
 
         with alone():
             export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
@@ -397,7 +397,7 @@ def _open_display(name: str, simulation):
         return None
     import newton  # noqa: PLC0415
 
-    from warpmag.engine.display import Display, no_viewer  # noqa: PLC0415
+    from warpmag.show.display import Display, no_viewer  # noqa: PLC0415
 
     try:
         viewer = getattr(newton.viewer, _VIEWERS[name])()

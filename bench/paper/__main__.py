@@ -22,7 +22,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     import matplotlib  # noqa: PLC0415 - slow to import, and --help goes without it
 
-    from warpmag.arrays import resolve_device  # noqa: PLC0415
+    from warpmag.moments.arrays import resolve_device  # noqa: PLC0415
 
     matplotlib.use("Agg")
     wp.config.log_level = wp.LOG_WARNING

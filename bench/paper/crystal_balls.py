@@ -14,10 +14,10 @@ import numpy as np
 import warp as wp
 
 import warpmag
-from warpmag import lattice
-from warpmag.dynamics import SubmagnetizationPairs
-from warpmag.magnets import SATURATION_OF_IRON
-from warpmag.system import MomentSystem
+from warpmag.declarations.magnets import SATURATION_OF_IRON
+from warpmag.moments.dynamics import SubmagnetizationPairs
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import lattice
 
 BALL_RADIUS = 0.005
 """[m]"""
@@ -55,7 +55,7 @@ def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **s
 
     Args:
         strength: Magnetization of the bar [A/m].
-        dynamics: One of ``warpmag.magnets.DYNAMICS``.
+        dynamics: One of ``warpmag.declarations.magnets.DYNAMICS``.
         device: Warp device.
         cells: Cells of the grid and of the bar.
         settings: More arguments of :class:`MomentSystem`.

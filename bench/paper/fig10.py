@@ -14,9 +14,9 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.patches import Circle
 
 from bench.paper.output import Output, table
-from warpmag import lattice
-from warpmag.magnets import SATURATION_OF_IRON
-from warpmag.system import MomentSystem
+from warpmag.declarations.magnets import SATURATION_OF_IRON
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import lattice
 
 RADIUS = 0.02
 """Of the sphere [m]."""

@@ -6,7 +6,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from bench.paper import crystal_balls
 from bench.paper.output import Output, table
-from warpmag.magnets import SATURATION_OF_IRON
+from warpmag.declarations.magnets import SATURATION_OF_IRON
 
 METHODS = {"llg": ("clamped", "Kim et al. 2018"), "theta-euler": ("tanh", "the paper"), "theta": ("tanh", "warpmag")}
 """Dynamics, its curve and whose it is."""

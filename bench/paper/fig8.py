@@ -5,7 +5,7 @@ import numpy as np
 
 from bench.paper import crystal_balls
 from bench.paper.output import Output, table
-from warpmag.dynamics import STEP
+from warpmag.moments.dynamics import STEP
 
 TOLERANCE = 1e-3
 ITERATIONS = 300

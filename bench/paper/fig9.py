@@ -15,8 +15,8 @@ from matplotlib.colors import LogNorm
 
 from bench.paper.isolated_moment import MOST_ITERATIONS, launch_sweep
 from bench.paper.output import Output, table
-from warpmag.dynamics import STEP
 from warpmag.kernels.material.curves import CLAMPED, TANH
+from warpmag.moments.dynamics import STEP
 
 FLOW_STEP = 3.0
 ROWS_AT_ONCE = 40

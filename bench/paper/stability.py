@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from bench.paper.output import Output, table
 from bench.paper.trials import SCENES, Trial, outcome_cells, outcome_head, run_trials
-from warpmag.dynamics import STEP
+from warpmag.moments.dynamics import STEP
 
 SECONDS, SMALL_SECONDS = 5.0, 0.1
 PATIENCE = 300.0
@@ -30,7 +30,7 @@ class Variant:
 
     Attributes:
         name: As the table has it.
-        method: Name of a published method, of :data:`warpmag.magnets.METHODS`.
+        method: Name of a published method, of :data:`warpmag.declarations.magnets.METHODS`.
         force: Force law in place of the method's own.
         saturated: Whether magnets saturate what they hold.
         max_evaluations: Field evaluations after which induction ends.

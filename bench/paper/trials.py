@@ -16,9 +16,9 @@ from pathlib import Path
 from unittest import mock
 
 import warpmag
-from warpmag import dynamics
+from warpmag.declarations.magnets import METHODS
 from warpmag.errors import SimulationError
-from warpmag.magnets import METHODS
+from warpmag.moments import dynamics
 from warpmag.scenes_usd import bundled
 
 SCENES = ("balls_up", "alphabets", "falling_magnet", "sakura_tree")
@@ -35,13 +35,13 @@ class Trial:
 
     Attributes:
         scene: Name of a bundled scene.
-        method: Name of a published method, of :data:`warpmag.magnets.METHODS`.
+        method: Name of a published method, of :data:`warpmag.declarations.magnets.METHODS`.
         seconds: Simulated time [s].
         device: Name of the Warp device.
         patience: Time after which the run is ended [s], the first step not counted.
         rtol: Magnetization error at which induction ends.
         max_evaluations: Field evaluations after which it ends at the latest.
-        pair_step: Step κ of pairs of submagnetizations, see ``warpmag.dynamics``.
+        pair_step: Step κ of pairs of submagnetizations, see ``warpmag.moments.dynamics``.
         force: Force law in place of the method's own.
         parameters: Parameters of the scene's script, where it is not to be as bundled.
     """

@@ -4,8 +4,8 @@ import numpy as np
 
 from bench.paper import crystal_balls
 from bench.paper.output import Output, table
-from warpmag import oracle
-from warpmag.magnets import DYNAMICS, SATURATION_OF_IRON
+from bench.reference import oracle
+from warpmag.declarations.magnets import DYNAMICS, SATURATION_OF_IRON
 
 RTOL = 1e-9
 MOST = {"theta": 200, "theta-euler": 3000, "llg": 3000, "llg-damping": 3000}

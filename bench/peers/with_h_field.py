@@ -1,7 +1,7 @@
 """warpmag.h_field of points, the whole call on NumPy arrays."""
 
 from bench.peers import Evaluation
-from warpmag import fields
+from warpmag.moments import fields
 
 
 def prepare(positions, moments, device, radii=None):

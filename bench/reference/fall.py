@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 import warpmag
-from warpmag import oracle
+from bench.reference import oracle
 
 RADIUS, SATURATION, DENSITY = 0.005, 1.7e6, 7870.0
 FIELD = np.array([2e5, 0.0, 1e5])

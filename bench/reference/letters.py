@@ -15,9 +15,10 @@ import numpy as np
 import warp as wp
 
 from bench.reference.table import FAINT
-from warpmag import demagnetization, even_field, facets, lattice
+from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import lettering
-from warpmag.system import MomentSystem
+from warpmag.shapes import demagnetization, facets, lattice
+from warpmag.shapes import uniform_response as even_field
 
 SIZE, THICKNESS, SPACING = 0.02, 0.005, 0.004
 """Height and thickness of letters in the scene, and the distance between their moments [m]."""

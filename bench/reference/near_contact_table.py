@@ -14,8 +14,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import gammaln
 
+from bench.reference.near_contact import long_range, long_range_self
 from bench.reference.spheres import sufficient_order
-from warpmag.contact_oracle import long_range, long_range_self
 from warpmag.kernels.near_contact.contact_table import FUNCTIONS, HARDNESSES, LOG_GAPS, TABLE_FILE
 
 

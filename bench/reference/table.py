@@ -14,8 +14,9 @@ import warp as wp
 
 from bench.machine import describe
 from bench.reference import susceptible
-from warpmag import demagnetization, even_field, lattice
-from warpmag.system import MomentSystem
+from warpmag.moments.system import MomentSystem
+from warpmag.shapes import demagnetization, lattice
+from warpmag.shapes import uniform_response as even_field
 
 SUSCEPTIBILITIES = (1.0, 10.0, 1000.0, math.inf)
 FAINT = 1e12

@@ -1,5 +1,5 @@
 // How fast the field of a source changes at targets, as these and the source move: what conducting balls see
-// (pairs/eddy.py). Takes the switch RATES from Python.
+// (eddy/eddy.py). Takes the switch RATES from Python.
 //
 // A target that moves at v, r away from where a source moves at v0 and turns at w, sees its field H change at
 // (u·∇)H + w × H with u = v − v0 − w × r. Moments, and with them permanent bodies, move as ``motion`` says, of which

@@ -3,8 +3,8 @@
     shape: First row and number of edges, of faces, first entry of ``begin``, first corner, first and number of points
         on edges and on faces, shape [shapes, 10].
     edge, face, corner, begin: See ``polyhedron.h``; flat.
-    edge_point, face_point: Points on edges and faces (``warpmag.polyhedra``), rows of ``passes.CHUNK`` side by side,
-        those of each shape filled up with points of no weight; flat.
+    edge_point, face_point: Points on edges and faces (``warpmag.shapes.polyhedra``), rows of ``passes.CHUNK`` side by
+        side, those of each shape filled up with points of no weight; flat.
 
 Bodies refer to them:
 
@@ -34,7 +34,7 @@ class SolidMagnet:
         volume: Volume of the first of them [m³].
         world: Its world.
         reach: Distance up to which the closed form counts [m].
-        shape: The ``warpmag.polyhedra.Polyhedron`` that bounds it, in the frame of its body.
+        shape: The ``warpmag.shapes.polyhedra.Polyhedron`` that bounds it, in the frame of its body.
         movable: Whether the force on it is wanted.
         response: k = 3χ/(3 + χ) of one that yields to fields; 0 of others.
     """

@@ -110,8 +110,8 @@ class CellCouplings:
 
     Args:
         bodies: Of each body the first moment, and the coupling of its cells: ``start``, ``other`` and ``tensor``, a
-            list for each, ``places``, ``common`` and ``hardening`` (see ``warpmag.demagnetization``). Bodies with one
-            and the same coupling share its table.
+            list for each, ``places``, ``common`` and ``hardening`` (see ``warpmag.shapes.demagnetization``). Bodies
+            with one and the same coupling share its table.
         worlds: First inducible moment of each world, and the end of them, shape [worlds, 2].
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].

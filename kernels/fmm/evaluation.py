@@ -27,7 +27,8 @@ class CellSums:
         quantity: What is summed; of ``MUTUAL_FORCE`` as of ``FORCE``.
         first: Column in the grid of the first target column.
         sources: Whether each moment counts as a source, NumPy, shape [n]; None means all do.
-        ranks: Processes that share out the sums (``warpmag.ranks.Ranks``); None means that there is but this one.
+        ranks: Processes that share out the sums (``warpmag.moments.ranks.Ranks``); None means that there is but this
+            one.
     """
 
     def __init__(

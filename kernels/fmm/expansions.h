@@ -1,5 +1,5 @@
 // Expansions of cells: multipoles of moments, of parents from their children, local expansions of children from their
-// parents', and fields from those. expansions.py says what the arrays are; warpmag/harmonics.py has the equations.
+// parents', and fields from those. expansions.py says what the arrays are; warpmag/moments/harmonics.py has the equations.
 //
 // The gradient of a harmonic is a sum of a few harmonics of one degree less. So moments are first summed with plain
 // harmonics, S_jc = Σ m_c R_j(u), of which a leaf makes its multipole once; and its local expansion becomes the

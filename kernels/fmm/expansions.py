@@ -1,6 +1,6 @@
 """Expansions of cells: from moments to multipoles, up and down between levels, and from local expansions to fields.
 
-What is particular to the harmonics comes from the caller, as numbers (``warpmag/fmm.py``).
+What is particular to the harmonics comes from the caller, as numbers (``warpmag/moments/fmm.py``).
 """
 
 from dataclasses import dataclass

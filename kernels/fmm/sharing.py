@@ -26,7 +26,7 @@ class CellShares:
 
     Args:
         grid: The cells of all.
-        ranks: The processes (``warpmag.ranks.Ranks``).
+        ranks: The processes (``warpmag.moments.ranks.Ranks``).
 
     Attributes:
         leaves: First leaf of this process, and the end after its last, shape [2].

@@ -70,7 +70,7 @@ def curve_tables(measured, dtype, device) -> wp.array:
     """Return the rows of measured curves for the kernels, shape [rows, 8].
 
     Args:
-        measured: Curves as :class:`warpmag.curves.MagnetizationCurve` has them: knots ``fields`` and
+        measured: Curves as :class:`warpmag.declarations.curves.MagnetizationCurve` has them: knots ``fields`` and
             ``magnetizations`` [A/m], ``slopes`` dM/dH at them, ``saturation`` [A/m] and the largest ``susceptibility``.
         dtype: Warp scalar type.
         device: Warp device.

@@ -79,7 +79,8 @@ class PairEvaluation:
         form: Form of the sums; None means the fastest.
         sums: Sums of the caller's: called with effective moments, packed columns of the target rows, and the partial
             sums to write, it launches them.
-        ranks: Processes that share out the sums (``warpmag.ranks.Ranks``); None means that there is but this one.
+        ranks: Processes that share out the sums (``warpmag.moments.ranks.Ranks``); None means that there is but this
+            one.
 
     Attributes:
         form: ``LOOP``, ``FUSED``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.

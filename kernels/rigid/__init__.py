@@ -9,7 +9,7 @@
 | stepping | the state machine of a step: substeps, attempts, log |
 | keyed_poses | poses and velocities of kinematic bodies whose transforms are keyed |
 | free_motion | what forces change in velocities, and velocities in poses |
-| contact_solve | XPBD's iterations over contacts; law in `contact_law.h`, all in a launch in `contact_cluster.h` |
+| contact_solve | XPBD's iterations over contacts; law in `contact_law.h`, all in a launch in `solve_cluster.h` |
 | joints | what XPBD's iterations over joints lack in Newton's kernels: moments, drives, slow motion |
 | mass_splitting | a correction to XPBD: shares of bodies that many contacts push |
 

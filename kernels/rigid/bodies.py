@@ -58,7 +58,7 @@ class ShapeMagnets:
     Attributes:
         kind: 0 for a shape that is no magnet.
         saturation, susceptibility, curve, recoil_permeability, moment_spacing, conductivity: As in
-            ``warpmag.engine.attributes``.
+            ``warpmag.engine.magnets.attributes``.
     """
 
     kind: wp.array[wp.int32]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.shared.keyed import (
+from warpmag.kernels.rigid.keys import (
     KeyedValues,
     key_before,
     keyed_number,

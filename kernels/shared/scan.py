@@ -1,4 +1,4 @@
-"""Prefix sums that allocate nothing, for the conditional nodes of CUDA graphs (see ``warpmag.engine.capture``)."""
+"""Prefix sums without allocation, as conditional nodes of CUDA graphs need (``engine/pile_xpbd/capture.py``)."""
 
 import warp as wp
 

@@ -127,7 +127,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
 @contextlib.contextmanager
 def _recorded() -> Iterator[list]:
     """Keep the simulations that are run meanwhile."""
-    from warpmag.engine.simulation import Simulation  # noqa: PLC0415 - a worker has it imported
+    from warpmag.engine.stepping.simulation import Simulation  # noqa: PLC0415 - a worker has it imported
 
     simulations, before = [], Simulation.run
 

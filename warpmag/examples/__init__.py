@@ -14,8 +14,8 @@ from pathlib import Path
 import newton.examples
 import warp as wp
 
-from warpmag.engine.display import no_viewer
 from warpmag.errors import InputError, extra
+from warpmag.show.display import no_viewer
 from warpmag.terminal import quiet_warp
 
 __all__ = ["create_parser", "get_examples", "init", "main", "run"]

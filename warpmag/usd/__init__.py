@@ -6,20 +6,18 @@ attributes right even then).
 """
 
 from warpmag.usd.schemas import author_magnet, author_settings, magnet_of, magnet_prim_of  # isort: skip  (registers the schemas first)
-from warpmag.usd.alike import MOMENTS, AlikeBalls, BallFrames
-from warpmag.usd.check import StageReport, check, inspect
-from warpmag.usd.clock import StageClock, stage_clock
-from warpmag.usd.coils import author_coil, author_field_map, is_source, placed_sources
-from warpmag.usd.densities import give_densities, has_volume
-from warpmag.usd.guard import readable, refusals
-from warpmag.usd.instancers import complete_instances
-from warpmag.usd.joints import GroundedJoint, enabled_joints, prepare_joints
-from warpmag.usd.looks import author_surface, metalness
-from warpmag.usd.meshes import author_mesh
-from warpmag.usd.motion import Recording, read_recording
 from warpmag.usd.paths import usable_path
-from warpmag.usd.playback import Playback
-from warpmag.usd.reader import (
+from warpmag.usd.read.alike import MOMENTS, AlikeBalls, BallFrames
+from warpmag.usd.read.check import StageReport, check, inspect
+from warpmag.usd.read.clock import StageClock, stage_clock
+from warpmag.usd.read.coils import author_coil, author_field_map, is_source, placed_sources
+from warpmag.usd.read.densities import give_densities, has_volume
+from warpmag.usd.read.guard import readable, refusals
+from warpmag.usd.read.instancers import complete_instances
+from warpmag.usd.read.joints import GroundedJoint, enabled_joints, prepare_joints
+from warpmag.usd.read.motion import Recording, read_recording
+from warpmag.usd.read.playback import Playback
+from warpmag.usd.read.reader import (
     StageContents,
     describe,
     first_camera,
@@ -30,10 +28,9 @@ from warpmag.usd.reader import (
     read_magnets,
     survey,
 )
-from warpmag.usd.render_layer import RenderLayer
-from warpmag.usd.swarms import Swarm, swarms_of
+from warpmag.usd.read.swarms import Swarm, swarms_of
 from warpmag.usd.values import Finding
-from warpmag.usd.writer import CacheWriter, Earlier
+from warpmag.usd.write.writer import CacheWriter, Earlier
 
 __all__ = [
     "MOMENTS",
@@ -45,7 +42,6 @@ __all__ = [
     "GroundedJoint",
     "Playback",
     "Recording",
-    "RenderLayer",
     "StageClock",
     "StageContents",
     "StageReport",
@@ -53,9 +49,7 @@ __all__ = [
     "author_coil",
     "author_field_map",
     "author_magnet",
-    "author_mesh",
     "author_settings",
-    "author_surface",
     "check",
     "complete_instances",
     "describe",
@@ -68,7 +62,6 @@ __all__ = [
     "is_source",
     "magnet_of",
     "magnet_prim_of",
-    "metalness",
     "open_apart",
     "open_motion",
     "open_stage",

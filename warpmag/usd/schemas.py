@@ -1,7 +1,7 @@
 """The applied API schemas ``WarpmagMagnetAPI`` and ``WarpmagSceneAPI``: registration, authoring and reading.
 
 The schemas are codeless; their text is ``schema/generatedSchema.usda``. Each attribute stands for one field of
-:class:`warpmag.magnets.Magnet` or :class:`warpmag.magnets.MagneticSettings`.
+:class:`warpmag.declarations.magnets.Magnet` or :class:`warpmag.declarations.magnets.MagneticSettings`.
 """
 
 import dataclasses
@@ -10,12 +10,19 @@ from pathlib import Path
 import newton_usd_schemas  # noqa: F401  (registers Newton's own schemas, which must happen before a stage is opened)
 from pxr import Gf, Plug, Sdf, Usd
 
-from warpmag import materials
-from warpmag.curves import MagnetizationCurve
+from warpmag.declarations import materials
+from warpmag.declarations.curves import MagnetizationCurve
+from warpmag.declarations.keys import Keys
+from warpmag.declarations.magnets import (
+    Magnet,
+    MagneticSettings,
+    check_curve,
+    check_finite,
+    check_material,
+    check_recoil,
+)
 from warpmag.errors import InputError
-from warpmag.keyed import Keys
-from warpmag.magnets import Magnet, MagneticSettings, check_curve, check_finite, check_material, check_recoil
-from warpmag.usd.keyed import KeyReader
+from warpmag.usd.read.keys import KeyReader
 from warpmag.usd.values import instance_finding, number, text, vector
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))

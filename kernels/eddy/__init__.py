@@ -1,0 +1,4 @@
+"""Eddy currents in single-moment balls.
+
+May import ``shared``, ``material`` and ``pairs``.
+"""

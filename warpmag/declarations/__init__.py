@@ -1,0 +1,1 @@
+"""Declarations of magnets, materials, coils and scenes: plain data and checks. Imports NumPy only."""

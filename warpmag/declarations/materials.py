@@ -1,0 +1,194 @@
+"""Magnetic materials by name.
+
+Values are typical ones at room temperature; a data sheet of the very part is better. The susceptibility is the initial
+one, of small fields: that of a ball hardly matters above 100, for its own demagnetizing field limits it to 3. Some have
+a measured curve (``measured.py``) in the place of both, which has the knee right. Densities are those of Bozorth's
+table and of makers' data sheets, rounded.
+"""
+
+import math
+from dataclasses import dataclass
+
+from warpmag.declarations.curves import MU0, MagnetizationCurve
+from warpmag.declarations.magnets import check_curve, shown
+from warpmag.declarations.measured import MEASURED_CURVES
+from warpmag.errors import InputError
+
+_BOZORTH = (
+    "R. M. Bozorth, Ferromagnetism, 1951, table of magnetic materials: permeability at 2 mT, saturation, resistivity"
+)
+_NDFEB = "GB/T 13560-2017, sintered NdFeB, middle of the range of remanence"
+
+
+@dataclass(frozen=True)
+class Material:
+    """A magnetic material.
+
+    Attributes:
+        name: Its name.
+        kind: ``inducible`` or ``permanent``.
+        polarization: Saturation polarization μ0·Ms of an inducible, remanence Br of a permanent material [T].
+        permeability: Initial relative permeability of an inducible material [dimensionless].
+        density: Mass density [kg/m³].
+        source: Where the numbers are from.
+        curve: Measured magnetization curve of an inducible material, None where it has none. Saturation and
+            permeability are then what it leads to, and the largest.
+        conductivity: Electrical conductivity [S/m], 0 where the source has none. A magnet does not take it by itself:
+            only balls do (``add_inducible(..., conductivity=...)``), and it costs a sum over pairs.
+    """
+
+    name: str
+    kind: str
+    polarization: float
+    permeability: float
+    density: float
+    source: str
+    curve: MagnetizationCurve | None = None
+    conductivity: float = 0.0
+
+    @property
+    def saturation(self) -> float:
+        """Saturation magnetization Ms [A/m] of an inducible material."""
+        return self.polarization / MU0
+
+    @property
+    def susceptibility(self) -> float:
+        """Susceptibility χ [dimensionless] of an inducible material."""
+        return self.permeability - 1.0
+
+    @property
+    def magnetization(self) -> float:
+        """Magnetization M = Br/μ0 [A/m] of a permanent material."""
+        return self.polarization / MU0
+
+
+def _inducible(name, saturation, permeability, density, resistivity, source):
+    return Material(name, "inducible", saturation, permeability, density, source, conductivity=1.0 / resistivity)
+
+
+def _measured(name, density):
+    source, *rows = MEASURED_CURVES[name]
+    h, b = zip(*(point for row in rows for point in row), strict=True)
+    curve = MagnetizationCurve.from_bh(h, b, name=name)
+    return Material(name, "inducible", MU0 * curve.saturation, 1.0 + curve.susceptibility, density, source, curve)
+
+
+def _permanent(name, remanence, density, source):
+    return Material(name, "permanent", remanence, math.nan, density, source)
+
+
+MATERIALS = {
+    one.name: one
+    for one in (
+        _inducible("iron", 2.15, 200.0, 7870.0, 1e-7, f"{_BOZORTH}; 99.91 % Fe"),
+        _inducible("mild-steel", 2.10, 180.0, 7870.0, 1e-7, f"{_BOZORTH}; cold-rolled steel, 98.5 % Fe"),
+        _inducible("silicon-steel", 1.97, 500.0, 7650.0, 6e-7, f"{_BOZORTH}; 4 % Si"),
+        _inducible("permalloy", 1.07, 8000.0, 8600.0, 1.6e-7, f"{_BOZORTH}; 78.5 % Ni"),
+        _inducible("mumetal", 0.65, 20000.0, 8580.0, 6.2e-7, f"{_BOZORTH}; 77 % Ni, 5 % Cu, 2 % Cr"),
+        _inducible("soft-ferrite", 0.47, 2300.0, 4800.0, 5.0, "Ferroxcube, Soft Ferrites, 2013; 3C90 (MnZn) at 25 °C"),
+        _measured("pure-iron", 7870.0),
+        _measured("1010-steel", 7870.0),
+        _measured("M-19", 7650.0),
+        _measured("430-stainless", 7700.0),
+        _permanent("N35", 1.195, 7500.0, _NDFEB),
+        _permanent("N42", 1.30, 7500.0, _NDFEB),
+        _permanent("N52", 1.45, 7500.0, _NDFEB),
+        _permanent("SmCo", 1.05, 8300.0, "Magna Tokyo, magnet characteristics: Sm2Co17"),
+        _permanent("AlNiCo5", 1.27, 7300.0, "Magna Tokyo, magnet characteristics"),
+        _permanent("AlNiCo8", 0.88, 7250.0, "Magna Tokyo, magnet characteristics"),
+        _permanent("hard-ferrite", 0.385, 4900.0, "Chinese standard grade Y30 (C5), middle of the range of remanence"),
+    )
+}
+"""Every material by its name."""
+
+
+def material(name: str) -> Material:
+    """Return a material by its name.
+
+    Raises:
+        InputError: There is no such material; the message names all.
+    """
+    return _look_up("material", name)
+
+
+def inducible(owner: str, name: str) -> dict:
+    """Return saturation [A/m] and susceptibility of an inducible material, or its curve, as arguments of a magnet.
+
+    Args:
+        owner: Who asks, for the message.
+        name: The material.
+
+    Raises:
+        InputError: There is no such material, or it is a permanent one.
+    """
+    found = _look_up(owner, name, "inducible")
+    if found.curve is not None:
+        return {"curve": found.curve}
+    return {"saturation": found.saturation, "susceptibility": found.susceptibility}
+
+
+def inducible_from(material: str | None, curve, given: dict) -> dict:
+    """Return what a material, a curve and numbers make of an inducible magnet, as its arguments.
+
+    Args:
+        material: Name of a material, or None.
+        curve: What :func:`measured` takes, or None.
+        given: Saturation [A/m] and susceptibility, where they are given.
+
+    Raises:
+        InputError: Two say the same.
+    """
+    values = given if curve is None else {**given, "curve": measured("curve", curve)}
+    table = isinstance(values.get("curve"), MagnetizationCurve)
+    brought = {} if material is None else inducible("material", material)
+    says = ("saturation", "susceptibility", "curve") if table or "curve" in brought else tuple(brought)
+    twice = [name for name in values if name in says and (material is not None or name != "curve")]
+    if twice and (material is not None or table):
+        who = f"material: {shown(material)}" if material is not None else "curve: it"
+        raise InputError(f"{who} says what {' and '.join(twice)} are, give one or the other")
+    return {**values, **brought}
+
+
+def measured(owner: str, curve):
+    """Return a magnetization curve: one with a token as it is, a measured one, or that of a material by its name.
+
+    Raises:
+        InputError: It is none of them.
+    """
+    known = [one.name for one in MATERIALS.values() if one.curve is not None]
+    if isinstance(curve, str) and curve in known:
+        return MATERIALS[curve].curve
+    check_curve(owner, curve, tuple(known))
+    return curve
+
+
+def name_of_curve(curve: MagnetizationCurve) -> str | None:
+    """Return the material that has a curve, None if none has."""
+    return next((one.name for one in MATERIALS.values() if one.curve == curve), None)
+
+
+def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the magnetization [A/m] of a permanent material along a direction of any length.
+
+    Args:
+        owner: Who asks, for the message.
+        name: The material.
+        direction: Where it is magnetized to.
+
+    Raises:
+        InputError: There is no such material, it is an inducible one, or the direction has no length.
+    """
+    found = _look_up(owner, name, "permanent")
+    length = math.hypot(*direction)
+    if not (length > 0.0 and math.isfinite(length)):
+        raise InputError(f"{owner}: magnetization: must have a direction for {name} to be magnetized in")
+    x, y, z = (found.magnetization * component / length for component in direction)
+    return x, y, z
+
+
+def _look_up(owner: str, name: str, kind: str | None = None) -> Material:
+    known = [one.name for one in MATERIALS.values() if kind in (None, one.kind)]
+    if not isinstance(name, str) or name not in known:
+        which = f"{kind} material" if kind else "material"
+        raise InputError(f"{owner}: {shown(name)} is no {which} known here, which are {', '.join(known)}")
+    return MATERIALS[name]

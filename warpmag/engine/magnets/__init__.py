@@ -1,0 +1,1 @@
+"""Magnets of a Newton model: declared on a builder, evaluated on a model."""

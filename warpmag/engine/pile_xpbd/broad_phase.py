@@ -1,0 +1,110 @@
+"""Newton's broad phase, by lists of neighbouring balls in place of a sort of all shapes, and the contacts of balls."""
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.kernels.contacts.broad_phase import PARTNERS, allocate, launch_find_shape_pairs
+from warpmag.kernels.pairs.neighbors import carried_lists
+from warpmag.kernels.rigid.newton_views import view_contacts
+
+_TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.BOX)
+"""Newton's types of ``PARTNERS``."""
+
+
+class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
+    """Finds the pairs of shapes that may touch; takes the place of the sweep of a ``CollisionPipeline``.
+
+    Once told where to, by :meth:`write_contacts`, it writes the contacts of balls, and leaves out their pairs. See
+    ``kernels.contacts.broad_phase`` for the method, and for the pairs of balls that it leaves out anyway.
+
+    Attributes:
+        leaves_pairs: Whether any pairs may be left for the pipeline to look at.
+    """
+
+    def __init__(self, model: newton.Model, farthest: float):
+        """Plan the search; the sweep stands in where it would take too long.
+
+        Args:
+            model: The model.
+            farthest: ``speculative_contact_gap_max`` of the pipeline [m].
+        """
+        colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
+        spheres = model.shape_type.numpy() == newton.GeoType.SPHERE
+        sought = model.shape_scale.numpy()[:, 0] + model.shape_margin.numpy() + model.shape_gap.numpy()
+        self._search = allocate(
+            model.shape_world.numpy(),
+            model.shape_body.numpy(),
+            colliding,
+            np.where(spheres, sought, np.nan),
+            farthest=farthest,
+            device=wp.get_device(model.device),
+        )
+        self._model = model
+        self.leaves_pairs = True
+        if self._search is None:
+            super().__init__(model.shape_world, shape_flags=model.shape_flags, sort_type="auto", device=model.device)
+            return
+        a = self._search.arrays
+        a.kind = wp.full(model.shape_count, len(PARTNERS), dtype=int, device=model.device)
+        a.scale, a.margin, a.gap = model.shape_scale, model.shape_margin, model.shape_gap
+
+    def write_contacts(self, pipeline: newton.CollisionPipeline, contacts: newton.Contacts) -> None:
+        """Have the contacts of balls written, too.
+
+        Args:
+            pipeline: The pipeline that finds the pairs of all shapes through this.
+            contacts: Where it writes contacts.
+        """
+        if self._search is None:
+            return
+        types = self._model.shape_type.numpy()
+        kinds = np.select([types == kind for kind in _TYPES], np.arange(len(PARTNERS)), len(PARTNERS))
+        a = self._search.arrays
+        a.kind.assign(kinds.astype(np.int32))
+        self.leaves_pairs = self._may_leave_pairs(kinds)
+        a.placement, a.frame = self._model.shape_transform, pipeline.geom_transform
+        a.contacts = view_contacts(self._model, contacts)
+
+    def _may_leave_pairs(self, kinds: np.ndarray) -> bool:
+        """Whether there are shapes whose contacts with balls are not found here, or that move and are no balls."""
+        model, kinematic = self._model, newton.BodyFlags.KINEMATIC
+        colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
+        flags = np.append(model.body_flags.numpy(), kinematic)  # of what has no body
+        body: np.ndarray = model.shape_body.numpy()
+        moving = (flags[body] & kinematic) == 0
+        others = colliding & (kinds != PARTNERS.index("ball"))
+        return bool((others & (moving | (kinds == len(PARTNERS)))).any())
+
+    def set_motion(self, state: newton.State, dt: float) -> None:
+        """Tell how bodies move, by ``state``, in the next ``dt`` [s] for which pairs are sought."""
+        if self._search is not None:
+            self._search.arrays.body_qd, self._search.arrays.dt = state.body_qd, dt
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return the arrays that one search hands on to the next one, by name."""
+        if self._search is None:
+            return {}
+        lists = self._search.arrays.lists
+        return carried_lists(lists) | {"packed": lists.packed}
+
+    def launch(self, shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count,
+               candidate_pair, candidate_pair_count, **options) -> None:  # fmt: skip
+        """Find the pairs; arguments as those of Newton's sweep."""
+        if self._search is None:
+            super().launch(
+                *(shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count),
+                *(candidate_pair, candidate_pair_count),
+                **options,
+            )
+            return
+        a = self._search.arrays
+        a.lower, a.upper, a.displacement = shape_lower, shape_upper, options.get("shape_displacement")
+        a.group, a.world, a.body, a.body_flags = (
+            *(shape_collision_group, shape_world),
+            *(options["shape_body"], options["body_flags"]),
+        )
+        a.excluded, a.excluded_count = options["filter_pairs"], options["num_filter_pairs"] or 0
+        a.fixed_pairs = int(options["include_static_kinematic_pairs"])
+        a.pairs, a.pair_count = candidate_pair, candidate_pair_count
+        launch_find_shape_pairs(self._search)

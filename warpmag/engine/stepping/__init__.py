@@ -1,0 +1,1 @@
+"""Advances a Newton model with magnets in time."""

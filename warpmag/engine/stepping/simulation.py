@@ -1,0 +1,469 @@
+"""Simulates a scene of magnets: a USD stage, or a Newton builder."""
+
+import contextlib
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.declarations.magnets import MagneticSettings, check_flag, check_positive, shown
+from warpmag.engine.magnets.attributes import NAMESPACE
+from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.engine.pile_xpbd.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
+from warpmag.engine.stepping.drive import Drive
+from warpmag.engine.stepping.fitness import articulate, check_control, check_model, solver_warnings
+from warpmag.engine.stepping.joint_gaps import strain_warnings, strained_joints
+from warpmag.engine.stepping.statistics import Statistics, find_held
+from warpmag.engine.stepping.stepper import Stepper
+from warpmag.errors import InputError, SimulationError
+from warpmag.garbage import collection_paused
+from warpmag.moments.arrays import resolve_device
+from warpmag.moments.ranks import agreed, ranks
+
+DEFAULT_STEP = 1e-3
+"""Time step [s] where neither the user nor the stage gives one: the paper's."""
+LONGEST_SUBSTEP = 5e-4
+"""Upper limit of a substep [s]: with XPBD's 60 iterations piles of 5 mm balls then come to rest."""
+_OVERLAP = 1e-4
+"""Bodies that overlap at the start by more than this part of their thickness are worth a warning."""
+_TOUCHING = 0.05
+"""Bodies closer than this part of their thickness touch, for the count of held ones."""
+_FRAME_RATE = 60.0
+"""Output frames per second [Hz] of a scene that is no stage."""
+_AHEAD = 16
+"""Steps that a GPU is given before the host writes the frame before them; a GPU makes it wait from some 20 on."""
+_STRONGEST_FIELD = 1e8
+"""Field, magnetization [A/m] or current [A] that is named where a run ends; the strongest are ten times less."""
+
+
+class Simulation:
+    """A scene of magnets that moves.
+
+    Attributes:
+        model: Newton's model.
+        step_size: Time step [s].
+        frame_rate: Output frames per second [Hz].
+        frame_count: Output frames that the stage asks for, the first excluded; None where it has no time range.
+    """
+
+    @collection_paused()
+    def __init__(
+        self,
+        scene: str | os.PathLike | newton.ModelBuilder,
+        *,
+        step: float | None = None,
+        solver: str = "xpbd",
+        force: str | None = None,
+        dynamics: str | None = None,
+        contact_model: str | None = None,
+        method: str = "auto",
+        rtol: float | None = None,
+        max_evaluations: int = 1000,
+        external_field: tuple[float, float, float] | None = None,
+        curve: str | None = None,
+        device: str | None = None,
+        graphs: bool = True,
+        visuals: bool = False,
+    ):
+        """Import the scene and get ready to step.
+
+        Args:
+            scene: USD file, or a builder with magnets added to it, which gets the articulations and colours that
+                ``solver`` asks for.
+            step: Time step [s]; by default the stage's, else 1 ms. It is split into substeps as motion demands.
+            solver: Newton's solver: ``xpbd``, ``steel``, ...
+            force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
+            dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
+            contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
+            method: How pairs are summed: ``direct``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
+            rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
+            max_evaluations: Field evaluations after which induction gives up.
+            external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
+            curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
+            device: Warp device; by default Warp's.
+            graphs: Replay captured graphs instead of launching kernels one by one.
+            visuals: Also import what is only seen, for a viewer.
+
+        Raises:
+            InputError: Something about the scene or an argument is wrong; the message names it.
+        """
+        check_solver(solver)
+        for name, flag in (("graphs", graphs), ("visuals", visuals)):
+            check_flag(name, flag)
+        self.device, self._ranks = resolve_device(device), ranks()
+        graphs &= self._ranks is None  # what merges the sums of ranks is in no graph of a step
+        own = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
+        how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
+        with agreed(self._ranks):
+            builder, settings, own_step = self._open(scene, visuals=visuals, articulations=solver not in MAXIMAL)
+            self.step_size = _time_step(step, own_step)
+            self.model = self._finalize(builder, solver, scene)
+            settings = settings.replaced(external_field=external_field, **own)
+            self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
+            self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
+            self._options = self._options_of(settings, solver, **how)
+            if self._ranks is not None:
+                self._ranks.check_alike(self._options | {"scene": list(self._stepper.save().values())})
+
+    def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
+        """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
+        self._scene, self.frame_rate, self.frame_count = None, _FRAME_RATE, None
+        if isinstance(scene, newton.ModelBuilder):
+            return scene, MagneticSettings(), None
+        from warpmag.engine.stepping.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
+
+        if not isinstance(scene, str | os.PathLike):
+            raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {shown(scene)}")
+        self._scene = import_scene(scene, **choices)
+        clock = self._scene.clock
+        self.frame_rate = clock.frames_per_second
+        seconds = (clock.end - clock.start) / clock.time_codes_per_second
+        self.frame_count = round(seconds * self.frame_rate) or None
+        return self._scene.builder, self._scene.magnets.settings, clock.step
+
+    def _options_of(self, settings: MagneticSettings, solver: str, **others) -> dict[str, str]:
+        """Return by what a run differs from others of its scene, in words: only an equal one can be resumed."""
+        kind = "cuda" if self._magnetics.system.device.is_cuda else "cpu"
+        options = {**vars(settings), **others, "step": self.step_size, "solver": solver, "device": kind}
+        options["external_field"] = tuple(np.asarray(settings.external_field, dtype=float).tolist())
+        return {name.replace("_", " "): str(value) for name, value in options.items()}
+
+    def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
+        """Make the model."""
+        articulate(builder, solver)
+        if not builder.body_count:  # Newton allocates nothing for bodies then; one without shapes changes nothing
+            whole = newton.ModelBuilder()
+            whole.add_builder(builder)
+            whole.add_link(is_kinematic=True)
+            builder = whole
+        if solver == "vbd":
+            builder.color()  # VBD moves bodies that touch nothing in common at once
+        with wp.ScopedDevice(self.device), self._refusals(scene):
+            model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
+        check_model(model, solver, LONGEST_SUBSTEP)
+        self._strained = strained_joints(model) if solver in MAXIMAL else {}
+        return model
+
+    def _drive(self, solver: str, own_field: bool) -> Drive | None:
+        """Return what lets the model follow the keys of its stage, those of the field if that is the stage's own."""
+        if self._scene is None:
+            return None
+        keys = self._scene.keys if own_field else replace(self._scene.keys, field=None)
+        if not any(vars(keys).values()):
+            return None
+        return Drive(self.model, self._magnetics, keys, ahead=solver in AHEAD)
+
+    def _prepare(self, solver: str, graphs: bool, drive: Drive | None) -> None:
+        """Set up what moves the bodies, and look at how they start."""
+        self._sizes = sizes = body_sizes(self.model)
+        self._solver = RigidSolver(self.model, sizes, solver=solver)
+        self._stepper = Stepper(
+            self.model,
+            self._magnetics,
+            self._solver,
+            sizes,
+            step=self.step_size,
+            longest_substep=LONGEST_SUBSTEP,
+            graphs=graphs,
+            drive=drive,
+        )
+        self._moving = np.array(
+            sorted({one.body for one in self._magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int
+        )
+        self._statistics = Statistics(magnets=len(self._moving))
+        if self._scene:
+            self._start_from_stage()
+        self._center = self._positions(self.state).mean(axis=0) if len(self._moving) else np.zeros(3)
+        overlap, _, self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)
+        self._stepper.begin_from(overlap)
+        self._statistics.coarseness = self._coarseness()
+
+    def _refusals(self, scene):
+        """Return what makes one line of Newton's errors about a stage; those about a builder stay as they are."""
+        if self._scene is None:
+            return contextlib.nullcontext()
+        from warpmag.usd import refusals  # noqa: PLC0415 - a builder can do without USD
+
+        return refusals(str(scene), "use")
+
+    def _moves(self, body: int) -> bool:
+        return math.isfinite(self._sizes.thickness[body])
+
+    def _coarseness(self) -> float:
+        """Return the distance of neighbouring single-precision positions over the thickness of the thinnest body."""
+        moving = np.isfinite(self._sizes.thickness)
+        if not moving.any():
+            return 0.0
+        farthest = np.abs(self.state.body_q.numpy()[moving, :3]).max()
+        return float(np.spacing(farthest) / self._sizes.thickness[moving].min())
+
+    def _start_from_stage(self) -> None:
+        """Let induction start from the moments that the stage holds, of an earlier run say."""
+        given = {}
+        volumes = dict(zip(self._magnetics.shapes.tolist(), self._magnetics.shape_volumes.tolist(), strict=True))
+        for prim, moment in self._scene.magnets.initial_moments.items():
+            shapes = self._scene.magnet_shapes[prim]
+            volume = sum(volumes[shape] for shape in shapes)
+            given |= dict.fromkeys(shapes, np.array(moment) / volume)
+        if given:
+            self._magnetics.start_from(given)
+
+    @property
+    def state(self) -> newton.State:
+        """The present state; waits for the device.
+
+        Raises:
+            SimulationError: The state was not finite any more; it is that of the last step that held.
+        """
+        self._look()
+        return self._stepper.state
+
+    @property
+    def control(self) -> newton.Control:
+        """Forces and targets of joints, as the scene has them at first; what a step in a graph reads, too.
+
+        Assign to its arrays between steps, ``simulation.control.joint_target_q.assign(...)``, or write into them by
+        kernels of your own. Another control of this model may be put in its place, which makes a graph anew.
+        """
+        return self._stepper.control
+
+    @control.setter
+    def control(self, control: newton.Control) -> None:
+        self._look()
+        check_control(control, self.model)
+        if control is not self._stepper.control:
+            self._stepper.control = control
+
+    @property
+    def magnetics(self) -> Magnetics:
+        """Its magnets, as of the present state; waits as :attr:`state` does."""
+        self._look()
+        return self._magnetics
+
+    @property
+    def statistics(self) -> Statistics:
+        """Figures of the run so far, those of the end filled in by :meth:`finish`; waits as :attr:`state` does."""
+        self._look()
+        return self._statistics
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
+        known = self._scene.warnings if self._scene else tuple(strain_warnings(self._strained))
+        known += tuple(solver_warnings(self._options["solver"]))
+        lines, figures, rtol = [], self.statistics, self._magnetics.system.rtol
+        if figures.field_error > rtol:
+            lines = [
+                f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; sum by method direct"
+            ]
+        return [*known, *figures.warnings(), *lines]
+
+    @property
+    def capture_failure(self) -> str:
+        """Why steps are launched from Python, which is slower, and not as one graph; empty where they are a graph."""
+        return self._stepper.capture_failure
+
+    @property
+    def time(self) -> float:
+        """Time since the start [s]."""
+        return self._stepper.steps * self.step_size
+
+    def step(self) -> None:
+        """Advance by one step; on a GPU without waiting for it.
+
+        Raises:
+            SimulationError: The state is not finite any more; on a GPU up to 64 steps later.
+        """
+        self._stepper.advance()
+        if self._stepper.due:
+            self._look()
+
+    def _look(self) -> None:
+        self._magnetics.check_model()
+        try:
+            for report in self._stepper.look():
+                self._statistics.add_step(report)
+        except SimulationError as error:
+            if not (cause := self._cause()):
+                raise
+            raise SimulationError(f"{error}; {cause}") from None
+
+    def _cause(self) -> str:
+        """Return why the state may have left all finite numbers, as far as the start and the run so far tell."""
+        if self._statistics.overlapping:
+            return "bodies overlapped at the start, and pushing them apart may turn them faster and faster"
+        if self._strained:
+            return f"the ends of the joint {next(iter(self._strained))} were apart at the start, and it pulls at them"
+        if self._statistics.capped:
+            return "bodies were moving too fast for the shortest substep before"
+        given = getattr(self.model, NAMESPACE)
+        strengths = {
+            "an applied field of {:.3g} A/m": self._magnetics.system.external_field.numpy(),
+            "a magnetization of {:.3g} A/m": given.magnetization.numpy(),
+            "a coil's current [A] or a field map's factor of {:.3g}": given.strength.numpy(),
+        }
+        for name, values in strengths.items():
+            strongest = float(np.abs(values).max(initial=0.0))
+            if strongest > _STRONGEST_FIELD:
+                return f"{name.format(strongest)} moves magnets too fast for the shortest substep"
+        return ""
+
+    def _positions(self, state: newton.State) -> np.ndarray:
+        return state.body_q.numpy()[self._moving, :3].astype(float)
+
+    def run(
+        self,
+        frames: int | None = None,
+        *,
+        output: str | os.PathLike | None = None,
+        copy_scene: bool = False,
+        resume: bool = False,
+        on_frame: Callable[[int], bool | None] | None = None,
+    ) -> Statistics:
+        """Simulate, and record the frames on a USD stage.
+
+        A frame is taken at the step nearest to its time and stands at the time of that step. Frames are written as they
+        come, so that the stage has them whatever ends the process.
+
+        Args:
+            frames: Output frames after the first; by default those of the stage, else one second.
+            output: USD file to write; only for a scene that came from a stage.
+            copy_scene: Copy the scene beside the output instead of pointing to it; one with unsaved edits always is.
+            resume: Go on with the run at the output, of the same scene with the same options, if there is one; on a CPU
+                it ends with the bits of a run that was never interrupted.
+            on_frame: Called after each frame with its number, from 0; returning False ends the run.
+
+        Returns:
+            The statistics, :meth:`finish` done.
+
+        Raises:
+            InputError: The output cannot be written, or what is there cannot be resumed.
+            SimulationError: The state is not finite any more.
+        """
+        frames = self.frames_of(frames)
+        recorder = None if output is None else self._open_recorder(output, copy_scene, frames)
+        if resume and recorder is None:
+            raise InputError("resume: only a run with an output can be resumed")
+        if resume and self._stepper.steps:
+            raise ValueError("only a simulation that has not begun can resume another")
+        if resume and self._options["solver"] in UNRESUMABLE:
+            raise InputError(f"resume: runs of the solver {self._options['solver']} cannot be resumed")
+        resumed = complete = False
+        try:
+            try:
+                if resume:
+                    resumed, complete = recorder.resume(frames, self._steps_at(frames), self.step_size)
+                if not complete:
+                    complete = self._run_frames(frames, recorder, on_frame, resumed)
+            finally:
+                if recorder:
+                    recorder.close(complete)
+        except (KeyboardInterrupt, InputError, SimulationError) as end:
+            if recorder and recorder.written is not None:
+                known = f"{output} has the frames up to {round(recorder.written * self.frame_rate)}"
+                end.args = (", ".join(filter(None, (str(end), known))),)
+            raise
+        return self.finish()
+
+    def _run_frames(self, frames: int, recorder, on_frame: Callable[[int], bool | None] | None, resumed: bool) -> bool:
+        """Simulate and record, the first frame unless ``resumed``; return whether all frames are done."""
+        figures, before = self._statistics, self._statistics.wall_seconds
+        began = time.perf_counter()
+        try:
+            for frame in range(frames + 1):
+                target = self._steps_at(frame)
+                if target <= self._stepper.steps and (frame or resumed):
+                    continue  # done before, or steps are longer than frames: several would stand at one time
+                ahead = min(self._stepper.steps + _AHEAD, target)
+                while self._stepper.steps < target:
+                    self.step()
+                    if recorder and self._stepper.steps == ahead:
+                        recorder.write()
+                state = self.state
+                self._follow(state)
+                figures.wall_seconds = before + time.perf_counter() - began
+                if recorder:
+                    recorder.add_frame(self.time, state)
+                if on_frame and on_frame(frame) is False:
+                    return frame == frames
+            return True
+        finally:
+            figures.wall_seconds = before + time.perf_counter() - began
+
+    def frames_of(self, frames: int | None) -> int:
+        """Return how many frames a run of ``frames`` has, which may be None for the scene's own number."""
+        if frames is None:
+            frames = self.frame_count if self.frame_count is not None else round(self.frame_rate)
+        if not (isinstance(frames, int) and frames > 0):
+            raise InputError(f"frames: must be a positive whole number, got {frames}")
+        return frames
+
+    def _open_recorder(self, output: str | os.PathLike, copy_scene: bool, frames: int):
+        if self._scene is None:
+            raise InputError(f"{Path(output)}: only a scene that came from a stage can be written to one")
+        from warpmag.engine.stepping.recording import Recorder  # noqa: PLC0415 - a builder can do without USD
+
+        return Recorder(
+            self._scene,
+            self._magnetics,
+            self._stepper,
+            self._statistics,
+            output,
+            copy_scene=copy_scene,
+            frames=frames + 1,
+            options=self._options,
+            resumable=self._options["solver"] not in UNRESUMABLE,
+            ranks=self._ranks,
+        )
+
+    def _steps_at(self, frame: int) -> int:
+        """Return how many steps are done at a frame."""
+        return round(frame / (self.frame_rate * self.step_size))
+
+    def _follow(self, state: newton.State) -> None:
+        if len(self._moving):
+            distance = np.linalg.norm(self._positions(state) - self._center, axis=1).max()
+            self._statistics.farthest = max(self._statistics.farthest, float(distance))
+
+    def finish(self) -> Statistics:
+        """Fill in the figures of the end and return the statistics."""
+        figures = self.statistics
+        figures.field_error = self._magnetics.system.field_error()
+        figures.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
+        figures.overlap, figures.depth = max(figures.overlap, figures.final_overlap), max(figures.depth, depth)
+        speeds = np.linalg.norm(self.state.body_qd.numpy()[:, :3], axis=1)
+        held = np.intersect1d(np.flatnonzero(self._held()), self._moving)
+        figures.held = len(held)
+        figures.held_rms_speed = float(np.sqrt(np.mean(speeds[held] ** 2))) if len(held) else 0.0
+        figures.held_median_speed = float(np.median(speeds[held])) if len(held) else 0.0
+        figures.rms_speed = float(np.sqrt(np.mean(speeds[self._moving] ** 2))) if len(self._moving) else 0.0
+        return figures
+
+    def _held(self) -> np.ndarray:
+        """Return which bodies a magnet holds; behind the bodies stand the static shapes, each for itself."""
+        model, contacts = self.model, self._solver.contacts
+        shape_body = model.shape_body.numpy()
+        node = np.where(shape_body >= 0, shape_body, model.body_count + np.arange(model.shape_count))
+        fixed = np.ones(model.body_count + model.shape_count, dtype=bool)
+        fixed[: model.body_count] = ~np.isfinite(self._sizes.thickness)
+        permanent = [one.magnet.kind == "permanent" for one in self.magnetics.magnets for _ in one.shapes]
+        holds = np.zeros_like(fixed)
+        holds[node[self.magnetics.shapes[fixed[node[self.magnetics.shapes]] | permanent]]] = True
+
+        count = int(contacts.rigid_contact_count.numpy()[0])
+        sides = [getattr(contacts, f"rigid_contact_shape{k}").numpy()[:count] for k in (0, 1)]
+        pairs = node[np.stack(sides, axis=1)]
+        touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
+        return find_held(pairs[touching], holds, fixed)[: model.body_count]
+
+
+def _time_step(given: float | None, own: float | None) -> float:
+    """Return the time step [s]: the one that is given, else the scene's own, else the default."""
+    step = next(one for one in (given, own, DEFAULT_STEP) if one is not None)
+    check_positive("step", step)
+    return float(step)

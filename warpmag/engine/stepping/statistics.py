@@ -1,0 +1,180 @@
+"""What a run reports about itself."""
+
+import math
+from array import array
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from warpmag.engine.stepping.stepper import StepReport
+
+_COARSE = 1e-3
+"""Coarseness of positions from which on contacts tremble: they are settled to about a thousandth of the thickness."""
+_UNTIMED = (math.nan,) * 3
+"""Times of a step in which kernels were compiled."""
+_DEEP = 0.05
+"""Penetration over the thickness that no user takes for contact."""
+
+
+@dataclass
+class Statistics:
+    """Figures of a run, gathered step by step.
+
+    Attributes:
+        magnets: Bodies with magnets that forces move.
+        steps: Steps done.
+        substeps: Substeps done, repeated ones left out.
+        repeated: Attempts at steps that were thrown away.
+        capped: Steps in which a body moved farther in a substep than allowed.
+        regrown: Steps in which contact or pair buffers had to grow.
+        unconverged: Substeps whose induction did not converge.
+        error: Largest magnetization error of any substep.
+        field_error: Relative error of the last field by the fast multipole method, measured at 256 random magnets by
+            sums over all pairs; 0 without it.
+        peak_speed: Highest speed of a body [m/s].
+        overlap: Deepest penetration over the thickness of the thinner body, a ball's radius.
+        depth: Deepest penetration [m].
+        final_overlap: The same as ``overlap``, at the end.
+        rms_speed: Root mean square speed of the magnets at the end [m/s].
+        held: Magnets held by a permanent or fixed magnet at the end, see :func:`find_held`.
+        held_rms_speed: Root mean square speed of those [m/s].
+        held_median_speed: Median speed of those [m/s]: far less where one slides on the others without friction.
+        farthest: Largest distance of a magnet from the centre of where they all started, in any frame [m].
+        overlapping: Contacts that overlap at the start.
+        coarseness: Distance of neighbouring single-precision positions at the start over the thinnest body's thickness.
+        wall_seconds: Time that the run took [s].
+    """
+
+    magnets: int = 0
+    steps: int = 0
+    substeps: int = 0
+    repeated: int = 0
+    capped: int = 0
+    regrown: int = 0
+    unconverged: int = 0
+    error: float = 0.0
+    field_error: float = 0.0
+    peak_speed: float = 0.0
+    overlap: float = 0.0
+    depth: float = 0.0
+    final_overlap: float = 0.0
+    rms_speed: float = 0.0
+    held: int = 0
+    held_rms_speed: float = 0.0
+    held_median_speed: float = 0.0
+    farthest: float = 0.0
+    overlapping: int = 0
+    coarseness: float = 0.0
+    wall_seconds: float = 0.0
+    _evaluations: array = field(default_factory=lambda: array("i"), repr=False)
+    _seconds: array = field(default_factory=lambda: array("f"), repr=False)
+
+    def add_step(self, report: StepReport) -> None:
+        """Take in one step."""
+        self.steps += 1
+        self.substeps += report.substeps
+        self.repeated += report.attempts - 1
+        self.capped += report.capped
+        self.regrown += report.regrown
+        self._evaluations.append(report.evaluations)
+        self.unconverged += report.unconverged
+        self.error = max(self.error, report.error)
+        self.peak_speed = max(self.peak_speed, report.speed)
+        self.overlap = max(self.overlap, report.overlap)
+        self.depth = max(self.depth, report.depth)
+        self._seconds.extend(report.seconds or _UNTIMED)
+
+    @property
+    def evaluations(self) -> list[int]:
+        """Field evaluations of each step."""
+        return self._evaluations.tolist()
+
+    @property
+    def milliseconds(self) -> tuple[float, float, float]:
+        """Mean time per step of induction Ti, magnetic forces Tf and rigid bodies Tr [ms], as the paper's Table 1."""
+        return self.milliseconds_since(0)
+
+    def milliseconds_since(self, step: int) -> tuple[float, float, float]:
+        """Mean times of the steps after the first ``step``; see :attr:`milliseconds`."""
+        seconds = np.array(self._seconds, dtype=float).reshape(-1, len(_UNTIMED))[step:]
+        timed = seconds[np.isfinite(seconds).all(axis=1)]
+        return tuple((1e3 * timed.mean(axis=0)).tolist()) if len(timed) else (0.0, 0.0, 0.0)
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Return copies of all figures by name: they are written while steps go on."""
+        return {one.name: np.array(getattr(self, one.name)) for one in fields(self)}
+
+    def load(self, saved: dict[str, np.ndarray]) -> None:
+        """Take over the figures that :meth:`save` returned."""
+        for one in fields(self):
+            own, value = getattr(self, one.name), saved[one.name].tolist()
+            setattr(self, one.name, array(own.typecode, value) if isinstance(own, array) else value)
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know before he trusts the run, a line each."""
+        lines = []
+        if self.overlapping:
+            many = self.overlapping > 1
+            lines.append(f"{self.overlapping} pair{'s' * many} of bodies overlap{'s' * (not many)} at the start")
+        if self.coarseness > _COARSE:
+            percent = 100.0 * self.coarseness
+            lines.append(f"bodies are so far from the origin that positions are known to {percent:.2g} % of a radius")
+        if self.unconverged:
+            lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
+        if self.final_overlap > _DEEP:
+            lines.append(f"bodies end {100.0 * self.final_overlap:.0f} % of their radius deep in each other")
+        if self.capped:
+            lines.append(f"bodies moved too fast for the shortest substep in {self.capped} of {self.steps} steps")
+        return lines
+
+    def summary(self) -> list[str]:
+        """Return the run in a few lines."""
+        if not self.steps:
+            return ["no steps"]
+        induction, force, rigid = self.milliseconds
+        evaluations = np.array(self.evaluations)
+        by_multipoles = f", of fields by multipoles {self.field_error:.1e} at the end" if self.field_error else ""
+        lines = [
+            f"magnets        {self.magnets} moving",
+            f"steps          {self.steps} ({self.substeps / self.steps:.2f} substeps each, {self.repeated} repeated, "
+            f"{self.regrown} buffer growths) in {self.wall_seconds:.1f} s",
+            f"time per step  Ti {induction:.2f} ms, Tf {force:.2f} ms, Tr {rigid:.2f} ms",
+            f"field          {evaluations.mean():.1f} evaluations per step (median {np.median(evaluations):.0f}, "
+            f"max {evaluations.max()}), magnetization error at most {self.error:.1e}{by_multipoles}",
+            f"speed          RMS {100.0 * self.rms_speed:.2f} cm/s at the end, peak {self.peak_speed:.2f} m/s",
+            f"penetration    {100.0 * self.overlap:.2f} % of the radius at most ({1e3 * self.depth:.4f} mm), "
+            f"{100.0 * self.final_overlap:.2f} % at the end",
+            f"farthest       {self.farthest:.3f} m from the centre of the start",
+        ]
+        if self.held:
+            rms, median = 100.0 * self.held_rms_speed, 100.0 * self.held_median_speed
+            lines.append(f"held           {self.held} by a magnet, RMS {rms:.2f} cm/s, median {median:.2f}")
+        return lines
+
+
+def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """Return which bodies a magnet holds: those that touch it, and what hangs on them and does not stand on the ground.
+
+    Args:
+        pairs: Bodies that touch, shape [n, 2].
+        holders: Whether each body is a magnet that holds others, by being permanent or by being fixed.
+        fixed: Whether each body is fixed in the world; the ground is one that is no magnet.
+
+    Returns:
+        Whether each body is held.
+    """
+
+    def neighbors(of: np.ndarray) -> np.ndarray:
+        touched = np.zeros(len(fixed), dtype=bool)
+        for one, other in (pairs.T, pairs.T[::-1]):
+            touched[other[of[one]]] = True
+        return touched
+
+    grounded = neighbors(fixed & ~holders)
+    touching = neighbors(holders) & ~fixed & ~holders
+    held = touching
+    while True:
+        more = touching | (neighbors(held & ~grounded) & ~grounded & ~fixed & ~holders)
+        if (more == held).all():
+            return held
+        held = more

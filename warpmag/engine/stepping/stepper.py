@@ -1,0 +1,455 @@
+"""Advances a model by the step that the user asked for, in as many substeps as its motion needs.
+
+A substep is: clear forces, induction, magnetic forces, collision, solver; substeps shorter than the longest ones share
+their forces with others. A step is attempted and then judged: if a body moved too far in a substep, or bodies were
+pressed into each other, the state is restored and the step done again with shorter substeps. All of that is decided on
+the device (``kernels.rigid.stepping``), so that a step is one graph that the host launches and does not wait for. The
+host looks every so many steps. Where it has to act, because a buffer overflowed or the state is not finite any more,
+the device has halted, and steps launched since did nothing.
+
+What cannot be captured in a graph is launched from Python, by the same code.
+"""
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.engine.pile_xpbd.capture import Workspace, without_allocations
+from warpmag.engine.pile_xpbd.contacts import BodySizes, RigidSolver
+from warpmag.engine.stepping.drive import Drive
+from warpmag.errors import SimulationError
+from warpmag.kernels.rigid import monitor, stepping
+from warpmag.kernels.rigid.bodies import predict_poses
+from warpmag.kernels.rigid.newton_views import view_bodies
+from warpmag.moments import snapshot
+
+TRAVEL_LIMIT = 0.25
+"""How far a body may glide along another, or forces may pull it, in a substep, in parts of its thickness; see
+``kernels.rigid.monitor``."""
+_SHARED_TRAVEL_LIMIT = 0.5
+"""The same while more than two substeps share their forces: a ball that flies alone moves two radii meanwhile."""
+OVERLAP_LIMIT = 0.008
+"""How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
+_EASE = 0.8
+"""Substeps double in length once the motion in twice their length would be below this part of the limit."""
+_FUTILE = 0.8
+"""Substeps of half the length that leave more than this part of a penetration do not press less, however short."""
+_RECORDS = 64
+"""Steps that may be done before the host looks; on a CPU, which it waits for anyway, it looks after each."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What happened in one step.
+
+    Attributes:
+        substeps: Substeps that the step was done in.
+        attempts: How often it was done, 1 if the first attempt held.
+        capped: Whether a body moved farther in a substep than allowed, with the shortest substeps there are.
+        regrown: Whether buffers had to grow.
+        travel: Farthest motion in a substep that tells, over the thickness of the body, see ``kernels.rigid.monitor``.
+        speed: Highest speed of a body [m/s].
+        overlap: Deepest penetration over the thickness of the thinner body.
+        depth: Deepest penetration [m].
+        error: Largest magnetization error of a substep.
+        evaluations: Field evaluations of all substeps.
+        unconverged: Substeps whose induction did not converge.
+        seconds: Time spent in induction, forces and rigid bodies [s], all attempts together; None where kernels were
+            compiled meanwhile.
+    """
+
+    substeps: int
+    attempts: int
+    capped: bool
+    regrown: bool
+    travel: float
+    speed: float
+    overlap: float
+    depth: float
+    error: float
+    evaluations: int
+    unconverged: int
+    seconds: tuple[float, float, float] | None
+
+
+class Stepper:
+    """Steps one model with its magnets.
+
+    Attributes:
+        steps: Steps asked for so far.
+        capture_failure: Why a step could not be captured in a graph; empty if it could, or was not tried.
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        magnetics: Magnetics,
+        solver: RigidSolver,
+        sizes: BodySizes,
+        *,
+        step: float,
+        longest_substep: float,
+        graphs: bool = True,
+        drive: Drive | None = None,
+    ):
+        """Prepare to step.
+
+        Args:
+            model: The model.
+            magnetics: Its magnets.
+            solver: Its collision and solver.
+            sizes: Sizes of its bodies.
+            step: Time step [s].
+            longest_substep: Upper limit of a substep [s].
+            graphs: Capture a step in a graph where the device and the solver allow it.
+            drive: What follows keys.
+        """
+        self._model, self._magnetics, self._solver, self._drive = model, magnetics, solver, drive
+        self._device = wp.get_device(model.device)
+        self._step = step
+        # Even, so that a step ends in the state that it began in.
+        self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
+        self._longest = step / self._fewest
+        self._state, self._other, self._saved = model.state(), model.state(), model.state()
+        self._control = model.control()
+        self._shared = model.state()  # between the poses that some substeps start from, and the forces there
+        self._machine = stepping.StepMachine(
+            _RECORDS,
+            len(solver.buffers),
+            self._device,
+            travel=TRAVEL_LIMIT,
+            shared_travel=_SHARED_TRAVEL_LIMIT,
+            overlap=OVERLAP_LIMIT,
+            ease=_EASE,
+            futile=_FUTILE,
+            fewest=self._fewest,
+        )
+        self._machine.keep(_arrays(self._state), _arrays(self._saved))
+        self._arrays = self._machine.arrays
+        self._watched = self._machine.watched(sizes.thickness, sizes.reach)
+        self._mirrors = self._make_mirrors()
+        self._clock = _Clock(self._device)
+        self._workspace = Workspace(self._device) if self._device.is_cuda else None
+        self._capture, self._graph = graphs, None
+        self.capture_failure = ""
+        self._cold: set[int] = set()
+        self.steps = self._reported = 0
+        if drive:
+            drive.place(self._state, 0.0, self._longest)
+        self._prepare()
+
+    def _make_mirrors(self) -> dict[str, wp.array]:
+        """Return where the host reads what the device writes, by name."""
+        mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
+        if self._device.is_cuda:
+            mirrors = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in mirrors.items()}
+        return mirrors
+
+    def _prepare(self) -> None:
+        """Fit everything to the solver's buffers, whose number does not change."""
+        self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
+        self._watched.fills.assign(self._solver.fills())
+        self._machine.forget_contacts()
+        self._graph, self._warm = None, False
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # What the host does
+    # -----------------------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> newton.State:
+        """The present state, once :meth:`look` has been called; it may be changed."""
+        self._machine.forget_contacts()
+        return self._state
+
+    @property
+    def control(self) -> newton.Control:
+        """Forces and targets of joints; its arrays may be changed between steps, or another put in its place."""
+        return self._control
+
+    @control.setter
+    def control(self, control: newton.Control) -> None:
+        self._control = control
+        self._graph, self._warm = None, False
+
+    @property
+    def due(self) -> bool:
+        """Whether :meth:`look` has to be called before the next step."""
+        return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
+
+    def advance(self) -> None:
+        """Advance :attr:`state` by one step; on a GPU without waiting for it.
+
+        Raises:
+            RuntimeError: More steps are asked for than can be reported at the next look.
+        """
+        if self.steps - self._reported >= _RECORDS:
+            raise RuntimeError(f"look() must be called every {_RECORDS} steps")
+        self.steps += 1
+        self._launch()
+
+    def look(self) -> Iterator[StepReport]:
+        """Wait for the steps asked for.
+
+        Yields:
+            A report of each step since the last look.
+
+        Raises:
+            SimulationError: The state is not finite any more; it is that of the last step that held.
+        """
+        while self.steps > self._reported:
+            status = self._read("status")
+            yield from self._reports(int(status[stepping.STATUS_DONE]))
+            if status[stepping.STATUS_HALT] == stepping.NOT_FINITE:
+                self._give_up()
+            if self.steps > self._reported:
+                assert status[stepping.STATUS_HALT] == stepping.OVERFLOW, "the device left steps undone"
+                self._solver.grow(self._fills())
+                self._prepare()
+                self._machine.set_status(stepping.STATUS_REGROWN, 1)
+                self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
+                for _ in range(self.steps - self._reported):
+                    self._launch()
+
+    def _reports(self, done: int) -> list[StepReport]:
+        """Read what the steps up to ``done`` logged."""
+        self._clock.look()
+        log = self._read("log")
+        numbers = range(self._reported, done)
+        self._reported = done
+        return [self._report(log[number % _RECORDS], number not in self._cold) for number in numbers]
+
+    def _report(self, record: np.ndarray, timed: bool) -> StepReport:
+        peaks = record[stepping.LOG_PEAKS :]
+        ticks = record[stepping.LOG_TICKS :]
+        return StepReport(
+            substeps=int(record[stepping.LOG_SUBSTEPS]),
+            attempts=int(record[stepping.LOG_ATTEMPTS]),
+            capped=bool(record[stepping.LOG_CAPPED]),
+            regrown=bool(record[stepping.LOG_REGROWN]),
+            travel=float(peaks[monitor.PEAK_TRAVEL]),
+            speed=float(peaks[monitor.PEAK_SPEED]),
+            overlap=float(peaks[monitor.PEAK_OVERLAP]),
+            depth=float(peaks[monitor.PEAK_DEPTH]),
+            error=float(peaks[monitor.PEAK_ERROR]),
+            evaluations=int(record[stepping.LOG_EVALUATIONS]),
+            unconverged=int(record[stepping.LOG_UNCONVERGED]),
+            seconds=tuple((self._clock.seconds_per_tick * ticks).tolist()) if timed else None,
+        )
+
+    def _give_up(self) -> None:
+        body = int(self._read("counts")[monitor.COUNT_BAD_BODY]) % self._model.body_count
+        self.steps, number = self._reported, self._reported + 1
+        for status in (stepping.STATUS_LEVEL, stepping.STATUS_ATTEMPTS):
+            self._machine.set_status(status, 0)
+        self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)  # the state may be mended
+        raise SimulationError(
+            f"step {number} ({number * self._step:g} s): {self._model.body_label[body]} has left all finite numbers"
+        )
+
+    def _fills(self) -> np.ndarray:
+        return self._read("counts")[monitor.COUNT_CAPACITIES :]
+
+    def _read(self, name: str) -> np.ndarray:
+        """Wait for the device and return one of the state machine's buffers."""
+        source, mirror = getattr(self._arrays, name), self._mirrors[name]
+        if mirror is not source:
+            wp.copy(mirror, source)
+            wp.synchronize_stream(self._device.stream)
+        return mirror.numpy()
+
+    def _launch(self) -> None:
+        """Launch a step: from Python at first, which compiles its kernels, then, if it can be captured, as a graph."""
+        if self._graph:
+            wp.capture_launch(self._graph)
+            return
+        with without_allocations(self._device, self._workspace):
+            self._run_step()
+            if not self._warm:
+                self._warm = True
+                self._cold.add(self._reported)
+                if self._capture and self._read("status")[stepping.STATUS_HALT] == stepping.RUNNING:
+                    self._capture_step()
+
+    def _capture_step(self) -> None:
+        try:
+            with wp.ScopedCapture(self._device) as capture:
+                self._run_step()
+            # the first launch makes the graph executable, or fails to; paused, it does nothing else
+            self._machine.set_status(stepping.STATUS_HALT, stepping.PAUSED)
+            wp.capture_launch(capture.graph)
+            self._graph = capture.graph
+        except Exception as error:  # whatever a solver does that cannot be captured, it can still be launched
+            self._capture, self.capture_failure = False, " ".join(str(error).split()) or type(error).__name__
+            _clear_error(self._device)
+        self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
+
+    def save(self) -> dict[str, np.ndarray]:
+        """Return all that the next step depends on, on a CPU valid until then; :meth:`look` first."""
+        numbers = {"steps": np.array(self.steps), "buffers": self._solver.limits()}
+        return numbers | snapshot.contents(self._carried())
+
+    def load(self, saved: dict[str, np.ndarray]) -> None:
+        """Go on from where :meth:`save` was called, in another run of the same model.
+
+        Raises:
+            InputError: It was called for something else.
+        """
+        self._solver.set_limits(saved["buffers"])
+        self._prepare()
+        snapshot.load(self._carried(), saved)
+        self.steps = self._reported = int(saved["steps"])
+
+    def _carried(self) -> dict[str, wp.array]:
+        """Return the arrays that a step hands on to the next one, by name."""
+        machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
+        parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
+        parts["control"] = dict(enumerate(_arrays(self._control)))
+        parts |= {"magnetics": self._magnetics.carried(), "solver": self._solver.carried()}
+        return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
+
+    def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
+        """Find the contacts of the present state; :meth:`look` first.
+
+        Returns:
+            Deepest penetration over the thickness of the thinner body, the same [m], and the number of contacts deeper
+            than ``overlap_threshold`` of the thickness.
+        """
+        a = self._arrays
+        while True:
+            a.peaks.zero_()
+            a.counts.zero_()
+            self._solver.collide(self._state, 0.0)
+            self._solver.watch(self._watched, self._state, substep=0, longest=0.0, threshold=overlap_threshold)
+            if not self._solver.grow(self._fills()):
+                break
+            self._prepare()
+        peaks, counts = self._read("peaks"), self._read("counts")
+        self._machine.forget_contacts()
+        depths = float(peaks[monitor.PEAK_OVERLAP]), float(peaks[monitor.PEAK_DEPTH])
+        return *depths, int(counts[monitor.COUNT_OVERLAPS])
+
+    def begin_from(self, overlap: float) -> None:
+        """Say how deep the first state has bodies in each other, over their thickness: steps press them no deeper."""
+        self._arrays.last_overlap.assign(np.array([overlap, math.inf], np.float32))
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # What the device does: all of the following only launches kernels
+    # -----------------------------------------------------------------------------------------------------------------
+
+    def _run_step(self) -> None:
+        self._machine.begin_step()
+        wp.capture_while(self._machine.attempting, self._attempt)
+
+    def _attempt(self) -> None:
+        machine = self._machine
+        for level, remaining in enumerate(machine.remaining):
+            wp.capture_while(remaining, self._advance_twice, level=level)
+        self._find_first_contacts(substep=monitor.NEXT)
+        machine.judge()
+        machine.restore()
+
+    def _advance_twice(self, level: int) -> None:
+        machine, dt = self._machine, self._longest / (1 << level)
+        if self._drive:
+            machine.tell_time(self._step, self._longest, self._drive.time)
+        wp.capture_if(machine.contacts_due, self._find_first_contacts, substep=0)
+        if level == 1:  # two substeps are all that share
+            self._share_forces(dt)
+        elif level > 1:
+            wp.capture_if(machine.forces_due, self._share_forces, dt=dt)
+        for half, (now, then) in enumerate(((self._state, self._other), (self._other, self._state))):
+            if half:
+                self._find_contacts(now, dt, half)
+            if level == 0:
+                if self._drive:
+                    self._drive.set_values(half * dt)
+                self._magnetize(now)
+            else:
+                wp.copy(now.body_f, self._shared.body_f)
+            self._move(now, then, half * dt, dt)
+        machine.end_pair(level)
+
+    def _move(self, now: newton.State, then: newton.State, begin: float, dt: float) -> None:
+        """Do a substep of ``dt`` [s] that begins ``begin`` [s] after the pair that it is of."""
+        if self._drive:
+            self._drive.lead(now, begin, dt)
+        self._solver.step(now, then, dt, self._control)
+        if self._drive:
+            self._drive.place(then, begin + dt, self._longest)
+
+    def _find_first_contacts(self, substep: int) -> None:
+        """Find the contacts that two substeps start from.
+
+        They hold for the longest substep, so that those at the end of a step serve the next one, whatever its level.
+        """
+        self._find_contacts(self._state, self._longest, substep)
+
+    def _find_contacts(self, state: newton.State, horizon: float, substep: int) -> None:
+        self._solver.collide(state, horizon)
+        self._solver.watch(self._watched, state, substep=substep, longest=self._longest, threshold=0.0)
+
+    def _share_forces(self, dt: float) -> None:
+        predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
+        if self._magnetics.system.eddy is not None:
+            wp.copy(self._shared.body_qd, self._state.body_qd)
+        if self._drive:
+            self._drive.set_values(0.0, shared=self._machine.sharing, substep=dt)
+        self._magnetize(self._shared)
+
+    def _magnetize(self, state: newton.State) -> None:
+        system = self._magnetics.system
+        state.clear_forces()
+        self._magnetics.induce(state)
+        monitor.watch_induction(self._watched, system.error, system.evaluations, system.converged)
+        self._magnetics.add_forces(state)
+        bodies = view_bodies(self._model, state)
+        monitor.watch_forces(self._watched, bodies, self._model.gravity, self._longest)
+
+
+def _clear_error(device) -> None:
+    """Clear the error that a failed graph leaves behind by sorting nothing: the next sort on a GPU does nothing."""
+    if device.is_cuda:
+        nothing = wp.zeros(2, dtype=wp.int32, device=device)
+        wp.utils.radix_sort_pairs(nothing, wp.zeros_like(nothing), 1)
+
+
+def _arrays(state: newton.State | newton.Control) -> list[wp.array]:
+    """Return what a state remembers, or a control holds, flat; forces on bodies are cleared before each substep."""
+    found = []
+    for name, value in vars(state).items():
+        if isinstance(value, newton.Model.AttributeNamespace):
+            found += _arrays(value)
+        elif isinstance(value, wp.array) and value.size and name not in ("body_f", "particle_f"):
+            found.append(value.flatten())
+    return found
+
+
+class _Clock:
+    """Tells how long a tick of the device's clock is.
+
+    Attributes:
+        seconds_per_tick: Known after a :meth:`look`.
+    """
+
+    def __init__(self, device):
+        self._time = wp.zeros(1, dtype=wp.uint64, device=device)
+        self._fixed = device.is_cuda
+        self.seconds_per_tick = 1e-9
+        self._began = (0, 0.0) if self._fixed else self._read()
+
+    def _read(self) -> tuple[int, float]:
+        stepping.launch_read_clock(self._time)
+        return int(self._time.numpy()[0]), time.perf_counter()
+
+    def look(self) -> None:
+        """Compare the device's clock with the host's; that of a GPU counts nanoseconds."""
+        if not self._fixed:
+            ticks, seconds = np.subtract(self._read(), self._began)
+            self.seconds_per_tick = float(seconds / ticks)

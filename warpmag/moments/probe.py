@@ -1,0 +1,118 @@
+"""Field of a system's moments at points, again and again."""
+
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warpmag.errors import InputError
+from warpmag.kernels.applied.fields import AppliedField
+from warpmag.kernels.pairs.evaluate import PairEvaluation
+from warpmag.kernels.pairs.inside import launch_field_of_worlds, launch_flux_density, launch_store_gradients
+from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.wrench import MU0
+from warpmag.moments.arrays import shape_message, vec3_type
+from warpmag.moments.system import MomentSystem
+
+_NO_BODY = -2
+"""Body label of points, which no moment has, and nothing that fills up packed rows either."""
+
+
+class FieldProbe:
+    """Field and flux density of a system's moments at points of its worlds, inside bodies and out.
+
+    :meth:`measure` only launches kernels, and can be captured in a graph.
+
+    Args:
+        system: The moments.
+        count: Number of points p.
+        worlds: World of each point, counted as the system's, shape [p]; None means the first for all. Points of one
+            world are best together.
+        gradients: Whether gradients are wanted, which cost three more sums over pairs.
+
+    Raises:
+        InputError: ``worlds`` is of another shape, or the system has no such world.
+
+    Attributes:
+        points: The points [m], shape [p]; written by the caller before :meth:`measure`.
+        h: Field H [A/m], shape [p]: the external field, that of sources (``kernels.applied``), and that of all moments
+            (Kim and Han 2022, Eq. 1); inside a ball that of a uniformly magnetized one.
+        b: Flux density B = μ0 (H + M) [T], shape [p].
+        gradient: Rows ∇H_x, ∇H_y, ∇H_z of the field's gradient [A/m²], shape [p], matrices, that of sources included;
+            the external field, which is uniform, has none. None if it is not wanted.
+    """
+
+    def __init__(
+        self, system: MomentSystem, count: int, *, worlds: npt.ArrayLike | None = None, gradients: bool = False
+    ):
+        """Allocate all buffers."""
+        self._system = system
+        ranges = system.world_ranges
+        worlds = np.zeros(count, int) if worlds is None else np.asarray(worlds, int)
+        if worlds.shape != (count,):
+            raise InputError(shape_message("worlds", f"[{count}]", worlds))
+        if (worlds < 0).any() or (worlds >= len(ranges)).any():
+            raise InputError(f"worlds: must be 0 to {len(ranges) - 1}")
+        device, dtype = system.device, system.dtype
+        vec3 = vec3_type(dtype)
+        self.points, self.h, self.b, self._base = (wp.zeros(count, dtype=vec3, device=device) for _ in range(4))
+        self._first = wp.array([ranges[world][0] for world in worlds], dtype=wp.int32, device=device)
+        radii = wp.zeros(count, dtype=dtype, device=device)
+        self._targets = PackedMoments(radii, largest_radius=0.0, labels=np.full(count, _NO_BODY), groups=worlds)
+        runs = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1))
+        segments = [(begin, end, *ranges[worlds[begin]][::2]) for begin, end in pairwise(runs)]
+        # of its own, since a search by others disturbs the system's lists
+        self._sources = sources = PackedMoments(
+            system.radii, largest_radius=float(system.radii.numpy().max(initial=0.0)), groups=system.worlds
+        )
+        base, self._applied = self._base, None
+        if system.sources is not None:
+            self._applied = AppliedField(system.sources, self._targets, worlds, self._base, points=True)
+            base = self._applied.field
+        self._field = PairEvaluation(Quantity.FIELD, segments, self._targets, sources, base, self.h)
+        self._nothing = wp.zeros(count, dtype=vec3, device=device)
+        self.gradient = None
+        self._gradients: list[PairEvaluation] = []
+        if gradients:
+            self.gradient = wp.zeros(count, dtype=wp.types.matrix((3, 3), dtype), device=device)
+            self._rows = [wp.zeros(count, dtype=vec3, device=device) for _ in range(3)]
+            self._gradients = [self._derivative(axis, segments) for axis in range(3)]
+
+    def _derivative(self, axis: int, segments) -> PairEvaluation:
+        """Derivative of H along an axis: the force μ0 (e·∇)H on a moment e of 1/μ0 along it."""
+        count = self._targets.count
+        unit = np.zeros((3, count))
+        unit[axis] = 1.0 / MU0
+        return PairEvaluation(
+            Quantity.FORCE,
+            segments,
+            self._targets,
+            self._sources,
+            self._base,
+            self._rows[axis],
+            effective=wp.array(unit, dtype=self._system.dtype, device=self._system.device),
+            turned=wp.zeros(count, dtype=wp.int32, device=self._system.device),
+            torques=self._nothing,
+        )
+
+    def measure(self) -> None:
+        """Launch the measurement at :attr:`points`, of the moments as the last solve left them."""
+        system, targets = self._system, self._targets
+        if targets.count == 0:
+            return
+        targets.pack(self.points, self._nothing)
+        self._sources.pack(system.positions, system.moments)
+        targets.find_overlaps(self._sources)
+        launch_field_of_worlds(system.external_field, self._first, self._base)
+        if self._applied is not None:
+            self._applied.launch()
+        self._field.launch()
+        launch_flux_density(self.points, targets, self._sources, self.h, self.b)
+        for evaluation in self._gradients:
+            evaluation.launch()
+        if self._gradients:
+            launch_store_gradients(self._rows, self.gradient)
+        if self._applied is not None:
+            self._applied.add_to_probe(self.b, self.gradient)

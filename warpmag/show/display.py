@@ -1,0 +1,175 @@
+"""Shows magnets in Newton's viewers."""
+
+import math
+import time as clock
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.errors import InputError, extra
+
+_DIRECTION = np.array((0.55, -0.75, 0.45))
+"""From the scene to the camera, along east, north and up."""
+_FIELD_OF_VIEW = math.radians(45.0)
+"""Of the viewers' cameras."""
+_COLORS = np.array([(0.27, 0.0, 0.33), (0.13, 0.57, 0.55), (0.99, 0.91, 0.14)])
+"""Of no magnetization, half and all of the largest one: viridis by three of its colours."""
+_LENGTH = 1.6
+"""Half the longest arrow over the radius of its shape, from which both ends look out."""
+_PAUSE = 1.0 / 60.0
+"""How long a viewer that is paused, or has nothing new to show, is left alone [s]."""
+
+
+def no_viewer(name: str, error: Exception) -> InputError:
+    """Return the one line about a viewer that could not open; each fails in its own way without what it needs."""
+    reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    display = "a display, without one take viser or rerun, and " if name == "gl" else ""
+    return InputError(f"viewer: {name} cannot open, it needs {display}{extra('viewers')}: {reason}")
+
+
+class Display:
+    """A model with its magnets in one of Newton's viewers.
+
+    On every magnetic shape there is an arrow along its magnetization, as long as that is strong, and coloured from
+    violet by green to yellow, the strongest magnet at the time. The camera of ``gl``, ``viser`` and ``rtx`` is put
+    where it sees all bodies. ::
+
+        display = warpmag.Display(newton.viewer.ViewerGL(), model, magnetics)
+        display.show(time, state)
+
+    Attributes:
+        viewer: The viewer.
+        restarted: Whether the reset button was pressed, after :meth:`allow_restart`.
+    """
+
+    def __init__(self, viewer, model: newton.Model, magnetics: Magnetics):
+        """Give the model to the viewer.
+
+        Args:
+            viewer: A viewer of :mod:`newton.viewer`.
+            model: The model.
+            magnetics: Its magnets.
+        """
+        self.viewer, self.restarted = viewer, False
+        self._set_model(model, magnetics)
+        self.frame()
+
+    def _set_model(self, model: newton.Model, magnetics: Magnetics) -> None:
+        self._model, self._magnetics = model, magnetics
+        self.viewer.set_model(model)
+        shapes = magnetics.shapes
+        self._bodies = model.shape_body.numpy()[shapes]
+        self._frames = model.shape_transform.numpy()[shapes].astype(float)
+        self._radii = model.shape_collision_radius.numpy()[shapes]
+        self._worlds = model.shape_world.numpy()[shapes]
+
+    def allow_restart(self) -> None:
+        """Let the reset button of the viewer, if it has one, set :attr:`restarted`."""
+        if hasattr(self.viewer, "set_reset_callback"):
+            self.viewer.set_reset_callback(lambda: setattr(self, "restarted", True))
+
+    def restart(self, model: newton.Model, magnetics: Magnetics) -> None:
+        """Show a model made anew in place of the one before, from where one looks now."""
+        self.restarted = False
+        self._set_model(model, magnetics)
+
+    def frame(self) -> None:
+        """Put the camera where it sees all bodies of the model as they start, those of shown worlds."""
+        points, radii = self._places(self._model.state())
+        if not len(points):
+            return
+        center = 0.5 * ((points - radii[:, None]).min(axis=0) + (points + radii[:, None]).max(axis=0))
+        reach = float((np.linalg.norm(points - center, axis=1) + radii).max())
+        up = int(self._model.up_axis)
+        east, north = (up + 1) % 3, (up + 2) % 3
+        if up == 1:  # the viewers turn about y the other way
+            east, north = 0, 2
+        direction = _DIRECTION / np.linalg.norm(_DIRECTION)
+        position = center.copy()
+        position[[east, north, up]] += 1.1 * reach / math.sin(0.5 * _FIELD_OF_VIEW) * direction
+        yaw = math.degrees(math.atan2(-direction[1], -direction[0]))
+        self.viewer.set_camera(wp.vec3(*position), math.degrees(-math.asin(direction[2])), yaw)
+
+    def _places(self, state: newton.State) -> tuple[np.ndarray, np.ndarray]:
+        """Centres [m], shape [n, 3], and radii [m], shape [n], of shapes on bodies and of magnets."""
+        model = self._model
+        bodies, radii = model.shape_body.numpy(), model.shape_collision_radius.numpy()
+        seen = (bodies >= 0) & (model.shape_flags.numpy() & int(newton.ShapeFlags.VISIBLE) != 0)
+        seen[self._magnetics.shapes] = True
+        which = np.flatnonzero(seen & (radii < 1e5))  # a plane's is without end
+        centers = _in_world(state, bodies[which], model.shape_transform.numpy()[which].astype(float))
+        return centers + self._offsets(model.shape_world.numpy()[which]), radii[which].astype(float)
+
+    def _offsets(self, worlds: np.ndarray) -> np.ndarray:
+        """How far the viewer shows each of ``worlds`` from where it is [m], shape [n, 3]."""
+        offsets = getattr(self.viewer, "world_offsets", None)
+        if offsets is None or not len(offsets):
+            return np.zeros((len(worlds), 3))
+        return np.where(worlds[:, None] >= 0, offsets.numpy()[np.maximum(worlds, 0)], 0.0)
+
+    def show(self, time: float, state: newton.State) -> None:
+        """Show a state and the magnetizations that :meth:`Magnetics.apply` found last; waits for the device.
+
+        Args:
+            time: Simulated time [s].
+            state: The state.
+        """
+        self.viewer.begin_frame(time)
+        self.viewer.log_state(state)
+        if not isinstance(self.viewer, newton.viewer.ViewerNull):
+            self._show_arrows(state)
+        self.viewer.end_frame()
+
+    def follow(self, time: float, state: newton.State) -> bool:
+        """Show a state, as long as the viewer is paused.
+
+        Args:
+            time: Simulated time [s].
+            state: The state.
+
+        Returns:
+            Whether to go on; the viewer may have been closed, or a restart asked for.
+        """
+        self.show(time, state)
+        while self.viewer.is_running() and not self.viewer.should_step() and not self.restarted:
+            clock.sleep(_PAUSE)
+            self.show(time, state)
+        return self.viewer.is_running() and not self.restarted
+
+    def stay(self) -> None:
+        """Keep what was shown last until the viewer is closed, Ctrl-C is pressed, or a restart is asked for."""
+        try:
+            while self.viewer.is_running() and not self.restarted:
+                clock.sleep(_PAUSE)
+                self.viewer.should_step()  # looks at the buttons
+        except KeyboardInterrupt:
+            pass
+        if not self.restarted:
+            self.viewer.close()
+
+    def _show_arrows(self, state: newton.State) -> None:
+        volumes = self._magnetics.shape_volumes[:, None]
+        magnetizations = self._magnetics.shape_moments() / np.where(volumes > 0.0, volumes, np.inf)
+        strengths = np.linalg.norm(magnetizations, axis=1)
+        largest = max(float(strengths.max(initial=0.0)), 1e-30)
+        centers = _in_world(state, self._bodies, self._frames) + self._offsets(self._worlds)
+        halves = _LENGTH * self._radii[:, None] * magnetizations / largest
+        colors = np.stack([np.interp(strengths / largest, (0.0, 0.5, 1.0), one) for one in _COLORS.T], axis=1)
+        starts, ends, colors = (
+            wp.array(np.ascontiguousarray(one, np.float32), dtype=wp.vec3, device=self._model.device)
+            for one in (centers - halves, centers + halves, colors)
+        )
+        self.viewer.log_arrows("/magnetization", starts, ends, colors, width=0.1 * float(np.median(self._radii)))
+
+
+def _in_world(state: newton.State, bodies: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Origins of frames of bodies, or of the world where the body is -1, in the world [m], shape [n, 3]."""
+    points = frames[:, :3]
+    if state.body_q is None or not len(state.body_q):
+        return points.copy()
+    poses = state.body_q.numpy()[np.maximum(bodies, 0)].astype(float)
+    axis, real = poses[:, 3:6], poses[:, 6:]
+    turned = points + 2.0 * np.cross(axis, np.cross(axis, points) + real * points)
+    return np.where(bodies[:, None] >= 0, poses[:, :3] + turned, points)

@@ -1,0 +1,262 @@
+"""Makes one web page of a stage for renderers, to orbit and play: viser's recording inside viser's own client."""
+
+import contextlib
+import functools
+import html
+import io
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdShade, Vt
+
+from warpmag.errors import InputError, extra
+from warpmag.show.glb import glb
+from warpmag.show.meshes import corner_normals, shape_of
+from warpmag.usd.write.placements import rigid, turn_of
+
+_REACH = 2.0
+"""Half the size of what is shown, in units of the page; viser's shadows and nearest plane are made for such a one."""
+_OUTSIDE = 0.02
+"""Part of the places of bodies that the camera need not see, on each side: a few may fly far."""
+_DIRECTION = (0.55, -0.75, 0.45)
+"""From the bodies to the camera, z up, where the stage has none."""
+_FIELD_OF_VIEW = math.radians(35.0)
+_LAST = 1.0
+"""How long the last frame stays before the page plays again [s]."""
+_MOST, _CLOSE = 400_000, 20.0
+"""Triangles that copies of a mesh have together from afar, and how many of its radii away that begins."""
+_GREY = (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Linear RGB, metalness and roughness."""
+
+    color: tuple[float, ...] = _GREY
+    metallic: float = 0.0
+    roughness: float = 0.6
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Meshes of one shape over time; f is 1 for what stays as it is.
+
+    Attributes:
+        points: Its points, shape [n, 3].
+        faces: Corners of each face.
+        positions: Shape [f, k, 3].
+        turns: Quaternions x y z w, shape [f, k, 4].
+        scales: Shape [f, k].
+        palette: Looks.
+        looks: The look of each in the palette, shape [f, k].
+    """
+
+    points: np.ndarray
+    faces: list[np.ndarray]
+    positions: np.ndarray
+    turns: np.ndarray
+    scales: np.ndarray
+    palette: list[_Look]
+    looks: np.ndarray
+
+
+def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
+    """Return a web page of a stage that needs neither a server nor a network.
+
+    Args:
+        stage: Meshes, PointInstancers of meshes and BasisCurves, as :class:`RenderLayer` makes them.
+        codes: Time codes to show, shape [f].
+        title: Title of the page.
+
+    Raises:
+        InputError: There is no viser, or no port of this machine that it can listen on.
+    """
+    try:
+        import viser  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise InputError(f"a web page needs {extra('viewers')}: {error}") from None
+    batches = [*_instances(stage, codes), *_meshes(stage, codes)]
+    curves = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves)]
+    with contextlib.redirect_stdout(io.StringIO()):  # it talks of its address
+        try:
+            server = viser.ViserServer(host="127.0.0.1", verbose=False)
+        except OSError as error:
+            raise InputError(f"a web page needs a port of this machine, which viser listens on ({error})") from None
+        try:
+            _put_camera(server, stage, batches, scale := _scale(batches))
+            recording = server.get_scene_serializer()
+            updates = [_add_batch(server.scene, f"/shape_{n}", one, scale) for n, one in enumerate(batches)]
+            updates += [_add_curves(server.scene, one, codes, scale) for one in curves]
+            for frame, wait in enumerate((np.diff(codes) / stage.GetTimeCodesPerSecond()).tolist(), start=1):
+                recording.insert_sleep(wait)
+                for update in updates:
+                    update(frame)
+            recording.insert_sleep(_LAST if len(codes) > 1 else 0.0)
+            page = recording.as_html()
+        finally:
+            server.stop()
+    return page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
+    """Return the instances of PointInstancers, those of one shape together; colours may change."""
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdGeom.PointInstancer):
+            continue
+        instancer = UsdGeom.PointInstancer(prim)
+        meshes = [stage.GetPrimAtPath(path) for path in instancer.GetPrototypesRel().GetTargets()]
+        shapes = [shape_of(mesh) for mesh in meshes]
+        palette = [_look_of(mesh) for mesh in meshes]
+        groups: dict[bytes, int] = {}
+        group = np.array([groups.setdefault(points.tobytes(), len(groups)) for points, _ in shapes])
+        positions = _values(instancer.GetPositionsAttr(), codes, Vt.Vec3fArray)
+        kinds = _values(instancer.GetProtoIndicesAttr(), codes, Vt.IntArray)
+        count = kinds.shape[1]
+        turns = _values(
+            instancer.GetOrientationsAttr(), codes, Vt.QuathArray, np.tile((0.0, 0.0, 0.0, 1.0), (count, 1))
+        )
+        scales = _values(instancer.GetScalesAttr(), codes, Vt.Vec3fArray, np.ones((count, 3)))[..., 0]
+        for number in range(len(groups)):
+            own = group[kinds[0]] == number
+            points, faces = shapes[int(np.argmax(group == number))]
+            yield _Batch(points, faces, positions[:, own], turns[:, own], scales[:, own], palette, kinds[:, own])
+
+
+def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
+    """Return the meshes that are no prototypes, each at its place."""
+    transforms = [UsdGeom.XformCache(code) for code in codes.tolist()]
+    todo = iter(Usd.PrimRange(stage.GetPseudoRoot()))
+    for prim in todo:
+        if prim.IsA(UsdGeom.PointInstancer):
+            todo.PruneChildren()
+        given = shape_of(prim) if prim.IsA(UsdGeom.Mesh) else None
+        if given is None or UsdGeom.Imageable(prim).ComputeVisibility(codes[0]) == UsdGeom.Tokens.invisible:
+            continue
+        frames = np.array([one.GetLocalToWorldTransform(prim) for one in transforms])
+        if (frames == frames[0]).all():
+            frames = frames[:1]
+        poses = [rigid(one) for one in frames]
+        own = frames[0] @ np.linalg.inv(poses[0])
+        points = np.c_[given[0], np.ones(len(given[0]))] @ own[:, :3]
+        faces = [face[::-1] for face in given[1]] if np.linalg.det(own) < 0.0 else given[1]
+        turns = np.array([turn_of(one) for one in poses])[:, None]
+        still = np.zeros((1, 1), dtype=int)
+        yield _Batch(points, faces, frames[:, None, 3, :3], turns, still + 1.0, [_look_of(prim)], still)
+
+
+def _look_of(prim: Usd.Prim) -> _Look:
+    """Return how a mesh looks, after the values of its UsdPreviewSurface or its own colour."""
+    color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+    look = {"color": tuple(color[0])} if color else {}
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    shader = material.ComputeSurfaceSource()[0] if material else None
+    for name, own in (("diffuseColor", "color"), ("metallic", "metallic"), ("roughness", "roughness")):
+        value = shader.GetInput(name).Get() if shader and shader.GetInput(name) else None
+        if value is not None:
+            look[own] = tuple(value) if own == "color" else float(value)
+    return _Look(**look)
+
+
+def _values(attribute: Usd.Attribute, codes: np.ndarray, array, default: np.ndarray | None = None) -> np.ndarray:
+    """Return the values of an attribute, shape [f, ...]; [1, ...] where they stay."""
+    if not attribute.HasAuthoredValue() and default is not None:
+        return default[None]
+    many = codes.tolist() if attribute.ValueMightBeTimeVarying() else [codes[0]]
+    return np.stack([np.array(array(attribute.Get(code))) for code in many])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _box(batches: list[_Batch]) -> np.ndarray:
+    """Return the corners of the box of what moves, or of all, at the first and the last frame, shape [2, 3]."""
+    moving = [one for one in batches if len(one.positions) > 1] or batches
+    lows, highs = [], []
+    for one in moving:
+        places = one.positions[[0, -1]].reshape(-1, 3)
+        size = float(one.scales.max()) * np.linalg.norm(one.points, axis=1).max()
+        lows.append(np.quantile(places, _OUTSIDE, axis=0) - size)
+        highs.append(np.quantile(places, 1.0 - _OUTSIDE, axis=0) + size)
+    return np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
+
+
+def _scale(batches: list[_Batch]) -> float:
+    """Return the size of a unit of the stage on the page."""
+    return 2.0 * _REACH / max(float(np.linalg.norm(np.ptp(_box(batches), axis=0))), 1e-30) if batches else 1.0
+
+
+def _put_camera(server, stage: Usd.Stage, batches: list[_Batch], scale: float) -> None:
+    """Look at what moves, from where the stage's camera does."""
+    up = 1 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else 2
+    middle = scale * _box(batches).mean(axis=0) if batches else np.zeros(3)
+    cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    if cameras:
+        frame = np.array(UsdGeom.XformCache(stage.GetStartTimeCode()).GetLocalToWorldTransform(cameras[0]))
+        direction = frame[2, :3]
+    else:
+        direction = np.roll(_DIRECTION, up - 2)
+    direction = direction / np.linalg.norm(direction)
+    server.scene.set_up_direction("+y" if up == 1 else "+z")
+    server.initial_camera.fov = _FIELD_OF_VIEW
+    server.initial_camera.position = middle + _REACH / math.sin(0.5 * _FIELD_OF_VIEW) * direction
+    server.initial_camera.look_at = middle
+
+
+def _add_batch(scene, name: str, batch: _Batch, scale: float) -> Callable[[int], None]:
+    """Add meshes as they are at first; return what shows them at a frame."""
+    points, normals, triangles = _corners(batch.points, batch.faces)
+    looks = [batch.palette[look] for look in np.unique(batch.looks).tolist()]
+    placed = {"positions": batch.positions, "wxyzs": batch.turns[..., [3, 0, 1, 2]], "scales": batch.scales}
+    if len(looks) == 1:
+        surface = {"color": looks[0].color, "metallic": looks[0].metallic, "roughness": looks[0].roughness}
+        add = functools.partial(scene.add_batched_glb, name, glb(points, normals, triangles, **surface))
+    else:  # which have no metal, but a colour each
+        colors = np.array([one.color for one in batch.palette]) ** (1.0 / 2.2)
+        placed["colors"] = np.rint(255.0 * colors[batch.looks]).astype(np.uint8)
+        add = functools.partial(scene.add_batched_meshes_simple, name, points, triangles)
+    placed = {f"batched_{key}": value for key, value in placed.items()}
+    share = _MOST / (len(triangles) * batch.positions.shape[1])
+    radius = scale * float(np.linalg.norm(points, axis=1).max()) * float(batch.scales[0].max())
+    detail = "off" if share >= 1.0 else ((_CLOSE * radius, share),)
+    solid = bool(np.ptp(points, axis=0).min() > 0.0)  # a ground would shade itself
+    handle = add(**{key: value[0] for key, value in placed.items()}, scale=scale, lod=detail, cast_shadow=solid)
+    moving = {key: value for key, value in placed.items() if len(value) > 1}
+
+    def show(frame: int) -> None:
+        for key, value in moving.items():
+            setattr(handle, key, value[frame])
+
+    return show
+
+
+def _corners(points: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points, normals and triangles of a surface, points of sharp edges once for each side."""
+    both = np.c_[points[np.concatenate(faces)], corner_normals(points, faces)].astype(np.float32)
+    kept, first = np.unique(np.round(both, 6), axis=0, return_inverse=True)
+    starts = np.cumsum([0, *(len(face) for face in faces)]).tolist()
+    fans = [(at, k, k + 1) for at, end in itertools.pairwise(starts) for k in range(at + 1, end - 1)]
+    return kept[:, :3], kept[:, 3:], first.reshape(-1)[np.array(fans)].astype(np.uint32)
+
+
+def _add_curves(scene, prim: Usd.Prim, codes: np.ndarray, scale: float) -> Callable[[int], None]:
+    """Add polylines as they are at first; return what shows them at a frame."""
+    curves = UsdGeom.BasisCurves(prim)
+    points = _values(curves.GetPointsAttr(), codes, Vt.Vec3fArray)
+    counts = np.array(curves.GetCurveVertexCountsAttr().Get())
+    begins = np.delete(np.arange(points.shape[1]), np.cumsum(counts) - 1)
+    segments = np.stack([points[:, begins], points[:, begins + 1]], axis=2)
+    color = np.rint(255.0 * np.array(_look_of(prim).color) ** (1.0 / 2.2)).astype(np.uint8)
+    width = scale * float(curves.GetWidthsAttr().Get()[0])
+    handle = scene.add_line_segments(str(prim.GetPath()), segments[0], color, thickness=width, scale=scale)
+
+    def show(frame: int) -> None:
+        if len(segments) > 1:
+            handle.points = segments[frame]
+
+    return show

@@ -1,0 +1,449 @@
+"""A stage for renderers, made of a scene and its motion: instanced meshes, materials, lights, a camera, no physics.
+
+Bodies become instances of two PointInstancers, balls and the rest: importers drop the materials of spheres and cubes,
+or make an object of each. Whatever else is drawn becomes meshes where it is. The stage runs at a rate of time codes per
+second that players keep, and its samples stand where the simulation put them.
+"""
+
+import os
+import tempfile
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
+
+from warpmag.errors import InputError
+from warpmag.show.instance_arrays import InstanceArrays, author_curves, author_instances, turns_to
+from warpmag.show.looks import author_materialx, author_surface, color_scale
+from warpmag.show.meshes import ARROW, BALL, Shape, author_mesh, shape_of
+from warpmag.show.page import page_of
+from warpmag.usd.paths import usable_path
+from warpmag.usd.read.instancers import complete_instances, expand_instancers
+from warpmag.usd.read.motion import read_recording
+from warpmag.usd.read.reader import copied_metadata, open_motion
+from warpmag.usd.read.swarms import Swarm
+from warpmag.usd.read.transforms import is_body
+from warpmag.usd.values import quiet
+from warpmag.usd.write.placements import rigid
+
+_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".html")
+_OWN = ("physics:", "newton:", "warpmag:", "collection:")
+"""What attributes of simulations begin with."""
+_SCHEMAS = ("Physics", "Newton", "Warpmag", "CollectionAPI")
+_SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height", "width", "length", "axis", "extent", "doubleSided")
+_PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+_DIGITS = 6
+"""Digits to which shapes and places in their bodies agree where bodies share a mesh."""
+_SHADES = 24
+"""Colours that a scale has."""
+
+
+@dataclass
+class DrawnShape:
+    """A shape of a body, or one that stands still.
+
+    Attributes:
+        path: Its prim.
+        row: Its body's row in the recording, -1 for what stands still.
+        frame: Its prim's transform in the frame of the body, or in the world, shape [4, 4], for rows of points.
+        drawn: Whether it is seen.
+        radius: Radius of a ball, 0 for others.
+        points: Its points there, shape [k, 3]; none of a ball.
+        faces: Corners of each face.
+    """
+
+    path: str
+    row: int
+    frame: np.ndarray
+    drawn: bool
+    radius: float
+    points: np.ndarray
+    faces: list[np.ndarray]
+    looks: tuple = ()
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Middle of its box, shape [3]."""
+        return self.frame[3, :3] if self.radius else 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
+
+    @property
+    def size(self) -> float:
+        """Largest side of its box."""
+        return 2.0 * self.radius if self.radius else float(np.ptp(self.points, axis=0).max())
+
+
+class RenderLayer:
+    """Builds the stage; :meth:`save` writes it.
+
+    Attributes:
+        recording: What moves in it.
+        shapes: What its magnets and bodies are made of, those that are not seen, too.
+    """
+
+    def __init__(self, path: str | os.PathLike, *, rate: float):
+        """Read a scene, or what a run wrote.
+
+        Args:
+            path: USD file.
+            rate: Time codes and frames per second.
+
+        Raises:
+            InputError: It is no stage.
+        """
+        source, swarms = open_motion(path)
+        self._files = {Path(layer.realPath).resolve() for layer in source.GetUsedLayers() if layer.realPath}
+        self.recording = read_recording(source, swarms)
+        self._codes = self.recording.codes * (rate / source.GetTimeCodesPerSecond())
+        self._stage = stage = Usd.Stage.Open(_scene_of(source, swarms, rate))
+        stage.SetStartTimeCode(float(np.floor(self._codes[0] + 1e-6)))
+        # the last frame stands at the step nearest to it, which may be a bit later
+        stage.SetEndTimeCode(float(np.ceil(self._codes[-1] - 0.05)))
+        self._before = Sdf.Layer.CreateAnonymous(".usda")
+        self._before.TransferContent(stage.GetRootLayer())
+        self.shapes = self._find_shapes()
+        for swarm in swarms:
+            self.shapes = swarm.with_shapes(self.shapes, self.recording.bodies)
+        instanced = self._instanced()
+        self._instances = [one for one in self.shapes if one.drawn and one.row >= 0 and instanced[one.row]]
+        self._root = self._make_root()
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def _make_root(self) -> Sdf.Path:
+        """Take out what is drawn in another way, or not at all; return the prim for what is new."""
+        stage, layer = self._stage, self._stage.GetRootLayer()
+        moved = {one.path for one in self._instances}
+        keep = [one for one in self.shapes if one.drawn and one.path not in moved]
+        kept = {one.path for one in keep}
+        with Sdf.ChangeBlock():
+            _strip(layer, [Sdf.Path(one.path) for one in self.shapes if one.path not in kept], kept)
+        for one in keep:
+            if not stage.GetPrimAtPath(one.path).IsA(UsdGeom.Mesh):
+                self._turn_into_mesh(one)
+        world = stage.GetDefaultPrim()
+        if not world:
+            world = UsdGeom.Xform.Define(stage, "/World").GetPrim()
+            stage.SetDefaultPrim(world)
+        root = UsdGeom.Xform.Define(stage, world.GetPath().AppendChild("Render"))
+        if not np.array_equal(UsdGeom.XformCache(self._codes[0]).GetLocalToWorldTransform(world), np.eye(4)):
+            root.SetResetXformStack(True)
+        UsdGeom.Scope.Define(stage, root.GetPath().AppendChild("Materials"))
+        return root.GetPath()
+
+    def _find_shapes(self) -> list[DrawnShape]:
+        """Return all solids and meshes of the stage, as they are at the first sample."""
+        stage, found = self._stage, []
+        rows = {path: row for row, path in enumerate(self.recording.bodies)}
+        transforms = UsdGeom.XformCache(stage.GetStartTimeCode())
+        frames: dict[str, np.ndarray] = {}
+        for prim in stage.Traverse():
+            given = shape_of(prim)
+            if given is None:
+                continue
+            body = _body_of(prim)
+            frame = np.array(transforms.GetLocalToWorldTransform(prim))
+            if body:
+                name = str(body.GetPath())
+                if name not in frames:
+                    own = rigid(np.array(transforms.GetLocalToWorldTransform(body)))
+                    frames[name] = np.linalg.inv(own)
+                frame = frame @ frames[name]
+            found.append(_drawn_shape(prim, given, rows[name] if body else -1, frame))
+        return found
+
+    def _instanced(self) -> np.ndarray:
+        """Return which bodies are drawn as instances, shape [n]: those that move, or might, and magnets."""
+        record, magnets = self.recording, set(self.recording.magnets)
+        found = np.ptp(record.positions, axis=0).any(axis=1) | np.ptp(record.turns, axis=0).any(axis=1)
+        for row, path in enumerate(record.bodies):
+            prim = self._stage.GetPrimAtPath(path)  # none of a ball in an instancer, which is dynamic
+            flag = prim and prim.GetAttribute("physics:kinematicEnabled")
+            found[row] |= path in magnets or not (flag and flag.Get())
+        return found
+
+    def _turn_into_mesh(self, shape: DrawnShape) -> None:
+        """Make a mesh of a solid that stands still, in its own frame."""
+        spec = self._stage.GetRootLayer().GetPrimAtPath(shape.path)
+        points, faces = shape_of(self._stage.GetPrimAtPath(shape.path))
+        for name in _SIZES:
+            if name in spec.properties:
+                spec.RemoveProperty(spec.properties[name])
+        author_mesh(UsdGeom.Mesh.Define(self._stage, shape.path), points, faces)
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def shapes_of_magnets(self) -> list[list[DrawnShape]]:
+        """Return the shapes of each magnet of the recording, those that are seen, or all if none is.
+
+        Raises:
+            InputError: A magnet has none.
+        """
+        found: dict[str, list[DrawnShape]] = {path: [] for path in self.recording.magnets}
+        for one in self.shapes:
+            path = one.path
+            while path and path not in found:
+                path = path.rpartition("/")[0]
+            if path:
+                found[path].append(one)
+        for path, shapes in found.items():
+            if not shapes:
+                raise InputError(f"{path}: a magnet without a shape")
+        return [[one for one in shapes if one.drawn] or shapes for shapes in found.values()]
+
+    def add_bodies(self, shades: np.ndarray | None = None) -> None:
+        """Add the bodies.
+
+        Args:
+            shades: Where each body's colour lies on the scale, 0 to 1, shape [f, n]; by default their own materials.
+        """
+        materials = self._scale() if shades is not None else []
+        record = self.recording
+        for name, own in (
+            ("Balls", [one for one in self._instances if one.radius]),
+            ("Bodies", [one for one in self._instances if not one.radius]),
+        ):
+            if not own:
+                continue
+            rows = np.array([one.row for one in own])
+            path = self._root.AppendChild(name)
+            prototypes: dict[tuple, int] = {}
+            kinds = self._kinds(path, own, shades, materials, prototypes)
+            balls = name == "Balls"
+            placed = InstanceArrays(
+                record.positions[:, rows],
+                kinds,
+                turns=None if balls else record.turns[:, rows],
+                scales=np.array([one.radius for one in own]) if balls else None,
+                linear=record.linear[:, rows],
+                angular=None if balls else record.angular[:, rows],
+            )
+            paths = [_prototype_path(path, number) for number in range(len(prototypes))]
+            author_instances(self._stage, path, paths, self._codes, placed)
+
+    def _kinds(self, path, shapes, shades, materials, prototypes) -> np.ndarray:
+        """Return the prototype of each shape, shape [k], or at each sample, [f, k]; author those that are missing."""
+        if shades is None:
+            steps = np.zeros((1, len(shapes)), dtype=int)
+        else:
+            steps = np.rint(shades[:, [one.row for one in shapes]] * (_SHADES - 1)).astype(int)
+        kinds = np.empty(steps.shape, dtype=int)
+        for column, shape in enumerate(shapes):
+            key = _key(shape, with_looks=shades is None)
+            for step in np.unique(steps[:, column]).tolist():
+                full = (key, step)
+                if full not in prototypes:
+                    prototypes[full] = len(prototypes)
+                    self._author_prototype(_prototype_path(path, prototypes[full]), shape, materials[step:][:1])
+                kinds[steps[:, column] == step, column] = prototypes[full]
+        return kinds[0] if shades is None else kinds
+
+    def _author_prototype(self, path: Sdf.Path, shape: DrawnShape, material: Sequence[UsdShade.Material]) -> None:
+        """Author a mesh to be instanced, in the frame of its body."""
+        stage = self._stage
+        UsdGeom.Scope.Define(stage, path.GetParentPath())
+        source = self._before.GetPrimAtPath(shape.path)
+        if source and source.typeName == "Mesh":  # a ball of an instancer has no prim
+            Sdf.CopySpec(self._before, shape.path, stage.GetRootLayer(), path)
+            with Sdf.ChangeBlock():
+                _strip(stage.GetRootLayer(), [], below=path)
+            mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+            _bake(mesh, shape)
+        else:
+            mesh = UsdGeom.Mesh.Define(stage, path)
+            author_mesh(mesh, *(BALL if shape.radius else (shape.points, shape.faces)))
+            if shape.looks[1]:
+                mesh.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*shape.looks[1])]))
+        binding = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+        if material:
+            binding.Bind(material[0])
+            mesh.GetDisplayColorAttr().Clear()
+        elif shape.looks[0]:
+            binding.Bind(UsdShade.Material(stage.GetPrimAtPath(shape.looks[0])))
+
+    def _scale(self) -> list[UsdShade.Material]:
+        """Author the materials of the colour scale."""
+        found = []
+        for number, color in enumerate(color_scale(_SHADES)):
+            path = self._root.AppendPath(f"Materials/Shade_{number:02d}")
+            found.append(UsdShade.Material.Define(self._stage, path))
+            author_surface(found[-1], color=color, roughness=0.35, coat=0.5)
+        return found
+
+    def add_arrows(self, middles: np.ndarray, moments: np.ndarray, lengths: np.ndarray) -> None:
+        """Add an arrow for each magnet.
+
+        Args:
+            middles: Their middles, shape [f, m, 3].
+            moments: Their moments, shape [f, m, 3].
+            lengths: Lengths of the arrows, shape [f, m].
+        """
+        path = self._root.AppendChild("Moments")
+        mesh = UsdGeom.Mesh.Define(self._stage, path.AppendPath("Prototypes/Arrow"))
+        UsdGeom.Scope.Define(self._stage, path.AppendChild("Prototypes"))
+        author_mesh(mesh, *ARROW)
+        self._paint(mesh.GetPrim(), "Arrow", (0.9, 0.35, 0.02))
+        kinds = np.zeros(moments.shape[1], dtype=int)
+        author_instances(
+            self._stage,
+            path,
+            [mesh.GetPath()],
+            self._codes,
+            InstanceArrays(middles, kinds, turns=turns_to(moments), scales=lengths),
+        )
+
+    def add_lines(self, points: np.ndarray, width: float) -> None:
+        """Add field lines, shape [f, lines, points, 3], as curves of a width."""
+        curves = author_curves(self._stage, self._root.AppendChild("FieldLines"), self._codes, points, width)
+        self._paint(curves.GetPrim(), "FieldLine", (0.02, 0.35, 0.8))
+
+    def _paint(self, prim: Usd.Prim, name: str, color: Sequence[float]) -> None:
+        material = UsdShade.Material.Define(self._stage, self._root.AppendPath(f"Materials/{name}"))
+        author_surface(material, color=color, roughness=0.4)
+        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+        UsdGeom.Gprim(prim).CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*color)]))
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    def save(self, output: str | os.PathLike, *, materialx: bool = False) -> None:
+        """Write the stage to a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, or as a web page, ``.html``.
+
+        Raises:
+            InputError: It cannot be written there.
+        """
+        path = usable_path(output)
+        if path.suffix not in _SUFFIXES:
+            raise InputError(f"{path}: a stage must end in {', '.join(_SUFFIXES)}, numbers in .npz or .csv")
+        if path.resolve() in self._files:
+            raise InputError(f"{path}: would overwrite what is exported")
+        if materialx:
+            author_materialx(self._stage)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as folder, quiet():
+                inner = Path(folder) / (f"{path.stem}.usdc" if path.suffix == ".usdz" else path.name)
+                if path.suffix == ".html":
+                    written = inner.write_text(page_of(self._stage, self._codes, path.stem), encoding="utf-8") > 0
+                else:
+                    written = self._stage.GetRootLayer().Export(str(inner))
+                if written and path.suffix == ".usdz":
+                    package = Path(folder) / path.name
+                    written = UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inner)), str(package))
+                    inner = package
+                if not written:
+                    raise InputError(f"{path}: cannot be written")
+                os.replace(inner, path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        if known := Sdf.Layer.Find(str(path)):
+            known.Reload(force=True)
+
+
+def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.Layer:
+    """Return the stage without what runs wrote over it, as one layer with ``rate`` time codes per second.
+
+    It has prims for instances, as the run had that wrote their motion; of ``swarms`` only for those like no other.
+    """
+    root = source.GetRootLayer()
+    top = Sdf.Layer.CreateAnonymous(".usda")
+    for key in copied_metadata(root):
+        top.pseudoRoot.SetInfo(key, root.pseudoRoot.GetInfo(key))
+    top.timeCodesPerSecond = top.framesPerSecond = rate
+    top.subLayerPaths[:] = [root.identifier]
+    stage = Usd.Stage.Open(top)
+    for layer in stage.GetUsedLayers():
+        if "warpmag" in layer.customLayerData:
+            stage.MuteLayer(layer.identifier)
+    whole = {one.path for one in swarms}
+    apart = expand_instancers(stage, stage.GetStartTimeCode(), apart=True)
+    complete_instances([one for one in apart if str(one.instancer) not in whole])
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
+            for prim in instances:
+                prim.SetInstanceable(False)
+    return stage.Flatten(addSourceFileComment=False)
+
+
+def _strip(
+    layer: Sdf.Layer, dropped: Sequence[Sdf.Path], drawn: Collection[str] = (), below: Sdf.Path | str = "/"
+) -> None:
+    """Take prims out of a layer, and all that is about simulations; what is then empty and not ``drawn`` goes, too."""
+    paths: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path(below), lambda path: paths.append(path) if path.IsPrimPath() else None)
+    gone = set(dropped)
+    for path in paths:  # what is below comes first
+        spec = layer.GetPrimAtPath(path)
+        if spec is None:
+            continue
+        physical = spec.typeName.startswith(("Physics", "Newton")) or spec.specifier == Sdf.SpecifierClass
+        schemas = spec.GetInfo("apiSchemas")
+        body = schemas and "PhysicsRigidBodyAPI" in schemas.GetAddedOrExplicitItems()
+        if physical or path in gone or (body and not spec.nameChildren and str(path) not in drawn):
+            parent = spec.nameParent or layer.pseudoRoot
+            del parent.nameChildren[spec.name]
+            continue
+        if schemas:
+            kept = [name for name in schemas.GetAddedOrExplicitItems() if not name.startswith(_SCHEMAS)]
+            spec.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit(kept))
+        if spec.typeName == "Scope" and not spec.nameChildren and not spec.properties:
+            del (spec.nameParent or layer.pseudoRoot).nameChildren[spec.name]
+            continue
+        for one in list(spec.properties):
+            if one.name.startswith(_OWN):
+                spec.RemoveProperty(one)
+
+
+def _body_of(prim: Usd.Prim) -> Usd.Prim | None:
+    """Return the rigid body that a prim is, or belongs to."""
+    while prim and not prim.IsPseudoRoot():
+        if is_body(prim):
+            return prim
+        prim = prim.GetParent()
+    return None
+
+
+def _drawn_shape(prim: Usd.Prim, given: Shape, row: int, frame: np.ndarray) -> DrawnShape:
+    image = UsdGeom.Imageable(prim)
+    drawn = image.ComputeVisibility() != UsdGeom.Tokens.invisible and image.ComputePurpose() in _PURPOSES
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+    looks = (str(material.GetPath()) if material else "", tuple(color[0]) if color else ())
+    gram, radius = frame[:3, :3] @ frame[:3, :3].T, 0.0
+    if prim.IsA(UsdGeom.Sphere) and np.allclose(gram, gram[0, 0] * np.eye(3), rtol=0.0, atol=1e-5 * gram[0, 0]):
+        radius = float(np.sqrt(gram[0, 0])) * prim.GetAttribute("radius").Get()
+        if row < 0 or np.abs(frame[3, :3]).max() < 1e-6 * radius:
+            return DrawnShape(str(prim.GetPath()), row, frame, drawn, radius, np.zeros((0, 3)), [], looks)
+    points, faces = given
+    points = np.c_[points, np.ones(len(points))] @ frame[:, :3]
+    return DrawnShape(str(prim.GetPath()), row, frame, drawn, 0.0, points, faces, looks)
+
+
+def _key(shape: DrawnShape, with_looks: bool) -> tuple:
+    """Return by what shapes are told apart that need another prototype."""
+    looks = shape.looks if with_looks else ()
+    if shape.radius:
+        return ("ball", looks)
+    size = max(shape.size, 1e-30)
+    return (np.round(shape.points / size, _DIGITS).tobytes(), round(float(np.log(size)), _DIGITS), looks)
+
+
+def _prototype_path(path: Sdf.Path, number: int) -> Sdf.Path:
+    return path.AppendPath(f"Prototypes/Shape_{number:03d}")
+
+
+def _bake(mesh: UsdGeom.Mesh, shape: DrawnShape) -> None:
+    """Put the points and normals of a mesh into the frame of its body, and leave its own transform behind."""
+    mesh.ClearXformOpOrder()
+    spec = mesh.GetPrim().GetPrimStack()[0]
+    for one in [one for one in spec.properties if one.name.startswith("xformOp")]:
+        spec.RemoveProperty(one)
+    mesh.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(shape.points, dtype=np.float32)))
+    for name in ("normals", "primvars:normals"):
+        normals = mesh.GetPrim().GetAttribute(name)
+        if normals and normals.Get() is not None:
+            turned = np.array(normals.Get(), dtype=float) @ np.linalg.inv(shape.frame[:3, :3]).T
+            turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
+            normals.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(turned, dtype=np.float32)))
+    box = shape.points.min(axis=0), shape.points.max(axis=0)
+    mesh.CreateExtentAttr([Gf.Vec3f(*side.tolist()) for side in box])

@@ -1,0 +1,1 @@
+"""Reads magnets, scenes and motions from USD stages, and checks them."""

@@ -1,0 +1,110 @@
+"""How time runs on a stage, and its units."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pxr import Usd, UsdGeom, UsdPhysics
+
+from warpmag.errors import InputError
+from warpmag.usd.read.units import units_of
+from warpmag.usd.values import Finding, value_of
+
+_RATES = (1e-3, 1e6)
+_LATEST = 1e12
+_MOST_FRAMES = 10_000_000
+
+
+@dataclass(frozen=True)
+class StageClock:
+    """How time runs on a stage.
+
+    Attributes:
+        start: Time code of the start.
+        end: Time code of the end; equal to ``start`` where the stage has no range.
+        time_codes_per_second: Time codes that make a second.
+        frames_per_second: Rate of the output frames [Hz].
+        step: Time step of the physics [s], None where the stage does not say.
+    """
+
+    start: float
+    end: float
+    time_codes_per_second: float
+    frames_per_second: float
+    step: float | None
+
+
+def stage_name(stage: Usd.Stage) -> str:
+    """Return the name by which messages call a stage."""
+    return stage.GetRootLayer().realPath or "stage"
+
+
+def start_of(stage: Usd.Stage) -> float:
+    """Return the time code at which a stage starts; raises :class:`InputError` where it is none."""
+    return _time_code(stage, "startTimeCode", stage.GetStartTimeCode())
+
+
+def stage_clock(stage: Usd.Stage) -> StageClock:
+    """Read how time runs on a stage; raises :class:`InputError` where that makes no sense."""
+    name = stage_name(stage)
+    codes = stage.GetTimeCodesPerSecond()
+    frames = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else codes
+    for what, rate in (("timeCodesPerSecond", codes), ("framesPerSecond", frames)):
+        _check_rate(name, what, rate)
+    start, end = start_of(stage), _time_code(stage, "endTimeCode", stage.GetEndTimeCode())
+    if end < start and stage.HasAuthoredMetadata("endTimeCode"):
+        raise InputError(f"{name}: endTimeCode {end:g} is before startTimeCode {start:g}")
+    end = max(start, end)
+    if (end - start) / codes * frames > _MOST_FRAMES:
+        raise InputError(f"{name}: {(end - start) / codes * frames:g} frames from startTimeCode to endTimeCode")
+    return StageClock(start, end, codes, frames, _step(stage))
+
+
+def check_rates(stage: Usd.Stage) -> None:
+    """Raise :class:`InputError` for a layer whose time codes have no rate: USD loops over its samples.
+
+    It divides the rates of layers where they differ, and takes two NaN for different.
+    """
+    for layer in stage.GetUsedLayers():
+        what = "timeCodesPerSecond" if layer.HasTimeCodesPerSecond() else "framesPerSecond"
+        _check_rate(layer.realPath or layer.identifier, what, layer.timeCodesPerSecond)
+
+
+def scenes(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Return the physics scenes of a stage; Newton takes the first."""
+    return [prim for prim in stage.Traverse() if prim.IsA(UsdPhysics.Scene)]
+
+
+def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
+    """Yield what is wrong with the units of a stage, and which length it has only by USD's default."""
+    units, name = units_of(stage), stage_name(stage)
+    for what, unit in (("metersPerUnit", units.metres), ("kilogramsPerUnit", units.kilograms)):
+        if not 1e-50 < unit < 1e50:
+            yield Finding(name, f"{what} must be positive and finite, got {unit:g}")
+    if (up := UsdGeom.GetStageUpAxis(stage)) not in ("Y", "Z"):
+        yield Finding(name, f"upAxis must be Y or Z, got {up!r}")
+    if not stage.GetRootLayer().pseudoRoot.HasInfo("metersPerUnit"):
+        message = f"metersPerUnit is not set, which in USD means {units.metres:g}: lengths are taken for so many metres"
+        yield Finding(name, message, "warning")
+
+
+def _check_rate(name, what, rate) -> None:
+    if not (rate > 0.0 and math.isfinite(rate)):
+        raise InputError(f"{name}: {what} must be positive and finite, got {rate}")
+    if not _RATES[0] <= rate <= _RATES[1]:
+        raise InputError(f"{name}: {what} must be from {_RATES[0]:g} to {_RATES[1]:g}, got {rate}")
+
+
+def _step(stage) -> float | None:
+    first = scenes(stage)[:1]
+    steps = first[0].GetAttribute("newton:timeStepsPerSecond") if first else None
+    if not (steps and steps.HasAuthoredValue()):
+        return None
+    rate = value_of(first[0], "newton:timeStepsPerSecond")
+    return None if rate is None else 1.0 / rate
+
+
+def _time_code(stage, what, code) -> float:
+    if not abs(code) <= _LATEST:
+        raise InputError(f"{stage_name(stage)}: {what} must be finite and at most {_LATEST:g} in size, got {code}")
+    return code

@@ -1,0 +1,146 @@
+"""Meshes and sizes of colliders: what Newton would read beyond its arrays, loop over without end, or take wrong."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from warpmag.errors import InputError
+from warpmag.shapes import lattice
+from warpmag.usd.values import LARGEST_COORDINATE, LARGEST_SIZE, SMALLEST_SIZE, Finding, finding_of, value_of
+
+_SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height")
+_SOLIDS = (
+    *(UsdGeom.Sphere, UsdGeom.Cube, UsdGeom.Mesh, UsdGeom.Cone),
+    *(UsdGeom.Capsule, UsdGeom.Capsule_1, UsdGeom.Cylinder, UsdGeom.Cylinder_1),
+)
+_LARGEST_MAGNET = 2e4
+"""Limit of a magnet's sizes [m], so that its moment and its square stay in single precision."""
+_AS_DRAWN = ("none", "meshSimplification", "sdf", None)
+"""Approximations of a mesh that keep its surface; all others close it, and magnetize in its place if it is open."""
+
+
+def is_solid(prim: Usd.Prim) -> bool:
+    """Whether a prim is of a type that has a volume."""
+    return any(prim.IsA(kind) for kind in _SOLIDS)
+
+
+def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:
+    """Yield what is wrong with the size of a collider in the world, and with its mesh."""
+    if prim.IsA(UsdGeom.Mesh):
+        yield from _mesh_findings(prim)
+    else:
+        yield from _size_findings(prim, LARGEST_SIZE)
+
+
+def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
+    """Yield why a collider that is sound as such cannot be magnetized."""
+    if not prim.IsA(UsdGeom.Mesh):
+        yield from _size_findings(prim, _LARGEST_MAGNET)
+        return
+    points, counts, indices = (np.asarray(value) for value in _topology(prim))
+    try:
+        lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
+    except InputError as error:
+        collided = prim.GetAttribute("physics:approximation").Get()
+        if collided in _AS_DRAWN:
+            yield Finding(str(prim.GetPath()), str(error))
+        else:
+            message = f"{error}: the {collided} that it collides as is magnetized in its place"
+            yield Finding(str(prim.GetPath()), message, "warning")
+
+
+def spacing_findings(magnet: Usd.Prim, colliders: list[Usd.Prim], spacing: float) -> Iterator[Finding]:
+    """Yield why the colliders of a magnet, which are sound, cannot be filled with moments at a spacing [m]."""
+    boxes = []
+    for prim in colliders if spacing > 0.0 else ():
+        lower, upper = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
+        boxes.append(np.subtract(upper, lower).astype(float) * np.linalg.norm(_axes(prim), axis=1))
+    if not lattice.fits(boxes, spacing):
+        yield Finding(
+            str(magnet.GetPath()),
+            f"warpmag:momentSpacing {spacing:g} m needs more than {lattice.LARGEST_COUNT} moments for one body",
+        )
+
+
+def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
+    """Yield why a viewer could not read the faces of a mesh that is only seen; it may have none."""
+    try:
+        points, counts, indices = _topology(prim)
+        holes = value_of(prim, "holeIndices")
+    except InputError as error:
+        yield finding_of(str(prim.GetPath()), error)
+        return
+    if points and indices and (message := _topology_fault(len(points), counts, indices, holes)):
+        yield Finding(str(prim.GetPath()), message)
+
+
+def _size_findings(prim, largest) -> Iterator[Finding]:
+    try:
+        sizes = [value_of(prim, name) for name in _SIZES] if prim.IsA(UsdGeom.Gprim) else []
+    except InputError:  # among the findings of the attributes already
+        return
+    lengths = np.linalg.norm(_axes(prim), axis=1)
+    for name, size in zip(_SIZES, sizes, strict=False):
+        if size is not None and not (SMALLEST_SIZE <= size * lengths.min() and size * lengths.max() <= largest):
+            yield Finding(
+                str(prim.GetPath()),
+                f"{name} {size:g} scaled by {lengths.min():g} to {lengths.max():g} must be from {SMALLEST_SIZE:g} "
+                f"to {largest:g} m",
+            )
+
+
+def _mesh_findings(prim) -> Iterator[Finding]:
+    path = str(prim.GetPath())
+    try:
+        points, counts, indices = _topology(prim)
+        holes = value_of(prim, "holeIndices")
+    except InputError:  # among the findings of the attributes already
+        return
+    if points is None or not len(points):
+        yield Finding(path, "mesh has no points")
+        return
+    if message := _topology_fault(len(points), counts, indices, holes):
+        yield Finding(path, message)
+        return
+    corners = np.asarray(points, dtype=float)[np.unique(np.asarray(indices))] @ _axes(prim)
+    extent = np.ptp(corners, axis=0).max()
+    if not SMALLEST_SIZE <= extent <= LARGEST_SIZE:
+        yield Finding(path, f"mesh is {extent:g} m long, must be from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} m")
+    elif not np.abs(corners).max() <= LARGEST_COORDINATE:
+        yield Finding(path, f"points reach {np.abs(corners).max():g} m, beyond {LARGEST_COORDINATE:g}")
+
+
+def _topology(prim) -> tuple:
+    return tuple(value_of(prim, name) for name in ("points", "faceVertexCounts", "faceVertexIndices"))
+
+
+def _topology_fault(vertices: int, counts, indices, holes) -> str:
+    """Return what is wrong with the faces of a mesh, empty where nothing is."""
+    if counts is None or indices is None or not len(counts):
+        return "mesh has no faces: faceVertexCounts or faceVertexIndices is empty"
+    counts, indices = np.asarray(counts, dtype=np.int64), np.asarray(indices, dtype=np.int64)
+    if (counts < 3).any():
+        return f"faceVertexCounts must be 3 or more, got {counts[counts < 3][0]}"
+    if counts.sum() != len(indices):
+        return f"faceVertexCounts sum to {counts.sum()}, but there are {len(indices)} faceVertexIndices"
+    wrong = indices[(indices < 0) | (indices >= vertices)]
+    if len(wrong):
+        return f"faceVertexIndices name point {wrong[0]}, but there are points 0 to {vertices - 1} only"
+    holes = np.asarray(holes if holes is not None else (), dtype=np.int64)
+    wrong = holes[(holes < 0) | (holes >= len(counts))]
+    if len(wrong):
+        return f"holeIndices name face {wrong[0]}, but there are faces 0 to {len(counts) - 1} only"
+    return ""
+
+
+def _triangles(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the triangles of polygons, as fans from their first corners."""
+    starts = np.repeat(np.cumsum(counts) - counts, counts - 2)
+    turns = np.arange(len(starts)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    return np.stack([indices[starts], indices[starts + turns + 1], indices[starts + turns + 2]], axis=1)
+
+
+def _axes(prim) -> np.ndarray:
+    """Return the rows that a transform turns the axes of a prim into."""
+    return np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim))[:3, :3]

@@ -1,0 +1,234 @@
+"""Reads what a stage gives time samples for and a run follows: transforms of kinematic bodies, fields, magnetizations.
+
+Samples are read from the stage without what its session holds, which would hide them. What moves by keys and is
+no rigid body, as artists leave it, becomes a kinematic one there, coils and field maps too.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+
+from warpmag.declarations.keys import Keys, Motion, Operation
+from warpmag.errors import InputError
+from warpmag.usd.read.session import without_held
+from warpmag.usd.read.transforms import is_animated, is_body, is_collider
+from warpmag.usd.values import LARGEST_COORDINATE, Finding
+
+_UNEVEN = 1e-5
+"""By this part of its size a scale may change, and its axes be off right angles: poses are often single precision."""
+
+
+class KeyReader:
+    """Reads the keys of one stage."""
+
+    def __init__(self, stage: Usd.Stage):
+        """Read those of ``stage``, held at any moment or not."""
+        self._stage = stage
+        self._moving: dict[Sdf.Path, bool] = {}
+
+    @cached_property
+    def plain(self) -> Usd.Stage:
+        """The stage without the values that are held."""
+        return without_held(self._stage)
+
+    def moves(self, prim: Usd.Prim, within: Usd.Prim | None = None) -> bool:
+        """Whether keys move a prim, or what is above it, in the world or within another prim above it."""
+        while prim and not prim.IsPseudoRoot() and prim != within:
+            path = prim.GetPath()
+            if path not in self._moving:
+                self._moving[path] = is_animated(prim) and self._varies(path)
+            if self._moving[path]:
+                return True
+            if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).GetResetXformStack():
+                return False
+            prim = prim.GetParent()
+        return False
+
+    def motion(self, prim: Usd.Prim) -> Motion:
+        """Return how keys move a prim, at time codes of the stage.
+
+        Raises:
+            InputError: A sample is missing, not finite, or nothing that USD can compose.
+        """
+        operations: list[Operation] = []
+        prim = self.plain.GetPrimAtPath(prim.GetPath())
+        while prim and not prim.IsPseudoRoot():
+            if prim.IsA(UsdGeom.Xformable):
+                xform = UsdGeom.Xformable(prim)
+                operations = [*_without_idle([_operation(one) for one in xform.GetOrderedXformOps()]), *operations]
+                if xform.GetResetXformStack():
+                    break
+            prim = prim.GetParent()
+        return Motion(tuple(operations))
+
+    def keys(self, prim: Usd.Prim, name: str, read: Callable[[str, object], tuple]) -> Keys | None:
+        """Return the time samples of an attribute, None where it has not several.
+
+        Args:
+            prim: The prim.
+            name: The attribute.
+            read: Checks a value, the first argument being its name for the message, and returns its numbers.
+
+        Raises:
+            InputError: A sample is none that ``read`` takes.
+        """
+        attribute = self.plain.GetPrimAtPath(prim.GetPath()).GetAttribute(name)
+        times = attribute.GetTimeSamples() if attribute else ()
+        where = f"{prim.GetPath()}: {name}"
+        if len(times) < 2:
+            return None
+        return _keys(times, [read(f"{where} at time code {time:g}", _sample(attribute, time)) for time in times], where)
+
+    def findings(self, prim: Usd.Prim, motion: Motion) -> Iterator[Finding]:
+        """Yield why a rigid body cannot follow a motion, at its keys and half-way between them."""
+        path = str(prim.GetPath())
+        times = np.unique(np.concatenate([one.keys.times for one in motion.operations if len(one.keys.times) > 1]))
+        times = np.unique(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
+        prim, places, sizes = self.plain.GetPrimAtPath(prim.GetPath()), UsdGeom.XformCache(), None
+        for time in times.tolist():
+            places.SetTime(time)
+            world = np.array(places.GetLocalToWorldTransform(prim))
+            if message := _fault(world):
+                yield Finding(path, f"keyed transform {message} at time code {time:g}")
+                return
+            own = np.linalg.norm(world[:3, :3], axis=1)
+            sizes = own if sizes is None else sizes
+            if np.abs(own - sizes).max() > _UNEVEN * sizes.max():
+                yield Finding(path, "its scale is keyed, and a rigid body keeps its size")
+                return
+
+    def _varies(self, path: Sdf.Path) -> bool:
+        """Whether a transform of a prim itself is not the same at all its samples."""
+        for one in UsdGeom.Xformable(self.plain.GetPrimAtPath(path)).GetOrderedXformOps():
+            if one.GetAttr().HasSpline():
+                return True
+            values = [_sample(one.GetAttr(), time) for time in one.GetTimeSamples()]
+            if any(value != values[0] for value in values):
+                return True
+        return False
+
+
+def make_kinematic(
+    stage: Usd.Stage, animated: Iterable[Sdf.Path], is_source: Callable[[Usd.Prim], bool] = lambda _: False
+) -> None:
+    """Make what collides or makes a field, moves by keys and is no rigid body a kinematic one, in the session layer.
+
+    Args:
+        stage: The stage.
+        animated: Prims whose own transforms have time samples.
+        is_source: Whether a prim is a coil or a field map.
+    """
+    roots = [path for path in Sdf.Path.RemoveDescendentPaths(list(animated)) if stage.GetPrimAtPath(path)]
+    reader, found = KeyReader(stage), []
+    for root in roots:
+        for prim in Usd.PrimRange(stage.GetPrimAtPath(root), Usd.TraverseInstanceProxies()):
+            chosen = is_collider(prim) or (prim.IsA(UsdGeom.Xformable) and is_source(prim))
+            if chosen and not _belongs(prim, found) and reader.moves(prim):
+                found.append(prim.GetPath())
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        for path in found:
+            prim = instance = stage.GetPrimAtPath(path)
+            while not instance.IsPseudoRoot() and not instance.IsInstance():
+                instance = instance.GetParent()
+            if prim.IsInstanceProxy():
+                where = instance.GetPath()
+                raise InputError(f"{path}: moves by keys inside an instance: set instanceable = false on {where}")
+            body = UsdPhysics.RigidBodyAPI.Apply(prim)
+            body.CreateRigidBodyEnabledAttr(True)
+            body.CreateKinematicEnabledAttr(True)
+            # which nothing depends on, but planes and open meshes have none, and Newton leaves bodies without out
+            mass = UsdPhysics.MassAPI.Apply(prim)
+            mass.CreateMassAttr(1.0)
+            mass.CreateDiagonalInertiaAttr(Gf.Vec3f(1.0))
+            mass.CreatePrincipalAxesAttr(Gf.Quatf(1.0))
+            mass.CreateCenterOfMassAttr(Gf.Vec3f(0.0))
+
+
+def _belongs(prim: Usd.Prim, found: list[Sdf.Path]) -> bool:
+    """Whether a prim is a rigid body, to be one, or part of one."""
+    while prim and not prim.IsPseudoRoot():
+        if is_body(prim) or prim.GetPath() in found:
+            return True
+        prim = prim.GetParent()
+    return False
+
+
+def _sample(attribute: Usd.Attribute, time: float):
+    """Return the value of an attribute at a time; raises :class:`InputError` if it has none that USD can read."""
+    try:
+        value = attribute.Get(time)
+    except Tf.ErrorException:
+        value = None
+    if value is None:
+        where = f"{attribute.GetPrim().GetPath()}: {attribute.GetName()}"
+        raise InputError(f"{where} has no value at time code {time:g} that USD can read")
+    return value
+
+
+def _keys(times, values, where: str, interpolation: str = "linear") -> Keys:
+    keys = Keys(np.array(times, dtype=float), np.array(values, dtype=float).reshape(len(times), -1), interpolation)
+    if not (np.isfinite(keys.times).all() and (np.diff(keys.times) > 0.0).all()):
+        raise InputError(f"{where} has time samples at times that are not finite")
+    wrong = ~np.isfinite(keys.values).all(axis=1)
+    if wrong.any():
+        raise InputError(f"{where} is not finite at time code {times[int(np.argmax(wrong))]:g}")
+    return keys
+
+
+def _operation(xform: UsdGeom.XformOp) -> Operation:
+    """Return one of USD's operations with its keys, a single one if it never changes."""
+    attribute = xform.GetAttr()
+    where = f"{attribute.GetPrim().GetPath()}: {attribute.GetName()}"
+    if attribute.HasSpline():
+        raise InputError(f"{where} is a spline, of which a run reads no keys: bake it into time samples")
+    token = UsdGeom.XformOp.GetOpTypeToken(xform.GetOpType())
+    times = xform.GetTimeSamples()
+    if times:
+        values = [_sample(attribute, time) for time in times]
+    else:
+        times, values = [0.0], [attribute.Get()]
+    if values[0] is None:  # for USD it is no transform at all
+        return Operation("matrix", Keys.constant(np.eye(4)))
+    if token == "orient":
+        quaternions = [(*value.GetImaginary(), value.GetReal()) for value in values]
+        keys = _keys(times, quaternions, where, "slerp")
+        lengths = np.linalg.norm(keys.values, axis=1, keepdims=True)
+        if not lengths.all():
+            raise InputError(f"{where} has a quaternion of zeros at time code {times[int(np.argmin(lengths))]:g}")
+        return Operation("orient", Keys(keys.times, keys.values / lengths, "slerp"), xform.IsInverseOp())
+    kind = "matrix" if token == "transform" else token
+    rows = _keys(times, [np.ravel(np.array(value, dtype=float)) for value in values], where)
+    if token[-1] in "XYZ" and token[:-1] in ("translate", "scale", "rotate"):
+        kind = token[:-1]
+        whole = np.full((len(times), 3), 1.0 if kind == "scale" else 0.0)
+        whole[:, "XYZ".index(token[-1])] = rows.values[:, 0]
+        kind, rows = ("rotateXYZ" if kind == "rotate" else kind), Keys(rows.times, whole)
+    return Operation(kind, rows, xform.IsInverseOp())
+
+
+def _without_idle(operations: list[Operation]) -> list[Operation]:
+    """Return operations without those that change nothing."""
+
+    def idle(one: Operation) -> bool:
+        neutral = {"translate": np.zeros(3), "scale": np.ones(3), "matrix": np.eye(4).ravel()}.get(one.kind)
+        return neutral is not None and bool((one.keys.values == neutral).all())
+
+    return [one for one in operations if not idle(one)]
+
+
+def _fault(world: np.ndarray) -> str:
+    """Return why no rigid body can have a transform, empty where one can."""
+    matrix = world[:3, :3]
+    if not np.isfinite(world).all() or not np.abs(world).max() <= LARGEST_COORDINATE:
+        return f"reaches beyond {LARGEST_COORDINATE:g}"
+    gram = matrix @ matrix.T
+    size = np.trace(gram) / 3.0
+    if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
+        return f"has a scale of less than {1.0 / LARGEST_COORDINATE:g}"
+    if np.abs(gram - np.diag(np.diag(gram))).max() > _UNEVEN * size:
+        return "is sheared"
+    if np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+        return "is a projection"
+    return "is mirrored" if np.linalg.det(matrix) < 0.0 else ""

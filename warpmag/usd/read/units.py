@@ -1,0 +1,235 @@
+"""Stages in other units than metres and kilograms, read in SI units: a layer of converted values over the scene.
+
+Newton's importer converts nothing, and takes no stage in other units. So every value with a length or a mass in it is
+written in SI units into a layer of the session, over the scene that stays as it is: values and time samples, and the
+defaults of shapes where nothing is authored (a sphere without a radius has one unit). Angles are degrees and times
+seconds everywhere. Of warpmag's own attributes lengths follow the stage, as those of shapes do. Magnetizations, fields,
+currents and moments are SI always: USD has no unit for a current, and data sheets have A/m.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
+
+from warpmag.errors import InputError
+from warpmag.usd.read.session import UNITS, add_layer, new_layer, release_instances
+
+_LENGTH, _NONE = (1, 0), (0, 0)
+_FORCE, _TORQUE = (1, 1), (2, 1)
+_STIFFNESS = (0, 1)
+"""Powers of length and mass in a unit; a stiffness is a force for a length, a damping one for a velocity."""
+
+_SIZES = (
+    *("radius", "radiusTop", "radiusBottom", "size", "height", "width", "length"),
+    *("clippingRange", "focusDistance", "focalLength"),
+    *("horizontalAperture", "verticalAperture", "horizontalApertureOffset", "verticalApertureOffset"),
+)
+"""Lengths whose defaults are in units of the stage, too."""
+_POWERS = {
+    **dict.fromkeys(_SIZES, _LENGTH),
+    **dict.fromkeys(("points", "extent", "extentsHint", "widths", "primvars:widths"), _LENGTH),
+    **dict.fromkeys(("positions", "velocities", "accelerations"), _LENGTH),
+    **dict.fromkeys((f"physics:{name}" for name in ("velocity", "centerOfMass", "gravityMagnitude")), _LENGTH),
+    **dict.fromkeys((f"physics:{name}" for name in ("localPos0", "localPos1", "minDistance", "maxDistance")), _LENGTH),
+    **dict.fromkeys(("physics:mass", "physics:masses"), (0, 1)),
+    "physics:density": (-3, 1),
+    "physics:diagonalInertia": (2, 1),
+    "physics:breakForce": _FORCE,
+    "physics:breakTorque": _TORQUE,
+    **dict.fromkeys(("newton:contactMargin", "newton:contactGap", "newton:contactAdhesion"), _LENGTH),
+    **dict.fromkeys(("newton:torsionalFriction", "newton:rollingFriction", "newton:shellThickness"), _LENGTH),
+    **dict.fromkeys(("newton:sdfTargetVoxelSize", "newton:sdfPadding"), _LENGTH),
+    **dict.fromkeys(("newton:sdfNarrowBandInner", "newton:sdfNarrowBandOuter"), _LENGTH),
+    **dict.fromkeys(("newton:contactStiffness", "newton:contactDamping", "newton:contactFrictionGain"), _STIFFNESS),
+    "newton:hydroelasticStiffness": (-2, 1),
+    "newton:inertia": (2, 1),
+    "newton:xpbd:jointLinearCompliance": (0, -1),
+    "newton:xpbd:jointAngularCompliance": (-2, -1),
+    **dict.fromkeys(("newton:vbd:rigid:jointLinearStiffness", "newton:vbd:rigid:jointLinearDamping"), _STIFFNESS),
+    **dict.fromkeys(("newton:vbd:rigid:jointAngularStiffness", "newton:vbd:rigid:jointAngularDamping"), _TORQUE),
+    **dict.fromkeys(("warpmag:momentSpacing", "warpmag:coil:radius", "warpmag:coil:length"), _LENGTH),
+    **dict.fromkeys(("warpmag:coil:points", "warpmag:coil:wireRadius"), _LENGTH),
+    **dict.fromkeys(("warpmag:fieldMap:origin", "warpmag:fieldMap:spacing"), _LENGTH),
+}
+_OF_JOINTS = {
+    **dict.fromkeys(("physics:lowerLimit", "physics:upperLimit"), (_LENGTH, _NONE)),
+    **dict.fromkeys(("newton:velocityLimit", "newton:mimicCoef0"), (_LENGTH, _NONE)),
+    "newton:armature": ((0, 1), (2, 1)),
+    "newton:friction": (_FORCE, _TORQUE),
+    **dict.fromkeys(("newton:damping", "newton:limitStiffness", "newton:limitDamping"), (_STIFFNESS, _TORQUE)),
+}
+"""What has one unit for joints that slide and another for those that turn."""
+_OF_DRIVES = {
+    **dict.fromkeys(("targetPosition", "targetVelocity"), (_LENGTH, _NONE)),
+    **dict.fromkeys(("stiffness", "damping"), (_STIFFNESS, _TORQUE)),
+    "maxForce": (_FORCE, _TORQUE),
+}
+_SLIDING = (UsdPhysics.PrismaticJoint, UsdPhysics.DistanceJoint)
+_TURNING = (UsdPhysics.RevoluteJoint, UsdPhysics.SphericalJoint)
+_PER_AXIS = re.compile(r"(drive|limit):(\w+):physics:(\w+)$")
+_UNIT = re.compile(r"Units:.*\b(distance|mass|force|torque|effort)\b")
+"""What the documentation of an attribute says whose unit has to be converted."""
+_PRECISE = {Sdf.ValueTypeNames.Half: Sdf.ValueTypeNames.Double, Sdf.ValueTypeNames.Half3: Sdf.ValueTypeNames.Double3}
+"""Types that would lose digits, and what takes their place."""
+_ARRAYS = (Vt.Vec3fArray, Vt.Vec3dArray, Vt.FloatArray, Vt.DoubleArray)
+_VECTORS = (Gf.Vec2f, Gf.Vec2d, Gf.Vec3f, Gf.Vec3d)
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of a stage.
+
+    Attributes:
+        metres: Unit of length [m].
+        kilograms: Unit of mass [kg].
+    """
+
+    metres: float
+    kilograms: float
+
+    @property
+    def are_si(self) -> bool:
+        """Whether nothing has to be converted."""
+        return math.isclose(self.metres, 1.0) and math.isclose(self.kilograms, 1.0)
+
+    @property
+    def are_sound(self) -> bool:
+        """Whether anything can be converted."""
+        return all(1e-50 < unit < 1e50 for unit in (self.metres, self.kilograms))
+
+
+def units_of(stage: Usd.Stage) -> Units:
+    """Return the units of the file of a stage, whatever it is read in."""
+    root = stage.GetRootLayer().pseudoRoot
+    defaults = (
+        ("metersPerUnit", UsdGeom.LinearUnits.centimeters),
+        ("kilogramsPerUnit", UsdPhysics.MassUnits.kilograms),
+    )
+    return Units(*(float(root.GetInfo(name)) if root.HasInfo(name) else default for name, default in defaults))
+
+
+def convert_units(stage: Usd.Stage) -> None:
+    """Let a stage be read in SI units, by a layer of its session; one that is, or whose units are wrong, stays.
+
+    Instances become editable: each has converted values of its own.
+
+    Raises:
+        InputError: An attribute cannot be converted.
+    """
+    units = units_of(stage)
+    if units.are_si or not units.are_sound:
+        return
+    layer = new_layer(UNITS)
+    add_layer(stage, layer)
+    release_instances(stage, layer, stage.GetPseudoRoot().GetPath())
+    # all is read before anything is written: what is referenced would be converted twice
+    everywhere = Usd.PrimRange(stage.GetPseudoRoot(), Usd.PrimAllPrimsPredicate)
+    converted = [one for prim in everywhere for one in _converted(prim, units)]
+    with Sdf.ChangeBlock():
+        for attribute, scale in converted:
+            _write(layer, attribute, scale)
+    session = stage.GetSessionLayer().pseudoRoot
+    session.SetInfo("metersPerUnit", 1.0)
+    session.SetInfo("kilogramsPerUnit", 1.0)
+
+
+@dataclass(frozen=True)
+class _Attribute:
+    """An attribute with all its values, as they were before anything was converted."""
+
+    path: Sdf.Path
+    kind: Sdf.ValueTypeName
+    variability: Sdf.Variability
+    default: object
+    samples: tuple[tuple[float, object], ...]
+
+
+def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[_Attribute, float]]:
+    """Yield the attributes of a prim that have to be converted, and the factors."""
+    for name in prim.GetPropertyNames():
+        attribute = prim.GetAttribute(name)
+        if not attribute or not (attribute.HasAuthoredValue() or name in _SIZES):
+            continue
+        length, mass = _powers(prim, name)
+        scale = units.metres**length * units.kilograms**mass
+        if scale != 1.0:
+            yield _values(attribute), scale
+
+
+def _powers(prim: Usd.Prim, name: str) -> tuple[int, int]:
+    """Return the powers of length and mass in the unit of an attribute."""
+    if name.startswith(("xformOp:translate", "xformOp:transform")):
+        return _LENGTH
+    if name in _POWERS:
+        return _POWERS[name]
+    if found := _PER_AXIS.match(name):
+        return _powers_per_axis(prim, *found.groups())
+    if name in _OF_JOINTS:
+        slides, turns = (any(prim.IsA(kind) for kind in kinds) for kinds in (_SLIDING, _TURNING))
+        if slides or turns:
+            return _OF_JOINTS[name][0 if slides else 1]
+    if name.startswith("mjc:") or (
+        name.startswith("newton:") and _UNIT.search(prim.GetAttribute(name).GetDocumentation().replace("\n", " "))
+    ):
+        raise InputError(f"{prim.GetPath()}: {name} is not converted: set metersPerUnit and kilogramsPerUnit to 1")
+    return _NONE
+
+
+def _powers_per_axis(prim, what: str, axis: str, name: str) -> tuple[int, int]:
+    slides = axis in ("linear", "distance") or axis.startswith("trans")
+    if what == "limit":
+        return _LENGTH if slides and name in ("low", "high") else _NONE
+    length, mass = _OF_DRIVES.get(name, (_NONE, _NONE))[0 if slides else 1]
+    if name in ("stiffness", "damping") and prim.GetAttribute(f"drive:{axis}:physics:type").Get() == "acceleration":
+        return _NONE  # it accelerates by so much, whatever the mass
+    return length, mass
+
+
+def _values(attribute: Usd.Attribute) -> _Attribute:
+    """Return what an attribute has; where USD cannot read a value, nothing of it: the reader tells later."""
+    path = attribute.GetPath()
+    if attribute.HasSpline():
+        where = f"{path.GetPrimPath()}: {attribute.GetName()}"
+        raise InputError(f"{where} is a spline, which is not converted from other units: bake it into time samples")
+    try:
+        samples = tuple((time, attribute.Get(time)) for time in attribute.GetTimeSamples())
+        default = attribute.Get()
+    except Tf.ErrorException:
+        samples, default = (), None
+    return _Attribute(path, attribute.GetTypeName(), attribute.GetVariability(), default, samples)
+
+
+def _write(layer: Sdf.Layer, attribute: _Attribute, scale: float) -> None:
+    """Write the converted values of an attribute, those that have the type of a length."""
+    default = _scaled(attribute.default, scale)
+    samples = [(time, _scaled(value, scale)) for time, value in attribute.samples]
+    if (default is None and not samples) or not attribute.kind:
+        return
+    kind = _PRECISE.get(attribute.kind, attribute.kind)
+    if not Sdf.JustCreatePrimAttributeInLayer(layer, attribute.path, kind, attribute.variability, False):
+        return
+    if default is not None:
+        layer.GetAttributeAtPath(attribute.path).default = default
+    for time, value in samples:
+        layer.SetTimeSample(attribute.path, time, Sdf.ValueBlock() if value is None else value)
+
+
+def _scaled(value, scale: float):
+    """Return a value times a factor, of a matrix its translation; None where it is no length."""
+    if isinstance(value, float):
+        return value * scale
+    if isinstance(value, Gf.Matrix4d):
+        return Gf.Matrix4d(value).SetTranslateOnly(value.ExtractTranslation() * scale)
+    if isinstance(value, Gf.Vec3h):
+        return Gf.Vec3d(value) * scale
+    if isinstance(value, _VECTORS):
+        return value * scale
+    if isinstance(value, _ARRAYS):
+        numbers = np.asarray(value)
+        with np.errstate(over="ignore", invalid="ignore"):  # the reader refuses what is not finite
+            return type(value).FromNumpy(np.ascontiguousarray(scale * numbers, dtype=numbers.dtype))
+    return None

@@ -1,0 +1,1 @@
+"""Writes a run's motion as a USD layer over its scene."""

@@ -1,0 +1,81 @@
+"""Copies a scene beside the output of a run, with everything that it is made of."""
+
+import os
+import shutil
+from pathlib import Path
+
+from pxr import Ar, Sdf, Usd, UsdUtils
+
+from warpmag.errors import InputError
+from warpmag.usd.read.session import unsaved_layers
+from warpmag.usd.write.output import Output
+
+
+def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
+    """Write a copy of the scene of a stage, to be placed beside a run's output.
+
+    A scene of one layer becomes ``out.scene.usdc`` and a package ``out.scene.usdz``. What has sublayers, references,
+    payloads or assets, textures say, becomes a folder ``out.scene`` with all of them, as they lie to each other. Edits
+    that are not saved are in the copy.
+
+    Returns:
+        The file or folder, and in it the root layer of the scene.
+
+    Raises:
+        InputError: There are such edits in a package.
+    """
+    scene, edited = stage.GetRootLayer(), unsaved_layers(stage)
+    for layer in edited:
+        if Ar.IsPackageRelativePath(layer.realPath) or layer.GetFileFormat().IsPackage():
+            raise InputError(f"{layer.realPath}: has edits that are not saved, and is in a package, which holds none")
+    if scene.GetFileFormat().IsPackage():
+        copied = output.beside(".scene.usdz")
+        shutil.copyfile(scene.realPath, output.temporary(copied))
+        return copied, copied
+    layers, assets, _ = ([], [], []) if scene.anonymous else UsdUtils.ComputeAllDependencies(scene.realPath)
+    files = {file_with(path) for path in (*(layer.realPath for layer in layers), *assets)}
+    if len(files) < 2:
+        copied = output.beside(".scene.usdc")
+        output.write(scene, copied)
+        return copied, copied
+    folder = output.beside(".scene")
+    top = os.path.commonpath([os.path.dirname(file) for file in files])
+    places = {file: output.temporary(folder) / os.path.relpath(file, top) for file in files}
+    for file, place in places.items():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, place)
+    for layer in layers:
+        if layer.realPath in places:  # not inside a package
+            _point_to_copies(layer, places, edited=layer in edited)
+    return folder, folder / os.path.relpath(scene.realPath, top)
+
+
+def file_with(path: str) -> str:
+    """Return the file that a layer or an asset is in, perhaps a package."""
+    return Ar.SplitPackageRelativePathOuter(path)[0]
+
+
+def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path], *, edited: bool) -> None:
+    """Let the copy of ``layer`` name the other copies and have its edits; names relative to its folder stay right."""
+    changed = edited
+    resolver = Ar.GetResolver()
+
+    def moved(path: str) -> str:
+        nonlocal changed
+        outer, inner = Ar.SplitPackageRelativePathOuter(path)
+        if not outer or outer.startswith(("./", "../")):
+            return path
+        found = resolver.Resolve(Sdf.ComputeAssetPathRelativeToLayer(layer, outer)).GetPathString()
+        if found not in places:
+            return path
+        changed = True
+        short = os.path.relpath(places[found], places[layer.realPath].parent)
+        short = short if short.startswith("../") else f"./{short}"
+        return Ar.JoinPackageRelativePath(short, inner) if inner else short
+
+    copied = Sdf.Layer.CreateAnonymous() if edited else Sdf.Layer.OpenAsAnonymous(layer.realPath)
+    if edited:
+        copied.TransferContent(layer)
+    UsdUtils.ModifyAssetPaths(copied, moved)
+    if changed:
+        copied.Export(str(places[layer.realPath]))
