@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from warpmag.declarations.magnets import check_finite, check_flag, check_positive, check_token, real, shown
+from warpmag.declarations.checks import check_flag, check_positive, check_token, check_vector, real_number, short_repr
 from warpmag.errors import InputError
 
 COIL_SHAPES = ("loop", "solenoid", "polyline")
@@ -87,14 +87,14 @@ class Coil:
         for size in ("radius", "length"):
             if size in has:
                 _check_size(f"{name}: {size}", getattr(self, size))
-            elif real(f"{name}: {size}", getattr(self, size)) != 0.0:
+            elif real_number(f"{name}: {size}", getattr(self, size)) != 0.0:
                 raise InputError(f"{name}: {size} is given, but a {self.shape} has none")
         if self.shape == "polyline":
             self._check_points(f"{name}: points")
         elif len(self.points):
             raise InputError(f"{name}: points are given, but a {self.shape} has none")
         most = self._thickest()
-        wire = real(f"{name}: wire radius", self.wire_radius)
+        wire = real_number(f"{name}: wire radius", self.wire_radius)
         if not 0.0 <= wire <= most:
             raise InputError(f"{name}: wire radius must be from 0 to {most:g}, got {wire:g}")
 
@@ -149,8 +149,8 @@ class FieldMap:
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
         check_strength(f"{name}: factor", self.factor)
-        check_finite(f"{name}: origin", self.origin)
-        check_finite(f"{name}: spacing", self.spacing)
+        check_vector(f"{name}: origin", self.origin)
+        check_vector(f"{name}: spacing", self.spacing)
         for step in self.spacing:
             _check_size(f"{name}: spacing", step)
         shape = np.shape(self.values)
@@ -199,7 +199,7 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
     except ValueError:  # a ragged list
         array = np.zeros(0, object)
     if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name}: must be vectors of three numbers, got {shown(values)}")
+        raise InputError(f"{name}: must be vectors of three numbers, got {short_repr(values)}")
     wrong = ~(np.abs(array) <= most).all(axis=1)
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -209,7 +209,7 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
 
 def check_strength(name: str, value: Any) -> None:
     """Raise :class:`InputError` unless ``value`` is a number of ampere-turns, or a factor, in range."""
-    number = real(name, value)
+    number = real_number(name, value)
     if not abs(number) <= MOST_AMPERE_TURNS:
         raise InputError(f"{name}: must be finite and at most {MOST_AMPERE_TURNS:g} in size, got {number:g}")
 

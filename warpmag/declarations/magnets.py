@@ -5,10 +5,9 @@ words whether it comes from a stage, from the command line or from a script.
 """
 
 import math
-import numbers
-import reprlib
 from dataclasses import dataclass, field, replace
 
+from warpmag.declarations.checks import check_not_negative, check_positive, check_token, check_vector, real_number
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.errors import InputError
 
@@ -35,33 +34,6 @@ _RECOIL = (1.001, 10.0)
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
 
-_REPR = reprlib.Repr()
-_REPR.maxother = 60
-
-
-def shown(value) -> str:
-    """Any value for a message: short, and on one line."""
-    return " ".join(_REPR.repr_instance(value, 0).split())
-
-
-def real(name: str, value) -> float:
-    """Return one real number as a float; :class:`InputError` for anything else, bools among it."""
-    plain = value
-    if getattr(value, "shape", None) == () and hasattr(value, "item") and not getattr(value, "mask", False):
-        plain = value.item()
-    if isinstance(plain, bool) or not isinstance(plain, numbers.Real):
-        raise InputError(f"{name}: must be one real number, got {shown(value)}")
-    try:
-        return float(plain)
-    except OverflowError as error:  # an int or a fraction
-        raise InputError(f"{name}: beyond the largest float, got {shown(value)}") from error
-
-
-def check_token(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Raise :class:`InputError` unless ``value`` is one of ``allowed``."""
-    if not isinstance(value, str) or value not in allowed:
-        raise InputError(f"{name}: {shown(value)} is not one of {', '.join(allowed)}")
-
 
 def check_curve(name: str, value, others: tuple[str, ...] = ()) -> None:
     """Raise :class:`InputError` unless ``value`` is a magnetization curve, one of :data:`CURVES` or a measured one.
@@ -70,13 +42,6 @@ def check_curve(name: str, value, others: tuple[str, ...] = ()) -> None:
     """
     if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
         check_token(name, value, (*CURVES, *others))
-
-
-def check_positive(name: str, value: float, *, infinite: bool = False) -> None:
-    """Raise :class:`InputError` unless ``value`` is positive and finite (or infinite where that is allowed)."""
-    number = real(name, value)
-    if not number > 0.0 or (math.isinf(number) and not infinite):
-        raise InputError(f"{name}: must be positive{'' if infinite else ' and finite'}, got {number:g}")
 
 
 def check_material(name: str, value: float, *, infinite: bool = False) -> None:
@@ -89,47 +54,9 @@ def check_material(name: str, value: float, *, infinite: bool = False) -> None:
 
 def check_recoil(name: str, value: float) -> None:
     """Raise :class:`InputError` unless ``value`` is a recoil permeability: 1, or from 1.001 to 10."""
-    number = real(name, value)
+    number = real_number(name, value)
     if number != 1.0 and not _RECOIL[0] <= number <= _RECOIL[1]:
         raise InputError(f"{name}: must be 1, or {_RECOIL[0]:g} to {_RECOIL[1]:g}, got {number:g}")
-
-
-def check_not_negative(name: str, value: float) -> None:
-    """Raise :class:`InputError` unless ``value`` is zero or positive and finite."""
-    number = real(name, value)
-    if not (number >= 0.0 and math.isfinite(number)):
-        raise InputError(f"{name}: must be zero or positive and finite, got {number:g}")
-
-
-def check_finite(name: str, values: tuple[float, ...]) -> None:
-    """Raise :class:`InputError` unless ``values`` are three finite numbers."""
-    try:
-        three = len(values) == 3
-    except TypeError:  # arrays of no dimension have a length, too, until it is asked for
-        three = False
-    if not three:
-        raise InputError(f"{name}: must be three numbers, got {shown(values)}")
-    if not all(math.isfinite(real(name, v)) for v in values):
-        raise InputError(f"{name}: must be finite, got {tuple(float(v) for v in values)}")
-
-
-def check_flag(name: str, value: bool) -> None:
-    """Raise :class:`InputError` unless ``value`` is true or false, as Python or NumPy has it."""
-    if type(value).__name__ not in ("bool", "bool_"):
-        raise InputError(f"{name}: must be True or False, got {shown(value)}")
-
-
-def check_whole(name: str, value: int) -> None:
-    """Raise :class:`InputError` unless ``value`` is a whole number."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-        raise InputError(f"{name}: must be a whole number, got {shown(value)}")
-
-
-def check_count(name: str, value: int) -> None:
-    """Raise :class:`InputError` unless ``value`` is a whole number from 1 to the largest of 32 bits."""
-    check_whole(name, value)
-    if not 1 <= value < 2**31:
-        raise InputError(f"{name}: must be at least 1 and below 2³¹, got {shown(value)}")
 
 
 def check_force(name: str, value: str, contact_model: str = "dipole") -> None:
@@ -141,7 +68,7 @@ def check_force(name: str, value: str, contact_model: str = "dipole") -> None:
 
 def check_rtol(name: str, value: float, dtype: str = "float32") -> None:
     """Raise :class:`InputError` unless ``value`` is a relative error that sums in ``dtype`` can reach."""
-    number = real(name, value)
+    number = real_number(name, value)
     if not ACCURACY[dtype] <= number < math.inf:
         raise InputError(f"{name}: must be at least {ACCURACY[dtype]:g} in {dtype} and finite, got {number:g}")
 
@@ -196,7 +123,7 @@ class Magnet:
             check_material(f"{name}: susceptibility", self.susceptibility, infinite=True)
             check_curve(f"{name}: curve", self.curve)
         else:
-            check_finite(f"{name}: magnetization", self.magnetization)
+            check_vector(f"{name}: magnetization", self.magnetization)
             check_recoil(f"{name}: recoil permeability", self.recoil_permeability)
         check_not_negative(f"{name}: moment spacing", self.moment_spacing)
         check_not_negative(f"{name}: conductivity", self.conductivity)
@@ -223,7 +150,7 @@ class MagneticSettings:
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` if a value is out of range."""
-        check_finite(f"{name}: external field", self.external_field)
+        check_vector(f"{name}: external field", self.external_field)
         check_token(f"{name}: contact model", self.contact_model, CONTACT_MODELS)
         check_force(f"{name}: force", self.force, self.contact_model)
         check_token(f"{name}: dynamics", self.dynamics, DYNAMICS)

@@ -9,8 +9,9 @@ table and of makers' data sheets, rounded.
 import math
 from dataclasses import dataclass
 
+from warpmag.declarations.checks import short_repr
 from warpmag.declarations.curves import MU0, MagnetizationCurve
-from warpmag.declarations.magnets import check_curve, shown
+from warpmag.declarations.magnets import check_curve
 from warpmag.declarations.measured import MEASURED_CURVES
 from warpmag.errors import InputError
 
@@ -144,7 +145,7 @@ def inducible_from(material: str | None, curve, given: dict) -> dict:
     says = ("saturation", "susceptibility", "curve") if table or "curve" in brought else tuple(brought)
     twice = [name for name in values if name in says and (material is not None or name != "curve")]
     if twice and (material is not None or table):
-        who = f"material: {shown(material)}" if material is not None else "curve: it"
+        who = f"material: {short_repr(material)}" if material is not None else "curve: it"
         raise InputError(f"{who} says what {' and '.join(twice)} are, give one or the other")
     return {**values, **brought}
 
@@ -190,5 +191,5 @@ def _look_up(owner: str, name: str, kind: str | None = None) -> Material:
     known = [one.name for one in MATERIALS.values() if kind in (None, one.kind)]
     if not isinstance(name, str) or name not in known:
         which = f"{kind} material" if kind else "material"
-        raise InputError(f"{owner}: {shown(name)} is no {which} known here, which are {', '.join(known)}")
+        raise InputError(f"{owner}: {short_repr(name)} is no {which} known here, which are {', '.join(known)}")
     return MATERIALS[name]

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warpmag.declarations.magnets import MATERIAL_RANGE, check_token, shown
+from warpmag.declarations.checks import check_token, short_repr
+from warpmag.declarations.magnets import MATERIAL_RANGE
 from warpmag.errors import InputError
 from warpmag.moments.ranks import launched
 
@@ -92,7 +93,7 @@ def resolve_device(device):
         return wp.get_device(device)
     except Exception as error:  # Warp raises RuntimeError, ValueError or TypeError, with long texts
         available = ", ".join(d.alias for d in wp.get_devices())
-        raise InputError(f"device: no {shown(device)} here; available: {available}") from error
+        raise InputError(f"device: no {short_repr(device)} here; available: {available}") from error
 
 
 def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
@@ -106,14 +107,14 @@ def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
     try:
         array = np.asarray(value)
     except Exception as error:  # a ragged list, or an object that fails to become an array
-        raise InputError(f"{name}: no array of numbers: {shown(value)}") from error
+        raise InputError(f"{name}: no array of numbers: {short_repr(value)}") from error
     if np.ma.is_masked(value):
         raise InputError(f"{name}: has masked entries")
     kind = array.dtype.kind
     if kind == "O" and array.size and all(isinstance(v, numbers.Real) for v in array.flat):
         kind = "b" if any(isinstance(v, bool) for v in array.flat) else "f"  # ints beyond 64 bits, fractions
     if kind not in "iuf":
-        raise InputError(f"{name}: must be real numbers, got {shown(value)}")
+        raise InputError(f"{name}: must be real numbers, got {short_repr(value)}")
     if single and array.dtype == np.float32:
         return array
     try:

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from warpmag.declarations.magnets import check_positive
+from warpmag.declarations.checks import check_positive
 from warpmag.errors import InputError
 from warpmag.kernels.induction import submagnetization, theta_flow
 from warpmag.kernels.induction.body_response import BodyResponses

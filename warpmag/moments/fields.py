@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import check_not_negative, check_rtol, check_token
+from warpmag.declarations.checks import check_not_negative, check_token
+from warpmag.declarations.magnets import check_rtol
 from warpmag.errors import InputError
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity

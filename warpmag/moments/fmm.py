@@ -5,7 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from warpmag.declarations.magnets import SUMS, check_token
+from warpmag.declarations.checks import check_token
+from warpmag.declarations.magnets import SUMS
 from warpmag.errors import InputError
 from warpmag.kernels.fmm.evaluation import CellSums
 from warpmag.kernels.fmm.expansions import ExpansionTables

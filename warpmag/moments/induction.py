@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.checks import short_repr
 from warpmag.declarations.curves import MagnetizationCurve
-from warpmag.declarations.magnets import shown
 from warpmag.declarations.materials import measured
 from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.moments.arrays import (
@@ -318,7 +318,7 @@ def _sources(kind: Kind, sources, farthest):
     if sources is None:
         sources = np.zeros((0, 3)), np.zeros((0, 3))
     if not isinstance(sources, (tuple, list)) or len(sources) != 2:
-        raise InputError(f"sources: must be (positions, moments), got {shown(sources)}")
+        raise InputError(f"sources: must be (positions, moments), got {short_repr(sources)}")
     x = kind.vectors("sources: positions", sources[0], farthest=farthest)
     return x, kind.vectors("sources: moments", sources[1], x.shape[0])
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.checks import check_token
 from warpmag.declarations.curves import MagnetizationCurve
-from warpmag.declarations.magnets import LINEAR_CURVE, check_token
+from warpmag.declarations.magnets import LINEAR_CURVE
 from warpmag.errors import InputError
 from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, LINEAR, MIXED, CurveParameters, curve_tables
 from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host_scalars, shape_message

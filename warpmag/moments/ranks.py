@@ -29,7 +29,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from warpmag.declarations.magnets import check_count
+from warpmag.declarations.checks import check_count
 from warpmag.errors import InputError, SimulationError, extra, one_line
 
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")

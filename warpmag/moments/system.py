@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, check_count, check_force, check_rtol, check_token
+from warpmag.declarations.checks import check_count, check_token
+from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, check_force, check_rtol
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.sources import Sources

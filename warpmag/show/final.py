@@ -7,7 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from warpmag.declarations.magnets import check_count
+from warpmag.declarations.checks import check_count
 from warpmag.errors import InputError
 from warpmag.show.export import export
 from warpmag.usd import open_motion, stage_clock, usable_path

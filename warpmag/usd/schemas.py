@@ -11,16 +11,10 @@ import newton_usd_schemas  # noqa: F401  (registers Newton's own schemas, which 
 from pxr import Gf, Plug, Sdf, Usd
 
 from warpmag.declarations import materials
+from warpmag.declarations.checks import check_vector
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.keys import Keys
-from warpmag.declarations.magnets import (
-    Magnet,
-    MagneticSettings,
-    check_curve,
-    check_finite,
-    check_material,
-    check_recoil,
-)
+from warpmag.declarations.magnets import Magnet, MagneticSettings, check_curve, check_material, check_recoil
 from warpmag.errors import InputError
 from warpmag.usd.read.keys import KeyReader
 from warpmag.usd.values import instance_finding, number, text, vector
@@ -94,7 +88,7 @@ def magnet_of(prim: Usd.Prim) -> Magnet:
     path = str(prim.GetPath())
     magnet.check(path)
     check_curve(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve)  # what its kind has no use for, too
-    check_finite(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
+    check_vector(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
     check_recoil(f"{path}: {_MAGNET_ATTRIBUTES['recoil_permeability']}", magnet.recoil_permeability)
     for field, infinite in (("saturation", False), ("susceptibility", True)):
         check_material(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
@@ -118,7 +112,7 @@ def moment_of(prim: Usd.Prim) -> tuple[float, float, float] | None:
     if value is None:
         return None
     moment = vector(f"{prim.GetPath()}: {MOMENT}", value)
-    check_finite(f"{prim.GetPath()}: {MOMENT}", moment)
+    check_vector(f"{prim.GetPath()}: {MOMENT}", moment)
     return moment
 
 
@@ -196,7 +190,7 @@ def magnetization_keys(prim: Usd.Prim, magnet: Magnet, keys: KeyReader) -> Keys 
 
 def _finite_vector(name: str, value) -> tuple[float, float, float]:
     found = vector(name, value)
-    check_finite(name, found)
+    check_vector(name, found)
     return found
 
 

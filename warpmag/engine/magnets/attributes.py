@@ -13,8 +13,9 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations import materials
+from warpmag.declarations.checks import check_vector, check_whole, short_repr
 from warpmag.declarations.curves import MagnetizationCurve
-from warpmag.declarations.magnets import CURVES, KINDS, SATURATION_OF_IRON, Magnet, check_finite, check_whole, shown
+from warpmag.declarations.magnets import CURVES, KINDS, SATURATION_OF_IRON, Magnet
 from warpmag.errors import InputError
 
 NAMESPACE = "warpmag"
@@ -211,7 +212,7 @@ def add_permanent(
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
             of range.
     """
-    check_finite("magnetization", magnetization)
+    check_vector("magnetization", magnetization)
     if material is not None:
         magnetization = materials.permanent("material", material, magnetization)
     for index in magnet_shapes(builder, body, shape):
@@ -266,13 +267,13 @@ def check_body(builder: newton.ModelBuilder, body: int) -> None:
 
 def _check_builder(builder: newton.ModelBuilder) -> None:
     if not isinstance(builder, newton.ModelBuilder):
-        raise InputError(f"builder: must be a newton.ModelBuilder, got {shown(builder)}")
+        raise InputError(f"builder: must be a newton.ModelBuilder, got {short_repr(builder)}")
 
 
 def _check_index(name: str, index: int, count: int, kind: str) -> None:
     check_whole(name, index)
     if not 0 <= index < count:
-        raise InputError(f"{name}: {shown(index)} is out of range, the builder has {count} {kind}")
+        raise InputError(f"{name}: {short_repr(index)} is out of range, the builder has {count} {kind}")
 
 
 def mark_shape(builder: newton.ModelBuilder, shape: int, magnet: Magnet) -> None:

@@ -10,8 +10,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations import materials
+from warpmag.declarations.checks import check_not_negative, check_positive, check_vector
 from warpmag.declarations.curves import MagnetizationCurve
-from warpmag.declarations.magnets import Magnet, check_finite, check_not_negative, check_positive
+from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import check_registered, mark_shapes
 from warpmag.errors import InputError
 from warpmag.garbage import collection_paused
@@ -87,7 +88,7 @@ def add_balls(
     check_registered(builder)
     poses = _poses(positions, orientations)
     if color is not None:
-        check_finite("color", color)
+        check_vector("color", color)
     count = len(poses)
     radii = _radii(radius, count)
     given = {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
@@ -198,7 +199,7 @@ def _magnet(material, given: dict, magnetization, recoil_permeability: float) ->
         return Magnet("inducible", **materials.inducible_from(material, curve, said))
     if said:
         raise InputError(f"{next(iter(said))}: is of inducible magnets only, and magnetization makes permanent ones")
-    check_finite("magnetization", magnetization)
+    check_vector("magnetization", magnetization)
     if material is not None:
         magnetization = materials.permanent("material", material, magnetization)
     return Magnet("permanent", magnetization=tuple(magnetization), recoil_permeability=recoil_permeability)

@@ -8,8 +8,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations import materials
+from warpmag.declarations.checks import check_positive
 from warpmag.declarations.curves import MagnetizationCurve
-from warpmag.declarations.magnets import MagneticSettings, check_positive
+from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.eddy import BodyEddies
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets

@@ -8,7 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import check_not_negative, check_whole, shown
+from warpmag.declarations.checks import check_not_negative, check_whole, short_repr
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.sites import Sites, find_sites, read_sites
@@ -60,7 +60,7 @@ class SensorMagnetometer:
         check_not_negative("noise", noise)
         check_whole("seed", seed)
         if not saturation > 0.0:
-            raise InputError(f"saturation: must be positive, got {shown(saturation)}")
+            raise InputError(f"saturation: must be positive, got {short_repr(saturation)}")
         self.sites = _find_sites(model, sites)
         self._noise, self._most, self._seed = float(noise), float(saturation), int(seed)
         worlds = np.maximum(model.shape_world.numpy()[self.sites], 0) if model.world_count > 1 else None
@@ -95,7 +95,7 @@ def _find_sites(model: newton.Model, wanted) -> list[int]:
         for index in wanted:
             check_whole("sites", index)
             if not 0 <= index < model.shape_count or not flags[index] & newton.ShapeFlags.SITE:
-                raise InputError(f"sites: {shown(index)} is no site")
+                raise InputError(f"sites: {short_repr(index)} is no site")
         return [int(index) for index in wanted]
     if isinstance(wanted, re.Pattern):
         matches = wanted.fullmatch
@@ -107,5 +107,5 @@ def _find_sites(model: newton.Model, wanted) -> list[int]:
         if not flags[index] & newton.ShapeFlags.SITE:
             raise InputError(f"sites: {model.shape_label[index]} is no site")
     if not found:
-        raise InputError(f"sites: no label matches {shown(getattr(wanted, 'pattern', wanted))}")
+        raise InputError(f"sites: no label matches {short_repr(getattr(wanted, 'pattern', wanted))}")
     return found

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import FARTHEST_POINT, Coil, FieldMap, SourceRecord, check_strength, checked_vectors
-from warpmag.declarations.magnets import check_whole, shown
 from warpmag.engine.magnets.attributes import NAMESPACE, check_body, check_registered
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
@@ -135,7 +135,7 @@ def add_source(
     if body != -1:
         check_body(builder, body)
     if not isinstance(label, str):
-        raise InputError(f"label: must be text, got {shown(label)}")
+        raise InputError(f"label: must be text, got {short_repr(label)}")
     frame = wp.transform() if xform is None else _checked_frame("xform", xform)
     values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
     values[f"{NAMESPACE}:current_keys"] = keys
@@ -202,7 +202,7 @@ def _checked_frame(name: str, xform) -> wp.transform:
     numbers = np.concatenate([np.zeros(0), *(host_array(name, part).ravel() for part in parts)])
     length = float(np.linalg.norm(numbers[3:]))
     if len(numbers) != 7 or not abs(length - 1.0) < _STRAIGHT or np.abs(numbers).max() > FARTHEST_POINT:
-        raise InputError(f"{name}: must be a place and a quaternion x y z w of length 1, got {shown(xform)}")
+        raise InputError(f"{name}: must be a place and a quaternion x y z w of length 1, got {short_repr(xform)}")
     return wp.transform(numbers[:3], numbers[3:] / length)
 
 
@@ -303,7 +303,7 @@ class ModelSources:
         else:
             found = [shape for shape in self.shapes if shape == which]
         if not found:
-            raise InputError(f"{name}: {shown(which)} is no source of the model")
+            raise InputError(f"{name}: {short_repr(which)} is no source of the model")
         return wp.array(found, dtype=wp.int32, device=self._model.device)
 
 

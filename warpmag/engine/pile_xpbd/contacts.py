@@ -12,7 +12,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import check_token
+from warpmag.declarations.checks import check_token
 from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
 from warpmag.errors import InputError, extra

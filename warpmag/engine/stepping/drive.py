@@ -8,8 +8,8 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.checks import short_repr
 from warpmag.declarations.keys import Keys, SceneKeys
-from warpmag.declarations.magnets import shown
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.errors import InputError
@@ -128,7 +128,7 @@ class KeyedCurrents:
         if time is not None:
             seconds = host_array("time", time)
             if seconds.size != 1:
-                raise InputError(f"time: must be one number, got {shown(time)}")
+                raise InputError(f"time: must be one number, got {short_repr(time)}")
             self.time.fill_(float(seconds.reshape(-1)[0]))
         launch_follow(self._followers, 0.0)
 

@@ -4,7 +4,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import shown
+from warpmag.declarations.checks import short_repr
 from warpmag.engine.pile_xpbd.contacts import MAXIMAL
 from warpmag.errors import InputError
 
@@ -74,7 +74,7 @@ def solver_warnings(solver: str) -> list[str]:
 def check_control(control: newton.Control, model: newton.Model) -> None:
     """Refuse what is no control of ``model``."""
     if not isinstance(control, newton.Control):
-        raise InputError(f"control: must be a newton.Control, got {shown(control)}")
+        raise InputError(f"control: must be a newton.Control, got {short_repr(control)}")
     for name, wanted in vars(model.control()).items():
         if isinstance(wanted, wp.array):
             given = getattr(control, name, None)

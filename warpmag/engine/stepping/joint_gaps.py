@@ -5,7 +5,7 @@ from typing import Any
 import newton
 import numpy as np
 
-from warpmag.declarations.joint_gaps import are_apart, told
+from warpmag.declarations.checks import joint_ends_apart, joint_gap_message
 from warpmag.engine.pile_xpbd.joints import are_pins
 
 
@@ -29,7 +29,7 @@ def strained_joints(model: newton.Model) -> dict[str, float]:
     gaps[slides] -= axes * (axes * gaps[slides]).sum(axis=1, keepdims=True)
     lengths = np.linalg.norm(gaps, axis=1)
     found = (are_pins(model) | slides) & _host(model.joint_enabled)
-    found &= are_apart(lengths, np.linalg.norm(one, axis=1))
+    found &= joint_ends_apart(lengths, np.linalg.norm(one, axis=1))
     return {model.joint_label[joint]: float(lengths[joint]) for joint in np.flatnonzero(found)}
 
 
@@ -57,4 +57,4 @@ def strain_warnings(strained: dict[str, float]) -> list[str]:
         return []
     label, more = next(iter(strained)), len(strained) - 1
     whose = f"{label} and {more} other joints: their ends are up to" if more else f"{label}: its ends are"
-    return [f"{whose} {told(max(strained.values()))}; place the bodies, with newton.eval_fk say"]
+    return [f"{whose} {joint_gap_message(max(strained.values()))}; place the bodies, with newton.eval_fk say"]

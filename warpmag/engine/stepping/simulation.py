@@ -12,7 +12,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import MagneticSettings, check_flag, check_positive, shown
+from warpmag.declarations.checks import check_flag, check_positive, short_repr
+from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
@@ -119,7 +120,7 @@ class Simulation:
         from warpmag.engine.stepping.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
 
         if not isinstance(scene, str | os.PathLike):
-            raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {shown(scene)}")
+            raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {short_repr(scene)}")
         self._scene = import_scene(scene, **choices)
         clock = self._scene.clock
         self.frame_rate = clock.frames_per_second

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
-from warpmag.declarations.joint_gaps import are_apart, told
+from warpmag.declarations.checks import joint_ends_apart, joint_gap_message
 from warpmag.errors import InputError
 from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.values import Finding, value_of
@@ -72,7 +72,7 @@ def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Fin
         elif not any(end.moves for end in _ends(stage, joint)):
             yield Finding(path, "joins things that do not move, and is left out", "warning")
     for path, gap in _strained_joints(stage).items():
-        yield Finding(path, f"its ends are {told(gap)}", "warning")
+        yield Finding(path, f"its ends are {joint_gap_message(gap)}", "warning")
 
 
 def _hung_on(stage, joint) -> str:
@@ -98,7 +98,7 @@ def _strained_joints(stage: Usd.Stage) -> dict[str, float]:
         except (InputError, Tf.ErrorException):  # among the findings of the attributes and ends
             continue
         gap = (one - other - axis * ((one - other) * axis)).GetLength()
-        if any(end.moves for end in ends) and are_apart(gap, one.GetLength()):
+        if any(end.moves for end in ends) and joint_ends_apart(gap, one.GetLength()):
             found[str(joint.GetPath())] = gap
     return found
 

@@ -1,0 +1,104 @@
+"""Checks of single values, each with a message of one line that names the value.
+
+Stages, command lines and scripts pass through the same checks, so that a wrong value gives the same message.
+"""
+
+import math
+import numbers
+import reprlib
+from typing import Any
+
+from warpmag.errors import InputError
+
+_JOINT_GAP, _JOINT_ROUNDING = 1e-4, 1e-5
+"""Gap at which the ends of a joint count as apart [m], plus a fraction of their coordinates.
+
+Poses are often in single precision, which the fraction allows for.
+"""
+
+_REPR = reprlib.Repr()
+_REPR.maxother = 60
+
+
+def short_repr(value: Any) -> str:
+    """Return any value as short text on one line, for a message."""
+    return " ".join(_REPR.repr_instance(value, 0).split())
+
+
+def real_number(name: str, value: Any) -> float:
+    """Return one real number as a float; raise :class:`InputError` for anything else, a bool too."""
+    plain = value
+    if getattr(value, "shape", None) == () and hasattr(value, "item") and not getattr(value, "mask", False):
+        plain = value.item()
+    if isinstance(plain, bool) or not isinstance(plain, numbers.Real):
+        raise InputError(f"{name}: must be one real number, got {short_repr(value)}")
+    try:
+        return float(plain)
+    except OverflowError as error:  # an int or a fraction
+        raise InputError(f"{name}: beyond the largest float, got {short_repr(value)}") from error
+
+
+def check_token(name: str, value: Any, allowed: tuple[str, ...]) -> None:
+    """Raise :class:`InputError` unless ``value`` is one of ``allowed``."""
+    if not isinstance(value, str) or value not in allowed:
+        raise InputError(f"{name}: {short_repr(value)} is not one of {', '.join(allowed)}")
+
+
+def check_positive(name: str, value: Any, *, infinite: bool = False) -> None:
+    """Raise :class:`InputError` unless ``value`` is positive and finite, or infinite where that is allowed."""
+    number = real_number(name, value)
+    if not number > 0.0 or (math.isinf(number) and not infinite):
+        raise InputError(f"{name}: must be positive{'' if infinite else ' and finite'}, got {number:g}")
+
+
+def check_not_negative(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is zero or positive and finite."""
+    number = real_number(name, value)
+    if not (number >= 0.0 and math.isfinite(number)):
+        raise InputError(f"{name}: must be zero or positive and finite, got {number:g}")
+
+
+def check_vector(name: str, values: Any) -> None:
+    """Raise :class:`InputError` unless ``values`` are three finite numbers."""
+    try:
+        three = len(values) == 3
+    except TypeError:  # NumPy arrays of no dimension define a length that raises
+        three = False
+    if not three:
+        raise InputError(f"{name}: must be three numbers, got {short_repr(values)}")
+    if not all(math.isfinite(real_number(name, component)) for component in values):
+        raise InputError(f"{name}: must be finite, got {tuple(float(component) for component in values)}")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is a bool of Python or NumPy."""
+    if type(value).__name__ not in ("bool", "bool_"):
+        raise InputError(f"{name}: must be True or False, got {short_repr(value)}")
+
+
+def check_whole(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is a whole number."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise InputError(f"{name}: must be a whole number, got {short_repr(value)}")
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is a whole number from 1 to the largest of 32 bits."""
+    check_whole(name, value)
+    if not 1 <= value < 2**31:
+        raise InputError(f"{name}: must be at least 1 and below 2³¹, got {short_repr(value)}")
+
+
+def joint_ends_apart(gap, distance):
+    """Return whether the ends of joints count as apart.
+
+    Args:
+        gap: Distance between the ends [m], a number or an array.
+        distance: Distance of one end from the origin [m], of the same shape.
+    """
+    return gap > _JOINT_GAP + _JOINT_ROUNDING * distance
+
+
+def joint_gap_message(gap: float) -> str:
+    """Return the part of a warning that says how far the ends of a joint are apart [m], and what follows."""
+    return f"{gap:.3g} m apart at the start, and a run begins by pulling"
