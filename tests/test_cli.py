@@ -64,12 +64,27 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"warpmag {metadata.version('warpmag')}\n"
 
 
-@pytest.mark.parametrize("method", ["warpmag", "paper", "kim2018"])
-def test_published_methods_run_by_name(scene, device, method, tmp_path, capfd):
+@pytest.mark.parametrize("preset", ["warpmag", "paper", "kim2018"])
+def test_presets_run_by_name(scene, device, preset, tmp_path, capfd):
     out = tmp_path / "out.usda"
-    command = ["run", str(scene), "-o", str(out), "--frames", "1", "--device", device, "--method", method]
+    command = ["run", str(scene), "-o", str(out), "--frames", "1", "--device", device, "--preset", preset]
     assert cli.main(command) == 0
     assert "magnetization error" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parsed"),
+    [
+        (["--sums", "fmm"], "--method fmm", (None, "fmm")),
+        (["--method", "paper"], "--preset paper", ("paper", "auto")),
+    ],
+)
+def test_renamed_options_still_work_with_a_warning(old, new, parsed, monkeypatch, capsys):
+    options = []
+    monkeypatch.setattr(cli, "_run", lambda given: options.append(given) or 0)
+    assert cli.main(["run", "balls_up", *old]) == 0
+    assert (options[0].preset, options[0].method) == parsed
+    assert capsys.readouterr().err == f"warpmag: warning: {' '.join(old)} is deprecated, write {new}\n"
 
 
 def test_a_run_repeats(scene, device, tmp_path, capfd):

@@ -187,7 +187,7 @@ def test_a_graph_does_what_launches_do(device):
 
 def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     out, scene = tmp_path / "out.usda", tmp_path / "falling_magnet_150.usdc"
-    options = ["--sums", "fmm", "--frames", "1", "--device", device, "-o", str(out)]
+    options = ["--method", "fmm", "--frames", "1", "--device", device, "-o", str(out)]
     assert main(["run", "falling_magnet", "--balls", "150", *options]) == 0
     printed = capsys.readouterr()
     assert "151 moving" in printed.out
@@ -201,7 +201,7 @@ def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     # of two solves, at places that differ by a hundredth of a ball
     assert apart(np.array(moments), simulation.magnetics.shape_moments()[:150]) <= 3.0 * RTOL
     assert main(["run", str(scene), "--balls", "3"]) == BAD_INPUT
-    assert "balls: only of bundled scenes" in capsys.readouterr().err
+    assert "--balls is for bundled scenes" in capsys.readouterr().err
 
 
 def test_a_scene_that_cannot_be_made_is_told_in_one_line(tmp_path, capsys):

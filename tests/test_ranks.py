@@ -106,7 +106,7 @@ def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
         sakura_tree.author(scene, balls=6000 if sums == "direct" else 400_000)
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}" / "out.usda"
-        command = [SCRIPT, "run", scene, "-o", out, "--frames", 1, "--sums", sums]
+        command = [SCRIPT, "run", scene, "-o", out, "--frames", 1, "--method", sums]
         done = start(ranks, *command, *([] if "cuda" in device else ["--device", device]))
         assert done.returncode == 0, done.stderr
         told.append(done)

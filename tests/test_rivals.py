@@ -233,5 +233,5 @@ def test_bad_settings_are_refused(settings, message, device):
 
 
 def test_methods_are_made_of_what_there_is():
-    for method in magnets.METHODS.values():
+    for method in magnets.PRESETS.values():
         assert method.dynamics in magnets.DYNAMICS and method.curve in magnets.CURVES and method.force in magnets.FORCES

@@ -318,7 +318,7 @@ def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, alw
     assert cli.main([*command, str(scene), "--frames", "6"]) == 0
     assert "written" in capsys.readouterr().out
     assert cli.main([*command, str(scene), "--frames", "6"]) == 0
-    assert "has all 6 frames already" in capsys.readouterr().out
+    assert "already has all 6 frames" in capsys.readouterr().out
     assert cli.main([*command, str(scene), "--frames", "7"]) == 2
     assert "there is nothing to resume" in capsys.readouterr().err
 

@@ -110,7 +110,7 @@ def test_a_viewer_in_a_browser_stays_until_one_leaves(scene, device, monkeypatch
 
     assert watch(scene, tmp_path / "out.usda", device, monkeypatch, Browser, "viser") == 0
     assert Notes.last.closed and next(asked, None) is None
-    assert "warpmag: the viser viewer keeps the last frame, Ctrl-C leaves" in capsys.readouterr().err
+    assert "warpmag: the viser viewer shows the last frame until Ctrl-C" in capsys.readouterr().err
 
 
 def test_a_restart_begins_anew(scene, device, monkeypatch, tmp_path, capsys):

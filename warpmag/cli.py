@@ -9,7 +9,7 @@ import traceback
 from pathlib import Path
 
 from warpmag import __version__
-from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, SUMS, check_rtol
+from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, PRESETS, check_rtol, check_token
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.garbage import collection_paused
 from warpmag.moments.ranks import Ranks, alone, by_first, is_first, ranks
@@ -17,20 +17,34 @@ from warpmag.progress import Progress
 from warpmag.terminal import Stopped, open_standard_files, quiet_warp, signals_raised, silence, tell
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
-"""Exit codes; 0 where all went well, ``STOPPED`` and the signal's number where a signal ended it."""
+"""Exit codes. 0 is success; ``STOPPED`` plus its number stands for a signal that ended the command."""
 
 _SOLVERS = ("xpbd", "steel", "mujoco", "semi-implicit", "featherstone", "kamino", "vbd")
 _VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
 _STAYING = ("viser", "rerun")
-"""Viewers in a browser, which shows nothing any more once the command ends."""
+"""Viewers that a browser shows only while the command runs."""
 _OUTPUT_FOLDER = Path("warpmag_out")
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong with the arguments."""
+    """A parser whose errors are :class:`InputError`."""
 
     def error(self, message: str):
         raise InputError(f"{message} (see {self.prog} --help)")
+
+
+class _Method(argparse.Action):
+    """Store the summation method. ``--sums``, and presets as values of ``--method``, are deprecated spellings."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        """Store the value of the option, as a preset if it names one."""
+        option = self.option_strings[0]
+        name = "preset" if values in PRESETS and option == "--method" else "method"
+        if name == "method":
+            check_token(option.strip("-"), values, METHODS)
+        if f"--{name}" != option:
+            _warn([f"{option} {values} is deprecated, write --{name} {values}"])
+        setattr(namespace, name, values)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -50,13 +64,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]:
-    """Do what the arguments say; return the exit code, and a line of what went wrong."""
+    """Run the command; return its exit code and an error line, empty on success."""
     try:
         with signals_raised():
             options = _parser().parse_args(arguments)
             if not is_first(all_ranks):
                 if options.command is not _run:
-                    return 0, ""  # only a run is shared out
+                    return 0, ""  # only a run is shared among ranks
                 silence(1)
             with contextlib.nullcontext() if options.command is _run else alone():
                 code = options.command(options)
@@ -72,11 +86,11 @@ def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]
         return FAILED, one_line(f"not enough memory ({error})" if str(error) else "not enough memory")
     except BrokenPipeError:
         silence(1)
-        return STOPPED + signal.SIGPIPE, "nobody reads the standard output any more"
+        return STOPPED + signal.SIGPIPE, "the standard output was closed"
     except Exception as error:
         if all_ranks is None:
             raise
-        traceback.print_exc()  # and the others must not wait for this one
+        traceback.print_exc()  # return, so that the other ranks end as well
         return FAILED, f"{type(error).__name__}: {error}"
 
 
@@ -88,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     scenes = commands.add_parser("scenes", help="list the bundled scenes")
     scenes.set_defaults(command=_scenes)
 
-    check = commands.add_parser("check", help="tell what a stage holds and what is wrong with it")
+    check = commands.add_parser("check", help="report the contents and the errors of a stage")
     check.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     check.set_defaults(command=_check)
 
@@ -101,30 +115,39 @@ def _add_run(commands) -> None:
     run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")
     run.add_argument("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
     run.add_argument("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
-    run.add_argument("--balls", type=int, metavar="N", help="balls of falling_magnet, sakura_tree or million")
-    run.add_argument("--frames", type=int, metavar="N", help="output frames to simulate (default: those of the stage)")
-    run.add_argument("--resume", action="store_true", help="go on with the run at the output, if there is one")
+    run.add_argument("--balls", type=int, metavar="N", help="number of balls of falling_magnet, sakura_tree or million")
+    run.add_argument(
+        "--frames", type=int, metavar="N", help="output frames to simulate (default: the time range of the stage)"
+    )
+    run.add_argument("--resume", action="store_true", help="continue the run at the output, if there is one")
     run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     run.add_argument("--solver", choices=_SOLVERS, default=_SOLVERS[0], help="rigid-body solver (default: %(default)s)")
     run.add_argument(
-        "--method",
-        choices=METHODS,
-        help="preset of force law, dynamics and all curves: this library's, Kim and Han 2022, Kim et al. 2018",
+        "--preset",
+        choices=PRESETS,
+        help="force law, dynamics and all curves of this library, of Kim and Han 2022, or of Kim et al. 2018",
     )
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
-    run.add_argument("--contact-model", choices=CONTACT_MODELS, help="balls that nearly touch (default: the stage's)")
     run.add_argument(
-        "--sums",
-        choices=SUMS,
-        default=SUMS[0],
-        help="sums: over all pairs, by the fast multipole method, or the faster one (default: %(default)s)",
+        "--contact-model", choices=CONTACT_MODELS, help="model of balls that nearly touch (default: the stage's)"
     )
     run.add_argument(
-        "--rtol", type=float, metavar="X", help="magnetization error to reach, at least 2e-6 (default: the stage's)"
+        "--method",
+        action=_Method,
+        default=METHODS[0],
+        metavar=f"{{{','.join(METHODS)}}}",
+        help="summation over all pairs, by the fast multipole method, or by the faster one (default: %(default)s)",
+    )
+    run.add_argument("--sums", dest="method", action=_Method, default=METHODS[0], help=argparse.SUPPRESS)
+    run.add_argument(
+        "--rtol",
+        type=float,
+        metavar="X",
+        help="relative magnetization error at which induction ends, at least 2e-6 (default: the stage's)",
     )
     run.add_argument(
-        "--viewer", choices=("none", *_VIEWERS), default="none", help="watch the run (default: %(default)s)"
+        "--viewer", choices=("none", *_VIEWERS), default="none", help="viewer that shows the run (default: %(default)s)"
     )
     run.add_argument(
         "--for",
@@ -136,24 +159,29 @@ def _add_run(commands) -> None:
 
 
 def _add_render(commands) -> None:
-    render = commands.add_parser("render", help="draw frames of a stage, of a finished run for example")
+    render = commands.add_parser("render", help="draw frames of a stage or of a finished run")
     render.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     render.add_argument("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
     several = render.add_mutually_exclusive_group()
-    several.add_argument("--frame", type=int, metavar="N", help="frame after the start (default: the last)")
-    several.add_argument("--frames", metavar="A:B", help="frames from A to B (default of a film: all)")
+    several.add_argument(
+        "--frame", type=int, metavar="N", help="number of the frame to draw, 0 for the start (default: the last)"
+    )
+    several.add_argument("--frames", metavar="A:B", help="first and last frame to draw (default for a film: all)")
     render.add_argument("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
     render.add_argument(
-        "--quality", choices=("draft", "final"), default="draft", help="final: by Blender's path tracer"
+        "--quality",
+        choices=("draft", "final"),
+        default="draft",
+        help="draft, or final by Blender's path tracer (default: %(default)s)",
     )
-    render.add_argument("--moments", action="store_true", help="show the moments of a finished run as arrows")
+    render.add_argument("--moments", action="store_true", help="draw the moments of a finished run as arrows")
     render.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     render.set_defaults(command=_render)
 
 
 def _add_export(commands) -> None:
     export = commands.add_parser(
-        "export", help="write a stage for renderers, a web page or numbers of a scene or a finished run"
+        "export", help="export a scene or a finished run: a stage for renderers, a web page, or numbers"
     )
     export.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     export.add_argument(
@@ -161,15 +189,17 @@ def _add_export(commands) -> None:
         "--output",
         metavar="OUT",
         required=True,
-        help=".usda, .usdc, .usdz; .html for a page; .npz or .csv for numbers",
+        help="file: .usda, .usdc or .usdz for renderers, .html for a web page, .npz or .csv for numbers",
     )
     export.add_argument(
-        "--rate", type=float, default=24.0, metavar="HZ", help="frames a second (default: %(default)g, as in Blender)"
+        "--rate", type=float, default=24.0, metavar="HZ", help="frames per second (default: %(default)g, as in Blender)"
     )
-    export.add_argument("--color", metavar="WHAT", help="colour bodies by magnetization, speed or force")
+    export.add_argument("--color", metavar="QUANTITY", help="color bodies by magnetization, speed or force")
     export.add_argument("--arrows", action="store_true", help="draw moments as arrows")
-    export.add_argument("--field-lines", type=int, default=0, metavar="N", help="draw field lines of permanent magnets")
-    export.add_argument("--materialx", action="store_true", help="describe materials in MaterialX, too")
+    export.add_argument(
+        "--field-lines", type=int, default=0, metavar="N", help="draw N field lines of the permanent magnets"
+    )
+    export.add_argument("--materialx", action="store_true", help="also write materials as MaterialX")
     export.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     export.set_defaults(command=_export)
 
@@ -186,7 +216,7 @@ def _scenes(options) -> int:
 
 
 def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLDER) -> tuple[Path, bool]:
-    """Return the file of a scene, and whether it is a bundled one; one that has to be made is written to ``folder``."""
+    """Return the file of a scene, and whether it is bundled. A generated scene is written to ``folder``."""
     from warpmag.scenes_usd import MADE, bundled, make  # noqa: PLC0415
     from warpmag.usd import usable_path  # noqa: PLC0415
 
@@ -200,9 +230,9 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
             tell(f"scene: {made}")
         return made, False
     if not os.path.exists(path) and not path.suffix:
-        raise InputError(f"{name}: no such file and no bundled scene (there are {', '.join((*scenes, *MADE))})")
+        raise InputError(f"{name}: no such file and no bundled scene (bundled: {', '.join((*scenes, *MADE))})")
     if balls is not None:
-        raise InputError(f"balls: only of bundled scenes, and {name} is a file")
+        raise InputError(f"balls: {name} is a file; --balls is for bundled scenes")
     return path, False
 
 
@@ -222,14 +252,14 @@ def _check(options) -> int:
         f"bodies      {len(contents.bodies)} ({len(contents.kinematic)} kinematic), {len(contents.colliders)} colliders"
     )
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
-    sources = [one for placed in contents.sources.values() for one in placed]
-    currents = sum(one.currents is not None for one in sources)
+    sources = [source for placed in contents.sources.values() for source in placed]
+    currents = sum(source.currents is not None for source in sources)
     if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
         more = f", {currents} currents" if currents else ""
         more += ", the external field" if contents.field_keys else ""
         print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{more}")
     if sources:
-        kinds = [type(one.source).__name__ for one in sources]
+        kinds = [type(source.source).__name__ for source in sources]
         print(f"sources     {kinds.count('Coil')} coils, {kinds.count('FieldMap')} field maps")
     settings = contents.settings
     field = ", ".join(f"{value:g}" for value in settings.external_field)
@@ -249,7 +279,7 @@ def _check(options) -> int:
 
 @collection_paused()
 def _load(path: Path, **options):
-    """Return the simulation of a stage, ready to step."""
+    """Return the simulation of a stage."""
     _start_warp(path)
     from warpmag.engine.stepping.simulation import Simulation  # noqa: PLC0415
 
@@ -257,10 +287,10 @@ def _load(path: Path, **options):
 
 
 def _start_warp(path: Path) -> None:
-    """Start Warp and tell who waits what for; must come before the first import of the engine."""
+    """Initialize Warp, and print a line on a terminal. Call it before the engine is imported."""
     quiet_warp()
     if sys.stderr.isatty():
-        print(f"{path.stem}: loading (a first run compiles kernels, which takes a minute or two)", file=sys.stderr)
+        print(f"{path.stem}: loading (the first run compiles kernels for a minute or two)", file=sys.stderr)
 
 
 def _render(options) -> int:
@@ -270,7 +300,7 @@ def _render(options) -> int:
         from warpmag.show.final import render_final  # noqa: PLC0415
 
         if options.frames or options.moments:
-            raise InputError("quality: 'final' draws one frame, without moments; 'warpmag export' has arrows")
+            raise InputError("quality: 'final' draws one frame without moments; 'warpmag export --arrows' draws them")
         print(
             f"written {render_final(path, options.output, frame=options.frame, size=_two('size', options.size, 'x'))}"
         )
@@ -291,7 +321,7 @@ def _render(options) -> int:
 
 
 def _two(name: str, text: str, between: str) -> tuple[int, int]:
-    """Return the two numbers of an argument."""
+    """Return the two whole numbers of an argument, such as 960x540."""
     parts = text.lower().split(between)
     if len(parts) != 2 or not all(part.isdecimal() and len(part) < 10 for part in parts):
         raise InputError(f"{name}: must be two whole numbers such as 10{between}20, got {text!r:.40}")
@@ -329,20 +359,20 @@ def _run(options) -> int:
         _simulate(simulation, path, options, display, copy_scene=is_bundled, resume=resume)
         if not (display and display.restarted):
             return 0
-        resume = False  # what was asked for anew begins at the start
+        resume = False  # a restart in the viewer begins at the first frame
 
 
 def _simulation_of(path: Path, options):
-    """Return the simulation that a run asks for."""
-    method = METHODS[options.method] if options.method else None
+    """Return the simulation that the options describe."""
+    preset = PRESETS[options.preset] if options.preset else None
     return _load(
         path,
         solver=options.solver,
-        force=options.force or (method and method.force),
-        dynamics=options.dynamics or (method and method.dynamics),
+        force=options.force or (preset and preset.force),
+        dynamics=options.dynamics or (preset and preset.dynamics),
         contact_model=options.contact_model,
-        curve=method and method.curve,
-        method=options.sums,
+        curve=preset and preset.curve,
+        method=options.method,
         rtol=options.rtol,
         device=options.device,
         visuals=options.viewer != "none",
@@ -350,7 +380,7 @@ def _simulation_of(path: Path, options):
 
 
 def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, resume: bool) -> None:
-    """Run to the end, or until one restarts or closes the viewer, and tell how it went."""
+    """Run to the end, or until the viewer restarts or closes, and print the summary."""
     output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
     known = simulation.warnings()
     _warn(known)
@@ -368,7 +398,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     if (display and display.restarted) or not is_first(ranks()):
         return
     if progress.done is None:
-        print(f"complete       {output} has all {progress.frames} frames already")
+        print(f"complete       {output} already has all {progress.frames} frames")
         return
     for line in statistics.summary():
         print(line)
@@ -383,7 +413,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
     if display is not None and options.viewer in _STAYING and display.viewer.is_running():
-        tell(f"the {options.viewer} viewer keeps the last frame, Ctrl-C leaves")
+        tell(f"the {options.viewer} viewer shows the last frame until Ctrl-C")
         display.stay()
 
 

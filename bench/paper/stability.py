@@ -30,7 +30,7 @@ class Variant:
 
     Attributes:
         name: As the table has it.
-        method: Name of a published method, of :data:`warpmag.declarations.magnets.METHODS`.
+        method: Name of a published method, of :data:`warpmag.declarations.magnets.PRESETS`.
         force: Force law in place of the method's own.
         saturated: Whether magnets saturate what they hold.
         max_evaluations: Field evaluations after which induction ends.

@@ -7,7 +7,7 @@ has the same time to itself, and its row says how many steps it did in it.
 
 from bench.paper.output import Output, table
 from bench.paper.trials import SCENES, Trial, outcome_cells, outcome_head, run_trials
-from warpmag.declarations.magnets import METHODS
+from warpmag.declarations.magnets import PRESETS
 
 SECONDS, SMALL_SECONDS = 1.0, 0.05
 RTOL = 1e-2
@@ -34,7 +34,7 @@ def run(output: Output):
     trials = [
         Trial(scene, method, seconds, output.device, PATIENCE[kind], rtol=RTOL)
         for scene in SCENES
-        for method in METHODS
+        for method in PRESETS
     ]
     rows = []
     for trial, values in run_trials(trials):

@@ -16,7 +16,7 @@ from pathlib import Path
 from unittest import mock
 
 import warpmag
-from warpmag.declarations.magnets import METHODS
+from warpmag.declarations.magnets import PRESETS
 from warpmag.errors import SimulationError
 from warpmag.moments import dynamics
 from warpmag.scenes_usd import bundled
@@ -35,7 +35,7 @@ class Trial:
 
     Attributes:
         scene: Name of a bundled scene.
-        method: Name of a published method, of :data:`warpmag.declarations.magnets.METHODS`.
+        method: Name of a published method, of :data:`warpmag.declarations.magnets.PRESETS`.
         seconds: Simulated time [s].
         device: Name of the Warp device.
         patience: Time after which the run is ended [s], the first step not counted.
@@ -121,7 +121,7 @@ def run_trial(trial: Trial) -> dict:
 
 def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
     """Load a trial's scene, authored in ``folder`` if it is not the bundled one."""
-    stage, method = bundled()[trial.scene], METHODS[trial.method]
+    stage, method = bundled()[trial.scene], PRESETS[trial.method]
     parameters = _AS_PUBLISHED.get(trial.scene, {}) | trial.parameters
     if parameters:
         stage = folder / f"{trial.scene}.usdc"

@@ -18,8 +18,8 @@ CURVES = ("tanh", "langevin", "clamped", "frohlich")
 """Magnetization curves, see ``kernels.material.curves``; a model has the place in this list."""
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")
-SUMS = ("auto", "direct", "fmm")
-"""How pairs of moments are summed: over all of them, by the fast multipole method, or as is faster."""
+METHODS = ("auto", "direct", "fmm")
+"""Summation methods: the faster one, over all pairs, by the fast multipole method."""
 DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 
 ACCURACY = {"float32": 2e-6, "float64": 1e-13}
@@ -177,17 +177,17 @@ class StageMagnets:
 
 
 @dataclass(frozen=True)
-class Method:
-    """A published way to simulate magnets, as a choice of dynamics, magnetization curve and force law."""
+class Preset:
+    """Dynamics, magnetization curve and force law of a published method."""
 
     dynamics: str
     curve: str
     force: str
 
 
-METHODS = {
-    "warpmag": Method(dynamics="theta", curve="tanh", force="kelvin"),
-    "paper": Method(dynamics="theta-euler", curve="tanh", force="zeeman"),
-    "kim2018": Method(dynamics="llg", curve="clamped", force="kelvin"),
+PRESETS = {
+    "warpmag": Preset(dynamics="theta", curve="tanh", force="kelvin"),
+    "paper": Preset(dynamics="theta-euler", curve="tanh", force="zeeman"),
+    "kim2018": Preset(dynamics="llg", curve="clamped", force="kelvin"),
 }
-"""This library's method; Kim and Han 2022, literally; Kim, Park and Han 2018."""
+"""Published methods: this library's; Kim and Han 2022 as published; Kim, Park and Han 2018."""

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from warpmag.declarations.checks import check_token
-from warpmag.declarations.magnets import SUMS
+from warpmag.declarations.magnets import METHODS
 from warpmag.errors import InputError
 from warpmag.kernels.fmm.evaluation import CellSums
 from warpmag.kernels.fmm.expansions import ExpansionTables
@@ -182,7 +182,7 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
     may move have to be near each other: in cells that are neighbours.
 
     Args:
-        method: One of ``magnets.SUMS``.
+        method: One of ``magnets.METHODS``.
         moments: Packed moments.
         layout: What each of them is (``layout.MomentLayout``).
         extent: Largest distance between moments of a body that may move [m]; None means not known.
@@ -191,7 +191,7 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
     Raises:
         InputError: The method is wanted where it cannot be had.
     """
-    check_token("method", method, SUMS)
+    check_token("method", method, METHODS)
     several, rtol = layout.movable & ~layout.alone, _PART_OF_FIELD * rtol
     known = extent is not None or not several.any()
     if method == "fmm":

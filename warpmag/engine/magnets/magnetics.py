@@ -112,6 +112,48 @@ class Magnetics:
         self._map_bodies()
         self._eddies = BodyEddies(model, self.magnets, self._body_moments, self._sources, self.system, step)
 
+    @property
+    def device(self) -> wp.Device:
+        """Device of the model."""
+        return self.system.device
+
+    @property
+    def rtol(self) -> float:
+        """Relative magnetization error at which induction ends."""
+        return self.system.rtol
+
+    @property
+    def external_field(self) -> wp.array:
+        """Uniform applied field H0 [A/m] at each moment on the device, world frame, shape [moments]."""
+        return self.system.external_field
+
+    @property
+    def error(self) -> wp.array:
+        """Relative magnetization error of the last solve, on the device, shape [worlds with magnets]."""
+        return self.system.error
+
+    @property
+    def evaluations(self) -> wp.array:
+        """Field evaluations of the last solve, on the device, shape [worlds with magnets]."""
+        return self.system.evaluations
+
+    @property
+    def converged(self) -> wp.array:
+        """1 where the last solve reached ``rtol``, else 0, on the device, shape [worlds with magnets]."""
+        return self.system.converged
+
+    @property
+    def needs_velocities(self) -> bool:
+        """Whether forces depend on velocities, ``State.body_qd``: they do where eddy currents flow."""
+        return self.system.eddy is not None
+
+    def field_error(self) -> float:
+        """Return the relative error of the last field by the fast multipole method; 0 for sums over all pairs.
+
+        Measured at 256 random magnets by sums over all pairs; waits for the device.
+        """
+        return self.system.field_error()
+
     def _map_bodies(self) -> None:
         """List for the kernels which moments belong to which body and to which shape."""
         device = self._model.device

@@ -139,7 +139,7 @@ class Recorder:
         self._mirrors.take()
         due = self._writer.save_due
         self._taken = time, due, self._save() if due and self._resumable else None
-        if not self._magnetics.system.device.is_cuda:
+        if not self._magnetics.device.is_cuda:
             self.write()
 
     def _save(self) -> dict[str, np.ndarray]:

@@ -130,7 +130,7 @@ class Simulation:
 
     def _options_of(self, settings: MagneticSettings, solver: str, **others) -> dict[str, str]:
         """Return by what a run differs from others of its scene, in words: only an equal one can be resumed."""
-        kind = "cuda" if self._magnetics.system.device.is_cuda else "cpu"
+        kind = "cuda" if self._magnetics.device.is_cuda else "cpu"
         options = {**vars(settings), **others, "step": self.step_size, "solver": solver, "device": kind}
         options["external_field"] = tuple(np.asarray(settings.external_field, dtype=float).tolist())
         return {name.replace("_", " "): str(value) for name, value in options.items()}
@@ -257,7 +257,7 @@ class Simulation:
         """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
         known = self._scene.warnings if self._scene else tuple(strain_warnings(self._strained))
         known += tuple(solver_warnings(self._options["solver"]))
-        lines, figures, rtol = [], self.statistics, self._magnetics.system.rtol
+        lines, figures, rtol = [], self.statistics, self._magnetics.rtol
         if figures.field_error > rtol:
             lines = [
                 f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; sum by method direct"
@@ -304,7 +304,7 @@ class Simulation:
             return "bodies were moving too fast for the shortest substep before"
         given = getattr(self.model, NAMESPACE)
         strengths = {
-            "an applied field of {:.3g} A/m": self._magnetics.system.external_field.numpy(),
+            "an applied field of {:.3g} A/m": self._magnetics.external_field.numpy(),
             "a magnetization of {:.3g} A/m": given.magnetization.numpy(),
             "a coil's current [A] or a field map's factor of {:.3g}": given.strength.numpy(),
         }
@@ -434,7 +434,7 @@ class Simulation:
     def finish(self) -> Statistics:
         """Fill in the figures of the end and return the statistics."""
         figures = self.statistics
-        figures.field_error = self._magnetics.system.field_error()
+        figures.field_error = self._magnetics.field_error()
         figures.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
         figures.overlap, figures.depth = max(figures.overlap, figures.final_overlap), max(figures.depth, depth)
         speeds = np.linalg.norm(self.state.body_qd.numpy()[:, :3], axis=1)

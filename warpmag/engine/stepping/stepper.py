@@ -397,18 +397,18 @@ class Stepper:
 
     def _share_forces(self, dt: float) -> None:
         predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
-        if self._magnetics.system.eddy is not None:
+        if self._magnetics.needs_velocities:
             wp.copy(self._shared.body_qd, self._state.body_qd)
         if self._drive:
             self._drive.set_values(0.0, shared=self._machine.sharing, substep=dt)
         self._magnetize(self._shared)
 
     def _magnetize(self, state: newton.State) -> None:
-        system = self._magnetics.system
+        magnetics = self._magnetics
         state.clear_forces()
-        self._magnetics.induce(state)
-        monitor.watch_induction(self._watched, system.error, system.evaluations, system.converged)
-        self._magnetics.add_forces(state)
+        magnetics.induce(state)
+        monitor.watch_induction(self._watched, magnetics.error, magnetics.evaluations, magnetics.converged)
+        magnetics.add_forces(state)
         bodies = view_bodies(self._model, state)
         monitor.watch_forces(self._watched, bodies, self._model.gravity, self._longest)
 
