@@ -22,7 +22,7 @@ struct Ball {
     template <class All> CUDA_CALLABLE Vector points(const All& all, int v) const {
         const Real* const p = all.points.data + first(v);
         const Number r = Number(Real(0)) + size;
-        return sum(spread(center), scaled(r, own_vector(p)));
+        return spread(center) + r * own_vector(p);
     }
 };
 template <class All> CUDA_CALLABLE inline Ball ball_at(const All& all, int i) {
@@ -44,24 +44,24 @@ struct Part {
 };
 CUDA_CALLABLE inline Part part_of(const Ball& ball, const Pose& pose, Three middle, Three half) {
     auto past = [](Real at, Real half) { return at > half ? at - half : at < -half ? at + half : Real(0); };
-    const Three r = mixed(1, ball.center, -1, pose.origin);
-    const Three at = mixed(1, pose.to_body(r), -1, middle);
+    const Three r = ball.center - pose.origin;
+    const Three at = pose.to_body(r) - middle;
     const Three d = {past(at.x, half.x), past(at.y, half.y), past(at.z, half.z)};
-    const Three beyond = mixed(1, mixed(d.x, pose.x, d.y, pose.y), d.z, pose.z);
+    const Three beyond = d.x * pose.x + d.y * pose.y + d.z * pose.z;
     const Real away = wp::sqrt(dot(d, d)) / ball.size, width = MAGNET_REACH_HIGH - MAGNET_REACH_LOW;
     const Real left = (MAGNET_REACH_HIGH - away) / width, t = left < 1 ? left : Real(1);
     if (!(t > 0)) return {0, {0, 0, 0}, beyond};
     const Real slope = t < 1 ? -6 * t * (1 - t) / (width * ball.size * ball.size * away) : Real(0);
-    return {t * t * (3 - 2 * t), mixed(slope, beyond, 0, beyond), beyond};
+    return {t * t * (3 - 2 * t), slope * beyond, beyond};
 }
 // Adds a field that takes part so far.
 CUDA_CALLABLE inline void add_part(Seen& to, const Part& part, const Seen& s) {
     auto product = [&](Real slope, Vector v) {
-        return sum(scaled(Number(Real(0)) + part.value, v), scaled(Number(Real(0)) + slope, s.h));
+        return (Number(Real(0)) + part.value) * v + (Number(Real(0)) + slope) * s.h;
     };
-    to.h = sum(to.h, scaled(Number(Real(0)) + part.value, s.h));
-    to.x = sum(to.x, product(part.slope.x, s.x)), to.y = sum(to.y, product(part.slope.y, s.y));
-    to.z = sum(to.z, product(part.slope.z, s.z));
+    to.h += (Number(Real(0)) + part.value) * s.h;
+    to.x = to.x + product(part.slope.x, s.x), to.y = to.y + product(part.slope.y, s.y);
+    to.z += product(part.slope.z, s.z);
 }
 
 // Adds what source s applies to the ball, unless both are of one body.
@@ -92,9 +92,8 @@ template <class All> CUDA_CALLABLE inline void add_body(const All& all, const Bo
     const Number zero = Number(Real(0)), least2 = zero + Real(0.0625) * ball.size * ball.size;
     for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {
         const Vector x = ball.points(all, v);
-        const Near field = near
-                               ? body.pose.to_world(field_of(body.solid, body.m, body.pose.place(x), least2, 0, 1))
-                               : mixed(INVERSE_4PI, lattice_field(all, body, x, zero, x.x != x.x, 0, 1), 0, no_field());
+        const Near field = near ? body.pose.to_world(field_of(body.solid, body.m, body.pose.place(x), least2, 0, 1))
+                                : (INVERSE_4PI * lattice_field(all, body, x, zero, x.x != x.x, 0, 1));
         add_part(ball.at[v], part, seen_of(field));
     }
 }
@@ -115,7 +114,7 @@ template <class All> CUDA_CALLABLE inline void expand(const All& all, int n) {
         for (int v = 0; ball.lit && v < HELD && Ball::first(v) < CHUNK; ++v) {
             const Real* const table = all.tables.data + 6 * CHUNK * row + Ball::first(v);
             tensor += dot(own_vector(table), ball.at[v].h);
-            slope = sum(slope, pulled(ball.at[v], own_vector(table + 3 * CHUNK)));
+            slope += pulled(ball.at[v], own_vector(table + 3 * CHUNK));
         }
         const Three pull = ball.lit ? added_up(slope) : Three{0, 0, 0};
         const Real rows[4] = {ball.lit ? added_up(tensor) : Real(0), pull.x, pull.y, pull.z};
@@ -133,11 +132,11 @@ template <class All> CUDA_CALLABLE inline Three pull_of(const All& all, const Ba
         Vector e = nothing_seen().h;
         for (int row = 0; row < TENSOR_ROWS; ++row) {
             const Real* const table = all.tables.data + 6 * CHUNK * row + 3 * CHUNK + Ball::first(v);
-            e = sum(e, scaled(Number(Real(0)) + response[row * CHUNK], own_vector(table)));
+            e += (Number(Real(0)) + response[row * CHUNK]) * own_vector(table);
         }
-        total = sum(total, pulled(ball.at[v], e));
+        total += pulled(ball.at[v], e);
     }
     const Real volume = INVERSE_4PI * ball.size * ball.size * ball.size;
-    return mixed(volume, added_up(total), 0, {0, 0, 0});
+    return volume * added_up(total);
 }
 }

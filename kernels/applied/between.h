@@ -16,7 +16,7 @@ CUDA_CALLABLE inline void between(const All& all, const Body& q, const Body& s, 
     const Vector m = spread(s.m), own = spread(q.m);
     Push push = no_push();
     auto potentials = [&](Vector x, Number& phi, Vector& a) { // of s, in the frame of q
-        const Vector g = potentials_of(s.solid, s.pose.place(sum(q.pose.to_world(x), spread(q.pose.origin))));
+        const Vector g = potentials_of(s.solid, s.pose.place(q.pose.to_world(x) + spread(q.pose.origin)));
         phi = dot(m, g);
         a = q.pose.to_body(s.pose.to_world(cross(m, g)));
     };
@@ -34,10 +34,10 @@ CUDA_CALLABLE inline void between(const All& all, const Body& q, const Body& s, 
         Vector a;
         potentials(x, phi, a);
         const Number along = dot(a, vector_of(at, 3));
-        const Vector aside = sum(scaled(s1, vector_of(at, 6)), scaled(s2, vector_of(at, 9)));
-        const Vector f = scaled(weight, less(scaled(along, less(scaled(s1, n1), scaled(s2, n2))), scaled(phi, aside)));
-        push.force = sum(push.force, f);
-        push.torque = sum(push.torque, cross(less(x, middle), f));
+        const Vector aside = s1 * vector_of(at, 6) + s2 * vector_of(at, 9);
+        const Vector f = weight * (along * (s1 * n1 - s2 * n2) - phi * aside);
+        push.force += f;
+        push.torque += cross(x - middle, f);
     }
     for (int i = tables[8] + WIDTH * share(); i < tables[8] + tables[9]; i += WIDTH * SHARES) {
         const Real* const at = rows_at(all.face_point.data, FACE_POINT, i);
@@ -47,7 +47,7 @@ CUDA_CALLABLE inline void between(const All& all, const Body& q, const Body& s, 
         Number phi;
         Vector a;
         potentials(vector_of(at, 0), phi, a);
-        push.torque = sum(push.torque, scaled(charge, less(a, scaled(dot(a, n), n))));
+        push.torque += charge * (a - dot(a, n) * n);
         push.energy += charge * phi;
     }
     push.force = q.pose.to_world(push.force), push.torque = q.pose.to_world(push.torque);
@@ -59,10 +59,10 @@ CUDA_CALLABLE inline void between(const All& all, const Body& q, const Body& s, 
         const Mask held = first_lanes(q.first + q.count - i);
         const Number radius = numbers(rows + 3 * pitch);
         const Vector moment =
-            q.yields ? scaled(Real(4.18879020478639) * radius * radius * radius, spread(q.uniform))
+            q.yields ? (Real(4.18879020478639) * radius * radius * radius * spread(q.uniform))
                      : Vector{numbers(rows + 4 * pitch), numbers(rows + 5 * pitch), numbers(rows + 6 * pitch)};
         const Near field = lattice_field(all, s, x, radius, held, 0, 1);
-        push_moments(push, held, seen_of(field), scaled(minus, moment), x, center);
+        push_moments(push, held, seen_of(field), minus * moment, x, center);
     }
     force = added_up(push.force), torque = added_up(push.torque), energy = added_up(push.energy);
 }

@@ -20,8 +20,8 @@ struct FieldAt {
 CUDA_CALLABLE inline FieldAt operator+(const FieldAt& a, const FieldAt& b) {
     return {a.h + b.h, a.dx + b.dx, a.dy + b.dy, a.dz + b.dz};
 }
-
-CUDA_CALLABLE inline FieldAt scaled(double k, const FieldAt& f) { return {k * f.h, k * f.dx, k * f.dy, k * f.dz}; }
+CUDA_CALLABLE inline FieldAt& operator+=(FieldAt& a, const FieldAt& b) { return a = a + b; }
+CUDA_CALLABLE inline FieldAt operator*(double k, const FieldAt& f) { return {k * f.h, k * f.dx, k * f.dy, k * f.dz}; }
 
 CUDA_CALLABLE inline Point cross(const Point& a, const Point& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};

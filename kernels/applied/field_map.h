@@ -42,6 +42,6 @@ CUDA_CALLABLE inline FieldAt map_field(const AppliedSource& source, Point x) {
             found.dy += u.value[i] * v.slope[j] / p[4] * line;
             found.dz += u.value[i] * v.value[j] / p[5] * slope;
         }
-    return scaled(source.strength.x, found);
+    return source.strength.x * found;
 }
 }

@@ -96,6 +96,6 @@ CUDA_CALLABLE inline FieldAt loop_field(const AppliedSource& source, Point x) {
     Point surface;
     const bool inside = within_ring(a, source.parameters[1], 0, x, wire, surface);
     const FieldAt found = inside ? wire.inner(thin_loop(a, surface)) : thin_loop(a, x);
-    return scaled(source.strength.x * INVERSE_PI, found);
+    return source.strength.x * INVERSE_PI * found;
 }
 }

@@ -95,8 +95,8 @@ template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(con
     if (share() != 0) return;
     const size_t column = 3 * (size_t)i;
     const Vector base = vectors((Real*)all.base.data + column, held);
-    put_vectors((Real*)all.field.data + column, held, sum(base, h));
-    put_vectors((Real*)all.acting.data + column, held, sum(base, acting.h));
+    put_vectors((Real*)all.field.data + column, held, base + h);
+    put_vectors((Real*)all.acting.data + column, held, base + acting.h);
     put_vectors((Real*)all.along_x.data + column, held, acting.x);
     put_vectors((Real*)all.along_y.data + column, held, acting.y);
     put_vectors((Real*)all.along_z.data + column, held, acting.z);
@@ -144,8 +144,8 @@ template <class All> CUDA_CALLABLE inline void react(const All& all, int row) {
             if constexpr (SOLIDS)
                 if (s >= coils) add_body(all, body, ball);
             const Three f = pull_of(all, ball);
-            force = mixed(1, force, 1, f);
-            torque = mixed(1, torque, 1, crossed(mixed(1, ball.center, -1, center), f));
+            force += f;
+            torque += cross(ball.center - center, f);
         }
     }
     if (share() != 0) return;
@@ -166,7 +166,7 @@ template <class All> CUDA_CALLABLE inline void add_bodies(const All& all, int b,
         const bool own = body.radius < other.radius || (body.radius == other.radius && b < c);
         const Body &q = own ? body : other, &s = own ? other : body;
         const Three &p = q.pose.origin, &x = q.pose.x, &y = q.pose.y, &z = q.pose.z, &d = q.middle;
-        const Vector middle = spread(mixed(1, mixed(1, p, d.x, x), 1, mixed(d.y, y, d.z, z)));
+        const Vector middle = spread(p + d.x * x + (d.y * y + d.z * z));
         const Real reach = q.radius + (q.reach > s.reach ? q.reach : s.reach);
         if (!any(away2(s, s.pose.place(middle)) < Number(Real(0)) + reach * reach)) continue;
         Three force, torque;
@@ -174,8 +174,8 @@ template <class All> CUDA_CALLABLE inline void add_bodies(const All& all, int b,
         between(all, q, s, force, torque, energy);
         if (own) add_numbers(total, force, torque, MU0);
         else {
-            const Three turn = crossed(mixed(1, center_of(all, q), -1, center_of(all, s)), force);
-            add_numbers(total, force, mixed(1, torque, 1, turn), -MU0);
+            const Three turn = cross(center_of(all, q) - center_of(all, s), force);
+            add_numbers(total, force, torque + turn, -MU0);
         }
         total[6] += Real(0.5) * MU0 * energy;
     }

@@ -33,10 +33,11 @@ struct Three {
 };
 CUDA_CALLABLE inline Three three(const Real* at) { return {at[0], at[1], at[2]}; }
 CUDA_CALLABLE inline Real dot(Three a, Three b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-CUDA_CALLABLE inline Three mixed(Real p, Three a, Real q, Three b) {
-    return {p * a.x + q * b.x, p * a.y + q * b.y, p * a.z + q * b.z};
-}
-CUDA_CALLABLE inline Three crossed(Three a, Three b) {
+CUDA_CALLABLE inline Three operator+(Three a, Three b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+CUDA_CALLABLE inline Three operator-(Three a, Three b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+CUDA_CALLABLE inline Three operator*(Real k, Three a) { return {k * a.x, k * a.y, k * a.z}; }
+CUDA_CALLABLE inline Three& operator+=(Three& a, Three b) { return a = a + b; }
+CUDA_CALLABLE inline Three cross(Three a, Three b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 CUDA_CALLABLE inline Vector spread(Three a) {
@@ -44,36 +45,29 @@ CUDA_CALLABLE inline Vector spread(Three a) {
     return {zero + a.x, zero + a.y, zero + a.z};
 }
 
-// Symmetric. It has a trace where balls overlap, that of their charges.
-struct Gradient {
-    Number xx, yy, zz, xy, yz, zx;
-};
-CUDA_CALLABLE inline Vector times(const Gradient& t, Vector a) {
-    return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
-            t.zx * a.x + t.yz * a.y + t.zz * a.z};
-}
-
 // Field and its gradient.
 struct Near {
     Vector h;
-    Gradient t;
+    Symmetric t;
 };
 CUDA_CALLABLE inline Near no_field() {
     const Number zero = Number(Real(0));
     return {{zero, zero, zero}, {zero, zero, zero, zero, zero, zero}};
 }
-CUDA_CALLABLE inline Near mixed(Real p, const Near& a, Real q, const Near& b) {
-    auto mix = [=](Number x, Number y) { return p * x + q * y; };
-    return {{mix(a.h.x, b.h.x), mix(a.h.y, b.h.y), mix(a.h.z, b.h.z)},
-            {mix(a.t.xx, b.t.xx), mix(a.t.yy, b.t.yy), mix(a.t.zz, b.t.zz), mix(a.t.xy, b.t.xy), mix(a.t.yz, b.t.yz),
-             mix(a.t.zx, b.t.zx)}};
+CUDA_CALLABLE inline Near operator*(Real k, const Near& a) {
+    const Symmetric& t = a.t;
+    return {k * a.h, {k * t.xx, k * t.yy, k * t.zz, k * t.xy, k * t.yz, k * t.zx}};
 }
-CUDA_CALLABLE inline void add_where(Mask wanted, Gradient& to, const Gradient& t) {
+CUDA_CALLABLE inline Near operator-(const Near& a, const Near& b) {
+    return {a.h - b.h,
+            {a.t.xx - b.t.xx, a.t.yy - b.t.yy, a.t.zz - b.t.zz, a.t.xy - b.t.xy, a.t.yz - b.t.yz, a.t.zx - b.t.zx}};
+}
+CUDA_CALLABLE inline void add_where(Mask wanted, Symmetric& to, const Symmetric& t) {
     to.xx += wanted ? t.xx : 0, to.yy += wanted ? t.yy : 0, to.zz += wanted ? t.zz : 0;
     to.xy += wanted ? t.xy : 0, to.yz += wanted ? t.yz : 0, to.zx += wanted ? t.zx : 0;
 }
 // Adds s (a b^T), of which the sum of all is symmetric.
-CUDA_CALLABLE inline void add_product(Gradient& t, Number s, Vector a, Vector b) {
+CUDA_CALLABLE inline void add_product(Symmetric& t, Number s, Vector a, Vector b) {
     t.xx += s * a.x * b.x, t.yy += s * a.y * b.y, t.zz += s * a.z * b.z;
     t.xy += s * a.x * b.y, t.yz += s * a.y * b.z, t.zx += s * a.z * b.x;
 }
@@ -86,7 +80,7 @@ struct Sight {
 CUDA_CALLABLE inline Sight sight_of(const Real* edge, Vector x, Number least2) {
     const Three along = three(edge + 3);
     const Real length = edge[6];
-    const Vector t = spread(along), a = less(spread(three(edge)), x), b = sum(a, scaled(Number(Real(0)) + length, t));
+    const Vector t = spread(along), a = spread(three(edge)) - x, b = a + (Number(Real(0)) + length) * t;
     const Real tiny = Real(1e-14) * length * length;
     const Vector c = cross(a, t);
     const Number rho2 = larger(dot(c, c), larger(least2, Number(Real(0)) + tiny));
@@ -101,8 +95,8 @@ CUDA_CALLABLE inline Sight sight_of(const Real* edge, Vector x, Number least2) {
 CUDA_CALLABLE inline Number half_angle(const Solid& solid, int f, Vector x) {
     const Number zero = Number(Real(0)), tiny = zero + Real(1e-30);
     auto towards = [&](int k) {
-        const Vector a = less(spread(three(solid.corner + 3 * k)), x);
-        return scaled(1 / root(larger(dot(a, a), tiny)), a);
+        const Vector a = spread(three(solid.corner + 3 * k)) - x;
+        return 1 / root(larger(dot(a, a), tiny)) * a;
     };
     const int begin = solid.begin[f], end = solid.begin[f + 1];
     const Vector p = towards(begin);
@@ -132,18 +126,18 @@ CUDA_CALLABLE inline Near field_of(const Solid& solid, Three m, Vector x, Number
         const Real s1 = INVERSE * dot(m, n1), s2 = INVERSE * dot(m, n2);
         if (s1 * s1 + s2 * s2 <= dark) continue;
         const Sight at = sight_of(edge, x, least2);
-        const Vector w = spread(mixed(s1, three(edge + 7), s2, three(edge + 10)));
+        const Vector w = spread(s1 * three(edge + 7) + s2 * three(edge + 10));
         const Number factor = 2 / (at.more * at.less), length = Number(Real(0)) + edge[6];
-        out.h = sum(out.h, scaled(logarithm(at.more / at.less), w));
-        add_product(out.t, length * factor, w, sum(scaled(1 / at.r1, at.a), scaled(1 / at.r2, at.b)));
+        out.h += logarithm(at.more / at.less) * w;
+        add_product(out.t, length * factor, w, 1 / at.r1 * at.a + 1 / at.r2 * at.b);
         const Number turn = length * factor * (1 / at.r1 + 1 / at.r2);
-        add_product(out.t, -turn, spread(mixed(s1, n1, -s2, n2)), at.across);
+        add_product(out.t, -turn, spread(s1 * n1 - s2 * n2), at.across);
     }
     for (int f = begin; f < solid.faces; f += step) {
         const Three n = three(solid.face + FACE_ROW * f);
         const Real charge = -2 * INVERSE * dot(m, n);
         if (charge * charge <= dark) continue;
-        out.h = sum(out.h, scaled(charge * half_angle(solid, f, x), spread(n)));
+        out.h += charge * half_angle(solid, f, x) * spread(n);
     }
     return out;
 }
@@ -156,15 +150,15 @@ CUDA_CALLABLE inline Vector potentials_of(const Solid& solid, Vector x) {
         const Real* const edge = solid.edge + EDGE_ROW * e;
         const Sight at = sight_of(edge, x, zero);
         const Number l = logarithm(at.more / at.less);
-        g = sum(g, scaled(l * dot(at.a, spread(three(edge + 7))), spread(three(edge + 13))));
-        g = sum(g, scaled(l * dot(at.a, spread(three(edge + 10))), spread(three(edge + 16))));
+        g += l * dot(at.a, spread(three(edge + 7))) * spread(three(edge + 13));
+        g += l * dot(at.a, spread(three(edge + 10))) * spread(three(edge + 16));
     }
     for (int f = 0; f < solid.faces; ++f) {
         const Vector n = spread(three(solid.face + FACE_ROW * f));
-        const Number height = dot(less(x, spread(three(solid.corner + 3 * solid.begin[f]))), n);
-        g = sum(g, scaled(2 * height * half_angle(solid, f, x), n));
+        const Number height = dot(x - spread(three(solid.corner + 3 * solid.begin[f])), n);
+        g += 2 * height * half_angle(solid, f, x) * n;
     }
-    return scaled(zero + Real(0.07957747154594767), g);
+    return (zero + Real(0.07957747154594767)) * g;
 }
 
 // Whether x, in the frame of the solid, lies inside.
@@ -172,7 +166,7 @@ CUDA_CALLABLE inline Mask inside_of(const Solid& solid, Vector x) {
     Mask inside = x.x == x.x;
     for (int f = 0; f < solid.faces; ++f) {
         const Vector n = spread(three(solid.face + FACE_ROW * f));
-        inside &= dot(less(x, spread(three(solid.corner + 3 * solid.begin[f]))), n) < 0;
+        inside &= dot(x - spread(three(solid.corner + 3 * solid.begin[f])), n) < 0;
     }
     return inside;
 }

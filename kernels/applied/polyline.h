@@ -44,7 +44,7 @@ CUDA_CALLABLE inline FieldAt piece_field(Point a, Point b, double w, Point x) {
 CUDA_CALLABLE inline FieldAt polyline_field(const AppliedSource& source, Point x) {
     FieldAt total = {};
     for (int k = 0; k + 1 < source.count; ++k)
-        total = total + piece_field(source.table[k], source.table[k + 1], source.parameters[0], x);
-    return scaled(0.25 * INVERSE_PI * source.strength.x, total);
+        total += piece_field(source.table[k], source.table[k + 1], source.parameters[0], x);
+    return 0.25 * INVERSE_PI * source.strength.x * total;
 }
 }

@@ -73,7 +73,7 @@ CUDA_CALLABLE inline Push no_push() {
 }
 // Moments m at x in a field, torques about ``center``.
 CUDA_CALLABLE inline void push_moments(Push& push, Mask wanted, const Seen& seen, Vector m, Vector x, Three center) {
-    const Vector f = pulled(seen, m), turn = sum(cross(less(x, spread(center)), f), cross(m, seen.h));
+    const Vector f = pulled(seen, m), turn = cross(x - spread(center), f) + cross(m, seen.h);
     add_where(wanted, push.force, f);
     add_where(wanted, push.torque, turn);
     push.energy -= wanted ? dot(m, seen.h) : 0;

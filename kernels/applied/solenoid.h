@@ -36,6 +36,6 @@ CUDA_CALLABLE inline FieldAt solenoid_field(const AppliedSource& source, Point x
     Point surface;
     const bool inside = within_ring(a, w, b, x, wire, surface) || within_ring(a, w, -b, x, wire, surface);
     const FieldAt found = inside ? wire.inner(thin_solenoid(a, b, surface)) : thin_solenoid(a, b, x);
-    return scaled(source.strength.x * INVERSE_PI / (2 * b), found);
+    return source.strength.x * INVERSE_PI / (2 * b) * found;
 }
 }

@@ -10,16 +10,14 @@ namespace warpmag {
 struct Pose {
     Three origin, x, y, z; // where the axes of the body point in the world
 
-    CUDA_CALLABLE Vector to_world(Vector v) const {
-        return sum(sum(scaled(v.x, spread(x)), scaled(v.y, spread(y))), scaled(v.z, spread(z)));
-    }
+    CUDA_CALLABLE Vector to_world(Vector v) const { return v.x * spread(x) + v.y * spread(y) + v.z * spread(z); }
     CUDA_CALLABLE Vector to_body(Vector v) const { return {dot(v, spread(x)), dot(v, spread(y)), dot(v, spread(z))}; }
     CUDA_CALLABLE Three to_body(Three v) const { return {dot(v, x), dot(v, y), dot(v, z)}; }
-    CUDA_CALLABLE Vector place(Vector v) const { return to_body(less(v, spread(origin))); }
+    CUDA_CALLABLE Vector place(Vector v) const { return to_body(v - spread(origin)); }
     // R T R^T
-    CUDA_CALLABLE Gradient to_world(const Gradient& t) const {
-        const Vector a = to_world(times(t, spread({x.x, y.x, z.x}))), b = to_world(times(t, spread({x.y, y.y, z.y})));
-        const Vector c = to_world(times(t, spread({x.z, y.z, z.z})));
+    CUDA_CALLABLE Symmetric to_world(const Symmetric& t) const {
+        const Vector a = to_world(t * spread({x.x, y.x, z.x})), b = to_world(t * spread({x.y, y.y, z.y}));
+        const Vector c = to_world(t * spread({x.z, y.z, z.z}));
         return {a.x, b.y, c.z, a.y, b.z, c.x};
     }
     CUDA_CALLABLE Near to_world(const Near& n) const { return {to_world(n.h), to_world(n.t)}; }
@@ -59,7 +57,7 @@ template <class All> CUDA_CALLABLE inline Body body_at(const All& all, int b) {
     const int first = own[1];
     const Three of = own[3] ? three((const Real*)all.bias.data + 3 * (size_t)first)
                             : Three{packed_at(all, 4, first), packed_at(all, 5, first), packed_at(all, 6, first)};
-    const Three m = mixed(size[0], of, 0, of);
+    const Three m = size[0] * of;
     return {solid,  pose,    pose.to_body(m), three(size + 3),          three(size + 6),
             m,      size[1], size[2],         packed_at(all, 7, first), first,
             own[2], own[0],  own[3]};
@@ -69,7 +67,7 @@ template <class All> CUDA_CALLABLE inline Body body_at(const All& all, int b) {
 template <class All> CUDA_CALLABLE inline Three moment_at(const All& all, const Body& body, int j) {
     if (!body.yields) return {packed_at(all, 4, j), packed_at(all, 5, j), packed_at(all, 6, j)};
     const Real radius = packed_at(all, 3, j), volume = Real(4.18879020478639) * radius * radius * radius;
-    return mixed(volume, body.uniform, 0, body.uniform);
+    return volume * body.uniform;
 }
 
 template <class All> CUDA_CALLABLE inline Three center_of(const All& all, const Body& body) {
@@ -94,20 +92,20 @@ CUDA_CALLABLE inline Near lattice_field(const All& all, const Body& body, Vector
                                         int begin, int step) {
     Near out = no_field();
     for (int j = body.first + begin; j < body.first + body.count; j += step) {
-        const Vector r = less(x, spread({packed_at(all, 0, j), packed_at(all, 1, j), packed_at(all, 2, j)}));
+        const Vector r = x - spread({packed_at(all, 0, j), packed_at(all, 1, j), packed_at(all, 2, j)});
         const Vector m = spread(moment_at(all, body, j));
         const Number other = Number(Real(0)) + packed_at(all, 3, j), s = radius + other, d2 = dot(r, r), s2 = s * s;
         const Number c = larger(d2, s2), i = Real(0.5) * twice_inverse_root(c), i2 = i * i, i3 = i2 * i;
         const Number g2 = 3 * i2 * i3, rm = dot(r, m);
         const Number g3 = -5 * i2 * (g2 * rm); // without r⁻⁷, which is no float at 1 µm
-        out.h = sum(out.h, less(scaled(g2 * rm, r), scaled(i3, m)));
+        out.h += (g2 * rm * r - i3 * m);
         add_product(out.t, g2, r, m), add_product(out.t, g2, m, r), add_product(out.t, g3, r, r);
         out.t.xx += g2 * rm, out.t.yy += g2 * rm, out.t.zz += g2 * rm;
         const Mask overlapping = wanted & (d2 < s2);
         if (!any(overlapping)) continue;
         const Overlap p = overlap_of(r, radius, other, m, overlapping);
         add_where(overlapping, out.h, field_of(p));
-        Gradient t = no_field().t; // of lanes that do not overlap it may be no number
+        Symmetric t = no_field().t; // of lanes that do not overlap it may be no number
         const Number of = p.unit * dot(p.u, p.m), k2 = p.unit * p.g.g2;
         add_product(t, k2, p.u, p.m), add_product(t, k2, p.m, p.u), add_product(t, p.g.g3 * of, p.u, p.u);
         t.xx += p.g.g2 * of, t.yy += p.g.g2 * of, t.zz += p.g.g2 * of;
@@ -122,7 +120,7 @@ CUDA_CALLABLE inline Near lacking(const All& all, const Body& body, Vector x, Nu
                                   int step) {
     const Near near = field_of(body.solid, body.m, body.pose.place(x), Real(0.25) * radius * radius, begin, step);
     const Near far = lattice_field(all, body, x, radius, wanted, begin, step);
-    return mixed(1, body.pose.to_world(near), -INVERSE_4PI, far);
+    return body.pose.to_world(near) - INVERSE_4PI * far;
 }
 
 // Magnetization of the body less that of its lattice's balls.
@@ -132,10 +130,10 @@ CUDA_CALLABLE inline Vector lacking_inside(const All& all, const Body& body, Vec
     Vector m = {zero, zero, zero};
     if (begin == 0) add_where(inside_of(body.solid, body.pose.place(x)), m, body.pose.to_world(spread(body.m)));
     for (int j = body.first + begin; j < body.first + body.count; j += step) {
-        const Vector r = less(x, spread({packed_at(all, 0, j), packed_at(all, 1, j), packed_at(all, 2, j)}));
+        const Vector r = x - spread({packed_at(all, 0, j), packed_at(all, 1, j), packed_at(all, 2, j)});
         const Real radius = packed_at(all, 3, j), each = -1 / (Real(4.18879020478639) * radius * radius * radius);
         const Vector own = spread(moment_at(all, body, j));
-        add_where(dot(r, r) < zero + radius * radius, m, scaled(zero + each, own));
+        add_where(dot(r, r) < zero + radius * radius, m, (zero + each) * own);
     }
     return m;
 }

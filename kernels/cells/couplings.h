@@ -32,7 +32,7 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
         const Vector m = {collect(moments, j), collect(moments + pitch, j), collect(moments + 2 * pitch, j)};
         const Number xx = numbers(t), yy = numbers(t + CHUNK), zz = numbers(t + 2 * CHUNK);
         const Number xy = numbers(t + 3 * CHUNK), xz = numbers(t + 4 * CHUNK), yz = numbers(t + 5 * CHUNK);
-        h = sum(h, {xx * m.x + xy * m.y + xz * m.z, xy * m.x + yy * m.y + yz * m.z, xz * m.x + yz * m.y + zz * m.z});
+        h += Vector{xx * m.x + xy * m.y + xz * m.z, xy * m.x + yy * m.y + yz * m.z, xz * m.x + yz * m.y + zz * m.z};
     }
     return group_sums(h);
 }
@@ -55,9 +55,9 @@ template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings
         const Real *const own = c.turned.data + row, *const at = c.place.data + table + row;
         const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
         const Number x = numbers(at), y = numbers(at + places), z = numbers(at + 2 * places);
-        sums[0] = sum(sums[0], m);
-        sums[1] = sum(sums[1], {x * m.x - z * m.z, y * m.y - z * m.z, x * m.y + y * m.x});
-        sums[2] = sum(sums[2], {x * m.z + z * m.x, y * m.z + z * m.y, z * 0});
+        sums[0] += m;
+        sums[1] += Vector{x * m.x - z * m.z, y * m.y - z * m.z, x * m.y + y * m.x};
+        sums[2] += Vector{x * m.z + z * m.x, y * m.z + z * m.y, z * 0};
     }
     for (Vector& one : sums) one = group_sums(one);
     if (share() != 0) return;
@@ -123,9 +123,9 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
     const Real* const at = c.place.data + in_table;
     const Vector place = {numbers(at), numbers(at + places), numbers(at + 2 * places)};
     const Vector common = common_field(c.common.data + (size_t)body * COMMON, place);
-    const Vector h = less(sum(sums, common), scaled(numbers(c.hardness.data + row), m));
+    const Vector h = sums + common - numbers(c.hardness.data + row) * m;
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
-    put_vectors(field, held, sum(vectors(field, held), turned(rotation, h)));
+    put_vectors(field, held, vectors(field, held) + turned(rotation, h));
 }
 
 template <class Word, class Couplings>

@@ -92,7 +92,7 @@ template <class Arrays> CUDA_CALLABLE inline bool is_contact(const Arrays& array
     const int body = arrays.body.data[t.other];
     if (body >= 0 && arrays.kind.data[t.other] != BALL) {
         const wp::vec3 arm = wp::quat_rotate(arrays.frame.data[t.other].q, t.core);
-        motion = motion + arrays.dt * wp::cross(wp::spatial_bottom(arrays.body_qd.data[body]), arm);
+        motion += arrays.dt * wp::cross(wp::spatial_bottom(arrays.body_qd.data[body]), arm);
     }
     const Real approach = -wp::dot(motion, t.towards);
     return (approach < arrays.farthest ? approach : arrays.farthest) >= t.separation;

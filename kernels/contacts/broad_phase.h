@@ -4,9 +4,9 @@
 // neighbours; the boxes of other shapes stand in rows of a table, side by side for a vector of them, those of all
 // worlds first.
 #pragma once
-#include "pairs/overlaps.h"
 #include "contacts/ball_contacts.h"
 #include "contacts/box_gap.h"
+#include "pairs/overlaps.h"
 #include "shared/team.h"
 
 namespace warpmag {

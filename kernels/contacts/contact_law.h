@@ -40,22 +40,15 @@ namespace warpmag {
 struct Quaternion {
     Number x, y, z, w;
 };
-struct Symmetric {
-    Number xx, yy, zz, xy, yz, zx;
-};
 
 CUDA_CALLABLE inline Vector turned(Quaternion q, Vector a) {
-    const Vector axis = {q.x, q.y, q.z}, t = scaled(2, cross(axis, a));
-    return sum(sum(a, scaled(q.w, t)), cross(axis, t));
-}
-CUDA_CALLABLE inline Vector times(const Symmetric& s, Vector a) {
-    return {s.xx * a.x + s.xy * a.y + s.zx * a.z, s.xy * a.x + s.yy * a.y + s.yz * a.z,
-            s.zx * a.x + s.yz * a.y + s.zz * a.z};
+    const Vector axis = {q.x, q.y, q.z}, t = 2 * cross(axis, a);
+    return a + q.w * t + cross(axis, t);
 }
 // A tensor of a frame that was turned.
 CUDA_CALLABLE inline Symmetric turned(Quaternion q, const Symmetric& s) {
     const Number none = q.w * Real(0), one = none + 1;
-    auto row = [&](Vector axis) { return turned(q, times(s, turned({-q.x, -q.y, -q.z, q.w}, axis))); };
+    auto row = [&](Vector axis) { return turned(q, s * turned({-q.x, -q.y, -q.z, q.w}, axis)); };
     const Vector x = row({one, none, none}), y = row({none, one, none}), z = row({none, none, one});
     return {x.x, y.y, z.z, x.y, y.z, z.x};
 }
@@ -101,8 +94,8 @@ struct Impulse {
 };
 
 CUDA_CALLABLE inline Vector spun(const Body& body, const Inertia& inertia, Vector torque) {
-    if constexpr (ROUND) return scaled(body.inv_inertia, torque);
-    return times(inertia.inverse, torque);
+    if constexpr (ROUND) return body.inv_inertia * torque;
+    return inertia.inverse * torque;
 }
 // How easily impulses at an arm along a and along b move a share of a body along b and along a.
 CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector arm, Vector a, Vector b) {
@@ -125,21 +118,21 @@ CUDA_CALLABLE inline Number inverse_length(Vector a) {
 }
 CUDA_CALLABLE inline Vector at_most(Vector a, Number length) {
     const Number one = length * Real(0) + 1;
-    return scaled(dot(a, a) > length * length ? length * inverse_length(a) : one, a);
+    return (dot(a, a) > length * length ? length * inverse_length(a) : one) * a;
 }
 // What of a vector is across a unit vector.
-CUDA_CALLABLE inline Vector tangential(Vector a, Vector n) { return less(a, scaled(dot(a, n), n)); }
+CUDA_CALLABLE inline Vector tangential(Vector a, Vector n) { return a - dot(a, n) * n; }
 // What is limited to ``across`` across a unit vector, and to ``about`` along it.
 CUDA_CALLABLE inline Vector limited(Vector a, Vector n, Number across, Number about) {
     const Number along = dot(a, n);
-    return sum(at_most(tangential(a, n), across), scaled(larger(smaller(along, about), -about), n));
+    return at_most(tangential(a, n), across) + larger(smaller(along, about), -about) * n;
 }
 // Some unit vector across a unit vector.
 CUDA_CALLABLE inline Vector across(Vector n) {
     const Number none = n.x * Real(0);
     const auto steep = n.x * n.x > Real(0.5);
     const Vector t = {steep ? n.y : none, steep ? -n.x : n.z, steep ? none : -n.y};
-    return scaled(inverse_length(t), t);
+    return inverse_length(t) * t;
 }
 
 // What sticks goes back by this part of its slip in a substep: all at once, layers that fall on each other come back at
@@ -158,21 +151,21 @@ CUDA_CALLABLE inline Number easiest_across(const Body& body, const Inertia& iner
 CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pose& other, const Body& body,
                                       const Body& other_body, const Inertia& inertia, const Inertia& other_inertia,
                                       const Slip& slipped, Real relaxation, Real dt) {
-    const Vector n = t.normal, apart = less(own.x, other.x);
+    const Vector n = t.normal, apart = own.x - other.x;
     const Vector rub = turned(own.q, t.rub), other_rub = turned(other.q, t.other_rub);
     const Number total = body.inv_mass + other_body.inv_mass;
-    const Vector apart_there = sum(apart, less(rub, other_rub));
+    const Vector apart_there = apart + (rub - other_rub);
     Contact c;
     c.normal = n;
-    c.arm = less(rub, scaled(quotient(other_body.inv_mass, total), apart_there));
-    c.other_arm = sum(other_rub, scaled(quotient(body.inv_mass, total), apart_there));
-    const Vector points = less(turned(own.q, t.point), turned(other.q, t.other_point));
+    c.arm = rub - quotient(other_body.inv_mass, total) * apart_there;
+    c.other_arm = other_rub + quotient(body.inv_mass, total) * apart_there;
+    const Vector points = turned(own.q, t.point) - turned(other.q, t.other_point);
     // kinematic bodies stand where they do at the end already, and lend their surfaces a velocity besides; without it
     // the gap is the one that they and others were found with
-    const Vector drift = sum(body.v, cross(body.spin, c.arm)), its = cross(other_body.spin, c.other_arm);
-    const Vector other_drift = sum(other_body.v, its);
+    const Vector drift = body.v + cross(body.spin, c.arm), its = cross(other_body.spin, c.other_arm);
+    const Vector other_drift = other_body.v + its;
     const Number lent = t.kinematic * dot(n, drift) - t.other_kinematic * dot(n, other_drift);
-    c.gap_speed = larger((dot(n, sum(apart, points)) - t.margin) / dt - lent, n.x * Real(0) - PUSH_OUT);
+    c.gap_speed = larger((dot(n, apart + points) - t.margin) / dt - lent, n.x * Real(0) - PUSH_OUT);
     // the sums over both bodies that mass_splitting.py bounds
     const Number none = n.x * Real(0), push_ease = ease(body, inertia, c.arm, n, n),
                  other_push_ease = ease(other_body, other_inertia, c.other_arm, n, n);
@@ -183,14 +176,14 @@ CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pos
     c.turn_rate =
         quotient(none + Real(FRICTION) * relaxation, turn_ease(body, inertia) + turn_ease(other_body, other_inertia));
     c.mu = t.mu, c.torsional = t.torsional, c.rolling = t.rolling;
-    c.back = {scaled(RETURN / dt, tangential(slipped.linear, n)), scaled(RETURN / dt, slipped.turn)};
+    c.back = {RETURN / dt * tangential(slipped.linear, n), RETURN / dt * slipped.turn};
     return c;
 }
 
 // How the own surface of a contact moves on the other one.
 CUDA_CALLABLE inline Slip slip_of(const Contact& c, const Body& own, const Body& other) {
-    const Vector mine = sum(own.v, cross(own.spin, c.arm)), its = sum(other.v, cross(other.spin, c.other_arm));
-    return {less(mine, its), less(own.spin, other.spin)};
+    const Vector mine = own.v + cross(own.spin, c.arm), its = other.v + cross(other.spin, c.other_arm);
+    return {mine - its, own.spin - other.spin};
 }
 // The impulse of a contact after an iteration, from one that its bodies have and from how they move: it does not pull,
 // and its push limits friction.
@@ -198,17 +191,15 @@ CUDA_CALLABLE inline Impulse relaxed(const Contact& c, const Body& own, const Bo
     const Slip slip = slip_of(c, own, other);
     const Number opening = dot(slip.linear, c.normal), none = opening * Real(0);
     const Number push = larger(dot(p.linear, c.normal) - c.push_rate * (opening + c.gap_speed), none);
-    const Vector pressed = scaled(push, c.normal);
-    if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return {pressed, scaled(none, c.normal)};
-    const Vector linear = less(p.linear, scaled(c.rub_rate, sum(slip.linear, c.back.linear)));
-    const Vector turn = less(p.turn, scaled(c.turn_rate, sum(slip.turn, c.back.turn)));
+    const Vector pressed = push * c.normal;
+    if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return {pressed, none * c.normal};
+    const Vector linear = p.linear - c.rub_rate * (slip.linear + c.back.linear);
+    const Vector turn = p.turn - c.turn_rate * (slip.turn + c.back.turn);
     const Vector rub = at_most(tangential(linear, c.normal), c.mu * push);
-    return {sum(rub, pressed), limited(turn, c.normal, c.rolling * push, c.torsional * push)};
+    return {rub + pressed, limited(turn, c.normal, c.rolling * push, c.torsional * push)};
 }
 
-CUDA_CALLABLE inline Impulse change(Impulse from, Impulse to) {
-    return {less(to.linear, from.linear), less(to.turn, from.turn)};
-}
+CUDA_CALLABLE inline Impulse change(Impulse from, Impulse to) { return {to.linear - from.linear, to.turn - from.turn}; }
 
 // What a contact has given its bodies: its impulse after the last iteration, and that with momentum, which they have.
 struct Given {
@@ -223,7 +214,7 @@ CUDA_CALLABLE inline Real momentum_at(int iteration, int iterations) {
 // One iteration of a contact: returns the impulse that it adds.
 CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body& other, Given& given, Real momentum) {
     const Impulse now = relaxed(c, own, other, given.ahead), gain = change(given.last, now);
-    const Impulse ahead = {sum(now.linear, scaled(momentum, gain.linear)), sum(now.turn, scaled(momentum, gain.turn))};
+    const Impulse ahead = {now.linear + momentum * gain.linear, now.turn + momentum * gain.turn};
     const Impulse added = change(given.ahead, ahead);
     given = {now, ahead};
     return added;
@@ -232,7 +223,7 @@ CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body
 CUDA_CALLABLE inline Slip slipped_so_far(const Contact& c, const Body& own, const Body& other, Impulse p,
                                          Real relaxation, Real dt) {
     const Slip slip = slip_of(c, own, other);
-    auto after = [&](Vector back, Vector now) { return scaled(dt, sum(scaled(1 / RETURN, back), now)); };
+    auto after = [&](Vector back, Vector now) { return dt * (1 / RETURN * back + now); };
     const Vector linear = after(c.back.linear, tangential(slip.linear, c.normal));
     const Vector turn = after(c.back.turn, slip.turn);
     const Number push = Real(FRICTION) * relaxation * dt / RETURN * dot(p.linear, c.normal);
@@ -241,14 +232,12 @@ CUDA_CALLABLE inline Slip slipped_so_far(const Contact& c, const Body& own, cons
             limited(turn, c.normal, c.rolling * per_turn, c.torsional * per_turn)};
 }
 // The angular impulses of an impulse about the centres of mass.
-CUDA_CALLABLE inline Vector on_own(const Contact& c, Impulse p) { return sum(cross(c.arm, p.linear), p.turn); }
-CUDA_CALLABLE inline Vector on_other(const Contact& c, Impulse p) {
-    return scaled(-1, sum(cross(c.other_arm, p.linear), p.turn));
-}
+CUDA_CALLABLE inline Vector on_own(const Contact& c, Impulse p) { return cross(c.arm, p.linear) + p.turn; }
+CUDA_CALLABLE inline Vector on_other(const Contact& c, Impulse p) { return -(cross(c.other_arm, p.linear) + p.turn); }
 
 // Moves a body by the sums of impulses and angular impulses.
 CUDA_CALLABLE inline void apply(Body& body, const Inertia& inertia, Vector linear, Vector angular) {
-    body.v = sum(body.v, scaled(body.inv_mass, linear));
-    body.spin = sum(body.spin, spun(body, inertia, angular));
+    body.v += body.inv_mass * linear;
+    body.spin += spun(body, inertia, angular);
 }
 }

@@ -133,7 +133,7 @@ CUDA_CALLABLE inline void begin_lines(const Arrays& a, int i) {
     }
     auto motion = [&](int quarter) { return own_four(a.motion, quarter, i); };
     Pose pose = read_pose([&](int quarter) { return own_four(a.pose, quarter, i); });
-    pose.x = sum(pose.x, turned(pose.q, centers(a, i)));
+    pose.x += turned(pose.q, centers(a, i));
     put_four(a.pose, 0, i, {pose.x.x, pose.x.y, pose.x.z, 0 * pose.x.x});
     Inertia inertia = read_inertia(motion);
     if constexpr (!ROUND) inertia.inverse = turned(pose.q, inertia.inverse);

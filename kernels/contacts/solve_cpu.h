@@ -84,7 +84,7 @@ inline void put_vector(const Arrays& a, const int* places, int half, Vector v) {
 // Writes the impulses of a vector of contacts on their second and first bodies into the records of these.
 inline void put_records(const Arrays& a, int k, Vector linear, Vector own, Vector other) {
     const int* const places = list_at(a.other, 4, 2, k);
-    put_vector(a, places, 0, scaled(-1, linear));
+    put_vector(a, places, 0, -linear);
     put_vector(a, places, 1, other);
     put_vector(a, places + CHUNK, 0, linear);
     put_vector(a, places + CHUNK, 1, own);

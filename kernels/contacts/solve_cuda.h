@@ -158,8 +158,8 @@ __device__ inline Pressure press_all(Sides side_at, Presses press_at, int k, int
         const Body other = read_body([&](int quarter) { return side.other.motion[quarter]; });
         const Impulse added =
             press_at(k, [&](Given& given) { return press(side.contact, own, other, given, momentum); });
-        total.linear = sum(total.linear, added.linear);
-        total.angular = sum(total.angular, on_own(side.contact, added));
+        total.linear += added.linear;
+        total.angular += on_own(side.contact, added);
     }
     return {group_sums(total.linear), group_sums(total.angular)};
 }
@@ -173,8 +173,8 @@ __device__ inline Pressure block_sums(Pressure mine, int sides) {
     __syncthreads();
     Pressure total = parts[0];
     for (int g = 1; g < GROUPS && g * GROUP < sides; ++g) {
-        total.linear = sum(total.linear, parts[g].linear);
-        total.angular = sum(total.angular, parts[g].angular);
+        total.linear += parts[g].linear;
+        total.angular += parts[g].angular;
     }
     return total;
 }

@@ -74,7 +74,7 @@ def _arrays_type(dtype):
 @cache
 def _passes(dtype, group: int):
     constants = {"MU0_4PI": MU0 * INVERSE_4PI, "GROUP": group}
-    options = native_options("pairs/rates.h", dtype=dtype, **constants)
+    options = native_options("eddy/rates.h", dtype=dtype, **constants)
     call = "warpmag::eddy_passes(thread, first, last, threads, team.data, arrays);"
     return passes_kernel(call, _arrays_type(dtype), options)
 

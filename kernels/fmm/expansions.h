@@ -1,5 +1,6 @@
 // Expansions of cells: multipoles of moments, of parents from their children, local expansions of children from their
-// parents', and fields from those. expansions.py says what the arrays are; warpmag/moments/harmonics.py has the equations.
+// parents', and fields from those. expansions.py says what the arrays are; warpmag/moments/harmonics.py has the
+// equations.
 //
 // The gradient of a harmonic is a sum of a few harmonics of one degree less. So moments are first summed with plain
 // harmonics, S_jc = Σ m_c R_j(u), of which a leaf makes its multipole once; and its local expansion becomes the
@@ -110,7 +111,7 @@ CUDA_CALLABLE inline Felt felt_at(const Arrays& a, const Fields<Q>& fields, Vect
         }
     });
     const Real scale = Real(1) / (Real)a.frame.data[4], volume = scale * scale * scale;
-    return {scaled(zero + volume, felt.h), scaled(zero + scale, scaled(zero + volume, felt.f))};
+    return {(zero + volume) * felt.h, (zero + scale) * ((zero + volume) * felt.f)};
 }
 CUDA_CALLABLE inline void add_vectors(Real* rows, int row, int held, Vector v) {
     for (int l = 0; l < held && l < WIDTH; ++l, rows += row)

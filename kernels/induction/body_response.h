@@ -61,7 +61,7 @@ CUDA_CALLABLE inline Vector sum_cells(const Body& body, const Real* table, int c
         const Real x = body.vectors[j], y = body.vectors[MOST_CELLS + j], z = body.vectors[2 * MOST_CELLS + j];
         const Number xx = numbers(t), yy = numbers(t + CHUNK), zz = numbers(t + 2 * CHUNK);
         const Number xy = numbers(t + 3 * CHUNK), xz = numbers(t + 4 * CHUNK), yz = numbers(t + 5 * CHUNK);
-        h = sum(h, {xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z});
+        h += Vector{xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z};
     }
     return group_sums(h);
 }
@@ -77,9 +77,8 @@ template <class Of> CUDA_CALLABLE inline void apply_whole(const Body& body, Cell
         put_some(body.vectors + 2 * MOST_CELLS + cell.number, cell.at.held, cell.field.z);
     });
     wait_for_body();
-    for_cells(body, cells, [&](Cell& cell) {
-        cell.field = less(sum_cells(body, body.whole, cell.number), scaled(cell.hardness, cell.field));
-    });
+    for_cells(body, cells,
+              [&](Cell& cell) { cell.field = sum_cells(body, body.whole, cell.number) - cell.hardness * cell.field; });
 }
 
 struct Pair {
@@ -115,7 +114,7 @@ template <class Of> CUDA_CALLABLE inline Pair sums_of_body(const Body& body, Cel
 
 // √(k V) D^½ v, D the derivative of the reduced magnetization by s.
 CUDA_CALLABLE inline Vector weighted(const Cell& cell, Vector v) {
-    return sum(scaled(cell.across, v), scaled((cell.along - cell.across) * dot(cell.axis, v), cell.axis));
+    return cell.across * v + (cell.along - cell.across) * dot(cell.axis, v) * cell.axis;
 }
 
 CUDA_CALLABLE inline void take_weights(Cell& cell) {
@@ -125,7 +124,7 @@ CUDA_CALLABLE inline void take_weights(Cell& cell) {
     const Number size = root(cell.material.slope * volume), zero = size * 0;
     cell.across = size * root(ratio);
     cell.along = size * root(larger(steepness, zero));
-    cell.axis = scaled(length_s > zero ? 1 / length_s : zero, cell.s);
+    cell.axis = (length_s > zero ? 1 / length_s : zero) * cell.s;
 }
 
 // Takes a step of Newton's method from s, where the residual is r: s + r + (k/Ms) T E z, (1 − E T E) z = E r Ms/k, by
@@ -133,8 +132,8 @@ CUDA_CALLABLE inline void take_weights(Cell& cell) {
 CUDA_CALLABLE inline void newton_step(const Body& body, Cell* cells) {
     for_cells(body, cells, [&](Cell& cell) {
         take_weights(cell);
-        cell.s = sum(cell.s, cell.residual);
-        cell.residual = scaled(1 / cell.scale, weighted(cell, cell.residual));
+        cell.s += cell.residual;
+        cell.residual = 1 / cell.scale * weighted(cell, cell.residual);
         cell.direction = cell.along_direction = cell.answer = {0, 0, 0};
     });
     double first = 0, before = 0, length_before = 0;
@@ -142,25 +141,25 @@ CUDA_CALLABLE inline void newton_step(const Body& body, Cell* cells) {
         apply_whole(body, cells, [](const Cell& cell) { return weighted(cell, cell.residual); });
         const Pair sums = sums_of_body(body, cells, [&](Cell& cell, Wide& square, Wide& curvature) {
             square = wide_dot(cell.residual, cell.residual);
-            curvature = wide_dot(cell.residual, less(cell.residual, weighted(cell, cell.field)));
+            curvature = wide_dot(cell.residual, cell.residual - weighted(cell, cell.field));
         });
         const double kept = step > 0 ? sums.first / before : 0;
         const double curvature = sums.second - (step > 0 ? kept * sums.first / length_before : 0);
         if (!(curvature > 0)) break;
         const double length = sums.first / curvature;
         for_cells(body, cells, [&](Cell& cell) {
-            cell.direction = sum(cell.residual, scaled((Real)kept, cell.direction));
-            cell.along_direction = sum(cell.field, scaled((Real)kept, cell.along_direction));
-            cell.answer = sum(cell.answer, scaled((Real)length, cell.along_direction));
-            const Vector change = less(cell.direction, weighted(cell, cell.along_direction));
-            cell.residual = less(cell.residual, scaled((Real)length, change));
+            cell.direction = cell.residual + (Real)kept * cell.direction;
+            cell.along_direction = cell.field + (Real)kept * cell.along_direction;
+            cell.answer += (Real)length * cell.along_direction;
+            const Vector change = cell.direction - weighted(cell, cell.along_direction);
+            cell.residual -= (Real)length * change;
         });
         if (step == 0) first = sums.first;
         if (sums.first <= ENOUGH * ENOUGH * first) break;
         before = sums.first;
         length_before = length;
     }
-    for_cells(body, cells, [](Cell& cell) { cell.s = sum(cell.s, scaled(cell.scale, cell.answer)); });
+    for_cells(body, cells, [](Cell& cell) { cell.s = cell.s + cell.scale * cell.answer; });
 }
 
 // Takes the body's own field at its ``past`` solution, times a weight, from the field in which it is to respond.
@@ -171,8 +170,7 @@ CUDA_CALLABLE inline void take_own_past(State& state, const Bodies& bodies, int 
     apply_whole(body, cells, [&](const Cell& cell) {
         return moments_of(cell.material, cell.radius, turned_back(rotation, get(state.past_g, cell.at, past)));
     });
-    for_cells(body, cells,
-              [&](Cell& cell) { cell.outside = less(cell.outside, scaled(weight, turned(rotation, cell.field))); });
+    for_cells(body, cells, [&](Cell& cell) { cell.outside = cell.outside - weight * turned(rotation, cell.field); });
 }
 
 // Reads the cells of body b, in the field of everything as it was summed, or at the start of a solve is expected.
@@ -195,7 +193,7 @@ CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, 
         cell.hardness = some(bodies.hardness.data + bodies.row.data[b] + offset, held, 0);
         cell.s = turned_back(rotation, get(state.s, cell.at));
         cell.outside = get(begin ? state.h0 : state.h, cell.at);
-        if (steady) cell.outside = scaled(1 / cell.scale, get(state.mixed_g, cell.at));
+        if (steady) cell.outside = 1 / cell.scale * get(state.mixed_g, cell.at);
     }
     if (!steady) return;
     const Real ahead = (Real)state.worlds.data[one[2]].ahead;
@@ -220,15 +218,15 @@ CUDA_CALLABLE inline void respond(State& state, const Bodies& bodies, int b, boo
     for_cells(body, cells, [&](Cell& cell) {
         // what was summed has the pair law between the body's own cells
         const Vector own = begin ? Vector{0, 0, 0} : sum_cells(body, body.law, cell.number);
-        const Vector outside = less(turned_back(rotation, cell.outside), own);
-        cell.residual = less(scaled(cell.scale, sum(outside, cell.field)), cell.s);
+        const Vector outside = turned_back(rotation, cell.outside) - own;
+        cell.residual = cell.scale * (outside + cell.field) - cell.s;
     });
     newton_step(body, cells);
     const int warm = state.warm.data[one[2]];
     if (share() == 0)
         for_cells(body, cells, [&](Cell& cell) {
             const Vector s = turned(rotation, cell.s);
-            if (!begin) return set(state.h, cell.at, scaled(1 / cell.scale, s));
+            if (!begin) return set(state.h, cell.at, 1 / cell.scale * s);
             if (warm != 0 && warm != STEADY) return; // s is given, or changes are not known yet
             set(state.s, cell.at, s);
             store_moments(state, cell.at, moments_of(cell.material, cell.radius, s));

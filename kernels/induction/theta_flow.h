@@ -82,7 +82,7 @@ template <class State> CUDA_CALLABLE inline Four balls_at(const State& state, co
 // Moments [A·m²] of balls of given radii [m] for dual variables s.
 CUDA_CALLABLE inline Vector moments_of(Material material, Number radius, Vector s) {
     const Number volume = Real(4.18879020478639) * radius * radius * radius;
-    return scaled(volume * material.saturation * curve_ratio(length(s), material.curves), s);
+    return volume * material.saturation * curve_ratio(length(s), material.curves) * s;
 }
 
 template <class State> CUDA_CALLABLE inline void store_moments(State& state, const Place& at, Vector m) {
@@ -184,15 +184,15 @@ CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& 
         const Four y0 = four_at(past, 0, j), y1 = four_at(past, 2, j);
         const Vector m0 = vector_of(four_at(past, 1, j)), m1 = vector_of(four_at(past, 3, j));
         Vector last = {0, 0, 0}, earlier = {0, 0, 0}, present = {0, 0, 0};
-        add_pair_field(last, less(x0, vector_of(y0)), ball.w, y0.w, m0, listed);
-        add_pair_field(earlier, less(x1, vector_of(y1)), ball.w, y1.w, m1, listed);
-        total = sum(total, sum(last, scaled(ahead, less(last, earlier))));
+        add_pair_field(last, x0 - vector_of(y0), ball.w, y0.w, m0, listed);
+        add_pair_field(earlier, x1 - vector_of(y1), ball.w, y1.w, m1, listed);
+        total += (last + ahead * (last - earlier));
         if (!any(whole)) return;
         const Index n = indices(j) + (at.i - at.row);
         const Vector y = {collect(packed, n), collect(packed + pitch, n), collect(packed + 2 * pitch, n)};
-        const Vector m = sum(m0, scaled(ahead, less(m0, m1)));
-        add_pair_field(present, less(vector_of(ball), y), ball.w, y0.w, m, listed & whole);
-        total = less(total, present);
+        const Vector m = m0 + ahead * (m0 - m1);
+        add_pair_field(present, vector_of(ball) - y, ball.w, y0.w, m, listed & whole);
+        total -= present;
     });
     return group_sums(total);
 }
@@ -213,17 +213,17 @@ template <class State> CUDA_CALLABLE inline void start(State& state, const Place
     if (any(mask_of(length(h0) > Real(0)))) raise_flag(world.in_field);
     Vector s = get(state.s, at);
     // the θ flow with κ = k from no magnetization: exact for a lone ball
-    if (warm == 0) s = scaled(whole_step<Real>(omega) * material.slope / material.saturation, h0);
-    if (warm == STEADY) s = sum(s, scaled(ahead, less(get(state.past_g, at), get(state.past_g, at, 1))));
+    if (warm == 0) s = (whole_step<Real>(omega) * material.slope / material.saturation) * h0;
+    if (warm == STEADY) s = s + ahead * (get(state.past_g, at) - get(state.past_g, at, 1));
     set(state.s, at, s);
     const Vector m = moments_of(material, ball.w, s);
     store_moments(state, at, m);
     put_four(state.now.data, 0, at.row, ball);
     put_four(state.swept.data, 0, at.row, ball);
     if (warm != STEADY) return;
-    const Vector field = get(state.past_field, at), change = less(field, get(state.past_field, at, 1));
-    const Vector far = less(sum(field, scaled(ahead, change)), scaled(INVERSE_4PI, near));
-    set(state.mixed_g, at, scaled(material.slope / material.saturation, sum(h0, far)));
+    const Vector field = get(state.past_field, at), change = field - get(state.past_field, at, 1);
+    const Vector far = field + ahead * change - INVERSE_4PI * near;
+    set(state.mixed_g, at, material.slope / material.saturation * (h0 + far));
     set(state.mixed_moment, at, {0, 0, 0});
     put_four(state.now.data, 1, at.row, {m.x, m.y, m.z, 0});
 }
@@ -238,21 +238,21 @@ template <class State> CUDA_CALLABLE inline void sweep(State& state, const Place
     Vector h = {0, 0, 0};
     visit_neighbors(state, at, [&](const int* j, Mask listed) {
         const Four other = four_at(from, 0, j), change = four_at(from, 1, j);
-        add_pair_field(h, less(vector_of(ball), vector_of(other)), ball.w, other.w, vector_of(change), listed);
+        add_pair_field(h, vector_of(ball) - vector_of(other), ball.w, other.w, vector_of(change), listed);
     });
     h = group_sums(h);
     if (share() != 0) return;
     const Material material = material_of(state, at);
     const Vector s = get(state.s, at);
-    const Vector g = sum(get(state.mixed_g, at), scaled(INVERSE_4PI * material.slope / material.saturation, h));
+    const Vector g = get(state.mixed_g, at) + INVERSE_4PI * material.slope / material.saturation * h;
     const Number step = smaller(Real(SWEEP_STEP) * step_of(state, at, world), Number(Real(1))), none = step * 0;
-    const Vector next = sum(s, scaled(responding(state, at) ? none : step, less(g, s)));
+    const Vector next = s + (responding(state, at) ? none : step) * (g - s);
     set(state.s, at, next);
     const Vector m = moments_of(material, ball.w, next);
     if (last) {
         store_moments(state, at, m);
     } else {
-        const Vector change = less(m, get(state.mixed_moment, at));
+        const Vector change = m - get(state.mixed_moment, at);
         put_four(state.swept.data, 1, at.row, {change.x, change.y, change.z, 0});
     }
 }
@@ -266,13 +266,13 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const auto& world = state.worlds.data[at.world];
     const History history = history_of(world);
     const Material material = material_of(state, at);
-    const Vector s = get(state.s, at), g = scaled(material.slope / material.saturation, get(state.h, at));
-    const Vector r = less(g, s);
+    const Vector s = get(state.s, at), g = material.slope / material.saturation * get(state.h, at);
+    const Vector r = g - s;
     Vector step = {0, 0, 0};
     if (world.linked) {
-        step = less(s, get(state.iterate_s, at));
+        step = s - get(state.iterate_s, at);
         set(state.history_s, at, step, history.newest);
-        set(state.history_r, at, less(r, get(state.iterate_r, at)), history.newest);
+        set(state.history_r, at, r - get(state.iterate_r, at), history.newest);
     }
     set(state.iterate_s, at, s);
     set(state.iterate_r, at, r);
@@ -281,7 +281,7 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Number worth_g = material.saturation * curve_ratio(length_g, material.curves);
     // lengths, not squares: a field of 1e-20 A/m squared is no float32
     const Wide goal = wide(induced_share(material) * worth_g * length_g),
-               deviation = wide(length(less(scaled(worth_g, g), scaled(worth_s, s))));
+               deviation = wide(length(worth_g * g - worth_s * s));
     const Wide weight = wide(length_s > length_g ? worth_s : worth_g), square = weight * weight;
     const Wide merit = weight * wide(length(r));
     put(DEVIATION, deviation * deviation);
@@ -290,8 +290,8 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     put(MERIT, merit * merit);
     put(LEFT, left * left);
     put(CHANGE, square * wide_dot(step, step));
-    const Vector past = get(state.past_g, at), earlier = less(past, get(state.past_g, at, 1));
-    put(FOLLOWED, square * wide_dot(less(g, past), earlier));
+    const Vector past = get(state.past_g, at), earlier = past - get(state.past_g, at, 1);
+    put(FOLLOWED, square * wide_dot(g - past, earlier));
     put(EARLIER, square * wide_dot(earlier, earlier));
     Vector change[DEPTH];
 #pragma unroll
@@ -308,14 +308,14 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
 template <class State>
 CUDA_CALLABLE inline void keep_solution(State& state, const Place& at, Material material, Vector mixed, Vector g) {
     const Four ball = own_four(state.now.data, 0, at.row);
-    const Vector m = moments_of(material, ball.w, mixed), h = scaled(material.saturation / material.slope, g);
+    const Vector m = moments_of(material, ball.w, mixed), h = material.saturation / material.slope * g;
     Real* const past = state.past.data;
     for (int quarter = 0; quarter < 2; ++quarter) put_four(past, 2 + quarter, at.row, own_four(past, quarter, at.row));
     put_four(past, 0, at.row, ball);
     put_four(past, 1, at.row, {m.x, m.y, m.z, 0});
     set(state.past_field, at, get(state.past_field, at), 1);
     set(state.past_g, at, get(state.past_g, at), 1);
-    set(state.past_field, at, less(h, get(state.h0, at)));
+    set(state.past_field, at, h - get(state.h0, at));
     set(state.past_g, at, g);
 }
 
@@ -337,26 +337,26 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
         for (int a = 0; a < world.used; ++a) {
             const int old = slot_of(world.newest, a);
             const Real alpha = (Real)world.alpha[a];
-            mixed = less(mixed, scaled(alpha, get(state.history_s, at, old)));
-            r = less(r, scaled(alpha, get(state.history_r, at, old)));
+            mixed -= alpha * get(state.history_s, at, old);
+            r -= alpha * get(state.history_r, at, old);
         }
     }
     const Number omega = step_of(state, at, world), longer = whole_step<Real>(omega);
-    const Vector g = sum(mixed, r), next = sum(mixed, scaled(responding(state, at) ? longer : omega, r));
+    const Vector g = mixed + r, next = mixed + (responding(state, at) ? longer : omega) * r;
     const Material material = material_of(state, at);
     set(state.s, at, next);
     // what ends takes a whole step, where moments and field are the material's; s is the next solve's start
     const bool ended = !world.active;
-    const Vector shown = ended ? sum(mixed, scaled(longer, r)) : next;
+    const Vector shown = ended ? (mixed + longer * r) : next;
     const Number radius = some(entries(state.packed, at, 3), at.held, 0);
     const Vector m = moments_of(material, radius, shown);
     store_moments(state, at, m);
     if (ended) {
-        set(state.h, at, scaled(material.saturation / material.slope, shown));
+        set(state.h, at, material.saturation / material.slope * shown);
         return keep_solution(state, at, material, mixed, g);
     }
     if (world.next != STEP_AND_SWEEP) return;
-    const Vector before = moments_of(material, radius, mixed), change = less(m, before);
+    const Vector before = moments_of(material, radius, mixed), change = m - before;
     set(state.mixed_g, at, g);
     set(state.mixed_moment, at, before);
     put_four(state.now.data, 1, at.row, {change.x, change.y, change.z, 0});

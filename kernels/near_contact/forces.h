@@ -27,7 +27,7 @@ CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductanc
                                + of_other(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
     const Number rest = w * radial - w * inverse * (by_alpha * a.alpha + by_gamma * a.gamma);
     const Number x = w * inverse * by_alpha, y = w * inverse * by_gamma;
-    return sum(sum(scaled(rest, u), scaled(x, a.field)), scaled(y, a.gradient));
+    return rest * u + x * a.field + y * a.gradient;
 }
 
 CUDA_CALLABLE inline void find_contact_forces(const Arrays& a, int i) {
@@ -55,12 +55,12 @@ CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& o
     const Vector t = own.t, m = own.m, t_j = other.t, m_j = other.m;
     const Number g1 = source * inverse, second = g2 * inverse;
     const Number along = dot(u, t), along_j = dot(u, t_j), along_m = dot(u, m), along_m_j = dot(u, m_j);
-    const Number among = dot(scaled(second, t), t_j) - dot(scaled(second, m), m_j);
+    const Number among = dot(second * t, t_j) - dot(second * m, m_j);
     const Number radial = source * own.q * other.q + own.q * g2 * along_j - other.q * g2 * along - among
                           - (third * along) * along_j + (third * along_m) * along_m_j;
     const Number on = g1 * own.q - second * along, on_j = -(g1 * other.q + second * along_j);
-    const Vector across = scaled(second, sum(scaled(along_m, m_j), scaled(along_m_j, m)));
-    return {radial, sum(sum(scaled(on, t_j), scaled(on_j, t)), across)};
+    const Vector across = second * (along_m * m_j + along_m_j * m);
+    return {radial, on * t_j + on_j * t + across};
 }
 
 // Of quadrupoles with sources, dipoles and each other: derivatives of their energy by the distance and the direction,
@@ -68,10 +68,10 @@ CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& o
 CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& other, Vector u, Number g2,
                                                 Number inverse, Number third, Number w, Number slope) {
     const Vector t = own.t, t_j = other.t;
-    const Tensor theta = own.theta, theta_j = other.theta;
+    const Traceless theta = own.theta, theta_j = other.theta;
     const Number q = own.q, q_j = other.q, a = dot(u, t), a_j = dot(u, t_j);
     const Number square = inverse * inverse, fourth = square * square;
-    const Vector v = times(theta, u), v_j = times(theta_j, u);
+    const Vector v = theta * u, v_j = theta_j * u;
     const Number f = dot(v, u), f_j = dot(v_j, u);
     const Number on_sources = q * f_j + q_j * f, k3 = Real(1.0 / 3.0) * g2;
     const Number on_dipoles = 5 * (a * f_j - a_j * f) - 2 * (dot(t, v_j) - dot(t_j, v));
@@ -81,7 +81,7 @@ CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Source
                            + 2 * (theta_j.xy * theta.xy + theta_j.yz * theta.yz + theta_j.zx * theta.zx);
     const Number energy_4 = fourth * on_dipoles;
     const Number energy_5 = fifth * (2 * product - 20 * dot(v, v_j) + 35 * f_j * f) * Real(1.0 / 3.0);
-    const Vector z = less(times(theta_j, t), times(theta, t_j)), x = sum(times(theta, v_j), times(theta_j, v));
+    const Vector z = theta_j * t - theta * t_j, x = theta * v_j + theta_j * v;
     auto turn_of = [=](Number t, Number t_j, Number v, Number v_j, Number z, Number x) -> Number {
         return 2 * k3 * (q * v_j + q_j * v) + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z)
                + fifth * (Real(70.0 / 3.0) * (f_j * v + v_j * f) - Real(20.0 / 3.0) * x);
@@ -92,17 +92,14 @@ CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Source
     const Number radial = slope * (k3 * on_sources + energy_4 + energy_5)
                           + w * Real(1.0 / 3.0) * (third + 2 * second) * on_sources
                           - w * inverse * (4 * energy_4 + 5 * energy_5 + dot(turn, u));
-    return {radial, scaled(w * inverse, turn)};
+    return {radial, w * inverse * turn};
 }
 
 // Sources, with lengths in another unit, of which a metre has so many.
 CUDA_CALLABLE inline Sources in_units(const Sources& o, Number metre) {
     const Number square = metre * metre, cube = square * metre;
-    const Tensor t = o.theta;
-    return {scaled(square, o.t),
-            scaled(square, o.m),
-            metre * o.q,
-            {cube * t.xx, cube * t.yy, cube * t.xy, cube * t.yz, cube * t.zx}};
+    const Traceless t = o.theta;
+    return {square * o.t, square * o.m, metre * o.q, {cube * t.xx, cube * t.yy, cube * t.xy, cube * t.yz, cube * t.zx}};
 }
 
 CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& sources) {
@@ -120,14 +117,14 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& so
         const Number inverse = size * row[6], apart = w > zero ? inverse : zero;
         const PairForce d = dipole_force(own, other, u, g1, g2, inverse, g3);
         const PairForce q = quadrupole_force(own, other, u, g2, apart, g3, w, size * slope[1]);
-        total = sum(total, d.across);
-        total = sum(total, sum(scaled(d.radial + q.radial, u), q.across));
+        total += d.across;
+        total += ((d.radial + q.radial) * u + q.across);
     }
     for (int s = share(); s - share() < contact_slots; s += SHARES) {
         const int* place = list_at(a.counterpart, CONTACT_SLOTS, s, i);
         const Real* forces = a.pair_forces;
         const Vector theirs = {gather(forces, place), gather(forces + CHUNK, place), gather(forces + 2 * CHUNK, place)};
-        total = sum(total, less(theirs, own_vector(a.pair_force(s, i))));
+        total += (theirs - own_vector(a.pair_force(s, i)));
     }
     return {group_total(total.x), group_total(total.y), group_total(total.z)};
 }

@@ -7,7 +7,7 @@ namespace warpmag {
 // Slope k_d of the curve at the ball's moment, between 0 and the 3 of an ideally permeable ball; 1/χ_d = 1/k_d − 1/3.
 CUDA_CALLABLE inline Number differential_slope(const Arrays& a, int i) {
     const Number slope = numbers(a.curve_slope + i), zero = slope * Real(0);
-    const Vector reduced = scaled(numbers(a.unsaturated + i), a.own_moment(i));
+    const Vector reduced = numbers(a.unsaturated + i) * a.own_moment(i);
     const Number steepness = curve_steepness(dot(reduced, reduced), a.curves(i));
     return smaller(larger(slope * steepness, zero), zero + 3);
 }

@@ -48,13 +48,13 @@ struct Arrays {
 struct Sources {
     Vector t, m;
     Number q;
-    Tensor theta;
+    Traceless theta;
 };
 // A ball's drive: φ, R e_m and R² e_Θ, and the weight that falls as the ball saturates.
 struct Drive {
     Number phi, weight;
     Vector e;
-    Tensor t;
+    Traceless t;
 };
 
 // Sources of balls j. On a GPU, which has no pass that publishes m before the others, it comes from where moments are.

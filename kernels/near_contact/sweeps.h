@@ -26,7 +26,7 @@ CUDA_CALLABLE inline void add_drive(Number (&sum)[16], const Rows<PAIR_ROWS>& ro
     const Number q = o.q, along = dot(u, t), source = row[4], g2 = row[5], inverse = row[6], w = row[7];
     const Number g1 = source * inverse, square = inverse * inverse;
     const Number k3 = Real(1.0 / 3.0) * w * g2, k4 = w * square * square, k5 = k4 * inverse;
-    const Vector v = times(o.theta, u);
+    const Vector v = o.theta * u;
     const Number f = dot(v, u);
     sum[13] += row[3] * q + source * along + k3 * f;
     const Number radial = 5 * k4 * f - source * q - g2 * along;
@@ -128,7 +128,7 @@ template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const Arrays& a, in
     }
     if (FIRST) return {zero, zero, zero};
     const Vector dipoles = {number(kept, 16), number(kept, 22), number(kept, 23)};
-    return less(dipoles, {number(difference, 5), number(difference, 6), number(difference, 7)});
+    return dipoles - Vector{number(difference, 5), number(difference, 6), number(difference, 7)};
 }
 
 // What a ball's drive is at a contact in direction u: φ, α, γ, R e_m, and R² e_Θ u.
@@ -137,7 +137,7 @@ struct ContactDrive {
     Vector field, gradient;
 };
 CUDA_CALLABLE inline ContactDrive at_contact(const Drive& o, Vector u, int sign) {
-    const Vector gradient = times(o.t, u);
+    const Vector gradient = o.t * u;
     return {o.phi, sign * dot(o.e, u), dot(gradient, u), o.e, gradient};
 }
 typedef Rows<CONDUCTANCE_ROWS> Conductances;

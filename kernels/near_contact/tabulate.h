@@ -172,7 +172,7 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
         const Mask live = weight > zero;
         const Number b = live ? other.w : size + (size > zero ? zero : one), sum = size + b;
         const Vector r = {other.x - own.x, other.y - own.y, other.z - own.z};
-        const Polar apart = polar(scaled(1 / sum, r));
+        const Polar apart = polar(1 / sum * r);
         // bounded: powers of 1/d that nothing comes of, since the balls overlap, may not overflow
         const Number d = live ? sum * larger(apart.d, zero + Real(1e-12)) : sum;
         const Number ratio = smaller(size, b) / larger(size, b);

@@ -22,7 +22,7 @@ struct Sight {
 // it.
 CUDA_CALLABLE inline Sight sight_of(Vector r, Number metre, Number b, Number alone, Mask taken) {
     const Number zero = metre * Real(0), one = zero + 1;
-    const Vector s = scaled(metre, r);
+    const Vector s = metre * r;
     const Number d2 = dot(s, s), its = metre * b, lone = alone > Real(0) ? one : zero;
     const Number depth = larger(its * (CELL_DEPTH + (1 - CELL_DEPTH) * lone), zero + LEAST_MAGNET);
     const Number deepest = 1 + (1 - MAGNET_OVERLAP_HIGH) * depth, shallow = 1 + (1 - MAGNET_OVERLAP_LOW) * depth;
@@ -45,7 +45,7 @@ CUDA_CALLABLE inline Sight sight_of(Vector r, Number metre, Number b, Number alo
         slope = slope * inner.value + weight * inner.slope * width;
         weight = weight * inner.value;
     }
-    return {scaled(live ? inverse : zero, s), inverse, weight, slope, live & (weight > zero)};
+    return {(live ? inverse : zero) * s, inverse, weight, slope, live & (weight > zero)};
 }
 
 // Symmetric tensors: of degree 2 xx, yy, zz, xy, yz, zx; of degree 3 xxx, yyy, zzz, xxy, xxz, yyx, yyz, zzx, zzy, xyz;
@@ -60,14 +60,14 @@ CUDA_CALLABLE inline void add_derivatives(Number (&sum)[FULL], const Sight& s, V
     const Number xy = u.x * u.y, yz = u.y * u.z, zx = u.z * u.x;
     const Number k2 = s.weight * s.inverse * s.inverse * s.inverse * s.inverse;
     const Number k3 = k2 * s.inverse * Real(1.0 / 3.0), k4 = k2 * s.inverse * s.inverse * Real(0.25);
-    const Vector p = scaled(k2, less(m, scaled(Real(2.5) * a, u)));
+    const Vector p = k2 * (m - Real(2.5) * a * u);
     sum[0] += 2 * p.x * u.x;
     sum[1] += 2 * p.y * u.y;
     sum[2] += 2 * p.z * u.z;
     sum[3] += p.x * u.y + p.y * u.x;
     sum[4] += p.y * u.z + p.z * u.y;
     sum[5] += p.z * u.x + p.x * u.z;
-    const Vector q = scaled(k3, less(scaled(Number(Real(3)), m), scaled(7 * a, u)));
+    const Vector q = k3 * (Number(Real(3)) * m - 7 * a * u);
     sum[6] += 3 * q.x * x;
     sum[7] += 3 * q.y * y;
     sum[8] += 3 * q.z * z;
@@ -78,8 +78,8 @@ CUDA_CALLABLE inline void add_derivatives(Number (&sum)[FULL], const Sight& s, V
     sum[13] += 2 * q.z * zx + q.x * z;
     sum[14] += 2 * q.z * yz + q.y * z;
     sum[15] += q.x * yz + q.y * zx + q.z * xy;
-    const Vector r = scaled(k4, less(scaled(Number(Real(4)), m), scaled(9 * a, u)));
-    const Vector by_x = scaled(x, r), by_y = scaled(y, r), by_z = scaled(z, r);
+    const Vector r = k4 * (Number(Real(4)) * m - 9 * a * u);
+    const Vector by_x = x * r, by_y = y * r, by_z = z * r;
     sum[16] += 4 * by_x.x * u.x;
     sum[17] += 4 * by_y.y * u.y;
     sum[18] += 4 * by_z.z * u.z;
@@ -135,14 +135,14 @@ CUDA_CALLABLE inline void put_response(Real* rows, const Real* sources, const Nu
 }
 
 // The tensor of degree 3 or 4 from row ``first`` on, contracted with u to degree 2.
-template <class Get> CUDA_CALLABLE inline Tensor contracted_3(const Get& b, int first, Vector u) {
+template <class Get> CUDA_CALLABLE inline Traceless contracted_3(const Get& b, int first, Vector u) {
     auto along = [=](Number x, Number y, Number z) { return x * u.x + y * u.y + z * u.z; };
     const Number xxx = b(first), yyy = b(first + 1), xxy = b(first + 2), xxz = b(first + 3), yyx = b(first + 4);
     const Number yyz = b(first + 5), xyz = b(first + 6);
     return {along(xxx, xxy, xxz), along(yyx, yyy, yyz), along(xxy, yyx, xyz), along(xyz, yyz, -(xxy + yyy)),
             along(xxz, xyz, -(xxx + yyx))};
 }
-template <class Get> CUDA_CALLABLE inline Tensor contracted_4(const Get& b, int first, Vector u) {
+template <class Get> CUDA_CALLABLE inline Traceless contracted_4(const Get& b, int first, Vector u) {
     const Number z = u.z * u.z, x = u.x * u.x - z, y = u.y * u.y - z;
     const Number xy = 2 * u.x * u.y, yz = 2 * u.y * u.z, zx = 2 * u.z * u.x;
     auto along = [=](Number a, Number c, Number d, Number e, Number f) {
@@ -160,7 +160,7 @@ template <class Get> CUDA_CALLABLE inline Tensor contracted_4(const Get& b, int 
 struct Push {
     Vector force, field;
 };
-CUDA_CALLABLE inline void add(Tensor& to, Number k, Tensor t) {
+CUDA_CALLABLE inline void add(Traceless& to, Number k, Traceless t) {
     to.xx += k * t.xx, to.yy += k * t.yy, to.xy += k * t.xy, to.yz += k * t.yz, to.zx += k * t.zx;
 }
 
@@ -168,25 +168,24 @@ CUDA_CALLABLE inline void add(Tensor& to, Number k, Tensor t) {
 template <class Get> CUDA_CALLABLE inline Push push_of(const Get& b, const Sight& s, Vector m) {
     const Vector u = s.u;
     const Number a = dot(u, m), k2 = s.inverse * s.inverse * s.inverse * s.inverse, zero = a * Real(0);
-    const Tensor of[3] = {{b(0), b(1), b(2), b(3), b(4)}, contracted_3(b, 5, u), contracted_4(b, 12, u)};
-    Tensor twice = {zero, zero, zero, zero, zero};
+    const Traceless of[3] = {{b(0), b(1), b(2), b(3), b(4)}, contracted_3(b, 5, u), contracted_4(b, 12, u)};
+    Traceless twice = {zero, zero, zero, zero, zero};
     Vector first = {zero, zero, zero}, second = first;
     Number on_m = zero, on_u = zero, k = k2;
     for (int n = 0; n < 3; ++n, k = k * s.inverse) {
         const Real l = Real(n + 2), odd = 2 * l + 1;
-        const Vector v = times(of[n], u);
+        const Vector v = of[n] * u;
         const Number f = k * odd * dot(v, u);
         add(twice, k * (l * (l - 1)), of[n]);
-        first = sum(first, scaled(k * l, v));
-        second = sum(second, scaled(k * (l * odd), v));
+        first += k * l * v;
+        second += k * (l * odd) * v;
         on_m += f;
         on_u += f * (odd + 2);
     }
-    const Vector gradient = less(first, scaled(on_m, u)); // of the response's potential
-    const Vector across = less(times(twice, m), sum(scaled(a, second), scaled(on_m, m)));
-    const Vector change = sum(across, scaled(on_u * a - dot(m, second), u));
-    return {sum(scaled(s.weight * s.inverse, change), scaled(s.slope * dot(m, gradient), u)),
-            scaled(s.weight, gradient)};
+    const Vector gradient = first - on_m * u; // of the response's potential
+    const Vector across = twice * m - (a * second + on_m * m);
+    const Vector change = across + (on_u * a - dot(m, second)) * u;
+    return {s.weight * s.inverse * change + s.slope * dot(m, gradient) * u, s.weight * gradient};
 }
 
 // By the response of all higher degrees to this moment alone, in closed form: of energy −½ p w² (Q m² + D (u·m)²).
@@ -200,8 +199,7 @@ CUDA_CALLABLE inline Push push_of_rest(Number p, const Sight& s, Vector m) {
                           - s.weight * x * s.inverse * (q_slope * square + d_slope * along)
                           - s.weight * s.inverse * x * d * along;
     const Number across = s.weight * s.inverse * x * d * a;
-    return {scaled(k, sum(scaled(radial, s.u), scaled(across, m))),
-            scaled(k * s.weight * x, sum(scaled(q, m), scaled(d * a, s.u)))};
+    return {k * (radial * s.u + across * m), k * s.weight * x * (q * m + d * a * s.u)};
 }
 
 // Both, of a moment that is ``alone`` on its body; of a cell only the first.
@@ -211,7 +209,7 @@ template <class Get> CUDA_CALLABLE inline Push whole_push(const Get& b, const Si
     if (!any(lone)) return push;
     const Number zero = alone * Real(0);
     const Push rest = push_of_rest(lone ? b(21) : zero, s, m);
-    return {sum(push.force, rest.force), sum(push.field, rest.field)};
+    return {push.force + rest.force, push.field + rest.field};
 }
 
 // What a pass reads of a moment: place, radius, moment and whether it is alone, of several or the same in all lanes.
@@ -276,7 +274,7 @@ CUDA_CALLABLE inline void visit_others(const Arrays& a, int i, Vector x, Number 
     const Number low = number_of(indices(begin)), high = number_of(indices(end));
     for (int start = first / CHUNK * CHUNK; start < last; start += CHUNK) {
         const Real* const bounds = a.bounds + BOUND_ROWS * (start / CHUNK);
-        const Vector r = less({spread(bounds[0]), spread(bounds[1]), spread(bounds[2])}, x);
+        const Vector r = Vector{spread(bounds[0]), spread(bounds[1]), spread(bounds[2])} - x;
         const Number reach = MAGNET_REACH_HIGH * (permanent ? spread(bounds[4]) : size) + bounds[3];
         if (!any((high > low) & (dot(r, r) < reach * reach))) continue;
         const int stop = start + CHUNK < last ? start + CHUNK : last;
@@ -286,7 +284,7 @@ CUDA_CALLABLE inline void visit_others(const Arrays& a, int i, Vector x, Number 
 }
 
 // Moments over the cube of a ball's radius 1/``metre``, in steps that stay in float32's range.
-CUDA_CALLABLE inline Vector over_cube(Vector m, Number metre) { return scaled(metre, scaled(metre, scaled(metre, m))); }
+CUDA_CALLABLE inline Vector over_cube(Vector m, Number metre) { return metre * (metre * (metre * m)); }
 
 // Pass 1: the response of balls.
 CUDA_CALLABLE inline void find_response(const Arrays& a, int i) {
@@ -298,7 +296,7 @@ CUDA_CALLABLE inline void find_response(const Arrays& a, int i) {
     visit_others(a, i, own.at, size, false, [&](int j, Mask taken) {
         if (a.group[j] >= 0 || a.alone[j] < 0) return; // no magnet
         const Magnet o = magnet(a, j);
-        const Sight s = sight_of(less(o.at, own.at), metre, o.size, o.alone, taken);
+        const Sight s = sight_of(o.at - own.at, metre, o.size, o.alone, taken);
         if (any(s.live)) add_derivatives(sums, s, over_cube(o.m, metre));
     });
     for (int c = 0; c < FULL; ++c) sums[c] = group_sum(sums[c]);
@@ -314,7 +312,7 @@ CUDA_CALLABLE inline Vector pull_of_sources(const Arrays& a, int i) {
     const Number zero = Number(Real(0));
     Vector total = {zero, zero, zero};
     for (int row = 0; row < TENSOR_ROWS; ++row)
-        total = sum(total, scaled(numbers(response + row * CHUNK), own_vector(slopes + 3 * row * CHUNK)));
+        total += numbers(response + row * CHUNK) * own_vector(slopes + 3 * row * CHUNK);
     return total;
 }
 
@@ -328,14 +326,14 @@ CUDA_CALLABLE inline void pull_balls(const Arrays& a, int i) {
     visit_others(a, i, own.at, size, false, [&](int j, Mask taken) {
         if (a.group[j] >= 0 || a.alone[j] < 0) return; // no magnet
         const Magnet o = magnet(a, j);
-        const Sight s = sight_of(less(o.at, own.at), metre, o.size, o.alone, taken);
+        const Sight s = sight_of(o.at - own.at, metre, o.size, o.alone, taken);
         if (!any(s.live)) return;
         auto response = [=](int row) -> Number { return numbers(rows + row * CHUNK); };
-        total = less(total, whole_push(response, s, over_cube(o.m, metre), o.alone).force);
+        total -= whole_push(response, s, over_cube(o.m, metre), o.alone).force;
     });
-    total = group_sums(scaled(size * size, total));
+    total = group_sums(size * size * total);
     if (share() > 0) return;
-    if (a.expansion) total = sum(total, scaled(size * size * size, pull_of_sources(a, i)));
+    if (a.expansion) total = total + size * size * size * pull_of_sources(a, i);
     add_to(a.forces, i, total, a.movable);
 }
 
@@ -348,13 +346,13 @@ CUDA_CALLABLE inline void push_magnets(const Arrays& a, int i) {
         if (a.group[j] < 0) return;
         const Magnet ball = magnet(a, j);
         const Number size = ball.size, metre = 1 / size;
-        const Sight s = sight_of(less(own.at, ball.at), metre, own.size, own.alone, taken);
+        const Sight s = sight_of(own.at - ball.at, metre, own.size, own.alone, taken);
         if (!any(s.live)) return;
         const Real* rows = rows_at(a.response, RESPONSE_ROWS, j);
         auto response = [=](int row) -> Number { return spread(rows[row * CHUNK]); };
         const Push push = whole_push(response, s, over_cube(own.m, metre), own.alone);
-        force = sum(force, scaled(size * size, push.force));
-        torque = sum(torque, cross(own.m, push.field));
+        force += size * size * push.force;
+        torque += cross(own.m, push.field);
     });
     force = group_sums(force);
     torque = group_sums(torque);

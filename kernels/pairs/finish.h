@@ -78,10 +78,10 @@ CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& 
     for (int part = share(); part < arrays.partial.shape[0]; part += SHARES) {
         const Real* const sums = arrays.partial.data + (size_t)part * arrays.partial.shape[1] * ROW + offset;
         if constexpr (ROW == 3 && WIDTH > 1) {
-            total = sum(total, vectors(sums + 3 * (size_t)at.first, at.held));
+            total += vectors(sums + 3 * (size_t)at.first, at.held);
         } else {
             const Index place = ROW * at.row;
-            total = sum(total, {collect(sums, place), collect(sums + 1, place), collect(sums + 2, place)});
+            total += Vector{collect(sums, place), collect(sums + 1, place), collect(sums + 2, place)};
         }
     }
     return total;
@@ -95,7 +95,7 @@ CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arr
     const Vector x = targets.vector(0, at.i);
     const Number radius = targets.number(3, at.i), label = targets.number(7, at.i);
     auto add = [&](auto j, Mask listed) {
-        const Vector r = less(x, sources.vector(0, j));
+        const Vector r = x - sources.vector(0, j);
         const Number other = sources.number(3, j), contact = radius + other;
         Mask wanted = listed & (dot(r, r) < contact * contact);
         if (Q != Quantity::FIELD) wanted &= label != sources.number(7, j);
@@ -114,13 +114,13 @@ template <Quantity Q, class Arrays>
 CUDA_CALLABLE inline void store(const Arrays& arrays, const TargetRows& at, Vector h, Vector f, Vector e, Vector base) {
     Real* const out = (Real*)arrays.out.data;
     if constexpr (Q == Quantity::FIELD) {
-        put_vectors_at(out, at, sum(base, scaled(INVERSE_4PI, h)));
+        put_vectors_at(out, at, base + INVERSE_4PI * h);
     } else {
-        put_vectors_at(out, at, scaled(MU0 * INVERSE_4PI, f));
+        put_vectors_at(out, at, MU0 * INVERSE_4PI * f);
         Vector torque = {0, 0, 0};
         if (Q == Quantity::WRENCH) {
             const Mask turned = nonzero_at(arrays.turned.data, at);
-            add_where(turned, torque, scaled(MU0, cross(e, sum(scaled(INVERSE_4PI, h), base))));
+            add_where(turned, torque, MU0 * cross(e, INVERSE_4PI * h + base));
         }
         put_vectors_at((Real*)arrays.torques.data, at, torque);
     }

@@ -69,9 +69,9 @@ struct Polar {
 CUDA_CALLABLE inline Polar polar(Vector r) {
     const Number zero = Number(Real(0)), one = Number(Real(1));
     const Mask tiny = dot(r, r) < Real(1e-20); // times 2⁶⁰, for its square to keep its digits
-    const Vector lifted = scaled(tiny ? Number(Real(1.152921504606847e18)) : one, r);
+    const Vector lifted = (tiny ? Number(Real(1.152921504606847e18)) : one) * r;
     const Number d = length(lifted);
-    return {d * (tiny ? Number(Real(8.673617379884035e-19)) : one), scaled(d > zero ? one / d : zero, lifted)};
+    return {d * (tiny ? Number(Real(8.673617379884035e-19)) : one), (d > zero ? one / d : zero) * lifted};
 }
 
 // An overlapping pair in units of its contact distance, in which no power of it overflows: direction u, distance d,
@@ -83,16 +83,14 @@ struct Overlap {
 };
 CUDA_CALLABLE inline Overlap overlap_of(Vector r, Number a, Number b, Vector m, Mask wanted) {
     const Number unit = 1 / (wanted ? a + b : Number(Real(1)));
-    const Polar at = polar(scaled(unit, r));
+    const Polar at = polar(unit * r);
     // |a − b| of the radii as they are: those in other units are rounded
     const Factors<Number> g = overlap_factors(at.d, unit * a, unit * b, unit * larger(a - b, b - a));
-    return {unit, at.d, at.u, scaled(unit * unit * unit, m), g};
+    return {unit, at.d, at.u, unit * unit * unit * m, g};
 }
 
 // 4π times the field that a clamped dipole lacks.
-CUDA_CALLABLE inline Vector field_of(const Overlap& p) {
-    return sum(scaled(p.g.g1, p.m), scaled(p.g.g2 * p.d * dot(p.u, p.m), p.u));
-}
+CUDA_CALLABLE inline Vector field_of(const Overlap& p) { return p.g.g1 * p.m + p.g.g2 * p.d * dot(p.u, p.m) * p.u; }
 
 // Adds 4π times the fields of moments m at separations r, of balls of radii a and b.
 CUDA_CALLABLE inline void add_pair_field(Vector& h, Vector r, Number a, Number b, Vector m, Mask wanted) {
@@ -109,9 +107,9 @@ CUDA_CALLABLE inline void add_pair_field(Vector& h, Vector r, Number a, Number b
 // 4π times the (e·∇)H that a clamped dipole lacks.
 CUDA_CALLABLE inline Vector force_of(const Overlap& p, Vector e) {
     const Number along = dot(p.u, e), of = dot(p.u, p.m);
-    const Vector across = sum(scaled(along, p.m), scaled(of, e));
+    const Vector across = along * p.m + of * e;
     const Number radial = p.g.g2 * dot(p.m, e) + p.g.g3 * of * along;
-    return scaled(p.unit, sum(scaled(p.g.g2, across), scaled(radial, p.u)));
+    return p.unit * (p.g.g2 * across + radial * p.u);
 }
 
 // Potential U of overlapping balls of radii a and b at distance d < a + b, in the forms of averaged_factors.

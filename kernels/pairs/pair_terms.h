@@ -60,6 +60,7 @@ template <class N> CUDA_CALLABLE inline Vec3<N> operator*(N factor, const Vec3<N
 }
 
 template <class N> CUDA_CALLABLE inline Vec3<N>& operator+=(Vec3<N>& sum, const Vec3<N>& v) { return sum = sum + v; }
+template <class N> CUDA_CALLABLE inline Vec3<N>& operator-=(Vec3<N>& sum, const Vec3<N>& v) { return sum = sum - v; }
 
 template <class N> CUDA_CALLABLE inline N dot(const Vec3<N>& a, const Vec3<N>& b) {
     return a.x * b.x + a.y * b.y + a.z * b.z;
@@ -116,7 +117,7 @@ CUDA_CALLABLE inline void add_mirrored_pair(Vec3<N>& h, Vec3<N>& g, const Vec3<N
         const N c = inv5 * rb, e = inv5 * rm, q = inv5 * (bm - FIVE * (inv2 * rb) * rm);
         const Vec3<N> f = c * m + e * b + q * r;
         h += f;
-        g = g - f;
+        g -= f;
     }
 }
 

@@ -300,7 +300,7 @@ __attribute__((noinline)) inline void add_tile_sums(const Tile& tile, Real* out)
     for (int i = 0; i < tile.count; i += WIDTH, out += 3 * WIDTH) {
         const auto h = [&](int c) { return warpmag::numbers((const Real*)tile.sums[c] + i); };
         const int held = tile.count - i;
-        put_vectors(out, held, sum(warpmag::vectors(out, held), scaled(H_FACTOR, {h(0), h(1), h(2)})));
+        put_vectors(out, held, warpmag::vectors(out, held) + H_FACTOR * Vector{h(0), h(1), h(2)});
     }
 }
 

@@ -7,21 +7,31 @@ namespace warpmag {
 struct Vector {
     Number x, y, z;
 };
-struct Tensor {
-    Number xx, yy, xy, yz, zx; // symmetric, traceless
+struct Traceless { // symmetric tensor with zz = −xx − yy
+    Number xx, yy, xy, yz, zx;
+};
+struct Symmetric {
+    Number xx, yy, zz, xy, yz, zx;
 };
 
 CUDA_CALLABLE inline Number dot(Vector a, Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-CUDA_CALLABLE inline Vector sum(Vector a, Vector b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-CUDA_CALLABLE inline Vector less(Vector a, Vector b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-CUDA_CALLABLE inline Vector scaled(Number k, Vector a) { return {k * a.x, k * a.y, k * a.z}; }
+CUDA_CALLABLE inline Vector operator+(Vector a, Vector b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+CUDA_CALLABLE inline Vector operator-(Vector a, Vector b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+CUDA_CALLABLE inline Vector operator-(Vector a) { return {-a.x, -a.y, -a.z}; }
+CUDA_CALLABLE inline Vector operator*(Number k, Vector a) { return {k * a.x, k * a.y, k * a.z}; }
+CUDA_CALLABLE inline Vector& operator+=(Vector& a, Vector b) { return a = a + b; }
+CUDA_CALLABLE inline Vector& operator-=(Vector& a, Vector b) { return a = a - b; }
 CUDA_CALLABLE inline Vector cross(Vector a, Vector b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 CUDA_CALLABLE inline Number length(Vector a) { return root(dot(a, a)); }
-CUDA_CALLABLE inline Vector times(Tensor t, Vector a) {
+CUDA_CALLABLE inline Vector operator*(Traceless t, Vector a) {
     return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
             t.zx * a.x + t.yz * a.y - (t.xx + t.yy) * a.z};
+}
+CUDA_CALLABLE inline Vector operator*(const Symmetric& t, Vector a) {
+    return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
+            t.zx * a.x + t.yz * a.y + t.zz * a.z};
 }
 CUDA_CALLABLE inline void add_where(Mask wanted, Vector& to, Vector a) {
     to.x += wanted ? a.x : 0;

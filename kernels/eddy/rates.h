@@ -11,25 +11,17 @@
 namespace warpmag {
 
 enum EddyPass { RATES, FIELDS, EDDY_PASSES }; // as in eddy.py
-// Symmetric. It has a trace where balls overlap, that of their charges.
-struct Slope {
-    Number xx, yy, zz, xy, yz, zx;
-};
-CUDA_CALLABLE inline Vector times(const Slope& t, Vector a) {
-    return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
-            t.zx * a.x + t.yz * a.y + t.zz * a.z};
-}
-CUDA_CALLABLE inline Number square(const Slope& t) {
+CUDA_CALLABLE inline Number square(const Symmetric& t) {
     return t.xx * t.xx + t.yy * t.yy + t.zz * t.zz + 2 * (t.xy * t.xy + t.yz * t.yz + t.zx * t.zx);
 }
 // g2 (r m^T + m r^T + r·m) + b r r^T
-CUDA_CALLABLE inline Slope slope_of(Vector r, Vector m, Number g2, Number b) {
+CUDA_CALLABLE inline Symmetric slope_of(Vector r, Vector m, Number g2, Number b) {
     const Number a = g2 * dot(r, m);
     return {a + 2 * g2 * r.x * m.x + b * r.x * r.x,       a + 2 * g2 * r.y * m.y + b * r.y * r.y,
             a + 2 * g2 * r.z * m.z + b * r.z * r.z,       g2 * (r.x * m.y + r.y * m.x) + b * r.x * r.y,
             g2 * (r.y * m.z + r.z * m.y) + b * r.y * r.z, g2 * (r.z * m.x + r.x * m.z) + b * r.z * r.x};
 }
-CUDA_CALLABLE inline void add(Slope& to, const Slope& t) {
+CUDA_CALLABLE inline void add(Symmetric& to, const Symmetric& t) {
     to.xx += t.xx, to.yy += t.yy, to.zz += t.zz, to.xy += t.xy, to.yz += t.yz, to.zx += t.zx;
 }
 
@@ -53,18 +45,18 @@ struct Columns {
 // give way to the ball's eddy currents.
 struct Seen {
     Vector h, rate;
-    Slope t;
+    Symmetric t;
     Number yield;
 };
 CUDA_CALLABLE inline void add_source(Seen& seen, const Columns& packed, const Columns& motion, int j, Vector x,
                                      Number radius, Vector velocity, Mask wanted) {
     const Number zero = Number(Real(0)), other = zero + packed.at(3, j), s = radius + other, s2 = s * s;
-    const Vector r = less(x, packed.three(0, j)), m = packed.three(4, j), w = cross(motion.three(3, j), m);
+    const Vector r = x - packed.three(0, j), m = packed.three(4, j), w = cross(motion.three(3, j), m);
     const Number d2 = dot(r, r), c = larger(d2, s2);
     const Number i = (wanted & (c > zero)) ? Real(0.5) * twice_inverse_root(c) : zero, i2 = i * i, i3 = i2 * i;
     const Number g2 = 3 * i2 * i3;
-    Slope t = slope_of(r, m, g2, -5 * i2 * (g2 * dot(r, m))); // without r⁻⁷, which is no float at 1 µm
-    Vector h = less(scaled(g2 * dot(r, m), r), scaled(i3, m)), turn = less(scaled(g2 * dot(r, w), r), scaled(i3, w));
+    Symmetric t = slope_of(r, m, g2, -5 * i2 * (g2 * dot(r, m))); // without r⁻⁷, which is no float at 1 µm
+    Vector h = g2 * dot(r, m) * r - i3 * m, turn = g2 * dot(r, w) * r - i3 * w;
     const Mask overlapping = wanted & (d2 < s2);
     if (any(overlapping)) {
         const Overlap p = overlap_of(r, radius, other, m, overlapping);
@@ -74,8 +66,8 @@ CUDA_CALLABLE inline void add_source(Seen& seen, const Columns& packed, const Co
         const Vector u = {overlapping ? p.u.x : 0, overlapping ? p.u.y : 0, overlapping ? p.u.z : 0};
         add(t, slope_of(u, p.m, overlapping ? g : 0, overlapping ? g3 * dot(p.u, p.m) : 0));
     }
-    seen.h = sum(seen.h, h);
-    seen.rate = sum(seen.rate, sum(times(t, less(velocity, motion.three(0, j))), turn));
+    seen.h += h;
+    seen.rate += (t * (velocity - motion.three(0, j)) + turn);
     add(seen.t, t);
     const Real unit = MU0_4PI * MU0_4PI;
     seen.yield += (unit * motion.at(6, j)) * square(t) + (unit * motion.at(7, j)) * dot(h, h);
@@ -111,7 +103,7 @@ template <class All> CUDA_CALLABLE inline void fields_at(const All& all, int slo
     Vector h = {zero, zero, zero};
     for (int k = chunk[1] + share(); k < chunk[2]; k += SHARES) {
         const int j = all.conductor.data[k];
-        add_pair_field(h, less(x, packed.three(0, j)), radius, zero + packed.at(3, j), eddy.three(0, j),
+        add_pair_field(h, x - packed.three(0, j), radius, zero + packed.at(3, j), eddy.three(0, j),
                        mask_of(label != packed.at(7, j)));
     }
     h = group_sums(h);
