@@ -305,7 +305,7 @@ def test_moment_system(arguments, message, device):
 @pytest.mark.parametrize(
     ("record", "message"),
     [
-        (Magnet(saturation="1"), "saturation magnetization: must be one real number"),
+        (Magnet(saturation="1"), "saturation: must be one real number"),
         (Magnet(susceptibility=True), "susceptibility: must be one real number"),
         (Magnet(moment_spacing=None), "moment spacing: must be one real number"),
         (Magnet(kind=["permanent"]), "kind: .* is not one of"),

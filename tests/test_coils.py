@@ -189,8 +189,8 @@ def test_what_ends_at_its_border():
     values = np.zeros((5, 5, 5, 3))
     values[2, 2, 2, 0] = 4.0
     values[0, 1, 1, 2] = -1.0
-    assert FieldMap((0.0,) * 3, (1.0,) * 3, values).border() == 0.25
-    assert FieldMap((0.0,) * 3, (1.0,) * 3, 0.0 * values).border() == 0.0
+    assert FieldMap((0.0,) * 3, (1.0,) * 3, values).border_ratio() == 0.25
+    assert FieldMap((0.0,) * 3, (1.0,) * 3, 0.0 * values).border_ratio() == 0.0
 
 
 @pytest.mark.parametrize(("arguments", "text"), [

@@ -64,8 +64,8 @@ def test_a_static_shape_can_be_a_magnet(builder, device):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"saturation": -1.0}, "saturation magnetization: must be positive"),
-        ({"saturation": math.nan}, "saturation magnetization: must be positive"),
+        ({"saturation": -1.0}, "saturation: must be positive"),
+        ({"saturation": math.nan}, "saturation: must be positive"),
         ({"susceptibility": 0.0}, "susceptibility: must be positive"),
         ({"curve": "cubic"}, "curve: 'cubic' is not one of"),
         ({"moment_spacing": -1.0}, "moment spacing: must be zero or positive"),

@@ -41,7 +41,7 @@ REFUSED = {
     ),
     "a saturation beyond single precision": (
         [physics(), ball("A", (0, 0, 1), "float warpmag:saturationMagnetization = 1e30")],
-        "/World/A: saturation magnetization: must be 1e-12 to 1e+15, got 1e+30",
+        "/World/A: saturation: must be 1e-12 to 1e+15, got 1e+30",
     ),
     **{
         f"a physics material that is {state}": (

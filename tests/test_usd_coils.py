@@ -10,9 +10,10 @@ from pxr import Usd, UsdGeom
 import warpmag
 from warpmag import cli
 from warpmag.declarations.coils import Coil, FieldMap
+from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
 from warpmag.errors import InputError
 from warpmag.usd import author_coil, author_field_map, check, open_stage, survey
-from warpmag.usd.read import coils
+from warpmag.usd.schemas import read_fields
 
 HEAD = '#usda 1.0\n(\n    metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"\n)\n'
 BALL = """
@@ -66,7 +67,7 @@ def test_every_attribute_survives_the_round_trip(tmp_path, suffix):
     assert (read.origin, read.spacing, read.factor) == (MAP.origin, MAP.spacing, MAP.factor)
     np.testing.assert_array_equal(read.values, VALUES)
     authored = {one.GetName() for one in stage.GetPrimAtPath("/Loop").GetAuthoredAttributes()}
-    assert authored == {name for name, _, _ in coils._COIL.values()}
+    assert authored == {row.usd_name for row in COIL_SCHEMA.attributes}
 
 
 def test_fallbacks_are_the_defaults_of_the_records():
@@ -74,8 +75,8 @@ def test_fallbacks_are_the_defaults_of_the_records():
     coil, field_map = (UsdGeom.Xform.Define(stage, name).GetPrim() for name in ("/Coil", "/Map"))
     coil.AddAppliedSchema("WarpmagCoilAPI")
     field_map.AddAppliedSchema("WarpmagFieldMapAPI")
-    assert coils._read(coil, coils._COIL) == dataclasses.asdict(Coil())
-    assert coils._read(field_map, coils._MAP) == {"origin": (0.0, 0.0, 0.0), "factor": 1.0}
+    assert read_fields(coil, COIL_SCHEMA.attributes) == dataclasses.asdict(Coil())
+    assert read_fields(field_map, FIELD_MAP_SCHEMA.attributes) == {"origin": (0.0, 0.0, 0.0), "factor": 1.0}
 
 
 def test_a_run_has_the_coils_of_its_stage_in_their_places(tmp_path, device):

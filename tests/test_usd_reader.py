@@ -80,10 +80,10 @@ def test_initial_moments(tmp_path):
 
 REFUSED = {
     "no magnets": (ball(apis=("PhysicsRigidBodyAPI", "PhysicsCollisionAPI")), "stage.usda: no magnets"),
-    "negative saturation": (ball("float warpmag:saturationMagnetization = -1"), "/Ball: saturation magnetization"),
-    "zero saturation": (ball("float warpmag:saturationMagnetization = 0"), "/Ball: saturation magnetization"),
-    "NaN saturation": (ball("float warpmag:saturationMagnetization = nan"), "/Ball: saturation magnetization"),
-    "infinite saturation": (ball("float warpmag:saturationMagnetization = inf"), "/Ball: saturation magnetization"),
+    "negative saturation": (ball("float warpmag:saturationMagnetization = -1"), "/Ball: saturation"),
+    "zero saturation": (ball("float warpmag:saturationMagnetization = 0"), "/Ball: saturation"),
+    "NaN saturation": (ball("float warpmag:saturationMagnetization = nan"), "/Ball: saturation"),
+    "infinite saturation": (ball("float warpmag:saturationMagnetization = inf"), "/Ball: saturation"),
     "NaN susceptibility": (ball("float warpmag:susceptibility = nan"), "/Ball: susceptibility"),
     "negative susceptibility": (ball("float warpmag:susceptibility = -0.1"), "/Ball: susceptibility"),
     "unknown kind": (ball('uniform token warpmag:kind = "iron"'), "/Ball: kind: 'iron' is not one of inducible"),

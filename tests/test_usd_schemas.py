@@ -5,15 +5,19 @@ import math
 import subprocess
 import sys
 
+import newton
 import numpy as np
 import pytest
-from pxr import Plug, Usd, UsdGeom, UsdPhysics
+from pxr import Plug, Sdf, Usd, UsdGeom, UsdPhysics
 
-from warpmag.declarations import magnets
+import warpmag
+from warpmag.declarations.attributes import attributes_of
 from warpmag.declarations.magnets import Magnet, MagneticSettings
-from warpmag.declarations.measured import MEASURED_CURVES
+from warpmag.declarations.schemas import SCHEMAS
 from warpmag.errors import InputError
+from warpmag.kernels.rigid.bodies import ShapeMagnets
 from warpmag.usd import author_magnet, author_settings, open_stage, read_magnets, schemas
+from warpmag.usd.schema_text import SCHEMA_FILE, schema_text
 
 MAGNETS = {
     "/Iron": Magnet(saturation=1.2e6, susceptibility=3.5, curve="langevin", moment_spacing=0.125),
@@ -67,42 +71,38 @@ def test_fallbacks_are_the_defaults_of_the_records():
     scene.AddAppliedSchema(schemas.SCENE_API)
     assert schemas.magnet_of(ball) == Magnet()
     assert schemas.settings_of(scene) == MagneticSettings()
-    for prim, attributes, record in (
-        (ball, schemas._MAGNET_ATTRIBUTES, Magnet()),
-        (scene, schemas._SETTINGS_ATTRIBUTES, MagneticSettings()),
-    ):
-        assert set(attributes) == {field.name for field in dataclasses.fields(record)}
-        for field, name in attributes.items():
-            # The fallback comes from the schema: nothing is authored. Single precision keeps seven digits.
-            fallback = prim.GetAttribute(name).Get()
-            value = getattr(record, field)
-            assert fallback == value if isinstance(value, str) else np.all(np.float32(value) == np.array(fallback))
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "allowed"),
-    [
-        ("warpmag:kind", "token", magnets.KINDS),
-        ("warpmag:saturationMagnetization", "float", None),
-        ("warpmag:susceptibility", "float", None),
-        ("warpmag:magnetization", "vector3f", None),
-        ("warpmag:curve", "token", (*magnets.CURVES, *MEASURED_CURVES)),
-        ("warpmag:momentSpacing", "float", None),
-        ("warpmag:moment", "vector3f", None),
-        ("warpmag:externalField", "vector3f", None),
-        ("warpmag:force", "token", magnets.FORCES),
-        ("warpmag:dynamics", "token", magnets.DYNAMICS),
-        ("warpmag:contactModel", "token", magnets.CONTACT_MODELS),
-        ("warpmag:rtol", "float", None),
-    ],
-)
-def test_types_and_tokens(name, kind, allowed):
-    registry = Usd.SchemaRegistry()
-    definitions = [registry.FindAppliedAPIPrimDefinition(api) for api in (schemas.MAGNET_API, schemas.SCENE_API)]
-    (spec,) = [d.GetSchemaAttributeSpec(name) for d in definitions if d.GetSchemaAttributeSpec(name)]
-    assert str(spec.typeName) == kind
-    assert (tuple(spec.allowedTokens) if allowed else None) == allowed
-    assert spec.documentation
+def test_the_schema_file_follows_from_the_table_of_attributes():
+    """After a change of the table: python -m warpmag.usd.schema_text."""
+    assert SCHEMA_FILE.read_text(encoding="utf-8") == schema_text()
+
+
+@pytest.mark.parametrize("schema", SCHEMAS, ids=lambda schema: schema.name)
+def test_usd_knows_every_row_of_the_table(schema):
+    """Names, types, variability, tokens and defaults, as USD registers them."""
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.name)
+    assert set(definition.GetPropertyNames()) == {row.usd_name for row in schema.attributes}
+    assert {field.name for field in dataclasses.fields(schema.record)} <= {row.field for row in schema.attributes}
+    for row in schema.attributes:
+        spec = definition.GetSchemaAttributeSpec(row.usd_name)
+        assert str(spec.typeName) == row.usd_type
+        assert tuple(spec.allowedTokens or ()) == row.tokens
+        assert (spec.variability == Sdf.VariabilityUniform) == row.uniform
+        assert spec.documentation
+        if isinstance(row.default, (str, bool)) or row.default is None:
+            assert spec.default == row.default
+        else:  # single precision keeps seven digits
+            np.testing.assert_array_equal(np.ravel(spec.default), np.ravel(np.float32(row.default)))
+
+
+def test_models_and_kernels_have_every_row_of_magnets():
+    """Newton's arrays, and the struct in which kernels compare all but magnetizations."""
+    builder = newton.ModelBuilder()
+    warpmag.register_custom_attributes(builder)
+    rows = attributes_of(Magnet)
+    assert {f"warpmag:{row.field}" for row in rows} < set(builder.custom_attributes)
+    assert set(ShapeMagnets.vars) == {row.field for row in rows if row.model_change != "substep"}
 
 
 def test_registering_twice_is_harmless():

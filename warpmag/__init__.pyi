@@ -2,16 +2,16 @@
 
 from warpmag.declarations.curves import MagnetizationCurve as MagnetizationCurve
 from warpmag.declarations.materials import material as material
-from warpmag.engine.magnets.attributes import add_inducible as add_inducible
-from warpmag.engine.magnets.attributes import add_permanent as add_permanent
-from warpmag.engine.magnets.attributes import register_attributes as register_attributes
-from warpmag.engine.magnets.attributes import register_custom_attributes as register_custom_attributes
 from warpmag.engine.magnets.balls import Balls as Balls
 from warpmag.engine.magnets.balls import add_balls as add_balls
+from warpmag.engine.magnets.declared_magnets import add_inducible as add_inducible
+from warpmag.engine.magnets.declared_magnets import add_permanent as add_permanent
+from warpmag.engine.magnets.declared_sources import add_coil as add_coil
+from warpmag.engine.magnets.declared_sources import add_field_map as add_field_map
 from warpmag.engine.magnets.magnetics import Magnetics as Magnetics
 from warpmag.engine.magnets.magnetometer import SensorMagnetometer as SensorMagnetometer
-from warpmag.engine.magnets.sources import add_coil as add_coil
-from warpmag.engine.magnets.sources import add_field_map as add_field_map
+from warpmag.engine.magnets.usd_import import register_attributes as register_attributes
+from warpmag.engine.magnets.usd_import import register_custom_attributes as register_custom_attributes
 from warpmag.engine.stepping.drive import KeyedCurrents as KeyedCurrents
 from warpmag.engine.stepping.simulation import Simulation as Simulation
 from warpmag.errors import ConvergenceWarning as ConvergenceWarning

@@ -1,199 +1,65 @@
-"""Sources of fields without a response, coils among them: plain data, shared by the USD part and the Newton part.
+"""Records of coils and field maps: their rows of the table of attributes, and what the kernels take of them.
 
-A source is a kind, some numbers and a table of vectors, in its own frame; ``kernels.applied`` has its field. On a
-builder it is one line of text, so that it survives whatever builders do to the shape that carries it.
+A source of a field does not respond to other fields. The kernels take a kind, some numbers and a table of vectors, in
+the frame of the source (``kernels.applied``). Newton's builders carry a source as one line of text on a shape, which
+survives all copying of shapes.
 """
 
 import base64
 import json
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
 
-from warpmag.declarations.checks import check_flag, check_positive, check_token, check_vector, real_number, short_repr
+from warpmag.declarations.attributes import Attribute, check_fields
+from warpmag.declarations.checks import check_flag, check_positive, check_vector, real_number, short_repr
 from warpmag.errors import InputError
 
 COIL_SHAPES = ("loop", "solenoid", "polyline")
-MOST_AMPERE_TURNS = 1e15
-"""Largest current times turns [A], and factor of a field map: single precision holds what follows."""
-THINNEST_WIRE = 0.01
-"""Default radius of a wire, in parts of the radius of the coil, or of the diagonal of the box around a polyline."""
-SIZES = (1e-7, 1e6)
+LARGEST_STRENGTH = 1e15
+"""Largest ampere-turns [A], and largest factor of a field map: fields stay within single precision."""
+DEFAULT_WIRE_RADIUS = 0.01
+"""Default radius of a wire, in radii of the coil, or in diagonals of the box around a polyline."""
+SIZE_RANGE = (1e-7, 1e6)
 """Least and largest radius, length and spacing [m]."""
-FARTHEST_POINT = 1e7
+LARGEST_POINT = 1e7
 """Largest coordinate [m] of a point of a coil or of a map."""
 STRONGEST_FIELD = 1e30
 """Largest component [A/m] of the field of a map."""
+_SIZE_TEXT = f"[{SIZE_RANGE[0]:g}, {SIZE_RANGE[1]:g}] m"
 
 Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class SourceRecord:
-    """One source in its own frame.
-
-    Attributes:
-        kind: Its kind, a name of ``kernels.applied.sources.SourceKind`` in lower case.
-        parameters: Its numbers.
-        table: Its vectors, shape [k, 3].
-    """
-
-    kind: str
-    parameters: tuple[float, ...]
-    table: np.ndarray
-
-    def to_text(self) -> str:
-        """Return the record as a line of text, numbers to their last bit."""
-        table = base64.b64encode(np.ascontiguousarray(self.table, "<f8").tobytes()).decode("ascii")
-        return json.dumps({"kind": self.kind, "parameters": self.parameters, "table": table})
-
-    @classmethod
-    def from_text(cls, text: str) -> "SourceRecord":
-        """Return the record that :meth:`to_text` made a line of."""
-        fields = json.loads(text)
-        table = np.frombuffer(base64.b64decode(fields["table"]), "<f8").reshape(-1, 3)
-        return cls(fields["kind"], tuple(fields["parameters"]), table)
+def check_strength(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is a valid number of ampere-turns, or a valid factor."""
+    number = real_number(name, value)
+    if not abs(number) <= LARGEST_STRENGTH:
+        raise InputError(f"{name}: must be finite and at most {LARGEST_STRENGTH:g} in size, got {number:g}")
 
 
-@dataclass(frozen=True)
-class Coil:
-    """A coil in its own frame. A loop or a solenoid is about the z axis, and a positive current makes a field along z.
-
-    Attributes:
-        shape: One of :data:`COIL_SHAPES`.
-        radius: Radius of a loop or a solenoid [m].
-        length: Length of a solenoid [m], whose middle is the origin.
-        points: Corners of a polyline [m], in the direction of a positive current.
-        closed: Whether its last point is joined to the first. An open one is a part of a circuit.
-        wire_radius: Radius of the wire [m], inside of which the field falls to zero; 0 means ``THINNEST_WIRE``.
-        ampere_turns: Current times turns [A].
-    """
-
-    shape: str = "loop"
-    radius: float = 0.0
-    length: float = 0.0
-    points: tuple[Vector, ...] = ()
-    closed: bool = True
-    wire_radius: float = 0.0
-    ampere_turns: float = 0.0
-
-    def check(self, name: str) -> None:
-        """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
-        check_token(f"{name}: shape", self.shape, COIL_SHAPES)
-        check_strength(f"{name}: ampere turns", self.ampere_turns)
-        check_flag(f"{name}: closed", self.closed)
-        has = {"loop": ("radius",), "solenoid": ("radius", "length"), "polyline": ()}[self.shape]
-        for size in ("radius", "length"):
-            if size in has:
-                _check_size(f"{name}: {size}", getattr(self, size))
-            elif real_number(f"{name}: {size}", getattr(self, size)) != 0.0:
-                raise InputError(f"{name}: {size} is given, but a {self.shape} has none")
-        if self.shape == "polyline":
-            self._check_points(f"{name}: points")
-        elif len(self.points):
-            raise InputError(f"{name}: points are given, but a {self.shape} has none")
-        most = self._thickest()
-        wire = real_number(f"{name}: wire radius", self.wire_radius)
-        if not 0.0 <= wire <= most:
-            raise InputError(f"{name}: wire radius must be from 0 to {most:g}, got {wire:g}")
-
-    def _check_points(self, name: str) -> None:
-        least = 3 if self.closed else 2
-        if len(self.points) < least:
-            raise InputError(f"{name}: must be at least {least}, got {len(self.points)}")
-        checked_vectors(name, self.points, FARTHEST_POINT)
-        lengths = np.linalg.norm(np.diff(self._chain(), axis=0), axis=1)
-        if not lengths.min() >= SIZES[0]:
-            raise InputError(f"{name}: must be {SIZES[0]:g} m apart or more, number {int(lengths.argmin())} is not")
-
-    def _chain(self) -> np.ndarray:
-        points = np.array(self.points, float).reshape(-1, 3)
-        return np.concatenate([points, points[:1]]) if self.closed else points
-
-    def _extent(self) -> float:
-        return float(np.linalg.norm(np.ptp(np.array(self.points), axis=0)))
-
-    def _thickest(self) -> float:
-        """Largest radius of the wire [m] that leaves it one."""
-        if self.shape == "polyline":
-            return 0.5 * self._extent()
-        return 0.5 * min(self.radius, self.length or self.radius)
-
-    def record(self) -> SourceRecord:
-        """Return the source that it is, per ampere-turn."""
-        if self.shape == "polyline":
-            wire = self.wire_radius or THINNEST_WIRE * self._extent()
-            return SourceRecord(self.shape, (float(wire),), self._chain())
-        wire = self.wire_radius or min(THINNEST_WIRE * self.radius, self._thickest())
-        halves = (0.5 * float(self.length),) if self.shape == "solenoid" else ()
-        return SourceRecord(self.shape, (float(self.radius), *halves, float(wire)), np.zeros((0, 3)))
+def check_size(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is a length [m] within :data:`SIZE_RANGE`."""
+    check_positive(name, value)
+    if not SIZE_RANGE[0] <= value <= SIZE_RANGE[1]:
+        raise InputError(f"{name}: must be from {SIZE_RANGE[0]:g} to {SIZE_RANGE[1]:g} m, got {float(value):g}")
 
 
-@dataclass(frozen=True, eq=False)
-class FieldMap:
-    """A field on a regular grid, in its own frame; zero beyond.
-
-    Attributes:
-        origin: The first node [m].
-        spacing: Distance of nodes along each axis [m].
-        values: H at the nodes [A/m], shape [nx, ny, nz, 3], at least two along each axis.
-        factor: Factor of the field.
-    """
-
-    origin: Vector
-    spacing: Vector
-    values: np.ndarray
-    factor: float = 1.0
-
-    def check(self, name: str) -> None:
-        """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
-        check_strength(f"{name}: factor", self.factor)
-        check_vector(f"{name}: origin", self.origin)
-        check_vector(f"{name}: spacing", self.spacing)
-        for step in self.spacing:
-            _check_size(f"{name}: spacing", step)
-        shape = np.shape(self.values)
-        if len(shape) != 4 or shape[3] != 3 or min(shape) < 2:
-            raise InputError(f"{name}: values: shape must be [nx, ny, nz, 3] of 2 or more each, got {list(shape)}")
-        corner = np.abs(np.add(self.origin, np.multiply(self.spacing, np.subtract(shape[:3], 1))))
-        farthest = max(*corner, *np.abs(self.origin))
-        if not farthest <= FARTHEST_POINT:
-            raise InputError(f"{name}: reaches {farthest:g} m, at most {FARTHEST_POINT:g} m")
-        checked_vectors(f"{name}: values", np.reshape(self.values, (-1, 3)), STRONGEST_FIELD)
-
-    def border(self) -> float:
-        """Return the largest field at the border, where the map ends, over the largest of all; 0 without any."""
-        size = np.linalg.norm(np.asarray(self.values, float), axis=3)
-        inner = size[1:-1, 1:-1, 1:-1].max(initial=0.0)
-        outer = max(size.take(end, axis).max() for axis in range(3) for end in (0, -1))
-        return float(outer / max(outer, inner)) if outer > 0.0 else 0.0
-
-    def record(self) -> SourceRecord:
-        """Return the source that it is, with one more node at either end of each axis."""
-        nodes = np.asarray(self.values, float)
-        counts = nodes.shape[:3]
-        for axis in range(3):
-            nodes = _extrapolated(nodes, axis)
-        parameters = (*map(float, self.origin), *map(float, self.spacing), *map(float, counts))
-        return SourceRecord("field_map", parameters, nodes.reshape(-1, 3))
-
-
-def _extrapolated(nodes: np.ndarray, axis: int) -> np.ndarray:
-    """Nodes with one more at either end, by a parabola through three of them, or a line through two (Keys 1981)."""
-
-    def beyond(ends):
-        first, second, third = ([*ends, None])[:3]
-        return 2.0 * first - second if third is None else 3.0 * (first - second) + third
-
-    count = min(3, nodes.shape[axis])
-    before = beyond([nodes.take([k], axis) for k in range(count)])
-    after = beyond([nodes.take([-1 - k], axis) for k in range(count)])
-    return np.concatenate([before, nodes, after], axis=axis)
+def check_spacing(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is three lengths [m] within :data:`SIZE_RANGE`."""
+    check_vector(name, value)
+    for step in value:
+        check_size(name, step)
 
 
 def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
-    """Return vectors as an array of shape [k, 3]; :class:`InputError` where a component is no number up to ``most``."""
+    """Return vectors as an array of shape [k, 3].
+
+    Raises:
+        InputError: The values are no vectors, or a component is not finite or larger than ``most``.
+    """
     try:
         array = np.asarray(values)
     except ValueError:  # a ragged list
@@ -207,14 +73,227 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
     return array.astype(float)
 
 
-def check_strength(name: str, value: Any) -> None:
-    """Raise :class:`InputError` unless ``value`` is a number of ampere-turns, or a factor, in range."""
-    number = real_number(name, value)
-    if not abs(number) <= MOST_AMPERE_TURNS:
-        raise InputError(f"{name}: must be finite and at most {MOST_AMPERE_TURNS:g} in size, got {number:g}")
+@dataclass(frozen=True, eq=False)
+class SourceRecord:
+    """One source in its own frame, as the kernels take it.
+
+    Attributes:
+        kind: Name of a ``kernels.applied.sources.SourceKind``, in lower case.
+        parameters: Numbers of the kind.
+        table: Vectors of the kind, shape [k, 3].
+    """
+
+    kind: str
+    parameters: tuple[float, ...]
+    table: np.ndarray
+
+    def to_text(self) -> str:
+        """Return the record as a line of text that keeps every bit of its numbers."""
+        table = base64.b64encode(np.ascontiguousarray(self.table, "<f8").tobytes()).decode("ascii")
+        return json.dumps({"kind": self.kind, "parameters": self.parameters, "table": table})
+
+    @classmethod
+    def from_text(cls, text: str) -> "SourceRecord":
+        """Return the record of a line that :meth:`to_text` wrote."""
+        fields = json.loads(text)
+        table = np.frombuffer(base64.b64decode(fields["table"]), "<f8").reshape(-1, 3)
+        return cls(fields["kind"], tuple(fields["parameters"]), table)
 
 
-def _check_size(name: str, value: Any) -> None:
-    check_positive(name, value)
-    if not SIZES[0] <= value <= SIZES[1]:
-        raise InputError(f"{name}: must be from {SIZES[0]:g} to {SIZES[1]:g} m, got {float(value):g}")
+@dataclass(frozen=True)
+class Coil:
+    """A coil in its own frame; each field is a row of the table of attributes.
+
+    Loops and solenoids are about the z axis. A positive current makes a field along z inside them.
+    """
+
+    shape: Annotated[
+        str,
+        Attribute(
+            "coil:shape", "token", "Shape",
+            "Shape of the coil: a circular loop, a sheet of current around a cylinder (solenoid), or straight pieces "
+            "of wire (polyline).",
+            tokens=COIL_SHAPES, uniform=True,
+        ),
+    ] = "loop"  # fmt: skip
+    radius: Annotated[
+        float,
+        Attribute(
+            "coil:radius", "float", "Radius", "Radius of a loop or a solenoid.",
+            unit="distance", range=_SIZE_TEXT, check=check_size, uniform=True,
+        ),
+    ] = 0.0  # fmt: skip
+    length: Annotated[
+        float,
+        Attribute(
+            "coil:length", "float", "Length", "Length of a solenoid; its middle is the origin of the prim.",
+            unit="distance", range=_SIZE_TEXT, check=check_size, uniform=True,
+        ),
+    ] = 0.0  # fmt: skip
+    points: Annotated[
+        tuple[Vector, ...],
+        Attribute(
+            "coil:points", "point3f[]", "Points", "Corners of a polyline, in the direction of a positive current.",
+            unit="distance", check=partial(checked_vectors, most=LARGEST_POINT), uniform=True,
+        ),
+    ] = ()  # fmt: skip
+    closed: Annotated[
+        bool,
+        Attribute(
+            "coil:closed", "bool", "Closed",
+            "Whether a wire joins the last corner of a polyline to the first. An open polyline is a part of a circuit.",
+            check=check_flag, uniform=True,
+        ),
+    ] = True  # fmt: skip
+    wire_radius: Annotated[
+        float,
+        Attribute(
+            "coil:wireRadius", "float", "Wire Radius",
+            "Radius of the wire; inside the wire the field falls to zero. 0 means a hundredth of the coil's radius, or "
+            "of the diagonal of the box around a polyline.",
+            unit="distance", range="[0, half the coil's radius or length]", check=real_number, uniform=True,
+        ),
+    ] = 0.0  # fmt: skip
+    ampere_turns: Annotated[
+        float,
+        Attribute(
+            "coil:ampereTurns", "float", "Ampere-Turns",
+            "Current times turns; a positive current makes a field along z inside a loop or a solenoid.",
+            unit="ampere", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
+        ),
+    ] = 0.0  # fmt: skip
+
+    def check(self, name: str) -> None:
+        """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
+        check_fields(self, name, "shape", "closed", "ampere_turns")
+        sizes = {"loop": ("radius",), "solenoid": ("radius", "length"), "polyline": ()}[self.shape]
+        for size in ("radius", "length"):
+            if size in sizes:
+                check_fields(self, name, size)
+            elif real_number(f"{name}: {size}", getattr(self, size)) != 0.0:
+                raise InputError(f"{name}: {size} is given, but a {self.shape} has none")
+        if self.shape == "polyline":
+            self._check_points(name)
+        elif len(self.points):
+            raise InputError(f"{name}: points are given, but a {self.shape} has none")
+        most = self._largest_wire_radius()
+        wire = real_number(f"{name}: wire radius", self.wire_radius)
+        if not 0.0 <= wire <= most:
+            raise InputError(f"{name}: wire radius must be from 0 to {most:g}, got {wire:g}")
+
+    def _check_points(self, name: str) -> None:
+        least = 3 if self.closed else 2
+        if len(self.points) < least:
+            raise InputError(f"{name}: points: must be at least {least}, got {len(self.points)}")
+        check_fields(self, name, "points")
+        lengths = np.linalg.norm(np.diff(self._path(), axis=0), axis=1)
+        if not lengths.min() >= SIZE_RANGE[0]:
+            short = int(lengths.argmin())
+            raise InputError(f"{name}: points: must be {SIZE_RANGE[0]:g} m apart or more, number {short} is not")
+
+    def _path(self) -> np.ndarray:
+        """Return the corners of a polyline in order, the first again at the end of a closed one, shape [k, 3]."""
+        points = np.array(self.points, float).reshape(-1, 3)
+        return np.concatenate([points, points[:1]]) if self.closed else points
+
+    def _diagonal(self) -> float:
+        """Return the diagonal of the box around a polyline [m]."""
+        return float(np.linalg.norm(np.ptp(np.array(self.points), axis=0)))
+
+    def _largest_wire_radius(self) -> float:
+        """Return the largest radius of a wire [m] that fits into the coil."""
+        if self.shape == "polyline":
+            return 0.5 * self._diagonal()
+        return 0.5 * min(self.radius, self.length or self.radius)
+
+    def record(self) -> SourceRecord:
+        """Return the coil as a source of one ampere-turn."""
+        if self.shape == "polyline":
+            wire = self.wire_radius or DEFAULT_WIRE_RADIUS * self._diagonal()
+            return SourceRecord(self.shape, (float(wire),), self._path())
+        wire = self.wire_radius or min(DEFAULT_WIRE_RADIUS * self.radius, self._largest_wire_radius())
+        halves = (0.5 * float(self.length),) if self.shape == "solenoid" else ()
+        return SourceRecord(self.shape, (float(self.radius), *halves, float(wire)), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap:
+    """A field on a regular grid, in its own frame, and zero outside; each field is a row of the table of attributes.
+
+    ``values`` has the shape [nx, ny, nz, 3], with at least two nodes along each axis.
+    """
+
+    origin: Annotated[
+        Vector,
+        Attribute(
+            "fieldMap:origin", "point3f", "Origin", "Position of the first node.",
+            unit="distance", check=check_vector, uniform=True, default=(0.0, 0.0, 0.0),
+        ),
+    ]  # fmt: skip
+    spacing: Annotated[
+        Vector,
+        Attribute(
+            "fieldMap:spacing", "vector3f", "Spacing", "Distance between nodes along each axis.",
+            unit="distance", range=_SIZE_TEXT, check=check_spacing, uniform=True,
+        ),
+    ]  # fmt: skip
+    values: Annotated[
+        np.ndarray,
+        Attribute(
+            "fieldMap:values", "vector3f[]", "Values",
+            "Field H at the nodes, in the frame of the prim. The index along z runs fastest, then y, then x.",
+            unit="ampere / meter", check=partial(checked_vectors, most=STRONGEST_FIELD), uniform=True,
+        ),
+    ]  # fmt: skip
+    factor: Annotated[
+        float,
+        Attribute(
+            "fieldMap:factor", "float", "Factor", "Factor of the field.",
+            unit="dimensionless", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
+            uniform=True,
+        ),
+    ] = 1.0  # fmt: skip
+
+    def check(self, name: str) -> None:
+        """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
+        check_fields(self, name, "factor", "origin", "spacing")
+        shape = np.shape(self.values)
+        if len(shape) != 4 or shape[3] != 3 or min(shape) < 2:
+            raise InputError(f"{name}: values: shape must be [nx, ny, nz, 3] of 2 or more each, got {list(shape)}")
+        corner = np.abs(np.add(self.origin, np.multiply(self.spacing, np.subtract(shape[:3], 1))))
+        farthest = max(*corner, *np.abs(self.origin))
+        if not farthest <= LARGEST_POINT:
+            raise InputError(f"{name}: reaches {farthest:g} m, at most {LARGEST_POINT:g} m")
+        checked_vectors(f"{name}: values", np.reshape(self.values, (-1, 3)), STRONGEST_FIELD)
+
+    def border_ratio(self) -> float:
+        """Return the largest field on the boundary of the map over the largest of all; 0 for a map of zeros."""
+        size = np.linalg.norm(np.asarray(self.values, float), axis=3)
+        inner = size[1:-1, 1:-1, 1:-1].max(initial=0.0)
+        outer = max(size.take(end, axis).max() for axis in range(3) for end in (0, -1))
+        return float(outer / max(outer, inner)) if outer > 0.0 else 0.0
+
+    def record(self) -> SourceRecord:
+        """Return the map as a source, with one more node at either end of each axis."""
+        nodes = np.asarray(self.values, float)
+        counts = nodes.shape[:3]
+        for axis in range(3):
+            nodes = _extrapolated(nodes, axis)
+        parameters = (*map(float, self.origin), *map(float, self.spacing), *map(float, counts))
+        return SourceRecord("field_map", parameters, nodes.reshape(-1, 3))
+
+
+def _extrapolated(nodes: np.ndarray, axis: int) -> np.ndarray:
+    """Return nodes with one more at either end of an axis (Keys 1981).
+
+    The new node lies on the parabola through the last three nodes, or on the line through the only two.
+    """
+
+    def beyond(ends):
+        first, second, third = ([*ends, None])[:3]
+        return 2.0 * first - second if third is None else 3.0 * (first - second) + third
+
+    count = min(3, nodes.shape[axis])
+    before = beyond([nodes.take([k], axis) for k in range(count)])
+    after = beyond([nodes.take([-1 - k], axis) for k in range(count)])
+    return np.concatenate([before, nodes, after], axis=axis)

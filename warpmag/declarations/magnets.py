@@ -1,21 +1,24 @@
-"""What a magnet is made of and how a scene is to be solved: plain data, shared by the USD part and the Newton part.
+"""Records of magnets and of the settings of a scene: the rows of the table of attributes that belong to them.
 
-Neither Warp, Newton nor USD is imported here. Each record checks itself, so that a bad value is refused in the same
-words whether it comes from a stage, from the command line or from a script.
+No Warp, Newton or USD is imported here. Stages, the command line and scripts check values through these records.
 """
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, Any
 
+from warpmag.declarations.attributes import Attribute, attributes_of, check_fields
 from warpmag.declarations.checks import check_not_negative, check_positive, check_token, check_vector, real_number
 from warpmag.declarations.curves import MagnetizationCurve
+from warpmag.declarations.measured import MEASURED_CURVES
 from warpmag.errors import InputError
 
 KINDS = ("inducible", "permanent")
 LINEAR_CURVE = "linear"
-"""Curve of permanent magnets that respond; no token, since nothing inducible is without saturation."""
+"""Curve of permanent magnets with recoil. It is no token of a stage: every inducible magnet saturates."""
 CURVES = ("tanh", "langevin", "clamped", "frohlich")
-"""Magnetization curves, see ``kernels.material.curves``; a model has the place in this list."""
+"""Formulas of magnetization curves (``kernels.material.curves``); a model stores the position in this list."""
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")
 METHODS = ("auto", "direct", "fmm")
@@ -23,50 +26,51 @@ METHODS = ("auto", "direct", "fmm")
 DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 
 ACCURACY = {"float32": 2e-6, "float64": 1e-13}
-"""Relative L2 error of all-pairs sums in each precision that tests hold them to: no tolerance below it is met."""
+"""Relative L2 error that tests allow to sums over all pairs, by precision; a smaller tolerance cannot be met."""
 
 MATERIAL_RANGE = {"float32": (1e-12, 1e15), "float64": (1e-100, 1e100)}
 """Least and largest saturation [A/m] and finite susceptibility, by the precision of a solve."""
+_MATERIAL_TEXT = f"[{MATERIAL_RANGE['float32'][0]:g}, {MATERIAL_RANGE['float32'][1]:g}]"
 
-_RECOIL = (1.001, 10.0)
-"""Least recoil permeability above 1 that single precision resolves, and more than any magnet's: AlNiCo has up to 5."""
+_RECOIL_RANGE = (1.001, 10.0)
+"""Least recoil permeability above 1 that single precision resolves, and a limit above all magnets: AlNiCo reaches 5."""
 
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
 
 
-def check_curve(name: str, value, others: tuple[str, ...] = ()) -> None:
-    """Raise :class:`InputError` unless ``value`` is a magnetization curve, one of :data:`CURVES` or a measured one.
+def check_curve(name: str, value: Any, others: tuple[str, ...] = ()) -> None:
+    """Raise :class:`InputError` unless ``value`` is one of :data:`CURVES` or a measured curve.
 
-    The message names ``others``, too.
+    The message lists ``others``, too.
     """
     if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
         check_token(name, value, (*CURVES, *others))
 
 
-def check_material(name: str, value: float, *, infinite: bool = False) -> None:
-    """Raise :class:`InputError` unless ``value`` is a saturation or a susceptibility that single precision resolves."""
+def check_material(name: str, value: Any, *, infinite: bool = False) -> None:
+    """Raise :class:`InputError` unless ``value`` is a saturation or susceptibility that single precision resolves."""
     check_positive(name, value, infinite=infinite)
     least, most = MATERIAL_RANGE["float32"]
     if not (least <= value <= most or math.isinf(value)):
         raise InputError(f"{name}: must be {least:g} to {most:g}, got {float(value):g}")
 
 
-def check_recoil(name: str, value: float) -> None:
+def check_recoil(name: str, value: Any) -> None:
     """Raise :class:`InputError` unless ``value`` is a recoil permeability: 1, or from 1.001 to 10."""
     number = real_number(name, value)
-    if number != 1.0 and not _RECOIL[0] <= number <= _RECOIL[1]:
-        raise InputError(f"{name}: must be 1, or {_RECOIL[0]:g} to {_RECOIL[1]:g}, got {number:g}")
+    if number != 1.0 and not _RECOIL_RANGE[0] <= number <= _RECOIL_RANGE[1]:
+        raise InputError(f"{name}: must be 1, or {_RECOIL_RANGE[0]:g} to {_RECOIL_RANGE[1]:g}, got {number:g}")
 
 
-def check_force(name: str, value: str, contact_model: str = "dipole") -> None:
+def check_force(name: str, value: Any, contact_model: str = "dipole") -> None:
     """Raise :class:`InputError` unless ``value`` is a force law that goes with ``contact_model``."""
     check_token(name, value, FORCES)
     if contact_model == "multipole" and value != "kelvin":
         raise InputError(f"{name}: the contact model 'multipole' goes with 'kelvin' only, got {value!r}")
 
 
-def check_rtol(name: str, value: float, dtype: str = "float32") -> None:
+def check_rtol(name: str, value: Any, dtype: str = "float32") -> None:
     """Raise :class:`InputError` unless ``value`` is a relative error that sums in ``dtype`` can reach."""
     number = real_number(name, value)
     if not ACCURACY[dtype] <= number < math.inf:
@@ -75,100 +79,177 @@ def check_rtol(name: str, value: float, dtype: str = "float32") -> None:
 
 @dataclass(frozen=True)
 class Magnet:
-    """The magnetic material of one rigid body or collider.
+    """The magnetic material of one rigid body or collider; each field is a row of the table of attributes.
 
-    Attributes:
-        kind: ``inducible`` (magnetized by the field it is in) or ``permanent``.
-        saturation: Saturation magnetization Ms [A/m], inducible only.
-        susceptibility: Susceptibility χ [dimensionless], may be infinite, inducible only.
-        curve: Magnetization curve, one of :data:`CURVES` or a measured one, which then says what saturation and
-            susceptibility (its largest) are; inducible only.
-        magnetization: Magnetization of a permanent magnet [A/m], in its own frame; with a recoil permeability above 1
-            the remanent one, of no field inside.
-        recoil_permeability: μ of a permanent magnet [dimensionless], M = M_r + (μ − 1) H with the field H inside.
-        moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
-        conductivity: Electrical conductivity [S/m] of a ball of one moment, whose eddy currents brake it; 0 means none.
+    A measured ``curve`` sets ``saturation`` and ``susceptibility`` to its own values, the latter to the largest.
+    ``magnetization`` is in the frame of whatever carries the magnet.
     """
 
-    kind: str = "inducible"
-    saturation: float = SATURATION_OF_IRON
-    susceptibility: float = math.inf
-    curve: str | MagnetizationCurve = "tanh"
-    magnetization: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    recoil_permeability: float = 1.0
-    moment_spacing: float = 0.0
-    conductivity: float = 0.0
+    kind: Annotated[
+        str,
+        Attribute(
+            "kind", "token", "Kind",
+            "Whether the applied field magnetizes the magnet (inducible), or it is magnetized for good (permanent).",
+            tokens=KINDS, uniform=True,
+        ),
+    ] = "inducible"  # fmt: skip
+    saturation: Annotated[
+        float,
+        Attribute(
+            "saturationMagnetization", "float", "Saturation Magnetization",
+            "Saturation magnetization Ms of an inducible magnet.",
+            unit="ampere / meter", range=_MATERIAL_TEXT, check=check_material, kind="inducible",
+            model_change="notified",
+        ),
+    ] = SATURATION_OF_IRON  # fmt: skip
+    susceptibility: Annotated[
+        float,
+        Attribute(
+            "susceptibility", "float", "Susceptibility",
+            "Magnetic susceptibility of an inducible magnet; infinite for an ideally permeable one.",
+            unit="dimensionless", range=f"{_MATERIAL_TEXT}, or inf", check=partial(check_material, infinite=True),
+            kind="inducible", model_change="notified",
+        ),
+    ] = math.inf  # fmt: skip
+    curve: Annotated[
+        str | MagnetizationCurve,
+        Attribute(
+            "curve", "token", "Magnetization Curve",
+            "Magnetization curve of an inducible magnet: a formula, or the measured curve of a material. A measured "
+            "curve replaces saturation magnetization and susceptibility.",
+            tokens=(*CURVES, *MEASURED_CURVES), check=check_curve, uniform=True, kind="inducible",
+        ),
+    ] = "tanh"  # fmt: skip
+    magnetization: Annotated[
+        tuple[float, float, float],
+        Attribute(
+            "magnetization", "vector3f", "Magnetization",
+            "Magnetization of a permanent magnet in the frame of the prim. With a recoil permeability above 1 it is "
+            "the remanent magnetization, at zero internal field.",
+            unit="ampere / meter", check=check_vector, kind="permanent", model_change="substep",
+        ),
+    ] = (0.0, 0.0, 0.0)  # fmt: skip
+    recoil_permeability: Annotated[
+        float,
+        Attribute(
+            "recoilPermeability", "float", "Recoil Permeability",
+            "Relative permeability mu of a permanent magnet, M = Mr + (mu - 1) H with the internal field H. At 1 no "
+            "field changes the magnetization.",
+            unit="dimensionless", range=f"1, or [{_RECOIL_RANGE[0]:g}, {_RECOIL_RANGE[1]:g}]", check=check_recoil,
+            kind="permanent", optional=True,
+        ),
+    ] = 1.0  # fmt: skip
+    moment_spacing: Annotated[
+        float,
+        Attribute(
+            "momentSpacing", "float", "Moment Spacing",
+            "Distance between the moments that sample the magnet; 0 means one moment for a ball, automatic otherwise.",
+            unit="distance", range="[0, inf)", check=check_not_negative,
+        ),
+    ] = 0.0  # fmt: skip
+    conductivity: Annotated[
+        float,
+        Attribute(
+            "conductivity", "float", "Conductivity",
+            "Electrical conductivity of a ball of one moment that is its body's only magnet. Eddy currents brake such "
+            "a ball; 0 means no eddy currents.",
+            unit="siemens / meter", range="[0, inf)", check=check_not_negative, optional=True,
+        ),
+    ] = 0.0  # fmt: skip
 
     def __post_init__(self):
-        """Take what a measured curve says."""
+        """Set saturation and susceptibility to those of a measured curve."""
         if isinstance(self.curve, MagnetizationCurve):
             object.__setattr__(self, "saturation", self.curve.saturation)
             object.__setattr__(self, "susceptibility", self.curve.susceptibility)
 
     @property
     def recoils(self) -> bool:
-        """Whether it is permanent and the field changes its magnetization."""
+        """Whether the magnet is permanent and the field changes its magnetization."""
         return self.kind == "permanent" and self.recoil_permeability > 1.0
 
     @property
     def fixed(self) -> bool:
-        """Whether no field changes its magnetization."""
+        """Whether no field changes the magnetization."""
         return self.kind == "permanent" and not self.recoils
 
-    def check(self, name: str) -> None:
-        """Raise :class:`InputError` naming ``name`` (a prim path or body label) if a value is out of range."""
-        check_token(f"{name}: kind", self.kind, KINDS)
-        if self.kind == "inducible":
-            check_material(f"{name}: saturation magnetization", self.saturation)
-            check_material(f"{name}: susceptibility", self.susceptibility, infinite=True)
-            check_curve(f"{name}: curve", self.curve)
-        else:
-            check_vector(f"{name}: magnetization", self.magnetization)
-            check_recoil(f"{name}: recoil permeability", self.recoil_permeability)
-        check_not_negative(f"{name}: moment spacing", self.moment_spacing)
-        check_not_negative(f"{name}: conductivity", self.conductivity)
+    def check(self, name: str, *, unused: bool = False) -> None:
+        """Raise :class:`InputError` if a value is out of range.
+
+        Args:
+            name: Prim path or label of the body, for the message.
+            unused: Whether to check attributes of the other kind of magnets, too.
+        """
+        for row in attributes_of(Magnet):
+            if unused or row.kind in ("", self.kind):
+                row.check_value(name, getattr(self, row.field))
 
 
 @dataclass(frozen=True)
 class MagneticSettings:
-    """How the magnetics of a whole scene is solved.
+    """Settings of a scene's magnetic solve; each field is a row of the table of attributes."""
 
-    Attributes:
-        external_field: Uniform applied field H0 [A/m], world frame.
-        force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
-        dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
-            ``llg-damping`` (Eq. 6, with and without precession).
-        contact_model: ``dipole``, or ``multipole``, which adds what balls lack where they nearly touch (Kelvin only).
-        rtol: Relative magnetization error at which a step's induction ends, the computable form of Eq. 12.
-    """
-
-    external_field: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    force: str = "kelvin"
-    dynamics: str = "theta"
-    contact_model: str = "dipole"
-    rtol: float = 1e-3
+    external_field: Annotated[
+        tuple[float, float, float],
+        Attribute(
+            "externalField", "vector3f", "External Field", "Uniform applied field H0 in the world frame.",
+            unit="ampere / meter", check=check_vector,
+        ),
+    ] = (0.0, 0.0, 0.0)  # fmt: skip
+    force: Annotated[
+        str,
+        Attribute(
+            "force", "token", "Force Law",
+            "Force law of the field on a moment: kelvin (Eqs. 13 and 14 of Kim and Han 2022) or zeeman (Eq. 4).",
+            tokens=FORCES, uniform=True,
+        ),
+    ] = "kelvin"  # fmt: skip
+    dynamics: Annotated[
+        str,
+        Attribute(
+            "dynamics", "token", "Magnetization Dynamics",
+            "Scheme that brings the moments to equilibrium: the exact flow, accelerated (theta), its explicit Euler "
+            "step (theta-euler), or LLG (Eq. 6) with and without precession (llg, llg-damping).",
+            tokens=DYNAMICS, uniform=True,
+        ),
+    ] = "theta"  # fmt: skip
+    contact_model: Annotated[
+        str,
+        Attribute(
+            "contactModel", "token", "Contact Model",
+            "Interaction of balls that nearly touch: their dipoles alone, or also the higher multipoles of the exact "
+            "solution of two balls. The latter requires the force law kelvin.",
+            tokens=CONTACT_MODELS, uniform=True,
+        ),
+    ] = "dipole"  # fmt: skip
+    rtol: Annotated[
+        float,
+        Attribute(
+            "rtol", "float", "Relative Tolerance",
+            "Relative error of the magnetization at which the induction of a step ends.",
+            unit="dimensionless", range=f"[{ACCURACY['float32']:g}, inf)", check=check_rtol,
+        ),
+    ] = 1e-3  # fmt: skip
 
     def check(self, name: str) -> None:
-        """Raise :class:`InputError` naming ``name`` if a value is out of range."""
-        check_vector(f"{name}: external field", self.external_field)
-        check_token(f"{name}: contact model", self.contact_model, CONTACT_MODELS)
+        """Raise :class:`InputError` naming ``name`` if a value is out of range, or values do not go together."""
+        check_fields(self, name, "external_field", "contact_model")
         check_force(f"{name}: force", self.force, self.contact_model)
-        check_token(f"{name}: dynamics", self.dynamics, DYNAMICS)
-        check_rtol(f"{name}: rtol", self.rtol)
+        check_fields(self, name, "dynamics", "rtol")
 
-    def replaced(self, **given) -> "MagneticSettings":
-        """Return settings with those of ``given`` that are not None, unchecked, in the place of these."""
-        return replace(self, **{name: value for name, value in given.items() if value is not None})
+    def replaced(self, **values) -> "MagneticSettings":
+        """Return the settings with those of ``values`` that are not None, unchecked."""
+        return replace(self, **{name: value for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True)
 class StageMagnets:
-    """All that a stage says about magnets, keyed by prim path.
+    """Magnets and settings of a stage, by prim path.
 
     Attributes:
         magnets: Magnet of each prim that carries one; the prim is a rigid body or a collider.
-        settings: The scene's magnetic settings.
-        initial_moments: Total moment [A·m²], world frame, of prims that carry ``warpmag:moment``, for a warm start.
+        settings: Magnetic settings of the scene.
+        initial_moments: Total moment [A·m²], world frame, of prims with ``warpmag:moment``, for a warm start.
     """
 
     magnets: dict[str, Magnet]

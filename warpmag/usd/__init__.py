@@ -5,12 +5,12 @@ before the first stage is opened in a process, for USD takes no new schemas afte
 attributes right even then).
 """
 
-from warpmag.usd.schemas import author_magnet, author_settings, magnet_of, magnet_prim_of  # isort: skip  (registers the schemas first)
+from warpmag.usd.schemas import author_magnet, author_settings, collider_magnet, magnet_of, shape_axis  # isort: skip  (registers the schemas first)
 from warpmag.usd.paths import usable_path
 from warpmag.usd.read.alike import MOMENTS, AlikeBalls, BallFrames
 from warpmag.usd.read.check import StageReport, check, inspect
 from warpmag.usd.read.clock import StageClock, stage_clock
-from warpmag.usd.read.coils import author_coil, author_field_map, is_source, placed_sources
+from warpmag.usd.read.coils import author_coil, author_field_map, is_source, placed_sources, world_matrix_at
 from warpmag.usd.read.densities import give_densities, has_volume
 from warpmag.usd.read.guard import readable, refusals
 from warpmag.usd.read.instancers import complete_instances
@@ -51,6 +51,7 @@ __all__ = [
     "author_magnet",
     "author_settings",
     "check",
+    "collider_magnet",
     "complete_instances",
     "describe",
     "enabled_joints",
@@ -61,7 +62,6 @@ __all__ = [
     "inspect",
     "is_source",
     "magnet_of",
-    "magnet_prim_of",
     "open_apart",
     "open_motion",
     "open_stage",
@@ -71,8 +71,10 @@ __all__ = [
     "read_recording",
     "readable",
     "refusals",
+    "shape_axis",
     "stage_clock",
     "survey",
     "swarms_of",
     "usable_path",
+    "world_matrix_at",
 ]

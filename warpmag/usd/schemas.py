@@ -1,102 +1,134 @@
 """The applied API schemas ``WarpmagMagnetAPI`` and ``WarpmagSceneAPI``: registration, authoring and reading.
 
-The schemas are codeless; their text is ``schema/generatedSchema.usda``. Each attribute stands for one field of
-:class:`warpmag.declarations.magnets.Magnet` or :class:`warpmag.declarations.magnets.MagneticSettings`.
+The schemas are codeless: their text, ``schema/generatedSchema.usda``, is made from the table of attributes
+(``warpmag.declarations.schemas``) by ``python -m warpmag.usd.schema_text``.
 """
 
 import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import newton_usd_schemas  # noqa: F401  (registers Newton's own schemas, which must happen before a stage is opened)
-from pxr import Gf, Plug, Sdf, Usd
+import numpy as np
+from pxr import Gf, Plug, Sdf, Usd, UsdGeom, Vt
 
 from warpmag.declarations import materials
+from warpmag.declarations.attributes import Attribute, Schema, attributes_of
 from warpmag.declarations.checks import check_vector
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.keys import Keys
-from warpmag.declarations.magnets import Magnet, MagneticSettings, check_curve, check_material, check_recoil
+from warpmag.declarations.magnets import Magnet, MagneticSettings
+from warpmag.declarations.schemas import MAGNET_SCHEMA, SCENE_SCHEMA
 from warpmag.errors import InputError
 from warpmag.usd.read.keys import KeyReader
-from warpmag.usd.values import instance_finding, number, text, vector
+from warpmag.usd.values import flag, instance_finding, number, point_array, text, vector, vector_array, whole_numbers
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
 
-MAGNET_API = "WarpmagMagnetAPI"
-SCENE_API = "WarpmagSceneAPI"
-MOMENT = "warpmag:moment"
-MATERIAL = "warpmag:material"
-CURVE_POINTS = "warpmag:curve:h", "warpmag:curve:b"
+MAGNET_API, SCENE_API = MAGNET_SCHEMA.name, SCENE_SCHEMA.name
+MOMENT = MAGNET_SCHEMA.usd_name("moment")
+MATERIAL = MAGNET_SCHEMA.usd_name("material")
+CURVE_POINTS = MAGNET_SCHEMA.usd_name("curve_fields"), MAGNET_SCHEMA.usd_name("curve_flux_densities")
 """Points of a measured curve: H [A/m] inside the material, and B [T]."""
+_CURVE = MAGNET_SCHEMA.usd_name("curve")
+_MAGNETIZATION = MAGNET_SCHEMA.usd_name("magnetization")
+_SET_BY_CURVE = ("saturation", "susceptibility", "curve")
+"""Fields that a measured curve sets."""
 
-_TYPES = {str: Sdf.ValueTypeNames.Token, float: Sdf.ValueTypeNames.Float, tuple: Sdf.ValueTypeNames.Vector3f}
-
-_READERS = {str: text, float: number, tuple: vector}
-
-_MAGNET_ATTRIBUTES = {
-    "kind": "warpmag:kind",
-    "saturation": "warpmag:saturationMagnetization",
-    "susceptibility": "warpmag:susceptibility",
-    "curve": "warpmag:curve",
-    "magnetization": "warpmag:magnetization",
-    "recoil_permeability": "warpmag:recoilPermeability",
-    "moment_spacing": "warpmag:momentSpacing",
-    "conductivity": "warpmag:conductivity",
+_READERS: dict[str, Callable[[str, Any], Any]] = {
+    "token": text,
+    "float": number,
+    "bool": flag,
+    "vector3f": vector,
+    "point3f": vector,
+    "int3": whole_numbers,
+    "vector3f[]": vector_array,
+    "point3f[]": point_array,
 }
-_OF_CURVE = ("saturation", "susceptibility", "curve")
-"""What a measured curve says."""
-_SETTINGS_ATTRIBUTES = {
-    "external_field": "warpmag:externalField",
-    "force": "warpmag:force",
-    "dynamics": "warpmag:dynamics",
-    "contact_model": "warpmag:contactModel",
-    "rtol": "warpmag:rtol",
+"""Functions from what a USD attribute holds to the value of a field, by the type that the schema has."""
+_TO_USD: dict[str, Callable[[Any], Any]] = {
+    "vector3f": lambda value: Gf.Vec3f(*value),
+    "point3f": lambda value: Gf.Vec3f(*value),
+    "int3": lambda value: Gf.Vec3i(*value),
+    "vector3f[]": lambda value: Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, np.float32).reshape(-1, 3)),
+    "point3f[]": lambda value: Vt.Vec3fArray([Gf.Vec3f(*point) for point in value]),
 }
-MAGNET_NAMES = (*_MAGNET_ATTRIBUTES.values(), MATERIAL, *CURVE_POINTS, MOMENT)
-SCENE_NAMES = tuple(_SETTINGS_ATTRIBUTES.values())
+"""Functions from the value of a field to what a USD attribute takes; other types take the value as it is."""
 
 
 def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
-    """Make ``prim`` a magnet, with every attribute authored (Newton sees authored values only, no fallbacks).
+    """Make ``prim`` a magnet and author its attributes: Newton reads authored values only, no fallbacks.
 
-    But for what has no meaning for this one: a recoil permeability of 1, no conductivity, and what a measured curve
-    says.
+    Attributes without a meaning for this magnet are left out: a recoil permeability of 1, a conductivity of 0, and
+    those that a measured curve sets.
     """
     magnet.check(str(prim.GetPath()))
-    left_out = [
-        *([] if magnet.recoils else ["recoil_permeability"]),
-        *([] if magnet.conductivity else ["conductivity"]),
-    ]
-    if isinstance(magnet.curve, MagnetizationCurve):
-        left_out += _OF_CURVE
+    measured = isinstance(magnet.curve, MagnetizationCurve)
+    prim.AddAppliedSchema(MAGNET_API)
+    for row in attributes_of(Magnet):
+        value = getattr(magnet, row.field)
+        unused = row.optional and (row.kind not in ("", magnet.kind) or value == row.default)
+        if not (unused or (measured and row.field in _SET_BY_CURVE)):
+            author(prim, row, value)
+    if measured:
         _author_curve(prim, magnet.curve)
-    said = {field: name for field, name in _MAGNET_ATTRIBUTES.items() if field not in left_out}
-    _author(prim, MAGNET_API, said, magnet)
 
 
 def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
-    """Write the scene's magnetic settings on its PhysicsScene ``prim``, every attribute authored."""
+    """Author all magnetic settings of the scene on its PhysicsScene ``prim``."""
     settings.check(str(prim.GetPath()))
-    _author(prim, SCENE_API, _SETTINGS_ATTRIBUTES, settings)
+    author_schema(prim, SCENE_SCHEMA, vars(settings))
+
+
+def author_schema(prim: Usd.Prim, schema: Schema, values: Mapping[str, Any]) -> None:
+    """Apply a schema to ``prim`` and author its attributes, those of ``values`` by field."""
+    prim.AddAppliedSchema(schema.name)
+    for row in schema.attributes:
+        if row.field in values:
+            author(prim, row, values[row.field])
+
+
+def author(prim: Usd.Prim, attribute: Attribute, value: Any) -> None:
+    """Author one attribute of the table on ``prim``."""
+    variability = Sdf.VariabilityUniform if attribute.uniform else Sdf.VariabilityVarying
+    kind = Sdf.ValueTypeNames.Find(attribute.usd_type)
+    made = prim.CreateAttribute(attribute.usd_name, kind, custom=False, variability=variability)
+    made.Set(_TO_USD[attribute.usd_type](value) if attribute.usd_type in _TO_USD else value)
+
+
+def read_fields(prim: Usd.Prim, attributes: Iterable[Attribute]) -> dict[str, Any]:
+    """Return the values of attributes of ``prim`` by field, without those that have no value.
+
+    Raises:
+        InputError: A value has the wrong type. The value itself is unchecked.
+    """
+    values = {}
+    for row in attributes:
+        attribute = prim.GetAttribute(row.usd_name)
+        value = attribute.Get() if attribute else None
+        if value is not None:
+            values[row.field] = _READERS[row.usd_type](f"{prim.GetPath()}: {row.usd_name}", value)
+    return values
 
 
 def magnet_of(prim: Usd.Prim) -> Magnet:
-    """Read and check the magnet that ``prim`` carries; raises :class:`InputError` naming the prim."""
-    magnet = _with_curve(prim, _read(prim, _MAGNET_ATTRIBUTES, Magnet()))
+    """Return the magnet that ``prim`` declares.
+
+    Raises:
+        InputError: A value is invalid, or two attributes contradict each other; the message names the prim.
+    """
+    magnet = _with_curve(prim, Magnet(**read_fields(prim, attributes_of(Magnet))))
     material = prim.GetAttribute(MATERIAL).Get()
     if material is not None and text(f"{prim.GetPath()}: {MATERIAL}", material):
-        magnet = dataclasses.replace(magnet, **_of_material(prim, material, magnet))
-    path = str(prim.GetPath())
-    magnet.check(path)
-    check_curve(f"{path}: {_MAGNET_ATTRIBUTES['curve']}", magnet.curve)  # what its kind has no use for, too
-    check_vector(f"{path}: {_MAGNET_ATTRIBUTES['magnetization']}", magnet.magnetization)
-    check_recoil(f"{path}: {_MAGNET_ATTRIBUTES['recoil_permeability']}", magnet.recoil_permeability)
-    for field, infinite in (("saturation", False), ("susceptibility", True)):
-        check_material(f"{path}: {_MAGNET_ATTRIBUTES[field]}", getattr(magnet, field), infinite=infinite)
+        magnet = dataclasses.replace(magnet, **_material_fields(prim, material, magnet))
+    magnet.check(str(prim.GetPath()), unused=True)
     return magnet
 
 
-def magnet_prim_of(collider: Usd.Prim) -> Usd.Prim | None:
-    """Return the prim that makes a collider a magnet: itself or its rigid body; None where neither does."""
+def _magnet_prim(collider: Usd.Prim) -> Usd.Prim | None:
+    """Return the prim that makes a collider a magnet: the collider itself or its rigid body, or None."""
     if not has_api(collider, "PhysicsCollisionAPI") or collider.GetTypeName() == "Plane":
         return None
     prim = collider
@@ -105,115 +137,128 @@ def magnet_prim_of(collider: Usd.Prim) -> Usd.Prim | None:
     return prim if has_api(prim, MAGNET_API) and (prim == collider or has_api(prim, "PhysicsRigidBodyAPI")) else None
 
 
+@dataclass(frozen=True)
+class ColliderMagnet:
+    """The magnet of one collider, for the shape that Newton makes of the collider.
+
+    Attributes:
+        magnet: The magnet, magnetization in the frame of the prim that declares it.
+        frames: World matrices of that prim and of the collider, for row vectors; empty where the prims are the same.
+        axis: Token of the axis of a capsule, cylinder or cone, None for other shapes.
+    """
+
+    magnet: Magnet
+    frames: tuple[np.ndarray, ...]
+    axis: str | None
+
+
+def collider_magnet(collider: Usd.Prim) -> ColliderMagnet | None:
+    """Return the magnet of a collider, None where the collider is no magnet; see :func:`magnet_of` for errors."""
+    prim = _magnet_prim(collider)
+    if prim is None:
+        return None
+    frames = () if prim == collider else (world_matrix(prim), world_matrix(collider))
+    return ColliderMagnet(magnet_of(prim), frames, _axis(collider))
+
+
+def shape_axis(stage: Usd.Stage, path: str) -> str | None:
+    """Return the token of the axis of the capsule, cylinder or cone at a path, None for other shapes."""
+    return _axis(stage.GetPrimAtPath(path))
+
+
+def _axis(prim: Usd.Prim) -> str | None:
+    axis = prim.GetAttribute("axis")
+    return axis.Get() if axis else None
+
+
+def world_matrix(prim: Usd.Prim) -> np.ndarray:
+    """Return the matrix from the frame of ``prim`` to the world, for row vectors, shape [4, 4]."""
+    return np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
+
+
 def moment_of(prim: Usd.Prim) -> tuple[float, float, float] | None:
-    """Read the authored moment of a magnet [A·m²], world frame, None where it has none."""
+    """Return the authored moment of a magnet [A·m²], world frame, None where there is none."""
     attribute = prim.GetAttribute(MOMENT)
     value = attribute.Get() if attribute and attribute.HasAuthoredValue() else None
-    if value is None:
-        return None
-    moment = vector(f"{prim.GetPath()}: {MOMENT}", value)
-    check_vector(f"{prim.GetPath()}: {MOMENT}", moment)
-    return moment
+    return None if value is None else _finite_vector(f"{prim.GetPath()}: {MOMENT}", value)
 
 
-def _of_material(prim: Usd.Prim, material: str, magnet: Magnet) -> dict:
-    """Return what a named material says about a magnet, which the prim must not say again."""
+def _material_fields(prim: Usd.Prim, material: str, magnet: Magnet) -> dict:
+    """Return the fields of a magnet that a named material sets; the prim must not author these, too."""
     owner = f"{prim.GetPath()}: {MATERIAL}"
     if magnet.kind == "permanent":
         return {"magnetization": materials.permanent(owner, material, magnet.magnetization)}
     values = materials.inducible(owner, material)
     if isinstance(magnet.curve, MagnetizationCurve):
         raise InputError(f"{owner}: {material} says what the magnet is made of, and a measured curve does, author one")
-    for field in _OF_CURVE if _OF_CURVE[2] in values else values:
-        if prim.GetAttribute(_MAGNET_ATTRIBUTES[field]).HasAuthoredValue():
-            raise InputError(f"{owner}: {material} says what {_MAGNET_ATTRIBUTES[field]} is, author one or the other")
+    for field in _SET_BY_CURVE if "curve" in values else values:
+        name = MAGNET_SCHEMA.usd_name(field)
+        if prim.GetAttribute(name).HasAuthoredValue():
+            raise InputError(f"{owner}: {material} says what {name} is, author one or the other")
     return values
 
 
 def _with_curve(prim: Usd.Prim, magnet: Magnet) -> Magnet:
-    """Return a magnet with the measured curve that the prim has by name or by points, which says Ms and χ, too."""
-    name, points = _MAGNET_ATTRIBUTES["curve"], [prim.GetAttribute(one).Get() for one in CURVE_POINTS]
+    """Return a magnet with the measured curve of the prim, by name or by points; it sets saturation and χ, too."""
+    points = [prim.GetAttribute(name).Get() for name in CURVE_POINTS]
     if any(points):
-        given = prim.GetAttribute(name)
-        if given and given.HasAuthoredValue():
-            raise InputError(f"{prim.GetPath()}: {name}: there are points of a curve, too, author one or the other")
+        curve_name = prim.GetAttribute(_CURVE)
+        if curve_name and curve_name.HasAuthoredValue():
+            raise InputError(f"{prim.GetPath()}: {_CURVE}: there are points of a curve, too, author one or the other")
         owner = f"{prim.GetPath()}: {' and '.join(CURVE_POINTS)}"
-        curve = MagnetizationCurve.from_bh(*(one or () for one in points), name=owner)
+        curve = MagnetizationCurve.from_bh(*(numbers or () for numbers in points), name=owner)
     else:
         curve = materials.measured(f"{prim.GetPath()}: curve", magnet.curve)
     if isinstance(curve, MagnetizationCurve):
-        for one in _OF_CURVE[:2]:
-            if prim.GetAttribute(_MAGNET_ATTRIBUTES[one]).HasAuthoredValue():
-                raise InputError(f"{prim.GetPath()}: {_MAGNET_ATTRIBUTES[one]}: a measured curve says it, author one")
+        for name in map(MAGNET_SCHEMA.usd_name, ("saturation", "susceptibility")):
+            if prim.GetAttribute(name).HasAuthoredValue():
+                raise InputError(f"{prim.GetPath()}: {name}: a measured curve says it, author one")
     return dataclasses.replace(magnet, curve=curve)
 
 
 def _author_curve(prim: Usd.Prim, curve: MagnetizationCurve) -> None:
-    """Write a measured curve, by its name where a material has it."""
+    """Author a measured curve: the name of its material where there is one, otherwise its points."""
     if name := materials.name_of_curve(curve):
-        attribute = prim.CreateAttribute(
-            _MAGNET_ATTRIBUTES["curve"], Sdf.ValueTypeNames.Token, custom=False, variability=Sdf.VariabilityUniform
-        )
-        attribute.Set(name)
+        (row,) = (row for row in attributes_of(Magnet) if row.field == "curve")
+        author(prim, row, name)
         return
-    for one, values in zip(CURVE_POINTS, (curve.fields, curve.flux_densities), strict=True):
-        prim.CreateAttribute(one, Sdf.ValueTypeNames.DoubleArray, custom=False).Set(values)
+    values = {"curve_fields": curve.fields, "curve_flux_densities": curve.flux_densities}
+    author_schema(prim, MAGNET_SCHEMA, values)
 
 
 def settings_of(prim: Usd.Prim) -> MagneticSettings:
-    """Read and check the magnetic settings of a PhysicsScene ``prim``; raises :class:`InputError` naming it."""
-    settings = _read(prim, _SETTINGS_ATTRIBUTES, MagneticSettings())
+    """Return the magnetic settings of a PhysicsScene ``prim``; raise :class:`InputError` naming it where invalid."""
+    settings = MagneticSettings(**read_fields(prim, attributes_of(MagneticSettings)))
     settings.check(str(prim.GetPath()))
     return settings
 
 
 def field_keys(prim: Usd.Prim, keys: KeyReader) -> Keys | None:
-    """Read the time samples of a scene's external field [A/m], None where it is constant."""
-    return keys.keys(prim, _SETTINGS_ATTRIBUTES["external_field"], _finite_vector)
+    """Return the time samples of a scene's external field [A/m], None where it is constant."""
+    return keys.keys(prim, SCENE_SCHEMA.usd_name("external_field"), _finite_vector)
 
 
 def magnetization_keys(prim: Usd.Prim, magnet: Magnet, keys: KeyReader) -> Keys | None:
-    """Read the time samples of a permanent magnet's magnetization [A/m], None where it is constant."""
-    name = _MAGNET_ATTRIBUTES["magnetization"]
+    """Return the time samples of a permanent magnet's magnetization [A/m], None where it is constant."""
     if magnet.kind != "permanent":
         return None
-    if finding := instance_finding(prim.GetAttribute(name)):
+    if finding := instance_finding(prim.GetAttribute(_MAGNETIZATION)):
         raise InputError(str(finding))
     material = prim.GetAttribute(MATERIAL).Get()
 
     def read(where: str, value) -> tuple:
-        given = _finite_vector(where, value)
-        return materials.permanent(where, material, given) if material else given
+        magnetization = _finite_vector(where, value)
+        return materials.permanent(where, material, magnetization) if material else magnetization
 
-    return keys.keys(prim, name, read)
+    return keys.keys(prim, _MAGNETIZATION, read)
 
 
 def _finite_vector(name: str, value) -> tuple[float, float, float]:
-    found = vector(name, value)
-    check_vector(name, found)
-    return found
+    components = vector(name, value)
+    check_vector(name, components)
+    return components
 
 
 def has_api(prim: Usd.Prim, name: str) -> bool:
-    """Whether the API schema ``name`` is applied to ``prim``, also if it was registered too late for USD to know it."""
+    """Return whether the API schema ``name`` is applied to ``prim``, registered in time for USD to know it or not."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
-
-
-def _author(prim, api, attributes, record) -> None:
-    prim.AddAppliedSchema(api)
-    for field, name in attributes.items():
-        value = getattr(record, field)
-        kind = type(value) if isinstance(value, (str, tuple)) else float
-        variability = Sdf.VariabilityUniform if kind is str else Sdf.VariabilityVarying
-        attribute = prim.CreateAttribute(name, _TYPES[kind], custom=False, variability=variability)
-        attribute.Set(Gf.Vec3f(*value) if kind is tuple else value)
-
-
-def _read(prim, attributes, defaults):
-    """Return ``defaults`` with each field replaced by the value of its attribute, where it has one."""
-    values = {}
-    for field, name in attributes.items():
-        value = prim.GetAttribute(name).Get()
-        if value is not None:
-            values[field] = _READERS[type(getattr(defaults, field))](f"{prim.GetPath()}: {name}", value)
-    return dataclasses.replace(defaults, **values)

@@ -237,6 +237,33 @@ def text(name: str, value) -> str:
     return value
 
 
+def flag(name: str, value) -> bool:
+    """Return true or false."""
+    if not isinstance(value, bool):
+        raise InputError(f"{name}: must be true or false, got {value!r:.60}")
+    return value
+
+
+def whole_numbers(name: str, value) -> tuple[int, int, int]:
+    """Return three whole numbers."""
+    if not isinstance(value, Gf.Vec3i):
+        raise InputError(f"{name}: must be three whole numbers, got {value!r:.60}")
+    x, y, z = value
+    return x, y, z
+
+
+def vector_array(name: str, value) -> np.ndarray:
+    """Return vectors, shape [k, 3]."""
+    if not isinstance(value, (Vt.Vec3fArray, Vt.Vec3dArray, Vt.Vec3hArray)):
+        raise InputError(f"{name}: must be an array of vectors, got {type(value).__name__}")
+    return np.array(value, dtype=float).reshape(-1, 3)
+
+
+def point_array(name: str, value) -> tuple[tuple[float, float, float], ...]:
+    """Return points as a tuple."""
+    return tuple((x, y, z) for x, y, z in vector_array(name, value).tolist())
+
+
 def check_type(prim: Usd.Prim, name: str, value, example) -> None:
     """Raise :class:`InputError` unless ``value`` is of the type of ``example``, which None leaves open."""
     if example is not None and type(value) is not type(example):

@@ -14,7 +14,7 @@ from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.eddy import BodyEddies
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
-from warpmag.engine.magnets.model_values import ModelValues, contents
+from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.moments import KINEMATIC, make_system
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.errors import InputError
@@ -92,7 +92,7 @@ class Magnetics:
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         if (all_ranks := ranks()) is not None:
             more = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "step": step}
-            all_ranks.check_alike(vars(settings) | more | contents(model), "Magnetics: ")
+            all_ranks.check_alike(vars(settings) | more | magnetic_arrays(model), "Magnetics: ")
         settings.check("Magnetics")
         check_positive("Magnetics: step", step)
         if curve is not None:

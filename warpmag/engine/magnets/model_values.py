@@ -1,8 +1,8 @@
-"""Notices when a model says something else about its magnets than when they were taken from it.
+"""Changes of ``model.warpmag`` after ``Magnetics`` was built.
 
-Magnetizations are read again in every substep. What else ``model.warpmag`` holds is made into buffers, tables and
-lattices once. A change of it is seen on the device, where moments are gathered, and told on the host, which on a GPU
-does not wait for the device to ask.
+Magnetizations are read again in every substep. All else in ``model.warpmag`` went into buffers, tables and lattices
+once. The kernel that gathers moments detects a change on the device. The host raises the error, which on a GPU it can
+do later, without a wait.
 """
 
 from typing import Any
@@ -11,114 +11,118 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import CURVES, check_material
-from warpmag.engine.magnets.attributes import NAMESPACE, NO_MAGNET
+from warpmag.declarations.attributes import NAMESPACE
+from warpmag.declarations.magnets import CURVES
+from warpmag.engine.magnets.attributes import MAGNET_ATTRIBUTES, NO_MAGNET
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import ShapeMagnets
 
-_MATERIAL = ("saturation", "susceptibility")
-"""What can be taken over; the others decide which moments there are, and what they are computed by."""
-_NAMES = ("kind", *_MATERIAL, "curve", "recoil_permeability", "moment_spacing", "conductivity")
-_PLACES = (
+_COMPARED = {row.field: row for row in MAGNET_ATTRIBUTES if row.model_change != "substep"}
+"""Attributes whose changes are detected, the fields of ``ShapeMagnets``."""
+_MATERIAL = [name for name, row in _COMPARED.items() if row.model_change == "notified"]
+"""Attributes that may change after a notification; the others determine the moments and their solver."""
+_MODEL_ARRAYS = (
     *("body_q", "body_com", "body_flags"),
     *("shape_body", "shape_type", "shape_transform", "shape_scale", "shape_world"),
 )
-"""What else of a model decides about its magnets, besides meshes."""
+"""Other arrays of a model that determine its magnets, besides meshes."""
 
 
-def contents(model: newton.Model) -> dict[str, Any]:
-    """Return what decides about the magnets of ``model`` and the forces on them, by names that messages have for it."""
-    own = {name: one for name, one in vars(getattr(model, NAMESPACE)).items() if isinstance(one, wp.array)}
-    meshes = [getattr(one, "vertices", None) for one in model.shape_source]
-    values = {name: getattr(model, name) for name in _PLACES} | {"shape_source": meshes}
-    values |= {f"{NAMESPACE}.{name}": one for name, one in own.items()}
-    return {f"model.{name}": one for name, one in values.items()}
+def magnetic_arrays(model: newton.Model) -> dict[str, Any]:
+    """Return the arrays that determine the magnets of ``model`` and the forces on them, by names for messages."""
+    own = {name: values for name, values in vars(getattr(model, NAMESPACE)).items() if isinstance(values, wp.array)}
+    meshes = [getattr(mesh, "vertices", None) for mesh in model.shape_source]
+    arrays = {name: getattr(model, name) for name in _MODEL_ARRAYS} | {"shape_source": meshes}
+    arrays |= {f"{NAMESPACE}.{name}": values for name, values in own.items()}
+    return {f"model.{name}": values for name, values in arrays.items()}
 
 
 class ModelValues:
-    """What one model says about magnets now, and what it said when it was last looked at.
+    """The attributes of a model's magnets, now and when ``Magnetics`` last read them.
 
     Attributes:
-        now, then: Both, for the kernels.
-        changed: A shape that has changed, plus one, or 0, on the device, shape [1].
+        now, then: Both, for the kernels; ``now`` are arrays of the model.
+        changed: One plus a shape that has changed, or 0, on the device, shape [1].
     """
 
     def __init__(self, model: newton.Model, *, measured: bool):
-        """Take the values of ``model``; ``measured`` tells whether one measured curve is that of all magnets."""
-        self._model, self._measured = model, measured
-        self.now, self.then = ShapeMagnets(), ShapeMagnets()
-        for name in _NAMES:
-            setattr(self.now, name, self._array(name))
-            setattr(self.then, name, wp.clone(self._array(name)))
-        self.changed = wp.zeros(1, dtype=wp.int32, device=model.device)
-        self._seen = self.changed
-        if self.changed.device.is_cuda:
-            self._seen = wp.zeros(1, dtype=wp.int32, device="cpu", pinned=True)
-
-    def _array(self, name: str) -> Any:
-        return getattr(getattr(self._model, NAMESPACE), name)
-
-    def check(self, *, wait: bool) -> None:
-        """Refuse to go on with a model that has changed.
+        """Copy the values of ``model``.
 
         Args:
-            wait: Wait for the device to say so. Otherwise a change may be told later.
+            model: The model.
+            measured: Whether all magnets have one measured curve in place of their own curves.
+        """
+        self._model, self._measured = model, measured
+        self.now, self.then = ShapeMagnets(), ShapeMagnets()
+        for name in _COMPARED:
+            array = getattr(getattr(model, NAMESPACE), name)
+            setattr(self.now, name, array)
+            setattr(self.then, name, wp.clone(array))
+        self.changed = wp.zeros(1, dtype=wp.int32, device=model.device)
+        self._changed_on_host = self.changed
+        if self.changed.device.is_cuda:
+            self._changed_on_host = wp.zeros(1, dtype=wp.int32, device="cpu", pinned=True)
 
-        Raises:
-            InputError: It has.
+    def check(self, *, wait: bool) -> None:
+        """Raise :class:`InputError` if the model has changed.
+
+        Args:
+            wait: Whether to wait for the device. Otherwise a later call may raise the error.
         """
         device = self.changed.device
-        if self._seen is not self.changed:
-            if device.is_capturing:  # nobody could be told; the device remembers
+        if self._changed_on_host is not self.changed:
+            if device.is_capturing:  # the host cannot read here; the flag stays set on the device
                 return
-            wp.copy(self._seen, self.changed)
+            wp.copy(self._changed_on_host, self.changed)
             if wait:
                 wp.synchronize_stream(device.stream)
-        if shape := int(self._seen.numpy()[0]):
-            name = next((one for one in _NAMES if (shape - 1) in self._differing(one)), _MATERIAL[0])
+        if shape := int(self._changed_on_host.numpy()[0]):
+            name = next((name for name in _COMPARED if (shape - 1) in self._differing(name)), _MATERIAL[0])
             raise InputError(
                 f"{self._model.shape_label[shape - 1]}: model.{NAMESPACE}.{name} was changed, call "
                 "notify_model_changed() of its Magnetics"
             )
 
     def _differing(self, name: str) -> np.ndarray:
-        """Shapes of which the model says something else under ``name`` than it said then."""
+        """Return the magnets among the shapes whose attribute has changed."""
         now, then = getattr(self.now, name).numpy(), getattr(self.then, name).numpy()
         magnet = (self.now.kind.numpy() != NO_MAGNET) | (name == "kind")
         return np.flatnonzero((now != then) & magnet)
 
     def changed_materials(self) -> np.ndarray:
-        """Return the shapes whose material has changed, once they are sound.
+        """Return the shapes whose material has changed.
 
         Raises:
-            InputError: A material is out of range, or something else has changed.
+            InputError: A material is out of range, or an attribute has changed that must not.
         """
         labels = self._model.shape_label
-        for name in _NAMES:
+        for name, row in _COMPARED.items():
             for shape in self._differing(name).tolist():
-                where = f"{labels[shape]}: {NAMESPACE}.{name}"
+                owner = f"{labels[shape]}: {NAMESPACE}.{name}"
                 if name not in _MATERIAL:
                     raise InputError(
-                        f"{where} was changed, and this Magnetics keeps what it was made with: make another"
+                        f"{owner} was changed, and this Magnetics keeps what it was made with: make another"
                     )
                 if self._measured or self.now.curve.numpy()[shape] >= len(CURVES):
-                    raise InputError(f"{where} was changed, and a measured curve says what it is")
-                value = float(getattr(self.now, name).numpy()[shape])
-                check_material(where, value, infinite=name == "susceptibility")
+                    raise InputError(f"{owner} was changed, and a measured curve says what it is")
+                assert row.check is not None, "only tokens have no check"
+                row.check(owner, float(getattr(self.now, name).numpy()[shape]))
         return np.unique(np.concatenate([self._differing(name) for name in _MATERIAL]))
 
     def material(self, shapes) -> tuple[np.ndarray, np.ndarray]:
-        """Return saturations [A/m] and susceptibilities of shapes as the model has them now."""
-        saturation, susceptibility = (getattr(self.now, name).numpy()[shapes].astype(float) for name in _MATERIAL)
+        """Return saturations [A/m] and susceptibilities of shapes, as the model has them now."""
+        saturation, susceptibility = (
+            getattr(self.now, name).numpy()[shapes].astype(float) for name in ("saturation", "susceptibility")
+        )
         return saturation, susceptibility
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays of what can be changed, by name."""
+        """Return the arrays of attributes that can change, by name, for a checkpoint."""
         return {f"{when}.{name}": getattr(getattr(self, when), name) for when in ("now", "then") for name in _MATERIAL}
 
     def take(self) -> None:
-        """Take the values that the model has now."""
-        for name in _NAMES:
+        """Copy the values that the model has now."""
+        for name in _COMPARED:
             wp.copy(getattr(self.then, name), getattr(self.now, name))
         self.changed.zero_()
-        self._seen.zero_()
+        self._changed_on_host.zero_()

@@ -11,9 +11,10 @@ import warp as wp
 
 from warpmag.declarations.keys import Keys, SceneKeys
 from warpmag.declarations.magnets import Magnet, StageMagnets
-from warpmag.engine.magnets.attributes import axis_turn, declare_attributes, in_shape_frame, magnet_shapes, mark_shape
+from warpmag.engine.magnets.attributes import declare_attributes, mark_shapes
 from warpmag.engine.magnets.balls import copy_ball
-from warpmag.engine.magnets.sources import add_placed_source
+from warpmag.engine.magnets.declared_magnets import axis_turn, in_shape_frame, magnet_shapes
+from warpmag.engine.magnets.declared_sources import add_placed_source
 from warpmag.engine.stepping.drawn import StageBuilder
 from warpmag.errors import InputError
 from warpmag.usd import (
@@ -33,6 +34,7 @@ from warpmag.usd import (
     prepare_joints,
     readable,
     refusals,
+    shape_axis,
     swarms_of,
 )
 
@@ -219,7 +221,7 @@ def _mark_magnets(
         covered[prim] = builder.as_drawn(covered[prim])
         for shape in covered[prim]:
             turn = _shape_turn(builder, stage, prim, shape, bodies)
-            mark_shape(builder, shape, in_shape_frame(magnet, turn))
+            mark_shapes(builder, [shape], in_shape_frame(magnet, turn))
     return covered
 
 
@@ -247,7 +249,7 @@ def _scene_keys(
 
 def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
     """Return how the frame of a shape is turned from that of the magnet prim that it belongs to."""
-    return builder.shape_transform[shape].q if prim in bodies else axis_turn(stage.GetPrimAtPath(prim))
+    return builder.shape_transform[shape].q if prim in bodies else axis_turn(shape_axis(stage, prim))
 
 
 def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> dict[int, Keys]:
@@ -257,9 +259,9 @@ def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) 
         Keys of the currents of those coils that have some, by the shape that stands for the coil.
     """
     currents = {}
-    for prim, one in ((prim, one) for prim, placed in sources.items() for one in placed):
+    for one in (one for placed in sources.values() for one in placed):
         body = -1 if one.body is None else bodies[one.body]
-        shape = add_placed_source(builder, one, prim, body, wp.transform(one.position, one.rotation))
+        shape = add_placed_source(builder, one, body, wp.transform(one.position, one.rotation))
         if one.currents is not None:
             currents[shape] = one.currents
     return currents

@@ -1,31 +1,30 @@
-"""The applied API schemas ``WarpmagCoilAPI`` and ``WarpmagFieldMapAPI``: authoring, and reading with their place.
+"""The applied API schemas ``WarpmagCoilAPI`` and ``WarpmagFieldMapAPI``: authoring, and reading with their places.
 
-Each attribute stands for a field of :class:`warpmag.declarations.coils.Coil` or
-:class:`warpmag.declarations.coils.FieldMap`. A source moves with the nearest rigid body at or above its prim.
+A source of a field moves with the nearest rigid body at or above its prim.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Usd, UsdGeom
 
+from warpmag.declarations.attributes import Schema
 from warpmag.declarations.coils import Coil, FieldMap, check_strength
 from warpmag.declarations.keys import Keys
+from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
 from warpmag.errors import InputError
+from warpmag.usd.read.clock import stage_clock
 from warpmag.usd.read.keys import KeyReader
 from warpmag.usd.read.transforms import TransformCheck, is_body
-from warpmag.usd.schemas import has_api
-from warpmag.usd.values import Finding, finding_of, instance_finding, number, text, vector
+from warpmag.usd.schemas import author_schema, has_api, read_fields, world_matrix
+from warpmag.usd.values import Finding, finding_of, instance_finding, number
 
-COIL_API = "WarpmagCoilAPI"
-MAP_API = "WarpmagFieldMapAPI"
-AMPERE_TURNS = "warpmag:coil:ampereTurns"
-
-_FADED = 0.05
-"""Part of its largest field that a map may have at its border without a warning."""
-_EVEN = 1e-5
-"""How much scales may differ and axes lean: poses are often single precision."""
+_AMPERE_TURNS = COIL_SCHEMA.usd_name("ampere_turns")
+_BORDER_WARNING = 0.05
+"""Largest field on the boundary of a map without a warning, as a fraction of its largest field."""
+_SCALE_TOLERANCE = 1e-5
+"""Largest relative difference of the scales of a frame: poses are often in single precision."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +32,15 @@ class PlacedSource:
     """A coil or a field map of a stage.
 
     Attributes:
-        source: What it is, in metres of the world.
-        body: Rigid-body prim that it moves with, None where it is fixed in the world.
+        prim: Path of the prim that declares it.
+        source: The coil or the map, in meters of the world.
+        body: Path of the rigid body that it moves with, None where it is fixed in the world.
         position: Origin of its frame in the world [m].
-        rotation: Rotation of its frame (x, y, z, w).
+        rotation: Rotation of its frame, a quaternion x y z w.
         currents: Keys of a coil's ampere-turns [A] at time codes, None where they are constant.
     """
 
+    prim: str
     source: Coil | FieldMap
     body: str | None
     position: tuple[float, float, float]
@@ -47,171 +48,124 @@ class PlacedSource:
     currents: Keys | None = None
 
 
-def _current(name: str, value) -> tuple[float]:
-    found = number(name, value)
-    check_strength(name, found)
-    return (found,)
-
-
-def _array(name: str, value, kinds: tuple) -> np.ndarray:
-    if not isinstance(value, kinds):
-        raise InputError(f"{name}: must be an array of vectors, got {type(value).__name__}")
-    return np.array(value, dtype=float).reshape(-1, 3)
-
-
-def _vectors(name: str, value) -> np.ndarray:
-    return _array(name, value, (Vt.Vec3fArray, Vt.Vec3dArray, Vt.Vec3hArray))
-
-
-def _points(name: str, value) -> tuple:
-    return tuple(map(tuple, _vectors(name, value).tolist()))
-
-
-def _flag(name: str, value) -> bool:
-    if not isinstance(value, bool):
-        raise InputError(f"{name}: must be true or false, got {value!r:.60}")
-    return value
-
-
-def _counts(name: str, value) -> tuple[int, int, int]:
-    if not isinstance(value, Gf.Vec3i):
-        raise InputError(f"{name}: must be three whole numbers, got {value!r:.60}")
-    return tuple(value)
-
-
-_NAMES = Sdf.ValueTypeNames
-_COIL = {
-    "shape": ("warpmag:coil:shape", text, _NAMES.Token),
-    "radius": ("warpmag:coil:radius", number, _NAMES.Float),
-    "length": ("warpmag:coil:length", number, _NAMES.Float),
-    "points": ("warpmag:coil:points", _points, _NAMES.Point3fArray),
-    "closed": ("warpmag:coil:closed", _flag, _NAMES.Bool),
-    "wire_radius": ("warpmag:coil:wireRadius", number, _NAMES.Float),
-    "ampere_turns": (AMPERE_TURNS, number, _NAMES.Float),
-}
-_MAP = {
-    "origin": ("warpmag:fieldMap:origin", vector, _NAMES.Point3f),
-    "spacing": ("warpmag:fieldMap:spacing", vector, _NAMES.Vector3f),
-    "counts": ("warpmag:fieldMap:counts", _counts, _NAMES.Int3),
-    "values": ("warpmag:fieldMap:values", _vectors, _NAMES.Vector3fArray),
-    "factor": ("warpmag:fieldMap:factor", number, _NAMES.Float),
-}
-_VARYING = ("ampere_turns",)
-COIL_NAMES, MAP_NAMES = (tuple(name for name, _, _ in one.values()) for one in (_COIL, _MAP))
-
-
 def author_coil(prim: Usd.Prim, coil: Coil) -> None:
     """Make ``prim`` a coil, with every attribute authored."""
     coil.check(str(prim.GetPath()))
-    values = {one.name: getattr(coil, one.name) for one in fields(coil)}
-    values["points"] = Vt.Vec3fArray([Gf.Vec3f(*point) for point in coil.points])
-    _author(prim, COIL_API, _COIL, values)
+    author_schema(prim, COIL_SCHEMA, vars(coil))
 
 
 def author_field_map(prim: Usd.Prim, field_map: FieldMap) -> None:
     """Make ``prim`` a field map, with every attribute authored."""
     field_map.check(str(prim.GetPath()))
-    nodes = np.ascontiguousarray(field_map.values, np.float32)
-    values = {
-        "origin": Gf.Vec3f(*field_map.origin),
-        "spacing": Gf.Vec3f(*field_map.spacing),
-        "counts": Gf.Vec3i(*nodes.shape[:3]),
-        "values": Vt.Vec3fArray.FromNumpy(nodes.reshape(-1, 3)),
-        "factor": field_map.factor,
-    }
-    _author(prim, MAP_API, _MAP, values)
-
-
-def _author(prim, api, attributes, values) -> None:
-    prim.AddAppliedSchema(api)
-    for field, (name, _, kind) in attributes.items():
-        variability = Sdf.VariabilityVarying if field in _VARYING else Sdf.VariabilityUniform
-        prim.CreateAttribute(name, kind, custom=False, variability=variability).Set(values[field])
+    author_schema(prim, FIELD_MAP_SCHEMA, vars(field_map) | {"counts": np.shape(field_map.values)[:3]})
 
 
 def is_source(prim: Usd.Prim) -> bool:
-    """Whether a prim is a coil or a field map."""
-    return has_api(prim, COIL_API) or has_api(prim, MAP_API)
+    """Return whether a prim is a coil or a field map."""
+    return has_api(prim, COIL_SCHEMA.name) or has_api(prim, FIELD_MAP_SCHEMA.name)
 
 
 def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> Iterator[PlacedSource | Finding]:
-    """Yield the coil and the field map that a prim is, or what is wrong with them."""
+    """Yield the coil and the field map that a prim declares, and the errors and warnings about them."""
     path = str(prim.GetPath())
     if not prim.IsA(UsdGeom.Xformable):
         yield Finding(path, "a coil or a field map on a prim that has no transform: use an Xform")
         return
-    wrong = list(transforms.findings(prim))
-    yield from wrong
-    if wrong or not transforms.is_sound(prim):
+    faults = list(transforms.findings(prim))
+    yield from faults
+    if faults or not transforms.is_sound(prim):
         return
     try:
         position, rotation, scale = _frame(prim)
-        owner = _owner(prim)
+        owner = _body_of(prim)
         body = owner and str(owner.GetPath())
         if keys.moves(prim, owner):
             yield Finding(path, f"keys move it within its rigid body {body}: a run holds it still there", "warning")
-        if has_api(prim, COIL_API):
-            currents = keys.keys(prim, AMPERE_TURNS, _current)
-            yield PlacedSource(_scaled_coil(coil_of(prim), scale), body, position, rotation, currents)
-        if has_api(prim, MAP_API):
-            found = field_map_of(prim)
-            if (rest := found.border()) > _FADED:
-                message = f"the field is up to {100.0 * rest:.0f} % of its largest where the map ends, and zero beyond"
+        if has_api(prim, COIL_SCHEMA.name):
+            currents = keys.keys(prim, _AMPERE_TURNS, _current)
+            yield PlacedSource(path, _scaled_coil(coil_of(prim), scale), body, position, rotation, currents)
+        if has_api(prim, FIELD_MAP_SCHEMA.name):
+            field_map = field_map_of(prim)
+            if (ratio := field_map.border_ratio()) > _BORDER_WARNING:
+                message = f"the field is up to {100.0 * ratio:.0f} % of its largest where the map ends, and zero beyond"
                 yield Finding(path, message, "warning")
-            yield PlacedSource(_scaled_map(found, scale), body, position, rotation)
+            yield PlacedSource(path, _scaled_map(field_map, scale), body, position, rotation)
     except InputError as error:
         yield finding_of(path, error)
 
 
 def placed_sources(prim: Usd.Prim) -> list[PlacedSource]:
-    """Return the coil and the field map that a prim is; raises :class:`InputError` if something is wrong with them."""
-    found = list(sources_of(prim, TransformCheck(), KeyReader(prim.GetStage())))
-    for one in found:
-        if isinstance(one, Finding) and one.severity == "error":
-            raise InputError(str(one))
-    return [one for one in found if isinstance(one, PlacedSource)]
+    """Return the coil and the field map that a prim declares, with keys of currents in seconds since the start.
+
+    Raises:
+        InputError: An error was found.
+    """
+    stage, sources = prim.GetStage(), []
+    for source in sources_of(prim, TransformCheck(), KeyReader(stage)):
+        if isinstance(source, Finding):
+            if source.severity == "error":
+                raise InputError(str(source))
+        elif source.currents is None:
+            sources.append(source)
+        else:
+            clock = stage_clock(stage)
+            seconds = source.currents.in_seconds(clock.start, clock.time_codes_per_second)
+            sources.append(replace(source, currents=seconds))
+    return sources
+
+
+def world_matrix_at(prim: Usd.Prim, path: str) -> np.ndarray:
+    """Return the world matrix of the prim at a path of the stage of ``prim``, for row vectors, shape [4, 4]."""
+    return world_matrix(prim.GetStage().GetPrimAtPath(path))
 
 
 def coil_of(prim: Usd.Prim) -> Coil:
-    """Read and check the coil that ``prim`` is, in its own frame; raises :class:`InputError` naming the prim."""
-    coil = Coil(**_read(prim, _COIL))
+    """Return the coil that ``prim`` declares, in its own frame; raise :class:`InputError` where it is invalid."""
+    coil = Coil(**_read(prim, COIL_SCHEMA))
     coil.check(str(prim.GetPath()))
     return coil
 
 
 def field_map_of(prim: Usd.Prim) -> FieldMap:
-    """Read and check the field map that ``prim`` is, in its own frame; raises :class:`InputError` naming the prim."""
-    path, given = str(prim.GetPath()), _read(prim, _MAP)
-    for field in ("spacing", "counts", "values"):
-        if field not in given:
-            raise InputError(f"{path}: {_MAP[field][0]} is missing")
-    counts, nodes = given.pop("counts"), given.pop("values")
+    """Return the field map that ``prim`` declares, in its own frame; raise :class:`InputError` where it is invalid."""
+    path, fields = str(prim.GetPath()), _read(prim, FIELD_MAP_SCHEMA)
+    for row in FIELD_MAP_SCHEMA.attributes:
+        if row.default is not None:
+            fields.setdefault(row.field, row.default)
+        elif row.field not in fields:
+            raise InputError(f"{path}: {row.usd_name} is missing")
+    counts, nodes = fields.pop("counts"), fields.pop("values")
     if min(counts) < 2 or np.prod(counts, dtype=float) != len(nodes):
-        names = _MAP["values"][0], _MAP["counts"][0]
+        names = [FIELD_MAP_SCHEMA.usd_name(field) for field in ("values", "counts")]
         raise InputError(f"{path}: {names[0]} has {len(nodes)} vectors, but {names[1]} is {counts}, 2 or more each")
-    found = FieldMap(**({"origin": (0.0, 0.0, 0.0)} | given), values=nodes.reshape(*counts, 3))
-    found.check(path)
-    return found
+    field_map = FieldMap(**fields, values=nodes.reshape(*counts, 3))
+    field_map.check(path)
+    return field_map
 
 
-def _read(prim, attributes) -> dict:
-    """Return the fields whose attributes have a value."""
-    found = {}
-    for field, (name, read, _) in attributes.items():
-        attribute = prim.GetAttribute(name)
-        value = attribute.Get() if attribute else None
-        if value is not None:
-            found[field] = read(f"{prim.GetPath()}: {name}", value)
-        if field not in _VARYING and attribute and _changes(attribute):
-            raise InputError(f"{prim.GetPath()}: {name} has time samples, but cannot change")
-        if attribute and (finding := instance_finding(attribute)):
+def _read(prim: Usd.Prim, schema: Schema) -> dict:
+    """Return the values of the attributes of a schema by field; none but ampere-turns may change over time."""
+    values = read_fields(prim, schema.attributes)
+    for row in schema.attributes:
+        if not (attribute := prim.GetAttribute(row.usd_name)):
+            continue
+        if row.uniform and _changes(attribute):
+            raise InputError(f"{prim.GetPath()}: {row.usd_name} has time samples, but cannot change")
+        if finding := instance_finding(attribute):
             raise InputError(str(finding))
-    return found
+    return values
+
+
+def _current(name: str, value) -> tuple[float]:
+    """Return the checked value of one key of a coil's ampere-turns [A]."""
+    current = number(name, value)
+    check_strength(name, current)
+    return (current,)
 
 
 def _changes(attribute: Usd.Attribute) -> bool:
-    """Whether a layer gives several time samples for an attribute, held or not."""
-    return any(one.layer.GetNumTimeSamplesForPath(one.path) > 1 for one in attribute.GetPropertyStack())
+    """Return whether a layer has several time samples for an attribute, also where a value is held over them."""
+    return any(spec.layer.GetNumTimeSamplesForPath(spec.path) > 1 for spec in attribute.GetPropertyStack())
 
 
 def _scaled_coil(coil: Coil, scale: float) -> Coil:
@@ -220,29 +174,29 @@ def _scaled_coil(coil: Coil, scale: float) -> Coil:
     return replace(coil, points=points, **sizes)
 
 
-def _scaled_map(found: FieldMap, scale: float) -> FieldMap:
-    return replace(found, origin=_times(scale, found.origin), spacing=_times(scale, found.spacing))
+def _scaled_map(field_map: FieldMap, scale: float) -> FieldMap:
+    return replace(field_map, origin=_times(scale, field_map.origin), spacing=_times(scale, field_map.spacing))
 
 
 def _times(scale: float, numbers) -> tuple[float, float, float]:
-    x, y, z = (scale * one for one in numbers)
+    x, y, z = (scale * component for component in numbers)
     return x, y, z
 
 
 def _frame(prim):
-    """Return place, rotation and scale of a prim's frame; raises :class:`InputError` where it is scaled unevenly."""
+    """Return position, rotation and scale of a prim's frame; raise :class:`InputError` where scales differ."""
     matrix = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim)
     axes = np.array(matrix)[:3, :3]
     scales = np.linalg.norm(axes, axis=1)
-    if np.ptp(scales) > _EVEN * scales.max() or np.linalg.det(axes) < 0.0:
+    if np.ptp(scales) > _SCALE_TOLERANCE * scales.max() or np.linalg.det(axes) < 0.0:
         raise InputError(f"{prim.GetPath()}: a coil or a field map must not be scaled unevenly or mirrored")
-    turn = Gf.Matrix3d((axes / scales[:, None]).tolist()).ExtractRotation().GetQuat()
-    rotation = (*turn.GetImaginary(), turn.GetReal())
+    quaternion = Gf.Matrix3d((axes / scales[:, None]).tolist()).ExtractRotation().GetQuat()
+    rotation = (*quaternion.GetImaginary(), quaternion.GetReal())
     return tuple(np.array(matrix)[3, :3].tolist()), rotation, float(scales.mean())
 
 
-def _owner(prim) -> Usd.Prim | None:
-    """Return the nearest rigid body at or above a prim."""
+def _body_of(prim) -> Usd.Prim | None:
+    """Return the nearest rigid body at or above a prim, None without one."""
     while prim and not prim.IsPseudoRoot():
         if is_body(prim):
             return prim

@@ -1,4 +1,4 @@
-"""Slips of the pen: attributes and schemas in warpmag's name that no schema has, and values that count for nothing."""
+"""Warnings about attributes without effect: misspelled names, missing schemas, values that do not go with the kind."""
 
 import difflib
 import functools
@@ -6,26 +6,27 @@ from collections.abc import Collection, Iterator
 
 from pxr import Usd
 
+from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.magnets import Magnet
-from warpmag.usd.read.coils import COIL_API, COIL_NAMES, MAP_API, MAP_NAMES
-from warpmag.usd.schemas import MAGNET_API, MAGNET_NAMES, MATERIAL, SCENE_API, SCENE_NAMES, has_api
+from warpmag.declarations.schemas import SCHEMAS
+from warpmag.usd.schemas import MATERIAL, has_api
 from warpmag.usd.values import Finding
 
-_NAMES = {MAGNET_API: MAGNET_NAMES, SCENE_API: SCENE_NAMES, COIL_API: COIL_NAMES, MAP_API: MAP_NAMES}
-_SCHEMA_OF = {name: schema for schema, names in _NAMES.items() for name in names}
-_NAMESPACE = "warpmag"
-_LIKE = 0.85
-"""How much a slip is like what is meant; one letter of seven, or two that changed places."""
+_SCHEMA_NAMES = [schema.name for schema in SCHEMAS]
+_SCHEMA_OF = {row.usd_name: schema.name for schema in SCHEMAS for row in schema.attributes}
+_SIMILAR = 0.85
+"""Similarity from which names count as misspellings of each other: a wrong letter of seven, or two swapped ones."""
 
 
 def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield which schemas and attributes in warpmag's name a prim has for nothing."""
+    """Yield warnings about schemas and attributes of a prim that are named like warpmag's and have no effect."""
     path = str(prim.GetPath())
     for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
-        if api not in _NAMES and _like(api[: len(_NAMESPACE)], (_NAMESPACE,)):
-            yield Finding(path, f"{api} has no effect: there is no such schema{_nearest(api, list(_NAMES))}", "warning")
+        if api not in _SCHEMA_NAMES and _is_similar(api[: len(NAMESPACE)], (NAMESPACE,)):
+            message = f"{api} has no effect: there is no such schema{_nearest(api, _SCHEMA_NAMES)}"
+            yield Finding(path, message, "warning")
     for name in prim.GetAuthoredPropertyNames():
-        if not _like(name.partition(":")[0], (_NAMESPACE,)):
+        if not _is_similar(name.partition(":")[0], (NAMESPACE,)):
             continue
         schema = _SCHEMA_OF.get(name)
         if schema is None:
@@ -36,11 +37,11 @@ def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Finding]:
-    """Yield what a magnet says that does not go with its kind.
+    """Yield warnings about values of a magnet that do not go with its kind.
 
     Args:
         prim: The prim.
-        magnet: What it says.
+        magnet: The magnet of the prim.
         keyed: Whether keys change the magnetization.
     """
     path, magnetized = str(prim.GetPath()), keyed or any(magnet.magnetization)
@@ -48,19 +49,19 @@ def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Fi
         message = f"a permanent magnet without magnetization: warpmag:magnetization says it, or {MATERIAL} its strength"
         yield Finding(path, message, "warning")
     if magnet.kind == "inducible":
-        for name, said in (("magnetization", magnetized), ("recoilPermeability", magnet.recoil_permeability > 1.0)):
-            if said:
+        for name, used in (("magnetization", magnetized), ("recoilPermeability", magnet.recoil_permeability > 1.0)):
+            if used:
                 message = f"warpmag:{name} has no effect on an inducible magnet: warpmag:kind says what it is"
                 yield Finding(path, message, "warning")
 
 
 @functools.cache  # thousands of prims have the same few names
-def _like(name: str, known: Collection[str]) -> bool:
-    """Return whether a name is, or may be a slip for, a known one."""
-    return any(difflib.SequenceMatcher(None, name.lower(), one.lower()).ratio() >= _LIKE for one in known)
+def _is_similar(name: str, known: Collection[str]) -> bool:
+    """Return whether a name is one of the known names, or may be a misspelling of one."""
+    return any(difflib.SequenceMatcher(None, name.lower(), other.lower()).ratio() >= _SIMILAR for other in known)
 
 
 def _nearest(name: str, known: list[str]) -> str:
-    """Return which known name is next to one, in words."""
-    found = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return f", the nearest is {found[0]}" if found else ""
+    """Return the end of a message that proposes the nearest known name, empty where none is near."""
+    matches = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    return f", the nearest is {matches[0]}" if matches else ""

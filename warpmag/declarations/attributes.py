@@ -1,0 +1,120 @@
+"""The table of attributes: a field of a record and all that follows from it, in one row.
+
+A record, such as ``Magnet``, is a dataclass. The annotation of each field carries an :class:`Attribute`, the row of the
+table. From the rows follow the attributes of Newton models, the USD schemas, their reading and writing, the checks of
+values, and the tables of the documentation. ``warpmag.declarations.schemas`` lists all rows.
+"""
+
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields, replace
+from functools import cache
+from typing import Any, Literal, get_type_hints
+
+from warpmag.declarations.checks import check_token
+
+NAMESPACE = "warpmag"
+"""Namespace of attributes in USD and in Newton models."""
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """One row of the table.
+
+    Attributes:
+        name: Name in USD, without the namespace.
+        usd_type: Type in USD: ``token``, ``float``, ``bool``, ``vector3f``, ``point3f``, ``int3`` or an array of them.
+        title: Name in user interfaces.
+        doc: Meaning, in one or two sentences.
+        unit: Unit as USD's own schemas write it, empty for tokens and flags; ``distance`` means the stage's unit.
+        range: Range of values for readers, empty where every finite value is valid.
+        tokens: Valid tokens.
+        check: Raises an error for a value out of range, by the name of the value and the value; None for tokens.
+        uniform: Whether USD allows no time samples.
+        kind: Kind of magnets that the attribute describes, empty for all.
+        optional: Whether a stage that warpmag writes leaves out the default.
+        model_change: When a change of a Newton model's array takes effect: in every substep, after
+            ``Magnetics.notify_model_changed``, or never, so that it is an error.
+        field: Field of the record, or what stands for it where USD alone has the attribute.
+        default: Default, None where the attribute has none.
+    """
+
+    name: str
+    usd_type: str
+    title: str
+    doc: str
+    unit: str = ""
+    range: str = ""
+    tokens: tuple[str, ...] = ()
+    check: Callable[[str, Any], Any] | None = None
+    uniform: bool = False
+    kind: str = ""
+    optional: bool = False
+    model_change: Literal["substep", "notified", "never"] = "never"
+    field: str = ""
+    default: Any = None
+
+    @property
+    def usd_name(self) -> str:
+        """Name in USD."""
+        return f"{NAMESPACE}:{self.name}"
+
+    @property
+    def documentation(self) -> str:
+        """Text of the USD schema: meaning, range and unit."""
+        lines = [self.doc, f"\nRange: {self.range}" if self.range else "", f"Units: {self.unit}" if self.unit else ""]
+        if self.unit and not self.range:
+            lines[2] = f"\n{lines[2]}"
+        return "\n".join(line for line in lines if line)
+
+    def check_value(self, owner: str, value: Any) -> None:
+        """Raise :class:`InputError` if ``value`` is invalid; the message names the owner and the field."""
+        name = f"{owner}: {self.field.replace('_', ' ')}"
+        if self.check is not None:
+            self.check(name, value)
+        else:
+            check_token(name, value, self.tokens)
+
+
+@cache
+def attributes_of(record: type) -> tuple[Attribute, ...]:
+    """Return the rows of a record, in the order of its fields, with field names and defaults."""
+    hints = get_type_hints(record, include_extras=True)
+    rows = []
+    for field in fields(record):
+        (row,) = hints[field.name].__metadata__
+        default = row.default if field.default is MISSING else field.default
+        rows.append(replace(row, field=field.name, default=default))
+    return tuple(rows)
+
+
+def check_fields(record: Any, owner: str, *names: str) -> None:
+    """Raise :class:`InputError` if a named field of a record is invalid; the message names ``owner``."""
+    for row in attributes_of(type(record)):
+        if row.field in names:
+            row.check_value(owner, getattr(record, row.field))
+
+
+@dataclass(frozen=True)
+class Schema:
+    """An applied API schema of USD.
+
+    Attributes:
+        name: Its name.
+        record: The record that a prim with the schema declares.
+        doc: Meaning, in a few sentences.
+        usd_only: Rows that no field of the record stands for.
+    """
+
+    name: str
+    record: type
+    doc: str
+    usd_only: tuple[Attribute, ...] = ()
+
+    @property
+    def attributes(self) -> tuple[Attribute, ...]:
+        """All rows: those of the record, then those of USD alone."""
+        return (*attributes_of(self.record), *self.usd_only)
+
+    def usd_name(self, field: str) -> str:
+        """Return the USD name of a field's attribute."""
+        return next(row.usd_name for row in self.attributes if row.field == field)

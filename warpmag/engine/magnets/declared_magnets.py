@@ -1,0 +1,169 @@
+"""Adding magnets to Newton builders: inducible and permanent materials of bodies and shapes."""
+
+from dataclasses import replace
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.declarations import materials
+from warpmag.declarations.checks import check_vector, check_whole
+from warpmag.declarations.curves import MagnetizationCurve
+from warpmag.declarations.magnets import Magnet
+from warpmag.engine.magnets.attributes import check_body, check_index, check_registered, mark_shapes
+from warpmag.errors import InputError
+
+_SOLID = (
+    newton.GeoType.SPHERE,
+    newton.GeoType.BOX,
+    newton.GeoType.CAPSULE,
+    newton.GeoType.CYLINDER,
+    newton.GeoType.ELLIPSOID,
+    newton.GeoType.CONE,
+    newton.GeoType.MESH,
+    newton.GeoType.CONVEX_MESH,
+)
+"""Types of shapes with a volume."""
+
+
+def add_inducible(
+    builder: newton.ModelBuilder,
+    body: int = -1,
+    *,
+    shape: int | None = None,
+    material: str | None = None,
+    saturation: float | None = None,
+    susceptibility: float | None = None,
+    curve: str | MagnetizationCurve | None = None,
+    moment_spacing: float = 0.0,
+    conductivity: float = 0.0,
+) -> None:
+    """Make a body, or one shape, a magnet that the field magnetizes: iron, steel, ferrite.
+
+    Args:
+        builder: The builder, with :func:`register_custom_attributes` called on it.
+        body: The body. All its colliding shapes, which must exist already, become one magnet.
+        shape: One shape in place of all shapes of the body; the way to make a static shape a magnet.
+        material: Name of an inducible material of :mod:`warpmag.declarations.materials`. It replaces the next two
+            arguments, and the curve where the material has a measured one.
+        saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
+        susceptibility: Susceptibility χ [dimensionless], infinite by default.
+        curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured curve. The latter is a
+            :class:`warpmag.MagnetizationCurve` or the name of a material that has one. It replaces saturation and
+            susceptibility.
+        moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+        conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet. Eddy currents brake
+            a conductor that moves through the field. 0 means none, with ``material``, too, since eddy currents cost a
+            sum over pairs (:class:`warpmag.declarations.materials.Material` lists conductivities).
+
+    Raises:
+        InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
+            of range.
+    """
+    numbers = {"saturation": saturation, "susceptibility": susceptibility}
+    values = materials.inducible_from(material, curve, {k: v for k, v in numbers.items() if v is not None})
+    magnet = Magnet("inducible", **values, moment_spacing=moment_spacing, conductivity=conductivity)
+    shapes = magnet_shapes(builder, body, shape)
+    magnet.check(builder.shape_label[shapes[0]])
+    mark_shapes(builder, shapes, magnet)
+
+
+def add_permanent(
+    builder: newton.ModelBuilder,
+    body: int = -1,
+    *,
+    shape: int | None = None,
+    material: str | None = None,
+    magnetization: tuple[float, float, float],
+    recoil_permeability: float = 1.0,
+    moment_spacing: float = 0.0,
+    conductivity: float = 0.0,
+) -> None:
+    """Make a body, or one shape, a permanent magnet.
+
+    Args:
+        builder: The builder, with :func:`register_custom_attributes` called on it.
+        body: The body. All its colliding shapes, which must exist already, become one magnet.
+        shape: One shape in place of all shapes of the body; the way to make a static shape a magnet.
+        material: Name of a permanent material of :mod:`warpmag.declarations.materials`, which gives the strength.
+        magnetization: Magnetization M [A/m] in the frame of the body, of the shape if that is static. With
+            ``material`` only its direction counts.
+        recoil_permeability: μ of M = M_r + (μ − 1) H [dimensionless], with the internal field H and ``magnetization``
+            M_r: about 1.05 for NdFeB, 1.1 for ferrite. At 1, the default, no field changes M. Above 1 the induction
+            solves for the magnet, too.
+        moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
+        conductivity: Electrical conductivity [S/m], as :func:`add_inducible` takes it.
+
+    Raises:
+        InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
+            of range.
+    """
+    check_vector("magnetization", magnetization)
+    if material is not None:
+        magnetization = materials.permanent("material", material, magnetization)
+    magnet = Magnet(
+        "permanent",
+        magnetization=magnetization,
+        recoil_permeability=recoil_permeability,
+        moment_spacing=moment_spacing,
+        conductivity=conductivity,
+    )
+    for index in magnet_shapes(builder, body, shape):
+        turn = wp.quat_identity()
+        if builder.shape_body[index] >= 0:
+            frame: Any = builder.shape_transform[index]  # Newton declares a tuple where it holds a transform
+            turn = frame.q
+        turned = in_shape_frame(magnet, turn)
+        turned.check(builder.shape_label[index])
+        mark_shapes(builder, [index], turned)
+
+
+def in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:
+    """Return ``magnet`` with its magnetization in the frame of a shape.
+
+    Args:
+        magnet: The magnet, in the frame of its body or prim.
+        turn: Rotation of the shape's frame in that frame.
+    """
+    if not np.any(magnet.magnetization):
+        return magnet
+    return replace(magnet, magnetization=tuple(wp.quat_rotate_inv(turn, wp.vec3(*magnet.magnetization))))
+
+
+def axis_turn(axis: str | None) -> Any:
+    """Return the rotation of a shape's frame in that of its prim.
+
+    Newton puts the axis of a capsule, cylinder or cone along z.
+
+    Args:
+        axis: Token of the prim's axis, None for other shapes.
+    """
+    return newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.from_any(axis)) if axis else wp.quat_identity()
+
+
+def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
+    """Return the shapes that a magnet on ``body``, or on ``shape`` alone, covers.
+
+    Raises:
+        InputError: Body or shape do not exist, or there is no colliding shape with a volume.
+    """
+    check_registered(builder)
+    if shape is not None:
+        check_index("shape", shape, builder.shape_count, "shapes")
+        check_whole("body", body)
+        if body not in (-1, builder.shape_body[shape]):
+            raise InputError(f"shape: {builder.shape_label[shape]} belongs to body {builder.shape_body[shape]}")
+        if builder.shape_type[shape] not in _SOLID:
+            kind = newton.GeoType(builder.shape_type[shape]).name.lower()
+            raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
+        return [shape]
+    check_body(builder, body)
+    shapes = [
+        index
+        for index in builder.body_shapes[body]
+        if builder.shape_flags[index] & newton.ShapeFlags.COLLIDE_SHAPES and builder.shape_type[index] in _SOLID
+    ]
+    if not shapes:
+        raise InputError(f"{builder.body_label[body]}: has no colliding solid shape yet, add its shapes first")
+    return shapes

@@ -1,0 +1,172 @@
+"""Adding coils and field maps to Newton builders.
+
+A source of a field is a site: a shape that neither collides nor weighs anything, with a body, a frame and a world. It
+survives ``add_builder``, ``add_world``, ``replicate`` and ``collapse_fixed_joints``.
+"""
+
+from typing import Any
+
+import newton
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warpmag.declarations.attributes import NAMESPACE
+from warpmag.declarations.checks import check_whole, short_repr
+from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, SourceRecord, checked_vectors
+from warpmag.engine.magnets.attributes import check_body, check_registered
+from warpmag.errors import InputError
+from warpmag.moments.arrays import host_array
+
+_UNIT_TOLERANCE = 1e-3
+"""Largest deviation of the length of a quaternion from 1: digits are often rounded."""
+
+
+def add_coil(
+    builder: newton.ModelBuilder,
+    body: int = -1,
+    *,
+    shape: str = "loop",
+    radius: float = 0.0,
+    length: float = 0.0,
+    points: npt.ArrayLike | None = None,
+    closed: bool = True,
+    wire_radius: float = 0.0,
+    ampere_turns: float = 0.0,
+    xform: wp.transform | tuple | None = None,
+    label: str | None = None,
+) -> int:
+    """Add a coil to a body or to the world; the reaction of the magnets acts on the body.
+
+    Loops and solenoids are about the z axis of their frame. A positive current makes a field along z inside them.
+    Closer to the axis of a wire than its radius the field falls to zero. Elsewhere the field is exact: of loops by
+    elliptic integrals, of sheets of current after Derby and Olbert 2010, of thin straight pieces in closed form.
+
+    Args:
+        builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
+        body: The body; -1 for a coil fixed in the world.
+        shape: ``loop``, ``solenoid`` or ``polyline``.
+        radius: Radius of a loop or a solenoid [m].
+        length: Length of a solenoid [m]; its middle is the origin.
+        points: Corners of a polyline [m], shape [k, 3], in the direction of a positive current.
+        closed: Whether a wire joins the last corner to the first; an open polyline is a part of a circuit.
+        wire_radius: Radius of the wire [m], of a solenoid that of the edges of its sheet. 0 means a hundredth of the
+            coil's radius, or of the diagonal of the box around a polyline.
+        ampere_turns: Current times turns [A], all turns of a solenoid; :meth:`warpmag.Magnetics.set_current` changes
+            it.
+        xform: Frame of the coil in that of the body, or of the world.
+        label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.
+
+    Returns:
+        The shape that represents the coil, a site.
+
+    Raises:
+        InputError: The attributes are not declared, the body does not exist, or a value is out of range.
+    """
+    corners = ()
+    if points is not None:
+        corners = checked_vectors("add_coil: points", host_array("add_coil: points", points), LARGEST_POINT)
+    coil = Coil(shape, radius, length, tuple(map(tuple, corners)), closed, wire_radius, ampere_turns)
+    coil.check("add_coil")
+    return _add_source(builder, body, coil.record(), ampere_turns, xform, _label(builder, "coil", label))
+
+
+def add_field_map(
+    builder: newton.ModelBuilder,
+    origin: tuple[float, float, float],
+    spacing: npt.ArrayLike,
+    values: npt.ArrayLike,
+    *,
+    body: int = -1,
+    factor: float = 1.0,
+    xform: wp.transform | tuple | None = None,
+    label: str | None = None,
+) -> int:
+    """Add a field on a regular grid, fixed in the world or on a body; the reaction of the magnets acts on the body.
+
+    Cubic convolution interpolates between the nodes, to third order in the spacing. Forces follow from the gradient of
+    the interpolant and are continuous. Outside the grid the field is zero, with a jump at the boundary: a map should
+    reach to where its field is small.
+
+    Args:
+        builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
+        origin: Position of the first node [m], in the frame of the map.
+        spacing: Distance between nodes [m], one number or one along each axis.
+        values: Field H at the nodes [A/m], shape [nx, ny, nz, 3], at least two along each axis, NumPy.
+        body: The body; -1 for a map fixed in the world.
+        factor: Factor of the field; :meth:`warpmag.Magnetics.set_current` changes it.
+        xform: Frame of the map in that of the body, or of the world.
+        label: Label of the map.
+
+    Returns:
+        The shape that represents the map, a site.
+
+    Raises:
+        InputError: The attributes are not declared, the body does not exist, or a value is out of range.
+    """
+    name = "add_field_map"
+    nodes, steps = host_array(f"{name}: values", values), host_array(f"{name}: spacing", spacing)
+    first = host_array(f"{name}: origin", origin)
+    field_map = FieldMap(
+        tuple(np.atleast_1d(first)), tuple(np.resize(steps, 3) if steps.ndim == 0 else steps), nodes, factor
+    )
+    field_map.check(name)
+    return _add_source(builder, body, field_map.record(), factor, xform, _label(builder, "field_map", label))
+
+
+def add_placed_source(
+    builder: newton.ModelBuilder, placed: Any, body: int, frame: wp.transform, current_keys: str = ""
+) -> int:
+    """Add a coil or a field map of a stage to a body or to the world.
+
+    Args:
+        builder: The builder.
+        placed: The source, a ``usd.read.coils.PlacedSource``; the path of its prim becomes the label.
+        body: The body, -1 for none.
+        frame: Frame of the source in the world.
+        current_keys: Keys of its current as text, for :class:`KeyedCurrents`; empty where another object sets the
+            current.
+
+    Returns:
+        The shape that represents the source, a site.
+    """
+    source = placed.source
+    strength = source.ampere_turns if isinstance(source, Coil) else source.factor
+    if body >= 0:
+        frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
+    return _add_source(builder, body, source.record(), strength, frame, placed.prim, current_keys)
+
+
+def _label(builder: newton.ModelBuilder, kind: str, label: str | None) -> str:
+    """Return the label of a new source, a default one for None."""
+    check_registered(builder)
+    return f"{kind}_{builder.shape_count}" if label is None else label
+
+
+def _add_source(
+    builder: newton.ModelBuilder, body: int, record: SourceRecord, strength: float, xform, label: str, keys: str = ""
+) -> int:
+    """Add a source to a body or to the world; return the site that represents it."""
+    check_registered(builder)
+    check_whole("body", body)
+    if body != -1:
+        check_body(builder, body)
+    if not isinstance(label, str):
+        raise InputError(f"label: must be text, got {short_repr(label)}")
+    frame = wp.transform() if xform is None else _checked_frame("xform", xform)
+    values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
+    values[f"{NAMESPACE}:current_keys"] = keys
+    return builder.add_site(body, xform=frame, label=label, custom_attributes=values)
+
+
+def _checked_frame(name: str, xform) -> wp.transform:
+    """Return the transform of seven numbers, or of a position and a rotation; the quaternion is normalized."""
+    try:
+        parts = list(xform)
+    except TypeError:
+        parts = []
+    numbers = np.concatenate([np.zeros(0), *(host_array(name, part).ravel() for part in parts)])
+    length = float(np.linalg.norm(numbers[3:]))
+    if len(numbers) != 7 or not abs(length - 1.0) < _UNIT_TOLERANCE or np.abs(numbers).max() > LARGEST_POINT:
+        raise InputError(f"{name}: must be a place and a quaternion x y z w of length 1, got {short_repr(xform)}")
+    return wp.transform(numbers[:3], numbers[3:] / length)

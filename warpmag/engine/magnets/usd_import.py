@@ -1,0 +1,100 @@
+"""Magnets, coils and field maps of a stage that a program imports with Newton's own ``builder.add_usd``.
+
+Newton calls back with prims. ``warpmag.usd`` turns each into a record; nothing here looks into a prim.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.engine.magnets.attributes import NAMESPACE, declare_attributes, stored_values
+from warpmag.engine.magnets.declared_magnets import axis_turn, in_shape_frame
+from warpmag.engine.magnets.declared_sources import add_placed_source
+from warpmag.errors import InputError
+
+
+def register_custom_attributes(builder: newton.ModelBuilder) -> None:
+    """Declare the attributes that magnets are stored in; call it before :func:`add_inducible` and friends.
+
+    Newton's solvers have class methods of this name; ``register_attributes`` is the same function.
+
+    Newton's ``builder.add_usd(stage)`` then imports the magnets, coils and field maps of a stage, too. Magnets are
+    colliders, or their rigid bodies, with ``WarpmagMagnetAPI``; attributes that are not authored have their defaults.
+
+    Args:
+        builder: The builder; declaring twice does nothing.
+    """
+    declare_attributes(builder, usd_value=_attribute_value)
+    builder.add_custom_frequency(
+        newton.ModelBuilder.CustomFrequency(
+            "source_prim", NAMESPACE, usd_prim_filter=_is_source, usd_entry_expander=_add_sources
+        )
+    )
+    # without an attribute of this frequency Newton does not call the two functions
+    builder.add_custom_attribute(
+        newton.ModelBuilder.CustomAttribute(
+            "source_prim", str, f"{NAMESPACE}:source_prim", namespace=NAMESPACE, default=""
+        )
+    )
+
+
+register_attributes = register_custom_attributes
+
+
+def _attribute_value(_, context: dict[str, Any]) -> Any:
+    """Return the value of one attribute for the shape of a prim, None where that is no magnet."""
+    from warpmag.usd import collider_magnet  # noqa: PLC0415 - a builder can do without USD
+
+    collider = collider_magnet(context["prim"])
+    if collider is None:
+        return None
+    turn = axis_turn(collider.axis)
+    if collider.frames:
+        magnet_turn, shape_turn = (_transform(matrix).q for matrix in collider.frames)
+        turn = wp.quat_inverse(magnet_turn) * shape_turn * turn
+    return stored_values(in_shape_frame(collider.magnet, turn))[context["attr"].name]
+
+
+def _transform(matrix: np.ndarray) -> wp.transform:
+    """Return the transform of a matrix for row vectors, as Newton reads it from a prim."""
+    position, rotation, _ = wp.transform_decompose(wp.mat44(matrix.astype(np.float32).T))
+    return wp.transform(position, rotation)
+
+
+def _is_source(prim: Any, _) -> bool:
+    """Return whether a prim is a coil or a field map."""
+    from warpmag.usd import is_source  # noqa: PLC0415 - a builder can do without USD
+
+    return is_source(prim)
+
+
+def _add_sources(prim: Any, context: dict[str, Any]) -> Iterable[dict[str, Any]]:
+    """Add the coil and the field map of a prim to the builder.
+
+    Returns:
+        No rows of attributes: the sources are sites.
+
+    Raises:
+        InputError: A source is invalid, or on a body that Newton has not imported.
+    """
+    from warpmag.usd import placed_sources, world_matrix_at  # noqa: PLC0415 - a builder can do without USD
+
+    builder, imported = context["builder"], context["result"]
+    bodies = imported["path_body_map"]
+    for source in placed_sources(prim):
+        if source.body is not None and source.body not in bodies:
+            raise InputError(f"{source.prim}: on {source.body}, of which Newton imports no body")
+        anchor = source.body or next(iter(bodies), None)
+        if anchor is None:  # nothing that moves: only the axes may have been turned
+            stage = wp.transform((0.0, 0.0, 0.0), newton.math.quat_between_axes(imported["up_axis"], builder.up_axis))
+        else:
+            pose = wp.transform(*builder.body_q[bodies[anchor]])
+            pose = pose * imported["path_body_relative_transform"].get(anchor, wp.transform_identity())
+            stage = pose * wp.transform_inverse(_transform(world_matrix_at(prim, anchor)))
+        frame = stage * wp.transform(source.position, source.rotation)
+        keys = "" if source.currents is None else source.currents.to_text()
+        add_placed_source(builder, source, -1 if source.body is None else bodies[source.body], frame, keys)
+    return []
