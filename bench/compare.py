@@ -1,7 +1,7 @@
 """warpmag and its peers, in one run on the same arrays: ``python -m bench.compare [--device cuda:0] [--sizes 243]``.
 
 What is timed is the field of n dipoles at each other, data in place, results left in place: evaluations one after the
-other and one wait at their end; of ``h_field`` and ``h_field_balls`` the whole call. Peers take turns. Each field is
+other and one wait at their end; of ``h_field`` the whole call. Peers take turns. Each field is
 compared with the float64 oracle on some targets. One JSON line a measurement; a peer whose library is missing, or that
 fails at a size, gets a line that says so.
 """

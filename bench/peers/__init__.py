@@ -48,7 +48,6 @@ class Peer:
 PEERS = (
     Peer("with_warpmag", "warpmag: native loop and overlap pass, captured in a graph", ("cpu", "cuda")),
     Peer("with_h_field", "warpmag.h_field of points, the whole call", ("cpu",)),
-    Peer("with_h_field_balls", "warpmag.h_field of balls, the whole call", ("cpu",)),
     Peer("with_warp_plain", "Warp: one thread a target, the textbook loop, in a graph", ("cpu", "cuda")),
     Peer("with_warp_tile", "Warp: its tile n-body example turned to dipoles, in a graph", ("cuda",)),
     Peer("with_torch", "PyTorch: broadcast over blocks of targets, torch.compile", ("cpu", "cuda")),
