@@ -10,7 +10,7 @@ model costs:
 | model | forces of two permeable balls as dipoles, or with the near-contact model | their exact multipole solution |
 | clusters | the same of three balls in a row and of thirteen, and their moments | ``bench.reference.clusters`` |
 | time step | energy of two balls that fall towards each other | conservation |
-| boxes | forces of two box magnets, sampled as they come | ``bench.reference.cuboids`` |
+| boxes | forces of two box magnets, sampled as they come | ``bench.reference.magnet_pairs`` |
 | price | time of the near-contact model in a touching pile | dipoles alone |
 | arrangements | magnetizations of many arrangements, and what the solve says of them | a float64 Newton solution |
 
@@ -30,7 +30,7 @@ import warpmag
 from bench.arrangements import ARRANGEMENTS, arranged, trace
 from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
-from bench.reference import clusters, cuboids, oracle, spheres
+from bench.reference import clusters, magnet_pairs, oracle, spheres
 from bench.reference.fall import DURATION, fall
 from bench.run import RUNNERS, make_system
 from bench.timing import measure
@@ -167,12 +167,12 @@ def time_step(device) -> Iterator[dict]:
         yield {"dt": dt, "steps": round(DURATION / dt), "error": found.drift, "momentum": found.momentum}
 
 
-def boxes(device, names=tuple(cuboids.PAIRS)) -> Iterator[dict]:
+def boxes(device, names=tuple(magnet_pairs.PAIRS)) -> Iterator[dict]:
     """Forces of two box magnets: relative error, and the moments that both are sampled with."""
     for name in names:
         for gap in BOX_GAPS:
-            half1, half2, offset = cuboids.pair(name, gap, SIDE)
-            exact = cuboids.force(half1, half2, offset, MAGNETIZATION, MAGNETIZATION)
+            half1, half2, offset = magnet_pairs.box_pair(name, gap, SIDE)
+            exact = magnet_pairs.box_force(half1, half2, offset, MAGNETIZATION, MAGNETIZATION)
             found, moments = _box_force(half1, half2, offset, device)
             yield {"boxes": name, "gap": gap, "moments": moments, "error": _relative(found, exact)}
 

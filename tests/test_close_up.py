@@ -1,7 +1,7 @@
 """Permanent boxes and cylinders close up: their fields, and their forces on each other and on balls.
 
 References: magpylib's closed forms, differentiated and meshed, for fields and for forces in any pose; Akoun and Yonnet
-(``bench/reference/cuboids.py``) and Vokoun et al. (``bench/reference/discs.py``) for parallel ones in contact.
+and Vokoun et al. (``bench/reference/magnet_pairs.py``) for parallel ones in contact.
 """
 
 import magpylib
@@ -12,7 +12,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpmag
-from bench.reference import cuboids, discs, oracle, uneven
+from bench.reference import ball_in_field, magnet_pairs, oracle
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.system import MomentSystem
@@ -160,7 +160,7 @@ def test_cubes_in_contact(place, device):
     """Gauss points leave 2e-3 at most, where an edge of one cube crosses the other's face."""
     found = force_on_second(device, (*CUBE,), (*CUBE, place))
     half = np.array(CUBE[1])
-    expected = cuboids.force(half, half, place, M, M)
+    expected = magnet_pairs.box_force(half, half, place, M, M)
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.linalg.norm(expected))
 
 
@@ -179,7 +179,7 @@ def test_cubes_of_any_size(side, device):
 def test_discs_in_line(gap, device):
     """The prism's rim is 0.2 % of the radius off the cylinder's, in and out."""
     found = force_on_second(device, (*DISC,), (*DISC, (0.0, 0.0, SIDE / 2 + gap)))
-    expected = discs.force(DISC[1][0], SIDE / 2, SIDE / 2, gap, M, M)
+    expected = magnet_pairs.cylinder_force(DISC[1][0], SIDE / 2, SIDE / 2, gap, M, M)
     np.testing.assert_allclose(found, [0.0, 0.0, expected], atol=3e-3 * abs(expected))
 
 
@@ -242,7 +242,9 @@ def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
     model = builder.finalize(device=device)
     magnetics, state = warpmag.Magnetics(model, contact_model="multipole"), model.state()
     magnetics.apply(state)
-    whole = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), weak), place, radius, order=20)
+    whole = ball_in_field.force_in_field(
+        lambda x: ball_in_field.box_field(x, np.full(3, half), weak), place, radius, order=20
+    )
     found = state.body_f.numpy()
     np.testing.assert_allclose(found[1, :3], whole, atol=0.03 * np.linalg.norm(whole))
     np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=1e-4 * np.linalg.norm(whole))

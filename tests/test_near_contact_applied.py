@@ -1,4 +1,4 @@
-"""Iron balls in the uneven field of coils, maps and boxes: exact series, what must be kept, and where it fades."""
+"""Iron balls in the non-uniform field of coils, maps and boxes: exact series, what must be kept, and where it fades."""
 
 import math
 import sys
@@ -17,7 +17,7 @@ from warpmag.moments.system import MomentSystem
 from warpmag.shapes import polyhedra
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
-from bench.reference import uneven
+from bench.reference import ball_in_field
 
 A, R = 0.02, 0.005  # m, radius of coils and of balls
 LINEAR = 1e15
@@ -112,7 +112,7 @@ def test_force_in_an_uneven_field(name, size, place, device):
     source, field = SOURCES[name], field_of(SOURCES[name], device)
     for susceptibility in (math.inf, 1.0):
         found = ball_in(source, device, size=size, susceptibility=susceptibility)(place)[:3]
-        exact = uneven.force_in_field(field, np.array(place), size, susceptibility, order=12)
+        exact = ball_in_field.force_in_field(field, np.array(place), size, susceptibility, order=12)
         # degrees above 4, and for maps the third power of the spacing
         assert np.linalg.norm(found - exact) < 5e-3 * np.linalg.norm(exact)
     dipole = ball_in(source, device, size=size, model="dipole", susceptibility=1.0)(place)[:3]
@@ -165,6 +165,8 @@ def test_far_away_nothing_is_added(device):
 def test_faces_of_a_box(half, touched, device):
     """Degrees 2 to 4 are all there is at a face, of a box eight or twenty times as wide as the ball's radius."""
     place = half * np.array(touched) + 1.0001 * R * np.trunc(touched)
-    exact = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), 1e4), place, R, order=16)
+    exact = ball_in_field.force_in_field(
+        lambda x: ball_in_field.box_field(x, np.full(3, half), 1e4), place, R, order=16
+    )
     found = box((half,) * 3, device, contact_model="multipole")(place)[:3]
     np.testing.assert_allclose(found, exact, atol=1e-3 * np.linalg.norm(exact))

@@ -1,4 +1,4 @@
-"""Iron balls in the uneven field of permanent magnets: images, exact multipoles, the energy, and what must be kept."""
+"""Iron balls in the non-uniform field of permanent magnets: images, exact multipoles, energy, conservation laws."""
 
 import itertools
 import sys
@@ -11,12 +11,11 @@ import warp as wp
 from arrangements import relative
 
 import warpmag
-from bench.reference import ball_response as uneven_oracle
 from warpmag.kernels.near_contact import contact_table, near_pairs
 from warpmag.moments.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
-from bench.reference import uneven
+from bench.reference import ball_in_field
 
 R = 0.005
 LINEAR = 1e15
@@ -54,7 +53,7 @@ def test_a_permanent_ball_beside_an_iron_ball(size, dtype, error, device):
         for gap in (0.0, 0.02, 0.1, 0.3, 1.0, 2.0):
             place, moment = np.array([0.0, 0.0, (1.0 + size + gap) * R]), 0.2 * np.array(direction)
             forces, _ = wrench(magnets, [np.zeros(3), place], [np.zeros(3), moment])
-            exact = uneven.image_force(*uneven.dipole_charges(place, moment, 1e-4 * R), R)
+            exact = ball_in_field.image_force(*ball_in_field.dipole_charges(place, moment, 1e-4 * R), R)
             # cut off nowhere; charges 1e-4 R apart; a gap of zero rounds to an overlap, which takes nothing away
             assert np.linalg.norm(forces[0] - exact) < error * np.linalg.norm(exact), (direction, gap)
 
@@ -68,7 +67,7 @@ def test_finite_permeability(susceptibility, along, device):
         distance = (2.0 + gap) * R
         moment = [0.0, 0.0, 0.2] if along else [0.2, 0.0, 0.0]
         forces, _ = wrench(magnets, [np.zeros(3), [0.0, 0.0, distance]], [np.zeros(3), moment])
-        exact = 0.04 * uneven.dipole_pull(distance, R, susceptibility, along)
+        exact = 0.04 * ball_in_field.dipole_pull(distance, R, susceptibility, along)
         assert abs(forces[0, 2] / exact - 1.0) < 2e-3
 
 
@@ -91,7 +90,9 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
 
     def energy(x, m):
         return sum(
-            uneven_oracle.energy(x[i], radii[i], SUSCEPTIBILITY[i], x[2:], radii[2:], m[2:], np.full(3, not cells))
+            ball_in_field.model_energy(
+                x[i], radii[i], SUSCEPTIBILITY[i], x[2:], radii[2:], m[2:], np.full(3, not cells)
+            )
             for i in (0, 1)
         )
 
@@ -137,7 +138,9 @@ def test_a_ball_at_a_cube_of_cells(touched, device):
     added = (found[0][0] - found[1][0])[0]
 
     def exact(order):
-        return uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), 1e6), place, R, order=order)
+        return ball_in_field.force_in_field(
+            lambda x: ball_in_field.box_field(x, np.full(3, half), 1e6), place, R, order=order
+        )
 
     whole = exact(20)
     assert np.linalg.norm(added + exact(1) - whole) < 0.055 * np.linalg.norm(whole)
@@ -159,7 +162,9 @@ def test_a_ball_at_a_cube_magnet(touched, device):
     magnetics, state = warpmag.Magnetics(model, contact_model="multipole", rtol=1e-5), model.state()
     magnetics.apply(state)
     forces = state.body_f.numpy()[:, :3]
-    exact = uneven.force_in_field(lambda x: uneven.box_field(x, np.full(3, half), 1e4), place, R, order=20)
+    exact = ball_in_field.force_in_field(
+        lambda x: ball_in_field.box_field(x, np.full(3, half), 1e4), place, R, order=20
+    )
     assert np.linalg.norm(forces[ball] - exact) < 0.03 * np.linalg.norm(exact)
     assert np.abs(forces.sum(0)).max() < 1e-5 * np.abs(forces).max()
 

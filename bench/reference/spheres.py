@@ -25,8 +25,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 from scipy.special import gammaln
 
-MU0 = 4e-7 * math.pi
-"""Vacuum permeability [T·m/A]."""
+from bench.reference.oracle import MU0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,246 @@
+"""Moments of inducible boxes, cylinders and bodies of boxes, from surface integral equations.
+
+Any susceptibility: M = −∇w in the body, and w/χ is the total potential. On the surface w solves
+
+    (1/χ + 1/2) w − (1/4π) ∫ w dΩ = H0·x,
+
+with dΩ the solid angle of dA. The moment is ∫ w n dA. w is constant on each rectangle of a box or ring of a cylinder
+and takes its value at the center. The error falls with the square of their number along a side, so results of two
+numbers are extrapolated: they are good to 0.3 %, compared with twice as many.
+
+Infinite susceptibility, body bounded by rectangles: the surface is at one potential, (1/4π) ∫ σ/‖x − y‖ dA = H0·x, and
+the moment is ∫ σ x dA. With twice the rectangles along each side results change by less than 0.2 %.
+
+Rectangles and rings shrink towards edges, where w and σ are singular. Boxes and cylinders are solved on an eighth and
+on a half of their surface: w is odd along H0 and even across it.
+"""
+
+import numpy as np
+
+CYLINDER_LENGTHS = (1.0, 5.0, 10.0)
+"""Lengths over diameters that tests compare."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Bodies bounded by rectangles
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def box_moments(sides, susceptibilities, rectangles=(10, 15)) -> np.ndarray:
+    """Moments over V H0 along each axis of a box of given ``sides``, shape [susceptibilities, 3]."""
+    return _extrapolated(lambda count: _box(sides, susceptibilities, count), rectangles)
+
+
+def permeable_moments(faces, volume: float, rectangles: int = 12) -> np.ndarray:
+    """Moments over V H0 of a body of infinite susceptibility that is bounded by rectangles, shape [3, 3].
+
+    Args:
+        faces: Lower and upper corner of each rectangle, equal along the rectangle's normal, shape [n, 2, 3].
+        volume: Volume of the body.
+        rectangles: Number of parts of each face along each of its sides.
+    """
+    parts = [_divided(face, rectangles) for face in np.asarray(faces, float)]
+    lower, upper, axis = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    center, charge = solved_charges(lower, upper, axis, 0.5 * (lower + upper))
+    return charge.T @ center / volume
+
+
+def solved_charges(lower, upper, axis, values) -> tuple[np.ndarray, np.ndarray]:
+    """Centers of rectangles, shape [n, 3], and their charges, shape [n, k], whose potential is ``values`` [n, k].
+
+    The total charge is zero, and a constant may be added to each potential.
+    """
+    center, area = 0.5 * (lower + upper), _areas(lower, upper, axis)
+    matrix = np.ones((len(axis) + 1, len(axis) + 1))
+    matrix[:-1, :-1] = potentials(center, lower, upper, axis)
+    matrix[-1] = np.append(area, 0.0)
+    return center, np.linalg.solve(matrix, np.append(values, np.zeros((1, values.shape[1])), axis=0))[:-1] * area[
+        :, None
+    ]
+
+
+def rectangles_of(edges, axis: int, end: float):
+    """Corners of the rectangles of a grid in the plane x[axis] = ``end``, and their axis, shapes [n, 3], [n, 3], [n].
+
+    Args:
+        edges: Coordinates of the grid's lines along each axis.
+        axis: Axis of the normal.
+        end: Coordinate along it.
+    """
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    i, j = (n.reshape(-1) for n in np.meshgrid(np.arange(len(edges[a]) - 1), np.arange(len(edges[b]) - 1)))
+    corners = np.full((2, len(i), 3), end)
+    corners[:, :, a], corners[:, :, b] = [edges[a][i], edges[a][i + 1]], [edges[b][j], edges[b][j + 1]]
+    return corners[0], corners[1], np.full(len(i), axis)
+
+
+def potentials(points, lower, upper, axes) -> np.ndarray:
+    """(1/4π) ∫ dA/‖x − y‖ over each rectangle at each point, shape [points, rectangles]."""
+    result = np.empty((len(points), len(axes)))
+    for axis in range(3):
+        own, z, corners = _seen_from(points, lower, upper, axes, axis)
+        z = np.abs(z)
+        total = 0.0
+        for sign, x, y in corners:
+            r = np.sqrt(x * x + y * y + z * z)
+            part = _times_log(x, y, r) + _times_log(y, x, r) - z * np.arctan2(x * y, z * r)
+            total = total + sign * part
+        result[:, own] = total / (4.0 * np.pi)
+    return result
+
+
+def _box(sides, susceptibilities, count: int) -> np.ndarray:
+    edges = [0.5 * side * np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, count + 1)) for side in sides]
+    parts = [rectangles_of(edges, axis, 0.5 * sides[axis]) for axis in range(3)]
+    lower, upper, axis = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    center, area = 0.5 * (lower + upper), _areas(lower, upper, axis)
+    moments = np.empty((len(susceptibilities), 3))
+    for along in range(3):
+        angles = np.zeros((len(axis), len(axis)))
+        for mirror in np.ndindex(2, 2, 2):
+            signs = 1.0 - 2.0 * np.array(mirror)
+            angles += signs[along] * _solid_angles(center * signs, lower, upper, axis)
+        for k, w in enumerate(_solved(angles, center[:, along], susceptibilities)):
+            moments[k, along] = 8.0 * (w * area)[axis == along].sum() / np.prod(sides)
+    return moments
+
+
+def _divided(face, count: int):
+    """Corners of rectangles that shrink towards the edges of a face, and the axis of its normal."""
+    axis = int(np.ptp(face, axis=0).argmin())
+    at = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, count + 1))
+    return rectangles_of((face[0] + np.outer(at, face[1] - face[0])).T, axis, face[0][axis])
+
+
+def _areas(lower, upper, axis) -> np.ndarray:
+    return np.prod(np.where(np.arange(3) == axis[:, None], 1.0, upper - lower), axis=1)
+
+
+def _seen_from(points, lower, upper, axes, axis: int):
+    """Indices of the rectangles across ``axis``, their heights over points, and signs and places of their corners."""
+    own, (a, b) = np.flatnonzero(axes == axis), ((axis + 1) % 3, (axis + 2) % 3)
+    corners = []
+    for i, j in np.ndindex(2, 2):
+        x = (upper if i else lower)[None, own, a] - points[:, None, a]
+        y = (upper if j else lower)[None, own, b] - points[:, None, b]
+        corners.append((1.0 if i == j else -1.0, x, y))
+    return own, lower[None, own, axis] - points[:, None, axis], corners
+
+
+def _times_log(a, b, r):
+    """a ln(b + r); for b < 0 the equal a ln((r² − b²)/(r − b)), which avoids cancellation."""
+    tiny = np.finfo(float).tiny
+    far, near = np.maximum(r + np.abs(b), tiny), np.maximum(r * r - b * b, tiny)
+    return a * np.where(b > 0.0, np.log(far), np.log(near) - np.log(far))
+
+
+def _solid_angles(points, lower, upper, axes) -> np.ndarray:
+    """Solid angle of each rectangle from each point, positive from below, shape [points, rectangles]."""
+    result = np.empty((len(points), len(axes)))
+    for axis in range(3):
+        own, z, corners = _seen_from(points, lower, upper, axes, axis)
+        total, safe = np.zeros_like(z), np.where(z == 0.0, 1.0, z)
+        for sign, x, y in corners:
+            total += sign * np.arctan(x * y / (safe * np.sqrt(x * x + y * y + z * z)))
+        result[:, own] = np.where(z == 0.0, 0.0, total)
+    return result
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Cylinders
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def cylinder_moments(length: float, susceptibilities, rings=(20, 30)) -> np.ndarray:
+    """Moments over V H0 along the axis and across it of a cylinder of unit diameter, shape [susceptibilities, 2]."""
+    return _extrapolated(lambda count: _cylinder(length, susceptibilities, count), rings)
+
+
+def _cylinder(length: float, susceptibilities, count: int) -> np.ndarray:
+    """As :func:`cylinder_moments`, with ``count`` rings on half of the side and as many on a cap.
+
+    w is constant around a ring for a field along the axis, and goes as the cosine of the azimuth for one across it.
+    """
+    radius, half = 0.5, 0.5 * length
+    at = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, count + 1))
+    side, cap = np.stack([np.full(count + 1, radius), half * at]), np.stack([radius * at, np.full(count + 1, half)])
+    lower, upper = (np.concatenate([side.T[part], cap.T[part]]) for part in (slice(None, -1), slice(1, None)))
+    middle, width = 0.5 * (lower + upper), np.linalg.norm(upper - lower, axis=1)
+    normals = np.repeat(np.eye(2), count, axis=0)
+    moments = np.empty((len(susceptibilities), 2))
+    for mode, sign, values in ((0, -1.0, middle[:, 1]), (1, 1.0, middle[:, 0])):
+        angles = _ring_angles(middle, lower, upper, normals, mode)
+        angles += sign * _ring_angles(middle * [1, -1], lower, upper, normals, mode)
+        part = slice(count, None) if mode == 0 else slice(None, count)  # caps, or the side
+        around = 2.0 * np.pi if mode == 0 else np.pi
+        for k, w in enumerate(_solved(angles, values, susceptibilities)):
+            moments[k, mode] = 2.0 * around * (w * middle[:, 0] * width)[part].sum() / (0.25 * np.pi * length)
+    return moments
+
+
+def _ring_angles(points, lower, upper, normals, mode: int) -> np.ndarray:
+    """∫ cos(mode φ) dΩ of each ring from each point, at azimuth 0, shape [points, rings]."""
+    result = np.empty((len(points), len(lower)))
+    for k, (a, b) in enumerate(zip(lower, upper, strict=True)):
+        total = 0.0
+        for y, weights in _ring_nodes(points, a, b):
+            values = y[..., 0] * _ring_kernel(points[:, None], y, normals[k], mode)
+            total = total + (np.where(np.isfinite(values), values, 0.0) * weights).sum(axis=1)
+        result[:, k] = total
+    return result
+
+
+def _ring_nodes(points, a, b):
+    """Nodes and weights on a ring from a to b, for each point; they cluster near the point, as logarithms require."""
+    near = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+    s, weights = (0.5 + 0.5 * _NODES) ** 3, 1.5 * (0.5 + 0.5 * _NODES) ** 2 * _WEIGHTS
+    for end in (0.0, 1.0):
+        t = near[:, None] + (end - near[:, None]) * s
+        yield a + t[..., None] * (b - a), np.abs(end - near)[:, None] * weights * np.linalg.norm(b - a)
+
+
+def _ring_kernel(x, y, normal, mode: int) -> np.ndarray:
+    """∫ cos(mode φ) n·(y − x)/‖x − y‖³ dφ over a circle through y, from complete elliptic integrals."""
+    rho, other, height = x[..., 0], y[..., 0], y[..., 1] - x[..., 1]
+    far2 = (rho + other) ** 2 + height**2
+    rest = ((rho - other) ** 2 + height**2) / far2  # 1 − k²
+    k2 = np.maximum(4.0 * rho * other / far2, np.finfo(float).tiny)
+    first, second = _elliptic(rest)
+    d_first, d_second = (second / rest - first) / (2.0 * k2), (second - first) / (2.0 * k2)
+    g, dg = 4.0 * first, 4.0 * d_first
+    if mode == 1:
+        g = 4.0 * ((2.0 / k2 - 1.0) * first - 2.0 / k2 * second)
+        dg = 4.0 * ((2.0 / k2 - 1.0) * d_first - 2.0 / k2 * d_second + 2.0 / k2**2 * (second - first))
+    total = 0.0
+    for n, d_far2, d_k2 in (
+        (normal[0], 2.0 * (rho + other), 4.0 * rho / far2 - 2.0 * k2 * (rho + other) / far2),
+        (normal[1], 2.0 * height, -2.0 * k2 * height / far2),
+    ):
+        total = total - n * (dg * d_k2 - 0.5 * g * d_far2 / far2) / np.sqrt(far2)
+    return total
+
+
+def _elliptic(rest) -> tuple[np.ndarray, np.ndarray]:
+    """K and E of 1 − k² by the arithmetic-geometric mean (Abramowitz and Stegun 17.6)."""
+    a, b = np.ones_like(rest), np.sqrt(rest)
+    total, power = 0.5 * (1.0 - rest), 0.5
+    for _ in range(12):
+        a, b, c = 0.5 * (a + b), np.sqrt(a * b), 0.5 * (a - b)
+        power *= 2.0
+        total = total + power * c * c
+    first = 0.5 * np.pi / a
+    return first, first * (1.0 - total)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _extrapolated(moments, counts) -> np.ndarray:
+    coarse, fine = map(moments, counts)
+    return fine + (fine - coarse) / ((counts[1] / counts[0]) ** 2 - 1.0)
+
+
+def _solved(angles, values, susceptibilities):
+    unit = np.eye(len(values))
+    return [np.linalg.solve((1.0 / chi + 0.5) * unit - angles / (4.0 * np.pi), values) for chi in susceptibilities]
