@@ -116,7 +116,7 @@ def test_ellipsoids_take_the_moment_of_the_closed_form(device, name, susceptibil
 def test_rods_and_sheets_take_the_moment_of_a_surface_integral_equation(device, sides):
     """1 % at the default spacing; the reference is good to 0.3 %."""
     found = magnetized(lattice.box(0.5 * np.array(sides)), math.inf, device)
-    np.testing.assert_allclose(found, surface_integrals.box_moments(sides, [math.inf], (6, 10))[0, [0, 2]], rtol=1e-2)
+    np.testing.assert_allclose(found, surface_integrals.box_moments(sides, [math.inf])[0, [0, 2]], rtol=1e-2)
 
 
 @pytest.mark.parametrize("length", surface_integrals.CYLINDER_LENGTHS)
@@ -143,7 +143,7 @@ def test_moments_of_any_susceptibility_are_those_of_a_surface_integral_equation(
 def test_bodies_of_a_cell_across_take_the_moment_of_their_surface(device, spacing):
     """1 %: 5, 3 and 1 cells of a rod, which alone take down to 11.3 of 17.5 along it."""
     found = magnetized(lattice.box([0.5, 0.5, 2.5]), math.inf, device, spacing)
-    expected = surface_integrals.box_moments((1.0, 1.0, 5.0), [math.inf], (6, 10))[0, [0, 2]]
+    expected = surface_integrals.box_moments((1.0, 1.0, 5.0), [math.inf])[0, [0, 2]]
     np.testing.assert_allclose(found, expected, rtol=1e-2)
 
 

@@ -9,7 +9,6 @@ import pytest
 from arrangements import relative
 
 from bench.reference import oracle
-from warpmag.kernels.material.curves import TANH
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.paper import __main__ as command
@@ -75,12 +74,12 @@ def test_crystal_balls_have_the_oracles_equilibrium(device):
 
 
 @pytest.fixture(scope="module")
-def sweeps(device):
+def sweeps():
     """Counts of the small grid of Fig. 9 by dynamics, and the grid."""
     from bench.paper import fig9  # noqa: PLC0415 - Matplotlib
 
-    grid = fig9.make_grid(True, device)
-    return {case.dynamics: fig9.sweep(case, grid, device) for case in fig9.PANELS.values()}, grid
+    grid = fig9.make_grid(True)
+    return {case.dynamics: fig9.sweep(case, grid) for case in fig9.PANELS.values()}, grid
 
 
 def test_theta_needs_at_most_two_iterations_in_every_cell(sweeps):
@@ -106,12 +105,12 @@ def test_rivals_fail_as_the_field_grows(sweeps):
     assert (counts["llg-damping"].failed[stable & (grid.strengths >= 0.5)[:, None]] == 0.0).all()
 
 
-def test_sweep_counts_what_the_flow_needs(device):
+def test_sweep_counts_what_the_flow_needs():
     """In a weak field the plain flow's error is (1 − ω)ⁿ: the least n that brings it to the tolerance."""
     from bench.paper import fig9  # noqa: PLC0415 - Matplotlib
 
     grid = fig9.Grid(np.array([1.0, 1.15, 1.3, 1.45]), np.array([1e-4]), 8)
-    counts = fig9.sweep(fig9.Case("theta-flow", TANH, 3.0), grid, device)
+    counts = fig9.sweep(fig9.Case("theta-flow", "tanh", 3.0), grid)
     expected = [1] + [int(np.ceil(np.log(1e-3) / np.log(omega - 1.0))) for omega in (1.15, 1.3, 1.45)]
     assert counts.most[0].tolist() == expected and counts.mean[0].tolist() == expected
 

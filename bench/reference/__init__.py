@@ -2,13 +2,14 @@
 
 | module | reference |
 |---|---|
-| ``oracle`` | the physics of warpmag in plain NumPy: pair law, curves, forces, equilibrium by Newton's method, eddy currents |
+| ``oracle`` | the physics of warpmag in NumPy: pair law, curves, forces, Newton solution of induction, eddy currents |
 | ``coils`` | fields of coils by the law of Biot and Savart |
 | ``near_contact`` | the near-contact model as dense matrices |
-| ``ball_in_field`` | a ball in the field of permanent magnets: images, multipoles, and the energy of the near-contact model |
-| ``spheres``, ``clusters`` | permeable balls by multipole expansions; solutions of clusters, stored in ``clusters.json`` |
+| ``ball_in_field`` | a ball in the field of permanent magnets: images, multipoles, energy of the near-contact model |
+| ``spheres``, ``clusters`` | permeable balls by multipole expansions; solutions of clusters in ``clusters.json`` |
 | ``magnet_pairs`` | forces between two boxes or cylinders, closed forms |
-| ``surface_integrals``, ``plate`` | moments of inducible boxes and cylinders, a magnet over a plate, by integral equations |
+| ``surface_integrals`` | moments of inducible boxes, cylinders and bodies of boxes, by integral equations |
+| ``plate`` | force of a magnet on a permeable plate, by an integral equation |
 | ``fall`` | energy and momentum of a fall of soft balls |
 
 Two programs belong to them: ``body_moments`` prints the moments of bodies with their errors, ``near_contact_table``
@@ -17,5 +18,5 @@ computes the table that ``warpmag.kernels.near_contact`` reads.
 Independence: no reference imports Warp, except ``body_moments``, ``fall`` and ``plate.of_model``, which run warpmag to
 compare it. ``near_contact``, ``near_contact_table`` and ``ball_in_field`` share with
 ``warpmag.kernels.near_contact.contact_table`` the constants that define the model; ``near_contact`` also reads the
-table by that module's ``gap_table``, ``b_spline`` and ``hardness``. ``spheres`` is what checks the table itself.
+table by that module's ``gap_table``, ``b_spline`` and ``hardness``. ``spheres`` checks the table itself.
 """
