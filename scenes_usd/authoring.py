@@ -14,7 +14,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.show.looks import author_surface
+from warpmag.show.materials import author_surface
 from warpmag.usd import author_magnet, author_settings
 from warpmag.usd.write.output import Output
 

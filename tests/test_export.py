@@ -19,9 +19,9 @@ from warpmag import cli
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
 from warpmag.scenes_usd import authoring, balls_up
+from warpmag.show.blender import render_final
 from warpmag.show.export import export
-from warpmag.show.field_lines import trace
-from warpmag.show.final import render_final
+from warpmag.show.magnet_overlays import trace
 from warpmag.usd import CacheWriter, open_stage
 
 R = 0.005  # m
@@ -293,7 +293,7 @@ def test_a_run_for_renderers(tmp_path, device, capsys):
     assert f"to render      {tmp_path / 'out.render.usdc'}" in capsys.readouterr().out
     assert Usd.Stage.Open(str(tmp_path / "out.render.usdc")).GetPrimAtPath("/World/Render/Balls")
     assert cli.main(["export", str(tmp_path / "out.usda"), "-o", str(tmp_path / "a.usdz"), "--color", "force"]) == 0
-    assert "colour         force, from 0 to" in capsys.readouterr().out
+    assert "color          force, from 0 to" in capsys.readouterr().out
 
 
 def test_a_finished_picture_that_cannot_be_is_told_in_a_line(run, monkeypatch):

@@ -8,7 +8,7 @@ from pxr import Usd
 from warpmag import cli
 from warpmag.errors import InputError
 from warpmag.scenes_usd import authoring, balls_up
-from warpmag.show.render import render
+from warpmag.show.ray_tracing import render
 
 pytest.importorskip("matplotlib")
 from matplotlib.image import imread

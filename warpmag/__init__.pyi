@@ -22,6 +22,6 @@ from warpmag.moments.fields import wrench as wrench
 from warpmag.moments.induction import InductionResult as InductionResult
 from warpmag.moments.induction import solve_induction as solve_induction
 from warpmag.moments.ranks import sweep as sweep
-from warpmag.show.display import Display as Display
+from warpmag.show.viewers import Display as Display
 
 __version__: str

@@ -297,7 +297,7 @@ def _render(options) -> int:
     path, _ = _find_scene(options.stage)
     _start_warp(path)
     if options.quality == "final":
-        from warpmag.show.final import render_final  # noqa: PLC0415
+        from warpmag.show.blender import render_final  # noqa: PLC0415
 
         if options.frames or options.moments:
             raise InputError("quality: 'final' draws one frame without moments; 'warpmag export --arrows' draws them")
@@ -305,7 +305,7 @@ def _render(options) -> int:
             f"written {render_final(path, options.output, frame=options.frame, size=_two('size', options.size, 'x'))}"
         )
         return 0
-    from warpmag.show.render import render  # noqa: PLC0415
+    from warpmag.show.ray_tracing import render  # noqa: PLC0415
 
     written = render(
         path,
@@ -427,7 +427,7 @@ def _open_display(name: str, simulation):
         return None
     import newton  # noqa: PLC0415
 
-    from warpmag.show.display import Display, no_viewer  # noqa: PLC0415
+    from warpmag.show.viewers import Display, no_viewer  # noqa: PLC0415
 
     try:
         viewer = getattr(newton.viewer, _VIEWERS[name])()

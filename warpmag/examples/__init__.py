@@ -15,7 +15,7 @@ import newton.examples
 import warp as wp
 
 from warpmag.errors import InputError, extra
-from warpmag.show.display import no_viewer
+from warpmag.show.viewers import no_viewer
 from warpmag.terminal import quiet_warp
 
 __all__ = ["create_parser", "get_examples", "init", "main", "run"]

@@ -1,95 +1,87 @@
-"""Draws a stage with Blender's path tracer: ``python -P blender.py STAGE OUTPUT FRAME SAMPLES WIDTH HEIGHT``.
+"""Finished pictures: exports a stage and renders it with Blender's path tracer in a child process."""
 
-A process of its own runs this file, which imports nothing of warpmag: Blender brings a USD that cannot live beside
-another one. It prints one line where it cannot draw.
-"""
-
+import importlib.util
+import os
+import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
-_FEWEST = 3
-_OUTSIDE, _MARGIN = 0.1, 1.65
-"""Part of the bodies that may lie outside on each side, and the width of the picture over that of the others."""
+from warpmag.declarations.checks import check_count
+from warpmag.errors import InputError
+from warpmag.show.export import export
+from warpmag.usd import open_motion, stage_clock, usable_path
+
+BLENDER = "WARPMAG_BLENDER"
+"""Environment variable: a Python with ``bpy``, where this Python has none."""
+_SAMPLES = 24
+"""Paths per pixel; a denoiser removes the remaining noise."""
+_PICTURES = (".png", ".jpg")
 
 
-def draw(stage: str, output: str, frame: int, samples: int, width: int, height: int) -> str:
-    """Draw a frame, denoised; return why that cannot be done, or nothing.
+def render_final(
+    stage: str | os.PathLike,
+    output: str | os.PathLike,
+    *,
+    frame: int | None = None,
+    size: tuple[int, int] = (1280, 720),
+    samples: int = _SAMPLES,
+    **overlays,
+) -> Path:
+    """Draw a frame of a scene, or of the recording of a run, as a finished picture.
 
     Args:
-        stage: USD file for renderers, as ``warpmag export`` writes it.
-        output: Picture to write.
-        frame: Time code.
+        stage: USD file.
+        output: ``.png`` or ``.jpg`` file to write.
+        frame: Frame after the start, at the stage's frame rate; by default the last.
+        size: Width and height [px].
         samples: Paths per pixel.
-        width: Width of the picture [px].
-        height: Height of the picture [px].
+        **overlays: ``color``, ``arrows`` and ``field_lines`` of :func:`warpmag.show.export.export`.
+
+    Returns:
+        The file written.
+
+    Raises:
+        InputError: Blender is missing or fails, or the stage cannot be read or has no such frame.
     """
-    import bpy  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - Blender as a module
-
-    bpy.ops.wm.read_factory_settings()
-    for one in list(bpy.data.objects):
-        bpy.data.objects.remove(one)
-    bpy.ops.wm.usd_import(filepath=stage)
-    _paint_curves(bpy)
-    scene = bpy.context.scene
-    cameras = [one for one in bpy.data.objects if one.type == "CAMERA"]
-    if not cameras:
-        return "the stage has no camera"
-    scene.camera = cameras[0]
-    scene.frame_set(frame)
-    _frame_bodies(bpy, scene.camera, width / height)
-    scene.view_settings.look = "AgX - Medium High Contrast"
-    scene.render.engine = "CYCLES"
-    scene.cycles.samples, scene.cycles.use_denoising = samples, True
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
-    scene.render.use_motion_blur = False
-    scene.render.filepath = output
-    scene.render.image_settings.file_format = "JPEG" if output.endswith((".jpg", ".jpeg")) else "PNG"
-    bpy.ops.render.render(write_still=True)
-    return ""
-
-
-def _paint_curves(bpy) -> None:
-    """Give curves their colour, which the importer leaves as an attribute, since it drops their materials."""
-    for one in bpy.data.objects:
-        color = one.data.attributes.get("displayColor") if one.type == "CURVES" and not one.data.materials else None
-        if color:
-            material = bpy.data.materials.new(one.name)
-            material.use_nodes = True
-            material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = color.data[0].color
-            one.data.materials.append(material)
+    path = usable_path(output)
+    if path.suffix not in _PICTURES:
+        raise InputError(f"{path}: a finished picture must end in {' or '.join(_PICTURES)}")
+    for name, value in zip(("width", "height", "samples"), (*size, samples), strict=True):
+        check_count(name, value)
+    python = _python()
+    clock = stage_clock(open_motion(stage)[0])
+    per_code = clock.frames_per_second / clock.time_codes_per_second
+    last = round((clock.end - clock.start) * per_code)
+    if frame is not None and not 0 <= frame <= last:
+        raise InputError(f"frame: {stage} has frames 0 to {last}, got {frame}")
+    code = round(clock.start * per_code) + (last if frame is None else frame)
+    with tempfile.TemporaryDirectory() as folder:
+        exported, drawn = Path(folder) / "stage.usdc", Path(folder) / f"picture{path.suffix}"
+        export(stage, exported, rate=clock.frames_per_second, **overlays)
+        script = Path(__file__).with_name("blender_script.py")
+        numbers = map(str, (code, samples, *size))
+        done = subprocess.run([python, "-P", script, exported, drawn, *numbers], capture_output=True, text=True)
+        if not drawn.exists():
+            errors = [line for line in done.stderr.splitlines() if line.strip()] or ["it wrote nothing"]
+            raise InputError(f"{stage}: Blender could not draw it ({errors[-1].strip()})")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(drawn.read_bytes())
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return path
 
 
-def _frame_bodies(bpy, camera, aspect: float) -> None:
-    """Zoom to what moves and shift the lens there, as an architect does; the camera stays where it is.
-
-    Of the bodies those count whose middles lie, across and up, between the outermost tenths, and what a usual one takes
-    on each side.
-    """
-    from mathutils import Vector  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - of Blender
-
-    back = camera.matrix_world.inverted()
-    boxes = []
-    for one in bpy.context.evaluated_depsgraph_get().object_instances:
-        if one.is_instance:
-            corners = [back @ (one.matrix_world @ Vector(corner)) for corner in one.object.bound_box]
-            if all(corner.z < 0.0 for corner in corners):
-                seen = [(corner.x / -corner.z, corner.y / -corner.z) for corner in corners]
-                boxes.append([(min(values), max(values)) for values in zip(*seen, strict=True)])
-    if len(boxes) < _FEWEST:
-        return
-    sides = []
-    for own in zip(*boxes, strict=True):
-        few = int(_OUTSIDE * len(own))
-        middles = sorted(0.5 * (low + high) for low, high in own)
-        size = sorted(high - low for low, high in own)[len(own) // 2]
-        sides.append((middles[few] - 0.5 * size, middles[-1 - few] + 0.5 * size))
-    (left, right), (low, high) = sides
-    lens = camera.data
-    width = _MARGIN * max(right - left, aspect * (high - low), 1e-6)
-    zoom = lens.sensor_width / width / lens.lens
-    lens.lens *= zoom
-    lens.dof.aperture_fstop *= zoom  # the aperture itself stays, and with it the depth of field
-    lens.shift_x, lens.shift_y = 0.5 * (left + right) / width, 0.5 * (low + high) / width
-
-
-if __name__ == "__main__":
-    sys.exit(draw(sys.argv[1], sys.argv[2], *map(int, sys.argv[3:7])) or 0)
+def _python() -> str:
+    """Return the path of a Python that has Blender."""
+    if path := os.environ.get(BLENDER):
+        if not os.access(path, os.X_OK):
+            raise InputError(f"{BLENDER}: {path} is no Python that can be started")
+        return path
+    if importlib.util.find_spec("bpy"):
+        return sys.executable
+    raise InputError(
+        "quality: 'final' needs Blender as a Python module, pip install bpy==5.0.1, which exists for Python 3.11 only; "
+        f"{BLENDER} may name another Python that has it"
+    )

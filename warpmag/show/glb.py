@@ -1,4 +1,4 @@
-"""Packs a mesh as binary glTF 2.0, the form in which pages get meshes with physically based materials."""
+"""Packs a mesh with a physically based material as binary glTF 2.0, for web pages."""
 
 import json
 import struct
@@ -23,7 +23,7 @@ def glb(
 
     Args:
         points: Shape [n, 3].
-        normals: Unit normals at them, shape [n, 3].
+        normals: Unit normals at the points, shape [n, 3].
         triangles: Corners, counterclockwise seen from outside, shape [k, 3].
         color: Linear RGB.
         metallic: Metalness, 0 to 1.
@@ -31,10 +31,10 @@ def glb(
     """
     points, normals = np.asarray(points, "<f4"), np.asarray(normals, "<f4")
     arrays = [points, normals, np.asarray(triangles, "<u4").reshape(-1)]
-    starts = np.cumsum([0, *(one.nbytes for one in arrays)]).tolist()
+    starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
     views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": one.nbytes, "target": target}
-        for start, one, target in zip(starts, arrays, (_VERTICES, _VERTICES, _INDICES), strict=False)
+        {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target}
+        for start, array, target in zip(starts, arrays, (_VERTICES, _VERTICES, _INDICES), strict=False)
     ]
     bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
     surface = {"baseColorFactor": [*color, 1.0], "metallicFactor": metallic, "roughnessFactor": roughness}
@@ -56,6 +56,6 @@ def glb(
     }
     text = json.dumps(head, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    data = b"".join(one.tobytes() for one in arrays)
+    data = b"".join(array.tobytes() for array in arrays)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x004E4942) + data
     return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks

@@ -1,4 +1,4 @@
-"""Meshes of what USD has other prims for: importers drop the materials of spheres and cubes, Blender's among them."""
+"""Meshes of the solids of UsdGeom: importers, such as Blender's, drop the materials of spheres and cubes."""
 
 import functools
 from collections.abc import Sequence
@@ -7,18 +7,18 @@ import numpy as np
 from pxr import Gf, Usd, UsdGeom, Vt
 
 _AROUND = 48
-"""Corners of a ball's equator, and of other round shapes."""
+"""Corners of a ball's equator and of other circles."""
 _CREASE = 0.82
-"""Cosine of the angle beyond which an edge is sharp."""
+"""Cosine of the angle between faces beyond which an edge is sharp."""
 
 Shape = tuple[np.ndarray, list[np.ndarray]]
 """Points, shape [n, 3], and the corners of each face, counterclockwise seen from outside."""
 
 
 def shape_of(prim: Usd.Prim) -> Shape | None:
-    """Return the surface of a mesh, of one of UsdGeom's solids, or of a plane, in its own frame; None for others.
+    """Return the surface of a mesh, of a solid of UsdGeom, or of a plane, in its own frame; None for others.
 
-    What is along another axis than z is turned there as UsdGeom says.
+    Solids whose ``axis`` is x or y are rotated from z by cyclic permutation, as UsdGeom does.
     """
     if prim.IsA(UsdGeom.Mesh):
         points, counts, indices = (
@@ -36,7 +36,7 @@ def shape_of(prim: Usd.Prim) -> Shape | None:
 
 
 def author_mesh(mesh: UsdGeom.Mesh, points: np.ndarray, faces: Sequence[np.ndarray]) -> None:
-    """Author flat faces with normals that are smooth but for sharp edges."""
+    """Author a mesh of flat faces whose normals are smooth except at sharp edges."""
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, dtype=np.float32)))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray([len(face) for face in faces]))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.concatenate(faces).astype(np.int32)))
@@ -53,7 +53,7 @@ def author_mesh(mesh: UsdGeom.Mesh, points: np.ndarray, faces: Sequence[np.ndarr
 
 
 def corner_normals(points: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarray:
-    """Return unit normals at the corners of faces: smooth where faces meet at less than 35°.
+    """Return unit normals at the corners of faces, smooth where faces meet at less than 35°.
 
     Args:
         points: Points of the mesh, shape [n, 3].
@@ -71,7 +71,7 @@ def corner_normals(points: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarra
     areas = np.zeros((len(faces), 3))
     np.add.at(areas, owners, np.cross(points[corners] - middle, points[following] - middle))
     flat = areas / np.linalg.norm(areas, axis=1, keepdims=True)
-    # all pairs of corners that share a point: those of a point stand side by side
+    # all pairs of corners that share a point; corners are sorted by point
     order = np.argsort(corners, kind="stable")
     shared = np.bincount(corners, minlength=len(points))
     first = (np.cumsum(shared) - shared)[corners]
@@ -79,18 +79,18 @@ def corner_normals(points: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarra
     mine = np.repeat(np.arange(len(corners)), count)
     turn = np.arange(len(mine)) - np.repeat(np.cumsum(count) - count, count)
     other = owners[order[first[mine] + turn]]
-    near = np.einsum("ni,ni->n", flat[owners[mine]], flat[other]) > _CREASE
+    smooth = np.einsum("ni,ni->n", flat[owners[mine]], flat[other]) > _CREASE
     sums = np.zeros((len(corners), 3))
-    np.add.at(sums, mine[near], areas[other[near]])
+    np.add.at(sums, mine[smooth], areas[other[smooth]])
     return sums / np.linalg.norm(sums, axis=1, keepdims=True)
 
 
 def turned(profile: np.ndarray, around: int = _AROUND) -> Shape:
-    """Return the surface that a line turned about z sweeps.
+    """Return the surface of revolution of a line about z.
 
     Args:
-        profile: Points (r, z) of the line from the lower pole to the upper one, r 0 at both alone, shape [k, 2].
-        around: Corners around.
+        profile: Points (r, z) of the line from the lower pole to the upper one, r = 0 at the poles only, shape [k, 2].
+        around: Number of corners around z.
     """
     angle = 2.0 * np.pi * np.arange(around) / around
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -108,12 +108,12 @@ def turned(profile: np.ndarray, around: int = _AROUND) -> Shape:
 
 
 def _arc(radius: float, middle: float, begin: float, end: float, count: int) -> np.ndarray:
-    """Return points (r, z) of an arc about (0, middle), angles from the equator in parts of π."""
+    """Return points (r, z) of an arc about (0, middle); angles from the equator in units of π."""
     angle = np.pi * np.linspace(begin, end, count)
     return np.stack([radius * np.cos(angle), middle + radius * np.sin(angle)], axis=1)
 
 
-@functools.cache  # thousands of balls are alike
+@functools.cache  # thousands of balls have the same radius
 def _sphere(radius: float) -> Shape:
     profile = _arc(radius, 0.0, -0.5, 0.5, _AROUND // 2 + 1)
     profile[[0, -1], 0] = 0.0
@@ -159,7 +159,7 @@ _MAKERS: dict[type, tuple] = {
     UsdGeom.Cone: (_cone, "radius", "height"),
     UsdGeom.Plane: (_plane, "width", "length"),
 }
-"""What makes a mesh of a kind of prim, and the attributes that it takes."""
+"""Maker of the mesh of each kind of prim, and the attributes that are its arguments."""
 
 BALL = _sphere(1.0)
 """A ball of radius 1."""

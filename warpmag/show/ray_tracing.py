@@ -1,8 +1,12 @@
-"""Draws moments of a stage by tracing rays, on a CPU too: pictures and films without a renderer.
+"""Draws frames of a stage by ray tracing on any device, a CPU too: pictures and films without a renderer.
 
-The stage may be a scene or what a run wrote: bodies stand where its time samples put them. Newton's camera sensor
-traces the model; of the stage it takes shapes, colours and the first camera, or looks at all bodies from above the
-front where there is none.
+The stage may be a scene or the recording of a run: bodies stand at the poses of their time samples. Newton's camera
+sensor traces the model. It takes shapes, colors and the first camera from the stage; without a camera it looks at all
+bodies from above the front.
+
+Newton's camera returns the light that each surface scatters. A metal scatters none: it mirrors its surroundings, here a
+sky that brightens towards the horizon, a ground and a sun, with Schlick's approximation of Fresnel's reflectance
+(Schlick 1994). Reflections of other bodies are left out.
 """
 
 # Warp declares vectors, but not that its functions take them
@@ -21,19 +25,26 @@ from newton.sensors import SensorCamera
 from warpmag.engine.stepping.scene import ImportedScene, import_scene
 from warpmag.errors import InputError
 from warpmag.moments.arrays import resolve_device
-from warpmag.show import pictures
-from warpmag.show.looks import metalness
-from warpmag.show.shading import AMBIENT, SUN, shade, to_linear, to_srgb
+from warpmag.show import films
+from warpmag.show.materials import metalness
 from warpmag.usd import Playback, StageClock, first_camera, open_apart, stage_clock
 
 _SAMPLES = 3
-"""Rays per pixel, along each of its sides."""
+"""Rays per pixel along each of its sides."""
 _VIEW = (0.55, -0.75, 0.4)
-"""Direction from the bodies to a camera that the stage does not have, where z is up."""
+"""Direction from the bodies to the camera of a stage that has none; z is up."""
 _FIELD_OF_VIEW = math.radians(30.0)
 _ARROW_COLOR = (1.0, 0.55, 0.05)
 _LEAST_SHOWN = 0.02
-"""Magnets of less moment over size cubed than this part of the strongest get no arrow."""
+"""Smallest moment over size cubed that gets an arrow, over the largest one."""
+_SUN = (-0.4, 0.55, -0.73)
+"""Direction of the sun's light."""
+_AMBIENT = ((0.5, 0.53, 0.58), (0.22, 0.21, 0.2))
+"""Linear radiance from above and from below."""
+_ZENITH, _HORIZON = np.array((0.42, 0.5, 0.62)), np.array((0.80, 0.83, 0.86))
+_GROUND = np.array((0.16, 0.155, 0.15))
+_HIGHLIGHT, _SHARPNESS = 4.0, 180.0
+"""Radiance of the sun's reflection in a polished surface, and the exponent by which it fades (Phong 1975)."""
 
 
 def render(
@@ -51,10 +62,10 @@ def render(
     Args:
         stage: USD file.
         output: ``.png`` for pictures; ``.mp4`` or ``.gif`` for a film, at the stage's frame rate.
-        frame: Frame after the start, at the stage's frame rate; by default the last, and all of a film.
-        frames: First and last frame of several, of which each picture gets its number into the name.
+        frame: Frame after the start, at the stage's frame rate; by default the last one, for films all.
+        frames: First and last frame of several; the name of each picture contains the number of its frame.
         size: Width and height [px].
-        moments: Whether arrows show the moments that are written on the stage.
+        moments: Whether arrows show the moments of the recording.
         device: Warp device; by default Warp's.
 
     Returns:
@@ -64,7 +75,7 @@ def render(
         InputError: The stage cannot be read, has no such frames or no moments, or the pictures cannot be written.
     """
     output = Path(output)
-    pictures.check_name(output)
+    films.check_name(output)
     if min(size) < 1 or max(size) > 2**14:
         raise InputError(f"size: must be 1 to 16384, got {size[0]} x {size[1]}")
     clock = stage_clock(open_apart(stage)[0])
@@ -74,14 +85,14 @@ def render(
         scene = import_scene(stage, visuals=True, time_code=min(codes[0], clock.end))
         studio = _Studio(scene, stage, size, moments)
         made = (studio.picture(code) for code in codes)
-        return pictures.write(output, made, numbers, clock.frames_per_second)
+        return films.write(output, made, numbers, clock.frames_per_second)
 
 
 def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: tuple[int, int] | None) -> list[int]:
-    """Return the numbers of the frames that are wanted."""
+    """Return the numbers of the frames to draw."""
     last = math.floor((clock.end - clock.start) * clock.frames_per_second / clock.time_codes_per_second + 1e-9)
     if frames is None and frame is None:
-        return list(range(last + 1)) if output.suffix.lower() in pictures.FILMS else [last]
+        return list(range(last + 1)) if output.suffix.lower() in films.FILMS else [last]
     first, final = frames or (frame or 0, frame or 0)
     if not 0 <= first <= final <= last:
         raise InputError(
@@ -91,11 +102,11 @@ def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: 
 
 
 class _Studio:
-    """A stage before a camera.
+    """A stage and a camera.
 
     Args:
-        scene: The stage, imported with what is only seen.
-        path: Its file.
+        scene: The stage, imported with its visual shapes.
+        path: File of the stage.
         size: Width and height of the pictures [px].
         moments: Whether arrows show moments.
     """
@@ -106,21 +117,24 @@ class _Studio:
         self._model = model = scene.builder.finalize()
         self._state = model.state()
         self._camera = camera = SensorCamera(model, load_textures=False)
-        camera.create_default_light(direction=wp.normalize(wp.vec3(*SUN)))
-        camera.set_ambient_light(*AMBIENT)
+        camera.create_default_light(direction=wp.normalize(wp.vec3(*_SUN)))
+        camera.set_ambient_light(*_AMBIENT)
         self._config = SensorCamera.RenderConfig(enable_shadows=True)
         self._bodies = list(scene.bodies)
         self._rows = np.array([scene.bodies[prim] for prim in self._bodies], dtype=int)
-        self._albedo = to_linear(model.shape_color.numpy())
-        like = {
-            one: prim for swarm in scene.swarms for prim, own in swarm.like(model.shape_label).items() for one in own
+        self._albedo = _to_linear(model.shape_color.numpy())
+        sources = {
+            label: prim
+            for swarm in scene.swarms
+            for prim, labels in swarm.like(model.shape_label).items()
+            for label in labels
         }
-        metal = {label: metalness(scene.stage, label) for label in model.shape_label if label not in like}
-        self._metal = np.array([metal[like.get(label, label)] for label in model.shape_label])
+        metal = {label: metalness(scene.stage, label) for label in model.shape_label if label not in sources}
+        self._metal = np.array([metal[sources.get(label, label)] for label in model.shape_label])
         self._view = _view(scene, model, camera, _SAMPLES * self._width, _SAMPLES * self._height)
 
     def picture(self, time_code: float) -> np.ndarray:
-        """Return a moment as 8-bit sRGB, shape [height, width, 3]."""
+        """Return the picture at a time code as 8-bit sRGB, shape [height, width, 3]."""
         model, state = self._model, self._state
         self._motion.seek(time_code)
         poses = model.body_q.numpy()
@@ -132,17 +146,16 @@ class _Studio:
         all_rays, place = self._view
         turn = np.array(wp.quat_to_matrix(wp.transform_get_rotation(place))).reshape(3, 3)
         places = wp.array([place], dtype=wp.transformf, device=model.device)
-        light = np.zeros((self._height, self._width, 3))
+        light, up = np.zeros((self._height, self._width, 3)), np.eye(3)[int(model.up_axis)]
         for k in range(_SAMPLES**2):
             rays = np.ascontiguousarray(all_rays[k // _SAMPLES :: _SAMPLES, k % _SAMPLES :: _SAMPLES])
             scattered, normals, shapes = self._traced(rays, places)
-            light += shade(
-                scattered, normals, rays[..., 0, 1, :] @ turn.T, shapes, self._albedo, self._metal, _up(model)
-            )
-        return to_srgb(light / _SAMPLES**2)
+            directions = rays[..., 0, 1, :] @ turn.T
+            light += _shade(scattered, normals, directions, shapes, self._albedo, self._metal, up)
+        return _to_srgb(light / _SAMPLES**2)
 
     def _traced(self, rays: np.ndarray, places: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return scattered light, normals and shapes (-1: none) of rays, shape [height, width, ...]."""
+        """Return scattered light, normals and shapes (-1 where a ray hits none), shape [height, width, ...]."""
         camera, shape = self._camera, (1, self._width, self._height)
         light: Any = camera.allocate_image_color_hdr(*shape)
         normals: Any = camera.allocate_image_normal(*shape)
@@ -156,19 +169,19 @@ class _Studio:
             shape_index_image=shapes,
             render_config=self._config,
         )
-        found = shapes.numpy()[0].astype(np.int64)
-        return light.numpy()[0], normals.numpy()[0], np.where(found < self._model.shape_count, found, -1)
+        hits = shapes.numpy()[0].astype(np.int64)
+        return light.numpy()[0], normals.numpy()[0], np.where(hits < self._model.shape_count, hits, -1)
 
 
 class _Arrows:
-    """Cones on magnets, which point where their moments do.
+    """Cones on magnets along their moments.
 
     Args:
         scene: The stage; its builder gets the cones.
-        path: Its file.
+        path: File of the stage.
 
     Raises:
-        InputError: The stage holds no moments.
+        InputError: The stage has no moments.
     """
 
     def __init__(self, scene: ImportedScene, path):
@@ -185,7 +198,7 @@ class _Arrows:
         ]
 
     def place(self, model: newton.Model, poses: np.ndarray, motion: Playback) -> None:
-        """Put the cones onto the magnets, into those that are too weak to show."""
+        """Place the cones on the magnets, hidden inside magnets that are too weak to show."""
         moments, frames = motion.moments(self._prims), model.shape_transform.numpy()
         lengths = np.linalg.norm(moments, axis=1)
         strengths = lengths / self._sizes**3
@@ -204,12 +217,8 @@ class _Arrows:
         model.shape_transform.assign(frames)
 
 
-def _up(model: newton.Model) -> np.ndarray:
-    return np.eye(3)[int(model.up_axis)]
-
-
 def _view(scene: ImportedScene, model: newton.Model, camera: SensorCamera, width: int, height: int) -> tuple[Any, Any]:
-    """Return the rays in the frame of the camera, shape [height, width, 1, 2, 3], and the camera's place."""
+    """Return the rays in the frame of the camera, shape [height, width, 1, 2, 3], and the pose of the camera."""
     prim = first_camera(scene.stage)
     if prim:
         rays: Any = SensorCamera.compute_camera_rays_pinhole_usd(width, height, prim, device="cpu")
@@ -220,7 +229,7 @@ def _view(scene: ImportedScene, model: newton.Model, camera: SensorCamera, width
 
 
 def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
-    """Return a place from which a view of ``field`` [rad] holds the shapes of all bodies, or all shapes without any."""
+    """Return a camera pose that sees all shapes of bodies, or all shapes without any, in a view of ``field`` [rad]."""
     shape_body, poses = model.shape_body.numpy(), model.body_q.numpy()
     frames, radii = model.shape_transform.numpy(), model.shape_collision_radius.numpy()
     shown = np.flatnonzero(shape_body >= 0) if (shape_body >= 0).any() else np.arange(model.shape_count)
@@ -237,3 +246,58 @@ def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
     axes = np.stack([right, np.cross(back, right), back], axis=1)  # the camera looks along its -z, y is up
     place = center + extent / math.sin(0.5 * field) * back
     return wp.transform(wp.vec3(*place), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Light and color
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _shade(scattered: np.ndarray, normals: np.ndarray, rays: np.ndarray, shapes, albedo, metal, up) -> np.ndarray:
+    """Return the linear radiance of each ray, shape [..., 3].
+
+    Args:
+        scattered: Radiance of the surfaces as if they were matt, shape [..., 3].
+        normals: Normals at the hit points, shape [..., 3].
+        rays: Unit directions, shape [..., 3].
+        shapes: Shape that each ray hits, -1 where it hits none, shape [...].
+        albedo: Linear color of each shape, shape [s, 3].
+        metal: Metalness of each shape, shape [s].
+        up: Direction from the ground to the sky, shape [3].
+    """
+    radiance = np.where((shapes < 0)[..., None], _surroundings(np.maximum(rays @ up, 0.0)), scattered)
+    polished = np.flatnonzero((shapes.ravel() >= 0) & (metal[shapes.ravel()] > 0.0))
+    if len(polished):
+        ray, normal = (values.reshape(-1, 3)[polished] for values in (rays, normals))
+        shape, flat = shapes.ravel()[polished], radiance.reshape(-1, 3)
+        facing = np.clip(-np.sum(ray * normal, axis=1, keepdims=True), 0.0, 1.0)
+        mirrored = ray + 2.0 * facing * normal
+        seen = _surroundings(mirrored @ up)
+        towards = np.clip(-mirrored @ (np.array(_SUN) / np.linalg.norm(_SUN)), 0.0, 1.0)[:, None]
+        lit = scattered.reshape(-1, 3)[polished] / np.maximum(albedo[shape], 1e-3)  # shadows darken reflections, too
+        seen = seen * np.clip(lit / np.array(_AMBIENT[0]), 0.35, 1.0) + _HIGHLIGHT * towards**_SHARPNESS
+        reflectance = albedo[shape] + (1.0 - albedo[shape]) * (1.0 - facing) ** 5
+        part = metal[shape][:, None]
+        flat[polished] = (1.0 - part) * flat[polished] + part * reflectance * seen
+    return radiance
+
+
+def _surroundings(height: np.ndarray) -> np.ndarray:
+    """Return the radiance of the surroundings, shape [..., 3], in directions whose upward component is ``height``."""
+    height = height[..., None]
+    sky = _HORIZON + (_ZENITH - _HORIZON) * np.sqrt(np.clip(height, 0.0, 1.0))
+    ground = _HORIZON + (_GROUND - _HORIZON) * np.clip(-6.0 * height, 0.0, 1.0)
+    return np.where(height >= 0.0, sky, ground)
+
+
+def _to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Return 8-bit sRGB of linear values (IEC 61966-2-1)."""
+    value = np.clip(linear, 0.0, 1.0)
+    curved = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
+    return np.round(255.0 * curved).astype(np.uint8)
+
+
+def _to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Return linear values of sRGB in 0 to 1 (IEC 61966-2-1)."""
+    value = np.asarray(srgb, dtype=float)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

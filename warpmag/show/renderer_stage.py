@@ -15,10 +15,10 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from warpmag.errors import InputError
-from warpmag.show.instance_arrays import InstanceArrays, author_curves, author_instances, turns_to
-from warpmag.show.looks import author_materialx, author_surface, color_scale
+from warpmag.show.instances import InstanceArrays, author_curves, author_instances, turns_to
+from warpmag.show.materials import author_materialx, author_surface, color_scale
 from warpmag.show.meshes import ARROW, BALL, Shape, author_mesh, shape_of
-from warpmag.show.page import page_of
+from warpmag.show.web_page import page_of
 from warpmag.usd.paths import usable_path
 from warpmag.usd.read.instancers import complete_instances, expand_instancers
 from warpmag.usd.read.motion import read_recording
@@ -74,7 +74,7 @@ class DrawnShape:
         return 2.0 * self.radius if self.radius else float(np.ptp(self.points, axis=0).max())
 
 
-class RenderLayer:
+class RendererStage:
     """Builds the stage; :meth:`save` writes it.
 
     Attributes:

@@ -67,7 +67,7 @@ def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
     """Return a web page of a stage that needs neither a server nor a network.
 
     Args:
-        stage: Meshes, PointInstancers of meshes and BasisCurves, as :class:`RenderLayer` makes them.
+        stage: Meshes, PointInstancers of meshes and BasisCurves, as :class:`RendererStage` makes them.
         codes: Time codes to show, shape [f].
         title: Title of the page.
 

@@ -11,19 +11,19 @@ from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.errors import InputError, extra
 
 _DIRECTION = np.array((0.55, -0.75, 0.45))
-"""From the scene to the camera, along east, north and up."""
+"""Direction from the scene to the camera, along east, north and up."""
 _FIELD_OF_VIEW = math.radians(45.0)
-"""Of the viewers' cameras."""
+"""Field of view of the viewers' cameras."""
 _COLORS = np.array([(0.27, 0.0, 0.33), (0.13, 0.57, 0.55), (0.99, 0.91, 0.14)])
-"""Of no magnetization, half and all of the largest one: viridis by three of its colours."""
+"""Colors of zero, half and the largest magnetization: three colors of viridis."""
 _LENGTH = 1.6
-"""Half the longest arrow over the radius of its shape, from which both ends look out."""
+"""Half the longest arrow over the radius of its shape; both ends stick out of the shape."""
 _PAUSE = 1.0 / 60.0
-"""How long a viewer that is paused, or has nothing new to show, is left alone [s]."""
+"""Time between two looks at the buttons of a viewer that is paused or has nothing new to show [s]."""
 
 
 def no_viewer(name: str, error: Exception) -> InputError:
-    """Return the one line about a viewer that could not open; each fails in its own way without what it needs."""
+    """Return an error of one line about a viewer that could not open."""
     reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
     display = "a display, without one take viser or rerun, and " if name == "gl" else ""
     return InputError(f"viewer: {name} cannot open, it needs {display}{extra('viewers')}: {reason}")
@@ -32,25 +32,25 @@ def no_viewer(name: str, error: Exception) -> InputError:
 class Display:
     """A model with its magnets in one of Newton's viewers.
 
-    On every magnetic shape there is an arrow along its magnetization, as long as that is strong, and coloured from
-    violet by green to yellow, the strongest magnet at the time. The camera of ``gl``, ``viser`` and ``rtx`` is put
-    where it sees all bodies. ::
+    Every magnetic shape has an arrow along its magnetization. Length and color of the arrow, from violet over green to
+    yellow, follow the magnetization over the largest one in the frame. The camera of ``gl``, ``viser`` and ``rtx``
+    starts where it sees all bodies. ::
 
         display = warpmag.Display(newton.viewer.ViewerGL(), model, magnetics)
         display.show(time, state)
 
     Attributes:
         viewer: The viewer.
-        restarted: Whether the reset button was pressed, after :meth:`allow_restart`.
+        restarted: True after the reset button was pressed, if :meth:`allow_restart` was called.
     """
 
     def __init__(self, viewer, model: newton.Model, magnetics: Magnetics):
-        """Give the model to the viewer.
+        """Set the model of the viewer.
 
         Args:
             viewer: A viewer of :mod:`newton.viewer`.
             model: The model.
-            magnetics: Its magnets.
+            magnetics: The magnets of the model.
         """
         self.viewer, self.restarted = viewer, False
         self._set_model(model, magnetics)
@@ -66,17 +66,17 @@ class Display:
         self._worlds = model.shape_world.numpy()[shapes]
 
     def allow_restart(self) -> None:
-        """Let the reset button of the viewer, if it has one, set :attr:`restarted`."""
+        """Connect the reset button of the viewer, if it has one, to :attr:`restarted`."""
         if hasattr(self.viewer, "set_reset_callback"):
             self.viewer.set_reset_callback(lambda: setattr(self, "restarted", True))
 
     def restart(self, model: newton.Model, magnetics: Magnetics) -> None:
-        """Show a model made anew in place of the one before, from where one looks now."""
+        """Replace the model by a new one; the camera stays."""
         self.restarted = False
         self._set_model(model, magnetics)
 
     def frame(self) -> None:
-        """Put the camera where it sees all bodies of the model as they start, those of shown worlds."""
+        """Place the camera where it sees all bodies of the model in their initial state, in all worlds shown."""
         points, radii = self._places(self._model.state())
         if not len(points):
             return
@@ -84,7 +84,7 @@ class Display:
         reach = float((np.linalg.norm(points - center, axis=1) + radii).max())
         up = int(self._model.up_axis)
         east, north = (up + 1) % 3, (up + 2) % 3
-        if up == 1:  # the viewers turn about y the other way
+        if up == 1:  # the yaw of viewers has the other sign about y
             east, north = 0, 2
         direction = _DIRECTION / np.linalg.norm(_DIRECTION)
         position = center.copy()
@@ -93,24 +93,24 @@ class Display:
         self.viewer.set_camera(wp.vec3(*position), math.degrees(-math.asin(direction[2])), yaw)
 
     def _places(self, state: newton.State) -> tuple[np.ndarray, np.ndarray]:
-        """Centres [m], shape [n, 3], and radii [m], shape [n], of shapes on bodies and of magnets."""
+        """Return centers [m], shape [n, 3], and radii [m], shape [n], of shapes on bodies and of magnets."""
         model = self._model
         bodies, radii = model.shape_body.numpy(), model.shape_collision_radius.numpy()
         seen = (bodies >= 0) & (model.shape_flags.numpy() & int(newton.ShapeFlags.VISIBLE) != 0)
         seen[self._magnetics.shapes] = True
-        which = np.flatnonzero(seen & (radii < 1e5))  # a plane's is without end
-        centers = _in_world(state, bodies[which], model.shape_transform.numpy()[which].astype(float))
-        return centers + self._offsets(model.shape_world.numpy()[which]), radii[which].astype(float)
+        shapes = np.flatnonzero(seen & (radii < 1e5))  # without infinite planes
+        centers = _in_world(state, bodies[shapes], model.shape_transform.numpy()[shapes].astype(float))
+        return centers + self._offsets(model.shape_world.numpy()[shapes]), radii[shapes].astype(float)
 
     def _offsets(self, worlds: np.ndarray) -> np.ndarray:
-        """How far the viewer shows each of ``worlds`` from where it is [m], shape [n, 3]."""
+        """Return the offsets at which the viewer shows each of ``worlds`` [m], shape [n, 3]."""
         offsets = getattr(self.viewer, "world_offsets", None)
         if offsets is None or not len(offsets):
             return np.zeros((len(worlds), 3))
         return np.where(worlds[:, None] >= 0, offsets.numpy()[np.maximum(worlds, 0)], 0.0)
 
     def show(self, time: float, state: newton.State) -> None:
-        """Show a state and the magnetizations that :meth:`Magnetics.apply` found last; waits for the device.
+        """Show a state and the magnetizations of the last :meth:`Magnetics.apply`; waits for the device.
 
         Args:
             time: Simulated time [s].
@@ -123,14 +123,14 @@ class Display:
         self.viewer.end_frame()
 
     def follow(self, time: float, state: newton.State) -> bool:
-        """Show a state, as long as the viewer is paused.
+        """Show a state, and again while the viewer is paused.
 
         Args:
             time: Simulated time [s].
             state: The state.
 
         Returns:
-            Whether to go on; the viewer may have been closed, or a restart asked for.
+            False if the viewer was closed or its reset button pressed, else true.
         """
         self.show(time, state)
         while self.viewer.is_running() and not self.viewer.should_step() and not self.restarted:
@@ -139,11 +139,11 @@ class Display:
         return self.viewer.is_running() and not self.restarted
 
     def stay(self) -> None:
-        """Keep what was shown last until the viewer is closed, Ctrl-C is pressed, or a restart is asked for."""
+        """Keep the last frame until the viewer is closed, Ctrl-C is pressed, or the reset button is pressed."""
         try:
             while self.viewer.is_running() and not self.restarted:
                 clock.sleep(_PAUSE)
-                self.viewer.should_step()  # looks at the buttons
+                self.viewer.should_step()  # polls the buttons
         except KeyboardInterrupt:
             pass
         if not self.restarted:
@@ -156,16 +156,16 @@ class Display:
         largest = max(float(strengths.max(initial=0.0)), 1e-30)
         centers = _in_world(state, self._bodies, self._frames) + self._offsets(self._worlds)
         halves = _LENGTH * self._radii[:, None] * magnetizations / largest
-        colors = np.stack([np.interp(strengths / largest, (0.0, 0.5, 1.0), one) for one in _COLORS.T], axis=1)
+        colors = np.stack([np.interp(strengths / largest, (0.0, 0.5, 1.0), channel) for channel in _COLORS.T], axis=1)
         starts, ends, colors = (
-            wp.array(np.ascontiguousarray(one, np.float32), dtype=wp.vec3, device=self._model.device)
-            for one in (centers - halves, centers + halves, colors)
+            wp.array(np.ascontiguousarray(rows, np.float32), dtype=wp.vec3, device=self._model.device)
+            for rows in (centers - halves, centers + halves, colors)
         )
         self.viewer.log_arrows("/magnetization", starts, ends, colors, width=0.1 * float(np.median(self._radii)))
 
 
 def _in_world(state: newton.State, bodies: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Origins of frames of bodies, or of the world where the body is -1, in the world [m], shape [n, 3]."""
+    """Return the origins of frames of bodies (-1: the world) in the world [m], shape [n, 3]."""
     points = frames[:, :3]
     if state.body_q is None or not len(state.body_q):
         return points.copy()

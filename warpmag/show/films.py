@@ -1,4 +1,4 @@
-"""Writes pictures one by one, or as a film."""
+"""Writes pictures as single files, or as a film."""
 
 import contextlib
 import itertools
@@ -14,11 +14,11 @@ from warpmag.errors import InputError, extra
 FILMS = (".mp4", ".gif")
 SUFFIXES = (".png", *FILMS)
 _GIF_RATE = 25.0
-"""Most pictures per second of a GIF [Hz]: players slow down faster ones."""
+"""Largest rate of a GIF [Hz]: players slow down faster ones."""
 
 
 def check_name(output: Path) -> None:
-    """Raise :class:`InputError` unless the name says a format, and what writes it is installed."""
+    """Raise :class:`InputError` unless the suffix names a format whose writer is installed."""
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: a picture is written as .png, a film as .mp4 or .gif")
     if output.suffix.lower() == ".mp4":
@@ -26,12 +26,12 @@ def check_name(output: Path) -> None:
 
 
 def write(output: Path, pictures: Iterable[np.ndarray], frames: list[int], rate: float) -> list[Path]:
-    """Write pictures, one file for a film, and one for each frame otherwise, which its number tells apart.
+    """Write one file for a film, else one for each picture; names of several contain the numbers of the frames.
 
     Args:
         output: ``.png``, ``.mp4`` or ``.gif``.
-        pictures: 8-bit sRGB, each of shape [height, width, 3], made as they are asked for.
-        frames: Their numbers.
+        pictures: 8-bit sRGB, each of shape [height, width, 3]; an iterator may make them one by one.
+        frames: Numbers of the frames.
         rate: Pictures per second [Hz] of a film.
 
     Returns:

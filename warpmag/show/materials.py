@@ -1,4 +1,4 @@
-"""How surfaces look: UsdPreviewSurface, which every renderer knows, and MaterialX beside it."""
+"""Materials of surfaces: UsdPreviewSurface, which every renderer reads, and MaterialX."""
 
 from collections.abc import Sequence
 
@@ -12,10 +12,10 @@ _NAMES = {
     "roughness": "specular_roughness",
     "clearcoat": "coat",
 }
-"""Inputs of UsdPreviewSurface that are authored here, and what MaterialX's standard surface calls them."""
+"""Inputs of UsdPreviewSurface that are authored here, and their names in MaterialX's standard surface."""
 
 _PLASMA = ((13, 8, 135), (92, 1, 166), (156, 23, 158), (204, 71, 120), (237, 121, 83), (253, 180, 47), (240, 249, 33))
-"""Colours of the scale, evenly spaced, 8-bit sRGB (Matplotlib's plasma, by N. Smith and S. van der Walt, CC0)."""
+"""Colors of the scale, evenly spaced, 8-bit sRGB (Matplotlib's plasma, by N. Smith and S. van der Walt, CC0)."""
 
 
 def author_surface(
@@ -40,29 +40,29 @@ def author_surface(
 
 
 def author_materialx(stage: Usd.Stage) -> None:
-    """Say in MaterialX what the materials of a stage say in UsdPreviewSurface by values, for renderers that want it.
+    """Author MaterialX shaders with the values of the UsdPreviewSurface materials of a stage.
 
-    USD's own Python package knows no MaterialX: its validators call these shaders unknown.
+    USD's Python package has no MaterialX: its validators report these shaders as unknown.
     """
     for prim in stage.Traverse():
         if prim.IsA(UsdShade.Material):
             material = UsdShade.Material(prim)
             shader, _, _ = material.ComputeSurfaceSource()
             if shader and shader.GetShaderId() == "UsdPreviewSurface":
-                given = {own: shader.GetInput(name) for name, own in _NAMES.items()}
-                values = {own: one.Get() for own, one in given.items() if one and one.Get() is not None}
+                inputs = {own: shader.GetInput(name) for name, own in _NAMES.items()}
+                values = {own: port.Get() for own, port in inputs.items() if port and port.Get() is not None}
                 _connect(material, "MaterialX", _MATERIALX, values, material.CreateSurfaceOutput("mtlx"), "out")
 
 
 def color_scale(count: int) -> np.ndarray:
-    """Return a scale of colours, linear RGB, shape [count, 3]."""
+    """Return a color scale, linear RGB, shape [count, 3]."""
     anchors = (np.array(_PLASMA) / 255.0) ** 2.2
     at = np.linspace(0.0, len(anchors) - 1.0, count)
     return np.stack([np.interp(at, np.arange(len(anchors)), anchors[:, k]) for k in range(3)], axis=1)
 
 
 def _connect(material, name, identifier, values, output, own_output) -> None:
-    """Author a shader below a material and connect the material's output to its own."""
+    """Author a shader below a material and connect its output ``own_output`` to the material's ``output``."""
     shader = UsdShade.Shader.Define(material.GetPrim().GetStage(), material.GetPath().AppendChild(name))
     shader.CreateIdAttr(identifier)
     for key, value in values.items():
@@ -72,9 +72,9 @@ def _connect(material, name, identifier, values, output, own_output) -> None:
 
 
 def metalness(stage: Usd.Stage, prim: str) -> float:
-    """Return how metallic the surface of a prim is, 0 to 1, after the UsdPreviewSurface that is bound to it."""
-    found = stage.GetPrimAtPath(prim)
-    material, _ = UsdShade.MaterialBindingAPI(found).ComputeBoundMaterial() if found else (None, None)
+    """Return the metalness of a prim's surface, 0 to 1, from the UsdPreviewSurface that is bound to it."""
+    drawn = stage.GetPrimAtPath(prim)
+    material, _ = UsdShade.MaterialBindingAPI(drawn).ComputeBoundMaterial() if drawn else (None, None)
     surface = material.ComputeSurfaceSource()[0] if material else None
     value = surface.GetInput("metallic").Get() if surface and surface.GetInput("metallic") else None
     return min(max(float(value), 0.0), 1.0) if isinstance(value, float) else 0.0

@@ -1,4 +1,4 @@
-"""Writes what moves as PointInstancers and curves, an array for each sample."""
+"""Authors moving bodies as PointInstancers and field lines as curves, one array per time sample."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from warpmag.usd.write.placements import rotate
 
 @dataclass(frozen=True)
 class InstanceArrays:
-    """Instances over time; what has no leading axis f is constant.
+    """Instances over time; arrays without the leading axis f are constant.
 
     Attributes:
-        positions: In the world, shape [f, k, 3].
-        kinds: Prototype of each, shape [f, k] or [k].
-        turns: Quaternions x y z w, shape [f, k, 4]; None where nothing is turned.
-        scales: Shape [f, k] or [k].
-        linear: Velocities [units/s], shape [f, k, 3]; None for what does not blur.
-        angular: Angular velocities [rad/s], shape [f, k, 3]; None with ``turns`` None.
+        positions: Positions in the world, shape [f, k, 3].
+        kinds: Prototype of each instance, shape [f, k] or [k].
+        turns: Quaternions x y z w, shape [f, k, 4]; None for no rotation.
+        scales: Scale factors, shape [f, k] or [k].
+        linear: Velocities [units/s], shape [f, k, 3]; None for no motion blur.
+        angular: Angular velocities [rad/s], shape [f, k, 3]; None if ``turns`` is None.
     """
 
     positions: np.ndarray
@@ -33,10 +33,10 @@ class InstanceArrays:
 def author_instances(
     stage: Usd.Stage, path: Sdf.Path, prototypes: Sequence[Sdf.Path], codes: np.ndarray, placed: InstanceArrays
 ) -> None:
-    """Author instances whose prototypes are there already."""
+    """Author instances of prototypes that exist already."""
     prim = UsdGeom.PointInstancer.Define(stage, path)
     prim.CreatePrototypesRel().SetTargets(list(prototypes))
-    own = np.array([_box_of(stage.GetPrimAtPath(one)) for one in prototypes]).reshape(-1, 2, 3)
+    boxes = np.array([_box_of(stage.GetPrimAtPath(prototype)) for prototype in prototypes]).reshape(-1, 2, 3)
     _set(prim.CreatePositionsAttr(), codes, placed.positions.astype(np.float32), Vt.Vec3fArray)
     kinds = placed.kinds
     if kinds.ndim == 2 and (kinds == kinds[0]).all():
@@ -51,20 +51,20 @@ def author_instances(
         _set(prim.CreateOrientationsAttr(), codes, placed.turns.astype(np.float16), Vt.QuathArray)
     if placed.angular is not None and len(codes) > 1:
         _set(prim.CreateAngularVelocitiesAttr(), codes, np.degrees(placed.angular).astype(np.float32), Vt.Vec3fArray)
-    extents = np.stack([_extent(placed, own, frame) for frame in range(len(codes))]).astype(np.float32)
+    extents = np.stack([_extent(placed, boxes, frame) for frame in range(len(codes))]).astype(np.float32)
     _set(prim.CreateExtentAttr(), codes, extents, Vt.Vec3fArray)
 
 
 def author_curves(
     stage: Usd.Stage, path: Sdf.Path, codes: np.ndarray, points: np.ndarray, width: float
 ) -> UsdGeom.BasisCurves:
-    """Author polylines that bend over time.
+    """Author polylines that deform over time.
 
     Args:
         stage: The stage.
-        path: Where.
+        path: Path of the curves.
         codes: Time codes, shape [f].
-        points: Shape [f, lines, points, 3].
+        points: Points of the lines, shape [f, lines, points, 3].
         width: Diameter.
     """
     curves = UsdGeom.BasisCurves.Define(stage, path)
@@ -80,7 +80,7 @@ def author_curves(
 
 
 def turns_to(vectors: np.ndarray) -> np.ndarray:
-    """Return quaternions x y z w that turn z to each vector, shape [..., 4]."""
+    """Return quaternions x y z w that rotate z to each vector, shape [..., 4]."""
     size = np.linalg.norm(vectors, axis=-1, keepdims=True)
     to = np.where(size > 0.0, vectors / np.maximum(size, 1e-300), (0.0, 0.0, 1.0))
     turns = np.stack([-to[..., 1], to[..., 0], np.zeros(to.shape[:-1]), 1.0 + to[..., 2]], axis=-1)
@@ -89,7 +89,7 @@ def turns_to(vectors: np.ndarray) -> np.ndarray:
 
 
 def _set(attribute: Usd.Attribute, codes: np.ndarray, values: np.ndarray, array) -> None:
-    """Author values, shape [f, k, ...] at the time codes, or one that holds always."""
+    """Author values, shape [f, k, ...], at the time codes, or one default value if they are constant."""
     sampled = values.ndim == (3 if array in (Vt.Vec3fArray, Vt.QuathArray) else 2)
     if not sampled or len(codes) == 1 or (values == values[0]).all():
         attribute.Set(array.FromNumpy(np.ascontiguousarray(values[0] if sampled else values)))
@@ -102,9 +102,9 @@ def _box_of(prim: Usd.Prim) -> np.ndarray:
     return np.array(UsdGeom.Boundable(prim).GetExtentAttr().Get(), dtype=float)
 
 
-def _extent(placed: InstanceArrays, own: np.ndarray, frame: int) -> np.ndarray:
-    """Return the box of all instances at a sample, shape [2, 3]."""
-    boxes = own[placed.kinds if placed.kinds.ndim == 1 else placed.kinds[frame]]
+def _extent(placed: InstanceArrays, prototypes: np.ndarray, frame: int) -> np.ndarray:
+    """Return the bounding box of all instances at a sample, shape [2, 3], from the boxes of the prototypes."""
+    boxes = prototypes[placed.kinds if placed.kinds.ndim == 1 else placed.kinds[frame]]
     middle, half = boxes.mean(axis=1), 0.5 * (boxes[:, 1] - boxes[:, 0])
     if placed.scales is not None:
         scales = placed.scales if placed.scales.ndim == 1 else placed.scales[frame]
