@@ -270,7 +270,7 @@ def test_a_kinematic_body_that_has_not_moved_stays(tmp_path):
 @pytest.mark.parametrize(
     "output,options,message",
     [
-        ("out.usda", {}, "would overwrite what is exported"),
+        ("out.usda", {}, "would overwrite the exported scene"),
         ("new.png", {}, "a stage must end in"),
         ("new.usda", {"color": "taste"}, "color: 'taste'"),
         ("new.usda", {"rate": 0.0}, "rate: must be positive"),

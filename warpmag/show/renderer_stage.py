@@ -1,8 +1,8 @@
-"""A stage for renderers, made of a scene and its motion: instanced meshes, materials, lights, a camera, no physics.
+"""A stage for renderers from a scene and its motion: instanced meshes, materials, lights, a camera, no physics.
 
-Bodies become instances of two PointInstancers, balls and the rest: importers drop the materials of spheres and cubes,
-or make an object of each. Whatever else is drawn becomes meshes where it is. The stage runs at a rate of time codes per
-second that players keep, and its samples stand where the simulation put them.
+Bodies become instances of two PointInstancers, one of balls and one of other bodies: importers drop the materials of
+spheres and cubes, or make an object of each. Other drawn prims become meshes in place. The stage has a rate of time
+codes per second that players keep; its time samples are at the times of the recording.
 """
 
 import os
@@ -30,28 +30,29 @@ from warpmag.usd.write.placements import rigid
 
 _SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".html")
 _OWN = ("physics:", "newton:", "warpmag:", "collection:")
-"""What attributes of simulations begin with."""
+"""Prefixes of attributes that describe a simulation."""
 _SCHEMAS = ("Physics", "Newton", "Warpmag", "CollectionAPI")
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height", "width", "length", "axis", "extent", "doubleSided")
 _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 _DIGITS = 6
-"""Digits to which shapes and places in their bodies agree where bodies share a mesh."""
+"""Digits to which shapes, and their places in their bodies, must agree to share a mesh."""
 _SHADES = 24
-"""Colours that a scale has."""
+"""Number of colors of a scale."""
 
 
 @dataclass
 class DrawnShape:
-    """A shape of a body, or one that stands still.
+    """A shape of a body, or a static one.
 
     Attributes:
-        path: Its prim.
-        row: Its body's row in the recording, -1 for what stands still.
-        frame: Its prim's transform in the frame of the body, or in the world, shape [4, 4], for rows of points.
-        drawn: Whether it is seen.
-        radius: Radius of a ball, 0 for others.
-        points: Its points there, shape [k, 3]; none of a ball.
+        path: Path of the shape's prim.
+        row: Row of the body in the recording, -1 for a static shape.
+        frame: Transform of the prim in the frame of the body, or in the world, shape [4, 4], for rows of points.
+        drawn: True if the shape is visible.
+        radius: Radius of a ball, 0 for other shapes.
+        points: Points in that frame, shape [k, 3]; empty for a ball.
         faces: Corners of each face.
+        looks: Path of the bound material, or "", and display color, or ().
     """
 
     path: str
@@ -65,12 +66,12 @@ class DrawnShape:
 
     @property
     def middle(self) -> np.ndarray:
-        """Middle of its box, shape [3]."""
+        """Middle of the bounding box, shape [3]."""
         return self.frame[3, :3] if self.radius else 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
 
     @property
     def size(self) -> float:
-        """Largest side of its box."""
+        """Largest side of the bounding box."""
         return 2.0 * self.radius if self.radius else float(np.ptp(self.points, axis=0).max())
 
 
@@ -78,19 +79,19 @@ class RendererStage:
     """Builds the stage; :meth:`save` writes it.
 
     Attributes:
-        recording: What moves in it.
-        shapes: What its magnets and bodies are made of, those that are not seen, too.
+        recording: Motion and moments of the stage.
+        shapes: Shapes of the bodies and magnets, invisible ones included.
     """
 
     def __init__(self, path: str | os.PathLike, *, rate: float):
-        """Read a scene, or what a run wrote.
+        """Read a scene, or the recording of a run.
 
         Args:
             path: USD file.
             rate: Time codes and frames per second.
 
         Raises:
-            InputError: It is no stage.
+            InputError: The file is not a stage.
         """
         source, swarms = open_motion(path)
         self._files = {Path(layer.realPath).resolve() for layer in source.GetUsedLayers() if layer.realPath}
@@ -98,7 +99,7 @@ class RendererStage:
         self._codes = self.recording.codes * (rate / source.GetTimeCodesPerSecond())
         self._stage = stage = Usd.Stage.Open(_scene_of(source, swarms, rate))
         stage.SetStartTimeCode(float(np.floor(self._codes[0] + 1e-6)))
-        # the last frame stands at the step nearest to it, which may be a bit later
+        # the last frame is at the step nearest to it, which may be slightly later
         stage.SetEndTimeCode(float(np.ceil(self._codes[-1] - 0.05)))
         self._before = Sdf.Layer.CreateAnonymous(".usda")
         self._before.TransferContent(stage.GetRootLayer())
@@ -106,22 +107,22 @@ class RendererStage:
         for swarm in swarms:
             self.shapes = swarm.with_shapes(self.shapes, self.recording.bodies)
         instanced = self._instanced()
-        self._instances = [one for one in self.shapes if one.drawn and one.row >= 0 and instanced[one.row]]
+        self._instances = [shape for shape in self.shapes if shape.drawn and shape.row >= 0 and instanced[shape.row]]
         self._root = self._make_root()
 
     # ---------------------------------------------------------------------------------------------------------------
 
     def _make_root(self) -> Sdf.Path:
-        """Take out what is drawn in another way, or not at all; return the prim for what is new."""
+        """Remove prims that are drawn as instances, or not at all; return the path of a prim for new ones."""
         stage, layer = self._stage, self._stage.GetRootLayer()
-        moved = {one.path for one in self._instances}
-        keep = [one for one in self.shapes if one.drawn and one.path not in moved]
-        kept = {one.path for one in keep}
+        moved = {shape.path for shape in self._instances}
+        static = [shape for shape in self.shapes if shape.drawn and shape.path not in moved]
+        kept = {shape.path for shape in static}
         with Sdf.ChangeBlock():
-            _strip(layer, [Sdf.Path(one.path) for one in self.shapes if one.path not in kept], kept)
-        for one in keep:
-            if not stage.GetPrimAtPath(one.path).IsA(UsdGeom.Mesh):
-                self._turn_into_mesh(one)
+            _strip(layer, [Sdf.Path(shape.path) for shape in self.shapes if shape.path not in kept], kept)
+        for shape in static:
+            if not stage.GetPrimAtPath(shape.path).IsA(UsdGeom.Mesh):
+                self._turn_into_mesh(shape)
         world = stage.GetDefaultPrim()
         if not world:
             world = UsdGeom.Xform.Define(stage, "/World").GetPrim()
@@ -133,14 +134,14 @@ class RendererStage:
         return root.GetPath()
 
     def _find_shapes(self) -> list[DrawnShape]:
-        """Return all solids and meshes of the stage, as they are at the first sample."""
-        stage, found = self._stage, []
+        """Return all solids and meshes of the stage at the first time sample."""
+        stage, shapes = self._stage, []
         rows = {path: row for row, path in enumerate(self.recording.bodies)}
         transforms = UsdGeom.XformCache(stage.GetStartTimeCode())
         frames: dict[str, np.ndarray] = {}
         for prim in stage.Traverse():
-            given = shape_of(prim)
-            if given is None:
+            surface = shape_of(prim)
+            if surface is None:
                 continue
             body = _body_of(prim)
             frame = np.array(transforms.GetLocalToWorldTransform(prim))
@@ -150,21 +151,21 @@ class RendererStage:
                     own = rigid(np.array(transforms.GetLocalToWorldTransform(body)))
                     frames[name] = np.linalg.inv(own)
                 frame = frame @ frames[name]
-            found.append(_drawn_shape(prim, given, rows[name] if body else -1, frame))
-        return found
+            shapes.append(_drawn_shape(prim, surface, rows[name] if body else -1, frame))
+        return shapes
 
     def _instanced(self) -> np.ndarray:
-        """Return which bodies are drawn as instances, shape [n]: those that move, or might, and magnets."""
+        """Return true for bodies that are drawn as instances, shape [n]: moving bodies, dynamic bodies and magnets."""
         record, magnets = self.recording, set(self.recording.magnets)
-        found = np.ptp(record.positions, axis=0).any(axis=1) | np.ptp(record.turns, axis=0).any(axis=1)
+        instanced = np.ptp(record.positions, axis=0).any(axis=1) | np.ptp(record.turns, axis=0).any(axis=1)
         for row, path in enumerate(record.bodies):
-            prim = self._stage.GetPrimAtPath(path)  # none of a ball in an instancer, which is dynamic
+            prim = self._stage.GetPrimAtPath(path)  # a ball of an instancer has no prim and is dynamic
             flag = prim and prim.GetAttribute("physics:kinematicEnabled")
-            found[row] |= path in magnets or not (flag and flag.Get())
-        return found
+            instanced[row] |= path in magnets or not (flag and flag.Get())
+        return instanced
 
     def _turn_into_mesh(self, shape: DrawnShape) -> None:
-        """Make a mesh of a solid that stands still, in its own frame."""
+        """Replace the prim of a static solid by a mesh in the same frame."""
         spec = self._stage.GetRootLayer().GetPrimAtPath(shape.path)
         points, faces = shape_of(self._stage.GetPrimAtPath(shape.path))
         for name in _SIZES:
@@ -175,47 +176,45 @@ class RendererStage:
     # ---------------------------------------------------------------------------------------------------------------
 
     def shapes_of_magnets(self) -> list[list[DrawnShape]]:
-        """Return the shapes of each magnet of the recording, those that are seen, or all if none is.
+        """Return the visible shapes of each magnet of the recording, or all shapes if none is visible.
 
         Raises:
-            InputError: A magnet has none.
+            InputError: A magnet has no shape.
         """
-        found: dict[str, list[DrawnShape]] = {path: [] for path in self.recording.magnets}
-        for one in self.shapes:
-            path = one.path
-            while path and path not in found:
+        magnets: dict[str, list[DrawnShape]] = {path: [] for path in self.recording.magnets}
+        for shape in self.shapes:
+            path = shape.path
+            while path and path not in magnets:
                 path = path.rpartition("/")[0]
             if path:
-                found[path].append(one)
-        for path, shapes in found.items():
+                magnets[path].append(shape)
+        for path, shapes in magnets.items():
             if not shapes:
                 raise InputError(f"{path}: a magnet without a shape")
-        return [[one for one in shapes if one.drawn] or shapes for shapes in found.values()]
+        return [[shape for shape in shapes if shape.drawn] or shapes for shapes in magnets.values()]
 
     def add_bodies(self, shades: np.ndarray | None = None) -> None:
         """Add the bodies.
 
         Args:
-            shades: Where each body's colour lies on the scale, 0 to 1, shape [f, n]; by default their own materials.
+            shades: Place of each body's color on the scale, 0 to 1, shape [f, n]; None keeps their own materials.
         """
         materials = self._scale() if shades is not None else []
         record = self.recording
-        for name, own in (
-            ("Balls", [one for one in self._instances if one.radius]),
-            ("Bodies", [one for one in self._instances if not one.radius]),
-        ):
-            if not own:
+        for name in ("Balls", "Bodies"):
+            balls = name == "Balls"
+            shapes = [shape for shape in self._instances if bool(shape.radius) == balls]
+            if not shapes:
                 continue
-            rows = np.array([one.row for one in own])
+            rows = np.array([shape.row for shape in shapes])
             path = self._root.AppendChild(name)
             prototypes: dict[tuple, int] = {}
-            kinds = self._kinds(path, own, shades, materials, prototypes)
-            balls = name == "Balls"
+            kinds = self._kinds(path, shapes, shades, materials, prototypes)
             placed = InstanceArrays(
                 record.positions[:, rows],
                 kinds,
                 turns=None if balls else record.turns[:, rows],
-                scales=np.array([one.radius for one in own]) if balls else None,
+                scales=np.array([shape.radius for shape in shapes]) if balls else None,
                 linear=record.linear[:, rows],
                 angular=None if balls else record.angular[:, rows],
             )
@@ -223,11 +222,11 @@ class RendererStage:
             author_instances(self._stage, path, paths, self._codes, placed)
 
     def _kinds(self, path, shapes, shades, materials, prototypes) -> np.ndarray:
-        """Return the prototype of each shape, shape [k], or at each sample, [f, k]; author those that are missing."""
+        """Return the prototype of each shape, shape [k] or per sample [f, k]; author missing prototypes."""
         if shades is None:
             steps = np.zeros((1, len(shapes)), dtype=int)
         else:
-            steps = np.rint(shades[:, [one.row for one in shapes]] * (_SHADES - 1)).astype(int)
+            steps = np.rint(shades[:, [shape.row for shape in shapes]] * (_SHADES - 1)).astype(int)
         kinds = np.empty(steps.shape, dtype=int)
         for column, shape in enumerate(shapes):
             key = _key(shape, with_looks=shades is None)
@@ -240,7 +239,7 @@ class RendererStage:
         return kinds[0] if shades is None else kinds
 
     def _author_prototype(self, path: Sdf.Path, shape: DrawnShape, material: Sequence[UsdShade.Material]) -> None:
-        """Author a mesh to be instanced, in the frame of its body."""
+        """Author the mesh of a prototype in the frame of its body."""
         stage = self._stage
         UsdGeom.Scope.Define(stage, path.GetParentPath())
         source = self._before.GetPrimAtPath(shape.path)
@@ -263,20 +262,20 @@ class RendererStage:
             binding.Bind(UsdShade.Material(stage.GetPrimAtPath(shape.looks[0])))
 
     def _scale(self) -> list[UsdShade.Material]:
-        """Author the materials of the colour scale."""
-        found = []
+        """Author and return the materials of the color scale."""
+        materials = []
         for number, color in enumerate(color_scale(_SHADES)):
             path = self._root.AppendPath(f"Materials/Shade_{number:02d}")
-            found.append(UsdShade.Material.Define(self._stage, path))
-            author_surface(found[-1], color=color, roughness=0.35, coat=0.5)
-        return found
+            materials.append(UsdShade.Material.Define(self._stage, path))
+            author_surface(materials[-1], color=color, roughness=0.35, coat=0.5)
+        return materials
 
     def add_arrows(self, middles: np.ndarray, moments: np.ndarray, lengths: np.ndarray) -> None:
         """Add an arrow for each magnet.
 
         Args:
-            middles: Their middles, shape [f, m, 3].
-            moments: Their moments, shape [f, m, 3].
+            middles: Middles of the magnets, shape [f, m, 3].
+            moments: Moments of the magnets, shape [f, m, 3].
             lengths: Lengths of the arrows, shape [f, m].
         """
         path = self._root.AppendChild("Moments")
@@ -294,7 +293,7 @@ class RendererStage:
         )
 
     def add_lines(self, points: np.ndarray, width: float) -> None:
-        """Add field lines, shape [f, lines, points, 3], as curves of a width."""
+        """Add field lines, shape [f, lines, points, 3], as curves of the given width."""
         curves = author_curves(self._stage, self._root.AppendChild("FieldLines"), self._codes, points, width)
         self._paint(curves.GetPrim(), "FieldLine", (0.02, 0.35, 0.8))
 
@@ -310,13 +309,13 @@ class RendererStage:
         """Write the stage to a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, or as a web page, ``.html``.
 
         Raises:
-            InputError: It cannot be written there.
+            InputError: The file cannot be written.
         """
         path = usable_path(output)
         if path.suffix not in _SUFFIXES:
             raise InputError(f"{path}: a stage must end in {', '.join(_SUFFIXES)}, numbers in .npz or .csv")
         if path.resolve() in self._files:
-            raise InputError(f"{path}: would overwrite what is exported")
+            raise InputError(f"{path}: would overwrite the exported scene")
         if materialx:
             author_materialx(self._stage)
         try:
@@ -341,9 +340,9 @@ class RendererStage:
 
 
 def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.Layer:
-    """Return the stage without what runs wrote over it, as one layer with ``rate`` time codes per second.
+    """Return the scene without the layers of runs, as one layer with ``rate`` time codes per second.
 
-    It has prims for instances, as the run had that wrote their motion; of ``swarms`` only for those like no other.
+    The layer has a prim for each instance, as in the run; for ``swarms`` only for balls that differ from all others.
     """
     root = source.GetRootLayer()
     top = Sdf.Layer.CreateAnonymous(".usda")
@@ -355,9 +354,9 @@ def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.La
     for layer in stage.GetUsedLayers():
         if "warpmag" in layer.customLayerData:
             stage.MuteLayer(layer.identifier)
-    whole = {one.path for one in swarms}
+    whole = {swarm.path for swarm in swarms}
     apart = expand_instancers(stage, stage.GetStartTimeCode(), apart=True)
-    complete_instances([one for one in apart if str(one.instancer) not in whole])
+    complete_instances([instance for instance in apart if str(instance.instancer) not in whole])
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
             for prim in instances:
@@ -368,11 +367,11 @@ def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.La
 def _strip(
     layer: Sdf.Layer, dropped: Sequence[Sdf.Path], drawn: Collection[str] = (), below: Sdf.Path | str = "/"
 ) -> None:
-    """Take prims out of a layer, and all that is about simulations; what is then empty and not ``drawn`` goes, too."""
+    """Remove prims and all physics from a layer, and prims that are then empty and not ``drawn``."""
     paths: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path(below), lambda path: paths.append(path) if path.IsPrimPath() else None)
     gone = set(dropped)
-    for path in paths:  # what is below comes first
+    for path in paths:  # children come before their parents
         spec = layer.GetPrimAtPath(path)
         if spec is None:
             continue
@@ -389,13 +388,13 @@ def _strip(
         if spec.typeName == "Scope" and not spec.nameChildren and not spec.properties:
             del (spec.nameParent or layer.pseudoRoot).nameChildren[spec.name]
             continue
-        for one in list(spec.properties):
-            if one.name.startswith(_OWN):
-                spec.RemoveProperty(one)
+        for attribute in list(spec.properties):
+            if attribute.name.startswith(_OWN):
+                spec.RemoveProperty(attribute)
 
 
 def _body_of(prim: Usd.Prim) -> Usd.Prim | None:
-    """Return the rigid body that a prim is, or belongs to."""
+    """Return the rigid body of a prim: the prim itself or an ancestor."""
     while prim and not prim.IsPseudoRoot():
         if is_body(prim):
             return prim
@@ -403,7 +402,7 @@ def _body_of(prim: Usd.Prim) -> Usd.Prim | None:
     return None
 
 
-def _drawn_shape(prim: Usd.Prim, given: Shape, row: int, frame: np.ndarray) -> DrawnShape:
+def _drawn_shape(prim: Usd.Prim, surface: Shape, row: int, frame: np.ndarray) -> DrawnShape:
     image = UsdGeom.Imageable(prim)
     drawn = image.ComputeVisibility() != UsdGeom.Tokens.invisible and image.ComputePurpose() in _PURPOSES
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
@@ -414,13 +413,13 @@ def _drawn_shape(prim: Usd.Prim, given: Shape, row: int, frame: np.ndarray) -> D
         radius = float(np.sqrt(gram[0, 0])) * prim.GetAttribute("radius").Get()
         if row < 0 or np.abs(frame[3, :3]).max() < 1e-6 * radius:
             return DrawnShape(str(prim.GetPath()), row, frame, drawn, radius, np.zeros((0, 3)), [], looks)
-    points, faces = given
+    points, faces = surface
     points = np.c_[points, np.ones(len(points))] @ frame[:, :3]
     return DrawnShape(str(prim.GetPath()), row, frame, drawn, 0.0, points, faces, looks)
 
 
 def _key(shape: DrawnShape, with_looks: bool) -> tuple:
-    """Return by what shapes are told apart that need another prototype."""
+    """Return the key of a shape's prototype: shapes with equal keys share one."""
     looks = shape.looks if with_looks else ()
     if shape.radius:
         return ("ball", looks)
@@ -433,11 +432,11 @@ def _prototype_path(path: Sdf.Path, number: int) -> Sdf.Path:
 
 
 def _bake(mesh: UsdGeom.Mesh, shape: DrawnShape) -> None:
-    """Put the points and normals of a mesh into the frame of its body, and leave its own transform behind."""
+    """Transform the points and normals of a mesh into the frame of its body, and remove the mesh's own transform."""
     mesh.ClearXformOpOrder()
     spec = mesh.GetPrim().GetPrimStack()[0]
-    for one in [one for one in spec.properties if one.name.startswith("xformOp")]:
-        spec.RemoveProperty(one)
+    for transform in [attribute for attribute in spec.properties if attribute.name.startswith("xformOp")]:
+        spec.RemoveProperty(transform)
     mesh.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(shape.points, dtype=np.float32)))
     for name in ("normals", "primvars:normals"):
         normals = mesh.GetPrim().GetAttribute(name)

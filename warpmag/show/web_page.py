@@ -1,4 +1,4 @@
-"""Makes one web page of a stage for renderers, to orbit and play: viser's recording inside viser's own client."""
+"""Makes a web page, to orbit and play, of a stage for renderers: a recording of viser inside viser's own client."""
 
 import contextlib
 import functools
@@ -18,40 +18,40 @@ from warpmag.show.meshes import corner_normals, shape_of
 from warpmag.usd.write.placements import rigid, turn_of
 
 _REACH = 2.0
-"""Half the size of what is shown, in units of the page; viser's shadows and nearest plane are made for such a one."""
+"""Half the size of the scene in units of the page: viser's shadows and near plane suit this size."""
 _OUTSIDE = 0.02
-"""Part of the places of bodies that the camera need not see, on each side: a few may fly far."""
+"""Part of the positions of bodies that the camera ignores on each side: a few bodies may fly far."""
 _DIRECTION = (0.55, -0.75, 0.45)
-"""From the bodies to the camera, z up, where the stage has none."""
+"""Direction from the bodies to the camera of a stage that has none; z is up."""
 _FIELD_OF_VIEW = math.radians(35.0)
 _LAST = 1.0
-"""How long the last frame stays before the page plays again [s]."""
-_MOST, _CLOSE = 400_000, 20.0
-"""Triangles that copies of a mesh have together from afar, and how many of its radii away that begins."""
-_GREY = (0.5, 0.5, 0.5)
+"""Time of the last frame before the page plays again [s]."""
+_FAR_TRIANGLES, _FAR_RADII = 400_000, 20.0
+"""Triangles of all copies of a mesh beyond a distance, and that distance over the radius of the mesh."""
+_GRAY = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
 class _Look:
-    """Linear RGB, metalness and roughness."""
+    """Material of a mesh: linear RGB, metalness and roughness."""
 
-    color: tuple[float, ...] = _GREY
+    color: tuple[float, ...] = _GRAY
     metallic: float = 0.0
     roughness: float = 0.6
 
 
 @dataclass(frozen=True)
 class _Batch:
-    """Meshes of one shape over time; f is 1 for what stays as it is.
+    """Copies of one mesh over time; f is 1 for constant arrays.
 
     Attributes:
-        points: Its points, shape [n, 3].
+        points: Points of the mesh, shape [n, 3].
         faces: Corners of each face.
-        positions: Shape [f, k, 3].
+        positions: Positions of the copies, shape [f, k, 3].
         turns: Quaternions x y z w, shape [f, k, 4].
-        scales: Shape [f, k].
-        palette: Looks.
-        looks: The look of each in the palette, shape [f, k].
+        scales: Scale factors, shape [f, k].
+        palette: Looks of the copies.
+        looks: Index of each copy's look in the palette, shape [f, k].
     """
 
     points: np.ndarray
@@ -64,15 +64,15 @@ class _Batch:
 
 
 def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
-    """Return a web page of a stage that needs neither a server nor a network.
+    """Return the HTML of a stage's page, which needs neither a server nor a network.
 
     Args:
-        stage: Meshes, PointInstancers of meshes and BasisCurves, as :class:`RendererStage` makes them.
+        stage: Stage of :class:`RendererStage`: meshes, PointInstancers of meshes and BasisCurves.
         codes: Time codes to show, shape [f].
         title: Title of the page.
 
     Raises:
-        InputError: There is no viser, or no port of this machine that it can listen on.
+        InputError: viser is missing, or has no free port to listen on.
     """
     try:
         import viser  # noqa: PLC0415 - an extra
@@ -80,16 +80,16 @@ def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
         raise InputError(f"a web page needs {extra('viewers')}: {error}") from None
     batches = [*_instances(stage, codes), *_meshes(stage, codes)]
     curves = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves)]
-    with contextlib.redirect_stdout(io.StringIO()):  # it talks of its address
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints its address
         try:
             server = viser.ViserServer(host="127.0.0.1", verbose=False)
         except OSError as error:
-            raise InputError(f"a web page needs a port of this machine, which viser listens on ({error})") from None
+            raise InputError(f"a web page needs a free port, on which viser listens ({error})") from None
         try:
             _put_camera(server, stage, batches, scale := _scale(batches))
             recording = server.get_scene_serializer()
-            updates = [_add_batch(server.scene, f"/shape_{n}", one, scale) for n, one in enumerate(batches)]
-            updates += [_add_curves(server.scene, one, codes, scale) for one in curves]
+            updates = [_add_batch(server.scene, f"/shape_{n}", batch, scale) for n, batch in enumerate(batches)]
+            updates += [_add_curves(server.scene, prim, codes, scale) for prim in curves]
             for frame, wait in enumerate((np.diff(codes) / stage.GetTimeCodesPerSecond()).tolist(), start=1):
                 recording.insert_sleep(wait)
                 for update in updates:
@@ -105,7 +105,7 @@ def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
 
 
 def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
-    """Return the instances of PointInstancers, those of one shape together; colours may change."""
+    """Return the instances of PointInstancers, one batch per shape; colors may change over time."""
     for prim in stage.Traverse():
         if not prim.IsA(UsdGeom.PointInstancer):
             continue
@@ -123,35 +123,36 @@ def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
         )
         scales = _values(instancer.GetScalesAttr(), codes, Vt.Vec3fArray, np.ones((count, 3)))[..., 0]
         for number in range(len(groups)):
-            own = group[kinds[0]] == number
+            members = group[kinds[0]] == number
             points, faces = shapes[int(np.argmax(group == number))]
-            yield _Batch(points, faces, positions[:, own], turns[:, own], scales[:, own], palette, kinds[:, own])
+            arrays = (values[:, members] for values in (positions, turns, scales))
+            yield _Batch(points, faces, *arrays, palette, kinds[:, members])
 
 
 def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
-    """Return the meshes that are no prototypes, each at its place."""
+    """Return the meshes that are not prototypes, one batch each."""
     transforms = [UsdGeom.XformCache(code) for code in codes.tolist()]
     todo = iter(Usd.PrimRange(stage.GetPseudoRoot()))
     for prim in todo:
         if prim.IsA(UsdGeom.PointInstancer):
             todo.PruneChildren()
-        given = shape_of(prim) if prim.IsA(UsdGeom.Mesh) else None
-        if given is None or UsdGeom.Imageable(prim).ComputeVisibility(codes[0]) == UsdGeom.Tokens.invisible:
+        surface = shape_of(prim) if prim.IsA(UsdGeom.Mesh) else None
+        if surface is None or UsdGeom.Imageable(prim).ComputeVisibility(codes[0]) == UsdGeom.Tokens.invisible:
             continue
-        frames = np.array([one.GetLocalToWorldTransform(prim) for one in transforms])
+        frames = np.array([cache.GetLocalToWorldTransform(prim) for cache in transforms])
         if (frames == frames[0]).all():
             frames = frames[:1]
-        poses = [rigid(one) for one in frames]
+        poses = [rigid(frame) for frame in frames]
         own = frames[0] @ np.linalg.inv(poses[0])
-        points = np.c_[given[0], np.ones(len(given[0]))] @ own[:, :3]
-        faces = [face[::-1] for face in given[1]] if np.linalg.det(own) < 0.0 else given[1]
-        turns = np.array([turn_of(one) for one in poses])[:, None]
+        points = np.c_[surface[0], np.ones(len(surface[0]))] @ own[:, :3]
+        faces = [face[::-1] for face in surface[1]] if np.linalg.det(own) < 0.0 else surface[1]
+        turns = np.array([turn_of(pose) for pose in poses])[:, None]
         still = np.zeros((1, 1), dtype=int)
         yield _Batch(points, faces, frames[:, None, 3, :3], turns, still + 1.0, [_look_of(prim)], still)
 
 
 def _look_of(prim: Usd.Prim) -> _Look:
-    """Return how a mesh looks, after the values of its UsdPreviewSurface or its own colour."""
+    """Return the look of a mesh from its UsdPreviewSurface, or from its display color."""
     color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
     look = {"color": tuple(color[0])} if color else {}
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
@@ -164,7 +165,7 @@ def _look_of(prim: Usd.Prim) -> _Look:
 
 
 def _values(attribute: Usd.Attribute, codes: np.ndarray, array, default: np.ndarray | None = None) -> np.ndarray:
-    """Return the values of an attribute, shape [f, ...]; [1, ...] where they stay."""
+    """Return the values of an attribute, shape [f, ...], or [1, ...] if they are constant."""
     if not attribute.HasAuthoredValue() and default is not None:
         return default[None]
     many = codes.tolist() if attribute.ValueMightBeTimeVarying() else [codes[0]]
@@ -175,24 +176,24 @@ def _values(attribute: Usd.Attribute, codes: np.ndarray, array, default: np.ndar
 
 
 def _box(batches: list[_Batch]) -> np.ndarray:
-    """Return the corners of the box of what moves, or of all, at the first and the last frame, shape [2, 3]."""
-    moving = [one for one in batches if len(one.positions) > 1] or batches
+    """Return the bounding box of moving batches, or of all, at the first and the last frame, shape [2, 3]."""
+    moving = [batch for batch in batches if len(batch.positions) > 1] or batches
     lows, highs = [], []
-    for one in moving:
-        places = one.positions[[0, -1]].reshape(-1, 3)
-        size = float(one.scales.max()) * np.linalg.norm(one.points, axis=1).max()
+    for batch in moving:
+        places = batch.positions[[0, -1]].reshape(-1, 3)
+        size = float(batch.scales.max()) * np.linalg.norm(batch.points, axis=1).max()
         lows.append(np.quantile(places, _OUTSIDE, axis=0) - size)
         highs.append(np.quantile(places, 1.0 - _OUTSIDE, axis=0) + size)
     return np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
 
 
 def _scale(batches: list[_Batch]) -> float:
-    """Return the size of a unit of the stage on the page."""
+    """Return the length of a unit of the stage in units of the page."""
     return 2.0 * _REACH / max(float(np.linalg.norm(np.ptp(_box(batches), axis=0))), 1e-30) if batches else 1.0
 
 
 def _put_camera(server, stage: Usd.Stage, batches: list[_Batch], scale: float) -> None:
-    """Look at what moves, from where the stage's camera does."""
+    """Aim the camera at the moving bodies, from the direction of the stage's camera."""
     up = 1 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else 2
     middle = scale * _box(batches).mean(axis=0) if batches else np.zeros(3)
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
@@ -209,22 +210,22 @@ def _put_camera(server, stage: Usd.Stage, batches: list[_Batch], scale: float) -
 
 
 def _add_batch(scene, name: str, batch: _Batch, scale: float) -> Callable[[int], None]:
-    """Add meshes as they are at first; return what shows them at a frame."""
+    """Add meshes at the first frame; return a function that shows them at a given frame."""
     points, normals, triangles = _corners(batch.points, batch.faces)
     looks = [batch.palette[look] for look in np.unique(batch.looks).tolist()]
     placed = {"positions": batch.positions, "wxyzs": batch.turns[..., [3, 0, 1, 2]], "scales": batch.scales}
     if len(looks) == 1:
         surface = {"color": looks[0].color, "metallic": looks[0].metallic, "roughness": looks[0].roughness}
         add = functools.partial(scene.add_batched_glb, name, glb(points, normals, triangles, **surface))
-    else:  # which have no metal, but a colour each
-        colors = np.array([one.color for one in batch.palette]) ** (1.0 / 2.2)
+    else:  # a color per copy, without metalness
+        colors = np.array([look.color for look in batch.palette]) ** (1.0 / 2.2)
         placed["colors"] = np.rint(255.0 * colors[batch.looks]).astype(np.uint8)
         add = functools.partial(scene.add_batched_meshes_simple, name, points, triangles)
     placed = {f"batched_{key}": value for key, value in placed.items()}
-    share = _MOST / (len(triangles) * batch.positions.shape[1])
+    share = _FAR_TRIANGLES / (len(triangles) * batch.positions.shape[1])
     radius = scale * float(np.linalg.norm(points, axis=1).max()) * float(batch.scales[0].max())
-    detail = "off" if share >= 1.0 else ((_CLOSE * radius, share),)
-    solid = bool(np.ptp(points, axis=0).min() > 0.0)  # a ground would shade itself
+    detail = "off" if share >= 1.0 else ((_FAR_RADII * radius, share),)
+    solid = bool(np.ptp(points, axis=0).min() > 0.0)  # a flat ground would cast a shadow on itself
     handle = add(**{key: value[0] for key, value in placed.items()}, scale=scale, lod=detail, cast_shadow=solid)
     moving = {key: value for key, value in placed.items() if len(value) > 1}
 
@@ -236,7 +237,7 @@ def _add_batch(scene, name: str, batch: _Batch, scale: float) -> Callable[[int],
 
 
 def _corners(points: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, normals and triangles of a surface, points of sharp edges once for each side."""
+    """Return points, normals and triangles of a surface; points of sharp edges occur once per side."""
     both = np.c_[points[np.concatenate(faces)], corner_normals(points, faces)].astype(np.float32)
     kept, first = np.unique(np.round(both, 6), axis=0, return_inverse=True)
     starts = np.cumsum([0, *(len(face) for face in faces)]).tolist()
@@ -245,7 +246,7 @@ def _corners(points: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, n
 
 
 def _add_curves(scene, prim: Usd.Prim, codes: np.ndarray, scale: float) -> Callable[[int], None]:
-    """Add polylines as they are at first; return what shows them at a frame."""
+    """Add polylines at the first frame; return a function that shows them at a given frame."""
     curves = UsdGeom.BasisCurves(prim)
     points = _values(curves.GetPointsAttr(), codes, Vt.Vec3fArray)
     counts = np.array(curves.GetCurveVertexCountsAttr().Get())
