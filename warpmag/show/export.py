@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpmag.declarations.checks import check_positive, check_token, shown
+from warpmag.declarations.checks import check_positive, check_token, short_repr
 from warpmag.errors import InputError
 from warpmag.show.magnet_overlays import COLORS, MagnetOverlays
 from warpmag.show.renderer_stage import RendererStage
@@ -53,7 +53,7 @@ def export(
     suffix = usable_path(output).suffix
     check_positive("rate", rate)
     if not (isinstance(field_lines, int) and field_lines >= 0):
-        raise InputError(f"field_lines: must be a whole number from 0 on, got {shown(field_lines)}")
+        raise InputError(f"field_lines: must be a whole number from 0 on, got {short_repr(field_lines)}")
     if color is not None:
         check_token("color", color, tuple(COLORS))
     if suffix in (".npz", ".csv"):
