@@ -13,8 +13,8 @@ import warpmag
 from warpmag.engine.pile_xpbd.contacts import body_sizes
 from warpmag.engine.stepping.simulation import Simulation
 from warpmag.errors import InputError
-from warpmag.garbage import collection_paused
 from warpmag.moments.layout import MomentLayout
+from warpmag.terminal import collection_paused
 
 COUNT = 7  # two rows of two and three alone: every way in which copies come about
 

@@ -263,7 +263,9 @@ def test_magnetics_of_a_model_without_bodies(device):
 
 def test_a_solver_that_needs_articulations_names_the_joint(device, tmp_path):
     path = write(tmp_path, physics(), A, B, CHAIN[0])
-    with pytest.raises(warpmag.InputError, match="/World/AB: a joint outside all articulations, which the solver stee"):
+    with pytest.raises(
+        warpmag.InputError, match="/World/AB: the joint is outside all articulations, which the solver stee"
+    ):
         Simulation(path, device=device, solver="steel")
 
 

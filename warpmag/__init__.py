@@ -1,31 +1,29 @@
 """Magnets for the Newton physics engine.
 
-Fields of magnetic moments, induction to magnetic equilibrium and magnetic forces, as NVIDIA Warp kernels for CPU and
-CUDA, after Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation". SI units everywhere.
+Fields of magnetic moments, induction to magnetic equilibrium and magnetic forces, in NVIDIA Warp kernels for CPU and
+CUDA. The method is that of Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation". All units are SI.
 
-Importing this package imports neither Warp nor Newton nor USD; the names below load what they need when first used.
+Importing this package imports neither Warp nor Newton nor USD. A public name loads its module on first use.
 """
 
 import ast
 from importlib import import_module
 from pathlib import Path
 
-from warpmag.garbage import collection_paused
+from warpmag.terminal import collection_paused
 
 __version__ = "0.1.0"
 
 _FOLDER = Path(__file__).resolve().parent
-if not (_FOLDER / "kernels").exists():  # a checkout, where kernels and scenes_usd are beside this folder
+if not (_FOLDER / "kernels").exists():  # in a checkout kernels and scenes_usd are beside this folder
     __path__.append(str(_FOLDER.parent))
 
 
 def _homes() -> dict[str, str]:
-    """Module of each public name, by the stub beside this file, which type checkers read."""
+    """Return the module of each public name, from the stub beside this file."""
     stub = ast.parse((_FOLDER / "__init__.pyi").read_text(encoding="utf-8"))
-    found = [
-        (one.module or "", alias.name) for one in stub.body if isinstance(one, ast.ImportFrom) for alias in one.names
-    ]
-    return {name: module for module, name in found}
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: node.module or "" for node in imports for alias in node.names}
 
 
 _HOMES = _homes()

@@ -1,4 +1,4 @@
-"""The public names of warpmag, each with the module that it is loaded from when first used."""
+"""The public names of warpmag, and the module that each is loaded from on first use."""
 
 from warpmag.declarations.curves import MagnetizationCurve as MagnetizationCurve
 from warpmag.declarations.materials import material as material

@@ -10,16 +10,15 @@ from pathlib import Path
 
 from warpmag import __version__
 from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, PRESETS, check_rtol, check_token
+from warpmag.engine.pile_xpbd.solvers import SOLVERS
 from warpmag.errors import InputError, SimulationError, one_line
-from warpmag.garbage import collection_paused
 from warpmag.moments.ranks import Ranks, alone, by_first, is_first, ranks
 from warpmag.progress import Progress
-from warpmag.terminal import Stopped, open_standard_files, quiet_warp, signals_raised, silence, tell
+from warpmag.terminal import Stopped, collection_paused, open_standard_files, quiet_warp, signals_raised, silence, tell
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes. 0 is success; ``STOPPED`` plus its number stands for a signal that ended the command."""
 
-_SOLVERS = ("xpbd", "steel", "mujoco", "semi-implicit", "featherstone", "kamino", "vbd")
 _VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
 _STAYING = ("viser", "rerun")
 """Viewers that a browser shows only while the command runs."""
@@ -121,7 +120,9 @@ def _add_run(commands) -> None:
     )
     run.add_argument("--resume", action="store_true", help="continue the run at the output, if there is one")
     run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
-    run.add_argument("--solver", choices=_SOLVERS, default=_SOLVERS[0], help="rigid-body solver (default: %(default)s)")
+    run.add_argument(
+        "--solver", choices=SOLVERS, default=next(iter(SOLVERS)), help="rigid-body solver (default: %(default)s)"
+    )
     run.add_argument(
         "--preset",
         choices=PRESETS,

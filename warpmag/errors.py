@@ -1,39 +1,39 @@
 """Errors and warnings of the library."""
 
 _BEGIN, _END = 400, 200
-"""Characters of a message that are kept, where names in it have hundreds of thousands."""
+"""Characters kept at the start and at the end of a long message."""
 
 
 def one_line(text: str) -> str:
-    """Return a text as one line that a terminal shows as it is, its middle left out where it is very long."""
-    if len(text) > _BEGIN + _END:  # first of all: of a gigabyte the characters one by one are more than memory holds
+    """Return ``text`` as one line of printable characters, without its middle if it is very long."""
+    if len(text) > _BEGIN + _END:  # cut first: a gigabyte as single characters does not fit into memory
         text = f"{text[:_BEGIN]} ... {text[-_END:]}"
-    return "".join(one if one.isprintable() else " " for one in text)
+    return "".join(character if character.isprintable() else " " for character in text)
 
 
 def extra(name: str) -> str:
-    """Return the extra of that name with the commands that bring it, for a line about what is missing."""
+    """Return the name of an extra with the commands that install it, for an error message."""
     return f"the extra '{name}' (in a checkout pip install '.[{name}]', or uv run --extra {name} ...)"
 
 
 class InputError(ValueError):
-    """Bad input from the user: one line that names the prim or the argument.
+    """Invalid input. The message is one line that names the prim or the argument.
 
-    The command prints it and exits with code 2; at the array and Newton level it is an ordinary ``ValueError``.
+    The command prints it and exits with code 2. In Python it is a ``ValueError``.
     """
 
     def __init__(self, message: str):
-        """Make one line of ``message``."""
+        """Turn ``message`` into one line."""
         super().__init__(one_line(str(message)))
 
 
 class SimulationError(RuntimeError):
-    """A simulation that cannot go on: one line that names the step and the body."""
+    """A simulation that cannot continue. The message is one line that names the step and the body."""
 
     def __init__(self, message: str):
-        """Make one line of ``message``."""
+        """Turn ``message`` into one line."""
         super().__init__(one_line(str(message)))
 
 
 class ConvergenceWarning(UserWarning):
-    """An induction solve that gave up before its tolerance."""
+    """An induction solve that ended before it reached its tolerance."""

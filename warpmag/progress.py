@@ -6,10 +6,10 @@ from warpmag.terminal import silence
 
 
 class Progress:
-    """A progress bar that appears with the first frame, so that bad input is answered by its one line alone."""
+    """A progress bar on stderr. It appears with the first frame, so that errors in the input stand alone."""
 
     def __init__(self, frames: int):
-        """Expect so many frames."""
+        """Make a bar for a number of frames."""
         self.frames, self.done = frames, None
         self._bar = None
 
@@ -18,7 +18,7 @@ class Progress:
         self.done = frame
         try:
             self._draw(frame)
-        except OSError:  # nobody reads it any more, which is no reason to end the run
+        except OSError:  # a closed stderr does not end the run
             silence(2)
 
     def _draw(self, frame: int) -> None:
@@ -37,7 +37,7 @@ class Progress:
         self._bar.update(frame - self._bar.n)
 
     def close(self) -> None:
-        """Leave the bar as it is."""
+        """Close the bar; it stays visible."""
         try:
             if self._bar is not None:
                 self._bar.close()

@@ -15,8 +15,8 @@ from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import check_registered, mark_shapes
 from warpmag.errors import InputError
-from warpmag.garbage import collection_paused
 from warpmag.moments.arrays import host_array, host_radii, host_scalars, shape_message
+from warpmag.terminal import collection_paused
 
 _SUFFIXES = {"body": "", "joint": "_free_joint", "articulation": "_articulation", "shape": "_shape"}
 """What Newton's ``add_body`` appends to the label of a body for what it makes with it, and we for the shape."""

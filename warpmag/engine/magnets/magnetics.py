@@ -14,11 +14,10 @@ from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.eddy import BodyEddies
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
+from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
-from warpmag.engine.magnets.moments import KINEMATIC, make_system
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.errors import InputError
-from warpmag.garbage import collection_paused
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
@@ -34,6 +33,7 @@ from warpmag.moments import snapshot
 from warpmag.moments.arrays import Kind, Numbers, farthest_place, host_array
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.ranks import ranks
+from warpmag.terminal import collection_paused
 
 
 class Magnetics:

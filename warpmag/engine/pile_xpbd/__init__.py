@@ -1,1 +1,1 @@
-"""Contacts and rigid-body solvers for piles. The only room that uses Newton's internals."""
+"""Contacts, and the solver of piles. The only room that uses internals of Newton and Warp."""

@@ -1,4 +1,4 @@
-"""Newton's broad phase, by lists of neighbouring balls in place of a sort of all shapes, and the contacts of balls."""
+"""Broad phase from neighbor lists of balls, in place of Newton's sort of all shapes, with the contacts of balls."""
 
 import newton
 import numpy as np
@@ -9,21 +9,21 @@ from warpmag.kernels.pairs.neighbors import carried_lists
 from warpmag.kernels.rigid.newton_views import view_contacts
 
 _TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.BOX)
-"""Newton's types of ``PARTNERS``."""
+"""Newton's types of shapes, in the order of ``PARTNERS``."""
 
 
 class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
-    """Finds the pairs of shapes that may touch; takes the place of the sweep of a ``CollisionPipeline``.
+    """Broad phase of a ``CollisionPipeline``: lists the pairs of shapes that may touch.
 
-    Once told where to, by :meth:`write_contacts`, it writes the contacts of balls, and leaves out their pairs. See
-    ``kernels.contacts.broad_phase`` for the method, and for the pairs of balls that it leaves out anyway.
+    After :meth:`write_contacts` it also writes the contacts of balls, and lists no pairs for them. The method, and the
+    pairs of balls that are never listed, are explained in ``kernels.contacts.broad_phase``.
 
     Attributes:
-        leaves_pairs: Whether any pairs may be left for the pipeline to look at.
+        leaves_pairs: True if the narrow phase of the pipeline may have pairs to process.
     """
 
     def __init__(self, model: newton.Model, farthest: float):
-        """Plan the search; the sweep stands in where it would take too long.
+        """Allocate the search; Newton's sweep is used where the search would take longer.
 
         Args:
             model: The model.
@@ -31,12 +31,12 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         """
         colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
         spheres = model.shape_type.numpy() == newton.GeoType.SPHERE
-        sought = model.shape_scale.numpy()[:, 0] + model.shape_margin.numpy() + model.shape_gap.numpy()
+        reach = model.shape_scale.numpy()[:, 0] + model.shape_margin.numpy() + model.shape_gap.numpy()
         self._search = allocate(
             model.shape_world.numpy(),
             model.shape_body.numpy(),
             colliding,
-            np.where(spheres, sought, np.nan),
+            np.where(spheres, reach, np.nan),
             farthest=farthest,
             device=wp.get_device(model.device),
         )
@@ -50,11 +50,11 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         a.scale, a.margin, a.gap = model.shape_scale, model.shape_margin, model.shape_gap
 
     def write_contacts(self, pipeline: newton.CollisionPipeline, contacts: newton.Contacts) -> None:
-        """Have the contacts of balls written, too.
+        """Write the contacts of balls from now on.
 
         Args:
-            pipeline: The pipeline that finds the pairs of all shapes through this.
-            contacts: Where it writes contacts.
+            pipeline: The pipeline that uses this broad phase.
+            contacts: Contacts that the pipeline writes.
         """
         if self._search is None:
             return
@@ -67,22 +67,22 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         a.contacts = view_contacts(self._model, contacts)
 
     def _may_leave_pairs(self, kinds: np.ndarray) -> bool:
-        """Whether there are shapes whose contacts with balls are not found here, or that move and are no balls."""
+        """Return true if a moving shape is no ball, or if there are shapes whose contacts with balls Newton finds."""
         model, kinematic = self._model, newton.BodyFlags.KINEMATIC
         colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
-        flags = np.append(model.body_flags.numpy(), kinematic)  # of what has no body
+        flags = np.append(model.body_flags.numpy(), kinematic)  # the last for shapes without a body
         body: np.ndarray = model.shape_body.numpy()
         moving = (flags[body] & kinematic) == 0
         others = colliding & (kinds != PARTNERS.index("ball"))
         return bool((others & (moving | (kinds == len(PARTNERS)))).any())
 
     def set_motion(self, state: newton.State, dt: float) -> None:
-        """Tell how bodies move, by ``state``, in the next ``dt`` [s] for which pairs are sought."""
+        """Set the velocities, those of ``state``, and the time ``dt`` [s] ahead for which pairs are searched."""
         if self._search is not None:
             self._search.arrays.body_qd, self._search.arrays.dt = state.body_qd, dt
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays that one search hands on to the next one, by name."""
+        """Return the arrays that the next search depends on, by name."""
         if self._search is None:
             return {}
         lists = self._search.arrays.lists
@@ -90,7 +90,7 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
 
     def launch(self, shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count,
                candidate_pair, candidate_pair_count, **options) -> None:  # fmt: skip
-        """Find the pairs; arguments as those of Newton's sweep."""
+        """List the pairs; arguments as those of Newton's sweep."""
         if self._search is None:
             super().launch(
                 *(shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count),

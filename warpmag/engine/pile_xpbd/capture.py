@@ -1,9 +1,8 @@
-"""Makes what Newton launches in a substep fit into conditional nodes of a CUDA graph.
+"""Removes memory allocations from a substep, so that it can be a conditional node of a CUDA graph.
 
-The body of such a node may hold kernels, copies and further conditional nodes, but nothing that allocates memory.
-Newton allocates in two places: solvers make temporary arrays, and collision adds up counts with Warp's ``array_scan``,
-which takes its scratch memory from the device's pool. While a step is launched or captured, temporary arrays therefore
-come from a :class:`Workspace`, and integer scans are done by a kernel that needs no scratch.
+The body of such a node may hold kernels, copies and further conditional nodes, but no allocations. Newton allocates in
+two places. Solvers make temporary arrays: here they come from a :class:`Workspace`. Collision sums counts with Warp's
+``array_scan``, which takes scratch memory from the device's pool: here a kernel without scratch replaces it.
 """
 
 import contextlib
@@ -16,13 +15,13 @@ from warpmag.kernels.shared.scan import launch_scan
 
 
 class Workspace:
-    """Memory for temporary arrays that is reused: an allocator for Warp.
+    """An allocator for Warp that reuses the memory of temporary arrays.
 
-    The first run of a step finds out what is needed; while a graph is captured, nothing new is allocated.
+    The first run of a step allocates the blocks. A later capture uses the same ones and allocates nothing.
     """
 
     def __init__(self, device):
-        """Serve arrays on ``device``, a CUDA device."""
+        """Make an empty workspace on ``device``, a CUDA device."""
         self._device = device
         self._blocks: list[wp.array] = []
         self._free: dict[int, list[int]] = defaultdict(list)
@@ -32,7 +31,7 @@ class Workspace:
         if self._free[size_in_bytes]:
             return self._free[size_in_bytes].pop()
         if self._device.is_capturing:
-            raise RuntimeError(f"{size_in_bytes} bytes are wanted that the step did not need when it ran")
+            raise RuntimeError(f"a captured step needs {size_in_bytes} bytes more than it needed when it ran")
         with wp.ScopedAllocator(self._device, None):
             block = wp.empty(size_in_bytes, dtype=wp.uint8, device=self._device)
         self._blocks.append(block)
@@ -46,7 +45,7 @@ class Workspace:
 
 @contextlib.contextmanager
 def without_allocations(device, workspace: Workspace | None) -> Iterator[None]:
-    """Take the memory of temporary arrays on a CUDA device from ``workspace``, and scan without scratch memory."""
+    """Use ``workspace`` for temporary arrays on a CUDA device, and scan without scratch memory."""
     if not device.is_cuda:
         yield
         return

@@ -1,47 +1,47 @@
-"""Collision and rigid-body solver, set up for piles of small bodies that strong forces press together.
+"""Collision and rigid-body solver for piles of small bodies that strong forces press together.
 
-Newton's defaults are for bodies of a metre. Here contact gaps follow the size of the bodies, contact and pair buffers
-have a fixed size that is checked and grown, and XPBD runs with the settings that let a magnetic pile come to rest.
+Newton's defaults are for bodies of a meter. Here contact gaps follow the sizes of the bodies, and contact and pair
+buffers that overflow are enlarged.
 """
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import check_token
 from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase
+from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
 from warpmag.errors import InputError, extra
 from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, Watched, watch, watch_flags
 from warpmag.kernels.rigid.newton_views import view_bodies, view_contacts
 
 _NEWTON_GAP = 0.1
-"""``ModelBuilder.rigid_gap`` [m] as Newton sets it: the gap of a shape for which nobody chose one."""
+"""Newton's default contact gap [m], ``ModelBuilder.rigid_gap``."""
 _GAP = 0.1
-"""Contact gap of a shape over the thickness of its body: contacts are known a tenth of a radius ahead."""
+"""Contact gap of a shape over the thickness of its body: contacts are found a tenth of a radius ahead."""
 _CONTACTS_PER_BALL, _CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 8, 12, 40
-"""First sizes of the buffers: in the densest packing there are 6 contacts for each ball, in a wall of boxes 12 a box; a
-contact takes some 600 bytes of a GPU."""
+"""First sizes of the buffers. The densest packing has 6 contacts per ball, a wall of boxes 12 per box.
+A contact takes about 600 bytes on a GPU."""
 _GROWTH = 1.5
-_NUMBERED = 2**20
-"""Triangle pairs that Newton can put into an order."""
+"""New size of a buffer over the number of entries that overflowed it."""
+_SORTABLE = 2**20
+"""Largest number of triangle pairs that Newton sorts."""
 _KINDS = ("contact", "pair", "triangle")
 """Kinds of buffers."""
 
 
 @dataclass(frozen=True)
 class BodySizes:
-    """What the motion of a body is measured by.
+    """Lengths that motions and penetrations are compared with.
 
     Attributes:
-        thickness: Half of the smallest dimension of the body's colliding shapes [m], a ball's radius; infinite for
-            bodies that forces do not move. Shape [body_count].
-        reach: Farthest point of a colliding shape from the centre of mass [m], zero for a ball about it. Shape
-            [body_count].
+        thickness: Half of the smallest dimension of the body's colliding shapes [m], the radius of a ball. Infinite
+            for bodies that forces do not move. Shape [body_count].
+        reach: Distance from the center of mass to the farthest point of a colliding shape [m], zero for a ball around
+            its center of mass. Shape [body_count].
         shape_thickness: Half of the smallest dimension of each shape [m], infinite for planes and height fields.
             Shape [shape_count].
     """
@@ -52,7 +52,7 @@ class BodySizes:
 
 
 def body_sizes(model: newton.Model) -> BodySizes:
-    """Measure the colliding shapes of every body."""
+    """Return the sizes of the bodies of ``model``, from their colliding shapes."""
     shape_body: np.ndarray = model.shape_body.numpy()
     colliding = model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES
     types, scales, radii = model.shape_type.numpy(), model.shape_scale.numpy(), model.shape_collision_radius.numpy()
@@ -74,18 +74,18 @@ def body_sizes(model: newton.Model) -> BodySizes:
 def _thicknesses(types: np.ndarray, scales: np.ndarray, sources: list) -> np.ndarray:
     """Return half of the smallest dimension [m] of each shape, shape [n]."""
     kinds = newton.GeoType
-    found = np.full(len(types), np.inf)
-    for of, columns in (
+    thickness = np.full(len(types), np.inf)
+    for sized_kinds, columns in (
         ((kinds.SPHERE, kinds.CAPSULE), 1),
         ((kinds.CYLINDER, kinds.CONE), 2),
         ((kinds.BOX, kinds.ELLIPSOID), 3),
     ):
-        chosen = np.isin(types, of)
-        found[chosen] = scales[chosen, :columns].min(axis=1)
+        selected = np.isin(types, sized_kinds)
+        thickness[selected] = scales[selected, :columns].min(axis=1)
     for shape in np.flatnonzero(np.isin(types, (kinds.MESH, kinds.CONVEX_MESH))).tolist():
         vertices = np.asarray(sources[shape].vertices) * scales[shape]
-        found[shape] = 0.5 * np.ptp(vertices, axis=0).min()
-    return found
+        thickness[shape] = 0.5 * np.ptp(vertices, axis=0).min()
+    return thickness
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ class Buffer:
 
     Attributes:
         kind: ``pair``, ``contact`` or ``triangle``.
-        fill: Entries that were asked for, on the device, shape [1]; more than ``limit`` if some were dropped. Or
-            whether any were, shape [n].
-        limit: Entries that fit; 0 where only whether any were dropped is known.
+        fill: Number of entries that had to be stored, on the device, shape [1]; entries beyond ``limit`` were dropped.
+            Or flags that are true where entries were dropped, shape [n].
+        limit: Number of entries that fit; 0 for flags.
     """
 
     kind: str
@@ -105,75 +105,28 @@ class Buffer:
 
 
 def scale_gaps(model: newton.Model, sizes: BodySizes) -> None:
-    """Give the shapes for which nobody chose a contact gap one that fits their size.
+    """Replace Newton's default contact gap, where a shape has it, by one that fits the size of the shape.
 
-    Static shapes get that of the thickest moving body: gaps of two shapes add up, and a plane has no size.
+    Static shapes get the gap of the thickest moving body: the gaps of two shapes add up, and a plane has no size.
     """
     gaps = model.shape_gap.numpy()
-    unchosen = np.isclose(gaps, _NEWTON_GAP)
+    default = np.isclose(gaps, _NEWTON_GAP)
     moving = np.isfinite(sizes.thickness)
-    if not (unchosen.any() and moving.any()):
+    if not (default.any() and moving.any()):
         return
     body: np.ndarray = model.shape_body.numpy()
     scale = np.full(model.shape_count, sizes.thickness[moving].max())
     on_moving = (body >= 0) & np.isfinite(sizes.thickness[body])
     scale[on_moving] = sizes.thickness[body[on_moving]]
-    model.shape_gap.assign(np.where(unchosen, np.minimum(gaps, _GAP * scale), gaps).astype(np.float32))
-
-
-def _xpbd(model: newton.Model, contact_max: int):
-    # Contacts are relaxed all at once: beyond a third of each correction the many contacts of a ball in a pile
-    # together overshoot, which keeps the pile hot for good (RMS speed on Balls Up after 1.5 s of 0.15 cm/s at 0.35,
-    # 1.6 at 0.5, 10 at Newton's 0.8). Averaging over a body's contacts instead would need far more iterations. Those of
-    # ``kernels.contacts.solve`` have momentum: on Balls Up after 5 s, 30 leave the same speeds as 60, and 0.5 % of
-    # the radius of overlap where these leave 0.2.
-    settings = {"iterations": 60, "rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
-    settings["contact_iterations"] = 30
-    # Joints are relaxed alike along and about their axes, or hinged bodies swing as if they were heavier (a quarter
-    # swing ends at 84.9 instead of 90 degrees with Newton's 0.7 and 0.4). Two at one place are stable up to 0.5 each.
-    settings |= {"joint_linear_relaxation": 0.4, "joint_angular_relaxation": 0.4}
-    return PileXPBD(model, contact_max, **settings)
-
-
-def _steel(model: newton.Model, contact_max: int):
-    return newton.solvers.SolverSteel(
-        model, iterations=60, free_body_constraint_max=3 * contact_max, warn_constraint_overflow=False
-    )
-
-
-def _mujoco(model: newton.Model, contact_max: int):
-    return newton.solvers.SolverMuJoCo(model, use_mujoco_contacts=False, nconmax=contact_max, njmax=3 * contact_max)
-
-
-SOLVERS: dict[str, Callable] = {
-    "xpbd": _xpbd,
-    "steel": _steel,
-    "mujoco": _mujoco,
-    "semi-implicit": lambda model, contact_max: newton.solvers.SolverSemiImplicit(model),
-    "featherstone": lambda model, contact_max: newton.solvers.SolverFeatherstone(model),
-    "kamino": lambda model, contact_max: newton.solvers.SolverKamino(model),
-    "vbd": lambda model, contact_max: newton.solvers.SolverVBD(model, iterations=20),
-}
-"""Rigid-body solvers by name; the first is the default and the one that piles are tested with."""
-UNRESUMABLE = ("mujoco", "kamino", "vbd")
-"""Solvers that start each step from what they keep to themselves of the last one, which no checkpoint has."""
-AHEAD = ("xpbd",)
-"""Solvers whose contacts are to be closed at the end of a step, where they want kinematic bodies to stand already."""
-MAXIMAL = ("xpbd", "semi-implicit", "kamino", "vbd")
-"""Solvers that know each body by its own pose, so that joints need no articulation."""
-
-
-def check_solver(solver: str) -> None:
-    """Raise :class:`InputError` unless a solver of that name is known."""
-    check_token("solver", solver, tuple(SOLVERS))
+    model.shape_gap.assign(np.where(default, np.minimum(gaps, _GAP * scale), gaps).astype(np.float32))
 
 
 class RigidSolver:
-    """One model's collision pipeline and solver.
+    """Collision pipeline and rigid-body solver of one model.
 
     Attributes:
         contacts: Contacts of the last :meth:`collide`.
-        overlaps: Depth of each contact over the thickness of its thinner body, once measured, on the device, shape
+        overlaps: Depth of each contact over the thickness of its thinner body after :meth:`watch`, on the device, shape
             [rigid_contact_max].
         buffers: The buffers that can overflow.
     """
@@ -189,13 +142,13 @@ class RigidSolver:
         """Set up collision and solver.
 
         Args:
-            model: The model; shapes with Newton's default contact gap get one that fits them.
+            model: The model; contact gaps of its shapes are changed by :func:`scale_gaps`.
             sizes: Sizes of its bodies.
-            solver: One of ``SOLVERS``.
-            capacity: First size of the contact and pair buffers over the usual one.
+            solver: Name of the solver, from ``SOLVERS``.
+            capacity: Factor of the first sizes of the contact and pair buffers.
 
         Raises:
-            InputError: There is no such solver, or it cannot be had or cannot run this model.
+            InputError: The solver is unknown, is not installed, or cannot run this model.
         """
         check_solver(solver)
         self._model, self._name = model, solver
@@ -221,21 +174,21 @@ class RigidSolver:
                 rigid_contact_max=self._limits["contact"],
                 shape_pairs_max=self._limits["pair"],
                 max_triangle_pairs=self._limits["triangle"],
-                deterministic=self._reduces_in_order(),
-                include_static_kinematic_pairs=False,  # their contacts move nothing
-                verify_buffers=False,  # would only print; the counters are read instead
+                deterministic=self._sorts_contacts(),
+                include_static_kinematic_pairs=False,  # these contacts move nothing
+                verify_buffers=False,  # would only print; the stepper reads the counters
             )
             self.contacts = self._pipeline.contacts()
             self._broad_phase = NeighborBroadPhase(self._model, self._speculation)
             self._pipeline.broad_phase = self._broad_phase
-            if not self._pipeline.deterministic:  # there Newton puts contacts into an order
+            if not self._pipeline.deterministic:  # else Newton sorts the contacts
                 self._broad_phase.write_contacts(self._pipeline, self.contacts)
             if not self._broad_phase.leaves_pairs:
-                self._pipeline.narrow_phase.launch_custom_write = lambda **arguments: None  # spares its launches
+                self._pipeline.narrow_phase.launch_custom_write = lambda **arguments: None  # saves its launches
             self._contact_view = view_contacts(self._model, self.contacts)
             self.overlaps = wp.zeros(self.contacts.rigid_contact_max, dtype=float, device=self._model.device)
             try:
-                self._solver = SOLVERS[self._name](self._model, self._limits["contact"])
+                self._solver = SOLVERS[self._name].make(self._model, self._limits["contact"])
             except ImportError as error:
                 reason = f"needs {extra('sim')}: {error.__cause__ or error}"
                 raise InputError(f"solver {self._name}: {reason}") from None
@@ -249,41 +202,42 @@ class RigidSolver:
         if narrow.triangle_pairs is not None:
             self.buffers += [
                 Buffer("triangle", narrow.triangle_pairs_count, narrow.triangle_pairs.shape[0]),
-                Buffer("triangle", self.contacts.contact_counters[2:3], 0),  # contacts lost while they were reduced
+                Buffer("triangle", self.contacts.contact_counters[2:3], 0),  # contacts lost during reduction
             ]
         lost = getattr(self._solver, "constraint_overflow", None)
         if lost is not None:
             self.buffers.append(Buffer("contact", lost, 0))
 
-    def _reduces_in_order(self) -> bool:
-        """Whether contacts of meshes are to be the same in every run, as long as Newton can number that many.
+    def _sorts_contacts(self) -> bool:
+        """Return true if Newton has to sort contacts, so that contacts of meshes on a GPU are the same in every run.
 
-        Those of other shapes are, in some order, which the solver makes up for.
+        Contacts of other shapes arrive in any order; the solver sorts them. Newton sorts at most ``_SORTABLE`` pairs of
+        triangles.
         """
         colliding = (self._model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
         kinds = self._model.shape_type.numpy()[colliding]
         meshes = np.isin(kinds, (newton.GeoType.MESH, newton.GeoType.HFIELD)).any()
         on_gpu = wp.get_device(self._model.device).is_cuda
-        return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _NUMBERED)
+        return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _SORTABLE)
 
     def limits(self) -> np.ndarray:
-        """Return the sizes of the buffers, for :meth:`set_limits`; 0 for Newton's estimate."""
+        """Return the sizes of the buffers for :meth:`set_limits`; 0 stands for Newton's estimate."""
         return np.array([self._limits[kind] or 0 for kind in _KINDS])
 
     def set_limits(self, limits: np.ndarray) -> None:
-        """Make the buffers as large as they were at :meth:`limits`; contacts and graphs are void afterwards."""
-        wanted = {kind: int(limit) or None for kind, limit in zip(_KINDS, limits, strict=True)}
-        if wanted != self._limits:
-            self._limits = wanted
+        """Set the buffer sizes that :meth:`limits` returned; contacts and captured graphs are void afterwards."""
+        new_limits = {kind: int(limit) or None for kind, limit in zip(_KINDS, limits, strict=True)}
+        if new_limits != self._limits:
+            self._limits = new_limits
             self._allocate()
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays that one substep hands on to the next one, by name."""
+        """Return the arrays that the next substep depends on, by name."""
         solver = self._solver.carried() if isinstance(self._solver, PileXPBD) else {}
         return self._broad_phase.carried() | solver
 
     def collide(self, state: newton.State, dt: float) -> None:
-        """Find the contacts of ``state`` and those expected within ``dt`` [s]; capturable in a graph."""
+        """Find the contacts at ``state`` and those expected within ``dt`` [s]; capturable in a graph."""
         self._broad_phase.set_motion(state, dt)
         self._pipeline.collide(state, self.contacts, dt=dt)
 
@@ -292,18 +246,19 @@ class RigidSolver:
         self._solver.step(state_in, state_out, control, self.contacts, dt)
 
     def fills(self) -> np.ndarray:
-        """Return the addresses of the fills of all buffers, 0 where these are flags."""
-        return np.array([0 if one.fill.dtype is wp.bool else one.fill.ptr for one in self.buffers], np.uint64)
+        """Return the address of the fill of each buffer, 0 for flags."""
+        fills = [buffer.fill for buffer in self.buffers]
+        return np.array([0 if fill.dtype is wp.bool else fill.ptr for fill in fills], np.uint64)
 
     def watch(self, watched: Watched, state: newton.State, *, substep: int, longest: float, threshold: float) -> None:
-        """Report to the monitor the contacts at ``state`` and how full each buffer is; capturable in a graph.
+        """Write the overlaps at ``state`` and the fills of the buffers to the monitor; capturable in a graph.
 
         Args:
-            watched: What is watched; its ``fills`` are those of this solver.
-            state: The state that was collided.
+            watched: Arrays of the monitor; its ``fills`` are those of this solver.
+            state: State of the last :meth:`collide`.
             substep: Substeps since the monitor counted them, or its ``NEXT``.
             longest: Length of the substeps of the first level [s].
-            threshold: Overlap from which a contact is counted, over the thickness of the thinner body.
+            threshold: Overlap above which a contact is counted, over the thickness of the thinner body.
         """
         bodies = view_bodies(self._model, state)
         watch(watched, self._contact_view, bodies, self.overlaps, substep=substep, longest=longest, threshold=threshold)
@@ -315,10 +270,10 @@ class RigidSolver:
         """Enlarge the buffers that overflowed; contacts and graphs are void afterwards.
 
         Args:
-            fills: How many entries each of ``buffers`` was asked for.
+            fills: Entries that each of ``buffers`` had to store.
 
         Returns:
-            Whether any had to grow.
+            True if a buffer grew.
         """
         grown = {}
         for buffer, fill in zip(self.buffers, fills, strict=True):

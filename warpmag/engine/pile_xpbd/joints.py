@@ -1,17 +1,18 @@
-"""XPBD for bodies with joints: velocities that joints, drives and contacts agree with, then one motion.
+"""XPBD for bodies with joints: iterations find velocities that satisfy joints, drives and contacts.
 
-Newton's kernels say how far joints and contacts are off at the poses that velocities lead to;
-``kernels.contacts.joints`` has what they lack.
+Newton's kernels evaluate the errors of joints and contacts at the poses that the velocities lead to.
+``kernels.contacts.joints`` corrects their lever arms and their drives. The bodies move once, after the iterations.
 """
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
-from newton._src.solvers.xpbd import kernels as newtons
+from newton._src.solvers.xpbd import kernels as newton_kernels
 
 from warpmag.kernels.contacts import joints as kernels
 from warpmag.kernels.contacts.free_motion import launch_accelerate, launch_move
@@ -20,15 +21,15 @@ from warpmag.kernels.rigid.newton_views import BodyView, view_contacts
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 _ONE_AXIS = (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC)
 _PINS = (newton.JointType.REVOLUTE, newton.JointType.BALL, newton.JointType.FIXED, newton.JointType.D6)
-"""Joints whose ends are at one place, unless they slide."""
-_ROWS_OF_FREE = (newton.JointType.FREE, newton.JointType.DISTANCE, newton.JointType.BALL, newton.JointType.FIXED)
-"""Joints whose degrees of freedom have no drive here."""
-_AT_ONCE = 6
-"""Iterations between two looks at whether there are more: a graph that holds all of them takes seconds to make."""
+"""Types of joints that keep two points together, unless the joint slides."""
+_UNDRIVEN = (newton.JointType.FREE, newton.JointType.DISTANCE, newton.JointType.BALL, newton.JointType.FIXED)
+"""Types of joints without drives."""
+_UNROLLED = 6
+"""Iterations in the body of the loop in a graph. A graph with all iterations takes seconds to make."""
 
 
 class JointSolve:
-    """The substeps of one model with joints."""
+    """Substeps of a model with joints."""
 
     def __init__(
         self,
@@ -39,14 +40,14 @@ class JointSolve:
         contact_relaxation: float,
         joint_relaxation: float,
     ):
-        """Allocate.
+        """Allocate all buffers.
 
         Args:
             model: The model.
-            contact_max: Most contacts.
+            contact_max: Capacity of the contact buffer.
             iterations: Iterations over joints and contacts.
-            contact_relaxation: Part of each correction of a contact that is done.
-            joint_relaxation: The same of a joint.
+            contact_relaxation: Factor of each contact's correction.
+            joint_relaxation: Factor of each joint's correction.
         """
         self._model, self._iterations = model, iterations
         self._relaxations = contact_relaxation, joint_relaxation
@@ -62,21 +63,21 @@ class JointSolve:
         types, counts = model.joint_type.numpy(), _axis_counts(model)
         self._pins = wp.array(are_pins(model), dtype=wp.bool, device=device)
         self._one_axis = wp.array(np.isin(types, _ONE_AXIS), dtype=wp.bool, device=device)
-        slides = (counts[:, 0] > 0) & ~np.isin(types, _ROWS_OF_FREE)
+        slides = (counts[:, 0] > 0) & ~np.isin(types, _UNDRIVEN)
         self._slides = wp.array(slides, dtype=wp.bool, device=device)
-        rows, others = _rows(model)
-        self._left = wp.zeros(1, dtype=wp.int32, device=device)
-        self._given = wp.zeros(len(rows), dtype=float, device=device)
+        rows, newton_dofs = _drive_rows(model)
+        self._loops_left = wp.zeros(1, dtype=wp.int32, device=device)
+        self._drive_impulses = wp.zeros(len(rows), dtype=float, device=device)
         self._rows = [wp.array(column, dtype=wp.int32, device=device) for column in rows.T[:3]]
         self._rows.append(wp.array(rows[:, 3] == 1, dtype=wp.bool, device=device))
-        # gains of the drives that Newton's kernel still has to know
+        # gains of the drives that Newton's kernel evaluates
         self._gains = [
-            wp.array(np.where(others, gain.numpy(), 0.0), dtype=float, device=device)
+            wp.array(np.where(newton_dofs, gain.numpy(), 0.0), dtype=float, device=device)
             for gain in (model.joint_target_ke, model.joint_target_kd)
         ]
 
     def _view(self) -> kernels.JointView:
-        """Return the model's joints as they are now."""
+        """Return the model's present joint arrays."""
         model, view = self._model, kernels.JointView()
         view.parent, view.child, view.enabled = model.joint_parent, model.joint_child, model.joint_enabled
         view.parent_frame, view.child_frame, view.axis = model.joint_X_p, model.joint_X_c, model.joint_axis
@@ -91,10 +92,10 @@ class JointSolve:
         """Advance by ``dt`` [s].
 
         Args:
-            before: The bodies as they are, with their whole masses.
-            after: Out, the bodies afterwards.
-            contact_masses: Called once ``after`` has the velocities without contacts and joints; returns the inverse
-                masses and inertias that a contact acts on.
+            before: The bodies at the start, with their whole masses.
+            after: Out, the bodies at the end.
+            contact_masses: Called when ``after`` has the velocities without contacts and joints; returns the inverse
+                masses and inertias that contacts act on.
             control: Forces and targets of the joints.
             contacts: Newton's contacts.
             dt: Length of the substep [s].
@@ -109,87 +110,116 @@ class JointSolve:
         kernels.launch_limit_push_out(view_contacts(model, contacts), after, _KINEMATIC, dt, self._margin)
         wp.copy(self._q, after.q)
         wp.copy(self._qd, after.qd)
-        self._given.zero_()
-        at_once = math.gcd(self._iterations, _AT_ONCE)
-        self._left.fill_(self._iterations // at_once)
+        self._drive_impulses.zero_()
+        unrolled = math.gcd(self._iterations, _UNROLLED)
+        self._loops_left.fill_(self._iterations // unrolled)
+
+        solve_contacts = self._contact_solve(masses, contacts, dt)
+        solve_joints = self._joint_solve(after, control, dt)
 
         def iterate():
-            for _ in range(at_once):
-                self._iterate(joints, after, masses, control, contacts, dt)
-            kernels.launch_count_down(self._left)
+            for _ in range(unrolled):
+                launch_move(after, _KINEMATIC, dt, self._q, self._qd)
+                solve_contacts()
+                kernels.launch_apply(after, self._deltas)
+                launch_move(after, _KINEMATIC, dt, self._q, self._qd)
+                solve_joints()
+                self._correct_joints(joints, after, control, dt)
+            kernels.launch_count_down(self._loops_left)
 
-        wp.capture_while(self._left, iterate)
+        wp.capture_while(self._loops_left, iterate)
         launch_move(after, _KINEMATIC, dt)
 
-    def _iterate(self, joints: kernels.JointView, bodies: BodyView, masses, control, contacts, dt: float) -> None:
-        """Change velocities as contacts ask for, and then as joints and drives do."""
-        launch_move(bodies, _KINEMATIC, dt, self._q, self._qd)
-        self._solve_contacts(masses, contacts, dt)
-        kernels.launch_apply(bodies, self._deltas)
-        launch_move(bodies, _KINEMATIC, dt, self._q, self._qd)
-        self._solve_joints(bodies, control, dt)
+    def _correct_joints(self, joints: kernels.JointView, bodies: BodyView, control, dt: float) -> None:
+        """Correct the lever arms of Newton's joint impulses, and add drives."""
         kernels.launch_turn_levers(joints, bodies, self._q, self._impulses, self._deltas)
-        targets = control.joint_target_q, control.joint_target_qd
-        kernels.launch_drive(joints, bodies, targets, self._given, self._deltas, relaxation=self._relaxations[1], dt=dt)
+        targets, impulses = (control.joint_target_q, control.joint_target_qd), self._drive_impulses
+        kernels.launch_drive(joints, bodies, targets, impulses, self._deltas, relaxation=self._relaxations[1], dt=dt)
         kernels.launch_apply(bodies, self._deltas)
 
     def _add_joint_forces(self, body_q, joint_f, dt: float) -> None:
-        model = self._model
-        inputs = [body_q, model.body_com, model.joint_type, model.joint_enabled, model.joint_parent, model.joint_child]
-        inputs += [model.joint_X_p, model.joint_X_c, model.joint_qd_start, model.joint_dof_dim, model.joint_axis]
-        self._launch(newtons.apply_joint_forces, model.joint_count, [*inputs, joint_f, dt], [self._forces, None])
+        outputs = {"body_f": self._forces, "joint_impulse": None}
+        count = self._model.joint_count
+        self._bind(newton_kernels.apply_joint_forces, count, body_q=body_q, joint_f=joint_f, dt=dt, **outputs)()
 
-    def _solve_contacts(self, masses, contacts, dt: float) -> None:
-        model = self._model
-        inputs = [self._q, self._qd, model.body_flags, model.body_com, *masses, model.shape_body]
-        names = ("count", "point0", "point1", "surface_velocity", "offset0", "offset1", "normal")
-        inputs += [getattr(contacts, f"rigid_contact_{name}") for name in names]
-        inputs.append(self._margin)
-        inputs += [getattr(contacts, f"rigid_contact_{name}") for name in ("margin1", "shape0", "shape1")]
-        inputs += [getattr(model, f"shape_material_{name}") for name in ("mu", "mu_torsional", "mu_rolling")]
-        inputs += [self._relaxations[0], dt]
-        outputs = [self._deltas, None, None]
-        self._launch(newtons.solve_body_contact_positions, contacts.rigid_contact_max, inputs, outputs)
+    def _contact_solve(self, masses, contacts, dt: float) -> Callable:
+        names = ("count", "point0", "point1", "surface_velocity", "offset0", "offset1", "normal", "shape0", "shape1")
+        return self._bind(
+            newton_kernels.solve_body_contact_positions,
+            contacts.rigid_contact_max,
+            **{f"contact_{name}": getattr(contacts, f"rigid_contact_{name}") for name in names},
+            contact_thickness0=self._margin,
+            contact_thickness1=contacts.rigid_contact_margin1,
+            body_q=self._q,
+            body_qd=self._qd,
+            body_m_inv=masses[0],
+            body_I_inv=masses[1],
+            relaxation=self._relaxations[0],
+            dt=dt,
+            deltas=self._deltas,
+            contact_inv_weight=None,
+            contact_impulse=None,
+        )
 
-    def _solve_joints(self, bodies: BodyView, control, dt: float) -> None:
-        model, relaxation = self._model, self._relaxations[1]
-        inputs = [self._q, self._qd, model.body_com, bodies.inv_mass, bodies.inv_inertia, model.joint_type]
-        inputs += [model.joint_enabled, model.joint_parent, model.joint_child, *self._frames]
-        inputs += [*self._limits, model.joint_qd_start, model.joint_target_q_start]
-        inputs += [model.joint_dof_dim, self._axes, control.joint_target_q, control.joint_target_qd, *self._gains]
-        inputs += [0.0, 0.0, relaxation, relaxation, dt]
-        self._launch(newtons.solve_body_joints, model.joint_count, inputs, [self._deltas, self._impulses])
+    def _joint_solve(self, bodies: BodyView, control, dt: float) -> Callable:
+        return self._bind(
+            newton_kernels.solve_body_joints,
+            self._model.joint_count,
+            body_q=self._q,
+            body_qd=self._qd,
+            body_inv_m=bodies.inv_mass,
+            body_inv_I=bodies.inv_inertia,
+            joint_X_p=self._frames[0],
+            joint_X_c=self._frames[1],
+            joint_axis=self._axes,
+            joint_limit_lower=self._limits[0],
+            joint_limit_upper=self._limits[1],
+            joint_target_q=control.joint_target_q,
+            joint_target_qd=control.joint_target_qd,
+            joint_target_ke=self._gains[0],
+            joint_target_kd=self._gains[1],
+            joint_linear_compliance=0.0,
+            joint_angular_compliance=0.0,
+            linear_relaxation=self._relaxations[1],
+            angular_relaxation=self._relaxations[1],
+            dt=dt,
+            deltas=self._deltas,
+            joint_impulse=self._impulses,
+        )
 
-    def _launch(self, kernel, dim: int, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._model.device)
+    def _bind(self, kernel, dim: int, **arguments) -> Callable:
+        """Return a launch of a Newton kernel. Other arguments are the model's arrays of the same names."""
+        names = [argument.label for argument in kernel.adj.args]
+        values = [arguments[name] if name in arguments else getattr(self._model, name) for name in names]
+        return partial(wp.launch, kernel, dim=dim, inputs=values, device=self._model.device)
 
 
 def _axis_counts(model: newton.Model) -> np.ndarray:
-    """Return how many axes each joint slides along, and turns about, shape [joints, 2]."""
+    """Return the numbers of sliding and of turning axes of each joint, shape [joints, 2]."""
     counts: Any = model.joint_dof_dim  # Newton's declaration hides that it is an array
     return counts.numpy()
 
 
 def are_pins(model: newton.Model) -> np.ndarray:
-    """Whether the ends of each joint are at one place, shape [joints]."""
+    """Return true for each joint that keeps two points together, shape [joints]."""
     return np.isin(model.joint_type.numpy(), _PINS) & (_axis_counts(model)[:, 0] == 0)
 
 
-def _rows(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
-    """List the axes that drives may act on.
+def _drive_rows(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
+    """List the axes whose drives ``kernels.contacts.joints`` evaluates.
 
     Returns:
-        Joint, degree of freedom, place of the target and whether it turns, shape [rows, 4], and which degrees of
-        freedom are left to Newton: those of joints that turn about several axes, shape [dofs].
+        Joint, degree of freedom, index of the target, and 1 for a turning axis, shape [rows, 4]; and true for each
+        degree of freedom whose drive Newton evaluates, shape [dofs]: joints that turn about several axes have them.
     """
-    rows, others = [], np.ones(model.joint_dof_count, dtype=bool)
+    rows, newton_dofs = [], np.ones(model.joint_dof_count, dtype=bool)
     types, counts = model.joint_type.numpy(), _axis_counts(model)
     dofs, targets = model.joint_qd_start.numpy(), model.joint_target_q_start.numpy()
     for joint in range(model.joint_count):
-        if types[joint] in _ROWS_OF_FREE:
+        if types[joint] in _UNDRIVEN:
             continue
         linear, angular = counts[joint]
         for k in range(linear + (angular if angular == 1 else 0)):
             rows.append((joint, dofs[joint] + k, targets[joint] + k, k >= linear))
-            others[dofs[joint] + k] = False
-    return np.array(rows, dtype=int).reshape(-1, 4), others
+            newton_dofs[dofs[joint] + k] = False
+    return np.array(rows, dtype=int).reshape(-1, 4), newton_dofs

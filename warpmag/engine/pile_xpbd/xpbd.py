@@ -1,17 +1,17 @@
-"""Newton's XPBD, corrected for bodies that are pressed together, whose work follows contacts.
+"""Newton's XPBD with a contact solver for piles: momentum is kept, and every run gives the same bits.
 
-Corners of boxes that lie face to face together overshoot what each of them corrects. Bodies are therefore split among
-their contacts (``kernels.contacts.mass_splitting``).
+Newton's solver launches every iteration over the whole contact buffer and sums with atomics, in another order in every
+run. Free bodies are solved by ``kernels.contacts.solve`` instead. It meets the same contact conditions, works on the
+contacts found only, and sums in a fixed order. It keeps momentum and angular momentum, which Newton's lever arms and
+damping of spins do not, and needs half the iterations (``kernels/contacts/contact_law.h``).
 
-Newton's solver launches every iteration over all contacts that its buffers may hold, and adds them up with atomics, in
-another order in every run. Rigid bodies are moved by ``kernels.contacts.solve`` instead, which solves the same
-conditions and gives the same bits in every run. It keeps momentum and angular momentum, which Newton's lever arms and
-its damping of spins do not, and needs half the iterations (``kernels/contacts/contact_law.h``). What sticks stays
-where it
-is, since contacts remember how far they slipped. Bodies that were put into each other are pushed apart at 2 m/s at
-most. Its end is Newton's own where no push overshoots. In heaps
-Newton's pushes do, stay, and make its end depend on its relaxation: without friction these are the least that leave no
-overlap, with friction they meet Coulomb's law.
+Where no push overshoots, the result is Newton's. In heaps pushes overshoot. Newton never takes them back, so that its
+result depends on its relaxation. Here the result without friction is the least pushes that leave no overlap, and with
+friction it satisfies Coulomb's law. Contacts that stick remember how far they slipped, so that heaps do not creep.
+Bodies that overlap are moved apart at 2 m/s at most.
+
+Corners of boxes that lie face to face overshoot together. Bodies are therefore split among their contacts
+(``kernels.contacts.mass_splitting``).
 """
 
 import contextlib
@@ -29,15 +29,18 @@ from warpmag.kernels.contacts.mass_splitting import ENTRIES, launch_find_shares,
 from warpmag.kernels.rigid.newton_views import BodyView, view_bodies, view_contacts
 
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
-_ALIKE = 0.1
-"""Part by which radii and inverse masses of balls may differ that count as alike."""
+_SIMILAR = 0.1
+"""Relative spread of radii and inverse masses up to which balls stay whole."""
 
 
 class PileXPBD(newton.solvers.SolverXPBD):
-    """Newton's XPBD with masses split among contacts, whose impulses keep momentum and angular momentum.
+    """Newton's XPBD with masses split among contacts, and impulses that keep momentum and angular momentum.
 
-    Models with joints, free ones apart, take the steps of :mod:`warpmag.engine.pile_xpbd.joints`, and those with
-    particles, tendons, restitution, moving surfaces or joints that mimic others Newton's own, with split masses.
+    The features of a model choose the steps:
+
+    * rigid bodies without joints, free joints apart: ``kernels.contacts.solve``;
+    * other joints: :mod:`warpmag.engine.pile_xpbd.joints`;
+    * particles, tendons, restitution, moving surfaces, mimic joints: Newton's own steps, with split masses.
     """
 
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
@@ -45,9 +48,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
         Args:
             model: The model.
-            contact_max: Most contacts.
-            contact_iterations: Iterations where there are none but contacts; by default as many as Newton's.
-            settings: Those of Newton's solver.
+            contact_max: Capacity of the contact buffer.
+            contact_iterations: Iterations of ``kernels.contacts.solve``; by default Newton's ``iterations``.
+            settings: Settings of Newton's solver.
         """
         super().__init__(model, **settings)
         splits = _splits(model, self.body_inv_mass_effective.numpy())
@@ -58,9 +61,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
             self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
             self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         self._contact_iterations = contact_iterations or self.iterations
-        others = model.particle_count, model.tendon_segment_count, self.enable_restitution
+        newton_only = model.particle_count, model.tendon_segment_count, self.enable_restitution
         self._solve = self._joints = self._free_dofs = None
-        plain = not any(others) and not self.rigid_contact_con_weighting
+        plain = not any(newton_only) and not self.rigid_contact_con_weighting
         if plain and (free_dofs := _free_dofs(model)) is not None:
             bodies = self._view_bodies(model.state())
             self._solve = contact_solve.allocate(contact_max, bodies, kinematic_flag=_KINEMATIC)
@@ -76,7 +79,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             )
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
-        """Advance by ``dt`` [s]; as Newton's."""
+        """Advance by ``dt`` [s]; arguments as those of Newton's solver."""
         if self._solve is not None and contacts.rigid_contact_surface_velocity is None:
             self._step_bodies(state_in, state_out, control, contacts, dt)
             return
@@ -88,7 +91,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             super().step(state_in, state_out, control, contacts, dt, observables=observables)
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays that one substep hands on to the next one, by name."""
+        """Return the arrays that the next substep depends on, by name."""
         return {} if self._solve is None else self._solve.carried()
 
     def _step_bodies(self, state_in, state_out, control, contacts, dt) -> None:
@@ -133,14 +136,14 @@ class PileXPBD(newton.solvers.SolverXPBD):
         self._joints.step(before, after, contact_masses, control, contacts, dt)
 
     def _view_bodies(self, state) -> BodyView:
-        """Return the bodies, of which forces and contacts do not move the kinematic ones."""
+        """Return the bodies with their effective masses; those of kinematic bodies are infinite."""
         bodies = view_bodies(self.model, state)
         bodies.inv_mass, bodies.inv_inertia = self.body_inv_mass_effective, self.body_inv_inertia_effective
         return bodies
 
     @contextlib.contextmanager
     def _splitting(self) -> Iterator[None]:
-        """Let Newton's contacts act on their share of each body's mass."""
+        """Set the masses that Newton's contacts act on to the shares of the bodies."""
         self._whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
         self.body_inv_mass_effective, self.body_inv_inertia_effective = self._contact_masses()
         try:
@@ -149,7 +152,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             self.body_inv_mass_effective, self.body_inv_inertia_effective = self._whole
 
     def _contact_masses(self) -> tuple[wp.array, wp.array]:
-        """Return the inverse masses and inertias that a contact acts on."""
+        """Return the inverse masses and inertias that contacts act on."""
         whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
         if self._splits is None:
             return whole
@@ -157,7 +160,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
         return self._split
 
     def _apply_body_deltas(self, model, state_in, state_out, body_deltas, dt, rigid_contact_inv_weight=None):
-        """Move whole bodies by what contacts did to their shares, however slowly; the states take turns."""
+        """Apply impulses on shares to whole bodies; the states alternate. Newton's version stops slow bodies."""
         now, then = (state_in, state_out) if self._body_delta_counter else (state_out, state_in)
         self._body_delta_counter = 1 - self._body_delta_counter
         bodies = view_bodies(model, now)
@@ -167,9 +170,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
 
 def _free_dofs(model: newton.Model) -> np.ndarray | None:
-    """Return the first degree of freedom of each body's free joint, -1 without one, shape [body_count].
+    """Return the first degree of freedom of each body's free joint, -1 without a free joint, shape [body_count].
 
-    None where there are joints that constrain something, or free ones between two bodies.
+    Return None if the model has other joints, or free joints between two bodies.
     """
     dofs, joints = np.full(model.body_count, -1), model.joint_count
     if joints:
@@ -181,17 +184,17 @@ def _free_dofs(model: newton.Model) -> np.ndarray | None:
 
 
 def _splits(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:
-    """Return which bodies contacts may split, as integers, shape [body_count].
+    """Return 1 for each body that contacts may split, else 0, shape [body_count].
 
-    Balls that are all alike stay whole: in their heaps neighbours take half of each correction.
+    Balls that are all similar stay whole: in their heaps each neighbor takes half of a correction.
     """
     colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
     shape_body, types = model.shape_body.numpy(), model.shape_type.numpy()
-    of_bodies = colliding & (shape_body >= 0)
-    shapes = np.bincount(shape_body[of_bodies], minlength=model.body_count)
-    is_ball = of_bodies & (types == newton.GeoType.SPHERE)
+    on_body = colliding & (shape_body >= 0)
+    shapes = np.bincount(shape_body[on_body], minlength=model.body_count)
+    is_ball = on_body & (types == newton.GeoType.SPHERE)
     balls = (shapes == 1) & (np.bincount(shape_body[is_ball], minlength=model.body_count) == 1) & (inv_mass > 0.0)
     radii = np.zeros(model.body_count)
     np.put(radii, shape_body[is_ball], model.shape_scale.numpy()[is_ball, 0])
-    alike = not any(np.ptp(x[balls]) > _ALIKE * np.max(x[balls]) for x in (radii, inv_mass) if balls.any())
-    return ((inv_mass > 0.0) & (shapes > 0) & ~(balls & alike)).astype(np.int32)
+    similar = not any(np.ptp(x[balls]) > _SIMILAR * np.max(x[balls]) for x in (radii, inv_mass) if balls.any())
+    return ((inv_mass > 0.0) & (shapes > 0) & ~(balls & similar)).astype(np.int32)

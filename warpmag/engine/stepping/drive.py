@@ -1,7 +1,6 @@
-"""Lets a model follow keys while it is stepped: poses of kinematic bodies, magnetizations, currents,
-the external field.
+"""Keyed values of a model in motion: poses of kinematic bodies, magnetizations, currents, the external field.
 
-Keys lie on the device and are looked up at its time, which repeated and shortened substeps move as they must.
+Keys are interpolated on the device at its own time, so that repeated and shortened substeps read the right values.
 """
 
 import newton
@@ -19,23 +18,23 @@ from warpmag.moments.arrays import host_array
 
 
 class Drive:
-    """What of one model follows keys; every method only launches kernels.
+    """Sets keyed values of one model. Every method only launches kernels.
 
     Attributes:
-        time: Time on the device [s], to be kept by who steps, float64, shape [1].
+        time: Time on the device [s], which the stepper sets, float64, shape [1].
     """
 
-    def __init__(self, model: newton.Model, magnetics: Magnetics, keys: SceneKeys, *, ahead: bool):
-        """Put the keys on the device.
+    def __init__(self, model: newton.Model, magnetics: Magnetics, keys: SceneKeys, *, ends_closed: bool):
+        """Copy the keys to the device.
 
         Args:
             model: The model.
             magnetics: Its magnets.
-            keys: What follows what.
-            ahead: Whether the solver wants kinematic bodies where they stand at the end of its step.
+            keys: Keys by body and by shape.
+            ends_closed: The solver reads kinematic bodies at their poses at the end of a step.
         """
         self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
-        self._magnetics, self._ahead = magnetics, ahead
+        self._magnetics, self._ends_closed = magnetics, ends_closed
         self._bodies = None
         if keys.motions:
             operations = {body: motion.operations for body, motion in keys.motions.items()}
@@ -55,12 +54,12 @@ class Drive:
         self._followers = follow(curves, targets, self.time) if curves else None
 
     def set_values(self, offset: float, *, shared: wp.array | None = None, substep: float = 0.0) -> None:
-        """Set magnetizations, currents and the field to what they are some seconds after :attr:`time`.
+        """Set magnetizations, currents and the field to their values ``offset`` after :attr:`time`.
 
         Args:
-            offset: The seconds.
-            shared: Substeps that share these values, see ``kernels.rigid.keys.launch_follow``.
-            substep: Length of these [s].
+            offset: Time after :attr:`time` [s].
+            shared: Number of substeps that share these values, see ``kernels.rigid.keys.launch_follow``.
+            substep: Length of these substeps [s].
         """
         if self._followers is not None:
             launch_follow(self._followers, offset, shared=shared, substep=substep)
@@ -68,62 +67,60 @@ class Drive:
             self._magnetics.set_external_field(self._field)
 
     def lead(self, state: newton.State, begin: float, dt: float) -> None:
-        """Make kinematic bodies ready for a substep of ``dt`` [s] that begins ``begin`` [s] after :attr:`time`."""
+        """Pose kinematic bodies for a substep of ``dt`` [s] that begins ``begin`` [s] after :attr:`time`."""
         if self._bodies is not None:
-            launch_place(self._bodies, state, begin, dt, at_end=self._ahead)
+            launch_place(self._bodies, state, begin, dt, at_end=self._ends_closed)
 
     def place(self, state: newton.State, begin: float, horizon: float) -> None:
-        """Place kinematic bodies ``begin`` [s] after :attr:`time`, with the velocities of the next ``horizon`` [s].
+        """Pose kinematic bodies as ``begin`` [s] after :attr:`time`, with mean velocities over ``horizon`` [s].
 
-        Contacts are sought with these.
+        The search for contacts uses these.
         """
         if self._bodies is not None:
             launch_place(self._bodies, state, begin, horizon, at_end=False)
 
 
 class KeyedCurrents:
-    """Currents of the coils of a stage that ``builder.add_usd`` brought in with time samples, for programs that step.
+    """Time-sampled currents of coils that ``builder.add_usd`` imported, for programs with a loop of their own.
 
-    ``Simulation`` follows the keys of a stage by itself. Magnetizations and motions with keys are not among these:
-    ``add_usd`` takes them where they start. Worlds that are replicas follow the same keys::
+    ``Simulation`` follows all keys of a stage by itself. ``KeyedCurrents`` has no motions and magnetizations:
+    ``add_usd`` imports their values at the start. Replicated worlds share keys::
 
         currents = warpmag.KeyedCurrents(model)
-        currents.set(0.25)
+        currents.set(0.25)  # 0.25 s after the start of the stage
         magnetics.apply(state)
 
     Attributes:
-        shapes: The sites that stand for the coils.
-        time: Time since the start of the stage [s] on the device, float64, shape [1].
+        shapes: Shape indices of the coils with keys.
+        time: Time since the start of the stage [s], on the device, float64, shape [1].
     """
 
     def __init__(self, model: newton.Model):
-        """Put the keys on the device, and set the currents to those at the start.
+        """Copy the keys to the device, and set the currents at the start.
 
         Args:
-            model: A finished model.
+            model: A finalized model.
 
         Raises:
             InputError: No coil of the model has keys.
         """
         texts = getattr(getattr(model, NAMESPACE, None), "current_keys", None) or ()
-        found = {shape: Keys.from_text(text) for shape, text in enumerate(texts) if text}
-        if not found:
+        keys = {shape: Keys.from_text(text) for shape, text in enumerate(texts) if text}
+        if not keys:
             raise InputError("KeyedCurrents: no coil of the model has a current with time samples")
-        self.shapes, strength = tuple(found), getattr(model, NAMESPACE).strength
+        self.shapes, strength = tuple(keys), getattr(model, NAMESPACE).strength
         self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
-        self._followers = follow(
-            list(found.values()), [strength[shape : shape + 1] for shape in self.shapes], self.time
-        )
+        self._followers = follow(list(keys.values()), [strength[shape : shape + 1] for shape in self.shapes], self.time)
         self.set()
 
     def set(self, time: float | None = None) -> None:
-        """Set the currents to what they are at a time; without one, at :attr:`time`, which a captured graph may move.
+        """Set the currents at a time; capturable in a graph if ``time`` is None.
 
         Args:
-            time: Time since the start of the stage [s].
+            time: Time since the start of the stage [s]. None stands for :attr:`time`, which a graph may advance.
 
         Raises:
-            InputError: It is not finite.
+            InputError: The time is not a finite number.
         """
         if time is not None:
             seconds = host_array("time", time)
@@ -134,9 +131,9 @@ class KeyedCurrents:
 
 
 def _free_joints(model: newton.Model, bodies: list[int]) -> list[int]:
-    """Return the free joint of each body, -1 if it has none."""
+    """Return the index of each body's free joint, -1 without one."""
     if not model.joint_count:
         return [-1] * len(bodies)
     free = np.flatnonzero(model.joint_type.numpy() == newton.JointType.FREE)
-    of_body = dict(zip(model.joint_child.numpy()[free].tolist(), free.tolist(), strict=True))
-    return [of_body.get(body, -1) for body in bodies]
+    joint_of_body = dict(zip(model.joint_child.numpy()[free].tolist(), free.tolist(), strict=True))
+    return [joint_of_body.get(body, -1) for body in bodies]

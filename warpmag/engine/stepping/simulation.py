@@ -16,16 +16,23 @@ from warpmag.declarations.checks import check_flag, check_positive, short_repr
 from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.magnetics import Magnetics
-from warpmag.engine.pile_xpbd.contacts import AHEAD, MAXIMAL, UNRESUMABLE, RigidSolver, body_sizes, check_solver
+from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
+from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.stepping.drive import Drive
-from warpmag.engine.stepping.fitness import articulate, check_control, check_model, solver_warnings
-from warpmag.engine.stepping.joint_gaps import strain_warnings, strained_joints
+from warpmag.engine.stepping.model_checks import (
+    articulate,
+    check_control,
+    check_model,
+    joint_gap_warnings,
+    joint_gaps,
+    solver_warnings,
+)
 from warpmag.engine.stepping.statistics import Statistics, find_held
 from warpmag.engine.stepping.stepper import Stepper
 from warpmag.errors import InputError, SimulationError
-from warpmag.garbage import collection_paused
 from warpmag.moments.arrays import resolve_device
 from warpmag.moments.ranks import agreed, ranks
+from warpmag.terminal import collection_paused
 
 DEFAULT_STEP = 1e-3
 """Time step [s] where neither the user nor the stage gives one: the paper's."""
@@ -102,7 +109,7 @@ class Simulation:
         own = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
         how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
         with agreed(self._ranks):
-            builder, settings, own_step = self._open(scene, visuals=visuals, articulations=solver not in MAXIMAL)
+            builder, settings, own_step = self._open(scene, visuals=visuals, articulations=not SOLVERS[solver].maximal)
             self.step_size = _time_step(step, own_step)
             self.model = self._finalize(builder, solver, scene)
             settings = settings.replaced(external_field=external_field, **own)
@@ -146,9 +153,9 @@ class Simulation:
         if solver == "vbd":
             builder.color()  # VBD moves bodies that touch nothing in common at once
         with wp.ScopedDevice(self.device), self._refusals(scene):
-            model = builder.finalize(device=self.device, skip_validation_joints=solver in MAXIMAL)
+            model = builder.finalize(device=self.device, skip_validation_joints=SOLVERS[solver].maximal)
         check_model(model, solver, LONGEST_SUBSTEP)
-        self._strained = strained_joints(model) if solver in MAXIMAL else {}
+        self._joint_gaps = joint_gaps(model) if SOLVERS[solver].maximal else {}
         return model
 
     def _drive(self, solver: str, own_field: bool) -> Drive | None:
@@ -158,7 +165,7 @@ class Simulation:
         keys = self._scene.keys if own_field else replace(self._scene.keys, field=None)
         if not any(vars(keys).values()):
             return None
-        return Drive(self.model, self._magnetics, keys, ahead=solver in AHEAD)
+        return Drive(self.model, self._magnetics, keys, ends_closed=SOLVERS[solver].ends_closed)
 
     def _prepare(self, solver: str, graphs: bool, drive: Drive | None) -> None:
         """Set up what moves the bodies, and look at how they start."""
@@ -255,7 +262,7 @@ class Simulation:
 
     def warnings(self) -> list[str]:
         """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
-        known = self._scene.warnings if self._scene else tuple(strain_warnings(self._strained))
+        known = self._scene.warnings if self._scene else tuple(joint_gap_warnings(self._joint_gaps))
         known += tuple(solver_warnings(self._options["solver"]))
         lines, figures, rtol = [], self.statistics, self._magnetics.rtol
         if figures.field_error > rtol:
@@ -298,8 +305,8 @@ class Simulation:
         """Return why the state may have left all finite numbers, as far as the start and the run so far tell."""
         if self._statistics.overlapping:
             return "bodies overlapped at the start, and pushing them apart may turn them faster and faster"
-        if self._strained:
-            return f"the ends of the joint {next(iter(self._strained))} were apart at the start, and it pulls at them"
+        if self._joint_gaps:
+            return f"the ends of the joint {next(iter(self._joint_gaps))} were apart at the start, and it pulls at them"
         if self._statistics.capped:
             return "bodies were moving too fast for the shortest substep before"
         given = getattr(self.model, NAMESPACE)
@@ -352,7 +359,7 @@ class Simulation:
             raise InputError("resume: only a run with an output can be resumed")
         if resume and self._stepper.steps:
             raise ValueError("only a simulation that has not begun can resume another")
-        if resume and self._options["solver"] in UNRESUMABLE:
+        if resume and not SOLVERS[self._options["solver"]].resumable:
             raise InputError(f"resume: runs of the solver {self._options['solver']} cannot be resumed")
         resumed = complete = False
         try:
@@ -418,7 +425,7 @@ class Simulation:
             copy_scene=copy_scene,
             frames=frames + 1,
             options=self._options,
-            resumable=self._options["solver"] not in UNRESUMABLE,
+            resumable=SOLVERS[self._options["solver"]].resumable,
             ranks=self._ranks,
         )
 

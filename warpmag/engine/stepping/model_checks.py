@@ -1,0 +1,129 @@
+"""Checks of a model: what its solver cannot move, joints whose ends are apart, and controls that do not fit."""
+
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from warpmag.declarations.checks import joint_ends_apart, joint_gap_message, short_repr
+from warpmag.engine.pile_xpbd.joints import are_pins
+from warpmag.engine.pile_xpbd.solvers import MAXIMAL, SOLVERS
+from warpmag.errors import InputError
+
+SPRING_STIFFNESS = 1e4
+"""Stiffness of the joints of Newton's semi-implicit solver [N/m and N·m/rad]."""
+
+
+def articulate(builder: newton.ModelBuilder, solver: str) -> None:
+    """Make an articulation of each single joint between a body and the world, for solvers that move articulations only.
+
+    Such solvers leave other bodies where they are.
+
+    Raises:
+        InputError: Another joint is outside all articulations.
+    """
+    if solver in MAXIMAL:
+        return
+    joints = list(zip(builder.joint_articulation, builder.joint_parent, builder.joint_child, strict=True))
+    articulated = {body for articulation, *bodies in joints if articulation >= 0 for body in bodies}
+    for joint, (articulation, parent, child) in enumerate(joints):
+        if articulation >= 0 or child in articulated:
+            continue
+        if parent >= 0 or builder.joint_world[joint] != builder.current_world:
+            raise InputError(
+                f"{builder.joint_label[joint]}: the joint is outside all articulations, which the solver {solver} does "
+                f"not support; use one of {', '.join(MAXIMAL)}, or apply PhysicsArticulationRootAPI above it"
+            )
+        builder.add_articulation([joint])
+        articulated.add(child)
+
+
+def check_model(model: newton.Model, solver: str, dt: float) -> None:
+    """Raise :class:`InputError` if the solver is unstable with substeps of ``dt`` [s], or a body's start not finite."""
+    _check_joint_springs(model, solver, dt)
+    for name, quantity in (("body_q", "position or orientation"), ("body_qd", "velocity")):
+        bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
+        if bad.any():
+            raise InputError(f"{model.body_label[int(np.argmax(bad))]}: {quantity} is not finite")
+
+
+def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
+    """Raise :class:`InputError` if the springs of the semi-implicit solver are too stiff for a body and ``dt`` [s]."""
+    kinds = model.joint_type.numpy() if model.joint_count else np.zeros(0, int)
+    constrained = np.flatnonzero((kinds != newton.JointType.FREE) & (kinds != newton.JointType.DISTANCE))
+    if solver != "semi-implicit" or not len(constrained):
+        return
+    spins = np.linalg.eigvalsh(np.asarray(model.body_inv_inertia.numpy(), dtype=float)).max(axis=1)
+    gains = np.maximum(model.body_inv_mass.numpy(), spins) * SPRING_STIFFNESS * dt**2
+    for joint in constrained:
+        bodies = model.joint_parent.numpy()[joint], model.joint_child.numpy()[joint]
+        if max(gains[body] for body in bodies if body >= 0) > 1.0:
+            raise InputError(
+                f"{model.joint_label[joint]}: a body of the joint is too light for the solver {solver}, whose joints "
+                f"are springs of {SPRING_STIFFNESS:g} N/m and N·m/rad; use another solver"
+            )
+
+
+def solver_warnings(solver: str) -> list[str]:
+    """Return the known weakness of the solver, a line, if there is one."""
+    return list(filter(None, [SOLVERS[solver].warning]))
+
+
+def check_control(control: newton.Control, model: newton.Model) -> None:
+    """Raise :class:`InputError` unless ``control`` fits ``model``."""
+    if not isinstance(control, newton.Control):
+        raise InputError(f"control: must be a newton.Control, got {short_repr(control)}")
+    for name, own in vars(model.control()).items():
+        if isinstance(own, wp.array):
+            array = getattr(control, name, None)
+            if not (isinstance(array, wp.array) and (array.shape, array.dtype) == (own.shape, own.dtype)):
+                raise InputError(f"control: {name} does not fit the model, make one with simulation.model.control()")
+            if array.device != own.device:
+                raise InputError(f"control: {name} is on {array.device}, the model is on {own.device}")
+
+
+def joint_gaps(model: newton.Model) -> dict[str, float]:
+    """Return the distances between the ends of joints at the start [m], by joint label, where they are apart.
+
+    Motion that a joint leaves free does not count. Such joints pull at the start. Newton does not place bodies by their
+    joints: call ``newton.eval_fk``, or add the bodies with ``xform``.
+    """
+    if not model.joint_count:
+        return {}
+    poses = np.append(_host(model.body_q), [[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]], axis=0)  # body -1 is the world
+    parents, frames = poses[_host(model.joint_parent)], _host(model.joint_X_p)
+    parent_ends = _to_world(parents, frames[:, :3])
+    gaps = parent_ends - _to_world(poses[_host(model.joint_child)], _host(model.joint_X_c)[:, :3])
+    slides = _host(model.joint_type) == newton.JointType.PRISMATIC
+    axes = _host(model.joint_axis)[_host(model.joint_qd_start)[:-1][slides]]
+    axes = _rotate(parents[slides], _rotate(frames[slides], axes))
+    gaps[slides] -= axes * (axes * gaps[slides]).sum(axis=1, keepdims=True)
+    lengths = np.linalg.norm(gaps, axis=1)
+    apart = (are_pins(model) | slides) & _host(model.joint_enabled)
+    apart &= joint_ends_apart(lengths, np.linalg.norm(parent_ends, axis=1))
+    return {model.joint_label[joint]: float(lengths[joint]) for joint in np.flatnonzero(apart)}
+
+
+def _to_world(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return points of frames with ``poses`` [n, 7] in the world, shape [n, 3]."""
+    return poses[:, :3] + _rotate(poses, points)
+
+
+def _rotate(poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return vectors of frames with ``poses`` [n, 7] in the world, shape [n, 3]."""
+    axes = poses[:, 3:6]
+    return vectors + 2.0 * np.cross(axes, np.cross(axes, vectors) + poses[:, 6:] * vectors)
+
+
+def _host(array: Any) -> np.ndarray:  # Newton's declarations hide that these are arrays
+    return array.numpy()
+
+
+def joint_gap_warnings(gaps: dict[str, float]) -> list[str]:
+    """Return a warning for :func:`joint_gaps`, at most a line. Stages have warnings of their own, by prim."""
+    if not gaps:
+        return []
+    label, more = next(iter(gaps)), len(gaps) - 1
+    ends = f"{label} and {more} other joints: their ends are up to" if more else f"{label}: its ends are"
+    return [f"{ends} {joint_gap_message(max(gaps.values()))}; place the bodies, for example with newton.eval_fk"]
