@@ -144,9 +144,15 @@ def spread(count):
 
 
 def test_letters_that_are_pulled_together_stay(device):
-    """Each of them has up to 16 contacts, with friction; the deepest overlap is 1 % of their thickness."""
+    """Each of them has up to 16 contacts, with friction.
+
+    Their impacts are chaotic: over 24 runs, from starts 0.1 µm apart and with AVX2 and AVX-512, the deepest overlap is
+    11 to 36 µm. The contact solve takes at least nine tenths of what an impact would overlap in one substep.
+    """
     simulation = warpmag.Simulation(bundled()["alphabets"], device=device)
     for _ in range(100):
         simulation.step()
     figures = simulation.finish()
-    assert figures.peak_speed < 1.5 and figures.overlap < 0.01
+    substep = 5e-4  # s, the longest
+    assert figures.peak_speed < 1.5 and figures.depth < 0.1 * figures.peak_speed * substep
+    assert figures.final_overlap < 0.01
