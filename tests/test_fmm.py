@@ -1,4 +1,4 @@
-"""The fast multipole method: its cells, and fields and forces against sums over all pairs in float64."""
+"""Fast multipole method: the octree, and fields and forces against sums over all pairs in float64."""
 
 import gc
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import warpmag
-from warpmag.kernels.fmm.grid import MomentGrid
+from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.moments import fmm, pair_sums
@@ -33,15 +33,15 @@ def moments_of(count: int, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((count, 3)).astype(np.float32).astype(float)
 
 
-def make_grid(places, worlds, occupancy, device) -> MomentGrid:
+def make_octree(places, worlds, occupancy, device) -> Octree:
     n = len(places)
     vectors = wp.array(places, dtype=wp.vec3, device=device)
     radii = wp.zeros(n, dtype=wp.float32, device=device)
     packed = PackedMoments(radii, largest_radius=0.0, groups=worlds, moving=False)
     packed.pack(vectors, vectors)
-    grid = MomentGrid(packed.packed, packed.groups, int(worlds.max()) + 1, occupancy=occupancy)
-    grid.build()
-    return grid
+    octree = Octree(packed.packed, packed.groups, int(worlds.max()) + 1, occupancy=occupancy)
+    octree.build()
+    return octree
 
 
 ARRANGEMENTS = {
@@ -55,47 +55,47 @@ ARRANGEMENTS = {
 
 
 @pytest.mark.parametrize("name", ARRANGEMENTS)
-def test_every_moment_is_in_one_cell_of_each_level(name, device):
+def test_every_moment_is_in_one_box_of_each_level(name, device):
     places, worlds = ARRANGEMENTS[name]
     places = places.astype(np.float32)
     world = np.sort(np.random.default_rng(5).integers(0, worlds, len(places)))
-    grid = make_grid(places, world, 20, device)
-    frame, begin, (depth, cells) = grid.frame.numpy(), grid.level_begin.numpy(), grid.counts.numpy()
-    source, firsts = grid.source.numpy(), grid.moment_begin.numpy()[: begin[1] + 1]
-    assert cells <= grid.capacity
+    octree = make_octree(places, world, 20, device)
+    frame, begin, (depth, boxes) = octree.frame.numpy(), octree.level_begin.numpy(), octree.counts.numpy()
+    source, firsts = octree.packed_index.numpy(), octree.moment_begin.numpy()[: begin[1] + 1]
+    assert boxes <= octree.capacity
     assert sorted(source) == list(range(len(places)))
     assert firsts[-1] == len(places)
     assert (np.diff(firsts) > 0).all()
     place = (places[source].astype(float) - frame[:3]) / frame[4]
-    # positions of float32 round to either side of a cell's face
-    middle = np.floor(place) + 0.5
-    assert np.abs(grid.inside.numpy().T).max() <= 0.5 + 1e-6
-    assert np.abs(middle + grid.inside.numpy().T - place).max() <= 1.0 + 1e-6
-    found = np.column_stack([np.round(place - grid.inside.numpy().T - 0.5).astype(int), world[source]])
-    parents, octants, children = grid.parent.numpy(), grid.octant.numpy(), grid.children.numpy()
-    cell_of, numbers = np.repeat(np.arange(begin[1]), np.diff(firsts)), {}
+    # float32 positions round to either side of a box's face
+    center = np.floor(place) + 0.5
+    assert np.abs(octree.leaf_position.numpy().T).max() <= 0.5 + 1e-6
+    assert np.abs(center + octree.leaf_position.numpy().T - place).max() <= 1.0 + 1e-6
+    box_index = np.column_stack([np.round(place - octree.leaf_position.numpy().T - 0.5).astype(int), world[source]])
+    parents, octants, children = octree.parent.numpy(), octree.octant.numpy(), octree.children.numpy()
+    box_of, numbers = np.repeat(np.arange(begin[1]), np.diff(firsts)), {}
     for height in range(depth + 1):
-        own = np.array([found[np.flatnonzero(cell_of == cell)[0]] for cell in range(begin[height], begin[height + 1])])
+        own = np.array([box_index[np.flatnonzero(box_of == box)[0]] for box in range(begin[height], begin[height + 1])])
         numbers = {tuple(key): begin[height] + k for k, key in enumerate(own)}
         assert len(numbers) == len(own)  # none twice
         assert (np.diff(own[:, [3, 2, 1, 0]] @ [2**42, 2**28, 2**14, 1]) > 0).all() or depth > 13
-        assert (found == own[cell_of - begin[height]]).all()
-        neighbors = grid.neighbors.numpy()[begin[height] : begin[height + 1]]
+        assert (box_index == own[box_of - begin[height]]).all()
+        neighbors = octree.neighbors.numpy()[begin[height] : begin[height + 1]]
         for k in range(27):
             offset = np.array([k % 3 - 1, k // 3 % 3 - 1, k // 9 - 1, 0])
             assert neighbors[:, k].tolist() == [numbers.get(tuple(key), -1) for key in own + offset]
         if height < depth:
             assert (octants[begin[height] : begin[height + 1]] == own[:, :3] % 2 @ [1, 2, 4]).all()
-            children_of = children[parents[cell_of], octants[cell_of]]
-            assert (children_of == cell_of).all()
-            cell_of = parents[cell_of]
-        found = found // [2, 2, 2, 1]
+            children_of = children[parents[box_of], octants[box_of]]
+            assert (children_of == box_of).all()
+            box_of = parents[box_of]
+        box_index = box_index // [2, 2, 2, 1]
 
 
-def order_is_by_octant(grid) -> bool:
-    depth, cells = grid.counts.numpy()
-    order, octants, begin = grid.order.numpy()[:cells], grid.octant.numpy(), grid.octant_begin.numpy()
-    level = grid.level_begin.numpy()
+def order_is_by_octant(octree) -> bool:
+    depth, boxes = octree.counts.numpy()
+    order, octants, begin = octree.order.numpy()[:boxes], octree.octant.numpy(), octree.octant_begin.numpy()
+    level = octree.level_begin.numpy()
     for height in range(depth + 1):
         for octant in range(8):
             own = order[begin[height, octant] : begin[height, octant + 1]]
@@ -105,9 +105,9 @@ def order_is_by_octant(grid) -> bool:
     return True
 
 
-def test_cells_are_listed_by_octant(device):
-    grid = make_grid(np.random.default_rng(2).random((4000, 3)), np.zeros(4000, int), 20, device)
-    assert order_is_by_octant(grid)
+def test_boxes_are_listed_by_octant(device):
+    octree = make_octree(np.random.default_rng(2).random((4000, 3)), np.zeros(4000, int), 20, device)
+    assert order_is_by_octant(octree)
 
 
 @pytest.mark.parametrize(("rtol", "dtype"), [(1e-3, "float32"), (1e-5, "float32"), (1e-5, "float64")])
@@ -121,7 +121,7 @@ def test_field_and_wrench_are_those_of_all_pairs(rtol, dtype, device):
     forces, torques = warpmag.wrench(places, moments, radii=0.4, method="fmm", rtol=rtol, dtype=dtype, device=device)
     assert apart(forces, expected[0]) <= rtol
     assert apart(torques, expected[1]) <= rtol
-    # actions and reactions are the same numbers but for rounding
+    # action and reaction cancel up to rounding
     unit = 1e-7 if dtype == "float32" else 1e-15
     assert np.abs(forces.astype(float).sum(axis=0)).max() <= unit * np.linalg.norm(forces, axis=1).sum()
 
@@ -130,9 +130,9 @@ def test_overlapping_balls_and_targets_elsewhere(device):
     places = jittered(3000)
     moments, targets = moments_of(len(places)), np.random.default_rng(4).uniform(-3, 18, (400, 3))
     for radii in (0.0, 0.6):
-        given = {"radii": radii, "target_radii": 0.3, "device": device}
-        expected = warpmag.h_field(places, moments, targets, dtype="float64", **given)
-        assert apart(warpmag.h_field(places, moments, targets, method="fmm", **given), expected) <= 1e-3
+        options = {"radii": radii, "target_radii": 0.3, "device": device}
+        expected = warpmag.h_field(places, moments, targets, dtype="float64", **options)
+        assert apart(warpmag.h_field(places, moments, targets, method="fmm", **options), expected) <= 1e-3
 
 
 @pytest.mark.parametrize("name", ["one", "heap", "chain", "stray"])
@@ -147,8 +147,8 @@ def test_odd_arrangements(name, device):
 def test_kinds_of_arrays_and_bad_arguments(device):
     places = jittered(200)
     moments, vec3 = moments_of(len(places)), vec3_type(resolve_dtype("float32"))
-    given = [wp.array(one, dtype=vec3, device=device) for one in (places, moments)]
-    field = warpmag.h_field(*given, method="fmm")
+    options = [wp.array(values, dtype=vec3, device=device) for values in (places, moments)]
+    field = warpmag.h_field(*options, method="fmm")
     assert isinstance(field, wp.array)
     assert (field.numpy() == warpmag.h_field(places, moments, method="fmm", device=device)).all()
     with pytest.raises(warpmag.InputError, match="rtol"):
@@ -158,20 +158,20 @@ def test_kinds_of_arrays_and_bad_arguments(device):
     assert warpmag.h_field(np.zeros((0, 3)), np.zeros((0, 3)), method="fmm", device=device).shape == (0, 3)
 
 
-def test_nothing_stays_of_a_call(device):
-    """But tables, which are those of any number of moments: not its cells, or another thread's call would have them."""
+def test_calls_cache_no_arrays_but_tables(device):
+    """Only the tables of harmonics are cached. Cached boxes could be shared with a call in another thread."""
 
     def arrays():
         pair_sums._kept.clear()
         gc.collect()
-        return {id(one): one for one in gc.get_objects() if isinstance(one, wp.array)}
+        return {id(item): item for item in gc.get_objects() if isinstance(item, wp.array)}
 
     known = {}
     for count in (300, 500):
         places, known = jittered(count), arrays()
         for function in (warpmag.h_field, warpmag.wrench):
             function(places, moments_of(len(places)), method="fmm", device=device)
-    assert not [one.shape for key, one in arrays().items() if key not in known]
+    assert not [array.shape for key, array in arrays().items() if key not in known]
 
 
 def test_auto_is_exact_unless_an_error_is_allowed(device, monkeypatch):
@@ -182,10 +182,10 @@ def test_auto_is_exact_unless_an_error_is_allowed(device, monkeypatch):
     assert (warpmag.h_field(places, moments, rtol=5e-6, device=device) == exact).all()
     assert 0.0 < apart(warpmag.h_field(places, moments, rtol=1e-3, device=device), exact) <= 1e-3
     few = [array[:1000] for array in (places, moments)]
-    given = {"smoothing": 0.5, "device": device}  # whatever is faster, expansions have no such law
+    options = {"smoothing": 0.5, "device": device}  # expansions have no smoothed law
     monkeypatch.setattr(fmm, "_COSTS", dict.fromkeys(fmm._COSTS, (0.0, 0.0)))
-    assert (warpmag.h_field(*few, rtol=1e-3, **given) == warpmag.h_field(*few, **given)).all()
-    assert (warpmag.wrench(*few, rtol=1e-3, **given)[0] == warpmag.wrench(*few, **given)[0]).all()
+    assert (warpmag.h_field(*few, rtol=1e-3, **options) == warpmag.h_field(*few, **options)).all()
+    assert (warpmag.wrench(*few, rtol=1e-3, **options)[0] == warpmag.wrench(*few, **options)[0]).all()
     monkeypatch.undo()
     assert (warpmag.h_field(*few, rtol=1e-3, device=device) == warpmag.h_field(*few, device=device)).all()
 
@@ -206,35 +206,35 @@ BALLS = {
 def test_induction_has_the_solution_of_all_pairs(name, device):
     places = 0.005 * BALLS[name]
     magnet = np.array([[-0.02, 0.01, 0.0]]), np.array([[3.0, 1.0, 0.0]])
-    given = {"saturation": 1.7e6, "external_field": (0.0, 1e4, 2e4), "sources": magnet, "device": device}
-    exact = warpmag.solve_induction(places, 0.0015, method="direct", rtol=1e-5, **given)
-    result = warpmag.solve_induction(places, 0.0015, method="fmm", rtol=1e-3, **given)
+    options = {"saturation": 1.7e6, "external_field": (0.0, 1e4, 2e4), "sources": magnet, "device": device}
+    exact = warpmag.solve_induction(places, 0.0015, method="direct", rtol=1e-5, **options)
+    result = warpmag.solve_induction(places, 0.0015, method="fmm", rtol=1e-3, **options)
     assert result.converged
     assert result.field_error <= 1e-3
     assert exact.field_error == 0.0
     assert apart(result.magnetizations, exact.magnetizations) <= 1e-3
     (forces, _), (expected, _) = result.wrench(), exact.wrench()
-    # a force has the errors of two magnetizations and of a gradient
+    # a force combines the errors of two magnetizations and of a gradient
     assert apart(forces, expected) <= 3e-3
 
 
 def test_the_error_of_fields_is_of_the_sums_alone(device, monkeypatch):
-    """Not what balls that touch lack as dipoles, which both ways of summing add to; and none where forces alone are
-    by multipoles."""
+    """Corrections of touching balls do not count, since both forms of the sums add them. Where only forces use
+    multipoles, the field has no error."""
     places = 0.0101 * np.stack(np.meshgrid(*3 * [np.arange(4.0)]), axis=-1).reshape(-1, 3)
-    given = {"saturation": 1.7e6, "external_field": (0.0, 0.0, 1e4), "contact_model": "multipole", "device": device}
-    result = warpmag.solve_induction(places, 0.005, method="fmm", **given)
+    options = {"saturation": 1.7e6, "external_field": (0.0, 0.0, 1e4), "contact_model": "multipole", "device": device}
+    result = warpmag.solve_induction(places, 0.005, method="fmm", **options)
     assert result._system.is_fast
-    assert result.field_error <= 1e-6  # one cell holds them all, and every pair is summed
+    assert result.field_error <= 1e-6  # one box holds them all, and every pair is summed
     kinds = {key: (0.0 if key[1] == Quantity.WRENCH else 1e9, 0.0) for key in fmm._COSTS}
     monkeypatch.setattr(fmm, "_COSTS", kinds)
-    result = warpmag.solve_induction(places, 0.005, method="auto", **given)
+    result = warpmag.solve_induction(places, 0.005, method="auto", **options)
     assert result._system.is_fast
     assert result.field_error == 0.0
 
 
 def test_worlds_do_not_see_each_other(device):
-    """Worlds at one place, of different moments: each as if it were alone."""
+    """Worlds at one place with different moments: each result equals that of the world alone."""
     places = 0.005 * clump(4.0)
     n, count = len(places), 6
     system = MomentSystem(
@@ -251,11 +251,11 @@ def test_worlds_do_not_see_each_other(device):
         lone = warpmag.solve_induction(
             places, 0.0015, saturation=1.7e6, external_field=(0.0, 0.0, strength), method="direct", device=device
         )
-        assert apart(solved[world], lone.magnetizations) <= 2e-3  # of two solves
+        assert apart(solved[world], lone.magnetizations) <= 2e-3  # errors of two solves
 
 
 def test_small_worlds_are_summed_over_all_pairs(device):
-    """However many they are: the method takes what it takes for all moments, sums over pairs only those of a world."""
+    """Even many small worlds: the multipole method costs the same per moment, direct sums only the pairs of a world."""
     count, worlds = 64, 300
     places = 0.005 * jittered(count)
     system = MomentSystem(
@@ -264,7 +264,7 @@ def test_small_worlds_are_summed_over_all_pairs(device):
     )  # fmt: skip
     system.positions.assign(np.tile(places, (worlds, 1)).astype(np.float32))
     system.solve()
-    assert system.field_error() == 0.0  # of all pairs
+    assert system.field_error() == 0.0  # direct sums
 
 
 def test_bodies_of_several_moments_are_refused():

@@ -57,7 +57,7 @@ def small_leaves(monkeypatch):
 
 def far_cells(magnetics) -> bool:
     """Whether there are cells that are not neighbours, so that expansions count."""
-    return magnetics.system._fast._grid.counts.numpy()[0] >= 2
+    return magnetics.system._fast._octree.counts.numpy()[0] >= 2
 
 
 def test_moments_and_forces_are_those_of_all_pairs(device):
@@ -236,8 +236,8 @@ def test_a_place_that_is_no_place_makes_no_harm(place, device):
     system.solve()
     system.apply_forces()
     assert abs(place) == 1e30 or not np.isfinite(system.forces.numpy()).all()
-    grid = system._fast._grid
-    assert grid.moment_begin.numpy()[grid.level_begin.numpy()[1]] == 300
+    octree = system._fast._octree
+    assert octree.moment_begin.numpy()[octree.level_begin.numpy()[1]] == 300
 
 
 def test_auto_and_bad_arguments(device, monkeypatch):

@@ -1,7 +1,7 @@
-"""Field and force sums of packed moments by the fast multipole method: a form of the sums of ``pairs.evaluate``.
+"""Field and force sums of packed moments by the fast multipole method, as one form of the sums of ``pairs.evaluate``.
 
-Near pairs are those of the all-pairs sums, clamped at contact; far ones come from expansions. Both are added in the
-order in which the grid sorts moments, and go to the partial sums of target rows from there.
+Near pairs are summed directly and clamped at contact, as in the all-pairs sums. Far pairs come from expansions. Both
+sums are in the octree's order of moments; a last kernel copies them to the partial sums of target rows.
 """
 
 from contextlib import contextmanager
@@ -11,83 +11,98 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.fmm.expansions import Expansions, ExpansionTables
-from warpmag.kernels.fmm.grid import MomentGrid
 from warpmag.kernels.fmm.near import launch_near_sums
-from warpmag.kernels.fmm.sharing import share_cells
+from warpmag.kernels.fmm.octree import Octree
+from warpmag.kernels.fmm.sharing import share_boxes
+from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PITCH
 from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
 
+_SAMPLED = 256
+"""Moments at which the error of the field is measured."""
 
-class CellSums:
-    """Sums of a quantity over all pairs of the moments of a grid.
+
+class FmmSums:
+    """Sums of a quantity over all pairs of an octree's moments.
 
     Args:
-        grid: The cells, built by the caller whenever moments have moved.
-        tables: Numbers of the harmonics.
-        quantity: What is summed; of ``MUTUAL_FORCE`` as of ``FORCE``.
-        first: Column in the grid of the first target column.
-        sources: Whether each moment counts as a source, NumPy, shape [n]; None means all do.
-        ranks: Processes that share out the sums (``warpmag.moments.ranks.Ranks``); None means that there is but this
-            one.
+        octree: The octree, built by the caller whenever moments have moved.
+        tables: Coefficients of the harmonics.
+        quantity: Quantity that is summed; ``MUTUAL_FORCE`` is summed as ``FORCE``.
+        first: Packed column of the first target in the octree.
+        sources: Whether each moment is a source, NumPy, shape [n]; None means all are.
+        ranks: Processes that share the sums (``warpmag.moments.ranks.Ranks``); None means a single process.
     """
 
     def __init__(
-        self, grid: MomentGrid, tables: ExpansionTables, quantity: Quantity, first: int = 0, sources=None, ranks=None
+        self, octree: Octree, tables: ExpansionTables, quantity: Quantity, first: int = 0, sources=None, ranks=None
     ):
         """Allocate the sums and the expansions."""
-        self._first, self._shares = first, share_cells(grid, ranks)
-        self._leaves = grid.level_begin if self._shares is None else self._shares.leaves
-        counts = np.ones(grid.count, np.int32) if sources is None else sources.astype(np.int32)
-        self._sources = wp.array(counts, dtype=wp.int32, device=grid.device)
+        self._first, self._shares = first, share_boxes(octree, ranks)
+        self._leaves = octree.level_begin if self._shares is None else self._shares.leaves
+        counts = np.ones(octree.count, np.int32) if sources is None else sources.astype(np.int32)
+        self._sources = wp.array(counts, dtype=wp.int32, device=octree.device)
         self._quantity = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
-        self._grid = grid
-        n, device, dtype = grid.count, grid.device, grid.sorted.dtype
+        self._octree = octree
+        n, device, dtype = octree.count, octree.device, octree.sorted.dtype
         self._sums = wp.zeros((n, WIDTHS[quantity]), dtype=dtype, device=device)
-        self._moments = grid.sorted
+        self._moments = octree.sorted
         self._effective = wp.zeros((3, (1 + -(-n // PITCH)) * PITCH), dtype=dtype, device=device)[:, :n]
-        self._expansions = Expansions(grid, tables, self._quantity, self._moments, self._effective, self._sums)
+        self._expansions = Expansions(octree, tables, self._quantity, self._moments, self._effective, self._sums)
         self._expansions.share(self._leaves, self._shares)
         self._stream = wp.Stream(device, priority=-1) if device.is_cuda else None
         self._events = [wp.Event(device) for _ in range(2)] if device.is_cuda else []
 
     def __call__(self, effective, target, partial):
-        """Launch the sums of the moments as they are now, where they were when the grid was built.
+        """Launch the sums of the present moments, at their positions when the octree was built.
 
         Args:
             effective: Effective moments e [A·m²] of the force, shape [3, n].
             target: Packed column of each target row.
-            partial: Out, sums of the target rows, shape [1, rows, 3 or 6].
+            partial: Out: sums of the target rows, shape [1, rows, 3 or 6].
         """
-        grid, device, dtype = self._grid, self._grid.device, self._sums.dtype
+        octree, device, dtype = self._octree, self._octree.device, self._sums.dtype
         wp.launch(
             _moments_kernel(dtype),
-            grid.count,
-            [grid.packed, grid.source, self._sources],
+            octree.count,
+            [octree.packed, octree.packed_index, self._sources],
             [self._moments],
             device=device,
         )
         if self._quantity != Quantity.FIELD:
-            wp.launch(_sort_kernel(dtype), (3, grid.count), [effective, grid.source], [self._effective], device=device)
+            wp.launch(
+                _sort_kernel(dtype),
+                (3, octree.count),
+                [effective, octree.packed_index],
+                [self._effective],
+                device=device,
+            )
         if self._shares is not None:
             self._shares.find()
             self._sums.zero_()
-        with self._beside():
-            self._expansions.gather()
+        with self._concurrent():
+            self._expansions.compute_multipoles()
             self._expansions.translate()
         launch_near_sums(
-            self._quantity, self._moments, self._effective, grid.neighbors, grid.moment_begin, self._leaves, self._sums
+            self._quantity,
+            self._moments,
+            self._effective,
+            octree.neighbors,
+            octree.moment_begin,
+            self._leaves,
+            self._sums,
         )
         if self._stream is not None:
             wp.get_stream(device).wait_event(self._events[1])
         self._expansions.add_fields()
         if self._shares is not None:
             self._shares.ranks.merge(self._sums)
-        inputs = [self._sums, target, grid.place[self._first :]]
+        inputs = [self._sums, target, octree.sorted_index[self._first :]]
         wp.launch(_return_kernel(dtype), partial.shape[1:], inputs, [partial], device=device)
 
     @contextmanager
-    def _beside(self):
-        """On a GPU, launch what follows on a stream of its own: far cells wait for each other, which near ones fill."""
+    def _concurrent(self):
+        """On a GPU, launch on a second stream: near sums fill the GPU while passes over boxes wait."""
         if self._stream is None:
             yield
             return
@@ -103,15 +118,15 @@ def _moments_kernel(dtype):
     def sort_moments(
         # inputs:
         packed: wp.array2d[dtype],
-        source: wp.array[int],
-        counts: wp.array[int],
+        packed_index: wp.array[int],
+        is_source: wp.array[int],
         # outputs:
         sorted_out: wp.array2d[dtype],
     ):
         i = wp.tid()
-        j = source[i]
+        j = packed_index[i]
         for c in range(4, 7):
-            sorted_out[c, i] = wp.where(counts[j] == 1, packed[c, j], dtype(0.0))
+            sorted_out[c, i] = wp.where(is_source[j] == 1, packed[c, j], dtype(0.0))
 
     return sort_moments
 
@@ -122,12 +137,12 @@ def _sort_kernel(dtype):
     def sort_vectors(
         # inputs:
         vectors: wp.array2d[dtype],
-        source: wp.array[int],
+        packed_index: wp.array[int],
         # outputs:
         sorted_out: wp.array2d[dtype],
     ):
         c, i = wp.tid()
-        sorted_out[c, i] = vectors[c, source[i]]
+        sorted_out[c, i] = vectors[c, packed_index[i]]
 
     return sort_vectors
 
@@ -139,11 +154,38 @@ def _return_kernel(dtype):
         # inputs:
         sums: wp.array2d[dtype],
         target: wp.array[int],
-        place: wp.array[int],
+        sorted_index: wp.array[int],
         # outputs:
         partial_out: wp.array3d[dtype],
     ):
         row, c = wp.tid()
-        partial_out[0, row, c] = sums[place[target[row]], c]
+        partial_out[0, row, c] = sums[sorted_index[target[row]], c]
 
     return return_sums
+
+
+def sampled_error(sums, moments, ranges, target_base, base) -> float:
+    """Return the relative error ‖H − H_exact‖/‖H_exact‖ of a field at random moments, against sums over all pairs.
+
+    Waits for the device.
+
+    Args:
+        sums: Sums of the targets' field on each other, as ``PairEvaluation`` takes them; None means over all pairs.
+        moments: Packed moments.
+        ranges: Columns of each world: begin and end of targets, and end of sources, integers [worlds, 3].
+        target_base: Field that the targets' sums are added to, with the other sources' field [A/m], shape [n].
+        base: Field that all sources' sums are added to [A/m], shape [n].
+    """
+    ranges = np.reshape(ranges, (-1, 3))
+    targets = np.concatenate([np.arange(begin, end) for begin, end, _ in ranges])
+    if len(targets) == 0:
+        return 0.0
+    rows = np.sort(np.random.default_rng(0).choice(targets, min(_SAMPLED, len(targets)), replace=False))
+    begin, middle, end = ranges[np.searchsorted(ranges[:, 2], rows, side="right")].T
+    fields = []
+    for last, added, form in ((middle, target_base, sums), (end, base, None)):
+        field, segments = wp.zeros_like(base), np.stack([rows, rows + 1, begin, last], axis=1)
+        PairEvaluation(Quantity.FIELD, segments, moments, moments, added, field, sums=form).launch()
+        fields.append(field.numpy()[rows].astype(float))
+    approximate, exact = fields
+    return float(np.linalg.norm(approximate - exact) / max(np.linalg.norm(exact), np.finfo(float).tiny))

@@ -1,10 +1,10 @@
-// Expansions of cells: multipoles of moments, of parents from their children, local expansions of children from their
-// parents', and fields from those. expansions.py says what the arrays are; warpmag/moments/harmonics.py has the
-// equations.
+// Expansions of boxes: multipoles of moments (P2M) and of parents (M2M), local expansions of children (L2L), and fields
+// from local expansions (L2P). expansions.py describes the arrays; warpmag/moments/harmonics.py has the equations.
 //
-// The gradient of a harmonic is a sum of a few harmonics of one degree less. So moments are first summed with plain
-// harmonics, S_jc = Σ m_c R_j(u), of which a leaf makes its multipole once; and its local expansion becomes the
-// coefficients G_jc of the field's components, H_c = −Σ G_jc R_j(u) / 4πh³, and of their derivatives.
+// The gradient of a harmonic is a sum of a few harmonics of one degree less. Moments are therefore summed with plain
+// harmonics first, S_jc = Σ m_c R_j(u), and each leaf converts these sums to its multipole once. Likewise each leaf
+// converts its local expansion to coefficients G_jc of the field's components, H_c = −Σ G_jc R_j(u) / 4πh³, and of
+// their derivatives.
 #pragma once
 #include "pairs/pair_terms.h"
 #include "shared/arrival.h"
@@ -13,15 +13,14 @@
 
 namespace warpmag {
 
-constexpr int BELOW = DEGREE * DEGREE; // harmonics of one degree less
-constexpr int TERMS = 5;               // terms of a multipole's coefficient, as in expansions.py
-constexpr bool is_force(Quantity q) { return q != Quantity::FIELD; }
-constexpr bool is_field(Quantity q) { return q == Quantity::FIELD || q == Quantity::WRENCH; }
+constexpr int LOWER_HARMONICS = DEGREE * DEGREE; // harmonics up to one degree less
+constexpr int TERMS = 5;                         // terms of a multipole's coefficient; as in expansions.py
+constexpr bool has_force(Quantity q) { return q != Quantity::FIELD; }
+constexpr bool has_field(Quantity q) { return q == Quantity::FIELD || q == Quantity::WRENCH; }
 
 CUDA_CALLABLE inline int index_of(int degree, int order) { return degree * degree + degree + order; }
 
-// Calls visit(j, R_j) for the harmonics at a point below DEGREE whose order is ``first`` or a multiple of ``step``
-// more.
+// Calls visit(j, R_j(u)) for the harmonics of degrees below DEGREE and orders m with m % step == first.
 template <class Visit>
 CUDA_CALLABLE inline void visit_harmonics(const Real* growth, const Real* decay, Vector u, int first, int step,
                                           Visit visit) {
@@ -47,96 +46,98 @@ CUDA_CALLABLE inline void visit_harmonics(const Real* growth, const Real* decay,
     }
 }
 
-// Rows of numbers of moments, one row after the other.
-struct Rows {
+// Rows of an array of moments.
+struct MomentRows {
     Real* data;
     size_t pitch;
 
-    CUDA_CALLABLE Rows(const wp::array_t<Real>& table) : data(table.data), pitch(table.strides[0] / sizeof(Real)) {}
+    CUDA_CALLABLE MomentRows(const wp::array_t<Real>& table)
+        : data(table.data), pitch(table.strides[0] / sizeof(Real)) {}
     CUDA_CALLABLE Vector vector(int row, int i) const {
         const Real* const at = data + row * pitch + i;
         return {numbers(at), numbers(at + pitch), numbers(at + 2 * pitch)};
     }
 };
 
-// Coefficient i of a multipole from the sums S of a leaf's moments.
+// Coefficient i of a leaf's multipole from the sums S of its moments.
 template <class Arrays> CUDA_CALLABLE inline Real multipole_of(const Arrays& a, const Real* sums, int i) {
-    if (i >= a.sources) return 0;
+    if (i >= a.source_harmonics) return 0;
     Real q = 0;
-    for (int t = TERMS * i; t < TERMS * (i + 1); ++t) q += a.gather_weight.data[t] * sums[a.gather_index.data[t]];
+    for (int t = TERMS * i; t < TERMS * (i + 1); ++t) q += a.multipole_weight.data[t] * sums[a.multipole_index.data[t]];
     return q;
 }
 
-// Derivative along an axis of an expansion, its coefficient j, of one in ``from``, whose coefficients are ``stride``
-// apart.
+// Coefficient j of the derivative along an axis of the expansion ``from``, with coefficients ``stride`` apart.
 template <class Arrays>
 CUDA_CALLABLE inline Real derivative(const Arrays& a, const Real* from, int stride, int j, int axis) {
     const int t = 2 * (3 * j + axis);
-    return a.spread_weight.data[t] * from[stride * a.spread_index.data[t]]
-           + a.spread_weight.data[t + 1] * from[stride * a.spread_index.data[t + 1]];
+    return a.derivative_weight.data[t] * from[stride * a.derivative_index.data[t]]
+           + a.derivative_weight.data[t + 1] * from[stride * a.derivative_index.data[t + 1]];
 }
 
-// Coefficients of the components of a field, and of the derivatives xx, xy, xz, yy, yz, zz.
+// Coefficients of the field's components, and of its derivatives xx, xy, xz, yy, yz, zz.
 constexpr int FIELD_ROW = 4, FORCE_ROW = 6;
-template <Quantity Q> struct Fields {
-    Real field[BELOW][FIELD_ROW];
-    Real force[is_force(Q) ? (DEGREE - 1) * (DEGREE - 1) : 1][FORCE_ROW];
+template <Quantity Q> struct FieldExpansion {
+    Real field[LOWER_HARMONICS][FIELD_ROW];
+    Real force[has_force(Q) ? (DEGREE - 1) * (DEGREE - 1) : 1][FORCE_ROW];
 };
 template <class Arrays> CUDA_CALLABLE inline void set_field(const Arrays& a, Real* row, const Real* local, int j) {
     for (int c = 0; c < 3; ++c) row[c] = derivative(a, local, 1, j, c);
 }
-template <Quantity Q, class Arrays> CUDA_CALLABLE inline void set_force(const Arrays& a, Fields<Q>& fields, int j) {
+template <Quantity Q, class Arrays>
+CUDA_CALLABLE inline void set_force(const Arrays& a, FieldExpansion<Q>& fields, int j) {
     for (int c = 0, k = 0; c < 3; ++c)
         for (int d = c; d < 3; ++d) fields.force[j][k++] = derivative(a, fields.field[0] + c, FIELD_ROW, j, d);
 }
 
-// What moments in a leaf feel: 4π times the field H, and (e·∇)H for moments e.
-struct Felt {
+// 4π times the field H, and 4π times (e·∇)H for effective moments e.
+struct FieldForce {
     Vector h, f;
 };
 template <Quantity Q, class Arrays>
-CUDA_CALLABLE inline Felt felt_at(const Arrays& a, const Fields<Q>& fields, Vector u, Vector e) {
+CUDA_CALLABLE inline FieldForce evaluate_expansion(const Arrays& a, const FieldExpansion<Q>& fields, Vector u,
+                                                   Vector e) {
     const Number zero = Number(Real(0));
-    Felt felt = {{zero, zero, zero}, {zero, zero, zero}};
+    FieldForce result = {{zero, zero, zero}, {zero, zero, zero}};
     visit_harmonics(a.growth.data, a.decay.data, u, 0, 1, [&](int j, Number r) {
-        if (is_field(Q)) {
+        if (has_field(Q)) {
             const Real* const g = fields.field[j];
-            felt.h.x -= g[0] * r, felt.h.y -= g[1] * r, felt.h.z -= g[2] * r;
+            result.h.x -= g[0] * r, result.h.y -= g[1] * r, result.h.z -= g[2] * r;
         }
-        if (is_force(Q) && j < (DEGREE - 1) * (DEGREE - 1)) {
+        if (has_force(Q) && j < (DEGREE - 1) * (DEGREE - 1)) {
             const Real* const t = fields.force[j];
-            felt.f.x -= r * (t[0] * e.x + t[1] * e.y + t[2] * e.z);
-            felt.f.y -= r * (t[1] * e.x + t[3] * e.y + t[4] * e.z);
-            felt.f.z -= r * (t[2] * e.x + t[4] * e.y + t[5] * e.z);
+            result.f.x -= r * (t[0] * e.x + t[1] * e.y + t[2] * e.z);
+            result.f.y -= r * (t[1] * e.x + t[3] * e.y + t[4] * e.z);
+            result.f.z -= r * (t[2] * e.x + t[4] * e.y + t[5] * e.z);
         }
     });
     const Real scale = Real(1) / (Real)a.frame.data[4], volume = scale * scale * scale;
-    return {(zero + volume) * felt.h, (zero + scale) * ((zero + volume) * felt.f)};
+    return {(zero + volume) * result.h, (zero + scale) * ((zero + volume) * result.f)};
 }
 CUDA_CALLABLE inline void add_vectors(Real* rows, int row, int held, Vector v) {
     for (int l = 0; l < held && l < WIDTH; ++l, rows += row)
         rows[0] += lane_of(v.x, l), rows[1] += lane_of(v.y, l), rows[2] += lane_of(v.z, l);
 }
-template <Quantity Q> CUDA_CALLABLE inline void add_felt(Real* sums, int held, const Felt& felt) {
-    if (is_force(Q)) add_vectors(sums, width(Q), held, felt.f);
-    if (is_field(Q)) add_vectors(sums + width(Q) - 3, width(Q), held, felt.h);
+template <Quantity Q> CUDA_CALLABLE inline void add_sums(Real* sums, int held, const FieldForce& result) {
+    if (has_force(Q)) add_vectors(sums, width(Q), held, result.f);
+    if (has_field(Q)) add_vectors(sums + width(Q) - 3, width(Q), held, result.h);
 }
 
-// The multipole of a leaf; on a GPU by a block.
+// Computes the multipole of a leaf; on a GPU a block does.
 template <class Arrays> CUDA_CALLABLE inline void leaf_multipole(const Arrays& a, int leaf) {
     const int begin = a.moment_begin.data[leaf], end = a.moment_begin.data[leaf + 1];
-    const Rows inside(a.inside), sorted(a.sorted);
+    const MomentRows position(a.leaf_position), sorted(a.sorted);
     Real* const multipole = a.multipoles.data + PITCH * (size_t)leaf;
 #if defined(__CUDA_ARCH__)
-    constexpr int EACH = (BELOW + THREADS - 1) / THREADS;
-    constexpr int BATCH = sizeof(Real) == 8 ? 16 : 32; // moments at a time: 48 KiB hold their harmonics
-    __shared__ Real harmonics[BELOW][BATCH + 1], moments[3][BATCH], sums[3 * BELOW];
+    constexpr int EACH = (LOWER_HARMONICS + THREADS - 1) / THREADS;
+    constexpr int BATCH = sizeof(Real) == 8 ? 16 : 32; // moments at a time, so that their harmonics fit into 48 KiB
+    __shared__ Real harmonics[LOWER_HARMONICS][BATCH + 1], moments[3][BATCH], sums[3 * LOWER_HARMONICS];
     const int lane = threadIdx.x % BATCH;
-    Real own[EACH][3] = {};
+    Real totals[EACH][3] = {};
     for (int first = begin; first < end; first += BATCH) {
         const int i = first + lane < end ? first + lane : end - 1;
         __syncthreads();
-        visit_harmonics(a.growth.data, a.decay.data, inside.vector(0, i), threadIdx.x / 32, THREADS / 32,
+        visit_harmonics(a.growth.data, a.decay.data, position.vector(0, i), threadIdx.x / 32, THREADS / 32,
                         [&](int j, Real r) { harmonics[j][lane] = r; });
         if (threadIdx.x < 32) {
             const Vector m = sorted.vector(4, i);
@@ -147,33 +148,33 @@ template <class Arrays> CUDA_CALLABLE inline void leaf_multipole(const Arrays& a
 #pragma unroll
         for (int e = 0; e < EACH; ++e) {
             const int j = threadIdx.x + e * THREADS;
-            if (j >= BELOW) break;
+            if (j >= LOWER_HARMONICS) break;
             for (int k = 0; k < BATCH; ++k)
-                for (int c = 0; c < 3; ++c) own[e][c] += moments[c][k] * harmonics[j][k];
+                for (int c = 0; c < 3; ++c) totals[e][c] += moments[c][k] * harmonics[j][k];
         }
     }
 #pragma unroll
     for (int e = 0; e < EACH; ++e)
         for (int c = 0; c < 3; ++c)
-            if (threadIdx.x + e * THREADS < BELOW) sums[3 * (threadIdx.x + e * THREADS) + c] = own[e][c];
+            if (threadIdx.x + e * THREADS < LOWER_HARMONICS) sums[3 * (threadIdx.x + e * THREADS) + c] = totals[e][c];
     __syncthreads();
     for (int i = threadIdx.x; i < HARMONICS; i += THREADS) multipole[i] = multipole_of(a, sums, i);
     __syncthreads();
 #else
-    Number harmonics[BELOW], parts[3 * BELOW] = {};
+    Number harmonics[LOWER_HARMONICS], parts[3 * LOWER_HARMONICS] = {};
     for (int i = begin; i < end; i += WIDTH) {
         Vector m = sorted.vector(4, i);
         for (int l = end - i; l < WIDTH; ++l) m.x[l] = m.y[l] = m.z[l] = 0;
-        visit_harmonics(a.growth.data, a.decay.data, inside.vector(0, i), 0, 1,
+        visit_harmonics(a.growth.data, a.decay.data, position.vector(0, i), 0, 1,
                         [&](int j, Number r) { harmonics[j] = r; });
-        for (int j = 0; j < BELOW; ++j) {
+        for (int j = 0; j < LOWER_HARMONICS; ++j) {
             parts[3 * j] += m.x * harmonics[j];
             parts[3 * j + 1] += m.y * harmonics[j];
             parts[3 * j + 2] += m.z * harmonics[j];
         }
     }
-    Real sums[3 * BELOW];
-    for (int k = 0; k < 3 * BELOW; ++k) {
+    Real sums[3 * LOWER_HARMONICS];
+    for (int k = 0; k < 3 * LOWER_HARMONICS; ++k) {
         sums[k] = 0;
         for (int l = 0; l < WIDTH; ++l) sums[k] += parts[k][l];
     }
@@ -181,38 +182,39 @@ template <class Arrays> CUDA_CALLABLE inline void leaf_multipole(const Arrays& a
 #endif
 }
 
-// Adds what all moments of a leaf feel from afar; on a GPU by a block.
+// Adds the far field and force at all moments of a leaf; on a GPU a block does.
 template <Quantity Q, class Arrays> CUDA_CALLABLE inline void leaf_fields(const Arrays& a, int leaf) {
     const int begin = a.moment_begin.data[leaf], end = a.moment_begin.data[leaf + 1];
-    const Rows inside(a.inside), effective(a.effective);
+    const MomentRows position(a.leaf_position), effective(a.effective);
     const Real* const local = a.locals.data + PITCH * (size_t)leaf;
 #if defined(__CUDA_ARCH__)
-    __shared__ Fields<Q> fields;
+    __shared__ FieldExpansion<Q> fields;
     const int first = threadIdx.x, step = THREADS;
     __syncthreads();
 #else
-    Fields<Q> fields;
+    FieldExpansion<Q> fields;
     const int first = 0, step = 1;
 #endif
-    for (int j = first; j < BELOW; j += step) set_field(a, fields.field[j], local, j);
+    for (int j = first; j < LOWER_HARMONICS; j += step) set_field(a, fields.field[j], local, j);
 #if defined(__CUDA_ARCH__)
     __syncthreads();
 #endif
-    if (is_force(Q))
+    if (has_force(Q))
         for (int j = first; j < (DEGREE - 1) * (DEGREE - 1); j += step) set_force<Q>(a, fields, j);
 #if defined(__CUDA_ARCH__)
     __syncthreads();
 #endif
     for (int i = begin + first * WIDTH; i < end; i += step * WIDTH) {
-        const Vector u = inside.vector(0, i), e = is_force(Q) ? effective.vector(0, i) : u;
-        add_felt<Q>(a.sums.data + (size_t)width(Q) * i, end - i, felt_at<Q>(a, fields, u, e));
+        const Vector u = position.vector(0, i), e = has_force(Q) ? effective.vector(0, i) : u;
+        add_sums<Q>(a.sums.data + (size_t)width(Q) * i, end - i, evaluate_expansion<Q>(a, fields, u, e));
     }
 }
 
-// The multipole of a cell from those of its children, and what its local expansion adds to theirs: a matrix for a child
-// in octant 0, mirrored for the others. On a GPU a block reads it once for all children.
+// M2M and L2L: the multipole of a box from those of its children, and its contribution to their local expansions. The
+// matrices are those of a child in octant 0; other octants are its mirror images. On a GPU a block reads a matrix once
+// for all children.
 #if defined(__CUDA_ARCH__)
-// Row i of a matrix, of which columns follow each other, times the expansions of 8 children side by side.
+// Adds row i of a column-major matrix times the expansions of 8 children side by side.
 CUDA_CALLABLE inline void multiply_row(Real (&sums)[8], const Real* matrix, const Real (*children)[8], int i) {
 #pragma unroll 8
     for (int k = 0; k < HARMONICS; ++k) {
@@ -222,40 +224,41 @@ CUDA_CALLABLE inline void multiply_row(Real (&sums)[8], const Real* matrix, cons
     }
 }
 
-// Other blocks of this launch write what is read of expansions here, so that it comes from the cache of all of them.
-template <class Arrays> CUDA_CALLABLE inline void merge_children(const Arrays& a, int cell) {
-    __shared__ alignas(16) Real signed_from[HARMONICS][8];
+// Other blocks of the same launch write these expansions, so that __ldcg reads them from L2.
+template <class Arrays> CUDA_CALLABLE inline void multipole_from_children(const Arrays& a, int box) {
+    __shared__ alignas(16) Real mirrored[HARMONICS][8];
     for (int item = threadIdx.x; item < 8 * HARMONICS; item += THREADS) {
-        const int o = item / HARMONICS, k = item % HARMONICS, child = a.children.data[8 * (size_t)cell + o];
+        const int o = item / HARMONICS, k = item % HARMONICS, child = a.children.data[8 * (size_t)box + o];
         const Real* const from = a.multipoles.data + PITCH * (size_t)child + k;
-        signed_from[k][o] = child < 0 ? 0 : a.signs.data[PITCH * o + k] * __ldcg(from);
+        mirrored[k][o] = child < 0 ? 0 : a.signs.data[PITCH * o + k] * __ldcg(from);
     }
     __syncthreads();
     for (int i = threadIdx.x; i < HARMONICS; i += THREADS) {
         Real sums[8] = {}, q = 0;
-        multiply_row(sums, a.up.data, signed_from, i);
+        multiply_row(sums, a.multipole_to_parent.data, mirrored, i);
         for (int o = 0; o < 8; ++o) q += a.signs.data[PITCH * o + i] * sums[o];
-        a.multipoles.data[PITCH * (size_t)cell + i] = i < a.sources ? q : 0;
+        a.multipoles.data[PITCH * (size_t)box + i] = i < a.source_harmonics ? q : 0;
     }
 }
-template <class Arrays> CUDA_CALLABLE inline void spread_to_children(const Arrays& a, int cell) {
-    __shared__ alignas(16) Real signed_from[HARMONICS][8];
+template <class Arrays> CUDA_CALLABLE inline void locals_to_children(const Arrays& a, int box) {
+    __shared__ alignas(16) Real mirrored[HARMONICS][8];
     for (int k = threadIdx.x; k < HARMONICS; k += THREADS) {
-        const Real own = __ldcg(a.locals.data + PITCH * (size_t)cell + k);
-        for (int o = 0; o < 8; ++o) signed_from[k][o] = a.signs.data[PITCH * o + k] * own;
+        const Real value = __ldcg(a.locals.data + PITCH * (size_t)box + k);
+        for (int o = 0; o < 8; ++o) mirrored[k][o] = a.signs.data[PITCH * o + k] * value;
     }
     __syncthreads();
     for (int i = threadIdx.x; i < HARMONICS; i += THREADS) {
         Real sums[8] = {};
-        multiply_row(sums, a.down.data, signed_from, i);
+        multiply_row(sums, a.local_to_child.data, mirrored, i);
 #pragma unroll
         for (int o = 0; o < 8; ++o) {
-            const int child = a.children.data[8 * (size_t)cell + o];
+            const int child = a.children.data[8 * (size_t)box + o];
             if (child >= 0) a.locals.data[PITCH * (size_t)child + i] += a.signs.data[PITCH * o + i] * sums[o];
         }
     }
 }
 #else
+// Adds to ``out`` the matrix-vector product with ``from``, mirrored by ``signs``.
 inline void add_product(Real* out, const Real* matrix, const Real* from, const Real* signs) {
     constexpr int VECTORS = PITCH / WIDTH;
     Number sums[VECTORS] = {};
@@ -264,63 +267,64 @@ inline void add_product(Real* out, const Real* matrix, const Real* from, const R
     for (int v = 0; v < VECTORS; ++v)
         put(out + v * WIDTH, numbers(out + v * WIDTH) + numbers(signs + v * WIDTH) * sums[v]);
 }
-// Calls visit(child, signs of its octant).
-template <class Arrays, class Visit> void visit_children(const Arrays& a, int cell, Visit visit) {
+// Calls visit(child, signs of the child's octant).
+template <class Arrays, class Visit> void visit_children(const Arrays& a, int box, Visit visit) {
     for (int octant = 0; octant < 8; ++octant) {
-        const int child = a.children.data[8 * (size_t)cell + octant];
+        const int child = a.children.data[8 * (size_t)box + octant];
         if (child >= 0) visit(child, a.signs.data + PITCH * octant);
     }
 }
-template <class Arrays> void merge_children(const Arrays& a, int cell) {
-    Real* const multipole = a.multipoles.data + PITCH * (size_t)cell;
+template <class Arrays> void multipole_from_children(const Arrays& a, int box) {
+    Real* const multipole = a.multipoles.data + PITCH * (size_t)box;
     __builtin_memset(multipole, 0, PITCH * sizeof(Real));
-    visit_children(a, cell, [&](int child, const Real* signs) {
-        add_product(multipole, a.up.data, a.multipoles.data + PITCH * (size_t)child, signs);
+    visit_children(a, box, [&](int child, const Real* signs) {
+        add_product(multipole, a.multipole_to_parent.data, a.multipoles.data + PITCH * (size_t)child, signs);
     });
-    for (int i = a.sources; i < HARMONICS; ++i) multipole[i] = 0;
+    for (int i = a.source_harmonics; i < HARMONICS; ++i) multipole[i] = 0;
 }
-template <class Arrays> void spread_to_children(const Arrays& a, int cell) {
-    visit_children(a, cell, [&](int child, const Real* signs) {
-        add_product(a.locals.data + PITCH * (size_t)child, a.down.data, a.locals.data + PITCH * (size_t)cell, signs);
+template <class Arrays> void locals_to_children(const Arrays& a, int box) {
+    visit_children(a, box, [&](int child, const Real* signs) {
+        add_product(a.locals.data + PITCH * (size_t)child, a.local_to_child.data, a.locals.data + PITCH * (size_t)box,
+                    signs);
     });
 }
 #endif
 
-// Steps over all cells: up from the leaves, down to them, and the fields at their moments. Only cells two levels and
-// more below the cube are translated to each other, so that none above has an expansion.
-enum class Step { RISE, FALL, FIELDS };
+// Steps over all boxes: upward pass, downward pass, and evaluation at the moments. Multipoles are translated between
+// boxes at least two levels below the cube only, so coarser boxes have no expansion.
+enum class Step { UPWARD, DOWNWARD, EVALUATE };
 
 #if defined(__CUDA_ARCH__)
-// A block has a leaf; the last of those of a cell's children goes on with the cell.
-template <class Arrays> CUDA_CALLABLE inline void rise(const Arrays& a, int block) {
+// Each block starts at a leaf. The last block to finish a child of a box goes on with that box.
+template <class Arrays> CUDA_CALLABLE inline void upward_pass(const Arrays& a, int block) {
     if (block >= a.level_begin.data[1]) return;
     leaf_multipole(a, block);
-    int cell = block;
+    int box = block;
     for (int level = a.counts.data[0] - 1; level >= 2; --level) {
-        cell = a.parent.data[cell];
+        box = a.parent.data[box];
         int children = 0;
-        for (int o = 0; o < 8; ++o) children += a.children.data[8 * (size_t)cell + o] >= 0;
-        if (!is_last_of(a.arrived.data + cell, children)) return;
-        merge_children(a, cell);
+        for (int o = 0; o < 8; ++o) children += a.children.data[8 * (size_t)box + o] >= 0;
+        if (!is_last_of(a.arrived.data + box, children)) return;
+        multipole_from_children(a, box);
     }
 }
 
-// Blocks have cells in turn, from the top down, and wait for a cell's parent. It belongs to an earlier turn, or to a
-// block before this one, which GPUs start before.
-template <class Arrays> CUDA_CALLABLE inline void fall(const Arrays& a, int block, int blocks) {
+// Blocks take boxes in turn, from the top down, and wait for each box's parent. The parent belongs to an earlier turn,
+// or to a block of lower index, which GPUs start earlier.
+template <class Arrays> CUDA_CALLABLE inline void downward_pass(const Arrays& a, int block, int blocks) {
     const int levels = a.counts.data[0];
     if (levels < 3) return;
     const int leaves = a.level_begin.data[1], parents = a.level_begin.data[2], top = a.level_begin.data[levels - 2];
-    for (int cell = a.level_begin.data[levels - 1] - 1 - block; cell >= leaves; cell -= blocks) {
-        if (cell < top && threadIdx.x == 0) {
-            while (*(volatile int*)(a.arrived.data + cell) == 0) __nanosleep(50);
-            a.arrived.data[cell] = 0;
+    for (int box = a.level_begin.data[levels - 1] - 1 - block; box >= leaves; box -= blocks) {
+        if (box < top && threadIdx.x == 0) {
+            while (*(volatile int*)(a.arrived.data + box) == 0) __nanosleep(50);
+            a.arrived.data[box] = 0;
             __threadfence();
         }
         __syncthreads();
-        spread_to_children(a, cell);
+        locals_to_children(a, box);
         __syncthreads();
-        const int child = cell >= parents && threadIdx.x < 8 ? a.children.data[8 * (size_t)cell + threadIdx.x] : -1;
+        const int child = box >= parents && threadIdx.x < 8 ? a.children.data[8 * (size_t)box + threadIdx.x] : -1;
         if (child >= 0) {
             __threadfence();
             atomicExch(a.arrived.data + child, 1);
@@ -329,27 +333,26 @@ template <class Arrays> CUDA_CALLABLE inline void fall(const Arrays& a, int bloc
 }
 
 template <Step S, Quantity Q, class Word, class Arrays>
-CUDA_CALLABLE inline void visit_cells(int thread, int threads, Word*, const Arrays& a) {
+CUDA_CALLABLE inline void run_step(int thread, int threads, Word*, const Arrays& a) {
     const int block = thread / THREADS, leaf = a.leaves.data[0] + block;
-    if constexpr (S == Step::RISE) rise(a, block);
-    else if constexpr (S == Step::FALL) fall(a, block, threads);
+    if constexpr (S == Step::UPWARD) upward_pass(a, block);
+    else if constexpr (S == Step::DOWNWARD) downward_pass(a, block, threads);
     else if (leaf < a.leaves.data[1]) leaf_fields<Q>(a, leaf);
 }
 #else
-template <Step S, Quantity Q, class Word, class Arrays>
-void visit_cells(int, int threads, Word* team, const Arrays& a) {
+template <Step S, Quantity Q, class Word, class Arrays> void run_step(int, int threads, Word* team, const Arrays& a) {
     const int levels = a.counts.data[0], *const begin = a.level_begin.data;
-    const auto visit_run = [&](const int* run, auto work) {
+    const auto for_range = [&](const int* run, auto work) {
         share_out(team, threads, run[1] - run[0], 4, [&](int i) { work(run[0] + i); });
     };
-    const auto visit = [&](int height, auto work) { visit_run(begin + height, work); };
-    if constexpr (S == Step::RISE) {
+    const auto visit = [&](int height, auto work) { for_range(begin + height, work); };
+    if constexpr (S == Step::UPWARD) {
         visit(0, [&](int leaf) { leaf_multipole(a, leaf); });
-        for (int height = 1; height <= levels - 2; ++height) visit(height, [&](int cell) { merge_children(a, cell); });
-    } else if constexpr (S == Step::FALL) {
-        for (int height = levels - 2; height > 0; --height)
-            visit(height, [&](int cell) { spread_to_children(a, cell); });
-    } else visit_run(a.leaves.data, [&](int leaf) { leaf_fields<Q>(a, leaf); });
+        for (int height = 1; height <= levels - 2; ++height)
+            visit(height, [&](int box) { multipole_from_children(a, box); });
+    } else if constexpr (S == Step::DOWNWARD) {
+        for (int height = levels - 2; height > 0; --height) visit(height, [&](int box) { locals_to_children(a, box); });
+    } else for_range(a.leaves.data, [&](int leaf) { leaf_fields<Q>(a, leaf); });
 }
 #endif
 }

@@ -1,7 +1,7 @@
-"""Sums over the pairs of moments in cells that are neighbours: field (Eq. 1), and force (Eqs. 4, 13, 14).
+"""Near-field sums: field (Eq. 1) and force (Eqs. 4, 13, 14) over pairs of moments in neighboring leaves.
 
-They are those of ``pairs/evaluate.py`` without the pairs that are far apart: of dipoles clamped at contact, as partial
-sums, to which ``finish.h`` adds what overlapping pairs lack.
+They are the sums of ``pairs/evaluate.py`` restricted to near pairs: dipoles clamped at contact, as partial sums.
+``finish.h`` then adds the corrections of overlapping pairs.
 """
 
 from functools import cache
@@ -15,59 +15,60 @@ from warpmag.kernels.shared.passes import passes_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
 _LEAVES_PER_THREAD = 16
-"""Leaves that make another thread worth waking."""
+"""Leaves per thread of a CPU, at least."""
 _WARPS = 4
-"""Warps of a block, each of which sums a leaf."""
-MOST_HELD = 4
+"""Warps of a block; each warp sums one leaf."""
+_TARGETS_PER_LANE = 4
 """Most targets of a lane, 2 or 4."""
 _BLOCKS = {
     2: {Quantity.FIELD: 6, Quantity.FORCE: 5, Quantity.WRENCH: 4},
     4: {Quantity.FIELD: 4, Quantity.FORCE: 3, Quantity.WRENCH: 2},
 }
-"""Blocks that a multiprocessor holds together then, in float32."""
+"""Blocks per multiprocessor in float32, by targets per lane and quantity."""
 
 
 @cache
-def near_arrays(dtype):
-    """Struct of what the sums work on."""
-
+def _arrays_type(dtype):
     @wp.struct
     class NearArrays:
+        # Moments in, sorted by leaf:
         moments: wp.array2d[dtype]
         effective: wp.array2d[dtype]
+        # Leaves in:
         neighbors: wp.array2d[int]
         moment_begin: wp.array[int]
         leaves: wp.array[int]
+        # Sums out:
         sums: wp.array2d[dtype]
 
     return NearArrays
 
 
 def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_begin, leaves, sums):
-    """Sum a quantity over the pairs in leaves that are neighbours.
+    """Launch the sums of a quantity over all pairs in neighboring leaves.
 
-    Labels of moments of a leaf that are near each other make forces fast: those of single balls are best their columns.
+    Forces are fastest where labels within a leaf are close to each other. Single balls are best labeled by column.
 
     Args:
         quantity: ``FIELD``, ``FORCE`` or ``WRENCH``.
-        moments: Packed moments sorted by leaf, leaves x fastest, then y, z and world, shape [8, n], with the pitch of
+        moments: Packed moments sorted by leaf, and leaves by world, z, y and x, shape [8, n], with the pitch of
             ``packing``.
-        effective: Effective moments e [A·m²] of the force, sorted likewise, shape [3, n].
-        neighbors: Leaf at each offset x + 3 y + 9 z, itself in the middle, −1 for none, shape [cells, 27].
-        moment_begin: First column of each leaf, and the end after the last, shape [cells + 1] or more.
-        leaves: First leaf whose moments are targets, and the end after the last.
-        sums: Out, a row for each sorted moment: 4π times the force sum and the field, shape [n, 3 or 6].
+        effective: Effective moments e [A·m²] of the force, in the same order, shape [3, n].
+        neighbors: Leaf at each offset x + 3 y + 9 z, itself in the middle, −1 for none, shape [boxes, 27].
+        moment_begin: First column of each leaf, and the end after the last, shape [boxes + 1] or more.
+        leaves: Range of leaves whose moments are targets, shape [2].
+        sums: Out: 4π times force sum and field of each sorted moment, shape [n, 3 or 6].
     """
-    a = near_arrays(sums.dtype)()
+    a = _arrays_type(sums.dtype)()
     a.moments, a.effective, a.neighbors = moments, effective, neighbors
     a.moment_begin, a.leaves, a.sums = moment_begin, leaves, sums
-    device, most = sums.device, moment_begin.shape[0] - 1
+    device, capacity = sums.device, moment_begin.shape[0] - 1
     if device.is_cuda:
         block = 32 * _WARPS
-        dim = -(-most // _WARPS) * block
-        wp.launch(_cuda_kernel(sums.dtype, quantity, MOST_HELD), dim=dim, inputs=[a], device=device, block_dim=block)
+        dim = -(-capacity // _WARPS) * block
+        wp.launch(_cuda_kernel(sums.dtype, quantity), dim=dim, inputs=[a], device=device, block_dim=block)
         return
-    threads = threads_for(most, _LEAVES_PER_THREAD)
+    threads = threads_for(capacity, _LEAVES_PER_THREAD)
     wp.launch(_cpu_kernel(sums.dtype, quantity), dim=1, inputs=[0, 1, threads, team(), a], device=device)
 
 
@@ -75,14 +76,14 @@ def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_b
 def _cpu_kernel(dtype, quantity: Quantity):
     return passes_kernel(
         f"warpmag::cpu::sum_near<warpmag::Quantity({quantity:d})>(arrays, threads, team.data);",
-        near_arrays(dtype),
-        native_options("fmm/near_cpu.h", dtype=dtype, TILE_SIZE=tile_size(dtype)),
+        _arrays_type(dtype),
+        native_options("fmm/near.h", dtype=dtype, TILE_SIZE=tile_size(dtype)),
     )
 
 
 @cache
-def _cuda_kernel(dtype, quantity: Quantity, most_held: int):
-    arrays_struct = near_arrays(dtype)
+def _cuda_kernel(dtype, quantity: Quantity):
+    arrays_struct = _arrays_type(dtype)
 
     @wp.func_native(f"warpmag::sum_leaf<warpmag::Quantity({quantity:d}), {_WARPS}>(thread, arrays);")
     def run(thread: int, arrays: arrays_struct): ...
@@ -91,8 +92,8 @@ def _cuda_kernel(dtype, quantity: Quantity, most_held: int):
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        launch_bounds=(32 * _WARPS, _BLOCKS[most_held][quantity] if dtype is wp.float32 else 1),
-        module_options=native_options("fmm/near_cuda.h", dtype=dtype, MOST_HELD=most_held),
+        launch_bounds=(32 * _WARPS, _BLOCKS[_TARGETS_PER_LANE][quantity] if dtype is wp.float32 else 1),
+        module_options=native_options("fmm/near.h", dtype=dtype, TARGETS_PER_LANE=_TARGETS_PER_LANE),
     )
     def near_sums_cuda(arrays: arrays_struct):
         run(wp.tid(), arrays)

@@ -1,67 +1,66 @@
-"""The part of the cells that one of several processes has: what they sum is merged, and has the bits of one process.
+"""One process's share of an octree's boxes: merged sums have the same bits as those of a single process.
 
-All have the grid and the multipoles. Of the leaves a process has a run, for the pairs that are near and for the fields
-at its moments. It translates to these and to the cells that they are part of, which two processes may both have: there
-are few of them, and local expansions then need not be merged.
+Every process has the octree and all multipoles. It takes a contiguous range of leaves, for near pairs and for fields at
+its moments. Multipoles are translated to these leaves and to their ancestors. Two processes may both compute an
+ancestor: there are few, and local expansions then need not be merged.
 """
 
 import warp as wp
 
-from warpmag.kernels.fmm.grid import MomentGrid
+from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.fmm.translate import Translation
 
-_LEAST_CELLS = {"cpu": 1, "cuda": 8193}
-"""Fewest cells that there is room for that are worth sharing out, by kind of device: for fewer a GPU translates in
-parts, all of which it adds up."""
+_LEAST_BOXES = {"cpu": 1, "cuda": 8193}
+"""Fewest boxes worth sharing, by device: below that a GPU splits translations into partial sums of all boxes."""
 
 
-def share_cells(grid: MomentGrid, ranks) -> "CellShares | None":
-    """Cells of one of ``ranks``; None where there are none of these, or each does better with all cells."""
-    worth = grid.capacity >= _LEAST_CELLS["cuda" if grid.device.is_cuda else "cpu"]
-    return CellShares(grid, ranks) if worth and ranks is not None else None
+def share_boxes(octree: Octree, ranks) -> "BoxShares | None":
+    """Return this rank's share of boxes; None for a single process, or where sharing does not pay."""
+    worth_sharing = octree.capacity >= _LEAST_BOXES["cuda" if octree.device.is_cuda else "cpu"]
+    return BoxShares(octree, ranks) if worth_sharing and ranks is not None else None
 
 
-class CellShares:
-    """Cells of one of several processes.
+class BoxShares:
+    """One process's share of the boxes.
 
     Args:
-        grid: The cells of all.
+        octree: The octree.
         ranks: The processes (``warpmag.moments.ranks.Ranks``).
 
     Attributes:
-        leaves: First leaf of this process, and the end after its last, shape [2].
-        order: Its cells by height and octant, as those of the grid.
-        octant_begin: Where those of each octant begin and end in ``order``.
+        leaves: Range of this process's leaves, shape [2].
+        order: This process's boxes sorted by height and octant.
+        octant_begin: Range of each height and octant in ``order``, shape [levels, 9].
     """
 
-    def __init__(self, grid: MomentGrid, ranks):
+    def __init__(self, octree: Octree, ranks):
         """Allocate the lists."""
-        self._grid, self.ranks = grid, ranks
-        self.leaves = wp.zeros(2, dtype=int, device=grid.device)
-        self._own, self._before = (wp.zeros(grid.capacity, dtype=int, device=grid.device) for _ in range(2))
-        self.order, self.octant_begin = wp.zeros_like(grid.order), wp.zeros_like(grid.octant_begin)
+        self._octree, self.ranks = octree, ranks
+        self.leaves = wp.zeros(2, dtype=int, device=octree.device)
+        self._marks, self._counts = (wp.zeros(octree.capacity, dtype=int, device=octree.device) for _ in range(2))
+        self.order, self.octant_begin = wp.zeros_like(octree.order), wp.zeros_like(octree.octant_begin)
 
     def find(self):
-        """Launch the choice of cells of a grid that has been built."""
-        grid, count, device = self._grid, self._grid.capacity, self._grid.device
-        self._own.zero_()
-        inputs = [self.ranks.rank, self.ranks.size, grid.level_begin, grid.parent]
-        wp.launch(_mark_cells, count, inputs, [self.leaves, self._own], device=device)
-        inputs = [grid.octant_begin, grid.order, self._own]
-        wp.launch(_list_marks, count, inputs, [self._before], device=device)
-        wp.utils.array_scan(self._before, self._before, inclusive=True)
-        inputs += [self._before]
+        """Launch the choice of boxes, after the octree was built."""
+        octree, count, device = self._octree, self._octree.capacity, self._octree.device
+        self._marks.zero_()
+        inputs = [self.ranks.rank, self.ranks.size, octree.level_begin, octree.parent]
+        wp.launch(_mark_boxes, count, inputs, [self.leaves, self._marks], device=device)
+        inputs = [octree.octant_begin, octree.order, self._marks]
+        wp.launch(_list_marks, count, inputs, [self._counts], device=device)
+        wp.utils.array_scan(self._counts, self._counts, inclusive=True)
+        inputs += [self._counts]
         outputs = [self.order, self.octant_begin]
-        wp.launch(_choose_cells, max(count, grid.octant_begin.size), inputs, outputs, device=device)
+        wp.launch(_choose_boxes, max(count, octree.octant_begin.size), inputs, outputs, device=device)
 
     def translate(self, translation: Translation, arrays):
-        """Launch the translation to the cells of this process, of arrays that are bound to its lists."""
-        arrays.locals.zero_()  # others get what their parents have, again and again
+        """Launch the translation to this process's boxes; ``arrays`` are bound to its lists."""
+        arrays.locals.zero_()  # the downward pass accumulates in boxes that are not translated to
         translation.launch(arrays)
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def _mark_cells(
+def _mark_boxes(
     # inputs:
     rank: int,
     ranks: int,
@@ -69,7 +68,7 @@ def _mark_cells(
     parent: wp.array[int],
     # outputs:
     leaves_out: wp.array[int],
-    own_out: wp.array[int],
+    marks_out: wp.array[int],
 ):
     leaf = wp.tid()
     begin = level_begin[1] * rank // ranks
@@ -78,10 +77,10 @@ def _mark_cells(
         leaves_out[0] = begin
         leaves_out[1] = end
     if leaf >= begin and leaf < end:
-        cell = int(leaf)
-        while cell >= 0 and own_out[cell] == 0:  # who has marked a cell goes on with those it is part of
-            own_out[cell] = 1
-            cell = parent[cell]
+        box = int(leaf)
+        while box >= 0 and marks_out[box] == 0:  # whoever marks a box goes on with its ancestors
+            marks_out[box] = 1
+            box = parent[box]
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -89,31 +88,31 @@ def _list_marks(
     # inputs:
     octant_begin: wp.array2d[int],
     order: wp.array[int],
-    own: wp.array[int],
+    marks: wp.array[int],
     # outputs:
     marks_out: wp.array[int],
 ):
     i = wp.tid()
     mark = int(0)
     if i < octant_begin[octant_begin.shape[0] - 1, 8]:
-        mark = own[order[i]]
+        mark = marks[order[i]]
     marks_out[i] = mark
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def _choose_cells(
+def _choose_boxes(
     # inputs:
     octant_begin: wp.array2d[int],
     order: wp.array[int],
-    own: wp.array[int],
-    before: wp.array[int],
+    marks: wp.array[int],
+    marks_before: wp.array[int],
     # outputs:
     order_out: wp.array[int],
     octant_begin_out: wp.array2d[int],
 ):
     i = wp.tid()
-    if i < octant_begin[octant_begin.shape[0] - 1, 8] and own[order[i]] == 1:
-        order_out[before[i] - 1] = order[i]
+    if i < octant_begin[octant_begin.shape[0] - 1, 8] and marks[order[i]] == 1:
+        order_out[marks_before[i] - 1] = order[i]
     if i < octant_begin.shape[0] * 9:
         first = octant_begin[i // 9, i % 9]
-        octant_begin_out[i // 9, i % 9] = wp.where(first > 0, before[wp.max(first - 1, 0)], 0)
+        octant_begin_out[i // 9, i % 9] = wp.where(first > 0, marks_before[wp.max(first - 1, 0)], 0)

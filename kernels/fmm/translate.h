@@ -1,44 +1,46 @@
-// Translation of multipoles to local expansions: what both devices share.
+// Multipole-to-local translation (M2L): parts that both devices share.
 //
-// A cell's far part comes from the children of its parent's neighbours that are not its own neighbours, at 189
-// displacements d = source − target. Where a component of d changes its sign, the matrix T of a translation does so in
-// rows and columns of odd parity only: T(σ|d|) = P T(|d|) P, P the diagonal of the harmonics' signs under σ. So those
-// of one |d| are summed before they are translated. With σ the n = 1, 2, 4 or 8 signs that components of 1 and 2 have
-// (those of 3 have one sign in an octant, and zeros none), the rows of parity class a are
+// Sources of a box's far field are the children of its parent's neighbors that are not its own neighbors, at up to 189
+// displacements d = source − target. A component of d that changes sign flips the translation matrix in rows and
+// columns of odd parity only: T(σ|d|) = P T(|d|) P, with P the diagonal of the harmonics' signs under σ. Sources of
+// equal |d| are therefore summed before they are translated. Let σ be the n = 1, 2, 4 or 8 sign combinations.
+// Components 1 and 2 have both signs; a component 3 has one sign in an octant, and 0 has no_box. Then the rows of
+// parity class a are
 //
 //     L_a = Σ_k T(|d|)_ak u_p[k],    u_p[k] = Σ_σ χ_p(σ) χ_class(k)(σ) q_σ[k],
 //
-// χ the products of signs over the odd axes of a class, p those of a: 56 matrix products do the work of 189, on planes
-// u of sources, which are Walsh-Hadamard transforms. An octant has the signs of octant 0, mirrored: its multipoles and
-// its results take the signs of its mirror images.
+// with χ the product of signs over the odd axes of a class, and p the signed axes of a. So 56 matrix products do the
+// work of 189. The planes u are Walsh-Hadamard transforms of the sources. Other octants are mirror images of octant 0:
+// their multipoles and results take the signs of that reflection.
 //
-// A class is a bit for each axis, 1 for x, 2 for y and 4 for z, set where a harmonic is odd.
+// A parity class has one bit per axis, 1 for x, 2 for y and 4 for z, set where a harmonic is odd.
 #pragma once
 
 namespace warpmag {
 
 constexpr int MOST_SIGNS = 8;
 
-// Magnitude |d| as 2 bits an axis, x the lowest: all from 0 to 63 with a component beyond 1.
+// Next magnitude |d| after ``code``, which has 2 bits per axis, x lowest. At least one component exceeds 1; 64 ends.
 CUDA_CALLABLE inline int next_magnitude(int code) {
     do ++code;
     while (code < 64 && !(code & 42));
     return code < 64 ? code : 64;
 }
 
-// Axes along which both signs of a displacement of that magnitude are translated, those of a component 1 or 2.
+// Axes whose component of |d| is 1 or 2, so that both signs occur.
 CUDA_CALLABLE inline int signed_axes(int code) {
     const int axes = (code ^ code >> 1) & 21;
     return (axes & 1) | (axes >> 1 & 2) | (axes >> 2 & 4);
 }
 
+// Number of sign combinations along some axes.
 CUDA_CALLABLE inline int signs_of(int axes) { return 1 << ((axes & 1) + (axes >> 1 & 1) + (axes >> 2 & 1)); }
 
-// The bits of a class at some axes, one beside the other; and back.
+// The bits of ``parity`` at ``axes``, packed together, and the inverse.
 CUDA_CALLABLE inline int extract_axes(int parity, int axes) {
     const int y = axes & 1, z = y + (axes >> 1 & 1);
-    const int wanted = parity & axes;
-    return (wanted & 1) | (wanted >> 1 & 1) << y | (wanted >> 2) << z;
+    const int bits = parity & axes;
+    return (bits & 1) | (bits >> 1 & 1) << y | (bits >> 2) << z;
 }
 
 CUDA_CALLABLE inline int deposit_axes(int bits, int axes) {
@@ -46,11 +48,11 @@ CUDA_CALLABLE inline int deposit_axes(int bits, int axes) {
     return (bits & axes & 1) | ((bits >> y) << 1 & axes & 2) | ((bits >> z) << 2 & axes & 4);
 }
 
-// The cell at a displacement of magnitude ``code`` from a cell of an octant, against the octant's own signs along the
-// axes ``flipped``; ``none`` where there is none.
+// Source box at a displacement of magnitude ``code`` from a box in an octant, or ``no_box``. The displacement has the
+// octant's usual signs, reversed along the axes ``flipped``.
 template <class Arrays>
-CUDA_CALLABLE inline int source_cell(const Arrays& arrays, int parent, int octant, int code, int flipped, int none) {
-    if (parent < 0) return none;
+CUDA_CALLABLE inline int source_box(const Arrays& arrays, int parent, int octant, int code, int flipped, int no_box) {
+    if (parent < 0) return no_box;
     int near = 0, child = 0;
 #pragma unroll
     for (int axis = 0, stride = 1; axis < 3; ++axis, stride *= 3) {
@@ -60,18 +62,18 @@ CUDA_CALLABLE inline int source_cell(const Arrays& arrays, int parent, int octan
         child |= (place & 1) << axis;
     }
     const int neighbor = arrays.neighbors.data[27 * (size_t)parent + near];
-    if (neighbor < 0) return none;
-    const int cell = arrays.children.data[8 * (size_t)neighbor + child];
-    return cell < 0 ? none : cell;
+    if (neighbor < 0) return no_box;
+    const int box = arrays.children.data[8 * (size_t)neighbor + child];
+    return box < 0 ? no_box : box;
 }
 
-// Cells of one octant and level that are translated together: places in ``order``.
-struct CellRun {
+// Range in ``order`` of boxes of one octant and level that are translated together.
+struct BoxRun {
     int begin, end, octant;
 };
 
-// The index-th run of at most ``width`` cells; none beyond the last. Shape of octant_begin: [levels, 9].
-CUDA_CALLABLE inline CellRun cell_run(const wp::array_t<int>& octant_begin, int width, int index) {
+// The index-th run of at most ``width`` boxes; empty beyond the last run. Shape of octant_begin: [levels, 9].
+CUDA_CALLABLE inline BoxRun box_run(const wp::array_t<int>& octant_begin, int width, int index) {
     for (int level = 0; level < (int)octant_begin.shape[0]; ++level) {
         const int* const begin = octant_begin.data + 9 * level;
         for (int octant = 0; octant < 8; ++octant) {
@@ -86,7 +88,7 @@ CUDA_CALLABLE inline CellRun cell_run(const wp::array_t<int>& octant_begin, int 
     return {0, 0, 0};
 }
 
-// Sums of N values by all their signs.
+// Walsh-Hadamard transform of N values, in place.
 template <int N, class V> CUDA_CALLABLE inline void transform_signs(V (&values)[N]) {
 #pragma unroll
     for (int step = 1; step < N; step *= 2)

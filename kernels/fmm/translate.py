@@ -1,8 +1,7 @@
-"""Translation of the multipoles of cells to the local expansions of others; ``translate.h`` has the equations.
+"""Multipole-to-local translation (M2L) of boxes of the octree; ``translate.h`` has the equations.
 
-A level is a grid of cells, of which only those that hold something exist. What a cell takes from afar comes from the
-children of its parent's 26 neighbours, and of its parent, that are not its own neighbours: 189 where all of them exist.
-Sums are in a fixed order, without atomics, so that results repeat bit by bit.
+Sources of a box's far field are children of its parent's neighborhood that are not its own neighbors: at most 189. Sums
+run in a fixed order without atomics, so results repeat bit by bit.
 """
 
 from functools import cache
@@ -14,44 +13,46 @@ from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.passes import passes_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
-_CELLS_PER_THREAD = 64
-"""Cells that make another thread worth waking."""
+_BOXES_PER_THREAD = 64
+"""Boxes per thread of a CPU, at least."""
 _WARPS_TOGETHER = 12
-"""Warps that a multiprocessor holds together in float32: what their registers allow."""
-_CELLS = 32
-"""Cells of a block of a GPU."""
+"""Warps per multiprocessor in float32, limited by registers."""
+_BOXES = 32
+"""Boxes per block of a GPU."""
 _GROUP_ROWS = 8
-"""Places for the rows of a thread of a GPU."""
+"""Row slots per thread of a GPU."""
 _MOST_SPLIT = 8192
-"""Most cells for which a GPU has room for several blocks that share the displacements of the same cells."""
+"""Most boxes for which several blocks of a GPU share the displacements of the same boxes: few boxes do not fill it."""
 OCTANTS = 8
 
 
 def pitch(harmonics: int) -> int:
-    """Coefficients of a row of an array of expansions, the last of them zero."""
+    """Return the padded row length of arrays of expansions; the padding is zero."""
     return -(-harmonics // 16) * 16
 
 
 def displacements() -> np.ndarray:
-    """The displacements, source − target, that have a matrix, in its order, shape [56, 3]."""
+    """Return the displacements source − target in the order of their matrices, shape [56, 3]."""
     x, y, z = np.arange(64) % 4, np.arange(64) // 4 % 4, np.arange(64) // 16
     return np.stack([x, y, z], axis=1)[np.maximum(np.maximum(x, y), z) > 1]
 
 
 @cache
-def translation_arrays(dtype):
-    """Struct of what a translation works on."""
-
+def _arrays_type(dtype):
     @wp.struct
     class TranslationArrays:
+        # Expansions:
         multipoles: wp.array2d[dtype]
         locals: wp.array2d[dtype]
+        # Boxes in:
         neighbors: wp.array2d[int]
         children: wp.array2d[int]
         parent: wp.array[int]
         order: wp.array[int]
         octant_begin: wp.array2d[int]
+        # Partial local expansions:
         parts: wp.array3d[dtype]
+        # Matrices, and parities of harmonics:
         matrices: wp.array[dtype]
         signs: wp.array2d[dtype]
         parity: wp.array[int]
@@ -62,11 +63,11 @@ def translation_arrays(dtype):
 
 
 class Translation:
-    """Matrices and launch of the translation of multipoles of one degree.
+    """Translation of multipoles of one degree: its matrices on a device, and its launch.
 
     Args:
-        matrices: Matrix of each of ``displacements``, harmonics of the target in rows, shape [56, K, K].
-        parity: Signs ±1 that harmonics take where x, y or z changes its sign, shape [3, K].
+        matrices: Matrix of each displacement, rows are harmonics of the target, shape [56, K, K].
+        parity: Signs ±1 of the harmonics under reflections of x, y and z, shape [3, K].
         dtype: Warp scalar type of the coefficients.
         device: Warp device.
     """
@@ -105,24 +106,24 @@ class Translation:
         }
 
     def parts(self, shape) -> wp.array | None:
-        """Partial sums for local expansions of a shape, which blocks of a GPU share where cells are few; else None."""
+        """Return buffers for partial sums of local expansions, for GPUs with few boxes; else None."""
         splits = _splits(self._constants["ROWS"]) if self._device.is_cuda and shape[0] <= _MOST_SPLIT else 1
         return wp.zeros((splits, *shape), dtype=self._dtype, device=self._device) if splits > 1 else None
 
     def bind(self, multipoles, local, neighbors, children, parent, order, octant_begin, parts=None):
-        """Return what :meth:`launch` works on; all evaluations have the same tables, and arrays of their own.
+        """Return the arrays for :meth:`launch`: shared tables, and the given arrays.
 
         Args:
-            multipoles: Multipoles of c cells, and a row of zeros, shape [c + 1, pitch].
-            local: Out, local expansions, of cells that are in ``order``, shape [c + 1, pitch].
-            neighbors: Cell at each offset x + 3 y + 9 z, −1 for none, shape [c, 27].
-            children: Child of each octant x + 2 y + 4 z of a cell, −1 for none, shape [c, 8].
-            parent: Parent of each cell, −1 for none, shape [c].
-            order: Cells of each level and octant.
-            octant_begin: Where those of each octant begin and end in ``order``, shape [levels, 9].
-            parts: What :meth:`parts` returned for these local expansions.
+            multipoles: Multipoles of c boxes, then a row of zeros, shape [c + 1, pitch].
+            local: Out: local expansions of the boxes in ``order``, shape [c + 1, pitch].
+            neighbors: Box at each offset x + 3 y + 9 z, −1 for none, shape [c, 27].
+            children: Child in each octant x + 2 y + 4 z, −1 for none, shape [c, 8].
+            parent: Parent of each box, −1 for none, shape [c].
+            order: Boxes sorted by level and octant.
+            octant_begin: Range of each level and octant in ``order``, shape [levels, 9].
+            parts: Buffers from :meth:`parts` for these local expansions.
         """
-        a = translation_arrays(self._dtype)()
+        a = _arrays_type(self._dtype)()
         for name, table in self._tables.items():
             setattr(a, name, table)
         a.multipoles, a.locals, a.neighbors, a.children = multipoles, local, neighbors, children
@@ -132,20 +133,20 @@ class Translation:
         return a
 
     def launch(self, arrays):
-        """Set the far part of the local expansions of all cells, with what their parents do not have."""
-        cells = arrays.multipoles.shape[0] - 1
+        """Launch the local expansions of all boxes, from the sources that are near neighbors of their parents."""
+        boxes = arrays.multipoles.shape[0] - 1
         if self._device.is_cuda:
-            self._launch_cuda(arrays, cells)
+            self._launch_cuda(arrays, boxes)
             return
         kernel = _cpu_kernel(self._dtype, tuple(self._constants.items()))
-        threads = threads_for(cells, _CELLS_PER_THREAD)
+        threads = threads_for(boxes, _BOXES_PER_THREAD)
         wp.launch(kernel, dim=1, inputs=[0, 1, threads, team(), arrays], device=self._device)
 
-    def _launch_cuda(self, a, cells: int):
-        """Launch the translation of arrays for so many cells on a GPU."""
+    def _launch_cuda(self, a, boxes: int):
+        """Launch the translation on a GPU, for at most ``boxes`` boxes."""
         splits = 1 if a.parts is None else a.parts.shape[0]
         kernel, threads = _cuda_kernel(self._dtype, splits, tuple(self._constants.items()))
-        blocks = splits * (-(-cells // _CELLS) + OCTANTS * a.octant_begin.shape[0])
+        blocks = splits * (-(-boxes // _BOXES) + OCTANTS * a.octant_begin.shape[0])
         wp.launch(kernel, dim=blocks * threads, inputs=[a], device=self._device, block_dim=threads)
         if splits > 1:
             inputs = [a.octant_begin, a.locals.shape[1], a.parts.reshape((splits, -1)), a.locals.flatten()]
@@ -153,32 +154,32 @@ class Translation:
 
 
 def _slice(dtype) -> int:
-    """Harmonics of the sources that a block has in shared memory at a time."""
+    """Return the number of the sources' harmonics in shared memory at a time."""
     return 8 if dtype is wp.float32 else 4
 
 
 def _grouped_rows(classes: np.ndarray, group: int, used: int) -> np.ndarray:
-    """Harmonics sorted by class, in groups of which the first ``used`` hold some of one class, and −1 behind them."""
+    """Return harmonics sorted by parity class, in groups of one class: ``used`` harmonics or −1, then −1."""
     groups = []
-    for one in range(OCTANTS):
-        members = np.flatnonzero(classes == one)
+    for parity_class in range(OCTANTS):
+        members = np.flatnonzero(classes == parity_class)
         padded = np.append(members, np.full(-len(members) % used, -1)).reshape(-1, used)
         groups.append(np.pad(padded, ((0, 0), (0, group - used)), constant_values=-1))
     return np.concatenate(groups).ravel()
 
 
 def _threads(rows: int) -> int:
-    """Threads of a block of a GPU for so many rows, in whole warps."""
-    return -(-(_CELLS // 8 * rows // _GROUP_ROWS) // 32) * 32
+    """Return the threads of a GPU's block for ``rows`` rows, in whole warps."""
+    return -(-(_BOXES // 8 * rows // _GROUP_ROWS) // 32) * 32
 
 
 def _splits(rows: int) -> int:
-    """Blocks that share the 56 displacements of the same few cells: of small ones more have room."""
+    """Return the number of blocks that share the 56 displacements: more where blocks are small."""
     return 14 if _threads(rows) <= 64 else 4
 
 
 def _used_rows(classes: np.ndarray) -> int:
-    """Rows of a thread of a GPU: 6 where classes fill groups of these so much better that a block has a tenth less."""
+    """Return the rows per thread of a GPU: 6 if parity classes then fill groups with a tenth less work, else 8."""
     work = {used: used * _threads(len(_grouped_rows(classes, _GROUP_ROWS, used))) for used in (6, 8)}
     return 6 if work[6] <= 0.9 * work[8] else 8
 
@@ -187,7 +188,7 @@ def _used_rows(classes: np.ndarray) -> int:
 def _cpu_kernel(dtype, constants):
     return passes_kernel(
         "warpmag::cpu::translate(arrays, threads, team.data);",
-        translation_arrays(dtype),
+        _arrays_type(dtype),
         native_options("fmm/translate_cpu.h", dtype=dtype, **dict(constants)),
     )
 
@@ -196,9 +197,9 @@ def _cpu_kernel(dtype, constants):
 def _cuda_kernel(dtype, splits: int, constants):
     sizes = dict(constants)
     threads = _threads(sizes["ROWS"])
-    arrays_struct = translation_arrays(dtype)
+    arrays_struct = _arrays_type(dtype)
     blocks = max(1, _WARPS_TOGETHER // (threads // 32)) if dtype is wp.float32 else 1
-    numbers = f"{_CELLS}, {_slice(dtype)}, {splits}"
+    numbers = f"{_BOXES}, {_slice(dtype)}, {splits}"
 
     @wp.func_native(f"warpmag::translate_block<{numbers}>(thread, arrays);")
     def run(thread: int, arrays: arrays_struct): ...
@@ -228,7 +229,7 @@ def _add_kernel(dtype):
         locals_out: wp.array[dtype],
     ):
         i = wp.tid()
-        if i >= octant_begin[octant_begin.shape[0] - 1, 8] * width:  # no cell
+        if i >= octant_begin[octant_begin.shape[0] - 1, 8] * width:  # beyond the last box
             return
         total = parts[0, i]
         for part in range(1, parts.shape[0]):

@@ -1,4 +1,4 @@
-// Translation of multipoles to local expansions on a CPU: vectors along cells, threads along runs of cells.
+// Multipole-to-local translation on a CPU: vectors run along boxes, threads along runs of boxes.
 #pragma once
 #include "fmm/translate.h"
 #include "shared/lanes.h"
@@ -7,14 +7,14 @@
 
 namespace warpmag::cpu {
 
-// A run of up to VECTORS vectors of cells: the sums of its rows, and planes of sources.
+// Buffers for a run of up to VECTORS vectors of boxes: planes of sources, and sums by row.
 template <int VECTORS> struct Run {
     Number planes[MOST_SIGNS][PITCH][VECTORS];
     Number sums[ROWS][VECTORS];
     int sources[MOST_SIGNS][VECTORS * WIDTH];
 };
 
-// Puts the sums over signs of N sources of each cell into their planes.
+// Transforms the N sources of each box, and writes them into their planes.
 template <int N, int VECTORS, class Arrays>
 __attribute__((noinline)) void fill_planes(Run<VECTORS>& run, const Arrays& arrays, int octant, int axes) {
     const Real* const signs = arrays.signs.data + octant * PITCH;
@@ -41,7 +41,7 @@ __attribute__((noinline)) void fill_planes(Run<VECTORS>& run, const Arrays& arra
         }
 }
 
-// Adds the product of a matrix and the planes of sources. Shape of matrix: [ROWS / GROUP_ROWS, HARMONICS, GROUP_ROWS].
+// Adds the product of a matrix with the planes of sources. Shape of matrix: [ROWS / GROUP_ROWS, HARMONICS, GROUP_ROWS].
 template <int VECTORS>
 __attribute__((noinline)) void add_product(Run<VECTORS>& run, const Real* matrix, const int* row_parity, int axes) {
     for (int row = 0; row < ROWS; row += GROUP_ROWS) {
@@ -57,41 +57,41 @@ __attribute__((noinline)) void add_product(Run<VECTORS>& run, const Real* matrix
     }
 }
 
-// Translates to the cells of a run.
-template <int VECTORS, class Arrays> void translate_run(const Arrays& arrays, CellRun cells) {
+// Writes the local expansions of a run of boxes.
+template <int VECTORS, class Arrays> void translate_run(const Arrays& arrays, BoxRun boxes) {
     constexpr int WIDE = VECTORS * WIDTH;
     Run<VECTORS> run;
     __builtin_memset(run.sums, 0, sizeof(run.sums));
-    const int none = (int)arrays.multipoles.shape[0] - 1, count = cells.end - cells.begin;
-    const int* const order = arrays.order.data + cells.begin;
+    const int no_box = (int)arrays.multipoles.shape[0] - 1, count = boxes.end - boxes.begin;
+    const int* const order = arrays.order.data + boxes.begin;
     const Real* matrix = arrays.matrices.data;
     for (int code = next_magnitude(0); code < 64; code = next_magnitude(code), matrix += ROWS * HARMONICS) {
         const int axes = signed_axes(code), signs = signs_of(axes);
-        bool found = false;
+        bool occupied = false;
         for (int i = 0; i < signs; ++i)
             for (int l = 0; l < WIDE; ++l) {
                 const int parent = l < count ? arrays.parent.data[order[l]] : -1;
-                const int source = source_cell(arrays, parent, cells.octant, code, deposit_axes(i, axes), none);
+                const int source = source_box(arrays, parent, boxes.octant, code, deposit_axes(i, axes), no_box);
                 run.sources[i][l] = source;
-                found |= source != none;
+                occupied |= source != no_box;
             }
-        if (!found) continue;
-        if (signs == 8) fill_planes<8>(run, arrays, cells.octant, axes);
-        else if (signs == 4) fill_planes<4>(run, arrays, cells.octant, axes);
-        else if (signs == 2) fill_planes<2>(run, arrays, cells.octant, axes);
-        else fill_planes<1>(run, arrays, cells.octant, axes);
+        if (!occupied) continue;
+        if (signs == 8) fill_planes<8>(run, arrays, boxes.octant, axes);
+        else if (signs == 4) fill_planes<4>(run, arrays, boxes.octant, axes);
+        else if (signs == 2) fill_planes<2>(run, arrays, boxes.octant, axes);
+        else fill_planes<1>(run, arrays, boxes.octant, axes);
         add_product<VECTORS>(run, matrix, arrays.row_parity.data, axes);
     }
     for (int l = 0; l < count; ++l) {
         Real* const local = arrays.locals.data + PITCH * (size_t)order[l];
         for (int row = 0; row < ROWS; ++row) {
             const int k = arrays.row_harmonic.data[row];
-            if (k >= 0) local[k] = arrays.signs.data[cells.octant * PITCH + k] * run.sums[row][l / WIDTH][l % WIDTH];
+            if (k >= 0) local[k] = arrays.signs.data[boxes.octant * PITCH + k] * run.sums[row][l / WIDTH][l % WIDTH];
         }
     }
 }
 
-// Translates to all cells.
+// Writes the local expansions of all boxes in ``order``.
 template <class Arrays> void translate(const Arrays& arrays, int threads, Word* team) {
     constexpr int WIDE = 2 * WIDTH;
     int runs = 0;
@@ -100,9 +100,9 @@ template <class Arrays> void translate(const Arrays& arrays, int threads, Word* 
         if (i % 9 < 8) runs += (begin[1] - begin[0] + WIDE - 1) / WIDE;
     }
     share_out(team, threads, runs, 1, [&](int index) {
-        const CellRun cells = cell_run(arrays.octant_begin, WIDE, index);
-        if (cells.end - cells.begin > WIDTH) translate_run<2>(arrays, cells);
-        else translate_run<1>(arrays, cells);
+        const BoxRun boxes = box_run(arrays.octant_begin, WIDE, index);
+        if (boxes.end - boxes.begin > WIDTH) translate_run<2>(arrays, boxes);
+        else translate_run<1>(arrays, boxes);
     });
 }
 

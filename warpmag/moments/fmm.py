@@ -8,9 +8,9 @@ import numpy as np
 from warpmag.declarations.checks import check_token
 from warpmag.declarations.magnets import METHODS
 from warpmag.errors import InputError
-from warpmag.kernels.fmm.evaluation import CellSums
+from warpmag.kernels.fmm.evaluation import FmmSums
 from warpmag.kernels.fmm.expansions import ExpansionTables
-from warpmag.kernels.fmm.grid import MomentGrid, join_moments
+from warpmag.kernels.fmm.octree import Octree, join_moments
 from warpmag.kernels.fmm.translate import displacements
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.moments import harmonics
@@ -30,9 +30,9 @@ def expansion_tables(degree: int) -> ExpansionTables:
         growth=growth,
         decay=decay,
         derivatives=harmonics.derivatives(degree),
-        up=harmonics.multipole_to_multipole(degree, 0),
-        down=harmonics.local_to_local(degree, 0),
-        across=np.stack([harmonics.multipole_to_local(degree, -offset) for offset in displacements()]),
+        multipole_to_parent=harmonics.multipole_to_multipole(degree, 0),
+        local_to_child=harmonics.local_to_local(degree, 0),
+        multipole_to_local=np.stack([harmonics.multipole_to_local(degree, -offset) for offset in displacements()]),
         parity=harmonics.parity(degree),
     )
 
@@ -115,17 +115,17 @@ class FastSums:
             self._first = moments.count
             packed, groups = join_moments(moments, targets)
         self._tables = expansion_tables(degree)
-        self._grid = MomentGrid(packed, groups, worlds, occupancy=held, reach=reach)
+        self._octree = Octree(packed, groups, worlds, occupancy=held, reach=reach)
 
     def build(self):
         """Launch the making of the cells, for moments that have moved."""
-        self._grid.build()
+        self._octree.build()
 
-    def sums(self, quantity: Quantity, sources=None) -> CellSums | None:
-        """Sums of a quantity, of some ``sources`` only (see :class:`CellSums`); None for those of none."""
+    def sums(self, quantity: Quantity, sources=None) -> FmmSums | None:
+        """Sums of a quantity, of some ``sources`` only (see :class:`FmmSums`); None for those of none."""
         if sources is not None and not sources.any():
             return None
-        return CellSums(self._grid, self._tables, quantity, self._first, sources, ranks())
+        return FmmSums(self._octree, self._tables, quantity, self._first, sources, ranks())
 
 
 class SystemSums(FastSums):
@@ -156,7 +156,7 @@ class SystemSums(FastSums):
         kind = Quantity.FIELD if quantity == Quantity.FIELD else Quantity.WRENCH
         return pairs >= self._always_from or is_fast(pairs / self._crowding, count, kind, rtol, device)
 
-    def sums_of(self, quantity: Quantity, pairs: float, sources=None) -> CellSums | None:
+    def sums_of(self, quantity: Quantity, pairs: float, sources=None) -> FmmSums | None:
         """Sums as :meth:`sums` has them; None where so many pairs are better summed one by one."""
         return self.sums(quantity, sources) if self.serves(quantity, pairs) else None
 

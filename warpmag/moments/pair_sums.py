@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from warpmag.kernels.fmm.evaluation import CellSums
+from warpmag.kernels.fmm.evaluation import FmmSums
 from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
@@ -99,7 +99,7 @@ class PairSums:
             self._all_pairs = self._evaluation()
         self._all_pairs.launch()
 
-    def _evaluation(self, sums: CellSums | None = None) -> PairEvaluation:
+    def _evaluation(self, sums: FmmSums | None = None) -> PairEvaluation:
         shape, count = self._shape, self.targets.count
         return PairEvaluation(
             shape.quantity, [(0, count, 0, shape.count)], self.targets, self.moments, self.base, self.out,

@@ -13,7 +13,7 @@ from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.sources import Sources
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.eddy.eddy import EddyCurrents
-from warpmag.kernels.fmm.check import sampled_error
+from warpmag.kernels.fmm.evaluation import sampled_error
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.bias import launch_add_bias
 from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, WholeBody

@@ -1,27 +1,30 @@
-// Sums over the pairs of moments in neighbouring cells on a GPU: a warp takes the moments of a leaf as its targets, and
-// passes over those of its neighbours as the warps of sums_cuda.h do.
+// Near-field sums: pairs of moments in neighboring leaves, by the loops of pairs/ over tiles.
+//
+// On a CPU a tile of targets comes from one leaf, tiles of sources from its neighbors (pairs/sums_cpu.h). On a GPU a
+// warp sums one leaf, and loops over its neighbors as the warps of pairs/tiles_cuda.h do.
 #pragma once
+#if defined(__CUDA_ARCH__)
 #include "pairs/tiles_cuda.h"
 
 namespace warpmag {
 
-// The moments of a leaf's neighbours one after the other: of three side by side along x they follow in memory.
+// Moments of a leaf's neighbors as nine ranges of columns: three neighbors along x are contiguous in memory.
 struct NearRanges {
-    int start[10], shift[9]; // number of the first of each range, and how far its column is from that
+    int start[10], shift[9]; // first source number of each range, and column minus source number
 };
 struct NearSources {
     const Table& table;
     const NearRanges& ranges;
 
-    CUDA_CALLABLE Moment moment(int j, bool wanted) const {
+    CUDA_CALLABLE Moment moment(int j, bool active) const {
         int shift = ranges.shift[0];
 #pragma unroll
         for (int r = 1; r < 9; ++r) shift = j >= ranges.start[r] ? ranges.shift[r] : shift;
-        return table.moment(j + shift, wanted);
+        return table.moment(j + shift, active);
     }
 };
 
-// The sums of the lane whose number differs by a bit.
+// The value of the lane whose number differs in bit ``step``.
 CUDA_CALLABLE inline Vec3<Real> from_lane(const Vec3<Real>& v, int step) {
     return {__shfl_xor_sync(ALL_LANES, v.x, step), __shfl_xor_sync(ALL_LANES, v.y, step),
             __shfl_xor_sync(ALL_LANES, v.z, step)};
@@ -30,8 +33,8 @@ CUDA_CALLABLE inline Sums<Real> from_lane(const Sums<Real>& s, int step) {
     return {from_lane(s.f, step), from_lane(s.h, step), from_lane(s.g, step), __shfl_xor_sync(ALL_LANES, s.a, step)};
 }
 
-// Sums of up to LANES times HELD moments of a leaf, from column begin on; ``own`` is the number of the first of them
-// among the sources.
+// Sums up to LANES × HELD targets of a leaf, from column ``begin`` on. ``own`` is the source number of the first
+// target.
 template <Quantity Q, int LANES, int HELD>
 CUDA_CALLABLE inline void sum_targets(int lane, const Table& moments, const Table& effective, const NearRanges& ranges,
                                       int own, int begin, int count, Quad* staged, Real* out) {
@@ -60,7 +63,7 @@ template <int LANES, int HELD> struct Form {
     static constexpr int lanes = LANES, held = HELD;
 };
 
-// One thread of a block whose warps sum a leaf each.
+// One thread of a block; each warp of the block sums one leaf.
 template <Quantity Q, int WARPS, class Arrays> CUDA_CALLABLE inline void sum_leaf(int thread, const Arrays& arrays) {
     __shared__ Quad staging[WARPS][80];
     __shared__ NearRanges all_ranges[WARPS];
@@ -75,7 +78,7 @@ template <Quantity Q, int WARPS, class Arrays> CUDA_CALLABLE inline void sum_lea
         const int last = row[2] >= 0 ? row[2] : row[1] >= 0 ? row[1] : row[0];
         if (first >= 0) begin = begin_of[first], length = begin_of[last + 1] - begin;
     }
-    int start = length; // up to the end of each range, then to its begin
+    int start = length; // inclusive prefix sum of lengths, then exclusive
 #pragma unroll
     for (int step = 1; step < 16; step *= 2) {
         const int before = __shfl_up_sync(ALL_LANES, start, step);
@@ -88,15 +91,15 @@ template <Quantity Q, int WARPS, class Arrays> CUDA_CALLABLE inline void sum_lea
     const int end = begin_of[leaf + 1], own_shift = ranges.shift[4];
     const Table moments(arrays.moments), effective(arrays.effective);
 #pragma unroll 1
-    for (int first = begin_of[leaf]; first < end; first += 32 * MOST_HELD) {
-        const int count = min(32 * MOST_HELD, end - first), own = first - own_shift;
+    for (int first = begin_of[leaf]; first < end; first += 32 * TARGETS_PER_LANE) {
+        const int count = min(32 * TARGETS_PER_LANE, end - first), own = first - own_shift;
         Real* const out = arrays.sums.data + (size_t)first * width(Q);
         const auto sum = [&](auto form) {
             sum_targets<Q, form.lanes, form.held>(lane, moments, effective, ranges, own, first, count, staging[warp],
                                                   out);
         };
-        // as few places for targets as will do, but as many of a lane as pay for what a source takes once
-        if constexpr (MOST_HELD == 2) {
+        // The fewest target slots that suffice; several targets per lane amortize the cost of loading a source.
+        if constexpr (TARGETS_PER_LANE == 2) {
             if (count <= 16) sum(Form<8, 2>());
             else if (count <= 32) sum(Form<16, 2>());
             else sum(Form<32, 2>());
@@ -110,5 +113,56 @@ template <Quantity Q, int WARPS, class Arrays> CUDA_CALLABLE inline void sum_lea
         }
     }
 }
-
 }
+#else
+#include "pairs/sums_cpu.h"
+
+namespace warpmag::cpu {
+
+// Sums one leaf.
+template <Quantity Q, class Arrays> void sum_leaf(const Arrays& arrays, int leaf) {
+    const Share share = {arrays.moments, arrays.moments, arrays.effective, nullptr, nullptr, arrays.sums.data, 0};
+    const int* const begin_of = arrays.moment_begin.data;
+    const int begin = begin_of[leaf], end = begin_of[leaf + 1];
+    __builtin_memset(share.sums_at<Q>(0, begin), 0, (end - begin) * width(Q) * sizeof(Real));
+    Tile targets, sources;
+    const auto clear = [&] {
+        sources.count = 0;
+        sources.begin = end; // beyond the targets: no target is among the sources
+    };
+    const auto sum_tile = [&] {
+        if (sources.count == 0) return;
+        complete<Q>(sources);
+        for (int i = begin; i < end; i += TILE_SIZE) {
+            fill<Q>(targets, share.targets, i, i + TILE_SIZE < end ? i + TILE_SIZE : end);
+            sum_all_pairs<Q, false>(share, targets, sources, share.sums_at<Q>(0, i));
+        }
+        clear();
+    };
+    clear();
+    for (int k = 0; k < 9; ++k) {
+        // moments of neighbors along x are contiguous
+        const int* const row = arrays.neighbors.data + 27 * (size_t)leaf + 3 * k;
+        const int lowest = row[0] >= 0 ? row[0] : row[1] >= 0 ? row[1] : row[2];
+        const int highest = row[2] >= 0 ? row[2] : row[1] >= 0 ? row[1] : row[0];
+        if (lowest < 0) continue;
+        const int last = begin_of[highest + 1];
+        for (int first = begin_of[lowest]; first < last;) {
+            const int room = TILE_SIZE - sources.count, taken = last - first < room ? last - first : room;
+            // the middle row contains the targets: their source numbers
+            if (k == 4) sources.begin = first - sources.count;
+            append(sources, share.sources, first, first + taken);
+            first += taken;
+            if (sources.count == TILE_SIZE) sum_tile();
+        }
+    }
+    sum_tile();
+}
+
+// Sums all leaves of the range ``leaves``.
+template <Quantity Q, class Arrays> void sum_near(const Arrays& arrays, int threads, Word* team) {
+    const int first = arrays.leaves.data[0], count = arrays.leaves.data[1] - first;
+    share_out(team, threads, count, 8, [&](int leaf) { sum_leaf<Q>(arrays, first + leaf); });
+}
+}
+#endif
