@@ -22,7 +22,7 @@ from keyed_stages import (
 from pxr import Gf, Ts, Usd, UsdGeom
 
 from warpmag import InputError, Simulation
-from warpmag.usd import check, hold, open_stage, survey
+from warpmag.usd import check, freeze, open_stage, survey
 
 MOTIONS = {
     "an arm": (
@@ -169,7 +169,7 @@ def test_a_stage_is_held_at_another_moment_as_well(tmp_path):
     path = write(tmp_path, prim("Cube", "Part", (COLLIDER,), "double size = 0.01", keys), held_ball(1))
     stage = open_stage(path)
     for time in (12.0, 24.0):
-        hold(stage, time)
+        freeze(stage, time)
         assert UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/World/Part"))[3][2] == time / 24.0
         contents = survey(stage)
         assert contents.kinematic == ["/World/Part"]

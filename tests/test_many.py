@@ -13,7 +13,7 @@ from warpmag.engine.stepping.scene import import_scene
 from warpmag.moments import fmm
 from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import make
-from warpmag.usd.read import alike, instancers
+from warpmag.usd.read import identical_balls, instancers
 
 RADIUS = 0.0025  # m
 FIELD = (0.0, 1e4, 3e4)  # A/m
@@ -215,11 +215,11 @@ def test_a_scene_that_cannot_be_made_is_told_in_one_line(tmp_path, capsys):
 
 
 def test_instances_that_stay_one_prim_are_not_counted_as_prims(tmp_path, monkeypatch):
-    monkeypatch.setattr(alike, "MANY", 50)
+    monkeypatch.setattr(identical_balls, "COMPACT_COUNT", 50)
     monkeypatch.setattr(instancers, "MOST_PRIMS", 60)
     stage = make("million", tmp_path, 100)
     assert import_scene(stage).builder.body_count == 101
-    monkeypatch.setattr(alike, "MANY", 200)
+    monkeypatch.setattr(identical_balls, "COMPACT_COUNT", 200)
     with pytest.raises(warpmag.InputError, match="more than 60 prims"):
         import_scene(stage)
 

@@ -53,7 +53,7 @@ def test_scenes_hold_what_the_paper_names(report):
     assert counts == CONTENTS[name]
     assert contents.settings == MagneticSettings()
     assert (found.clock.step, found.clock.frames_per_second, found.up_axis) == (1e-3, 60.0, "Z")
-    assert (found.metres_per_unit, found.kilograms_per_unit) == (1.0, 1.0)
+    assert (found.meters_per_unit, found.kilograms_per_unit) == (1.0, 1.0)
 
 
 def test_every_magnet_says_all_of_itself(report):

@@ -7,7 +7,7 @@ from small_stages import FIELD, LEFT, RIGHT, A, B, R, ball, joint, physics, told
 from warpmag import Simulation
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
-from warpmag.usd import author_magnet, author_settings, check, refusals
+from warpmag.usd import author_magnet, author_settings, check, newton_errors
 
 OPEN = """def Mesh "Open" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI",
     "PhysicsMeshCollisionAPI", "PhysicsMassAPI", "WarpmagMagnetAPI"]) {{
@@ -178,7 +178,7 @@ def test_an_instance_that_says_nothing_runs(tmp_path, device, capsys):
 
 def test_what_newton_complains_of_is_told_in_the_same_words():
     """USD names a stage with its session layer, which has an address."""
-    with pytest.raises(InputError) as caught, refusals("scene.usda", "import"):
+    with pytest.raises(InputError) as caught, newton_errors("scene.usda", "import"):
         raise ValueError("Cycle: @a.usda@,@anon:0x56157832e270:a-session.usda@</A/B> CANNOT reference: @a.usda@</A>")
     assert (
         str(caught.value)

@@ -34,7 +34,7 @@ def test_usd_reads_what_it_would_write(tmp_path, count):
     paths = paths_of(rng, count)
     chosen = {name: [path for path in paths if rng.random() < 0.8] for name in SIZES}
     sizes = np.repeat(list(SIZES.values()), [len(chosen[name]) for name in SIZES])
-    hand, data = crate.Overs(sizes), b""
+    hand, data = crate.OverLayer(sizes), b""
     for name, value in METADATA.items():
         hand.set_metadata(name, value)
         usd.pseudoRoot.SetInfo(name, value)
@@ -65,7 +65,7 @@ def test_usd_reads_what_it_would_write(tmp_path, count):
 @pytest.mark.parametrize("count", [1, 5, 64, 70])
 def test_a_closed_file_has_as_many_references_as_times(tmp_path, count):
     """USD goes by the times alone, readers of other makes compare them; 70 frames need a longer file than there is."""
-    hand, path = crate.Overs(np.full(3, 12)), tmp_path / "hand.usdc"
+    hand, path = crate.OverLayer(np.full(3, 12)), tmp_path / "hand.usdc"
     hand.set_metadata("endTimeCode", 0.0)
     hand.add_sampled(["/A", "/B", "/C"], "warpmag:moment", "vector3f", crate.VEC3F)
     layer = hand.encode()

@@ -13,7 +13,7 @@ from pxr import Sdf, Usd, UsdGeom
 from warpmag import Simulation
 from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError, SimulationError
-from warpmag.usd import check, open_stage, read_magnets, refusals, stage_clock, survey
+from warpmag.usd import check, newton_errors, open_stage, read_magnets, stage_clock, survey
 from warpmag.usd.values import _DECLARED
 
 METRES = 'metersPerUnit = 1\nkilogramsPerUnit = 1\nupAxis = "Z"'
@@ -313,18 +313,21 @@ def test_what_newton_raises_or_leaves_out_is_one_line():
     for error in (KeyError("joint"), ZeroDivisionError("x\ny"), MemoryError()):
         with (
             pytest.raises(InputError, match=r"^s\.usda: Newton cannot import it") as caught,
-            refusals("s.usda", "import"),
+            newton_errors("s.usda", "import"),
         ):
             raise error
         assert "\n" not in str(caught.value)
-    with pytest.raises(InputError) as caught, refusals("s.usda", "import"):
+    with pytest.raises(InputError) as caught, newton_errors("s.usda", "import"):
         Usd.Stage.CreateInMemory().DefinePrim("no path")
     assert str(caught.value).startswith("s.usda: Newton cannot import it (") and "pxrInternal" not in str(caught.value)
-    with pytest.raises(InputError, match="cannot import all of it .Skipping collider /A"), refusals("s.usda", "import"):
+    with (
+        pytest.raises(InputError, match="cannot import all of it .Skipping collider /A"),
+        newton_errors("s.usda", "import"),
+    ):
         warnings.warn("Skipping collider /A: no volume", stacklevel=1)
-    with pytest.raises(InputError, match="expected 6. Ignoring"), refusals("s.usda", "import"):
+    with pytest.raises(InputError, match="expected 6. Ignoring"), newton_errors("s.usda", "import"):
         warnings.warn("newton:inertia has 1 elements, expected 6. Ignoring.", stacklevel=1)
-    with refusals("s.usda", "import"):
+    with newton_errors("s.usda", "import"):
         warnings.warn("a remark", stacklevel=1)
         warnings.warn("mass is authored, too. Ignoring body-level density.", stacklevel=1)
 
@@ -378,9 +381,9 @@ def test_what_newton_takes_as_declared():
 
 def test_what_newton_logs_is_kept_off_stderr_or_one_line(capfd):
     log = logging.getLogger("newton._src.usd.utils")
-    with refusals("s.usda", "import"):
+    with newton_errors("s.usda", "import"):
         log.warning("a remark")
-    with pytest.raises(InputError, match="cannot import all of it .Skipping /A"), refusals("s.usda", "import"):
+    with pytest.raises(InputError, match="cannot import all of it .Skipping /A"), newton_errors("s.usda", "import"):
         log.warning("Skipping %s", "/A")
     assert capfd.readouterr().err == ""
 

@@ -7,7 +7,7 @@ from pxr import Usd
 
 from warpmag.declarations.magnets import Magnet
 from warpmag.errors import InputError
-from warpmag.usd import check, describe, hold, open_stage, read_magnets, stage_clock, survey
+from warpmag.usd import check, describe, freeze, open_stage, read_magnets, stage_clock, survey
 
 METRES = 'metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"'
 BALL = """
@@ -273,7 +273,7 @@ def test_animated_values_are_held_at_the_start(tmp_path):
     stage = open_stage(path)
     place = stage.GetAttributeAtPath("/Ball.xformOp:translate")
     assert place.Get(Usd.TimeCode.Default()) == (0.5, 0.0, 0.0)
-    hold(stage, 10.0)
+    freeze(stage, 10.0)
     assert place.Get(Usd.TimeCode.Default()) == (1.0, 0.0, 0.0)
     assert open_stage(path, 2.5).GetAttributeAtPath("/Ball.xformOp:translate").Get() == (0.25, 0.0, 0.0)
     assert path.read_text() == text
@@ -298,7 +298,7 @@ def test_report(tmp_path):
     assert report.contents.bodies == report.contents.colliders == ["/Ball", "/Bar"]
     assert report.contents.kinematic == ["/Bar"]
     assert (report.magnets("inducible"), report.magnets("permanent")) == (["/Ball"], ["/Bar"])
-    assert (report.metres_per_unit, report.kilograms_per_unit, report.up_axis) == (1.0, 1.0, "Z")
+    assert (report.meters_per_unit, report.kilograms_per_unit, report.up_axis) == (1.0, 1.0, "Z")
     assert report.contents.magnets["/Ball"].susceptibility == math.inf
 
 
@@ -332,9 +332,9 @@ def test_samples_that_block_a_value_are_held_as_none(tmp_path):
     stage = open_stage(write(tmp_path, ball(samples, kind="Sphere").replace("double radius = 0.005\n", "")))
     radius = stage.GetPrimAtPath("/Ball").GetAttribute("radius")
     assert (radius.Get(), radius.HasAuthoredValue()) == (None, False)
-    hold(stage, 10.0)
+    freeze(stage, 10.0)
     assert radius.Get() == 7.0
-    hold(stage, 0.0)
+    freeze(stage, 0.0)
     with pytest.raises(InputError, match="^/Ball: radius is blocked and has no value"):
         read_magnets(stage)
 

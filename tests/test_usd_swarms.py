@@ -8,9 +8,10 @@ from test_usd_instancers import BALL, MAGNET, instancer, write
 from warpmag.engine.stepping.scene import import_scene
 from warpmag.engine.stepping.simulation import Simulation
 from warpmag.show.export import export
-from warpmag.usd import Playback, open_motion, read_recording
-from warpmag.usd.read import alike, check, swarms
+from warpmag.usd import Playback, open_animated, read_recording
+from warpmag.usd.read import check, identical_balls
 from warpmag.usd.read.instancers import expand_instancers
+from warpmag.usd.write import instancer_frames
 
 COUNT, FRAMES = 12, 3
 LAST = float(FRAMES)
@@ -35,24 +36,24 @@ def runs(device, tmp_path_factory):
     folder, places = tmp_path_factory.mktemp("swarm"), [(0.03 * k, 0.02 * (k % 3), 0.05) for k in range(COUNT)]
     path = write(folder, instancer(["Ball", "Shifted"], [0, 0, 1] * 4, places, LINES, BALL + SHIFTED), MAGNET)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(alike, "MANY", COUNT)
-        patch.setattr(swarms, "_BLOCK", 3)  # balls of a prototype are placed in several steps, the last one smaller
+        patch.setattr(identical_balls, "COMPACT_COUNT", COUNT)
+        patch.setattr(instancer_frames, "_BLOCK", 3)  # several blocks, the last one smaller
         Simulation(path, device=device).run(FRAMES, output=folder / "whole.usda", on_frame=lambda frame: frame < 1)
         Simulation(path, device=device).run(FRAMES, output=folder / "whole.usda", resume=True)
-        patch.setattr(alike, "MANY", COUNT + 1)
+        patch.setattr(identical_balls, "COMPACT_COUNT", COUNT + 1)
         Simulation(path, device=device).run(FRAMES, output=folder / "prims.usda")
     return folder
 
 
 @pytest.fixture
 def whole(runs, monkeypatch):
-    monkeypatch.setattr(alike, "MANY", COUNT)
+    monkeypatch.setattr(identical_balls, "COMPACT_COUNT", COUNT)
     return runs / "whole.usda"
 
 
 def arrays(recording):
     """What a recording holds of each body and magnet, by name."""
-    bodies = zip(recording.positions, recording.turns, recording.linear, recording.angular, strict=True)
+    bodies = zip(recording.positions, recording.rotations, recording.linear, recording.angular, strict=True)
     values = np.concatenate([np.concatenate(one, axis=-1)[None] for one in bodies])
     rows = {name: values[:, row] for row, name in enumerate(recording.bodies)}
     moments = {name: recording.moments[:, row] for row, name in enumerate(recording.magnets)}
@@ -66,7 +67,7 @@ def same(found, wanted, atol):
 
 
 def test_an_instancer_says_what_prims_say(runs, whole):
-    one, other = (read_recording(*open_motion(runs / f"{name}.usda")) for name in ("whole", "prims"))
+    one, other = (read_recording(*open_animated(runs / f"{name}.usda")) for name in ("whole", "prims"))
     np.testing.assert_array_equal(one.codes, other.codes)
     (rows, moments, permanent), (wanted, theirs, kinds) = arrays(one), arrays(other)
     assert len(rows) == COUNT and min(np.ptp(values[:, 2]) for values in rows.values()) > 3e-3  # they fly
@@ -141,7 +142,7 @@ def test_it_is_played_and_exported_as_prims_are(runs, whole, tmp_path):
 def test_few_balls_and_those_that_are_not_alone_become_prims(runs, monkeypatch):
     """An instancer that is scaled, that moves or speeds up, or that holds something else beside balls that are alike;
     and each ball by itself where something may speak of single ones."""
-    monkeypatch.setattr(alike, "MANY", COUNT)
+    monkeypatch.setattr(identical_balls, "COMPACT_COUNT", COUNT)
     text = (runs / "scene.usda").read_text()
     by_two = '"xformOp:rotateZ", "xformOp:scale"]\n float3 xformOp:scale = (2, 2, 2)'
     scaled = text.replace('"xformOp:rotateZ"]', by_two, 1)

@@ -325,7 +325,7 @@ def test_unwritable_places_are_refused_before_the_run(tmp_path, scene):
 def test_time_must_rise(tmp_path, scene):
     writer = CacheWriter(open_stage(scene), tmp_path / "run.usda", [], [])
     writer.add_frame(0.5, np.zeros((0, 7)), np.zeros((0, 6)), np.zeros((0, 3)))
-    with pytest.raises(ValueError, match="time must rise"):
+    with pytest.raises(ValueError, match="time must increase"):
         writer.add_frame(0.5, np.zeros((0, 7)), np.zeros((0, 6)), np.zeros((0, 3)))
 
 

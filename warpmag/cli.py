@@ -243,7 +243,7 @@ def _check(options) -> int:
     report = check(_find_scene(options.stage)[0])
     contents = report.contents
     print(f"stage       {report.path}")
-    print(f"units       {report.metres_per_unit:g} m, {report.kilograms_per_unit:g} kg, {report.up_axis} up")
+    print(f"units       {report.meters_per_unit:g} m, {report.kilograms_per_unit:g} kg, {report.up_axis} up")
     if report.clock:
         clock = report.clock
         step = "not given" if clock.step is None else f"{1e3 * clock.step:g} ms"

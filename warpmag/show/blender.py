@@ -10,7 +10,7 @@ from pathlib import Path
 from warpmag.declarations.checks import check_count
 from warpmag.errors import InputError
 from warpmag.show.export import export
-from warpmag.usd import open_motion, stage_clock, usable_path
+from warpmag.usd import open_animated, stage_clock, usable_path
 
 BLENDER = "WARPMAG_BLENDER"
 """Environment variable: a Python with ``bpy``, where this Python has none."""
@@ -50,7 +50,7 @@ def render_final(
     for name, value in zip(("width", "height", "samples"), (*size, samples), strict=True):
         check_count(name, value)
     python = _python()
-    clock = stage_clock(open_motion(stage)[0])
+    clock = stage_clock(open_animated(stage)[0])
     per_code = clock.frames_per_second / clock.time_codes_per_second
     last = round((clock.end - clock.start) * per_code)
     if frame is not None and not 0 <= frame <= last:

@@ -10,7 +10,7 @@ from warpmag.declarations.checks import check_positive, check_token, short_repr
 from warpmag.errors import InputError
 from warpmag.show.magnet_overlays import COLORS, MagnetOverlays
 from warpmag.show.renderer_stage import RendererStage
-from warpmag.usd import Recording, open_motion, read_recording, usable_path
+from warpmag.usd import Recording, open_animated, read_recording, usable_path
 
 _TOP = 0.99
 """Quantile of all values at the end of the color scale: a few collisions would leave one color for the rest."""
@@ -80,11 +80,11 @@ def export(
 
 def _write_numbers(stage: str | os.PathLike, path: Path) -> None:
     """Write the recording of a stage as arrays in SI units, in the world frame."""
-    record = read_recording(*open_motion(stage))
+    record = read_recording(*open_animated(stage))
     columns = {
-        "positions": record.positions * record.metres_per_unit,
-        "orientations": record.turns,
-        "velocities": record.linear * np.float32(record.metres_per_unit),
+        "positions": record.positions * record.meters_per_unit,
+        "orientations": record.rotations,
+        "velocities": record.linear * np.float32(record.meters_per_unit),
         "angular_velocities": record.angular,
     }
     try:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
-from warpmag.usd.write.placements import rotate
+from warpmag.declarations.rotations import rotate
 
 
 @dataclass(frozen=True)

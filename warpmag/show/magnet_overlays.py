@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from warpmag.declarations.rotations import rotate
 from warpmag.errors import InputError
 from warpmag.moments.fields import h_field, wrench
 from warpmag.shapes import lattice
 from warpmag.show.meshes import BALL
 from warpmag.show.renderer_stage import DrawnShape, RendererStage
-from warpmag.usd.write.placements import rotate
 
 COLORS = {"magnetization": "A/m", "speed": "m/s", "force": "N"}
 """Quantities that may color bodies, and their units."""
@@ -41,7 +41,7 @@ class MagnetOverlays:
     def __init__(self, stage: RendererStage):
         """Sample the magnets of a stage."""
         self._record = record = stage.recording
-        self._unit = record.metres_per_unit
+        self._unit = record.meters_per_unit
         self._shapes = stage.shapes_of_magnets()
         others = sum(not shape.radius for shapes in self._shapes for shape in shapes)
         parts = [_moments_of(shapes, others) for shapes in self._shapes]
@@ -93,7 +93,7 @@ class MagnetOverlays:
         local, rows = [], np.repeat(self.rows[sources], each)
         for magnet in sources.tolist():
             row = self.rows[magnet]
-            back = record.turns[:1, row] * (-1.0, -1.0, -1.0, 1.0) if row >= 0 else np.array([[0.0, 0.0, 0.0, 1.0]])
+            back = record.rotations[:1, row] * (-1.0, -1.0, -1.0, 1.0) if row >= 0 else np.array([[0.0, 0.0, 0.0, 1.0]])
             along = rotate(back, record.moments[:1, magnet].astype(float))[0]
             local.append(_seeds(self._shapes[magnet], along, each, _OFFSET * self.sizes[magnet]))
         local, size = np.concatenate(local), float(self.sizes[sources].max())
@@ -126,7 +126,7 @@ class MagnetOverlays:
         """Return points of the world in the frame of a body."""
         if row < 0:
             return points
-        turn = self._record.turns[frame, row].astype(float) * (-1.0, -1.0, -1.0, 1.0)
+        turn = self._record.rotations[frame, row].astype(float) * (-1.0, -1.0, -1.0, 1.0)
         away = points - self._record.positions[frame, row]
         return rotate(np.broadcast_to(turn, (len(points), 4)), away)
 
@@ -139,7 +139,7 @@ class MagnetOverlays:
         """Return points of bodies in the world at a frame; row -1 is the world itself."""
         record, placed = self._record, local.copy()
         own = rows >= 0
-        turns = record.turns[frame, rows[own]].astype(float)
+        turns = record.rotations[frame, rows[own]].astype(float)
         placed[own] = rotate(turns, local[own]) + record.positions[frame, rows[own]]
         return placed
 

@@ -27,7 +27,7 @@ from warpmag.errors import InputError
 from warpmag.moments.arrays import resolve_device
 from warpmag.show import films
 from warpmag.show.materials import metalness
-from warpmag.usd import Playback, StageClock, first_camera, open_apart, stage_clock
+from warpmag.usd import Playback, StageClock, first_camera, open_deferred, stage_clock
 
 _SAMPLES = 3
 """Rays per pixel along each of its sides."""
@@ -78,7 +78,7 @@ def render(
     films.check_name(output)
     if min(size) < 1 or max(size) > 2**14:
         raise InputError(f"size: must be 1 to 16384, got {size[0]} x {size[1]}")
-    clock = stage_clock(open_apart(stage)[0])
+    clock = stage_clock(open_deferred(stage)[0])
     numbers = _numbers(stage, clock, output, frame, frames)
     codes = [clock.start + number * clock.time_codes_per_second / clock.frames_per_second for number in numbers]
     with wp.ScopedDevice(resolve_device(device)):
@@ -126,7 +126,7 @@ class _Studio:
         sources = {
             label: prim
             for swarm in scene.swarms
-            for prim, labels in swarm.like(model.shape_label).items()
+            for prim, labels in swarm.copies_of(model.shape_label).items()
             for label in labels
         }
         metal = {label: metalness(scene.stage, label) for label in model.shape_label if label not in sources}

@@ -20,13 +20,13 @@ from warpmag.show.materials import author_materialx, author_surface, color_scale
 from warpmag.show.meshes import ARROW, BALL, Shape, author_mesh, shape_of
 from warpmag.show.web_page import page_of
 from warpmag.usd.paths import usable_path
+from warpmag.usd.read.ball_instancers import BallInstancer
 from warpmag.usd.read.instancers import complete_instances, expand_instancers
-from warpmag.usd.read.motion import read_recording
-from warpmag.usd.read.reader import copied_metadata, open_motion
-from warpmag.usd.read.swarms import Swarm
-from warpmag.usd.read.transforms import is_body
+from warpmag.usd.read.opening import copied_metadata, open_animated
+from warpmag.usd.read.prims import is_body
+from warpmag.usd.read.recording import read_recording
+from warpmag.usd.read.transforms import rigid_part
 from warpmag.usd.values import quiet
-from warpmag.usd.write.placements import rigid
 
 _SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".html")
 _OWN = ("physics:", "newton:", "warpmag:", "collection:")
@@ -93,7 +93,7 @@ class RendererStage:
         Raises:
             InputError: The file is not a stage.
         """
-        source, swarms = open_motion(path)
+        source, swarms = open_animated(path)
         self._files = {Path(layer.realPath).resolve() for layer in source.GetUsedLayers() if layer.realPath}
         self.recording = read_recording(source, swarms)
         self._codes = self.recording.codes * (rate / source.GetTimeCodesPerSecond())
@@ -105,7 +105,7 @@ class RendererStage:
         self._before.TransferContent(stage.GetRootLayer())
         self.shapes = self._find_shapes()
         for swarm in swarms:
-            self.shapes = swarm.with_shapes(self.shapes, self.recording.bodies)
+            self.shapes = swarm.with_copies(self.shapes, self.recording.bodies)
         instanced = self._instanced()
         self._instances = [shape for shape in self.shapes if shape.drawn and shape.row >= 0 and instanced[shape.row]]
         self._root = self._make_root()
@@ -148,7 +148,7 @@ class RendererStage:
             if body:
                 name = str(body.GetPath())
                 if name not in frames:
-                    own = rigid(np.array(transforms.GetLocalToWorldTransform(body)))
+                    own = rigid_part(np.array(transforms.GetLocalToWorldTransform(body)))
                     frames[name] = np.linalg.inv(own)
                 frame = frame @ frames[name]
             shapes.append(_drawn_shape(prim, surface, rows[name] if body else -1, frame))
@@ -157,7 +157,7 @@ class RendererStage:
     def _instanced(self) -> np.ndarray:
         """Return true for bodies that are drawn as instances, shape [n]: moving bodies, dynamic bodies and magnets."""
         record, magnets = self.recording, set(self.recording.magnets)
-        instanced = np.ptp(record.positions, axis=0).any(axis=1) | np.ptp(record.turns, axis=0).any(axis=1)
+        instanced = np.ptp(record.positions, axis=0).any(axis=1) | np.ptp(record.rotations, axis=0).any(axis=1)
         for row, path in enumerate(record.bodies):
             prim = self._stage.GetPrimAtPath(path)  # a ball of an instancer has no prim and is dynamic
             flag = prim and prim.GetAttribute("physics:kinematicEnabled")
@@ -213,7 +213,7 @@ class RendererStage:
             placed = InstanceArrays(
                 record.positions[:, rows],
                 kinds,
-                turns=None if balls else record.turns[:, rows],
+                turns=None if balls else record.rotations[:, rows],
                 scales=np.array([shape.radius for shape in shapes]) if balls else None,
                 linear=record.linear[:, rows],
                 angular=None if balls else record.angular[:, rows],
@@ -339,7 +339,7 @@ class RendererStage:
             known.Reload(force=True)
 
 
-def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.Layer:
+def _scene_of(source: Usd.Stage, swarms: Sequence[BallInstancer], rate: float) -> Sdf.Layer:
     """Return the scene without the layers of runs, as one layer with ``rate`` time codes per second.
 
     The layer has a prim for each instance, as in the run; for ``swarms`` only for balls that differ from all others.
@@ -355,7 +355,7 @@ def _scene_of(source: Usd.Stage, swarms: Sequence[Swarm], rate: float) -> Sdf.La
         if "warpmag" in layer.customLayerData:
             stage.MuteLayer(layer.identifier)
     whole = {swarm.path for swarm in swarms}
-    apart = expand_instancers(stage, stage.GetStartTimeCode(), apart=True)
+    apart = expand_instancers(stage, stage.GetStartTimeCode(), defer=True)
     complete_instances([instance for instance in apart if str(instance.instancer) not in whole])
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:

@@ -15,7 +15,7 @@ from pxr import Usd, UsdGeom, UsdShade, Vt
 from warpmag.errors import InputError, extra
 from warpmag.show.glb import glb
 from warpmag.show.meshes import corner_normals, shape_of
-from warpmag.usd.write.placements import rigid, turn_of
+from warpmag.usd.read.transforms import rigid_part, rotation_of
 
 _REACH = 2.0
 """Half the size of the scene in units of the page: viser's shadows and near plane suit this size."""
@@ -142,11 +142,11 @@ def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
         frames = np.array([cache.GetLocalToWorldTransform(prim) for cache in transforms])
         if (frames == frames[0]).all():
             frames = frames[:1]
-        poses = [rigid(frame) for frame in frames]
+        poses = [rigid_part(frame) for frame in frames]
         own = frames[0] @ np.linalg.inv(poses[0])
         points = np.c_[surface[0], np.ones(len(surface[0]))] @ own[:, :3]
         faces = [face[::-1] for face in surface[1]] if np.linalg.det(own) < 0.0 else surface[1]
-        turns = np.array([turn_of(pose) for pose in poses])[:, None]
+        turns = np.array([rotation_of(pose) for pose in poses])[:, None]
         still = np.zeros((1, 1), dtype=int)
         yield _Batch(points, faces, frames[:, None, 3, :3], turns, still + 1.0, [_look_of(prim)], still)
 

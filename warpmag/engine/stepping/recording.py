@@ -81,7 +81,7 @@ class Recorder:
                     output,
                     list(own),
                     list(scene.magnet_shapes),
-                    swarms=scene.swarms,
+                    instancers=scene.swarms,
                     copy_scene=copy_scene,
                     frames=frames,
                     options=options,

@@ -18,24 +18,24 @@ from warpmag.engine.magnets.declared_sources import add_placed_source
 from warpmag.engine.stepping.drawn import StageBuilder
 from warpmag.errors import InputError
 from warpmag.usd import (
-    MOMENTS,
-    AlikeBalls,
+    MOMENTS_PRIMVAR,
     BallFrames,
+    BallInstancer,
     GroundedJoint,
+    IdenticalBalls,
     StageClock,
     StageContents,
-    Swarm,
+    ball_instancers,
     complete_instances,
     enabled_joints,
     give_densities,
     has_volume,
     inspect,
-    open_apart,
+    newton_errors,
+    open_deferred,
     prepare_joints,
-    readable,
-    refusals,
     shape_axis,
-    swarms_of,
+    usd_errors,
 )
 
 
@@ -56,7 +56,7 @@ class ImportedScene:
     """
 
     opened: Any
-    apart: list[AlikeBalls]
+    apart: list[IdenticalBalls]
     builder: newton.ModelBuilder
     clock: StageClock
     magnets: StageMagnets
@@ -68,13 +68,13 @@ class ImportedScene:
     @cached_property
     def stage(self) -> Any:
         """The open stage with a prim for each body but those of :attr:`swarms`."""
-        complete_instances([one for one in self.apart if not one.whole])
+        complete_instances([one for one in self.apart if not one.stays_instancer])
         return self.opened
 
     @cached_property
-    def swarms(self) -> list[Swarm]:
+    def swarms(self) -> list[BallInstancer]:
         """Instancers that hold too many bodies for prims."""
-        return swarms_of(self.opened, self.apart)
+        return ball_instancers(self.opened, self.apart)
 
 
 def import_scene(
@@ -95,12 +95,12 @@ def import_scene(
     Raises:
         InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
     """
-    with readable(str(path)):
+    with usd_errors(str(path)):
         return _import(path, visuals, time_code, articulations)
 
 
 def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, articulations: bool) -> ImportedScene:
-    stage, apart = open_apart(path, time_code)
+    stage, apart = open_deferred(path, time_code)
     report = inspect(stage, path)
     if report.errors:
         raise InputError(str(report.errors[0]))
@@ -151,7 +151,7 @@ def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[st
 
 def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:
     """Let Newton import ``stage``; return which prim became what."""
-    with refusals(str(path), "import"):
+    with newton_errors(str(path), "import"):
         return builder.add_usd(
             stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals, only_load_enabled_rigid_bodies=True
         )
@@ -160,7 +160,7 @@ def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, vis
 def _copy_balls(
     builder: newton.ModelBuilder,
     stage,
-    balls: AlikeBalls,
+    balls: IdenticalBalls,
     bodies: dict[str, int],
     covered: dict[str, list[int]],
     magnets: StageMagnets,
@@ -172,9 +172,9 @@ def _copy_balls(
     speeds = frames.velocities(balls.arrays, np.array(builder.body_qd[body], float))
     added = copy_ball(builder, body, frames.poses(balls.arrays)[1:], speeds[1:], first, others)
     bodies |= dict(zip(others, added.bodies, strict=True))
-    moments = balls.arrays[MOMENTS]
+    moments = balls.arrays[MOMENTS_PRIMVAR]
     for prim in [one for one in covered if one == first or one.startswith(f"{first}/")]:
-        own = balls.others_of(prim)
+        own = balls.copies_of(prim)
         covered |= zip(own, ([shape] for shape in added.shapes), strict=True)
         magnets.magnets.update(dict.fromkeys(own, magnets.magnets[prim]))
         if prim in magnets.initial_moments:

@@ -196,9 +196,9 @@ class Simulation:
         """Return what makes one line of Newton's errors about a stage; those about a builder stay as they are."""
         if self._scene is None:
             return contextlib.nullcontext()
-        from warpmag.usd import refusals  # noqa: PLC0415 - a builder can do without USD
+        from warpmag.usd import newton_errors  # noqa: PLC0415 - a builder can do without USD
 
-        return refusals(str(scene), "use")
+        return newton_errors(str(scene), "use")
 
     def _moves(self, body: int) -> bool:
         return math.isfinite(self._sizes.thickness[body])

@@ -1,18 +1,20 @@
-"""What a stage holds and what is wrong with it, for ``warpmag check``."""
+"""Checks a stage for ``warpmag check``: its contents, its errors, and the findings of USD's own validators."""
 
 import os
+import warnings
 from dataclasses import dataclass, replace
 
 from pxr import Tf, Usd, UsdGeom, UsdValidation
 
 from warpmag.errors import InputError
+from warpmag.usd.read.ball_instancers import BallInstancer, ball_instancers
 from warpmag.usd.read.clock import StageClock, stage_clock, stage_name
-from warpmag.usd.read.guard import readable
+from warpmag.usd.read.input_errors import usd_errors
 from warpmag.usd.read.instancers import complete_instances
 from warpmag.usd.read.joints import joint_findings
-from warpmag.usd.read.reader import StageContents, open_apart, survey
+from warpmag.usd.read.opening import open_deferred
 from warpmag.usd.read.session import file_of
-from warpmag.usd.read.swarms import Swarm, swarms_of
+from warpmag.usd.read.survey import StageContents, survey
 from warpmag.usd.read.units import units_of
 from warpmag.usd.values import Finding, quiet
 
@@ -21,21 +23,22 @@ _SEVERITIES = {"Error": "error", "Warn": "warning"}
 
 @dataclass(frozen=True)
 class StageReport:
-    """What a stage holds and what is wrong with it.
+    """Contents of a stage and everything that is wrong with it.
 
     Attributes:
         path: File of the stage.
-        metres_per_unit: Unit of length [m].
+        meters_per_unit: Unit of length [m].
         kilograms_per_unit: Unit of mass [kg].
         up_axis: ``Y`` or ``Z``.
-        clock: How time runs, None where that is wrong.
+        clock: Times and rates of the stage, None where they are invalid.
         contents: Bodies, colliders, magnets and settings.
-        findings: All that is wrong, the findings of ``UsdValidation`` included; errors before warnings.
-        broken_rules: What ``UsdValidation`` calls an error. A stage that breaks a rule of USD runs: it is a warning.
+        findings: All errors and warnings, errors first. Errors of ``UsdValidation`` are warnings here, because a stage
+            that breaks a rule of USD still runs.
+        broken_rules: Errors of ``UsdValidation``.
     """
 
     path: str
-    metres_per_unit: float
+    meters_per_unit: float
     kilograms_per_unit: float
     up_axis: str
     clock: StageClock | None
@@ -43,55 +46,63 @@ class StageReport:
     findings: tuple[Finding, ...]
     broken_rules: tuple[Finding, ...]
 
+    def __getattr__(self, name: str):
+        """Return the unit of length under its earlier name."""
+        if name == "metres_per_unit":
+            message = "StageReport.metres_per_unit is deprecated, use meters_per_unit"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            return self.meters_per_unit
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
     @property
     def errors(self) -> tuple[Finding, ...]:
-        """The findings for which a run refuses the stage."""
+        """Findings that prevent a run."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """The findings with which a stage still runs, broken rules of USD among them."""
+        """Findings that do not prevent a run, including broken rules of USD."""
         return tuple(finding for finding in self.findings if finding.severity != "error")
 
     def magnets(self, kind: str) -> list[str]:
-        """Paths of the magnets of one kind, ``inducible`` or ``permanent``."""
+        """Return the paths of the magnets of one kind, ``inducible`` or ``permanent``."""
         return [path for path, magnet in self.contents.magnets.items() if magnet.kind == kind]
 
 
 def check(path: str | os.PathLike) -> StageReport:
-    """Find out what a stage holds and everything that is wrong with it.
+    """Return the contents of a stage, with all errors and warnings.
 
     Raises:
-        InputError: The file cannot be opened as a stage at all.
+        InputError: The file cannot be opened as a stage.
     """
-    stage, apart = open_apart(path)
-    with readable(str(path)):
-        complete_instances([one for one in apart if not one.whole])
+    stage, deferred = open_deferred(path)
+    with usd_errors(str(path)):
+        complete_instances([balls for balls in deferred if not balls.stays_instancer])
         report = inspect(stage, path)
-        for swarm in swarms_of(stage, apart):
-            _name_balls(report.contents, swarm)
+        for instancer in ball_instancers(stage, deferred):
+            _add_balls(report.contents, instancer)
     return report
 
 
 def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
-    """Do what :func:`check` does with an open stage.
+    """Return the report of :func:`check` on an open stage.
 
     Args:
-        stage: As :func:`open_stage` opened it.
+        stage: A stage from :func:`open_stage`.
         path: File of the stage.
     """
-    with readable(str(path)):
+    with usd_errors(str(path)):
         return _report(stage, path)
 
 
-def _name_balls(contents: StageContents, swarm: Swarm) -> None:
-    """Let the balls of an instancer be among what a stage holds, behind the one that has prims."""
-    for names in (contents.bodies, contents.colliders):
-        for prim, others in swarm.like(names).items():
-            after = names.index(prim) + 1
-            names[after:after] = others
-    for prim, others in swarm.like(list(contents.magnets)).items():
-        contents.magnets |= dict.fromkeys(others, contents.magnets[prim])
+def _add_balls(contents: StageContents, instancer: BallInstancer) -> None:
+    """Add the balls of an instancer to ``contents``, behind the ball with prims that they are identical to."""
+    for paths in (contents.bodies, contents.colliders):
+        for prim, copies in instancer.copies_of(paths).items():
+            position = paths.index(prim) + 1
+            paths[position:position] = copies
+    for prim, copies in instancer.copies_of(list(contents.magnets)).items():
+        contents.magnets |= dict.fromkeys(copies, contents.magnets[prim])
 
 
 def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
@@ -104,42 +115,44 @@ def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
         where, _, message = str(error).rpartition(": ")
         findings.append(Finding(where, message))
     rules, units = validate(file_of(stage)), units_of(stage)
-    findings += [replace(one, severity="warning") for one in rules]
+    findings += [replace(rule, severity="warning") for rule in rules]
     return StageReport(
         path=str(path),
-        metres_per_unit=units.metres,
+        meters_per_unit=units.meters,
         kilograms_per_unit=units.kilograms,
         up_axis=UsdGeom.GetStageUpAxis(stage),
         clock=clock,
         contents=contents,
         findings=tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")),
-        broken_rules=tuple(one for one in rules if one.severity == "error"),
+        broken_rules=tuple(rule for rule in rules if rule.severity == "error"),
     )
 
 
 @quiet()
 def validate(stage: Usd.Stage) -> list[Finding]:
-    """Return the errors and warnings of USD's own validators, those for usdz packages left out."""
+    """Return the errors and warnings of USD's own validators, without those for usdz packages."""
     registry = UsdValidation.ValidationRegistry()
-    packages = {one.name for one in registry.GetValidatorMetadataForKeyword("UsdzValidators")}
-    names = [one.name for one in registry.GetAllValidatorMetadata() if not one.isSuite and one.name not in packages]
+    packages = {validator.name for validator in registry.GetValidatorMetadataForKeyword("UsdzValidators")}
+    validators = [validator for validator in registry.GetAllValidatorMetadata() if not validator.isSuite]
+    names = [validator.name for validator in validators if validator.name not in packages]
     try:
         errors = UsdValidation.ValidationContext(registry.GetOrLoadValidatorsByName(names)).Validate(stage)
-    except Tf.ErrorException as error:  # transforms that cannot be composed stop them all
+    except Tf.ErrorException as error:  # a transform that cannot be composed stops all validators
         reason = error.args[0].commentary if error.args else type(error).__name__
         return [Finding(stage_name(stage), f"USD's validators cannot read it ({' '.join(str(reason).split())})")]
     findings = []
     for error in errors:
         severity = _SEVERITIES.get(error.GetType().name)
-        # This rule also fires for a turned body whose scales differ, by a decomposition that is not unique; survey()
-        # finds the sheared ones.
+        # RigidBodyOrientationScale also fires for rotated bodies with non-uniform scale, as its decomposition is not
+        # unique; survey() reports sheared bodies.
         if severity and error.GetName() != "RigidBodyOrientationScale":
             message = f"{' '.join(error.GetMessage().split())} [{error.GetIdentifier()}]"
-            findings.append(Finding(_place(error, stage), message, severity))
-    return sorted(findings, key=lambda one: (one.where, one.message))  # its threads have found them in any order
+            findings.append(Finding(_site(error, stage), message, severity))
+    return sorted(findings, key=lambda finding: (finding.where, finding.message))  # threads return them in any order
 
 
-def _place(error, stage) -> str:
+def _site(error, stage) -> str:
+    """Return the path of the property or prim of a validation error, else the name of the stage."""
     for site in error.GetSites():
         if site.IsProperty():
             return str(site.GetProperty().GetPath())

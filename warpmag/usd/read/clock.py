@@ -78,13 +78,13 @@ def scenes(stage: Usd.Stage) -> list[Usd.Prim]:
 def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
     """Yield what is wrong with the units of a stage, and which length it has only by USD's default."""
     units, name = units_of(stage), stage_name(stage)
-    for what, unit in (("metersPerUnit", units.metres), ("kilogramsPerUnit", units.kilograms)):
+    for what, unit in (("metersPerUnit", units.meters), ("kilogramsPerUnit", units.kilograms)):
         if not 1e-50 < unit < 1e50:
             yield Finding(name, f"{what} must be positive and finite, got {unit:g}")
     if (up := UsdGeom.GetStageUpAxis(stage)) not in ("Y", "Z"):
         yield Finding(name, f"upAxis must be Y or Z, got {up!r}")
     if not stage.GetRootLayer().pseudoRoot.HasInfo("metersPerUnit"):
-        message = f"metersPerUnit is not set, which in USD means {units.metres:g}: lengths are taken for so many metres"
+        message = f"metersPerUnit is not set, which in USD means {units.meters:g}: lengths are taken for so many meters"
         yield Finding(name, message, "warning")
 
 

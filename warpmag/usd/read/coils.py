@@ -16,7 +16,8 @@ from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
 from warpmag.errors import InputError
 from warpmag.usd.read.clock import stage_clock
 from warpmag.usd.read.keys import KeyReader
-from warpmag.usd.read.transforms import TransformCheck, is_body
+from warpmag.usd.read.prims import is_body
+from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.schemas import author_schema, has_api, read_fields, world_matrix
 from warpmag.usd.values import Finding, finding_of, instance_finding, number
 

@@ -10,19 +10,10 @@ from warpmag.shapes import lattice
 from warpmag.usd.values import LARGEST_COORDINATE, LARGEST_SIZE, SMALLEST_SIZE, Finding, finding_of, value_of
 
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height")
-_SOLIDS = (
-    *(UsdGeom.Sphere, UsdGeom.Cube, UsdGeom.Mesh, UsdGeom.Cone),
-    *(UsdGeom.Capsule, UsdGeom.Capsule_1, UsdGeom.Cylinder, UsdGeom.Cylinder_1),
-)
 _LARGEST_MAGNET = 2e4
 """Limit of a magnet's sizes [m], so that its moment and its square stay in single precision."""
 _AS_DRAWN = ("none", "meshSimplification", "sdf", None)
 """Approximations of a mesh that keep its surface; all others close it, and magnetize in its place if it is open."""
-
-
-def is_solid(prim: Usd.Prim) -> bool:
-    """Whether a prim is of a type that has a volume."""
-    return any(prim.IsA(kind) for kind in _SOLIDS)
 
 
 def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:

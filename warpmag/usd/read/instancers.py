@@ -1,12 +1,11 @@
-"""Point instancers of bodies: Newton imports nothing from them, so each instance becomes prims of its own.
+"""Expands PointInstancers of physical prims, which Newton does not import: each instance becomes prims of its own.
 
-They lie in a layer of the session, below the instancer, which is an Xform there: ``/Balls/instance12/Ball`` with a
-reference to the prototype. A run writes that layer below its cache, in which the instances then move one by one.
-Instances with an inactive id are left out, invisible ones are not. What instancers of colliders, bodies or magnets need
-not be made of stays as it is. Very many balls that are alike stay one instancer in the cache, too (``swarms.py``).
+The prims are in a layer of the session, below the instancer, which becomes an Xform: ``/Balls/instance12/Ball`` with a
+reference to the prototype. A run writes that layer below its cache, in which each instance then moves by itself.
+Instances with an inactive id are left out, invisible ones are not. Instancers without colliders, bodies and magnets
+stay unchanged. Instancers of very many identical balls stay instancers (``ball_instancers.py``).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,10 +13,18 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from warpmag.errors import InputError
-from warpmag.usd.read.alike import ARRAYS, MOMENTS, AlikeBalls, alike, ball_in, may_be_alike, may_stay_whole
-from warpmag.usd.read.first_reading import MOST_PRIMS
-from warpmag.usd.read.session import INSTANCES, add_layer, is_physical, new_layer, release, release_instances
-from warpmag.usd.read.transforms import is_body, is_collider
+from warpmag.usd.read.identical_balls import (
+    INSTANCE_ARRAYS,
+    MOMENTS_PRIMVAR,
+    IdenticalBalls,
+    ball_in,
+    can_stay_instancer,
+    group_identical,
+    has_interchangeable_instances,
+)
+from warpmag.usd.read.prims import descendants, is_body, is_collider, is_physical
+from warpmag.usd.read.session import INSTANCES, add_layer, new_layer, release, release_instances
+from warpmag.usd.read.trial_read import MOST_PRIMS
 from warpmag.usd.read.units import units_of
 from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
 
@@ -28,53 +35,54 @@ _OPERATIONS = (
     ("xformOp:orient", "orientations", _TYPES.Quatf),
     ("xformOp:scale", "scales", _TYPES.Float3),
 )
-"""What moves an instance, in the order of operations, the array of the instancer and the type of a value."""
-_SPEEDS = "velocities", "angularVelocities"
-_TURNS = tuple, Vt.QuathArray, Vt.QuatfArray, Vt.QuatdArray
+"""Transform operations of an instance in their order, with the array of the instancer and the type of a value."""
+_VELOCITIES = "velocities", "angularVelocities"
+_QUATERNION_ARRAYS = tuple, Vt.QuathArray, Vt.QuatfArray, Vt.QuatdArray
 _RESET = "!resetXformStack!"
 _LENGTH_ERROR = 0.01
-"""How far from 1 the length of an orientation may be, which half precision leaves 1e-3: USD skews what is farther."""
+"""Largest deviation of an orientation's length from 1. Half precision leaves 1e-3; USD shears larger deviations."""
 
 
-def expand_instancers(stage: Usd.Stage, time_code: float, *, apart: bool = False) -> list[AlikeBalls]:
-    """Let a stage have a prim for each instance of what is physical, by a layer of its session.
+def expand_instancers(stage: Usd.Stage, time_code: float, *, defer: bool = False) -> list[IdenticalBalls]:
+    """Create prims for the instances of physical prims, in a layer of the stage's session.
 
     Args:
         stage: The stage.
-        time_code: The moment at which instances stand, those left out whose transforms are followed over time.
-        apart: Leave it at the first of those instances that are alike.
+        time_code: The time code whose positions the instances take. Instances whose motion a run follows keep all their
+            time samples.
+        defer: Create prims only for the first of identical balls.
 
     Returns:
-        The instances left out, which :func:`complete_instances` makes prims of.
+        The deferred instances, whose prims :func:`complete_instances` creates.
 
     Raises:
-        InputError: An instancer is not what USD says one must be, or stands for too many prims.
+        InputError: An instancer breaks USD's rules or stands for too many prims.
     """
-    expansion = _Expansion(stage, time_code, apart)
+    expansion = _Expansion(stage, time_code, defer)
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
-    found = [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]
-    for path in found:
+    paths = [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.PointInstancer)]
+    for path in paths:
         expansion.expand(path)
-    return expansion.apart
+    return expansion.deferred
 
 
-def complete_instances(apart: list[AlikeBalls]) -> None:
-    """Let a stage have prims for those instances, too, that :func:`expand_instancers` has left out."""
-    for balls in apart:
-        balls.write()
+def complete_instances(deferred: list[IdenticalBalls]) -> None:
+    """Create the prims of instances that :func:`expand_instancers` has deferred."""
+    for balls in deferred:
+        balls.create_prims()
 
 
 @dataclass(frozen=True)
 class _Prototype:
-    """What instances are made of.
+    """A prototype of instances.
 
     Attributes:
-        path: Its root.
+        path: Path of its root.
         name: Name of its root.
-        order: Its operations where it would leave the transform of its instance behind, else None.
-        bodies: Rigid bodies in it, by their path below the root, and their transforms there.
-        magnets: Magnets in it.
-        prims: How many prims it has.
+        order: Transform operations of its root without the reset of the transform stack, None if it has no reset.
+        bodies: Rigid bodies in it: path below the root, and transform relative to the root's parent.
+        magnets: Paths of the magnets in it, below the root.
+        prims: Number of its prims.
     """
 
     path: Sdf.Path
@@ -86,17 +94,17 @@ class _Prototype:
 
 
 class _Expansion:
-    """Expands the instancers of one stage, those first that are in prototypes of others."""
+    """Expands the instancers of one stage, beginning with instancers in prototypes of others."""
 
-    def __init__(self, stage: Usd.Stage, time_code: float, apart: bool):
+    def __init__(self, stage: Usd.Stage, time_code: float, defer: bool):
         self._stage, self._time = stage, time_code
-        self._left_apart, self.apart = apart, list[AlikeBalls]()
+        self._defer, self.deferred = defer, list[IdenticalBalls]()
         self._layer: Sdf.Layer | None = None
         self._done: set[Sdf.Path] = set()
         self._prims = 0
 
     def expand(self, path: Sdf.Path, within: tuple[Sdf.Path, ...] = ()) -> None:
-        """Expand an instancer, in prototypes of those ``within``, unless it is only seen."""
+        """Expand an instancer with physical prims, nested in prototypes of the instancers ``within``."""
         if path in within:
             raise InputError(f"{path}: a PointInstancer that is part of its own prototypes")
         if path in self._done:
@@ -104,27 +112,26 @@ class _Expansion:
         instancer = UsdGeom.PointInstancer(self._editable(path))
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         roots = [self._prototype_prim(path, target) for target in targets]
-        held = [one for root in (instancer.GetPrim(), *roots) for one in _all_below(root)]
-        if not any(map(is_physical, held)):
+        if not any(is_physical(prim) for root in (instancer.GetPrim(), *roots) for prim in descendants(root)):
             return
-        inner = [one.GetPath() for root in roots for one in _all_below(root) if one.IsA(UsdGeom.PointInstancer)]
-        for one in inner:
-            self.expand(one, (*within, path))
+        nested = [prim.GetPath() for root in roots for prim in descendants(root) if prim.IsA(UsdGeom.PointInstancer)]
+        for inner in nested:
+            self.expand(inner, (*within, path))
         self._write(UsdGeom.PointInstancer.Get(self._stage, path), targets)
         self._done.add(path)
 
     def _layer_of_prims(self) -> Sdf.Layer:
-        """Return the layer, part of the stage from the first time on."""
+        """Return the layer of the prims; the first call adds it to the stage."""
         if self._layer is None:
             self._layer = new_layer(INSTANCES)
             add_layer(self._stage, self._layer)
         return self._layer
 
     def _editable(self, path: Sdf.Path) -> Usd.Prim:
-        """Return the prim at a path, no longer in an instance."""
+        """Return the prim at a path; where it is physical, instances around it become editable."""
         while (prim := self._stage.GetPrimAtPath(path)) and prim.IsInstanceProxy():
-            if not any(is_physical(one) for one in _all_below(prim)):
-                break  # only seen, or what it has is elsewhere, which must not be in an instance
+            if not any(map(is_physical, descendants(prim))):
+                break
             while not prim.IsInstance():
                 prim = prim.GetParent()
             release(self._stage, self._layer_of_prims(), [prim.GetPath()])
@@ -136,53 +143,58 @@ class _Expansion:
         return prim
 
     def _write(self, instancer: UsdGeom.PointInstancer, targets) -> None:
-        """Write the prims of all instances of an instancer."""
+        """Write the prims of an instancer's instances, except for deferred ones."""
         path, layer = instancer.GetPath(), self._layer_of_prims()
         instances = _Instances(instancer, len(targets), self._time)
-        if any(len(instances.arrays[name]) for name in _SPEEDS):  # which bodies get, in instances, too
+        if any(len(instances.arrays[name]) for name in _VELOCITIES):  # which bodies inside instances get, too
             for target in targets:
                 release_instances(self._stage, layer, target)
         prototypes = [_prototype(self._stage.GetPrimAtPath(target)) for target in targets]
-        followed = instances.samples() if any(map(self._follows_keys, targets)) else ()
+        samples = instances.samples() if any(map(self._follows_keys, targets)) else ()
         prefix = _NAME
         while any(name.startswith(prefix) for name in instancer.GetPrim().GetAllChildrenNames()):
             prefix += "_"
-        write = partial(_write_instances, layer, path, prefix, instances, prototypes, followed)
-        left = self._alike(instancer, instances, prefix) if self._left_apart and not followed else []
-        whole = {row for balls in left if balls.whole for row in balls.rows.tolist()}  # never are prims
+        write = partial(_write_instances, layer, path, prefix, instances, prototypes, samples)
+        groups = self._identical(instancer, instances, prefix) if self._defer and not samples else []
+        without_prims = {row for balls in groups if balls.stays_instancer for row in balls.rows.tolist()}
         self._prims += sum(
-            1 + prototypes[instances.prototypes[row]].prims for row in instances.rows if row not in whole
+            1 + prototypes[instances.prototypes[row]].prims for row in instances.rows if row not in without_prims
         )
         if self._prims > MOST_PRIMS:
             raise InputError(f"{path}: instances of bodies that stand for more than {MOST_PRIMS} prims")
-        later = [balls.rows[1:].tolist() for balls in left]
-        self.apart += [replace(balls, write=partial(write, rows)) for balls, rows in zip(left, later, strict=True)]
+        later = [balls.rows[1:].tolist() for balls in groups]
+        self.deferred += [
+            replace(balls, create_prims=partial(write, rows)) for balls, rows in zip(groups, later, strict=True)
+        ]
         with Sdf.ChangeBlock():
-            own = Sdf.CreatePrimInLayer(layer, path)
-            own.typeName = "Xform"
+            root = Sdf.CreatePrimInLayer(layer, path)
+            root.typeName = "Xform"
             for target in targets:
                 if target.HasPrefix(path):
                     Sdf.CreatePrimInLayer(layer, target).active = False
-        unwritten = {row for rows in later for row in rows}
-        write([row for row in instances.rows if row not in unwritten])
+        deferred = {row for rows in later for row in rows}
+        write([row for row in instances.rows if row not in deferred])
 
-    def _alike(self, instancer: UsdGeom.PointInstancer, instances: "_Instances", prefix: str) -> list[AlikeBalls]:
-        """Find out which instances are alike; those in other units are not, nor are any where a number is none."""
+    def _identical(
+        self, instancer: UsdGeom.PointInstancer, instances: "_Instances", prefix: str
+    ) -> list[IdenticalBalls]:
+        """Return the identical balls of an instancer; none unless units are SI and all arrays are finite."""
         finite = all(np.isfinite(values).all() for values in instances.arrays.values())
-        if not (finite and units_of(self._stage).are_si and may_be_alike(self._stage, instancer, self._time)):
+        is_si = units_of(self._stage).are_si
+        if not (finite and is_si and has_interchangeable_instances(self._stage, instancer, self._time)):
             return []
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
-        found = {number: ball_in(self._stage.GetPrimAtPath(target)) for number, target in enumerate(targets)}
-        balls = {number: body for number, body in found.items() if body is not None}
-        groups = list(alike(*instances.listed(f"{instancer.GetPath()}/{prefix}"), instances.arrays, balls))
-        if not may_stay_whole(instancer, self._time):
-            groups = [replace(one, whole=False) for one in groups]
+        bodies = [ball_in(self._stage.GetPrimAtPath(target)) for target in targets]
+        balls = {number: body for number, body in enumerate(bodies) if body is not None}
+        groups = list(group_identical(*instances.kinds(f"{instancer.GetPath()}/{prefix}"), instances.arrays, balls))
+        if not can_stay_instancer(instancer, self._time):
+            groups = [replace(group, stays_instancer=False) for group in groups]
         return groups
 
     def _follows_keys(self, target: Sdf.Path) -> bool:
-        """Whether something of a prototype moves as its instance does over time: what is no dynamic body."""
+        """Return whether a prototype has kinematic bodies or colliders without a body, which follow the instance."""
         dynamic = False
-        for prim in _all_below(self._stage.GetPrimAtPath(target)):
+        for prim in descendants(self._stage.GetPrimAtPath(target)):
             if is_body(prim):
                 dynamic = not UsdPhysics.RigidBodyAPI(prim).GetKinematicEnabledAttr().Get()
                 if not dynamic:
@@ -193,16 +205,16 @@ class _Expansion:
 
 
 class _Instances:
-    """The arrays of an instancer at one moment.
+    """Arrays of an instancer at one time code.
 
     Attributes:
-        rows: Indices of the instances that are active.
-        prototypes: Number of the prototype of each, shape [n].
-        arrays: What else is said of single ones, see :data:`warpmag.usd.read.alike.ARRAYS`; empty where nothing is.
+        rows: Rows of the active instances.
+        prototypes: Number of each instance's prototype, shape [n].
+        arrays: :data:`warpmag.usd.read.identical_balls.INSTANCE_ARRAYS`; empty where the instancer has none.
     """
 
     def __init__(self, instancer: UsdGeom.PointInstancer, prototypes: int, time_code: float):
-        """Read them; raises :class:`InputError` where they do not fit each other."""
+        """Read the arrays; raises :class:`InputError` where their lengths or types are inconsistent."""
         self._prim, self._path = instancer.GetPrim(), instancer.GetPath()
         time = Usd.TimeCode(time_code)
         self.prototypes = self._array("protoIndices", time, None)
@@ -210,105 +222,101 @@ class _Instances:
         wrong = self.prototypes[(self.prototypes < 0) | (self.prototypes >= prototypes)]
         if len(wrong):
             raise InputError(f"{self._path}: protoIndices names prototype {wrong[0]}, but there are {prototypes}")
-        self.arrays = {name: self._array(name, time, 3) for name, width in ARRAYS.items() if width == 3}
-        self.arrays["orientations"] = self._turns(time)
+        self.arrays = {name: self._array(name, time, 3) for name, width in INSTANCE_ARRAYS.items() if width == 3}
+        self.arrays["orientations"] = self._orientations(time)
         self._scales = self._array("scales", time, 3)
         if not len(self.arrays["positions"]) and self._count:
             raise InputError(f"{self._path}: positions is missing, of {self._count} instances")
         ids = self._array("ids", time, None)
-        inactive = self._prim.GetMetadata("inactiveIds")
-        off = set(inactive.GetAppliedItems() if inactive else ())
-        self.rows = [row for row in range(self._count) if (int(ids[row]) if len(ids) else row) not in off]
+        metadata = self._prim.GetMetadata("inactiveIds")
+        inactive = set(metadata.GetAppliedItems() if metadata else ())
+        self.rows = [row for row in range(self._count) if (int(ids[row]) if len(ids) else row) not in inactive]
 
     def value(self, name: str, row: int):
-        """Return what an array says of an instance, None where it is empty."""
+        """Return an instance's value of an array, None where the array is empty."""
         values = self._scales if name == "scales" else self.arrays[name]
         return _typed(name, values[row]) if len(values) else None
 
-    def listed(self, prefix: str) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """Return paths, rows and kinds of the active ones as :func:`alike` takes them."""
+    def kinds(self, prefix: str) -> tuple[list[str], np.ndarray, np.ndarray]:
+        """Return paths, rows and kinds of the active instances, as :func:`group_identical` takes them."""
         rows = np.array(self.rows, int)
         kinds = np.c_[self.prototypes, self._scales] if len(self._scales) else self.prototypes[:, None]
         return [f"{prefix}{row}" for row in self.rows], rows, kinds[rows]
 
     def samples(self) -> tuple[tuple[float, dict[str, np.ndarray]], ...]:
-        """Return the arrays that move instances at all their times, nothing where they have but one."""
+        """Return the arrays of the instances' transforms at all time samples; empty for fewer than two samples."""
         names = ("positions", "orientations", "orientationsf", "scales", "protoIndices")
         times = {name: self._prim.GetAttribute(name).GetTimeSamples() for name in names}
         if len(times["protoIndices"]) > 1:
             raise InputError(f"{self._path}: protoIndices has time samples, and bodies in it follow their instances")
-        every = sorted({time for one in times.values() for time in one})
-        return tuple((time, self._at(Usd.TimeCode(time))) for time in every) if len(every) > 1 else ()
+        all_times = sorted({time for samples in times.values() for time in samples})
+        return tuple((time, self._transforms(Usd.TimeCode(time))) for time in all_times) if len(all_times) > 1 else ()
 
-    def _at(self, time) -> dict[str, np.ndarray]:
-        found = {name: self._array(name, time, 3) for name in ("positions", "scales")}
-        return found | {"orientations": self._turns(time)}
+    def _transforms(self, time) -> dict[str, np.ndarray]:
+        arrays = {name: self._array(name, time, 3) for name in ("positions", "scales")}
+        return arrays | {"orientations": self._orientations(time)}
 
     def _array(self, name: str, time, width: int | None) -> np.ndarray:
-        """Return an array of as many values as there are instances, or none."""
+        """Return an array with one value for each instance, or an empty one."""
         attribute = self._prim.GetAttribute(name)
         value = attribute.Get(time) if attribute else None
-        found = np.zeros(0) if value is None else np.asarray(value)
+        array = np.zeros(0) if value is None else np.asarray(value)
         kinds = "if" if width else "i"
-        if found.size and (found.dtype.kind not in kinds or found.ndim != (2 if width else 1)):
+        if array.size and (array.dtype.kind not in kinds or array.ndim != (2 if width else 1)):
             raise InputError(f"{self._path}: {name} is no array of {'vectors' if width else 'whole numbers'}")
-        if name != "protoIndices" and len(found) not in (0, self._count):
-            raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
-        return found if width else found.astype(np.int64)
+        if name != "protoIndices" and len(array) not in (0, self._count):
+            raise InputError(f"{self._path}: {name} has {len(array)} values for {self._count} instances")
+        return array if width else array.astype(np.int64)
 
-    def _turns(self, time) -> np.ndarray:
-        """Return the orientations, the precise ones if there are any, quaternions x y z w of length 1."""
+    def _orientations(self, time) -> np.ndarray:
+        """Return unit quaternions (x, y, z, w): ``orientationsf`` where authored, else ``orientations``."""
         values = {name: self._prim.GetAttribute(name).Get(time) or () for name in ("orientations", "orientationsf")}
         for name, value in values.items():
-            if not isinstance(value, _TURNS):
+            if not isinstance(value, _QUATERNION_ARRAYS):
                 raise InputError(f"{self._path}: {name} is no array of quaternions")
         name = "orientationsf" if len(values["orientationsf"]) else "orientations"
-        found = np.array(values[name], dtype=float) if len(values[name]) else np.zeros((0, 4))
-        if found.shape not in ((0, 4), (self._count, 4)):
-            raise InputError(f"{self._path}: {name} has {len(found)} values for {self._count} instances")
-        lengths = np.linalg.norm(found, axis=1)
-        odd = ~(np.abs(lengths - 1.0) <= _LENGTH_ERROR)
-        if odd.any():
-            row = int(odd.argmax())
+        quaternions = np.array(values[name], dtype=float) if len(values[name]) else np.zeros((0, 4))
+        if quaternions.shape not in ((0, 4), (self._count, 4)):
+            raise InputError(f"{self._path}: {name} has {len(quaternions)} values for {self._count} instances")
+        lengths = np.linalg.norm(quaternions, axis=1)
+        wrong = ~(np.abs(lengths - 1.0) <= _LENGTH_ERROR)
+        if wrong.any():
+            row = int(wrong.argmax())
             raise InputError(f"{self._path}: {name} of instance {row} has length {lengths[row]:g} in place of 1")
-        return found / lengths[:, None]
-
-
-def _all_below(prim: Usd.Prim) -> Iterator[Usd.Prim]:
-    return iter(Usd.PrimRange(prim, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)))
+        return quaternions / lengths[:, None]
 
 
 def _prototype(root: Usd.Prim) -> _Prototype:
-    places, below = UsdGeom.XformCache(), list(_all_below(root))
+    transforms, prims = UsdGeom.XformCache(), list(descendants(root))
     order = UsdGeom.Xformable(root).GetXformOpOrderAttr().Get() if root.IsA(UsdGeom.Xformable) else None
-    outside = places.GetParentToWorldTransform(root).GetInverse()
+    to_parent = transforms.GetParentToWorldTransform(root).GetInverse()
     bodies = tuple(
-        (one.GetPath().MakeRelativePath(root.GetPath()), places.GetLocalToWorldTransform(one) * outside)
-        for one in below
-        if is_body(one)
+        (prim.GetPath().MakeRelativePath(root.GetPath()), transforms.GetLocalToWorldTransform(prim) * to_parent)
+        for prim in prims
+        if is_body(prim)
     )
-    kept = [one for one in order if one != _RESET] if order and _RESET in order else None
-    magnets = tuple(one.GetPath().MakeRelativePath(root.GetPath()) for one in below if has_api(one, MAGNET_API))
-    return _Prototype(root.GetPath(), root.GetName(), kept, bodies, magnets, len(below))
+    kept = [name for name in order if name != _RESET] if order and _RESET in order else None
+    magnets = tuple(prim.GetPath().MakeRelativePath(root.GetPath()) for prim in prims if has_api(prim, MAGNET_API))
+    return _Prototype(root.GetPath(), root.GetName(), kept, bodies, magnets, len(prims))
 
 
-def _write_instances(layer, path, prefix: str, instances: _Instances, prototypes, followed, rows: list[int]) -> None:
+def _write_instances(layer, path, prefix: str, instances: _Instances, prototypes, samples, rows: list[int]) -> None:
     """Write the prims of some instances of the instancer at a path."""
-    own = layer.GetPrimAtPath(path)
+    root = layer.GetPrimAtPath(path)
     with Sdf.ChangeBlock():
         for row in rows:
-            prim = Sdf.PrimSpec(own, f"{prefix}{row}", Sdf.SpecifierDef, "Xform")
+            prim = Sdf.PrimSpec(root, f"{prefix}{row}", Sdf.SpecifierDef, "Xform")
             prototype = prototypes[instances.prototypes[row]]
-            _write_transform(prim, instances, row, followed)
+            _write_transform(prim, instances, row, samples)
             _write_prototype(prim, prototype)
             _write_velocities(prim, prototype, instances, row)
-            if len(prototype.magnets) == 1 and (moment := instances.value(MOMENTS, row)) is not None:
+            if len(prototype.magnets) == 1 and (moment := instances.value(MOMENTS_PRIMVAR, row)) is not None:
                 magnet = prim.path.AppendChild(prototype.name).AppendPath(prototype.magnets[0])
                 Sdf.AttributeSpec(Sdf.CreatePrimInLayer(layer, magnet), MOMENT, _TYPES.Vector3f).default = moment
 
 
 def _typed(name: str, value) -> object:
-    numbers = [float(one) for one in value]
+    numbers = [float(number) for number in value]
     if name == "orientations":
         return Gf.Quatf(numbers[3], *numbers[:3])
     return Gf.Vec3d(*numbers) if name == "positions" else Gf.Vec3f(*numbers)
@@ -341,23 +349,23 @@ def _write_prototype(instance: Sdf.PrimSpec, prototype: _Prototype) -> None:
 
 
 def _write_velocities(prim: Sdf.PrimSpec, prototype: _Prototype, instances: _Instances, row: int) -> None:
-    """Give the bodies of an instance its velocities, which are in the frame of the instancer, in their own frames."""
-    given = [instances.value(name, row) for name in _SPEEDS]
-    if all(one is None for one in given):
+    """Write the velocities of an instance's bodies, converted from the instancer's frame to the bodies' frames."""
+    authored = [instances.value(name, row) for name in _VELOCITIES]
+    if all(value is None for value in authored):
         return
-    velocity, spin = (Gf.Vec3d(0.0) if one is None else Gf.Vec3d(one) for one in given)
-    turn = instances.value("orientations", row) or Gf.Quatf(1.0)
+    linear, angular = (Gf.Vec3d(0.0) if value is None else Gf.Vec3d(value) for value in authored)
+    orientation = instances.value("orientations", row) or Gf.Quatf(1.0)
     scale = instances.value("scales", row) or Gf.Vec3f(1.0)
-    rotation = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Quatd(turn)))
+    rotation = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Quatd(orientation)))
     for below, matrix in prototype.bodies:
         placed = matrix * Gf.Matrix4d().SetScale(Gf.Vec3d(scale)) * rotation
-        own = Gf.Transform(placed).GetRotation().GetInverse()
-        across = Gf.Cross(spin, placed.ExtractTranslation()) * np.pi / 180.0
+        to_body = Gf.Transform(placed).GetRotation().GetInverse()
+        tangential = Gf.Cross(angular, placed.ExtractTranslation()) * np.pi / 180.0
         path = prim.path.AppendChild(prototype.name).AppendPath(below)
         body = Sdf.CreatePrimInLayer(prim.layer, path)
-        for name, value, said in (
-            ("physics:velocity", own.TransformDir(velocity + across), given[0]),
-            ("physics:angularVelocity", own.TransformDir(spin), given[1]),
+        for name, value, authored_value in (
+            ("physics:velocity", to_body.TransformDir(linear + tangential), authored[0]),
+            ("physics:angularVelocity", to_body.TransformDir(angular), authored[1]),
         ):
-            if said is not None:
+            if authored_value is not None:
                 Sdf.AttributeSpec(body, name, _TYPES.Vector3f).default = Gf.Vec3f(value)

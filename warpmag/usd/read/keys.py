@@ -12,8 +12,9 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.declarations.keys import Keys, Motion, Operation
 from warpmag.errors import InputError
+from warpmag.usd.read.prims import is_body, is_collider
 from warpmag.usd.read.session import without_held
-from warpmag.usd.read.transforms import is_animated, is_body, is_collider
+from warpmag.usd.read.transforms import is_animated
 from warpmag.usd.values import LARGEST_COORDINATE, Finding
 
 _UNEVEN = 1e-5

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from pxr import Sdf, Usd
 
 from warpmag.errors import InputError
+from warpmag.usd.read.prims import is_physical
 from warpmag.usd.values import Finding
 
 INSTANCES, UNITS = "warpmag_instances", "warpmag_units"
@@ -65,12 +66,6 @@ def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> No
         if any(is_physical(one) or one.GetTypeName().startswith("Physics") for one in Usd.PrimRange(prim, everywhere))
     ):
         raise InputError(str(finding))
-
-
-def is_physical(prim: Usd.Prim) -> bool:
-    """Whether a prim is a body, a collider, a magnet or a source, by the schemas applied."""
-    schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
-    return any(one.startswith(("PhysicsRigidBody", "PhysicsCollision", "Warpmag")) for one in schemas)
 
 
 def instances_around(prims: Iterable[Usd.Prim]) -> list[Usd.Prim]:

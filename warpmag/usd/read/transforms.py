@@ -3,23 +3,14 @@
 from collections.abc import Iterator
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Tf, Usd, UsdGeom
 
 from warpmag.errors import InputError
+from warpmag.usd.read.prims import is_body
 from warpmag.usd.values import LARGEST_COORDINATE, Finding, finding_of, instance_finding, value_of
 
 _RESET = "!resetXformStack!"
 _INVERSE = "!invert!"
-
-
-def is_body(prim: Usd.Prim) -> bool:
-    """Whether a prim is an enabled rigid body."""
-    return prim.HasAPI(UsdPhysics.RigidBodyAPI) and bool(UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get())
-
-
-def is_collider(prim: Usd.Prim) -> bool:
-    """Whether a prim is an enabled collider."""
-    return prim.HasAPI(UsdPhysics.CollisionAPI) and bool(UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get())
 
 
 def is_animated(prim: Usd.Prim) -> bool:
@@ -33,6 +24,23 @@ def is_animated(prim: Usd.Prim) -> bool:
     operations = (prim.GetAttribute(name.removeprefix(_INVERSE)) for name in order if "xformOp:" in name)
     specs = [spec for one in operations if one for spec in one.GetPropertyStack()]
     return any(spec.HasInfo("timeSamples") or spec.HasInfo("spline") for spec in specs)
+
+
+def rigid_part(matrix) -> np.ndarray:
+    """Return position and rotation of a transform without its scale, shape [4, 4]: the frame of a rigid body.
+
+    USD's physics and Newton take the same rotation.
+    """
+    transform = Gf.Transform(Gf.Matrix4d(matrix.tolist()))
+    rigid = Gf.Matrix4d().SetRotate(transform.GetRotation())
+    rigid.SetTranslateOnly(transform.GetTranslation())
+    return np.array(rigid)
+
+
+def rotation_of(matrix) -> np.ndarray:
+    """Return the rotation of a transform as a quaternion (x, y, z, w)."""
+    rotation = Gf.Transform(Gf.Matrix4d(matrix.tolist())).GetRotation().GetQuat()
+    return np.array([*rotation.GetImaginary(), rotation.GetReal()])
 
 
 class TransformCheck:

@@ -1,4 +1,4 @@
-"""Stages in other units than metres and kilograms, read in SI units: a layer of converted values over the scene.
+"""Stages in other units than meters and kilograms, read in SI units: a layer of converted values over the scene.
 
 Newton's importer converts nothing, and takes no stage in other units. So every value with a length or a mass in it is
 written in SI units into a layer of the session, over the scene that stays as it is: values and time samples, and the
@@ -84,22 +84,22 @@ class Units:
     """Units of a stage.
 
     Attributes:
-        metres: Unit of length [m].
+        meters: Unit of length [m].
         kilograms: Unit of mass [kg].
     """
 
-    metres: float
+    meters: float
     kilograms: float
 
     @property
     def are_si(self) -> bool:
         """Whether nothing has to be converted."""
-        return math.isclose(self.metres, 1.0) and math.isclose(self.kilograms, 1.0)
+        return math.isclose(self.meters, 1.0) and math.isclose(self.kilograms, 1.0)
 
     @property
     def are_sound(self) -> bool:
         """Whether anything can be converted."""
-        return all(1e-50 < unit < 1e50 for unit in (self.metres, self.kilograms))
+        return all(1e-50 < unit < 1e50 for unit in (self.meters, self.kilograms))
 
 
 def units_of(stage: Usd.Stage) -> Units:
@@ -155,7 +155,7 @@ def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[_Attribute, float
         if not attribute or not (attribute.HasAuthoredValue() or name in _SIZES):
             continue
         length, mass = _powers(prim, name)
-        scale = units.metres**length * units.kilograms**mass
+        scale = units.meters**length * units.kilograms**mass
         if scale != 1.0:
             yield _values(attribute), scale
 

@@ -61,7 +61,7 @@ class LayerFile:
     types: np.ndarray
 
 
-class Overs:
+class OverLayer:
     """A layer that has opinions on attributes and defines no prim.
 
     Attributes that are to get time samples have the numbers in which they are added. Their defaults are the values of

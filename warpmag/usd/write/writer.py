@@ -1,9 +1,8 @@
-"""Writes a run as a cache layer over an untouched scene, frame by frame.
+"""Writes a run frame by frame, as a cache layer over an untouched scene.
 
-``out.usda`` is a thin root whose sublayers are ``./out.cache.usdc``, which holds the motion, and the scene; between
-them stand the prims that were made of instances, if there are any. The root repeats the metadata of the scene, since
-that does not compose, and has no prims: an opinion there would hide the samples of the cache. ``crate.py`` writes the
-cache, ``samples.py`` lets it grow, ``output.py`` has the files.
+``out.usda`` is a short root layer. Its sublayers are ``./out.cache.usdc`` with the motion, the prims that were created
+for instances, if any, and the scene. The root repeats the metadata of the scene, because metadata of sublayers do not
+compose. It has no prims: an opinion there would hide the samples of the cache.
 """
 
 import contextlib
@@ -20,32 +19,35 @@ from pxr import Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
 from warpmag.usd.paths import path_between
-from warpmag.usd.read.alike import MOMENTS
+from warpmag.usd.read.ball_instancers import BallInstancer
 from warpmag.usd.read.clock import stage_clock
-from warpmag.usd.read.guard import readable
-from warpmag.usd.read.reader import copied_metadata
+from warpmag.usd.read.identical_balls import MOMENTS_PRIMVAR
+from warpmag.usd.read.input_errors import usd_errors
+from warpmag.usd.read.opening import copied_metadata
+from warpmag.usd.read.recording import ORIENT, SCALE, TRANSLATE
 from warpmag.usd.read.session import INSTANCES, added_layer, as_written, instances_around, unsaved_layers
-from warpmag.usd.read.swarms import Swarm
 from warpmag.usd.read.units import units_of
 from warpmag.usd.write import crate
-from warpmag.usd.write.columns import BODY, MAGNET, ORIENT, SCALE, TRANSLATE, Column
+from warpmag.usd.write.columns import BODY, MAGNET, Column
+from warpmag.usd.write.instancer_frames import InstancerFrames
 from warpmag.usd.write.output import Output
 from warpmag.usd.write.placements import Placements
 from warpmag.usd.write.samples import SampleFile
 from warpmag.usd.write.scene_copy import copy_scene, file_with
 
 _CHECKPOINT_SECONDS = 1.0
+"""Least time between checkpoints [s]."""
 _CHECKPOINT_SHARE = 0.01
-"""Checkpoints come so often, and take at most this part of the time."""
+"""Largest share of the run time spent on checkpoints."""
 
 
 @dataclass(frozen=True)
-class Earlier:
-    """A run that was found at the output.
+class PreviousRun:
+    """An earlier run whose output is being continued.
 
     Attributes:
         time: Time of its last frame since the start of the stage [s].
-        state: What the run had saved by then; None if it was complete.
+        state: The saved state of the run; None if it was complete.
     """
 
     time: float
@@ -53,37 +55,36 @@ class Earlier:
 
 
 class _Rows:
-    """Which rows of what a run hands over go where.
+    """Assignment of a run's rows to prims and instancers.
 
     Attributes:
         bodies: Rows of the bodies that have prims.
         magnets: Rows of the magnets that have prims.
-        of_swarms: Instancers, the rows of their balls, and those of the magnets that these are, -1 where they are none.
+        of_instancers: For each instancer the rows of its balls and of their magnets, -1 for balls without.
     """
 
-    def __init__(self, body_paths: Sequence[str], magnet_paths: Sequence[str], swarms: Sequence[Swarm]):
+    def __init__(self, body_paths: Sequence[str], magnet_paths: Sequence[str], instancers: Sequence[BallInstancer]):
         self.body_count, self.magnet_count = len(body_paths), len(magnet_paths)
-        of_body = {path: row for row, path in enumerate(body_paths)} if swarms else {}
-        of_magnet = {path: row for row, path in enumerate(magnet_paths)} if swarms else {}
-        self.of_swarms = [
+        body_rows = {path: row for row, path in enumerate(body_paths)} if instancers else {}
+        magnet_rows = {path: row for row, path in enumerate(magnet_paths)} if instancers else {}
+        self.of_instancers = [
             (
-                one,
-                np.array([of_body[path] for path in one.bodies], int),
-                np.array([of_magnet.get(path, -1) for path in one.magnets], int),
+                np.array([body_rows[path] for path in instancer.bodies], int),
+                np.array([magnet_rows.get(path, -1) for path in instancer.magnets], int),
             )
-            for one in swarms
+            for instancer in instancers
         ]
         bodies, magnets = np.ones(self.body_count, bool), np.ones(self.magnet_count, bool)
-        for _, own, held in self.of_swarms:
-            bodies[own], magnets[held[held >= 0]] = False, False
+        for balls, ball_magnets in self.of_instancers:
+            bodies[balls], magnets[ball_magnets[ball_magnets >= 0]] = False, False
         self.bodies, self.magnets = np.flatnonzero(bodies), np.flatnonzero(magnets)
 
 
 class CacheWriter:
-    """Writes the frames of a run as they come.
+    """Writes the frames of a run as they are computed.
 
-    The stage can be opened from the first frame on, and has all frames whatever ends the process. Used as a context
-    manager it closes in any case. Without a single frame nothing is written.
+    The stage can be opened from the first frame on, and is valid whatever ends the process. As a context manager the
+    writer always closes its files. Without any frame nothing is written.
     """
 
     def __init__(
@@ -93,23 +94,23 @@ class CacheWriter:
         body_paths: Sequence[str],
         magnet_paths: Sequence[str],
         *,
-        swarms: Sequence[Swarm] = (),
+        instancers: Sequence[BallInstancer] = (),
         copy_scene: bool = False,
         frames: int | None = None,
         options: dict[str, str] | None = None,
     ):
-        """Prepare for a run.
+        """Prepare for a run; nothing is written yet.
 
         Args:
             stage: The scene, as :func:`warpmag.usd.open_stage` opened it.
             path: File of the root layer, ``.usd``, ``.usda`` or ``.usdc``.
-            body_paths: Prims of the rigid bodies, in the order of the frames' rows.
-            magnet_paths: Prims of the magnets, in the order of the frames' moments.
-            swarms: Instancers that hold some of the bodies and stay instancers.
-            copy_scene: Copy the scene beside the root, as is right for a bundled one, instead of pointing to it. A
-                scene that is no file, or has edits that are not saved, is always copied.
-            frames: Frames that are expected; without it the file may become longer than it has to be.
-            options: What a run that goes on from this one must have in common with it, besides the scene.
+            body_paths: Paths of the rigid bodies, in the order of the frames' rows.
+            magnet_paths: Paths of the magnets, in the order of the frames' moments.
+            instancers: Instancers that contain some of the bodies and stay instancers.
+            copy_scene: Copy the scene beside the root layer instead of referring to it, as for a bundled scene. A scene
+                without a file or with unsaved edits is always copied.
+            frames: Expected number of frames; without it the file may become longer than necessary.
+            options: Options that a resumed run must share with this one, besides the scene.
 
         Raises:
             InputError: The path has another suffix, cannot be written or would overwrite a layer of the scene.
@@ -119,17 +120,19 @@ class CacheWriter:
         self._copy_scene = copy_scene or stage.GetRootLayer().anonymous or bool(unsaved_layers(stage))
         scene = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
         self._output = Output(path, scene, copy_scene=self._copy_scene)
-        self._rows = _Rows(body_paths, magnet_paths, swarms)
-        self._bodies = Placements(stage, [body_paths[row] for row in self._rows.bodies.tolist()], self._units.metres)
+        self._rows = _Rows(body_paths, magnet_paths, instancers)
+        self._bodies = Placements(stage, [body_paths[row] for row in self._rows.bodies.tolist()], self._units.meters)
         self._magnet_paths = [magnet_paths[row] for row in self._rows.magnets.tolist()]
+        self._instancer_paths = [instancer.path for instancer in instancers]
+        self._instancers = [InstancerFrames(instancer) for instancer in instancers]
         self._columns = [Column(kind, self._bodies.paths) for kind in BODY] + [Column(MAGNET, self._magnet_paths)]
-        self._columns += [column for one in swarms for column in one.columns()]
+        self._columns += [column for instancer in self._instancers for column in instancer.columns]
         self._frames, self._options = frames, options or {}
         self._samples: SampleFile | None = None
         self._first: list[np.ndarray] = []
         self._last: list[np.ndarray] | None = None
         self._last_time = -np.inf
-        self._below: list[str] = []
+        self._sublayers: list[str] = []
         self._save_time = 0.0
 
     def __enter__(self) -> "CacheWriter":
@@ -137,31 +140,31 @@ class CacheWriter:
         return self
 
     def __exit__(self, kind, *exception) -> None:
-        """Close, whatever ended the run."""
+        """Close the files."""
         self.close(complete=kind is None)
 
-    def resume(self) -> Earlier | None:
-        """Go on with the run that is at the output; call it before the first frame.
+    def resume(self) -> PreviousRun | None:
+        """Continue the run at the output; call it before the first frame.
 
         Returns:
-            What was found, None if there is nothing. A complete run is left as it is.
+            The previous run, None if there is none. A complete run stays unchanged.
 
         Raises:
-            InputError: Another run is writing there, or what is there is another run's, or none's.
+            InputError: Another process is writing there, or the output belongs to another run or to no run.
         """
         if not (self._output.root.exists() or self._output.checkpoint.exists()):
             return None
         self._output.lock()
         try:
             checkpoint = self._output.load_checkpoint()
-            return self._completed() if checkpoint is None else self._go_on(*checkpoint)
+            return self._completed() if checkpoint is None else self._continue(*checkpoint)
         except BaseException:
             self._output.close()
             raise
 
-    def _go_on(self, about: dict[str, str], arrays: dict[str, np.ndarray]) -> Earlier:
-        """Go on from a checkpoint."""
-        self._compare(about)
+    def _continue(self, run: dict[str, str], arrays: dict[str, np.ndarray]) -> PreviousRun:
+        """Continue from a checkpoint."""
+        self._check_same_run(run)
         output = self._output
         places = {name[5:]: array for name, array in arrays.items() if name.startswith("file/")}
         state = {name[6:]: array for name, array in arrays.items() if name.startswith("state/")}
@@ -169,33 +172,33 @@ class CacheWriter:
             self._samples = SampleFile.resume(output.cache, self._value_sizes(), places)
         self._first = self._unpack(self._samples.frame(0))
         self._last = self._unpack(self._samples.frame(self._samples.count - 1))
-        self._last_time = float(about["time"])
+        self._last_time = float(run["time"])
         for target in self._write_scene_and_root():
             output.place(target)
         output.place(output.root)
-        return Earlier(self._last_time, state)
+        return PreviousRun(self._last_time, state)
 
-    def _completed(self) -> Earlier:
-        """Return what there is to say about a run that has left no checkpoint."""
+    def _completed(self) -> PreviousRun:
+        """Return a complete run, which has left no checkpoint."""
         path = self._output.cache
-        with readable(str(path)):
+        with usd_errors(str(path)):
             cache = Sdf.Layer.OpenAsAnonymous(str(path)) if path.exists() else None
-        about = cache.customLayerData.get("warpmag") if cache else None
-        if about is None:
+        run = cache.customLayerData.get("warpmag") if cache else None
+        if run is None:
             raise InputError(f"{self._output.root}: nothing to resume, no run of this version has written it")
-        self._compare(about)
-        return Earlier((cache.endTimeCode - self._clock.start) / self._clock.time_codes_per_second, None)
+        self._check_same_run(run)
+        return PreviousRun((cache.endTimeCode - self._clock.start) / self._clock.time_codes_per_second, None)
 
-    def _compare(self, about: dict[str, str]) -> None:
-        """Refuse to go on with another run."""
-        for name, value in self._about.items():
-            if about.get(name) != value:
-                change = "" if name == "scene" else f": {about.get(name, 'unknown')}, now {value}"
+    def _check_same_run(self, run: dict[str, str]) -> None:
+        """Raise :class:`InputError` where the previous run had another scene or other options."""
+        for name, value in self._identity.items():
+            if run.get(name) != value:
+                change = "" if name == "scene" else f": {run.get(name, 'unknown')}, now {value}"
                 raise InputError(f"{self._output.root}: cannot resume, it was run with another {name}{change}")
 
     @cached_property
-    def _about(self) -> dict[str, str]:
-        """What makes out the run."""
+    def _identity(self) -> dict[str, str]:
+        """Digest of the scene and the options: equal for runs that may continue each other."""
         return {"scene": _digest(self._stage), **self._options}
 
     def add_frame(
@@ -208,26 +211,28 @@ class CacheWriter:
         """Write one frame.
 
         Args:
-            time: Time since the start of the stage [s]; rises from frame to frame.
+            time: Time since the start of the stage [s]; must increase from frame to frame.
             body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
-            body_qd: Linear velocity of the centre of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
+            body_qd: Linear velocity of the center of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
             moments: Moments of the magnets [A·m²], world frame, shape [m, 3].
 
         Raises:
-            InputError: It cannot be written; the stage has the frames before.
+            InputError: It cannot be written; the stage keeps the earlier frames.
         """
         if not time > self._last_time:
-            raise ValueError(f"time must rise from frame to frame: {time} after {self._last_time}")
+            raise ValueError(f"time must increase from frame to frame: {time} after {self._last_time}")
         rows, last = self._rows, self._last
         body_q = np.asarray(body_q, dtype=np.float32).reshape(rows.body_count, 7)
         body_qd = np.asarray(body_qd, dtype=np.float32).reshape(rows.body_count, 6)
         moments = np.asarray(moments, dtype=np.float32).reshape(rows.magnet_count, 3)
         placed = self._bodies.place(body_q[rows.bodies], body_qd[rows.bodies], last and last[1])
-        values = [placed.positions, placed.turns, placed.linear, placed.angular, moments[rows.magnets]]
-        for swarm, bodies, magnets in rows.of_swarms:
-            own = np.where(magnets[:, None] < 0, np.float32(0.0), moments[magnets] if len(moments) else np.float32(0.0))
-            turns = last and last[len(values) + 1]
-            values += swarm.place(body_q[bodies], body_qd[bodies], own, turns)
+        values = [placed.positions, placed.rotations, placed.linear, placed.angular, moments[rows.magnets]]
+        for instancer, (balls, magnets) in zip(self._instancers, rows.of_instancers, strict=True):
+            ball_moments = np.where(
+                magnets[:, None] < 0, np.float32(0.0), moments[magnets] if len(moments) else np.float32(0.0)
+            )
+            last_rotations = last and last[len(values) + 1]
+            values += instancer.values(body_q[balls], body_qd[balls], ball_moments, last_rotations)
         if self._samples is None:
             self._samples = self._begin(time, values)
         else:
@@ -235,14 +240,14 @@ class CacheWriter:
 
     @property
     def save_due(self) -> bool:
-        """Whether :meth:`save` should be called after the next frame: about once a second."""
+        """Whether :meth:`save` should be called after the next frame, about once a second."""
         return clock_time.monotonic() >= self._save_time
 
     def save(self, state: dict[str, np.ndarray] | None) -> None:
-        """Write what changes with every frame besides the cache, after at least one frame.
+        """Write the root layer and a checkpoint, after at least one frame.
 
         Args:
-            state: All that the run needs to go on from the last frame; None if it cannot be resumed.
+            state: State from which the run can continue after the last frame; None if it cannot be resumed.
 
         Raises:
             InputError: It cannot be written.
@@ -251,11 +256,11 @@ class CacheWriter:
         began = clock_time.monotonic()
         self._place_root()
         if state is not None:
-            about = {**self._about, "time": repr(self._last_time)}
+            run = {**self._identity, "time": repr(self._last_time)}
             arrays = {f"file/{name}": array for name, array in self._samples.places().items()}
             arrays |= {f"state/{name}": array for name, array in state.items()}
             with self._output.errors(self._output.checkpoint):
-                self._output.save_checkpoint(about, arrays)
+                self._output.save_checkpoint(run, arrays)
         spent = clock_time.monotonic() - began
         self._save_time = began + max(_CHECKPOINT_SECONDS, spent / _CHECKPOINT_SHARE)
 
@@ -263,14 +268,15 @@ class CacheWriter:
         """Close the files; a second call does nothing.
 
         Args:
-            complete: Whether all frames are there, so that nobody will want to resume.
+            complete: Whether all frames are written, so that the checkpoint can be removed.
         """
         samples, self._samples = self._samples, None
         output = self._output
         try:
             if samples is None:
                 return
-            with contextlib.nullcontext() if complete else contextlib.suppress(InputError):  # there is a reason already
+            # the error that ended an incomplete run is the one to report
+            with contextlib.nullcontext() if complete else contextlib.suppress(InputError):
                 with output.errors(output.cache):
                     samples.close()
                 self._place_root()
@@ -279,13 +285,13 @@ class CacheWriter:
         finally:
             output.close()
         for path in (output.beside(".scene.usdc"), output.instances, output.cache, output.root):
-            if known := Sdf.Layer.Find(str(path)):  # an earlier run's result that this process has open
-                known.Reload(force=True)
+            if layer := Sdf.Layer.Find(str(path)):  # an earlier result that this process has open
+                layer.Reload(force=True)
 
     # ---------------------------------------------------------------------------------------------------------------
 
     def _begin(self, time: float, values: list[np.ndarray]) -> SampleFile:
-        """Write the files with the first frame; an earlier result stays until all of them are whole."""
+        """Write the files with the first frame; an earlier result stays until all of them are complete."""
         output = self._output
         output.lock()
         with output.errors(output.cache):
@@ -308,29 +314,29 @@ class CacheWriter:
     def _append(self, samples: SampleFile, time: float, values: list[np.ndarray]) -> None:
         changed = np.zeros(0, dtype=int)
         if not samples.sampled.all():
-            moved = [(own != first).any(axis=1) for own, first in zip(values, self._first, strict=True)]
-            changed = np.flatnonzero(np.concatenate(moved) & ~samples.sampled)
-        data = b"".join(column.packed(one) for column, one in zip(self._columns, values, strict=True))
+            differs = [(value != first).any(axis=1) for value, first in zip(values, self._first, strict=True)]
+            changed = np.flatnonzero(np.concatenate(differs) & ~samples.sampled)
+        data = b"".join(column.pack(value) for column, value in zip(self._columns, values, strict=True))
         with self._output.errors(self._output.cache):
             samples.append(self._code(time), data, changed)
         self._last_time, self._last = float(time), values
 
     def _write_scene_and_root(self) -> list[Path]:
-        """Write what the root names, without placing it, and the root; return what to place before that."""
+        """Write the root and the layers below it to temporary files; return the targets to place before the root."""
         output, written = self._output, []
-        self._below = []
+        self._sublayers = []
         if instances := self._instances_layer():
             written.append(output.instances)
             with output.errors(output.instances):
                 output.write(instances, output.instances)
-            self._below.append(f"./{output.instances.name}")
+            self._sublayers.append(f"./{output.instances.name}")
         if self._copy_scene:
             with output.errors(output.beside(".scene")):
                 target, scene = copy_scene(self._stage, output)
             written.append(target)
-            self._below.append(f"./{scene.relative_to(output.root.parent)}")
+            self._sublayers.append(f"./{scene.relative_to(output.root.parent)}")
         else:
-            self._below.append(path_between(output.root, Path(self._stage.GetRootLayer().realPath)))
+            self._sublayers.append(path_between(output.root, Path(self._stage.GetRootLayer().realPath)))
         with output.errors(output.root):
             output.write(self._root_layer(), output.root)
         return written
@@ -350,17 +356,17 @@ class CacheWriter:
         return np.concatenate([column.sizes for column in self._columns])
 
     def _unpack(self, data: bytes) -> list[np.ndarray]:
-        """Return the values of a frame, as they were written."""
-        found, place = [], 0
+        """Return the values of a frame, one array for each column."""
+        values, start = [], 0
         for column in self._columns:
-            found.append(column.unpacked(data, place))
-            place += int(column.sizes.sum())
-        return found
+            values.append(column.unpack(data, start))
+            start += int(column.sizes.sum())
+        return values
 
     def _metadata(self, end: float) -> dict[str, float | str]:
-        """Return what says how the numbers of the scene are meant; the cache and the root repeat it."""
+        """Return units, axis and times of the scene, which the cache and the root repeat."""
         return {
-            "metersPerUnit": self._units.metres,
+            "metersPerUnit": self._units.meters,
             "kilogramsPerUnit": self._units.kilograms,
             "upAxis": str(UsdGeom.GetStageUpAxis(self._stage)),
             "timeCodesPerSecond": self._clock.time_codes_per_second,  # equal in all layers: USD rescales otherwise
@@ -374,53 +380,57 @@ class CacheWriter:
         root = Sdf.Layer.CreateAnonymous()
         for key in copied_metadata(scene):
             root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
-        # Players stop at whole frames: the last one, which stands at the step nearest to it, is not to be cut off.
-        whole = round(self._last_time * self._clock.frames_per_second) / self._clock.frames_per_second
-        for key, value in self._metadata(self._code(max(whole, self._last_time))).items():
+        # Players stop at whole frames. The last frame stands at its nearest step, perhaps later, and must be shown.
+        last_frame = round(self._last_time * self._clock.frames_per_second) / self._clock.frames_per_second
+        for key, value in self._metadata(self._code(max(last_frame, self._last_time))).items():
             root.pseudoRoot.SetInfo(key, value)
-        root.subLayerPaths[:] = [f"./{self._output.cache.name}", *self._below]
+        root.subLayerPaths[:] = [f"./{self._output.cache.name}", *self._sublayers]
         return root
 
     def _instances_layer(self) -> Sdf.Layer | None:
-        """Return the layer with the prims of instances, without those of instancers that stay such; None without."""
-        found, swarms = added_layer(self._stage, INSTANCES), [swarm for swarm, *_ in self._rows.of_swarms]
-        if found is None or not swarms:
-            return found
+        """Return the layer with the prims of instances, None if there is none.
+
+        Instancers that stay instancers get no prims in it, only the primvar of their moments.
+        """
+        instances = added_layer(self._stage, INSTANCES)
+        if instances is None or not self._instancer_paths:
+            return instances
         layer = Sdf.Layer.CreateAnonymous()
-        layer.TransferContent(found)
-        for one in swarms:
-            spec = layer.GetPrimAtPath(one.path)
+        layer.TransferContent(instances)
+        for path in self._instancer_paths:
+            spec = layer.GetPrimAtPath(path)
             del (spec.nameParent or layer.pseudoRoot).nameChildren[spec.name]
-            prim = Sdf.CreatePrimInLayer(layer, one.path)
-            moments = Sdf.AttributeSpec(prim, MOMENTS, Sdf.ValueTypeNames.Vector3fArray)
+            prim = Sdf.CreatePrimInLayer(layer, path)
+            moments = Sdf.AttributeSpec(prim, MOMENTS_PRIMVAR, Sdf.ValueTypeNames.Vector3fArray)
             moments.SetInfo("interpolation", UsdGeom.Tokens.vertex)
         return layer
 
-    def _cache_layer(self) -> crate.Overs:
-        """Return the layer with the motion, without its frames."""
-        cache, bodies = crate.Overs(self._value_sizes()), self._bodies
+    def _cache_layer(self) -> crate.OverLayer:
+        """Return the cache without its frames."""
+        cache, bodies = crate.OverLayer(self._value_sizes()), self._bodies
         for name, value in self._metadata(self._clock.start).items():
             cache.set_metadata(name, value)
-        cache.set_metadata("customLayerData", {"warpmag": self._about})
+        cache.set_metadata("customLayerData", {"warpmag": self._identity})
         for column in self._columns:
             cache.add_sampled(column.paths, column.kind.name, column.kind.type_name, column.kind.kind)
         scaled = ~np.isclose(bodies.scales, 1.0, rtol=0.0, atol=1e-6).all(axis=1)
         orders: dict[tuple[str, ...], list[str]] = {}
-        for path, scale, free, has_scale in zip(bodies.paths, bodies.scales, bodies.free, scaled, strict=True):
+        for path, scale, resets, has_scale in zip(bodies.paths, bodies.scales, bodies.resets, scaled, strict=True):
             if has_scale:
                 cache.add_vector(path, SCALE, scale)
-            order = (*["!resetXformStack!"] * bool(free), TRANSLATE, ORIENT, *[SCALE] * bool(has_scale))
+            order = (*["!resetXformStack!"] * bool(resets), TRANSLATE, ORIENT, *[SCALE] * bool(has_scale))
             orders.setdefault(order, []).append(path)
         for order, paths in orders.items():
             cache.add_tokens(paths, "xformOpOrder", order)
-        stage, above = as_written(self._stage), {path.rpartition("/")[0] for one in self._columns for path in one.paths}
-        for prim in instances_around(stage.GetPrimAtPath(path or "/") for path in above):
-            cache.make_editable(str(prim.GetPath()))  # opinions in it have no effect before
+        stage = as_written(self._stage)
+        parents = {path.rpartition("/")[0] for column in self._columns for path in column.paths}
+        for prim in instances_around(stage.GetPrimAtPath(path or "/") for path in parents):
+            cache.make_editable(str(prim.GetPath()))  # USD ignores opinions inside an instance
         return cache
 
 
 def _digest(stage: Usd.Stage) -> str:
-    """Return a digest of the layers that a stage is made of, wherever they lie, with edits that nobody has saved."""
+    """Return a digest of the content of a stage's layers, unsaved edits included, independent of their paths."""
     layers = [layer for layer in stage.GetUsedLayers() if layer.realPath or layer == stage.GetRootLayer()]
     in_memory = [layer for layer in layers if layer.dirty or not layer.realPath]
     digests = [hashlib.sha256(layer.ExportToString().encode()).hexdigest() for layer in in_memory]

@@ -1,0 +1,227 @@
+"""Opens USD stages, and makes the values of one time code their defaults.
+
+Newton imports neither PointInstancers of bodies, nor units other than meters and kilograms, nor time samples, and it
+would fetch textures from network addresses. Layers of the session therefore hold prims for instances
+(``instancers.py``), converted units (``units.py``) and the values of one time code; the scene's own layers stay
+unchanged.
+"""
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from pxr import Sdf, Tf, Usd, UsdGeom
+
+from warpmag.errors import InputError
+from warpmag.usd.paths import full_path, usable_path
+from warpmag.usd.read.ball_instancers import BallInstancer, ball_instancers
+from warpmag.usd.read.clock import check_rates, start_of
+from warpmag.usd.read.coils import is_source
+from warpmag.usd.read.identical_balls import IdenticalBalls
+from warpmag.usd.read.input_errors import NOT_USD, one_line_of, usd_errors
+from warpmag.usd.read.instancers import complete_instances, expand_instancers
+from warpmag.usd.read.keys import make_kinematic
+from warpmag.usd.read.prims import descendants
+from warpmag.usd.read.trial_read import trial_read
+from warpmag.usd.read.units import convert_units
+from warpmag.usd.values import check_type, declared, quiet
+
+_ORDER = "xformOpOrder"
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""Beginning of a network address; a Windows drive has one letter."""
+_COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")
+"""Metadata of a layer that layers above it inherit."""
+
+
+def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.Stage:
+    """Open a stage with the values of one time code as its defaults.
+
+    Args:
+        path: USD file.
+        time_code: The time code; by default the start of the stage.
+
+    Returns:
+        The stage in meters and kilograms, with prims for each instance of a body. Its layers are unchanged; all
+        additions are in its session.
+
+    Raises:
+        InputError: The file is missing, is not USD or does not compose.
+    """
+    stage, deferred = open_deferred(path, time_code)
+    with usd_errors(str(path)):
+        complete_instances(deferred)
+    return stage
+
+
+def open_deferred(path: str | os.PathLike, time_code: float | None = None) -> tuple[Usd.Stage, list[IdenticalBalls]]:
+    """Open a stage like :func:`open_stage`, with prims only for the first of identical balls.
+
+    Returns:
+        The stage, and the instances whose prims :func:`complete_instances` creates.
+    """
+    file = _existing(path)
+    if reason := trial_read(full_path(file)):
+        raise InputError(f"{path}: {reason}")
+    stage = _open(file, path)
+    with usd_errors(str(path)):
+        time_code = start_of(stage) if time_code is None else time_code
+        deferred = expand_instancers(stage, time_code, defer=True)
+        convert_units(stage)
+        freeze(stage, time_code)
+    return stage, deferred
+
+
+def open_animated(path: str | os.PathLike) -> tuple[Usd.Stage, list[BallInstancer]]:
+    """Open a stage with its time samples, in its own units.
+
+    There is no trial read in a child process: for a long run it would take longer than the export.
+
+    Returns:
+        The stage with prims for each instance of a body, and the instancers whose balls have no prims.
+
+    Raises:
+        InputError: The file is missing, is not USD, does not compose, or has invalid instancers.
+    """
+    stage = _open(_existing(path), path)
+    with usd_errors(str(path)):
+        deferred = expand_instancers(stage, start_of(stage), defer=True)
+        complete_instances([balls for balls in deferred if not balls.stays_instancer])
+        return stage, ball_instancers(stage, deferred)
+
+
+def _existing(path: str | os.PathLike) -> Path:
+    """Return a path that USD can name; raises :class:`InputError` unless it can be opened for reading."""
+    file = usable_path(path)
+    if not os.path.isfile(file):
+        raise InputError(f"{path}: no such file")
+    try:
+        with open(file, "rb"):
+            return file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
+    """Open an existing file, with the name ``path`` in messages."""
+    with usd_errors(str(path), NOT_USD):
+        stage = Usd.Stage.Open(str(full_path(file)))
+        _reload(stage)
+        broken = [str(error) for error in stage.GetCompositionErrors()]
+    if broken:
+        raise InputError(f"{path}: {one_line_of(broken[0])}")
+    check_rates(stage)
+    return stage
+
+
+def _reload(stage: Usd.Stage) -> None:
+    """Read layers again whose files have changed since this process read them, except for layers with unsaved edits."""
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not layer.dirty:
+            layer.Reload()
+
+
+@quiet()
+def freeze(stage: Usd.Stage, time_code: float) -> None:
+    """Make the values of ``time_code`` the defaults of the stage, in its session layer.
+
+    Newton reads default values only: it would take a pose with nothing but time samples for the identity. Values inside
+    instances cannot be frozen; :func:`warpmag.usd.survey` reports those that matter. USD ignores time samples of the
+    order of transform operations, so that order stays. Network addresses are blocked. Animated colliders without a
+    rigid body become kinematic bodies.
+
+    Raises:
+        InputError: Time samples have another type than their attribute, an address cannot be blocked, or an animated
+            prim cannot become a body.
+    """
+    session = stage.GetSessionLayer()
+    candidates = [
+        attribute
+        for prim in stage.Traverse()
+        for attribute in prim.GetAuthoredAttributes()
+        if attribute.GetNumTimeSamples() or attribute.HasSpline() or session.GetAttributeAtPath(attribute.GetPath())
+    ]
+    sampled = [attribute for attribute in candidates if _unfreeze(attribute, session)]
+    values = [(attribute, _value_at(attribute, time_code)) for attribute in sampled if attribute.GetName() != _ORDER]
+    with Usd.EditContext(stage, session):
+        for attribute, value in values:
+            if value is not None:
+                attribute.Set(value)
+            else:  # a blocked sample: as if nothing were authored
+                attribute.Block()
+    _block_addresses(stage)
+    transforms = [attribute for attribute in sampled if attribute.GetName().startswith("xformOp:")]
+    make_kinematic(stage, {attribute.GetPrim().GetPath() for attribute in transforms}, is_source)
+
+
+def _unfreeze(attribute: Usd.Attribute, session: Sdf.Layer) -> bool:
+    """Remove the value of an earlier :func:`freeze`; return whether the attribute has time samples or a spline."""
+    spec = session.GetAttributeAtPath(attribute.GetPath())
+    value = spec.default if spec else None
+    if spec:
+        spec.ClearDefaultValue()
+    if attribute.GetNumTimeSamples() or attribute.HasSpline():
+        return True
+    if value is not None:  # written by something else
+        spec.default = value
+    return False
+
+
+def _value_at(attribute, time_code):
+    prim, name = attribute.GetPrim(), attribute.GetName()
+    try:
+        value = attribute.Get(time_code)
+    except Tf.ErrorException:
+        raise InputError(f"{prim.GetPath()}: {name} has time samples that USD cannot read") from None
+    if value is not None:
+        check_type(prim, name, value, declared(attribute))
+    return value
+
+
+def _block_addresses(stage: Usd.Stage) -> None:
+    """Block shader inputs with network addresses, in the session layer; ``warpmag check`` warns of them.
+
+    Newton would fetch a texture from any address in a shader.
+
+    Raises:
+        InputError: An input lies inside an instance, where it cannot be blocked.
+    """
+    addresses = list(_addresses(stage))
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        for attribute, address in addresses:
+            prim = attribute.GetPrim()
+            if prim.IsInstanceProxy():
+                raise InputError(
+                    f"{prim.GetPath()}: {attribute.GetName()} is {address[:80]!r} inside an instance, and nothing is "
+                    "fetched from a network: name a file, or set instanceable = false"
+                )
+            attribute.Block()
+
+
+def _addresses(stage: Usd.Stage) -> Iterator[tuple[Usd.Attribute, str]]:
+    """Yield shader inputs whose values are network addresses, and the addresses."""
+    for prim in descendants(stage.GetPseudoRoot()):
+        for attribute in prim.GetAuthoredPropertiesInNamespace("inputs"):
+            value = attribute.Get() if isinstance(attribute, Usd.Attribute) else None
+            text = value.path if isinstance(value, Sdf.AssetPath) else value
+            if isinstance(text, str) and _ADDRESS.match(text):
+                yield attribute, text
+
+
+def first_camera(stage: Usd.Stage) -> Usd.Prim | None:
+    """Return the first perspective camera of a stage, None where there is none."""
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Camera) and UsdGeom.Camera(prim).GetProjectionAttr().Get() == UsdGeom.Tokens.perspective:
+            return prim
+    return None
+
+
+def describe(path: str | os.PathLike) -> str:
+    """Return the first line of a stage's documentation, without composing the stage."""
+    layer = Sdf.Layer.OpenAsAnonymous(str(path), metadataOnly=True)
+    return (layer.documentation.strip().splitlines() or [""])[0]
+
+
+def copied_metadata(root: Sdf.Layer) -> list[str]:
+    """Return the names of a root layer's metadata that a root layer above it must repeat."""
+    return [key for key in root.pseudoRoot.ListInfoKeys() if key not in _COMPOSED]

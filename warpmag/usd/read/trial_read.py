@@ -1,0 +1,89 @@
+"""Opens a stage in a child process first, because USD's reader can crash or hang on damaged or hostile files.
+
+The child costs a quarter of a second, so a single text file without references is read directly. This file is also the
+program of the child, which imports nothing of warpmag. Errors that USD raises are left to this process's own reading.
+"""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from itertools import accumulate, islice
+
+MOST_PRIMS, DEEPEST_NESTING = 500_000, 5_000
+"""Most prims of a stage, and levels of brackets in a text: USD reads 10,000 levels, and crashes at 100,000."""
+_SECONDS, _BYTES_PER_SECOND = 30.0, 5e6
+"""CPU time of the child [s], and bytes of the stage and the files it names for which it gets a second more."""
+_ARCS = re.compile(rb"@|references|payload|inherits|specializes|prototypes")
+"""Words of a text by which other files, or prims repeatedly, become part of it."""
+_NO_BRACKETS = bytes(set(range(256)) - set(b"{[(}])"))
+_NO_TABLE, _NO_TEXT = "its table of contents names bytes beyond its end", "text that is not UTF-8"
+_WARNINGS = {b"posix_madvise": f"damaged: {_NO_TABLE}", b"UnicodeDecodeError": f"damaged: {_NO_TEXT}"}
+"""Texts that USD prints on stderr in place of an error, and their meaning."""
+
+
+def trial_read(path: str | os.PathLike) -> str:
+    """Return why a file must not be read in this process; empty where it can be."""
+    with open(path, "rb") as file:
+        text = file.read() if file.peek(5).startswith(b"#usda") else b""
+    nesting = accumulate(1 if bracket in b"{[(" else -1 for bracket in text.translate(None, _NO_BRACKETS))
+    if max(nesting, default=0) > DEEPEST_NESTING:
+        return f"brackets are nested more than {DEEPEST_NESTING} deep"
+    if text and not _ARCS.search(text):
+        return ""
+    names = {os.path.join(os.path.dirname(path), os.fsdecode(name)) for name in re.findall(rb"@([^@\n\0]+)@", text)}
+    size = os.path.getsize(path) + sum(os.path.getsize(name) for name in names if os.path.isfile(name))
+    limit = round(_SECONDS + size / _BYTES_PER_SECOND)
+    arguments = [json.dumps(sys.path), str(path), str(MOST_PRIMS), str(limit)]
+    with contextlib.suppress(OSError):  # no interpreter, in an application that embeds Python
+        command = [sys.executable or "", "-S", "-E", __file__, *arguments]
+        with contextlib.suppress(subprocess.TimeoutExpired):  # twice the time, for a loaded machine
+            child = subprocess.run(command, capture_output=True, check=False, timeout=2 * limit)
+            if child.returncode >= 0:
+                meanings = (meaning for words, meaning in _WARNINGS.items() if words in child.stderr)
+                return child.stdout.decode().strip() or next(meanings, "")
+            if child.returncode != -signal.SIGXCPU:
+                return f"USD's reader crashes on it ({signal.Signals(-child.returncode).name})"
+        return f"USD did not read it within {limit} s"
+    return ""
+
+
+def _read(path: str, most_prims: int) -> str:  # pragma: no cover - runs in the child
+    """Read a stage up to the last value of its layers; return why it is refused."""
+    from pxr import Sdf, Usd  # noqa: PLC0415 - only the child needs it
+
+    stage = Usd.Stage.Open(path)
+    have_rates = all(1e-6 < layer.timeCodesPerSecond < 1e9 for layer in stage.GetUsedLayers())
+    prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
+    for count, prim in enumerate(islice(prims, most_prims + 1), 1):
+        if count > most_prims:
+            return f"holds more than {most_prims} prims"
+        for attribute in prim.GetAuthoredAttributes() if have_rates else ():
+            attribute.Get()
+            attribute.GetTimeSamples()  # never ends where offsets of layers overflow
+    for layer in (layer for layer in stage.GetUsedLayers() if layer.GetFileFormat().formatId != "usda"):
+        copy, paths = Sdf.Layer.CreateAnonymous(".usda"), []
+        copy.TransferContent(layer)
+        layer.Traverse("/", paths.append)
+        for spec in filter(None, (layer.GetPrimAtPath(path) for path in paths if path.IsPrimPath())):
+            if None in spec.variantSets.values():  # crashes USD's validators
+                return f"damaged: {spec.path} names variants that are not there"
+    return ""
+
+
+if __name__ == "__main__":  # pragma: no cover - runs in the child
+    import resource
+
+    sys.path[:], half = json.loads(sys.argv[1]), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    limits = {resource.RLIMIT_AS: half, resource.RLIMIT_CORE: 0, resource.RLIMIT_CPU: int(sys.argv[4])}
+    for kind, (soft, hard) in {kind: resource.getrlimit(kind) for kind in limits}.items():
+        resource.setrlimit(kind, (limits[kind] if soft < 0 else min(soft, limits[kind]), hard))
+    try:
+        print(_read(sys.argv[2], int(sys.argv[3])))
+    except MemoryError:
+        print("USD needs more than half of the memory to read it")
+    except Exception:
+        pass
