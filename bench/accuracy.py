@@ -33,6 +33,7 @@ from bench.machine import describe
 from bench.reference import clusters, magnet_pairs, oracle, spheres
 from bench.reference.fall import DURATION, fall
 from bench.run import RUNNERS, make_system
+from bench.systems import moment_system
 from bench.timing import measure
 from warpmag.declarations.magnets import CONTACT_MODELS
 from warpmag.moments.system import MomentSystem
@@ -72,14 +73,14 @@ def iteration(device) -> Iterator[dict]:
     exact = oracle.equilibrium(x, float(np.float32(RADIUS)), field, saturation=SATURATION).magnetizations
     for dtype in ("float32", "float64"):
         for rtol in TOLERANCES:
-            system = MomentSystem(
+            system = moment_system(
                 radii=np.full(BLOCK, RADIUS), saturation=SATURATION, external_field=field, rtol=rtol, dtype=dtype,
                 device=device,
             )  # fmt: skip
             system.positions.assign(x)
 
             def cold(system=system):
-                system.forget()
+                system.start_cold()
                 system.solve()
 
             milliseconds = 1e3 * measure(cold, device)
@@ -131,7 +132,7 @@ def _pair_force(positions, field, permeability, contact_model, device) -> float:
 
 def _solve(positions, field, permeability, contact_model, device) -> MomentSystem:
     """Balls of ``RADIUS`` with their moments and forces."""
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(len(positions), RADIUS), saturation=SATURATION, susceptibility=permeability - 1.0,
         external_field=field, rtol=1e-10, dtype="float64", contact_model=contact_model, device=device,
     )  # fmt: skip
@@ -209,7 +210,7 @@ def price(device) -> Iterator[dict]:
             found = []
             for system in systems:
                 if start == "cold":
-                    system.forget()
+                    system.start_cold()
                 system.solve()
                 found.append(int(system.evaluations.numpy()[0]))
             names = dict(zip(CONTACT_MODELS, found, strict=True))

@@ -11,6 +11,7 @@ import numpy as np
 
 from bench.cases import RADIUS, SATURATION
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.moments.system import MomentSystem
 
 TILTED = np.array([0.48, 0.6, 0.64])
@@ -138,7 +139,7 @@ ARRANGEMENTS: dict[str, Callable[[], Arrangement]] = {
 def arranged(one: Arrangement, **settings) -> MomentSystem:
     """Balls that are arranged, with more arguments of the system."""
     radii = np.broadcast_to(one.radii, len(one.positions))
-    system = MomentSystem(radii=radii, external_field=one.applied, **one.material, **settings)
+    system = moment_system(radii=radii, external_field=one.applied, **one.material, **settings)
     system.positions.assign(one.positions)
     return system
 
@@ -147,7 +148,7 @@ def trace(system: MomentSystem) -> np.ndarray:
     """Solve, and return the residual after each field evaluation."""
     residuals = []
     system.begin()
-    while not residuals or (not system.converged.numpy()[0] and len(residuals) < system.max_evaluations):
+    while not residuals or (not system.converged.numpy()[0] and len(residuals) < system.settings.max_evaluations):
         system.iterate()
         residuals.append(float(system.residual.numpy()[0]))
     return np.array(residuals)

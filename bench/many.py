@@ -25,7 +25,7 @@ from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.moments.fmm import FastSums
-from warpmag.moments.ranks import ranks
+from warpmag.moments.ranks import current_ranks
 
 SIZES = {
     "cpu": (1_000, 2_197, 4_913, 10_648, 21_952, 50_653, 97_336),
@@ -64,7 +64,7 @@ class Moments:
         segments = [(0, n, 0, n)] if rows is None else [(row, row + 1, 0, n) for row in rows]
         return PairEvaluation(
             quantity, segments, self.packed, self.packed, self._base, self.out, turned=self._turned,
-            torques=self._torques, sums=sums, ranks=ranks(),
+            torques=self._torques, sums=sums, ranks=current_ranks(),
         )  # fmt: skip
 
     def parts(self, quantity: Quantity, rtol: float | None) -> tuple[Callable[[], None], Callable[[], None]]:

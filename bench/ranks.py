@@ -16,7 +16,7 @@ from bench.many import Moments, lattice, repetitions
 from bench.timing import measure
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.moments.arrays import resolve_device
-from warpmag.moments.ranks import Ranks, alone, is_first, ranks
+from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, without_ranks
 
 CASES = ((131_072, None), (1_000_000, None), (1_000_000, 1e-3), (4_019_679, 1e-3), (4_019_679, 1e-5))
 """Numbers of moments, and relative errors asked for; None means all pairs."""
@@ -26,7 +26,7 @@ def run_case(count: int, quantity: Quantity, rtol: float | None, all_ranks: Rank
     """Measure the sums of one rank and those of all; ``cells_seconds`` of both are for the cells, which all make."""
     own = Moments(*lattice(count), wp.float32, device)
     found = []
-    for sharing in (alone(), nullcontext()):
+    for sharing in (without_ranks(), nullcontext()):
         with sharing:
             build, evaluate = own.parts(quantity, rtol)
         build()
@@ -55,14 +55,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="mpirun -n 2 python -m bench.ranks", description=__doc__.partition("\n")[0])
     parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    all_ranks, device = ranks(), resolve_device(None)
+    all_ranks, device = current_ranks(), resolve_device(None)
     if all_ranks is None or not device.is_cuda:
         parser.error("to be started by mpirun, with a GPU for each rank")
     machine = describe(device)
     for count, rtol in CASES:
         for quantity in (Quantity.FIELD, Quantity.WRENCH):
             line = run_case(count, quantity, rtol, all_ranks, device)
-            if is_first(all_ranks):
+            if is_first_rank(all_ranks):
                 print(json.dumps({"case": "ranks"} | line | machine), flush=True)
 
 

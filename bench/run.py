@@ -18,6 +18,7 @@ from bench.machine import describe
 from bench.reference import oracle
 from bench.scene import run_bundled, run_scene
 from bench.swarm import run_swarm
+from bench.systems import moment_system
 from bench.timing import measure
 from bench.writing import run_writing
 from warpmag.moments.system import MomentSystem
@@ -30,7 +31,7 @@ _CHECKED = 64
 
 def make_system(count: int, dtype: str, device, contact_model: str = "dipole") -> MomentSystem:
     """A touching pile of iron balls in a field of half their saturation, positions set."""
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(count, RADIUS), saturation=SATURATION, external_field=[0.0, 0.0, 0.5 * SATURATION],
         contact_model=contact_model, dtype=dtype, device=device,
     )  # fmt: skip
@@ -74,7 +75,7 @@ def run_induction(system, device) -> dict:
     """Time a cold and a warm solve; the error is the solve's own residual."""
 
     def cold():
-        system.forget()
+        system.start_cold()
         system.solve()
 
     seconds = measure(cold, device)
@@ -92,7 +93,7 @@ def run_induction(system, device) -> dict:
 
 def make_worlds(worlds: int, count: int, device) -> tuple[MomentSystem, list[wp.array]]:
     """As many piles of ``make_system`` in a world each, and their positions before and after a little motion [m]."""
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(worlds * count, RADIUS), worlds=np.repeat(np.arange(worlds), count), saturation=SATURATION,
         external_field=[0.0, 0.0, 0.5 * SATURATION], device=device,
     )  # fmt: skip

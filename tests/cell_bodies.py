@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from bench.reference import oracle
-from warpmag.moments.system import MomentSystem
+from bench.systems import moment_system
 from warpmag.shapes import demagnetization, lattice
 from warpmag.shapes import uniform_response as even_field
 
@@ -35,7 +35,7 @@ def make_system(body, *, turn=(0.0, 0.0, 0.0, 1.0), permanent=(), coupling=None,
     """System of one body at the origin, and permanent dipoles (position, moment) of another."""
     count = len(body.volumes)
     coupling = demagnetization.coupling(body, body.radii) if coupling is None else coupling
-    system = MomentSystem(
+    system = moment_system(
         radii=np.append(body.radii, np.zeros(len(permanent))), permanent=np.arange(count + len(permanent)) >= count,
         bodies=np.append(np.zeros(count, int), np.ones(len(permanent), int)),
         couplings=[(0, coupling)], **{"saturation": FAINT, **settings},

@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 
 import warpmag
+from bench.systems import moment_system
 from warpmag import cli
 from warpmag.kernels.pairs import evaluate
-from warpmag.moments.ranks import by_first, ranks
-from warpmag.moments.system import MomentSystem
+from warpmag.moments.ranks import current_ranks, on_first_rank
 
 SIZES = {"cpu": (1, 7, 1001), "cuda": (1, 7, 6001)}
 """Numbers of moments; the last is shared out by all forms of the sums, which a GPU takes for thousands of them."""
@@ -22,7 +22,7 @@ def main(what: str, *arguments: str) -> int:
     """Do it, with all sums shared out, and say on stderr how often they were merged; return the exit code."""
     wp.config.enable_backward = False  # as the tests do, so that both find the same compiled kernels
     evaluate._LEAST_SHARED = dict.fromkeys(evaluate._LEAST_SHARED, 1)
-    all_ranks, merged = ranks(), []
+    all_ranks, merged = current_ranks(), []
     if all_ranks is not None:
         merge = all_ranks.merge
         all_ranks.merge = lambda array: (merged.append(1), merge(array))
@@ -35,8 +35,8 @@ def calls(path: str, device: str) -> int:
     """Write results by name to ``path``, ``_``, the rank and ``.npz``; of several ranks print what errors they get."""
     place = None if device == "cuda" else device  # each rank has a GPU of its own
     results = sums(place) | {"worlds": several_worlds([3, 700, 641, 800], place)} | sweeps(place)
-    np.savez(f"{path}_{0 if ranks() is None else ranks().rank}.npz", **results)
-    if ranks() is not None:
+    np.savez(f"{path}_{0 if current_ranks() is None else current_ranks().rank}.npz", **results)
+    if current_ranks() is not None:
         differ()
     return 0
 
@@ -70,7 +70,7 @@ def moments(n: int) -> tuple[np.ndarray, np.ndarray]:
 def several_worlds(sizes: list[int], device: str | None) -> np.ndarray:
     """Magnetizations of worlds of some sizes."""
     worlds, random = np.repeat(range(len(sizes)), sizes), np.random.default_rng(0)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(len(worlds), 0.4), worlds=worlds, saturation=1e6, external_field=(0, 0, 1e5), device=device
     )
     system.positions.assign(10.0 * random.random((len(worlds), 3)))
@@ -80,19 +80,19 @@ def several_worlds(sizes: list[int], device: str | None) -> np.ndarray:
 
 def differ() -> None:
     """Print the errors that this rank gets where ranks are told different things, a line each."""
-    rank, x = ranks().rank, np.eye(3)
+    rank, x = current_ranks().rank, np.eye(3)
     model = small_scene(1e6 + rank).finalize(device="cpu")
     tries = {
         "h_field": lambda: warpmag.h_field(x * (1 + rank), x, device="cpu"),
         "not finite": lambda: warpmag.h_field(x, x * (1.0 if rank == 0 else np.nan), device="cpu"),
         "wrench": lambda: warpmag.wrench(x, x, radii=[0.1 + rank, 0.1, 0.1], device="cpu"),
         "solve_induction": lambda: warpmag.solve_induction(x, 0.1, saturation=1e6 + rank, device="cpu"),
-        "sources": lambda: warpmag.solve_induction(x, 0.1, saturation=1e6, sources=(x + 2, x + rank), device="cpu"),
+        "permanent": lambda: warpmag.solve_induction(x, 0.1, saturation=1e6, permanent=(x + 2, x + rank), device="cpu"),
         "Magnetics": lambda: warpmag.Magnetics(model),
         "rtol": lambda: warpmag.Magnetics(small_scene().finalize(device="cpu"), rtol=1e-3 * (1 + rank)),
         "Simulation": lambda: warpmag.Simulation(small_scene(), step=1e-3 * (1 + rank), device="cpu"),
         "one only": lambda: warpmag.Simulation("no.usda" if rank else small_scene(), device="cpu"),
-        "by_first": lambda: by_first(lambda: 1 // 0, ranks()),
+        "on_first_rank": lambda: on_first_rank(lambda: 1 // 0, current_ranks()),
         "sweep": lambda: warpmag.sweep(lambda worlds: 1 // (1 - worlds[0]), 4, together=1),
     }
     for name, given in tries.items():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.moments.probe import FieldProbe
-from warpmag.moments.system import MomentSystem
 
 newton = pytest.importorskip("newton")
 from bench.reference import coils as coil_oracle  # noqa: E402
@@ -33,7 +33,7 @@ POLYLINE = source_of(Coil("polyline", points=tuple(map(tuple, CORNERS)), wire_ra
 
 def field_of(source, points, device, strength=100.0, frame=(0, 0, 0, 0, 0, 0, 1)):
     """Field and gradient of one source, float64, by a probe beside a moment of zero."""
-    system = MomentSystem(radii=[1e-9], permanent=[True], applied=[source], dtype="float64", device=device)
+    system = moment_system(radii=[1e-9], permanent=[True], sources=[source], dtype="float64", device=device)
     system.sources.strengths.assign([[strength, 0.0, 0.0]])
     system.sources.frames.assign([frame])
     system.positions.assign([[1e3, 0.0, 0.0]])
@@ -210,9 +210,9 @@ def make_loaded_system(device, source=PUSHED):
     places = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 0, 1)]) * 2.3 * R
     places += rng.normal(size=places.shape) * 0.05 * R
     permanent = np.arange(12) >= 8
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(12, R), permanent=permanent, bodies=[0, 0, *range(2, 12)], saturation=2e5, susceptibility=50.0,
-        external_field=(1e3, 2e3, -5e2), applied=[source], dtype="float64", rtol=1e-11, device=device,
+        external_field=(1e3, 2e3, -5e2), sources=[source], dtype="float64", rtol=1e-11, device=device,
     )  # fmt: skip
     system.positions.assign(places)
     system.moments.assign(np.where(permanent[:, None], rng.normal(size=(12, 3)) * 3e4 * VOLUME, 0.0))
@@ -239,7 +239,7 @@ def test_gradient_of_the_energy_is_the_force(kind, device):
 
     energy(places)
     system.apply_forces()
-    forces, reaction = system.forces.numpy(), system.applied.wrenches.numpy()[0, :3]
+    forces, reaction = system.forces.numpy(), system.source_interaction.wrenches.numpy()[0, :3]
     step = 1e-6  # m: the third derivative's part is (step/R)² of the force
     for ball, axis in ((0, 0), (3, 1), (7, 2), (8, 0), (11, 2)):
         moved = np.zeros((12, 3))
@@ -285,8 +285,8 @@ def test_reaction_is_opposite_and_equal(force, device):
     forces = oracle.kelvin_force(effective, gradient)
     torques = oracle.torque(effective, coil) + np.cross(places - frame[:3], forces)
     for found, expected in (
-        (system.applied.wrenches.numpy()[0, :3], forces),
-        (system.applied.wrenches.numpy()[0, 3:6], torques),
+        (system.source_interaction.wrenches.numpy()[0, :3], forces),
+        (system.source_interaction.wrenches.numpy()[0, 3:6], torques),
     ):
         np.testing.assert_allclose(found, -expected.sum(axis=0), atol=1e-13 * np.abs(expected).sum())
 
@@ -295,8 +295,8 @@ def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
     """A coil with a core: the core is a moment of its body."""
     for body in (0, 1):
         coil = LOOP._replace(world=0, body=body, pushed=True)
-        system = MomentSystem(
-            radii=[R], bodies=[0], applied=[coil], lone_torque=True, dtype="float64", rtol=1e-9, device=device
+        system = moment_system(
+            radii=[R], bodies=[0], sources=[coil], single_torque=True, dtype="float64", rtol=1e-9, device=device
         )
         system.sources.strengths.assign([[100.0, 0.0, 0.0]])
         place = np.array([[0.3 * A, 0.0, 0.4 * A]])
@@ -307,14 +307,14 @@ def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
         np.testing.assert_allclose(system.moments.numpy(), oracle.magnetization(h, 1.0)[0] * VOLUME)
         expected = oracle.kelvin_force(system.moments.numpy(), gradient) * body
         np.testing.assert_allclose(system.forces.numpy(), expected, rtol=1e-12)
-        np.testing.assert_allclose(system.applied.wrenches.numpy()[:, :3], -expected, rtol=1e-12)
+        np.testing.assert_allclose(system.source_interaction.wrenches.numpy()[:, :3], -expected, rtol=1e-12)
 
 
 def test_each_world_has_its_sources(device):
     """One for all, one of the second world alone; the first is fixed, the second pushed."""
     everywhere, second = LOOP, LOOP._replace(world=1, body=9, pushed=True)
-    system = MomentSystem(
-        radii=[R, R, R], worlds=[0, 1, 1], saturation=1e9, applied=[everywhere, second], dtype="float64", rtol=1e-10,
+    system = moment_system(
+        radii=[R, R, R], worlds=[0, 1, 1], saturation=1e9, sources=[everywhere, second], dtype="float64", rtol=1e-10,
         device=device,
     )  # fmt: skip
     places = np.array([[0.0, 0.0, 0.01], [0.0, 0.0, 0.01], [0.03, 0.0, 0.01]])
@@ -329,7 +329,7 @@ def test_each_world_has_its_sources(device):
     found = system.forces.numpy()
     np.testing.assert_allclose(found[0], oracle.kelvin_force(m, strengths[:, None, None] * gradient)[0], atol=1e-15)
     push = -oracle.kelvin_force(m[1:], -40.0 * gradient[1:]).sum(axis=0)
-    np.testing.assert_allclose(system.applied.wrenches.numpy()[:, :3], [[0, 0, 0], push], atol=1e-18)
+    np.testing.assert_allclose(system.source_interaction.wrenches.numpy()[:, :3], [[0, 0, 0], push], atol=1e-18)
     probe = FieldProbe(system, 2, worlds=[1, 0])
     probe.points.assign([[0.0, 0.0, 1.0]] * 2)
     probe.measure()

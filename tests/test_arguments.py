@@ -118,9 +118,9 @@ REFUSED = [
     ({"device": ["cpu"]}, "device: no "),
     ({"device": 3.5}, "device: no 3.5"),
     ({"device": np.zeros(2)}, "device: no "),
-    ({"sources": X}, "sources: must be "),
-    ({"sources": (X,)}, "sources: must be "),
-    ({"sources": (X, M[:2])}, r"sources: moments: shape must be \[3\] or \[3, 3\]"),
+    ({"permanent": X}, "permanent: must be "),
+    ({"permanent": (X,)}, "permanent: must be "),
+    ({"permanent": (X, M[:2])}, r"permanent: moments: shape must be \[3\] or \[3, 3\]"),
     ({"positions": X[:, :2]}, r"positions: shape must be \[n, 3\], got \[3, 2\]"),
     ({"positions": X * 1e25}, "positions: 2e.23 m from the origin .row 2., at most 1e.07 m in float32; use float64"),
     ({"positions": X + 1e3, "radii": 1e-7}, "positions: .* with balls of this size at most 200 m"),
@@ -128,9 +128,9 @@ REFUSED = [
     ({"saturation": 0}, "saturation: must be positive, got 0"),
     ({"saturation": 1e30}, "saturation: must be 1e-12 to 1e.15 in float32, got 1e.30; use float64"),
     ({"saturation": math.inf}, "saturation: must be finite"),
-    ({"external_field": (0, 0, 1e30)}, "external_field, sources, saturation: a field of 1e.30 A/m is too strong"),
-    ({"external_field": (0, 0, 1e-25)}, "external_field, sources, saturation: a field of .* A/m is too weak"),
-    ({"sources": (X + 1.0, M * 1e38)}, "external_field, sources, saturation: a field of .* is too strong"),
+    ({"external_field": (0, 0, 1e30)}, "external_field, permanent, saturation: a field of 1e.30 A/m is too strong"),
+    ({"external_field": (0, 0, 1e-25)}, "external_field, permanent, saturation: a field of .* A/m is too weak"),
+    ({"permanent": (X + 1.0, M * 1e38)}, "external_field, permanent, saturation: a field of .* is too strong"),
 ]
 
 
@@ -207,11 +207,11 @@ def test_integers_are_numbers(integer, device):
         "positions": x,
         "external_field": (0, 0, 100_000),
         "initial": (0, 0, 1),
-        "sources": ([[9, 9, 9]], [[1, 2, 3]]),
+        "permanent": ([[9, 9, 9]], [[1, 2, 3]]),
     }
     found = call("solve_induction", device, radii=integer(1), saturation=integer(1_700_000), **given)
-    given = {key: np.asarray(value, float) for key, value in given.items() if key != "sources"}
-    given["sources"] = (np.full((1, 3), 9.0), np.array([[1.0, 2.0, 3.0]]))
+    given = {key: np.asarray(value, float) for key, value in given.items() if key != "permanent"}
+    given["permanent"] = (np.full((1, 3), 9.0), np.array([[1.0, 2.0, 3.0]]))
     for one, other in zip(found, call("solve_induction", device, radii=1.0, saturation=1.7e6, **given), strict=True):
         assert np.array_equal(one, other)
 
@@ -265,12 +265,12 @@ def test_results_are_the_callers(device):
 
 
 @pytest.mark.parametrize("gap", [-0.02, 0.05, 0.3])
-def test_sources_beside_near_contacts(gap, device):
-    """A far and weak source, in one vector with balls that touch, changes nothing; it read outside the table."""
+def test_permanent_moment_beside_near_contacts(gap, device):
+    """A far, weak permanent moment beside balls that touch, in one vector of a CPU, changes nothing."""
     x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.01 * (1.0 + gap)]])
     arguments = {"positions": x, "contact_model": "multipole", "rtol": 1e-5}
     alone = call("solve_induction", device, **arguments)
-    beside = call("solve_induction", device, sources=([[1e3, 0.0, 0.0]], [[1.0, 0.0, 0.0]]), **arguments)
+    beside = call("solve_induction", device, permanent=([[1e3, 0.0, 0.0]], [[1.0, 0.0, 0.0]]), **arguments)
     for one, other in zip(beside, alone, strict=True):
         assert np.abs(one - other).max() <= 1e-4 * max(np.abs(other).max(), 1e-4)
 
@@ -296,10 +296,10 @@ def test_sources_beside_near_contacts(gap, device):
     ],
 )
 def test_moment_system(arguments, message, device):
-    from warpmag.moments.system import MomentSystem  # noqa: PLC0415 - imports Warp
+    from bench.systems import moment_system  # noqa: PLC0415 - imports Warp
 
     with pytest.raises(warpmag.InputError, match=f"^{message}"):
-        MomentSystem(**{"radii": [0.1, 0.1], "device": device, **arguments})
+        moment_system(**{"radii": [0.1, 0.1], "device": device, **arguments})
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def test_any_field_and_force(device, arrangement, power, seed, guise, dtype, ref
         assert np.abs(wrench[1] - torque).max() <= rtol * 1e-6 * size[2] * size[0] + tiny
 
 
-@given(arrangements(), SCALES, SCALES, GUISE, st.sampled_from(["float32", "float64"]), st.sampled_from(["", "sources"]))
+@given(arrangements(), SCALES, SCALES, GUISE, st.sampled_from(["float32", "float64"]), st.booleans())
 def test_any_induction(device, arrangement, field, strength, guise, dtype, beside):
     x, scale, radii = arrangement
     radii = scale * 0.5 if radii is None else radii
@@ -113,7 +113,7 @@ def test_any_induction(device, arrangement, field, strength, guise, dtype, besid
     h0 = np.broadcast_to(single(applied, dtype), x.shape).copy()
     if beside:
         places, moments = scale * np.array([[3.0, 1.0, 2.0]]), np.array([[1e5 * scale**3, 0.0, 0.0]])
-        arguments["sources"] = places, moments
+        arguments["permanent"] = places, moments
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", warpmag.errors.ConvergenceWarning)
@@ -138,8 +138,8 @@ def test_any_induction(device, arrangement, field, strength, guise, dtype, besid
 ARGUMENTS = {
     "h_field": "positions moments targets radii target_radii smoothing method rtol dtype device",
     "wrench": "positions moments radii external_field smoothing method rtol dtype device",
-    "solve_induction": "positions radii saturation susceptibility curve external_field sources dynamics contact_model "
-    "rtol max_evaluations initial dtype device",
+    "solve_induction": "positions radii saturation susceptibility curve external_field permanent dynamics "
+    "contact_model rtol max_evaluations initial dtype device",
 }
 
 

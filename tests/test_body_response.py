@@ -6,9 +6,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.kernels.induction import body_response
 from warpmag.kernels.shared import team
-from warpmag.moments.system import MomentSystem
 from warpmag.shapes import demagnetization, lattice
 
 MS = 1.7e6
@@ -34,7 +34,7 @@ class Scene:
         self.settings |= settings
 
     def system(self, **settings):
-        return MomentSystem(**self.settings | settings)
+        return moment_system(**self.settings | settings)
 
     def places(self, poses):
         parts = [turn.apply(one.positions) + place for one, (turn, place) in zip(self.bodies, poses, strict=True)]

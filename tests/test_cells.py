@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 import warpmag
 from bench.reference import oracle, plate, surface_integrals
-from warpmag.moments.system import MomentSystem
+from bench.systems import moment_system
 from warpmag.shapes import demagnetization, lattice
 from warpmag.shapes import uniform_response as even_field
 
@@ -220,7 +220,7 @@ def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
     n, coupling = len(body.volumes), demagnetization.coupling(body, body.radii)
     found = []
     for seed in range(3):
-        system = MomentSystem(
+        system = moment_system(
             radii=np.tile(body.radii, 2), bodies=np.repeat([0, 1], n), saturation=1.7e6, external_field=(0.0, 0.0, 1e3),
             couplings=[(0, coupling), (n, coupling)], rtol=1e-8, max_evaluations=3000, dtype="float64", device=device,
         )  # fmt: skip
@@ -237,7 +237,7 @@ def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
 def intersecting(body, coupling, places, turns, device):
     """A system of equal bodies, and their operator H = −D M symmetrized by volumes, by one field for each moment."""
     n, count = len(body.volumes), len(places)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.tile(body.radii, count), bodies=np.repeat(np.arange(count), n), saturation=FAINT,
         susceptibility=math.inf, external_field=(0.0, 0.0, 1e3), dtype="float64", device=device,
         couplings=[(n * k, coupling) for k in range(count)],
@@ -379,7 +379,7 @@ def test_a_needle_of_a_model_turns_into_the_field(device):
     np.testing.assert_allclose(wrench[:3], 0.0, atol=1e-6 * np.abs(wrench).max() / 0.05)
     # the same bits again, and from a graph
     again = model.state()
-    magnetics.system.forget()
+    magnetics.system.start_cold()
     with wp.ScopedCapture(device=device) as capture:
         magnetics.apply(again)
     again.clear_forces()

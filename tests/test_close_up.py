@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 import warpmag
 from bench.reference import ball_in_field, magnet_pairs, oracle
+from bench.systems import moment_system
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.moments.probe import FieldProbe
-from warpmag.moments.system import MomentSystem
 from warpmag.shapes import polyhedra
 
 M = 1.05e6  # A/m, N42
@@ -92,7 +92,7 @@ def near_system(half, device, dtype="float64", places=((0.0, 0.0, 0.0),), balls=
     count = n * len(places) + len(balls)
     radii = np.concatenate([np.tile(body.depths, len(places)), np.full(len(balls), 1e-3)])
     labels = np.concatenate([np.repeat(np.arange(len(places)), n), len(places) + np.arange(len(balls))])
-    system = MomentSystem(
+    system = moment_system(
         radii=radii, permanent=np.ones(count, bool), bodies=labels, solids=solids, dtype=dtype, device=device
     )
 

@@ -14,6 +14,7 @@ from small_builders import add_ball, new_builder
 from warp._src import context
 
 import warpmag
+from bench.systems import moment_system
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
 from warpmag.engine.stepping.simulation import Simulation
 from warpmag.kernels.applied.solids import SolidMagnet
@@ -271,12 +272,12 @@ SYSTEMS = {
     "paper": MANY | {"dynamics": "theta-euler", "force": "zeeman"},
     "gilbert": MANY | {"dynamics": "llg"},
     "near": MANY | {"contact_model": "multipole"},
-    "turned": MANY | {"contact_model": "multipole", "lone_torque": True},
+    "turned": MANY | {"contact_model": "multipole", "single_torque": True},
     "yielding": MANY | {"contact_model": "multipole", "curve": ["linear"] * 40},
     "cells": cells(0.005),
     "whole": cells(0.02),
-    "coils": MANY | {"applied": [COIL, LINES], "contact_model": "multipole"},
-    "solids": MANY | {"solids": [solid(18)], "applied": [COIL]},
+    "coils": MANY | {"sources": [COIL, LINES], "contact_model": "multipole"},
+    "solids": MANY | {"solids": [solid(18)], "sources": [COIL]},
     "fast": MANY | {"method": "fmm"},
     "most": {"radii": np.full(7001, 0.005)},
 }
@@ -301,9 +302,9 @@ EXPECTED = {
 
 def drive(which: str, dtype: str) -> MomentSystem:
     """Launch induction, forces and fields at points, with eddy currents where there are balls alone."""
-    magnets = MomentSystem(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
+    magnets = moment_system(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
     if which in ("balls", "coils", "solids"):
-        magnets.conduct(np.full(magnets.count, 1e7), 1e-3)
+        magnets.set_conductivity(np.full(magnets.count, 1e7), 1e-3)
     for step in (magnets.solve, magnets.evaluate, magnets.apply_forces, magnets.forget):
         step()
     magnets.start_from(wp.zeros_like(magnets.moments))

@@ -10,8 +10,8 @@ import warp as wp
 
 import warpmag
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.errors import InputError
-from warpmag.moments.system import MomentSystem
 
 RADIUS, COUNT, PERMANENT = 0.005, 12, 3
 MASS = 7870.0 * 4.0 / 3.0 * math.pi * RADIUS**3
@@ -29,7 +29,7 @@ class Clump:
         self.positions = 1.98 * RADIUS * (grid + 0.01 * rng.normal(size=(COUNT, 3)))
         permanent = np.arange(COUNT) >= COUNT - PERMANENT
         self.conductivity = np.where(np.arange(COUNT) % 2 == 1, conductivity, 0.0)
-        self.system = system = MomentSystem(
+        self.system = system = moment_system(
             radii=np.full(COUNT, RADIUS),
             permanent=permanent,
             saturation=1.7e6,
@@ -40,7 +40,7 @@ class Clump:
         moments = np.where(permanent[:, None], 0.8 * rng.normal(size=(COUNT, 3)), 0.0)
         system.positions.assign(self.positions)
         system.moments.assign(moments)
-        system.conduct(self.conductivity, step)
+        system.set_conductivity(self.conductivity, step)
         system.solve()
         self.moments = system.moments.numpy().astype(float)
         h = oracle.h_field(self.positions, self.moments, radii=np.full(COUNT, RADIUS))
@@ -103,10 +103,12 @@ def test_micrometres(device):
     """Balls of 1 µm in single precision as in double; r⁻⁷ there is no float."""
     found = []
     for dtype in ("float32", "float64"):
-        system = MomentSystem(radii=[1e-6, 1e-6], saturation=1.7e6, permanent=[False, True], dtype=dtype, device=device)
+        system = moment_system(
+            radii=[1e-6, 1e-6], saturation=1.7e6, permanent=[False, True], dtype=dtype, device=device
+        )
         system.positions.assign([[0.5e-6, 0.0, 2.5e-6], [0.0, 0.0, 0.0]])
         system.moments.assign([[0.0, 0.0, 0.0], [0.0, 0.0, 4e-12]])
-        system.conduct([1e16, 0.0], 1e-12)  # so good that currents show beside the pull
+        system.set_conductivity([1e16, 0.0], 1e-12)  # so good that currents show beside the pull
         system.solve()
         system.eddy.motion.assign(np.outer([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0]))
         system.apply_forces()
@@ -271,13 +273,13 @@ def test_nothing_is_prepared_without_conductors(device):
     builder = _ball_at_a_magnet(lambda body, place: (np.zeros(3), np.zeros(3)))
     warpmag.add_inducible(builder, 1)
     system = warpmag.Magnetics(builder.finalize(device=device)).system
-    assert system.eddy is None and system.applied.rates is None
+    assert system.eddy is None and system.source_interaction.rates is None
 
 
 def test_worlds_do_not_see_each_other(clump, device):
     """Twice the same balls, of which only the second world's conduct in part as those of the first."""
     motion, alone = np.zeros((8, 2 * COUNT)), clump.braked(*_motion())
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(2 * COUNT, RADIUS),
         worlds=np.repeat([0, 1], COUNT),
         permanent=np.tile(np.arange(COUNT) >= COUNT - PERMANENT, 2),
@@ -288,7 +290,7 @@ def test_worlds_do_not_see_each_other(clump, device):
     )
     system.positions.assign(np.tile(clump.positions, (2, 1)))
     system.moments.assign(np.tile(clump.moments, (2, 1)))
-    system.conduct(np.concatenate([np.zeros(COUNT), clump.conductivity]), NO_STEP)
+    system.set_conductivity(np.concatenate([np.zeros(COUNT), clump.conductivity]), NO_STEP)
     system.solve()
     found = []
     for speed in (1.0, 0.0):

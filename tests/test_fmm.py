@@ -8,12 +8,12 @@ import pytest
 import warp as wp
 
 import warpmag
+from bench.systems import moment_system
 from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.moments import fmm, pair_sums
 from warpmag.moments.arrays import resolve_dtype, vec3_type
-from warpmag.moments.system import MomentSystem
 
 
 def apart(a, b) -> float:
@@ -237,7 +237,7 @@ def test_worlds_do_not_see_each_other(device):
     """Worlds at one place with different moments: each result equals that of the world alone."""
     places = 0.005 * clump(4.0)
     n, count = len(places), 6
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(n * count, 0.0015), worlds=np.repeat(np.arange(count), n), saturation=1.7e6,
         external_field=np.repeat(np.linspace(1e4, 2e6, count), n)[:, None] * [0.0, 0.0, 1.0], method="fmm",
         device=device,
@@ -258,7 +258,7 @@ def test_small_worlds_are_summed_over_all_pairs(device):
     """Even many small worlds: the multipole method costs the same per moment, direct sums only the pairs of a world."""
     count, worlds = 64, 300
     places = 0.005 * jittered(count)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(count * worlds, 0.0015), worlds=np.repeat(np.arange(worlds), count), saturation=1.7e6,
         external_field=[0.0, 0.0, 1e5], rtol=3e-3, device=device,
     )  # fmt: skip
@@ -269,7 +269,7 @@ def test_small_worlds_are_summed_over_all_pairs(device):
 
 def test_bodies_of_several_moments_are_refused():
     with pytest.raises(warpmag.InputError, match="several moments"):
-        MomentSystem(radii=[0.1, 0.1], bodies=[0, 0], method="fmm", device="cpu")
+        moment_system(radii=[0.1, 0.1], bodies=[0, 0], method="fmm", device="cpu")
 
 
 @pytest.mark.parametrize(("quantity", "count"), [(Quantity.FIELD, 45_000), (Quantity.WRENCH, 25_000)])

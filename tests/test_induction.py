@@ -11,8 +11,8 @@ from arrangements import as_float32, fcc_block, overlapping, pile, relative
 
 import warpmag
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.declarations import magnets
-from warpmag.moments.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.arrangements import ARRANGEMENTS, arranged, trace
@@ -51,18 +51,25 @@ def test_isolated_ball_takes_one_iteration(curve, susceptibility, strength, devi
 @pytest.mark.parametrize("evaluations, error", [(6, 1e-2), (8, 1e-3), (11, 1e-4)])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_cold_block_converges_fast(block, evaluations, error, dtype, device):
-    x, radius, sources, exact = block
+    x, radius, permanent, exact = block
     found = warpmag.solve_induction(
-        x, radius, saturation=MS, sources=sources, rtol=2e-6, max_evaluations=evaluations, dtype=dtype, device=device
+        x,
+        radius,
+        saturation=MS,
+        permanent=permanent,
+        rtol=2e-6,
+        max_evaluations=evaluations,
+        dtype=dtype,
+        device=device,
     )
     assert found.evaluations <= evaluations
     assert relative(found.magnetizations, exact.magnetizations) < error
 
 
 def test_tight_tolerance_reaches_the_newton_solution(block, device):
-    x, radius, sources, exact = block
+    x, radius, permanent, exact = block
     found = warpmag.solve_induction(
-        x, radius, saturation=MS, sources=sources, rtol=1e-11, dtype="float64", device=device
+        x, radius, saturation=MS, permanent=permanent, rtol=1e-11, dtype="float64", device=device
     )
     assert found.converged and found.error <= 1e-11
     # the residual is amplified by the inverse Jacobian, whose norm is below 20 here
@@ -92,9 +99,9 @@ def test_error_is_one(name, device):
 
 def test_residual_is_that_of_the_last_evaluation(block, device):
     """It is ‖M − f(H(M))‖/‖f(H(M))‖ (Eq. 12) of the moments whose field was summed, evaluated independently."""
-    x, radius, sources, _ = block
-    applied = oracle.h_field(*sources, x)
-    system = MomentSystem(
+    x, radius, permanent, _ = block
+    applied = oracle.h_field(*permanent, x)
+    system = moment_system(
         radii=np.full(len(x), radius), saturation=MS, external_field=applied, rtol=1e-6, dtype="float64", device=device
     )
     system.positions.assign(x)
@@ -112,15 +119,17 @@ def test_residual_is_that_of_the_last_evaluation(block, device):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_magnetizations_and_fields_are_the_materials(block, dtype, device):
     """M = f(H) of what is returned, however early the solve ends."""
-    x, radius, sources, _ = block
-    found = warpmag.solve_induction(x, radius, saturation=MS, sources=sources, rtol=1e-1, dtype=dtype, device=device)
+    x, radius, permanent, _ = block
+    found = warpmag.solve_induction(
+        x, radius, saturation=MS, permanent=permanent, rtol=1e-1, dtype=dtype, device=device
+    )
     expected, _ = oracle.magnetization(found.h_field, MS)
     assert relative(found.magnetizations, expected) < (1e-6 if dtype == "float32" else 1e-14)
 
 
 def test_warm_start_and_initial(block, device):
-    x, radius, sources, exact = block
-    settings = {"saturation": MS, "sources": sources, "rtol": 1e-4, "device": device}
+    x, radius, permanent, exact = block
+    settings = {"saturation": MS, "permanent": permanent, "rtol": 1e-4, "device": device}
     cold = warpmag.solve_induction(x, radius, **settings)
     again = warpmag.solve_induction(x, radius, initial=exact.magnetizations, **settings)
     assert again.evaluations == 1 < cold.evaluations
@@ -168,20 +177,20 @@ def test_curves_and_materials(curve, device):
 
 
 def test_not_converging_is_said(block, device):
-    x, radius, sources, _ = block
+    x, radius, permanent, _ = block
     with pytest.warns(warpmag.ConvergenceWarning, match="did not converge, error .* after max_evaluations = 2"):
-        found = warpmag.solve_induction(x, radius, saturation=MS, sources=sources, max_evaluations=2, device=device)
+        found = warpmag.solve_induction(x, radius, saturation=MS, permanent=permanent, max_evaluations=2, device=device)
     assert not found.converged and found.evaluations == 2 and found.error > 1e-3
 
 
 @pytest.mark.parametrize("force", ["kelvin", "zeeman"])
 def test_wrench_of_the_result(block, force, device):
-    x, radius, sources, exact = block
+    x, radius, permanent, exact = block
     found = warpmag.solve_induction(
-        x, radius, saturation=MS, sources=sources, rtol=1e-9, dtype="float64", device=device
+        x, radius, saturation=MS, permanent=permanent, rtol=1e-9, dtype="float64", device=device
     )
     volume = 4.0 / 3.0 * np.pi * radius**3
-    everything = np.concatenate([x, sources[0]]), np.concatenate([volume * exact.magnetizations, sources[1]])
+    everything = np.concatenate([x, permanent[0]]), np.concatenate([volume * exact.magnetizations, permanent[1]])
     gradient = oracle.field_gradient(*everything, radii=np.append(np.full(len(x), radius), 0.0))[:-1]
     if force == "kelvin":
         expected = oracle.kelvin_force(volume * exact.magnetizations, gradient)
@@ -226,7 +235,7 @@ def test_warp_arrays(device):
         ({"rtol": np.nan}, "rtol: must be at least"),
         ({"max_evaluations": 0}, "max_evaluations: must be at least 1"),
         ({"external_field": [np.inf, 0, 0]}, "external_field: not finite"),
-        ({"sources": (np.zeros((2, 3)), np.zeros((3, 3)))}, "sources: moments: shape"),
+        ({"permanent": (np.zeros((2, 3)), np.zeros((3, 3)))}, "permanent: moments: shape"),
     ],
 )
 def test_bad_arguments(arguments, message, device):

@@ -8,10 +8,10 @@ from pxr import Usd
 
 import warpmag
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.cli import BAD_INPUT, main
 from warpmag.engine.stepping.scene import import_scene
 from warpmag.moments import fmm
-from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import make
 from warpmag.usd.read import identical_balls, instancers
 
@@ -73,7 +73,7 @@ def test_moments_and_forces_are_those_of_all_pairs(device):
     assert far_cells(magnetics)
     assert 0.0 < magnetics.system.field_error() <= RTOL
     exact = warpmag.solve_induction(
-        x, RADIUS, saturation=warpmag.declarations.magnets.SATURATION_OF_IRON, external_field=FIELD, sources=magnet,
+        x, RADIUS, saturation=warpmag.declarations.magnets.SATURATION_OF_IRON, external_field=FIELD, permanent=magnet,
         method="direct", rtol=1e-6, dtype="float64", device="cpu",
     )  # fmt: skip
     moments = magnetics.system.moments.numpy().astype(float)
@@ -171,7 +171,7 @@ def test_a_graph_does_what_launches_do(device):
     for captured in (False, True):
         magnetics, state = warpmag.Magnetics(model, method="fmm", external_field=FIELD), model.state()
         magnetics.apply(state)
-        magnetics.system.forget()
+        magnetics.system.start_cold()
         state.body_q.assign(state.body_q.numpy() * np.float32(1.3))  # other cells
         state.clear_forces()
         if captured:
@@ -229,7 +229,7 @@ def test_a_place_that_is_no_place_makes_no_harm(place, device):
     """As at the end of a simulation that explodes: whoever looks finds what is not finite."""
     x = places_of(300)
     x[77, 1] = place
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(300, RADIUS), saturation=1e6, external_field=FIELD, method="fmm", max_evaluations=5, device=device
     )
     system.positions.assign(x.astype(np.float32))

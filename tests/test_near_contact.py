@@ -13,8 +13,8 @@ import warpmag
 from bench.reference import near_contact as contact_oracle
 from bench.reference import oracle
 from bench.reference.near_contact import NearContacts
+from bench.systems import moment_system
 from warpmag.kernels.near_contact import contact_table
-from warpmag.moments.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.reference import clusters
@@ -285,7 +285,7 @@ def test_device_worlds_and_bodies_keep_apart(device):
     """Worlds do not see each other, and only single inducible moments take part."""
     x = np.concatenate([MIXED, MIXED, MIXED])
     n = len(MIXED)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.tile(MIXED_RADII, 3), worlds=np.repeat([0, 1, 2], n), saturation=IRON, contact_model="multipole",
         bodies=np.concatenate([np.arange(2 * n), np.full(n, 2 * n)]), external_field=1e5 * ALONG, rtol=1e-11,
         dtype="float64", device=device,
@@ -313,10 +313,10 @@ def test_device_precisions_agree_before_a_solve_has_ended(device):
     magnet[5] = [0.3, 0.0, 0.4]
     found = {}
     for dtype in ("float64", "float32"):
-        system = MomentSystem(
+        system = moment_system(
             radii=np.append(MIXED_RADII, 0.005), permanent=np.arange(6) == 5, movable=np.arange(6) != 1,
             saturation=IRON, susceptibility=np.append(MIXED_SUSCEPTIBILITIES, 1.0), contact_model="multipole",
-            external_field=1e5 * np.array([0.4, -0.3, 0.9]), lone_torque=True, max_evaluations=2, dtype=dtype,
+            external_field=1e5 * np.array([0.4, -0.3, 0.9]), single_torque=True, max_evaluations=2, dtype=dtype,
             device=device,
         )  # fmt: skip
         system.positions.assign(x)
@@ -337,7 +337,7 @@ def test_device_precisions_agree_before_a_solve_has_ended(device):
 def test_device_graph_gives_the_same_bits(device):
     x = as_float32(fcc_block((3, 3, 3)))[0]
     plain, captured = (
-        MomentSystem(
+        moment_system(
             radii=np.full(len(x), 0.00499), saturation=IRON, contact_model="multipole",
             external_field=1e4 * np.array([0.4, -0.3, 0.9]), device=device,
         )
@@ -379,7 +379,7 @@ def test_only_the_kelvin_law(device):
     with pytest.raises(warpmag.InputError, match="multipole"):
         found.wrench("zeeman")
     with pytest.raises(warpmag.InputError, match="multipole"):
-        MomentSystem(radii=np.ones(2), force="zeeman", contact_model="multipole", device=device)
+        moment_system(radii=np.ones(2), force="zeeman", contact_model="multipole", device=device)
 
 
 def test_two_balls_that_approach_conserve_energy(device):
@@ -388,7 +388,7 @@ def test_two_balls_that_approach_conserve_energy(device):
     Energy is kinetic plus the co-energy −½ μ0 Σ m·H0 of unsaturated balls.
     """
     field, mass, end = np.array([0.0, 0.0, 200.0]), 4.1e-3, 0.0
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(2, 0.005), saturation=1e12, external_field=field, contact_model="multipole", rtol=1e-11,
         dtype="float64", device=device,
     )  # fmt: skip

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.declarations.coils import Coil, FieldMap
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.near_contact import contact_table
 from warpmag.moments.probe import FieldProbe
-from warpmag.moments.system import MomentSystem
 from warpmag.shapes import polyhedra
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
@@ -43,7 +43,7 @@ def box(half, device, **settings):
     body = polyhedra.box_moments(half)
     n = len(body.volumes)
     solid = SolidMagnet(1, n, body.volumes[0], 0, body.reach, polyhedra.box(half), True)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.append(R, body.depths), permanent=np.arange(n + 1) > 0, bodies=np.append(0, np.ones(n, int)),
         saturation=LINEAR, solids=[solid], dtype="float64", rtol=1e-10, device=device, **settings,
     )  # fmt: skip
@@ -64,8 +64,8 @@ def box(half, device, **settings):
 
 def ball_in(source, device, *, susceptibility=math.inf, size=R, dtype="float64", model="multipole", **where):
     """What a ball and a source feel of each other: forces, and the source's torque about its frame, shape [9]."""
-    system = MomentSystem(
-        radii=[size], saturation=LINEAR, susceptibility=susceptibility, contact_model=model, applied=[source],
+    system = moment_system(
+        radii=[size], saturation=LINEAR, susceptibility=susceptibility, contact_model=model, sources=[source],
         dtype=dtype, rtol=1e-10 if dtype == "float64" else 1e-5, device=device,
     )  # fmt: skip
     strength = where.get("strength", 100.0 if source.kind != SourceKind.FIELD_MAP else 1.0)
@@ -76,7 +76,7 @@ def ball_in(source, device, *, susceptibility=math.inf, size=R, dtype="float64",
         system.positions.assign([place])
         system.solve()
         system.apply_forces()
-        return np.concatenate([system.forces.numpy()[0], system.applied.wrenches.numpy()[0, :6]])
+        return np.concatenate([system.forces.numpy()[0], system.source_interaction.wrenches.numpy()[0, :6]])
 
     return wrenches
 
@@ -92,7 +92,7 @@ def field_of(source, device):
     """The field that a map is of, or that of a coil, which ``test_applied.py`` compares with closed forms."""
     if source.kind == SourceKind.FIELD_MAP:
         return lambda x: oracle.h_field(*DIPOLE, x)
-    system = MomentSystem(radii=[1e-9], permanent=[True], applied=[source], dtype="float64", device=device)
+    system = moment_system(radii=[1e-9], permanent=[True], sources=[source], dtype="float64", device=device)
     system.sources.strengths.assign([[100.0, 0.0, 0.0]])
     system.positions.assign([[1e3, 0.0, 0.0]])
 

@@ -12,10 +12,10 @@ from arrangements import relative
 
 import warpmag
 from warpmag.kernels.near_contact import contact_table, near_pairs
-from warpmag.moments.system import MomentSystem
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.reference import ball_in_field
+from bench.systems import moment_system
 
 R = 0.005
 LINEAR = 1e15
@@ -30,7 +30,7 @@ SUSCEPTIBILITY = np.array([np.inf, 4.0, 1.0, 1.0, 1.0])
 def system(radii, device, *, contact_model="multipole", dtype="float64", saturation=LINEAR, **settings):
     n = len(radii)
     balls = settings.pop("balls", 1)
-    return MomentSystem(
+    return moment_system(
         radii=radii, saturation=saturation, contact_model=contact_model, dtype=dtype, device=device,
         **{"permanent": np.arange(n) >= balls, "rtol": 1e-11 if dtype == "float64" else 1e-5} | settings,
     )  # fmt: skip
@@ -288,11 +288,11 @@ def test_graph_gives_the_same_bits(device):
     with wp.ScopedCapture(device=device) as capture:
         captured.solve()
         captured.apply_forces()
-    captured.forget()
+    captured.start_cold()
     for step in range(3):
         x = (1.0 + 1e-3 * step) * PLACES
         if step == 0:
-            plain.forget()
+            plain.start_cold()
         expected = wrench(plain, x, MOMENTS)
         captured.positions.assign(x)
         captured.moments.assign(MOMENTS)

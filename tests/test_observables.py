@@ -9,8 +9,8 @@ from small_builders import R, add_ball, new_builder
 
 import warpmag
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.moments.probe import FieldProbe
-from warpmag.moments.system import MomentSystem
 
 M = 1e6  # A/m
 VOLUME = 4.0 / 3.0 * math.pi * R**3
@@ -34,7 +34,7 @@ def make_system(curve, device, *, dtype="float64", rtol=1e-11):
     n = 24
     x, permanent = apart(rng, n, 2.1 * R), np.arange(n) >= 18
     m = np.where(permanent[:, None], rng.normal(size=(n, 3)) * 3e5 * VOLUME, 0.0)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(n, R), permanent=permanent, saturation=2e5, susceptibility=50.0, curve=curve,
         external_field=H0, dtype=dtype, rtol=rtol, device=device,
     )  # fmt: skip
@@ -68,7 +68,7 @@ def test_gradient_of_the_energy_is_the_force(curve, device):
 def test_energy_of_one_ball(device):
     """μ0 of minus half moment times field, where the curve is straight; less a quarter of Ms² where it saturates."""
     for saturation, expected in ((1e9, -1.5 * np.dot(H0, H0)), (1e3, -1e3 * (np.linalg.norm(H0) - 1e3 / 6.0))):
-        system = MomentSystem(
+        system = moment_system(
             radii=[R], saturation=saturation, curve="clamped", external_field=H0, dtype="float64", device=device
         )
         system.solve()
@@ -76,7 +76,7 @@ def test_energy_of_one_ball(device):
 
 
 def test_energy_of_the_multipole_model_is_refused(device):
-    system = MomentSystem(radii=[R, R], contact_model="multipole", device=device)
+    system = moment_system(radii=[R, R], contact_model="multipole", device=device)
     with pytest.raises(warpmag.InputError, match="contact_model"):
         system.energy()
 
@@ -145,7 +145,7 @@ def test_a_probe_in_a_crowd_of_balls(device):
     rng = np.random.default_rng(1)
     x = rng.normal(size=(n, 3)) * 0.1 * R
     m = rng.normal(size=(n, 3)) * VOLUME * M
-    system = MomentSystem(radii=np.full(n, R), permanent=np.ones(n, bool), dtype="float64", device=device)
+    system = moment_system(radii=np.full(n, R), permanent=np.ones(n, bool), dtype="float64", device=device)
     system.positions.assign(x)
     system.moments.assign(m)
     system.solve()

@@ -76,18 +76,18 @@ def test_worlds_of_a_sweep_are_each_its_own(calls):
 
 
 def test_a_difference_is_told_in_one_line_on_all_ranks(calls):
-    given = "rank 1 was given another value than rank 0; ranks share out one calculation"
+    given = "differs between rank 1 and rank 0; the ranks of one calculation need equal arguments"
     lines = {
         "h_field": f"positions: {given}",
         "not finite": f"moments: {given}",
         "wrench": f"radii: {given}",
         "solve_induction": f"saturation: {given}",
-        "sources": f"sources: {given}",
+        "permanent": f"permanent: {given}",
         "Magnetics": f"Magnetics: model.warpmag.saturation: {given}",
         "rtol": f"Magnetics: rtol: {given}",
         "Simulation": f"step: {given}",
         "one only": "rank 1: no.usda: no such file",
-        "by_first": "rank 0: ZeroDivisionError: integer division or modulo by zero",
+        "on_first_rank": "rank 0: ZeroDivisionError: integer division or modulo by zero",
         "sweep": "rank 1: ZeroDivisionError: integer division or modulo by zero",
     }
     printed = calls[0][1].stdout.splitlines()
@@ -131,8 +131,8 @@ def test_a_graph_of_a_cpu_that_would_not_merge_sums_is_refused():
 def test_a_rank_that_ends_leaves_none_waiting(end, line):
     lines = (
         "import os, numpy as np, warpmag",
-        "from warpmag.moments.ranks import ranks",
-        f"if ranks().rank: {end}",
+        "from warpmag.moments.ranks import current_ranks",
+        f"if current_ranks().rank: {end}",
         "warpmag.h_field(np.eye(3), np.eye(3), device='cpu')",
     )
     done = start(2, "-c", "\n".join(lines))

@@ -9,11 +9,11 @@ import warp as wp
 from pxr import Gf, Sdf
 
 import warpmag
+from bench.systems import moment_system
 from tests.test_materials import PERMANENT, stage_with
 from warpmag.declarations.magnets import LINEAR_CURVE
 from warpmag.engine.magnets.attributes import marked_shapes
 from warpmag.errors import InputError
-from warpmag.moments.system import MomentSystem
 from warpmag.usd import author_magnet, read_magnets
 
 MU0 = 4e-7 * math.pi
@@ -87,7 +87,7 @@ def test_energy_and_force_go_together(device):
     x = np.array([[0, 0, 0], [0.012, 0, 0], [0, 0.013, 0.002], [0.011, 0.012, 0], [0.004, 0.006, 0.013]], float)
     chi, remanence = np.array([0.05, 0.1, 50.0, 3.0, 1.0]), 1e6 * rng.normal(size=(n, 3))
     permanent = np.arange(n) == 4
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(n, 0.005), permanent=permanent, saturation=1.7e6, susceptibility=chi,
         curve=[LINEAR_CURVE, LINEAR_CURVE, "tanh", "langevin", "tanh"], external_field=(1e5, 0.0, 2e5), rtol=1e-12,
         dtype="float64", device=device,
@@ -160,7 +160,7 @@ def test_bad_permeabilities_are_refused(value, device):
 
 
 def test_explicit_dynamics_know_no_recoil(device):
-    with pytest.raises(InputError, match="dynamics: 'llg' knows no recoil permeability"):
+    with pytest.raises(InputError, match="dynamics: 'llg' lacks recoil permeability"):
         solved(device, 0.01, 1.05, dynamics="llg")
 
 

@@ -6,9 +6,9 @@ import warp as wp
 from arrangements import fcc_block, pile, relative
 
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.declarations import magnets
 from warpmag.errors import InputError
-from warpmag.moments.system import MomentSystem
 
 MS = 1.7e6
 RIVALS = ("theta-euler", "llg", "llg-damping")
@@ -53,7 +53,7 @@ def lone_moments(fields, device, **settings):
     """One moment per world, each in a field of its own along an oblique direction [reduced by Ms]."""
     fields = np.asarray(fields, float)
     unit = np.array([0.48, -0.6, 0.64])
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(len(fields), 0.005), worlds=np.arange(len(fields)), saturation=MS,
         external_field=MS * fields[:, None] * unit, device=device, **settings,
     )  # fmt: skip
@@ -162,7 +162,7 @@ def test_rivals_find_the_oracles_equilibrium(dynamics, device):
     """Section 6.3: one solution, in a touching pack. LLG needs a step small enough for its precession."""
     x, h0 = fcc_block((2, 2, 1)), np.array([2e5, -1e5, 4e5])
     exact = oracle.equilibrium(x, 0.005, h0, saturation=MS)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(16, 0.005), saturation=MS, external_field=h0, dynamics=dynamics, rtol=1e-7, dtype="float64",
         step=0.03 if dynamics == "llg" else 0.3, max_evaluations=5000, device=device,
     )  # fmt: skip
@@ -178,7 +178,7 @@ def test_rivals_find_the_oracles_equilibrium(dynamics, device):
 def piles(device):
     """Two worlds of balls in an oblique field, the second three times as dense: a system and its positions."""
     x = np.concatenate([pile(count=40)[0], 2.0 * pile(count=60)[0]])
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(100, 0.004), worlds=np.repeat([0, 1], [40, 60]), saturation=MS, dynamics="llg", curve="clamped",
         external_field=(4e4, 2e4, 1e4), device=device,
     )  # fmt: skip
@@ -187,24 +187,24 @@ def piles(device):
 
 
 def test_pairs_outlive_a_solve_and_worlds_end_for_themselves(piles):
-    piles.forget()
+    piles.start_cold()
     piles.solve()
     cold = piles.evaluations.numpy()
     assert piles.converged.numpy().all() and (cold > 20).all() and cold[0] != cold[1]
     piles.solve()
     assert piles.evaluations.numpy().tolist() == [1, 1]
-    piles.forget()
+    piles.start_cold()
     piles.solve()
     assert np.array_equal(piles.evaluations.numpy(), cold)
 
 
 def test_solve_of_pairs_can_be_captured(piles, device):
-    piles.forget()
+    piles.start_cold()
     piles.solve()
     launched = piles.moments.numpy()
     with wp.ScopedCapture(device) as capture:
         piles.solve()
-    piles.forget()
+    piles.start_cold()
     wp.capture_launch(capture.graph)
     assert np.array_equal(piles.moments.numpy(), launched)
 
@@ -229,7 +229,7 @@ def test_pairs_give_up_after_max_evaluations_and_rest_without_a_field(device):
 )
 def test_bad_settings_are_refused(settings, message, device):
     with pytest.raises(InputError, match=message):
-        MomentSystem(radii=[0.005], device=device, **settings)
+        moment_system(radii=[0.005], device=device, **settings)
 
 
 def test_methods_are_made_of_what_there_is():

@@ -308,7 +308,7 @@ def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, alw
     for name, message in [
         ("buffers", "its checkpoint has no 'buffers'"),
         ("stat.steps", "its checkpoint has no 'steps'"),
-        ("state.0", "checkpoint: state.0 is not that of this run"),
+        ("state.0", "checkpoint: state.0 does not fit this run"),
     ]:
         left = {key: array for key, array in arrays.items() if key != f"state/{name}"}
         np.savez(checkpoint, about=np.array(json.dumps({**noted, "names": sorted(left)})), **left)

@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 
 import warpmag
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag import MagnetizationCurve
 from warpmag.declarations.materials import MATERIALS
 from warpmag.declarations.measured import MEASURED_CURVES
@@ -21,7 +22,6 @@ from warpmag.engine.magnets.attributes import marked_shapes
 from warpmag.errors import InputError
 from warpmag.kernels.material import curves as kernel_curves
 from warpmag.kernels.shared.native import native_options
-from warpmag.moments.system import MomentSystem
 
 MU0 = 4e-7 * math.pi
 NAMES = list(MEASURED_CURVES)
@@ -126,7 +126,7 @@ def test_balls_of_several_materials(dtype, device):
     fields = np.geomspace(30.0, 3e6, 7)
     each = [curves[i % len(curves)] for i in range(len(curves) * len(fields))]
     h0 = np.repeat(fields, len(curves))
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(len(each), 0.005), worlds=np.arange(len(each)), saturation=1.7e6, susceptibility=300.0,
         curve=[MATERIALS[one].curve if one in NAMES else one for one in each], dtype=dtype, device=device,
         external_field=np.outer(h0, [0.6, 0.0, -0.8]),
@@ -209,7 +209,7 @@ def test_forces_follow_the_table(force, device):
     """Kelvin's is minus the gradient of the energy; Zeeman's takes the slope of the curve (Eq. 4)."""
     x = np.array([[0.0, 0.0, 0.0], [0.012, 0.003, 0.0], [0.004, 0.013, 0.005]])
     n, h0 = len(x), np.array([1e5, 2e5, 3e5])
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(n, 0.005), curve=MATERIALS["M-19"].curve, external_field=h0, rtol=1e-11, dtype="float64",
         force=force, device=device,
     )  # fmt: skip
@@ -246,7 +246,7 @@ def test_the_default_curve_is_low_at_the_knee_of_steel(device):
     applied = np.outer(h[knee] + m / 3.0, [0.0, 0.0, 1.0])
 
     def magnetized(**magnet):
-        system = MomentSystem(
+        system = moment_system(
             radii=np.full(len(m), 0.01), worlds=np.arange(len(m)), external_field=applied, device=device, **magnet
         )
         system.solve()
@@ -341,8 +341,8 @@ def test_bad_files_are_refused_by_name(tmp_path, text, message):
 @pytest.mark.parametrize(
     "given,message",
     [
-        ({"curve": "M-19", "saturation": 1e6}, "saturation: a measured curve says it"),
-        ({"curve": "M-19", "susceptibility": 10.0}, "susceptibility: a measured curve says it"),
+        ({"curve": "M-19", "saturation": 1e6}, "saturation: a measured curve has its own"),
+        ({"curve": "M-19", "susceptibility": 10.0}, "susceptibility: a measured curve has its own"),
         ({"curve": "tanh"}, "saturation: must be given"),
         ({"curve": "M-20", "saturation": 1e6}, "curve: 'M-20' is not one of tanh, .*M-19"),
         ({"curve": ["tanh", "M-19"]}, "saturation: must be given"),

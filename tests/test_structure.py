@@ -32,7 +32,7 @@ OWNERS = {
         "warpmag/terminal.py",  # keeps Warp quiet for commands
         *(
             f"warpmag/{name}.py"
-            for name in "arrays dynamics energies fields induction layout pair_sums probe ranks snapshot system".split()
+            for name in "arrays dynamics fields induction layout pair_sums probe ranks system".split()
         ),
     ),
 }

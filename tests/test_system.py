@@ -7,13 +7,13 @@ from arrangements import as_float32, fcc_block, overlapping, pile, relative
 
 import warpmag
 from bench.reference import oracle
+from bench.systems import moment_system
 from warpmag.declarations import magnets
 from warpmag.errors import InputError
 from warpmag.kernels.pairs import evaluate
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared import team
-from warpmag.moments.system import MomentSystem
 
 MS = 1.7e6
 
@@ -25,7 +25,7 @@ def two_worlds(device, **settings):
     moments = np.zeros((152, 3))
     moments[60], moments[151] = [0.0, 0.0, 400.0], [300.0, 0.0, 100.0]
     sizes = np.concatenate([radii[:60], [0.01], radii[:90], [0.01]])
-    system = MomentSystem(
+    system = moment_system(
         radii=sizes, worlds=np.repeat([0, 1], [61, 91]), permanent=np.isin(np.arange(152), [60, 151]),
         saturation=MS, rtol=1e-5, device=device, **settings,
     )  # fmt: skip
@@ -69,7 +69,7 @@ def test_one_world_is_not_moved_by_another(device):
 def test_moments_of_one_body_exert_no_force_on_each_other(device):
     x, radii, m = pile(count=40)
     bodies = np.repeat([0, 1], 20)
-    system = MomentSystem(radii=radii, permanent=np.ones(40, bool), bodies=bodies, device=device)
+    system = moment_system(radii=radii, permanent=np.ones(40, bool), bodies=bodies, device=device)
     system.positions.assign(x)
     system.moments.assign(m)
     system.solve()
@@ -91,7 +91,7 @@ def test_a_body_is_turned_as_by_all_pairs_of_moments(force, strength, tolerance,
     letter = 2.2 * radius * np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 2, 0], [0, 0, 1]])
     x, n = np.concatenate([letter, magnets]), len(letter)
     moments = np.concatenate([np.zeros((n, 3)), strength * 1e-5 * np.array([[1.0, -2.0, 0.5], [0.3, 1.0, 2.0]])])
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(n + 2, radius), permanent=np.arange(n + 2) >= n, bodies=np.r_[np.zeros(n, int), 1, 2],
         saturation=MS, force=force, rtol=1e-10, dtype="float64", device=device,
     )  # fmt: skip
@@ -120,7 +120,7 @@ def test_forces_on_balls_and_on_magnets(device, monkeypatch):
     balls, fixed, free = np.arange(700) < 600, slice(600, 660), slice(660, 700)
     bodies, movable = np.where(balls, np.arange(700), 600), np.ones(700, bool)
     bodies[free], movable[fixed] = 601, False
-    system = MomentSystem(
+    system = moment_system(
         radii=radii, permanent=~balls, bodies=bodies, movable=movable, saturation=MS, rtol=1e-5, device=device
     )
     system.positions.assign(x)
@@ -140,7 +140,7 @@ def test_only_movable_moments_get_forces(device):
     x, radii, m = pile(count=30)
     movable = np.arange(30) % 7 < 4
     everything, some = (
-        MomentSystem(radii=radii, permanent=np.ones(30, bool), movable=which, device=device)
+        moment_system(radii=radii, permanent=np.ones(30, bool), movable=which, device=device)
         for which in (None, movable)
     )
     for system in (everything, some):
@@ -169,7 +169,7 @@ def test_warm_start_follows_a_slow_motion(device):
     system.solve()
     warm = system.evaluations.numpy().max()
     assert warm < cold
-    system.forget()
+    system.start_cold()
     system.solve()
     assert system.evaluations.numpy().max() >= cold - 1
 
@@ -179,7 +179,7 @@ def test_extrapolation_follows_a_steady_motion(device):
     x, radii, _ = pile(count=150)
     evaluations, errors = [], []
     for remembering in (True, False):
-        system = MomentSystem(radii=radii, saturation=MS, rtol=1e-3, device=device)
+        system = moment_system(radii=radii, saturation=MS, rtol=1e-3, device=device)
         system.positions.assign(x)
         for angle in 0.01 * np.arange(12.0):
             field = 0.5 * MS * np.array([np.sin(angle), 0.0, np.cos(angle)])
@@ -198,7 +198,7 @@ def test_a_start_knows_where_the_neighbors_have_gone(device):
     """What balls that shift at random do to their neighbours, the first moments have in them, before any field."""
     x, radii, _ = pile(count=150)
     field = np.array([0.0, 0.0, 0.1 * MS])
-    system = MomentSystem(radii=radii, saturation=MS, external_field=field, rtol=1e-5, device=device)
+    system = moment_system(radii=radii, saturation=MS, external_field=field, rtol=1e-5, device=device)
     system.positions.assign(x)
     for _ in range(4):
         system.solve()
@@ -221,7 +221,7 @@ def test_error_is_one_in_every_step(motion, device):
     rng = np.random.default_rng(6)
     x, field = fcc_block((3, 3, 3)), MS * np.array([1e-4, 0.0, 2e-4])
     velocity = 1e-5 * rng.normal(size=x.shape)  # m a step; 5 mm balls
-    system = MomentSystem(radii=np.full(108, 0.005), saturation=MS, external_field=field, rtol=1e-3, device=device)
+    system = moment_system(radii=np.full(108, 0.005), saturation=MS, external_field=field, rtol=1e-3, device=device)
     evaluations = []
     for step in range(12):
         moved = step * velocity if motion == "drift" else 2.5e-5 * rng.normal(size=x.shape)
@@ -257,7 +257,7 @@ def test_starts_never_decide_the_solution(dtype, device, starts):
     """Whatever was extrapolated before it, a jump, a restored state or a reversed field ends in the one solution."""
     radii, states = starts
     rtol = 1e-5 if dtype == "float32" else 1e-10
-    system = MomentSystem(radii=radii, saturation=MS, rtol=rtol, dtype=dtype, device=device)
+    system = moment_system(radii=radii, saturation=MS, rtol=rtol, dtype=dtype, device=device)
     for step, (positions, field, exact) in enumerate(states):
         system.positions.assign(positions)
         system.external_field.assign(np.tile(field, (100, 1)))
@@ -279,7 +279,7 @@ def test_every_stage_of_a_step(dtype, curve, device):
     radii = as_float32(np.r_[radii, np.random.default_rng(4).uniform(0.005, 0.01, 150)])[0]
     velocities = np.random.default_rng(3).normal(size=(211, 3)) * 2e-4
     permanent, external = np.isin(np.arange(211), [60, 210]), np.array([0.0, 0.0, 1e5])
-    system = MomentSystem(
+    system = moment_system(
         radii=radii, worlds=np.repeat([0, 1], [61, 150]), permanent=permanent, saturation=MS, curve=curve,
         external_field=external, dtype=dtype, device=device,
     )  # fmt: skip
@@ -326,7 +326,7 @@ def _host(array):
 
 def test_magnet_in_a_world_of_its_own(device):
     """A ball in another world is in the external field alone."""
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(2, 0.005), worlds=[0, 1], permanent=[False, True], saturation=MS, external_field=[0.0, 0.0, 1e5],
         rtol=1e-5, device=device,
     )  # fmt: skip
@@ -340,8 +340,8 @@ def test_bodies_that_cannot_be_told_apart_are_refused(device, monkeypatch):
     """Neighbouring numbers that are one in single precision would be one body, whose moments do not act."""
     given = {"radii": [0.01, 0.01], "bodies": [2**24, 2**24 + 1], "device": device}
     with pytest.raises(InputError, match="bodies: numbers too large, at most 16777216 in float32; use float64"):
-        MomentSystem(**given)
-    assert MomentSystem(dtype="float64", **given).count == 2
+        moment_system(**given)
+    assert moment_system(dtype="float64", **given).count == 2
     monkeypatch.setattr("warpmag.moments.arrays.MOST_BODIES", {wp.float32: 2, wp.float64: 3})
     places = np.eye(3)
     with pytest.raises(InputError, match="positions: 3 moments that act on each other, at most 2 in float32"):
@@ -353,7 +353,7 @@ def test_moments_out_of_order_are_refused(device):
     """Inducible moments come first in each world, and worlds one after the other."""
     for wrong in ({"permanent": [True, False]}, {"worlds": [1, 0]}):
         with pytest.raises(InputError, match="ordered by world"):
-            MomentSystem(radii=np.ones(2), device=device, **wrong)
+            moment_system(radii=np.ones(2), device=device, **wrong)
 
 
 def test_threads_do_not_show(device, monkeypatch):
@@ -363,7 +363,7 @@ def test_threads_do_not_show(device, monkeypatch):
     results = []
     for cores in (3, 3, 1):
         monkeypatch.setattr(team, "cores", lambda cores=cores: cores)
-        system = MomentSystem(
+        system = moment_system(
             radii=np.full(len(x), 0.005), saturation=MS, external_field=[0.0, 0.0, 1e5], rtol=1e-5, device=device
         )
         for step in range(4):

@@ -9,12 +9,12 @@ import pytest
 from arrangements import as_float32, overlapping, pile
 
 import warpmag
+from bench.systems import moment_system
 from warpmag.engine.stepping.simulation import Simulation
 from warpmag.kernels.induction import theta_flow
 from warpmag.kernels.near_contact import near_pairs
 from warpmag.kernels.pairs import evaluate, neighbors
 from warpmag.kernels.shared import cores, team
-from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import balls_up
 
 COUNTS = (1, 2, 3, 8, 64)
@@ -76,7 +76,7 @@ def test_solves_over_time(contact_model, device, assert_same_bits):
     velocities = np.where(magnet[:, None], 0.0, 2e-4 * np.random.default_rng(5).normal(size=positions.shape))
 
     def work():
-        system = MomentSystem(
+        system = moment_system(
             radii=np.where(magnet, 0.0025, 0.005), worlds=np.repeat([0, 1], [len(x) + len(lattice), 900]),
             permanent=magnet, bodies=bodies, saturation=MS, external_field=[0.0, 0.0, 1e5],
             contact_model=contact_model, rtol=1e-4, device=device,
@@ -103,7 +103,7 @@ def test_a_world_keeps_its_bits_in_company(device):
     found = []
     for companions in (0, 1300):
         n = len(x) + companions
-        system = MomentSystem(
+        system = moment_system(
             radii=np.concatenate([radii, np.full(companions, 0.005)]), worlds=(np.arange(n) >= len(x)).astype(int),
             saturation=MS, external_field=[0.0, 0.0, 1e5], device=device,
         )  # fmt: skip

@@ -12,7 +12,7 @@ from warpmag import __version__
 from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, PRESETS, check_rtol, check_token
 from warpmag.engine.pile_xpbd.solvers import SOLVERS
 from warpmag.errors import InputError, SimulationError, one_line
-from warpmag.moments.ranks import Ranks, alone, by_first, is_first, ranks
+from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, on_first_rank, without_ranks
 from warpmag.progress import Progress
 from warpmag.terminal import Stopped, collection_paused, open_standard_files, quiet_warp, signals_raised, silence, tell
 
@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
     open_standard_files()
     try:
-        all_ranks = ranks()
+        all_ranks = current_ranks()
     except InputError as error:
         tell(error)
         return BAD_INPUT
@@ -67,11 +67,11 @@ def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]
     try:
         with signals_raised():
             options = _parser().parse_args(arguments)
-            if not is_first(all_ranks):
+            if not is_first_rank(all_ranks):
                 if options.command is not _run:
                     return 0, ""  # only a run is shared among ranks
                 silence(1)
-            with contextlib.nullcontext() if options.command is _run else alone():
+            with contextlib.nullcontext() if options.command is _run else without_ranks():
                 code = options.command(options)
             sys.stdout.flush()
             return code, ""
@@ -226,8 +226,8 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
     if name in (*scenes, *MADE) and not os.path.isfile(path):
         if balls is None and name in scenes:
             return scenes[name], True
-        made = by_first(lambda: make(name, folder, balls), ranks())
-        if is_first(ranks()):
+        made = on_first_rank(lambda: make(name, folder, balls), current_ranks())
+        if is_first_rank(current_ranks()):
             tell(f"scene: {made}")
         return made, False
     if not os.path.exists(path) and not path.suffix:
@@ -346,7 +346,7 @@ def _run(options) -> int:
         raise InputError(f"frames: must be positive, got {options.frames}")
     if options.rtol is not None:
         check_rtol("rtol", options.rtol)
-    if options.viewer != "none" and ranks() is not None:
+    if options.viewer != "none" and current_ranks() is not None:
         raise InputError("viewer: not with several ranks")
     folder = Path(options.output).parent if options.output else _OUTPUT_FOLDER
     path, is_bundled = _find_scene(options.scene, options.balls, folder)
@@ -388,7 +388,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     progress = Progress(simulation.frames_of(options.frames))
 
     def show(frame: int) -> bool:
-        if is_first(ranks()):
+        if is_first_rank(current_ranks()):
             progress.show(frame)
         return display is None or display.follow(simulation.time, simulation.state)
 
@@ -396,7 +396,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
         statistics = simulation.run(progress.frames, output=output, copy_scene=copy_scene, resume=resume, on_frame=show)
     finally:
         progress.close()
-    if (display and display.restarted) or not is_first(ranks()):
+    if (display and display.restarted) or not is_first_rank(current_ranks()):
         return
     if progress.done is None:
         print(f"complete       {output} already has all {progress.frames} frames")
@@ -407,7 +407,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     if options.purpose:
         from warpmag.show.export import export  # noqa: PLC0415
 
-        with alone():
+        with without_ranks():
             export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
         print(f"to render      {rendered}")
     _warn([line for line in simulation.warnings() if line not in known])
@@ -419,7 +419,7 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
 
 
 def _warn(lines: list[str]) -> None:
-    for line in lines if is_first(ranks()) else ():
+    for line in lines if is_first_rank(current_ranks()) else ():
         tell(f"warning: {line}")
 
 

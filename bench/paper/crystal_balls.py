@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 import warpmag
+from bench.systems import moment_system
 from warpmag.declarations.magnets import SATURATION_OF_IRON
 from warpmag.moments.dynamics import SubmagnetizationPairs
 from warpmag.moments.system import MomentSystem
@@ -63,7 +64,7 @@ def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **s
     place = layout(cells)
     balls, bar = place.balls, place.bar
     count = len(balls) + len(bar.positions)
-    system = MomentSystem(
+    system = moment_system(
         radii=np.concatenate([np.full(len(balls), BALL_RADIUS), bar.radii]),
         permanent=np.arange(count) >= len(balls),
         saturation=SATURATION_OF_IRON,
@@ -117,7 +118,7 @@ def trace(system: MomentSystem, iterations: int) -> np.ndarray:
     """Solve, and return the magnetization error e_M (Eq. 12) after each field evaluation, at most ``iterations``."""
     errors = []
     system.begin()
-    for _ in range(min(iterations, system.max_evaluations)):
+    for _ in range(min(iterations, system.settings.max_evaluations)):
         system.iterate()
         errors.append(float(system.residual.numpy()[0]))
         if errors[-1] <= system.rtol or not np.isfinite(errors[-1]):

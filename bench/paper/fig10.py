@@ -14,6 +14,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.patches import Circle
 
 from bench.paper.output import Output, table
+from bench.systems import moment_system
 from warpmag.declarations.magnets import SATURATION_OF_IRON
 from warpmag.moments.system import MomentSystem
 from warpmag.shapes import lattice
@@ -62,7 +63,7 @@ def _inside(level: float, output: Output):
     volume = pitch**3
     # the applied field that magnetizes a sphere to this level: inside, H = H0 − M/3, and a moment sees H0
     applied = SATURATION_OF_IRON * np.arctanh(level) / 3.0
-    system = MomentSystem(
+    system = moment_system(
         radii=np.full(len(positions), (0.75 * volume / np.pi) ** (1.0 / 3.0)),
         saturation=SATURATION_OF_IRON,
         external_field=(applied, 0.0, 0.0),
@@ -86,7 +87,7 @@ def _outside(level: float, output: Output):
     points = np.stack(np.meshgrid(index, index, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
     points = points[np.linalg.norm(points, axis=1) > RADIUS + BALL_RADIUS]
     n = len(points)
-    system = MomentSystem(
+    system = moment_system(
         worlds=np.repeat(np.arange(n), 2),
         permanent=np.tile([False, True], n),
         radii=np.tile([BALL_RADIUS, RADIUS], n),

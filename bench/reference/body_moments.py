@@ -15,6 +15,7 @@ import warp as wp
 from bench.machine import describe
 from bench.reference.oracle import MU0
 from bench.reference.surface_integrals import box_moments, cylinder_moments
+from bench.systems import moment_system
 from warpmag.moments.system import MomentSystem
 from warpmag.shapes import demagnetization, lattice
 from warpmag.shapes import uniform_response as even_field
@@ -70,7 +71,7 @@ def cells_of(solid, half: bool):
 
 def solved(body, coupling, susceptibility: float, field, device=None) -> MomentSystem:
     """System of the cells of a body in a uniform field [A/m], solved."""
-    system = MomentSystem(
+    system = moment_system(
         radii=body.radii, bodies=np.zeros(len(body.radii), int), couplings=[(0, coupling)], saturation=LINEAR,
         susceptibility=susceptibility, external_field=field, max_evaluations=5000, device=device,
     )  # fmt: skip

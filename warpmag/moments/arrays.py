@@ -1,4 +1,7 @@
-"""Arrays in and out: NumPy or Warp, checked once, returned in the kind they came in."""
+"""Array arguments: every check of their shapes, values and ranges, and conversion between NumPy and Warp.
+
+Calls on arrays take NumPy or Warp arrays and return what they were given. Snapshots of Warp arrays are at the end.
+"""
 
 import math
 import numbers
@@ -12,82 +15,91 @@ import warp as wp
 from warpmag.declarations.checks import check_token, short_repr
 from warpmag.declarations.magnets import MATERIAL_RANGE
 from warpmag.errors import InputError
-from warpmag.moments.ranks import launched
+from warpmag.moments.ranks import launched_ranks
 
 Numbers = npt.ArrayLike | wp.array
-"""What arguments take: numbers, lists of them and NumPy arrays, or a Warp array."""
+"""Type of array arguments: numbers, lists of numbers, NumPy arrays and Warp arrays."""
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
 RADIUS_RANGE = {wp.float32: (5e-8, 2e4), wp.float64: (1e-30, 1e30)}
 """Smallest and largest radius [m] of a ball by Warp scalar type: neither r⁻⁵ nor products of moments may overflow."""
 FARTHEST = {wp.float32: 1e7, wp.float64: 1e30}
-"""Largest coordinate [m] by Warp scalar type: r⁻⁵ of two of them is still a normal number."""
+"""Largest coordinate [m] by Warp scalar type: r⁻⁵ of the largest distance is still a normal number."""
 REFERENCE_RADIUS_RANGE = {wp.float32: (1e-6, 2e4), wp.float64: (1e-30, 1e30)}
+"""Smallest and largest radius [m] for the method ``reference``, which computes r⁶ of overlapping balls."""
 REFERENCE_FARTHEST = {wp.float32: 5e4, wp.float64: 1e30}
-"""The same of the plain loop, which has r⁶ of overlapping balls."""
-LEAST_OF_FORCE = {wp.float32: 1e-18, wp.float64: 1e-150}
-"""Least of the largest component of moments [A·m²], by Warp scalar type: products of smaller ones have no digits."""
-CELLS = 1e9
-"""Distance from the origin, in contact distances of the largest balls, to which the search for neighbours has cells."""
+"""Largest coordinate [m] for the method ``reference``."""
+LEAST_FORCE_MOMENT = {wp.float32: 1e-18, wp.float64: 1e-150}
+"""Smallest accepted maximum of moment components [A·m²] for forces, by Warp scalar type: smaller products underflow."""
+GRID_REACH = 1e9
+"""Largest coordinate that the grid of the neighbor search can index, in contact distances of the largest balls."""
 
 _INTEGERS = (wp.int8, wp.uint8, wp.int16, wp.uint16, wp.int32, wp.uint32, wp.int64, wp.uint64)
 _NUMBERS = (wp.float16, wp.float32, wp.float64, *_INTEGERS)
 
 
-def name_of(dtype) -> str:
-    """Name of a Warp scalar type as it is passed."""
-    return next(name for name, one in DTYPES.items() if one is dtype)
-
-
 MOST_BODIES = {wp.float32: 2**24, wp.float64: 2**31 - 1}
-"""Bodies that are told apart by their numbers, which are packed with moments, by Warp scalar type."""
+"""Largest number of bodies by Warp scalar type: kernels store a body's number as a scalar beside its moments."""
+
+
+def dtype_name(dtype) -> str:
+    """Return ``"float32"`` or ``"float64"`` for a Warp scalar type."""
+    return next(name for name, scalar in DTYPES.items() if scalar is dtype)
 
 
 def check_bodies(text: str, count: int, dtype) -> None:
-    """Raise ``InputError`` that begins with a text where ``count`` numbers of bodies are too many for ``dtype``."""
+    """Raise ``InputError``, beginning with ``text``, if ``count`` bodies are too many for the scalar type ``dtype``."""
     if count > MOST_BODIES[dtype]:
         raise InputError(f"{text}, at most {MOST_BODIES[dtype]} {hint(dtype)}")
 
 
 def hint(dtype) -> str:
-    """End of a message about numbers that are out of range of the Warp scalar type ``dtype``."""
+    """Return the end of a message about numbers out of range of the Warp scalar type ``dtype``."""
     return "in float32; use float64" if dtype is wp.float32 else "in float64"
 
 
 def range_message(name: str, unit: str, value: float, limits: tuple[float, float], dtype) -> str:
-    """Text for a value that is out of the range of the Warp scalar type ``dtype``."""
-    text = f"{name}: must be {limits[0]:g} to {limits[1]:g}{unit} in {name_of(dtype)}, got {value:g}"
+    """Return the message for a value that is out of the range of the Warp scalar type ``dtype``."""
+    text = f"{name}: must be {limits[0]:g} to {limits[1]:g}{unit} in {dtype_name(dtype)}, got {value:g}"
     return text + ("; use float64" if dtype is wp.float32 else "")
 
 
-def farthest_place(dtype, reach: float, *, reference: bool = False) -> float:
-    """Largest coordinate [m] in the Warp scalar type ``dtype`` of balls that touch at ``reach`` [m], 0 for points."""
+def largest_coordinate(dtype, reach: float, *, reference: bool = False) -> float:
+    """Return the largest coordinate [m] that positions may have.
+
+    Args:
+        dtype: Warp scalar type.
+        reach: Contact distance of the largest balls [m]; 0 for points.
+        reference: True for the method ``reference``.
+    """
     most = (REFERENCE_FARTHEST if reference else FARTHEST)[dtype]
-    return min(most, CELLS * reach) if reach > 0.0 else most
+    return min(most, GRID_REACH * reach) if reach > 0.0 else most
 
 
-def shape_message(name: str, wanted: str, array) -> str:
-    """Text for an array whose shape is not as wanted."""
-    return f"{name}: shape must be {wanted}, got {list(array.shape)}"
+def shape_message(name: str, expected: str, array) -> str:
+    """Return the message for an array of the wrong shape."""
+    return f"{name}: shape must be {expected}, got {list(array.shape)}"
 
 
 def vec3_type(dtype):
-    """Three-vector of a Warp scalar type."""
+    """Return the Warp three-vector of a scalar type."""
     return wp.vec3 if dtype is wp.float32 else wp.vec3d
 
 
 def resolve_dtype(dtype: str):
-    """Warp scalar type of ``"float32"`` or ``"float64"``."""
+    """Return the Warp scalar type of ``"float32"`` or ``"float64"``."""
     check_token("dtype", dtype, tuple(DTYPES))
     return DTYPES[dtype]
 
 
 def resolve_device(device):
-    """Warp device of a name, a device or None: Warp's default, which of several ranks is each its own GPU.
+    """Return the Warp device of a name, a device or None.
+
+    None means Warp's default device. Under ``mpirun``, each rank on a host gets another GPU.
 
     Raises:
-        InputError: There is no such device.
+        InputError: The device does not exist.
     """
-    if device is None and wp.is_cuda_available() and (all_ranks := launched()) is not None:
+    if device is None and wp.is_cuda_available() and (all_ranks := launched_ranks()) is not None:
         wp.set_device(f"cuda:{all_ranks.local_rank % wp.get_cuda_device_count()}")
     try:
         return wp.get_device(device)
@@ -97,10 +109,10 @@ def resolve_device(device):
 
 
 def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
-    """Real numbers as a NumPy array of float64, or what is float32 as such if ``single``, whatever holds them.
+    """Return real numbers as a NumPy float64 array; ``single`` keeps float32 as it is.
 
     Raises:
-        InputError: There is anything else.
+        InputError: The value holds anything but real numbers, or masked entries.
     """
     if isinstance(value, (wp.array, wp.indexedarray)):
         value = value.numpy()
@@ -125,7 +137,7 @@ def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
 
 
 def host_array(name: str, value, *, infinite: bool = False) -> np.ndarray:
-    """Real numbers as by :func:`real_array`, all finite, or else only infinite where ``infinite`` allows it."""
+    """Return a NumPy float64 array of real numbers that are finite, or not NaN if ``infinite``."""
     array = real_array(name, value)
     if not (np.isnan(array).any() if infinite else not np.isfinite(array).all()):
         return array
@@ -133,7 +145,7 @@ def host_array(name: str, value, *, infinite: bool = False) -> np.ndarray:
 
 
 def host_radii(name: str, value, dtype, *, reference: bool = False) -> np.ndarray:
-    """NumPy float64 array of radii [m]: zero or in range of the Warp scalar type ``dtype``, of any shape."""
+    """Return a NumPy float64 array of radii [m] of any shape, each 0 or in the range of the scalar type ``dtype``."""
     radii = host_array(name, value)
     if not (radii >= 0.0).all():
         raise InputError(f"{name}: must not be negative, got {radii.min():g}")
@@ -145,7 +157,7 @@ def host_radii(name: str, value, dtype, *, reference: bool = False) -> np.ndarra
 
 
 def host_scalars(name: str, value, count: int, *, infinite: bool = False) -> np.ndarray:
-    """NumPy float64 array of shape [count] from one number or an array of either kind, checked."""
+    """Return a NumPy float64 array of shape [count], from one number or from ``count`` numbers."""
     array = host_array(name, value, infinite=infinite)
     if array.shape not in ((), (count,)):
         raise InputError(shape_message(name, f"[] or [{count}]", array))
@@ -153,11 +165,11 @@ def host_scalars(name: str, value, count: int, *, infinite: bool = False) -> np.
 
 
 def host_positive(name: str, value, count: int, dtype, *, infinite: bool = False) -> np.ndarray:
-    """As :func:`host_scalars`, of numbers that are positive and in range of the Warp scalar type ``dtype``."""
+    """Return :func:`host_scalars` that are positive and in :data:`MATERIAL_RANGE` of the Warp scalar type ``dtype``."""
     array = host_scalars(name, value, count, infinite=infinite)
     if not (array > 0.0).all():
         raise InputError(f"{name}: must be positive, got {array.min():g}")
-    least, most = MATERIAL_RANGE[name_of(dtype)]
+    least, most = MATERIAL_RANGE[dtype_name(dtype)]
     outside = (array < least) | (np.isfinite(array) & (array > most))
     if outside.any():
         raise InputError(range_message(name, "", array[outside][0], (least, most), dtype))
@@ -165,20 +177,23 @@ def host_positive(name: str, value, count: int, dtype, *, infinite: bool = False
 
 
 def norm_squared(array) -> float:
-    """Sum of the squares of a Warp array of vectors, infinite or NaN if one of them is: on a GPU one reduction."""
+    """Return the sum of squares of a Warp array of vectors; infinite or NaN if a component is."""
     total: Any = wp.utils.array_inner(array, array)
     return float(total)
 
 
 def largest(array) -> float:
-    """Largest absolute component of a Warp array of vectors; on a GPU their norm, where its square is a float32."""
+    """Return the largest absolute component of a Warp array of vectors.
+
+    On a GPU the root of the sum of squares stands for it, if that sum is in the range of float32: one reduction.
+    """
     if array.shape[0] and array.device.is_cuda and 1e-30 < (squared := norm_squared(array)) < 1e30:
         return math.sqrt(squared)
     return float(np.abs(array.numpy()).max(initial=0.0))
 
 
 def first_not_finite(array, count: int) -> int | None:
-    """Row among the first ``count`` of an array that is not finite, None if all are: on a GPU one reduction."""
+    """Return the first row, of ``count``, that is not finite, or None; on a GPU a reduction decides if there is any."""
     if isinstance(array, wp.array):
         if not count or (array.device.is_cuda and math.isfinite(norm_squared(array[:count]))):
             return None
@@ -188,64 +203,73 @@ def first_not_finite(array, count: int) -> int | None:
 
 
 @dataclass(frozen=True)
-class Kind:
-    """Where a call computes and what it returns: device, scalar type, NumPy or Warp."""
+class CallContext:
+    """Device and scalar type of a call on arrays, and the library of the arrays that it returns.
+
+    Attributes:
+        device: Warp device.
+        dtype: Warp scalar type.
+        warp_out: True if results are Warp arrays, False if they are NumPy arrays.
+    """
 
     device: Any
     dtype: type
     warp_out: bool
 
-    def finish(self, array, count=None):
-        """Return a Warp array, or a copy of its first ``count`` entries, as the caller's kind."""
+    def result(self, array, count=None):
+        """Return the first ``count`` entries of a Warp array, or all, as an array of the caller's library."""
         if not self.warp_out:
             return array.numpy() if count is None else array.numpy()[:count].copy()
         if count is None:
             return array
-        # Warp refuses an empty slice
+        # Warp cannot slice zero entries
         return wp.clone(array[:count]) if count else wp.empty(0, dtype=array.dtype, device=array.device)
 
     def vectors(self, name, value, count=None, *, farthest=None, least=None, shared=False):
-        """Warp array of three-vectors, shape [n], from [n, 3] or, with ``count``, from one vector for all.
+        """Return a Warp array of three-vectors, shape [n], from an array [n, 3] or a Warp array.
 
         Args:
-            name: Name of the argument.
-            value: Its value.
-            count: Number of vectors; None means any.
-            farthest: If they are places, the largest coordinate [m] that is allowed.
-            least: The least that the largest of all components may be unless they are zero, by Warp scalar type.
-            shared: Whether the array may be the caller's own memory: it is only read, before the call returns.
+            name: Name of the argument, for messages.
+            value: Its value; with ``count`` also one vector, shape [3], for all.
+            count: Number of vectors; None accepts any.
+            farthest: Largest coordinate [m], for positions; None accepts any.
+            least: Smallest accepted maximum of the components by Warp scalar type; zeros are always accepted.
+            shared: True if the result may share the caller's memory, because the call only reads it.
+
+        Raises:
+            InputError: Wrong shape, type or device, a value that is not finite, or out of range.
         """
         least = 0.0 if least is None else least[self.dtype]
         if isinstance(value, (wp.array, wp.indexedarray)):
             array = self._from_warp(name, value, vec3_type(self.dtype), count)
-            if not _within(array, least, self._most(farthest)):
+            if not _is_within(array, least, self._most(farthest)):
                 self._check_size(name, array.numpy(), farthest, least)
             return array
         array = real_array(name, value, single=True)
         if count is not None and array.shape == (3,):
             array = np.broadcast_to(array, (count, 3))
         if array.ndim != 2 or array.shape[1] != 3 or (count is not None and len(array) != count):
-            wanted = "[n, 3]" if count is None else f"[3] or [{count}, 3]"
-            raise InputError(shape_message(name, wanted, array))
+            expected = "[n, 3]" if count is None else f"[3] or [{count}, 3]"
+            raise InputError(shape_message(name, expected, array))
         self._check_size(name, array, farthest, least)
         return self._upload(array, vec3_type(self.dtype), shared)
 
     def scalars(self, name, value, count):
-        """Warp array of scalars, shape [count], from one number or [count]."""
+        """Return a Warp array of scalars, shape [count], from one number or ``count`` numbers."""
         if isinstance(value, (wp.array, wp.indexedarray)):
             return self._from_warp(name, value, self.dtype, count)
         return self._upload(host_scalars(name, value, count), self.dtype)
 
     def _upload(self, array, warp_type, shared=False):
-        array = np.ascontiguousarray(array, dtype=name_of(self.dtype))
+        array = np.ascontiguousarray(array, dtype=dtype_name(self.dtype))
         return wp.array(array, dtype=warp_type, device=self.device, copy=not shared)
 
     def _most(self, farthest) -> float:
-        return float(np.finfo(name_of(self.dtype)).max) if farthest is None else farthest
+        return float(np.finfo(dtype_name(self.dtype)).max) if farthest is None else farthest
 
     def _check_size(self, name, array, farthest, least):
-        """Raise ``InputError`` where the largest absolute value of an array is out of range, or is no number."""
-        size = max(float(array.max(initial=0.0)), -float(array.min(initial=0.0)))  # both are NaN if one is
+        """Raise ``InputError`` if the largest absolute value of an array is out of range or NaN."""
+        size = max(float(array.max(initial=0.0)), -float(array.min(initial=0.0)))  # NaN if any entry is
         if least <= size <= self._most(farthest) or size == 0.0:
             return
         if np.isnan(size):
@@ -254,41 +278,73 @@ class Kind:
             raise InputError(f"{name}: all below {least:g}, the largest is {size:g}, {hint(self.dtype)}")
         row = int(np.argwhere(np.abs(array) == size)[0, 0])
         if size > self._most(None):
-            raise InputError(f"{name}: not finite in {name_of(self.dtype)} (row {row})")
-        where = f"{name}: {size:g} m from the origin (row {row})"
+            raise InputError(f"{name}: not finite in {dtype_name(self.dtype)} (row {row})")
+        text = f"{name}: {size:g} m from the origin (row {row})"
         if farthest not in (FARTHEST[self.dtype], REFERENCE_FARTHEST[self.dtype]):
-            raise InputError(f"{where}, with balls of this size at most {farthest:g} m; shift the origin")
-        raise InputError(f"{where}, at most {farthest:g} m {hint(self.dtype)}")
+            raise InputError(f"{text}, with balls of this size at most {farthest:g} m; shift the origin")
+        raise InputError(f"{text}, at most {farthest:g} m {hint(self.dtype)}")
 
     def _from_warp(self, name, array, warp_type, count):
-        """Warp array of a type, from one of its shape that may be strided, indexed or of another scalar type."""
+        """Return a contiguous Warp array of a type, from an array that may be strided, indexed or of another scalar."""
         if array.ndim != 1 or (count is not None and array.shape[0] != count):
-            wanted = f"[{'n' if count is None else count}] of {warp_type.__name__}"
-            raise InputError(shape_message(name, wanted, array) + f" of {array.dtype.__name__}")
+            expected = f"[{'n' if count is None else count}] of {warp_type.__name__}"
+            raise InputError(shape_message(name, expected, array) + f" of {array.dtype.__name__}")
         if array.device != self.device:
-            raise InputError(f"{name}: lives on {array.device}, not on {self.device}")
+            raise InputError(f"{name}: is on {array.device}, not on {self.device}")
         array = array.contiguous()
         if wp.types.types_equal(array.dtype, warp_type):
             return array
         convertible = _NUMBERS if warp_type is self.dtype else (wp.types.vector(3, scalar) for scalar in _NUMBERS)
-        if not any(wp.types.types_equal(array.dtype, one) for one in convertible):
+        if not any(wp.types.types_equal(array.dtype, other) for other in convertible):
             raise InputError(f"{name}: cannot convert {array.dtype.__name__} to {warp_type.__name__}")
         cast = wp.empty(array.shape[0], dtype=warp_type, device=self.device)
         wp.utils.array_cast(in_array=array, out_array=cast)
         return cast
 
 
-def _within(array, least: float, most: float) -> bool:
-    """Whether a reduction on a GPU tells that the largest absolute value of an array of vectors is in range."""
+def _is_within(array, least: float, most: float) -> bool:
+    """Return True if one reduction on a GPU proves that the largest absolute component is in range."""
     if not (array.shape[0] and array.device.is_cuda):
         return False
-    square = norm_squared(array)  # of the largest, at least, and at most so many times that
+    square = norm_squared(array)  # between the square of the largest component and 3n times that
     return 3.0 * array.shape[0] * least**2 < square < math.inf and math.sqrt(square) <= most
 
 
-def resolve_kind(first, dtype: str, device) -> Kind:
-    """Decide device, scalar type and kind of result from the first array argument, ``dtype`` and ``device``."""
+def resolve_context(first, dtype: str, device) -> CallContext:
+    """Return the context of a call from its first array argument, ``dtype`` and ``device``."""
     warp_out = isinstance(first, (wp.array, wp.indexedarray))
     if device is None and warp_out:
         device = first.device
-    return Kind(resolve_device(device), resolve_dtype(dtype), warp_out)
+    return CallContext(resolve_device(device), resolve_dtype(dtype), warp_out)
+
+
+def _memory(array: wp.array) -> wp.array:
+    """Return the memory of a contiguous array as a Warp array of bytes."""
+    assert array.is_contiguous, "a snapshot needs contiguous memory"
+    size = array.size * wp.types.type_size_in_bytes(array.dtype)
+    return wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device)
+
+
+def snapshot_views(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
+    """Return the bytes of each array, without copying on a CPU: such a view changes with its array."""
+    return {name: _memory(array).numpy() for name, array in arrays.items() if array.size}
+
+
+def take_snapshot(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
+    """Return a copy of the bytes of each array, by name."""
+    views = snapshot_views(arrays)
+    return {name: view.copy() if arrays[name].device.is_cpu else view for name, view in views.items()}
+
+
+def restore_snapshot(arrays: dict[str, wp.array], saved: dict[str, np.ndarray]) -> None:
+    """Write the bytes that :func:`take_snapshot` returned back into the arrays.
+
+    Raises:
+        InputError: The snapshot lacks an array, or has one of another size.
+    """
+    for name, array in arrays.items():
+        if array.size:
+            memory, data = _memory(array), saved.get(name)
+            if data is None or data.dtype != np.uint8 or data.shape != memory.shape:
+                raise InputError(f"checkpoint: {name} does not fit this run")
+            memory.assign(data)

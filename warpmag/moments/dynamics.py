@@ -1,10 +1,14 @@
-"""Magnetization dynamics: how inducible moments move from a field evaluation towards equilibrium.
+"""Magnetization dynamics, which bring inducible moments from a field evaluation towards equilibrium.
 
-This is the one place where a dynamics is chosen. Each is an object with the same methods, which only launch kernels:
-``start`` begins a solve in the applied field, ``refine`` improves the moments by the field of their neighbours before
-the whole field is summed, ``iterate`` takes one step from it, and ``start_from`` sets the magnetizations of the next
-start; ``carried`` says what they remember from one solve to the next. They work on the state of a solve
-(``kernels.induction.solve_state``), bound to its moments.
+:func:`make_dynamics` alone chooses a dynamics. All have the same methods, which only launch kernels:
+
+* ``start_from`` sets the magnetizations from which the next solve starts,
+* ``start`` starts a solve in the applied field,
+* ``refine`` improves the moments by the field of their neighbors, before the whole field is summed,
+* ``iterate`` checks convergence in the summed field and takes one step.
+
+``carried`` returns the arrays that a solve leaves for the next one. All work on the state of a solve
+(``kernels.induction.solve_state``), which is bound to its moments.
 """
 
 from functools import cached_property
@@ -17,49 +21,49 @@ from warpmag.kernels.induction import submagnetization, theta_flow
 from warpmag.kernels.induction.body_response import BodyResponses
 
 STEP = 0.3
-"""Default step κ = βΔtMs [dimensionless] of the explicit dynamics: none of the larger ones measured converges in weak
-and in strong fields alike (``bench.paper``, Fig. 8)."""
+"""Default step κ = βΔtMs [dimensionless] of the explicit dynamics: the largest measured one that converges in weak and
+in strong fields (``bench.paper``, Fig. 8)."""
 DAMPING = 0.2
 """Default damping α [dimensionless] of LLG: the paper's 0.2 to 0.25."""
 
 
 class ThetaFlow:
-    """The exact flow of the θ dynamics, accelerated; it chooses its own step."""
+    """Exact flow of the θ dynamics (Kim and Han 2022, Eqs. 8, 9), accelerated, with an automatic step."""
 
-    def __init__(self, state, bodies: BodyResponses | None = None):
-        """Move the moments of ``state``, of which some ``bodies`` respond as wholes."""
-        self._state, self._bodies = state, bodies
+    def __init__(self, state, responses: BodyResponses | None = None):
+        """Act on the moments of ``state``; ``responses`` are the bodies that respond as wholes."""
+        self._state, self._responses = state, responses
 
     def carried(self) -> dict:
-        """Return the arrays of its own that one solve hands on to the next one, by name."""
-        return {} if self._bodies is None else self._bodies.carried()
+        """Return by name the arrays of the dynamics that a solve leaves for the next one."""
+        return {} if self._responses is None else self._responses.carried()
 
     @cached_property
     def _launches(self) -> theta_flow.Launches:
-        return theta_flow.Launches(self._state, self._bodies)
+        return theta_flow.Launches(self._state, self._responses)
 
     def start_from(self, magnetizations):
-        """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
+        """Start the next solve from magnetizations [A/m], a Warp array of vectors, shape [n]."""
         theta_flow.launch_set_state(self._state, magnetizations)
 
     def start(self):
-        """Begin a solve."""
+        """Start a solve."""
         for launch in self._launches.begin:
             launch.launch()
 
     def refine(self):
-        """Sweep over neighbours."""
+        """Sweep over the neighbors of each moment."""
         for launch in self._launches.sweeps:
             launch.launch()
 
     def iterate(self):
-        """Check convergence in the field just summed and move."""
+        """Check convergence in the summed field and take one step."""
         for launch in self._launches.iteration:
             launch.launch()
 
 
 class SubmagnetizationPairs:
-    """The explicit dynamics of pairs of submagnetizations: the paper's literal one, LLG, and LLG without precession.
+    """Explicit dynamics of pairs of submagnetizations (Kim and Han 2022, Eqs. 6, 8, 9).
 
     Attributes:
         first: Directions M1/Ms, shape [n].
@@ -67,56 +71,56 @@ class SubmagnetizationPairs:
     """
 
     def __init__(self, state, law: str, step: float, damping: float):
-        """Move the moments of ``state`` by the law ``theta-euler``, ``llg`` or ``llg-damping``."""
+        """Act on the moments of ``state`` by the law ``theta-euler``, ``llg`` or ``llg-damping`` (no precession)."""
         self._state = state
         self._pairs = submagnetization.make_pairs(state, law, step, 1.0 / damping if law == "llg" else 0.0)
         self.first, self.second = self._pairs.first, self._pairs.second
 
     def carried(self) -> dict:
-        """Return the arrays of its own that one solve hands on to the next one, by name."""
+        """Return by name the arrays of the dynamics that a solve leaves for the next one."""
         return {"first": self.first, "second": self.second}
 
     def set_pairs(self, first, second):
-        """Start the next solve from given directions of M1 and M2, NumPy arrays of unit vectors, shape [n, 3]."""
+        """Start the next solve from directions of M1 and M2, unit vectors of shape [n, 3]."""
         self.first.assign(np.asarray(first))
         self.second.assign(np.asarray(second))
         self._state.warm.fill_(1)
 
     def start_from(self, magnetizations):
-        """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
+        """Start the next solve from magnetizations [A/m], a Warp array of vectors, shape [n]."""
         submagnetization.launch_split(self._state, self._pairs, magnetizations)
 
     def start(self):
-        """Begin a solve."""
+        """Start a solve."""
         submagnetization.launch_begin(self._state, self._pairs)
 
     def refine(self):
-        """Nothing to do."""
+        """Do nothing: explicit dynamics have no sweeps."""
 
     def iterate(self):
-        """Check convergence in the field just summed and step the pairs."""
+        """Check convergence in the summed field and take one step of the pairs."""
         submagnetization.launch_iteration(self._state, self._pairs)
 
 
-def make_dynamics(name: str, state, *, bodies=None, step: float | None = None, damping: float | None = None):
-    """Return the dynamics of a name.
+def make_dynamics(name: str, state, *, responses=None, step: float | None = None, damping: float | None = None):
+    """Return a magnetization dynamics.
 
     Args:
         name: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``.
-        state: State of the solve that it moves, bound to its moments.
-        bodies: Bodies that respond as wholes (``BodyResponses``), or None; only ``theta`` lets them.
+        state: State of the solve, bound to its moments.
+        responses: Bodies that respond as wholes (``BodyResponses``), or None; only ``theta`` uses them.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means :data:`STEP`.
         damping: Damping α [dimensionless] of ``llg``; None means :data:`DAMPING`.
 
     Raises:
-        InputError: A setting is out of range, or one that this dynamics does not have.
+        InputError: A setting is out of range, or the dynamics does not have it.
     """
     if step is not None and name == "theta":
-        raise InputError("step: the dynamics 'theta' chooses its own step")
+        raise InputError("step: the dynamics 'theta' has an automatic step")
     if damping is not None and name != "llg":
-        raise InputError(f"damping: the dynamics {name!r} has none to choose")
+        raise InputError(f"damping: the dynamics {name!r} has no damping")
     if name == "theta":
-        return ThetaFlow(state, bodies)
+        return ThetaFlow(state, responses)
     step, damping = STEP if step is None else step, DAMPING if damping is None else damping
     check_positive("step", step)
     check_positive("damping", damping)

@@ -1,19 +1,19 @@
-"""Real solid harmonics and their translations, in float64: the expansions of the fast multipole method.
+"""Real solid harmonics and their translations in float64, for the expansions of the fast multipole method.
 
-Harmonics are Schmidt semi-normalised: with unit vectors, the squares of one degree sum to 1, so that coefficients keep
-near 1 up to high degrees, and
+Harmonics are Schmidt semi-normalized: at a unit vector the squares of one degree sum to 1, so that coefficients stay
+near 1 up to high degrees. They satisfy
 
     1/|y − x| = Σ R_i(x) I_i(y) for |x| < |y|,    i = n² + n + m, m > 0 for cos mφ, m < 0 for sin |m|φ.
 
-There are K = (degree + 1)² of them. Each is even or odd under x → −x, y → −y and z → −z (``parity``), so that
-translations by offsets that differ in signs differ in signs only.
+There are K = (degree + 1)² of them. Each is even or odd under x → −x, y → −y and z → −z (``parity``). Translations by
+offsets that differ in signs therefore differ in signs only.
 
-Cells have edges of length 1: positions are relative to a cell's centre, in units of its edge h. A multipole q and a
-local expansion L stand for the potential ψ, H = −∇ψ, of dipoles with moments m,
+Positions are relative to the center of an octree box, in units of its edge h. A multipole q and a local expansion L
+represent the potential ψ, H = −∇ψ, of dipoles with moments m,
 
     4π h² ψ(u) = Σ q_i I_i(u) far away, q_i = m·∇R_i,    4π h² ψ(u) = Σ L_i R_i(u) inside.
 
-Since h doubles from a cell to its parent, translations between them have that factor in them. The theorems are those of
+Translations between a box and its parent include the factor 2 between their edges. The theorems are from
 W. Dehnen, "A fast multipole method for stellar dynamics", Comput. Astrophys. Cosmol. 1 (2014), appendix A.
 """
 
@@ -24,23 +24,23 @@ import numpy as np
 
 
 def count(degree: int) -> int:
-    """Number K of harmonics up to a degree."""
+    """Return the number K of harmonics up to a degree."""
     return (degree + 1) ** 2
 
 
 def degrees(degree: int) -> np.ndarray:
-    """Degree n of each harmonic, shape [K]."""
+    """Return the degree n of each harmonic, shape [K]."""
     return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
 
 
 def orders(degree: int) -> np.ndarray:
-    """Order m of each harmonic, negative for those with a sine, shape [K]."""
+    """Return the order m of each harmonic, negative for sin |m|φ, shape [K]."""
     n = degrees(degree)
     return np.arange(count(degree)) - n * n - n
 
 
 def parity(degree: int) -> np.ndarray:
-    """Signs that harmonics take where x, y or z changes its sign, shape [3, K]."""
+    """Return the factor ±1 of each harmonic when x, y or z changes its sign, shape [3, K]."""
     n, m = degrees(degree), orders(degree)
     sine = np.where(m < 0, -1, 1)
     odd_order = np.where(m % 2, -1, 1)
@@ -48,7 +48,7 @@ def parity(degree: int) -> np.ndarray:
 
 
 def regular(degree: int, points) -> np.ndarray:
-    """Regular harmonics R, polynomials of degree n.
+    """Return the regular harmonics R, polynomials of degree n.
 
     Args:
         degree: Highest degree.
@@ -60,31 +60,31 @@ def regular(degree: int, points) -> np.ndarray:
     x, y, z = np.asarray(points, np.float64).T
     r2 = x * x + y * y + z * z
     values = np.zeros((count(degree), len(x)))
-    along = np.ones(len(x), complex)  # (cos mφ + i sin mφ) part of degree and order m
+    sectoral = np.ones(len(x), complex)  # harmonic of degree and order m, with cos mφ + i sin mφ
     for m in range(degree + 1):
         if m > 0:
-            along = along * (x + 1j * y) * (1 if m == 1 else np.sqrt((2 * m - 1) / (2 * m)))
-        last, before = along, np.zeros_like(along)
+            sectoral = sectoral * (x + 1j * y) * (1 if m == 1 else np.sqrt((2 * m - 1) / (2 * m)))
+        last, before = sectoral, np.zeros_like(sectoral)
         for n in range(m, degree + 1):
             if n > m:
-                grown = (2 * n - 1) * z * last - np.sqrt((n + m - 1) * (n - m - 1)) * r2 * before
-                last, before = grown / np.sqrt((n + m) * (n - m)), last
+                following = (2 * n - 1) * z * last - np.sqrt((n + m - 1) * (n - m - 1)) * r2 * before
+                last, before = following / np.sqrt((n + m) * (n - m)), last
             values[n * n + n - m] = np.imag(last)
             values[n * n + n + m] = np.real(last)
     return values.T.copy()
 
 
 def irregular(degree: int, points) -> np.ndarray:
-    """Irregular harmonics I = R/r^(2n + 1), shape [n, K]; ``points`` as in ``regular``, none at the origin."""
+    """Return the irregular harmonics I = R/r^(2n + 1), shape [n, K], at points [n, 3] other than the origin."""
     r = np.linalg.norm(np.asarray(points, np.float64), axis=1)
     return regular(degree, points) / r[:, None] ** (2 * degrees(degree) + 1)
 
 
 @cache
 def derivatives(degree: int) -> np.ndarray:
-    """Matrices D with ∇R_i = Σ_j D[:, i, j] R_j, shape [3, K, K]."""
+    """Return the matrices D with ∇R_i = Σ_j D[:, i, j] R_j, shape [3, K, K]."""
     size = count(degree)
-    mixed = np.zeros((3, size, size), complex)  # of complex harmonics: ∂x − i∂y, ∂x + i∂y, ∂z
+    mixed = np.zeros((3, size, size), complex)  # ∂x − i∂y, ∂x + i∂y and ∂z of complex harmonics
     n, m = degrees(degree), orders(degree)
     for k, (shift, sign) in enumerate(((-1, 1), (1, -1), (0, 1))):
         i = np.flatnonzero(np.abs(m + shift) < n)
@@ -94,7 +94,7 @@ def derivatives(degree: int) -> np.ndarray:
 
 
 def regular_gradients(degree: int, points) -> np.ndarray:
-    """Gradients of regular harmonics, shape [n, K, 3]; ``points`` as in ``regular``."""
+    """Return the gradients of the regular harmonics at points [n, 3], shape [n, K, 3]."""
     index, factor = _derivative_terms(degree)
     values = regular(degree, points)
     return (values[:, index] * factor).sum(axis=-1).transpose(0, 2, 1)
@@ -102,18 +102,18 @@ def regular_gradients(degree: int, points) -> np.ndarray:
 
 @cache
 def _derivative_terms(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """The two harmonics that a row of ``derivatives`` has at most, and their factors, both of shape [3, K, 2]."""
+    """Return the at most two nonzero columns of each row of ``derivatives``, and their values, shapes [3, K, 2]."""
     matrices = derivatives(degree)
     index = np.argsort(-np.abs(matrices), axis=2, kind="stable")[..., :2]
     return index, np.take_along_axis(matrices, index, axis=2)
 
 
 def dipole_to_multipole(degree: int, points, moments) -> np.ndarray:
-    """Multipole of dipoles in a cell.
+    """Return the multipole of the dipoles in a box.
 
     Args:
         degree: Highest degree.
-        points: Positions relative to the cell's centre, in units of its edge, shape [n, 3].
+        points: Positions relative to the box's center, in units of its edge, shape [n, 3].
         moments: Magnetic moments [A·m²], shape [n, 3].
 
     Returns:
@@ -123,25 +123,25 @@ def dipole_to_multipole(degree: int, points, moments) -> np.ndarray:
 
 
 def octant_offset(octant: int) -> np.ndarray:
-    """Centre of a child from its parent's, in units of the child's edge; octant = x + 2 y + 4 z."""
+    """Return the vector from a box's center to its child's, in units of the child's edge; octant = x + 2 y + 4 z."""
     return np.array([octant & 1, octant >> 1 & 1, octant >> 2 & 1]) - 0.5
 
 
 def multipole_to_multipole(degree: int, octant: int) -> np.ndarray:
-    """Matrix that takes a child's multipole to its part of its parent's, shape [K, K]."""
+    """Return the matrix from a child's multipole to its contribution to the parent's, shape [K, K]."""
     shrink = 2.0 ** (1 - degrees(degree))
     return shrink[:, None] * _regular_shift(degree, octant_offset(octant))
 
 
 def multipole_to_local(degree: int, offsets) -> np.ndarray:
-    """Matrices that take a cell's multipole to the local expansion of another of the same size.
+    """Return the matrices from a box's multipole to the local expansion of another box of the same size.
 
     Args:
         degree: Highest degree of both.
-        offsets: From the source's centre to the target's, in units of their edge, shape [3] or [n, 3].
+        offsets: From the center of the multipole to that of the local expansion, in edges, shape [3] or [n, 3].
 
     Returns:
-        Shape [K, K] or [n, K, K]: the target's coefficients in rows.
+        Shape [K, K] or [n, K, K]; rows belong to the local expansion.
     """
     offsets = np.asarray(offsets, np.float64)
     values = irregular(2 * degree, offsets.reshape(-1, 3))
@@ -152,19 +152,20 @@ def multipole_to_local(degree: int, offsets) -> np.ndarray:
 
 @cache
 def _shift_terms(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a matrix of ``multipole_to_local`` has of the harmonics at the offset: two factors, and two indices.
+    """Return the two terms of each entry of ``multipole_to_local``: factors and indices of harmonics at the offset.
 
-    A complex harmonic V of degree n and order m at d + u is Σ (−1)^k conj(W) V(d), W regular ones of degree k and order
-    j at u, those at d of degree n + k and order m + j. Of the orders ±j, the terms are those of m + |j| and m − |j|.
+    A complex harmonic V of degree n and order m at d + u is Σ (−1)^k conj(W) V(d). Here W are the regular
+    harmonics of degree k and order j at u, and V(d) those of degree n + k and order m + j. The orders ±j give the terms
+    m + |j| and m − |j|.
     """
     n, m, sine = degrees(degree), np.abs(orders(degree)), orders(degree) < 0
     k, j, target_sine = n[:, None], m[:, None], sine[:, None]
-    crossed = target_sine != sine  # sines at the offset
+    crossed = target_sine != sine  # the harmonic at the offset has a sine
     reached, sum_order, difference = k + n, m + j, np.abs(m - j)
     sign = np.where(k % 2, -1.0, 1.0) * _irregular_scales(degree) / _scales(degree)[:, None]
     added = sign * np.where(target_sine & sine, -1, 1)
     subtracted = sign * np.where(target_sine & ~sine, -1, 1) * np.where(j % 2, -1, 1)
-    # of a negative order m − |j|, (−1)^(m − j) times the conjugate
+    # a harmonic of negative order m − |j| is (−1)^(m − j) times the conjugate
     subtracted = subtracted * np.where(m < j, np.where(difference % 2, -1, 1) * np.where(crossed, -1, 1), 1)
     subtracted = np.where((j == 0) | (crossed & (difference == 0)), 0, subtracted)
     side = np.where(crossed, -1, 1)
@@ -175,17 +176,17 @@ def _shift_terms(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
 
 def local_to_local(degree: int, octant: int) -> np.ndarray:
-    """Matrix that takes a parent's local expansion to a child's, shape [K, K]."""
+    """Return the matrix from a parent's local expansion to a child's, shape [K, K]."""
     shrink = 2.0 ** (-2 - degrees(degree))
     return (shrink[:, None] * _regular_shift(degree, octant_offset(octant))).T.copy()
 
 
 def local_to_field(local, points) -> np.ndarray:
-    """4π h³ times the field H of a local expansion.
+    """Return 4π h³ times the field H of a local expansion.
 
     Args:
         local: Coefficients L [A·m²], shape [K].
-        points: Positions relative to the cell's centre, in units of its edge h, shape [n, 3].
+        points: Positions relative to the box's center, in units of its edge h, shape [n, 3].
 
     Returns:
         Shape [n, 3] [A·m²].
@@ -195,27 +196,27 @@ def local_to_field(local, points) -> np.ndarray:
 
 
 def _mirrored(degree: int) -> np.ndarray:
-    """Index of the harmonic of order −m, shape [K]."""
+    """Return the index of the harmonic of order −m, shape [K]."""
     n = degrees(degree)
     return n * n + n - orders(degree)
 
 
 def _scales(degree: int) -> np.ndarray:
-    """Norm of each real harmonic over that of the complex ones, r^n P_n^m/(n + m)! exp(imφ), shape [K]."""
+    """Return each real harmonic's norm over that of the complex harmonic r^n P_n^m/(n + m)! exp(imφ), shape [K]."""
     pairs = zip(degrees(degree).tolist(), np.abs(orders(degree)).tolist(), strict=True)
     return np.array([np.sqrt(float((2 if m else 1) * factorial(n - m) * factorial(n + m))) for n, m in pairs])
 
 
 def _irregular_scales(degree: int) -> np.ndarray:
-    """The same for irregular ones, (n − m)! P_n^m/r^(n + 1) exp(imφ)."""
+    """Return :func:`_scales` for the irregular harmonics, (n − m)! P_n^m/r^(n + 1) exp(imφ)."""
     return np.where(orders(degree) == 0, 1, 2) / _scales(degree)
 
 
 def _real(matrix: np.ndarray, degree: int) -> np.ndarray:
-    """A matrix that maps complex regular harmonics, (−1)^m times conjugates for m < 0, as one that maps real ones."""
+    """Return the matrix between real harmonics for one between complex ones, in which order −m is (−1)^m conj."""
     m, mirrored, scale = orders(degree), _mirrored(degree), _scales(degree)
     sign = np.where(m % 2, -1, 1)
-    # a cosine is half the sum of the orders m and −m, a sine their difference over 2i
+    # cos is half the sum of the orders m and −m, sin their difference over 2i
     own = np.where(m == 0, scale, np.where(m > 0, scale / 2, sign * scale * 0.5j))
     other = np.where(m == 0, 0, np.where(m > 0, sign * scale / 2, -0.5j * scale))
     rows = own[:, None] * matrix + other[:, None] * matrix[mirrored]
@@ -223,14 +224,14 @@ def _real(matrix: np.ndarray, degree: int) -> np.ndarray:
 
 
 def _complex(values: np.ndarray, degree: int) -> np.ndarray:
-    """Complex harmonics from real ones of the same norm, shape [K]."""
+    """Return the complex harmonics for real ones of the same norm, shape [K]."""
     m, mirrored = orders(degree), _mirrored(degree)
     sign = np.where(m % 2, -1, 1)
     return np.where(m < 0, sign * (values[mirrored] - 1j * values), values + np.where(m == 0, 0, 1j) * values[mirrored])
 
 
 def _regular_shift(degree: int, offset: np.ndarray) -> np.ndarray:
-    """Matrix A with R_i(u + offset) = Σ_j A[i, j] R_j(u), shape [K, K]."""
+    """Return the matrix A with R_i(u + offset) = Σ_j A[i, j] R_j(u), shape [K, K]."""
     n, m = degrees(degree), orders(degree)
     at_offset = _complex(regular(degree, offset[None, :])[0] / _scales(degree), degree)
     lower, order = n[:, None] - n[None, :], m[:, None] - m[None, :]

@@ -1,4 +1,4 @@
-"""Magnetic equilibrium of inducible balls: the one-shot call on arrays."""
+"""Magnetic equilibrium of inducible balls in one call on arrays."""
 
 import math
 import warnings
@@ -14,44 +14,44 @@ from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.materials import measured
 from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.moments.arrays import (
-    LEAST_OF_FORCE,
-    Kind,
+    LEAST_FORCE_MOMENT,
+    CallContext,
     Numbers,
-    farthest_place,
+    dtype_name,
     first_not_finite,
     hint,
-    host_positive,
     host_radii,
     host_scalars,
     largest,
-    name_of,
+    largest_coordinate,
     real_array,
-    resolve_kind,
+    resolve_context,
 )
-from warpmag.moments.ranks import alike
-from warpmag.moments.system import MomentSystem
+from warpmag.moments.layout import Material
+from warpmag.moments.ranks import compare_arguments
+from warpmag.moments.system import MomentSystem, SolverSettings
 
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
-"""Least and largest field in units of saturation of which neither square nor root is lost, by Warp scalar type."""
+"""Smallest and largest field in units of the saturation by Warp scalar type: its square and root keep their digits."""
 _USUAL = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
-"""Numbers that are not the cause where a result is not finite, by Warp scalar type."""
+"""Range of plausible values by Warp scalar type; an error about a result names the arguments outside."""
 
 
 @dataclass(frozen=True)
 class InductionResult:
-    """Magnetic equilibrium of n balls.
+    """Magnetic equilibrium of n balls, returned by :func:`solve_induction`.
 
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
-        h_field: Field H at the balls [A/m], external, from the sources and from the other balls, shape [n, 3].
-        error: Estimate of the relative error of the magnetizations, ‖M − M*‖/‖M*‖ over all balls, M* being the exact
-            solution, rounding apart: the residual of the last iterate times what the solve learnt of its amplification
-            (see ``warpmag.kernels.induction.theta_flow``). Of other dynamics than ``theta`` that residual,
-            ‖M − f(H)‖/‖f(H)‖, the computable form of Eq. 12.
-        evaluations: All-pairs field evaluations among the balls.
-        converged: Whether ``error`` is at most ``rtol``.
-        field_error: Relative error ‖H − H_exact‖/‖H_exact‖ of the fields that the solve went by, measured at 256 random
-            balls by sums over all pairs: that of the fast multipole method, or 0 without it.
+        h_field: Field H at the balls [A/m], from everything but the ball itself, shape [n, 3].
+        error: Estimated relative error of the magnetizations, ‖M − M*‖/‖M*‖ over all balls, where M* is the exact
+            solution. ``theta`` multiplies the last residual by its estimated amplification (see
+            ``warpmag.kernels.induction.theta_flow``). For other dynamics it is the residual ‖M − f(H)‖/‖f(H)‖, the
+            computable form of Eq. 12.
+        evaluations: Number of field evaluations.
+        converged: True if ``error`` is at most ``rtol``.
+        field_error: Relative error ‖H − H_exact‖/‖H_exact‖ of the fast multipole method's field, from sums over all
+            pairs at 256 random balls; 0 without the method.
     """
 
     magnetizations: Any
@@ -61,37 +61,48 @@ class InductionResult:
     converged: bool
     field_error: float
     _system: MomentSystem = field(repr=False)
-    _kind: Kind = field(repr=False)
-    _given: dict = field(repr=False)
+    _context: CallContext = field(repr=False)
+    _arguments: dict = field(repr=False)
     _count: int = field(repr=False)
 
     def wrench(self, force: str = "kelvin") -> tuple[Any, Any]:
-        """Force and torque on each ball from the other balls, the sources and the external field.
+        """Return force and torque on each ball, from the other balls, permanent moments and the external field.
 
         Args:
-            force: ``kelvin``, F = μ0 (m·∇)H (Eqs. 13, 14), or ``zeeman`` (Eq. 4), with the contact model ``dipole``.
+            force: ``kelvin``, F = μ0 (m·∇)H (Kim and Han 2022, Eqs. 13, 14). ``zeeman``: Eq. 4, only with the contact
+                model ``dipole``.
 
         Returns:
-            Forces [N] and torques μ0 m × H [N·m], each of shape [n, 3], in the kind of the solve's arrays. The torques
-            vanish as far as the solve converged.
+            Forces [N] and torques μ0 m × H [N·m], each of shape [n, 3], NumPy or Warp like the solve's arrays. The
+            torques are 0 at exact convergence.
 
         Raises:
-            InputError: Unknown force law, a force that is not finite, or moments so small that it would have no digits.
+            InputError: The force law is unknown, a force is not finite, or moments are too small for forces in this
+                precision.
+
+        Example:
+            >>> import warpmag
+            >>> pair = warpmag.solve_induction(
+            ...     [[0, 0, 0], [0, 0, 0.012]], 0.005, saturation=1.7e6, external_field=(0, 0, 1e5), device="cpu"
+            ... )
+            >>> forces, torques = pair.wrench()
+            >>> bool(forces[0, 2] > 0.0)  # the balls attract each other along the field
+            True
         """
-        system = self._system
+        system, dtype = self._system, self._context.dtype
         system.apply_forces(force)
         strongest = largest(system.moments)
-        if 0.0 < strongest < LEAST_OF_FORCE[self._kind.dtype]:
+        if 0.0 < strongest < LEAST_FORCE_MOMENT[dtype]:
             raise InputError(
                 f"radii, saturation, external_field: moments of at most {strongest:.3g} A·m² are too small for forces "
-                f"{hint(self._kind.dtype)}"
+                f"{hint(dtype)}"
             )
-        forces, torques = (self._kind.finish(array, self._count) for array in (system.forces, system.torques))
-        _check_finite(self._kind, self._count, self._given, force=forces, torque=torques)
+        forces, torques = (self._context.result(array, self._count) for array in (system.forces, system.torques))
+        _check_finite(dtype, self._count, self._arguments, force=forces, torque=torques)
         return forces, torques
 
 
-@alike
+@compare_arguments
 def solve_induction(
     positions: Numbers,
     radii: Numbers,
@@ -100,7 +111,7 @@ def solve_induction(
     susceptibility: Numbers = math.inf,
     curve: str | MagnetizationCurve | Sequence[str | MagnetizationCurve] = "tanh",
     external_field: Numbers | None = None,
-    sources: tuple[Numbers, Numbers] | None = None,
+    permanent: tuple[Numbers, Numbers] | None = None,
     dynamics: str = "theta",
     contact_model: str = "dipole",
     method: str = "auto",
@@ -109,196 +120,191 @@ def solve_induction(
     initial: Numbers | None = None,
     dtype: str = "float32",
     device: wp.DeviceLike = None,
+    sources: tuple[Numbers, Numbers] | None = None,
 ) -> InductionResult:
-    """Bring inducible balls to magnetic equilibrium, M = f(H), with one another and an applied field.
+    """Return the magnetic equilibrium M = f(H) of inducible balls in an applied field (Kim and Han 2022, Eq. 5).
 
-    Balls may overlap at will: with the contact model ``dipole`` and sums over all pairs, the solution is unique for any
-    arrangement. The iteration is safeguarded, and warns where it ends early.
+    Balls may overlap. With the contact model ``dipole`` and sums over all pairs the solution is unique for any
+    arrangement.
 
     Args:
-        positions: Ball centres [m], shape [n, 3], NumPy or Warp.
+        positions: Ball centers [m], shape [n, 3], NumPy or Warp.
         radii: Ball radii [m], scalar or [n].
-        saturation: Saturation magnetization Ms [A/m], scalar or [n]; must be given, unless all curves are measured.
+        saturation: Saturation magnetization Ms [A/m], scalar or [n]; required unless all curves are measured.
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-        curve: Magnetization curve: one of ``magnets.CURVES``, or a measured one, which has its own saturation and
-            susceptibility, as a :class:`warpmag.MagnetizationCurve` or the name of a material that has one. A tuple or
-            list of n gives each ball its own.
+        curve: Magnetization curve: one of ``magnets.CURVES``, a measured :class:`warpmag.MagnetizationCurve`, or the
+            name of a material with a measured curve. Measured curves have their own saturation and susceptibility. A
+            tuple or list of n gives each ball its own curve.
         external_field: Applied field H0 [A/m], shape [3] or [n, 3].
-        sources: Permanent magnets as (positions [m], moments [A·m²]), each of shape [k, 3]; point dipoles.
-        dynamics: ``theta``: the exact flow of Eqs. 8 and 9, accelerated; ``theta-euler``: their explicit step;
-            ``llg``, ``llg-damping``: Eq. 6 with and without precession.
-        contact_model: ``dipole``; or ``multipole``, which adds what balls lack where they nearly touch, from the exact
+        permanent: Permanent point dipoles as (positions [m], moments [A·m²]), each of shape [k, 3].
+        dynamics: ``theta``: accelerated exact flow of Eqs. 8 and 9. ``theta-euler``: their explicit step. ``llg``,
+            ``llg-damping``: Eq. 6 with and without precession.
+        contact_model: ``dipole``; ``multipole`` adds the higher multipoles of balls that nearly touch, from the exact
             solution of two balls (see ``warpmag.kernels.near_contact``).
-        method: How fields are summed: ``direct``, over all pairs; ``fmm``, by the fast multipole method, to an
-            error that ``rtol`` allows; or ``auto``, the faster one.
-        rtol: Relative error of the magnetizations to reach.
-        max_evaluations: Field evaluations after which to give up; ``converged`` tells.
+        method: Summation of fields: ``direct``, over all pairs; ``fmm``, the fast multipole method with errors that
+            ``rtol`` allows; ``auto``, the faster of the two.
+        rtol: Relative error of the magnetizations at which the solve ends.
+        max_evaluations: Field evaluations after which the solve ends unconverged.
         initial: Magnetizations to start from [A/m], shape [n, 3].
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means that of the arrays, or Warp's default.
+        sources: Deprecated name of ``permanent``.
 
     Returns:
         The equilibrium, an :class:`InductionResult`.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers, is out of range of ``dtype`` (see
+        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
             ``warpmag.moments.arrays``), or the result is not finite.
 
     Warns:
-        ConvergenceWarning: ``max_evaluations`` did not suffice; the result is the best that was found.
+        ConvergenceWarning: ``max_evaluations`` field evaluations did not reach ``rtol``; the best result is returned.
+
+    Example:
+        >>> import warpmag
+        >>> field = (0, 0, 1e4)
+        >>> ball = warpmag.solve_induction([[0, 0, 0]], 0.005, saturation=1.7e6, external_field=field, device="cpu")
+        >>> round(float(ball.magnetizations[0, 2]))  # a permeable ball takes 3 H0
+        30000
     """
-    kind = resolve_kind(positions, dtype, device)
-    balls = _read_balls(kind, positions, radii, saturation, susceptibility, curve, external_field, sources)
-    choices = {"dynamics": dynamics, "contact_model": contact_model, "rtol": rtol, "max_evaluations": max_evaluations}
-    choices["method"] = method
-    system = balls.make_system(kind, initial, **choices)
+    if sources is not None:
+        warnings.warn("solve_induction: sources is deprecated, use permanent", DeprecationWarning, stacklevel=3)
+        permanent = sources if permanent is None else permanent
+    context = resolve_context(positions, dtype, device)
+    balls = _read_balls(context, positions, radii, external_field, permanent)
+    material = _read_material(balls.count, saturation, susceptibility, curve)
+    settings = SolverSettings(
+        dynamics=dynamics, contact_model=contact_model, method=method, rtol=rtol, max_evaluations=max_evaluations,
+        single_torque=True,
+    )  # fmt: skip
+    system = balls.make_system(context, material, settings, initial)
     system.solve()
-    return _read_result(kind, system, balls, _by_name(balls, positions, external_field, sources, initial))
+    permanent_positions, permanent_moments = (None, None) if permanent is None else permanent
+    arguments = {
+        "positions": positions,
+        "radii": balls.radii,
+        "saturation": system.material.saturation.numpy()[: balls.count],
+        "external_field": external_field,
+        "permanent: positions": permanent_positions,
+        "permanent: moments": permanent_moments,
+        "initial": initial,
+    }
+    return _read_result(context, system, balls.count, arguments)
 
 
 @dataclass(frozen=True)
 class _Balls:
-    """n inducible balls in an applied field, and k permanent magnets, on the device or still on the host.
+    """n inducible balls in an applied field, and k permanent point dipoles.
 
     Attributes:
-        positions: Centres [m], Warp, shape [n].
-        radii: Radii [m], shape [n].
-        saturation: Saturation magnetizations [A/m], shape [n].
-        susceptibility: Susceptibilities [dimensionless], shape [n].
-        curves: Magnetization curves, one for all, or n.
-        external: Applied field [A/m], Warp, shape [n].
-        source_positions: Places of the permanent magnets [m], Warp, shape [k].
-        source_moments: Their moments [A·m²], Warp, shape [k].
+        positions: Centers [m], Warp, shape [n].
+        radii: Radii [m], NumPy, shape [n].
+        external_field: Applied field [A/m], Warp, shape [n].
+        permanent_positions: Positions of the permanent dipoles [m], Warp, shape [k].
+        permanent_moments: Their moments [A·m²], Warp, shape [k].
     """
 
     positions: wp.array
     radii: np.ndarray
-    saturation: np.ndarray
-    susceptibility: np.ndarray
-    curves: list
-    external: wp.array
-    source_positions: wp.array
-    source_moments: wp.array
+    external_field: wp.array
+    permanent_positions: wp.array
+    permanent_moments: wp.array
 
     @property
     def count(self) -> int:
-        """How many they are."""
+        """Number n of balls."""
         return self.positions.shape[0]
 
-    def make_system(self, kind: Kind, initial, **choices) -> MomentSystem:
-        """Return them as moments, the permanent ones last, before a solve from ``initial`` magnetizations or None."""
-        n, k = self.count, self.source_positions.shape[0]
+    def make_system(self, context: CallContext, material: Material, settings: SolverSettings, initial) -> MomentSystem:
+        """Return a system of the balls, followed by the permanent dipoles, ready to solve from ``initial`` or None."""
+        n, k = self.count, self.permanent_positions.shape[0]
 
-        def with_sources(values, others):
-            return np.concatenate([values, np.full(k, others)])
+        def padded(values):  # the values of permanent moments are ignored
+            return np.append(values, np.ones(k))
 
         system = MomentSystem(
-            radii=with_sources(self.radii, 0.0),
+            radii=np.append(self.radii, np.zeros(k)),
             permanent=np.arange(n + k) >= n,
             movable=np.arange(n + k) < n,
-            saturation=with_sources(self.saturation, 1.0),
-            susceptibility=with_sources(self.susceptibility, 1.0),
-            curve=self.curves[0] if len(self.curves) == 1 else [*self.curves, *["tanh"] * k],
-            lone_torque=True,
-            dtype=name_of(kind.dtype),
-            device=kind.device,
-            **choices,
+            material=Material(
+                padded(material.saturation),
+                padded(material.susceptibility),
+                [*material.curve, *["tanh"] * k] if isinstance(material.curve, list) else material.curve,
+            ),
+            settings=settings,
+            dtype=dtype_name(context.dtype),
+            device=context.device,
         )
-        wp.copy(system.external_field, self.external, count=n)
+        wp.copy(system.external_field, self.external_field, count=n)
         wp.copy(system.positions, self.positions, count=n)
         if k:
-            wp.copy(system.positions, self.source_positions, dest_offset=n, count=k)
-            wp.copy(system.moments, self.source_moments, dest_offset=n, count=k)
+            wp.copy(system.positions, self.permanent_positions, dest_offset=n, count=k)
+            wp.copy(system.moments, self.permanent_moments, dest_offset=n, count=k)
         if initial is not None:
-            system.start_from(kind.vectors("initial", initial, n))
+            system.start_from(context.vectors("initial", initial, n))
         return system
 
 
-def _read_balls(kind: Kind, positions, radii, saturation, susceptibility, curve, external_field, sources) -> _Balls:
-    """Return the arguments of :func:`solve_induction` as arrays; raises ``InputError`` for those that cannot be."""
-    size = host_radii("radii", radii, kind.dtype)
-    farthest = farthest_place(kind.dtype, 2.0 * float(size.max(initial=0.0)))
-    x = kind.vectors("positions", positions, farthest=farthest)
+def _read_balls(context: CallContext, positions, radii, external_field, permanent) -> _Balls:
+    """Return the arrays of :func:`solve_induction`, raising ``InputError`` for those that it cannot take."""
+    radii = host_radii("radii", radii, context.dtype)
+    farthest = largest_coordinate(context.dtype, 2.0 * float(radii.max(initial=0.0)))
+    x = context.vectors("positions", positions, farthest=farthest)
     n = x.shape[0]
-    size = host_scalars("radii", size, n)
-    if not (size > 0.0).all():
-        raise InputError(f"radii: must be positive, got {size.min():g}")
-    external = kind.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
-    source_positions, source_moments = _sources(kind, sources, farthest)
-    curves = _curves(curve, n)
-    saturation, susceptibility = _materials(curves, saturation, susceptibility)
-    return _Balls(
-        positions=x,
-        radii=size,
-        saturation=host_positive("saturation", saturation, n, kind.dtype),
-        susceptibility=host_positive("susceptibility", susceptibility, n, kind.dtype, infinite=True),
-        curves=curves,
-        external=external,
-        source_positions=source_positions,
-        source_moments=source_moments,
+    radii = host_scalars("radii", radii, n)
+    if not (radii > 0.0).all():
+        raise InputError(f"radii: must be positive, got {radii.min():g}")
+    field = context.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
+    if permanent is None:
+        permanent = np.zeros((0, 3)), np.zeros((0, 3))
+    if not isinstance(permanent, (tuple, list)) or len(permanent) != 2:
+        raise InputError(f"permanent: must be (positions, moments), got {short_repr(permanent)}")
+    places = context.vectors("permanent: positions", permanent[0], farthest=farthest)
+    return _Balls(x, radii, field, places, context.vectors("permanent: moments", permanent[1], places.shape[0]))
+
+
+def _read_material(count: int, saturation, susceptibility, curve) -> Material:
+    """Return the material of ``count`` balls: arrays, and one curve or a list of ``count``.
+
+    :meth:`Material.parameters` checks the values, and replaces those of measured curves.
+    """
+    each = isinstance(curve, (tuple, list)) and len(curve) == count and count > 0
+    curves = [measured("curve", item) for item in curve] if each else [measured("curve", curve)]
+    if all(isinstance(item, MagnetizationCurve) for item in curves):
+        if saturation is not None or not np.array_equal(susceptibility, math.inf):
+            name = "saturation" if saturation is not None else "susceptibility"
+            raise InputError(f"{name}: a measured curve has its own, give one or the other")
+    elif saturation is None:
+        raise InputError("saturation: must be given, unless all curves are measured")
+    return Material(
+        host_scalars("saturation", 1.0 if saturation is None else saturation, count),
+        host_scalars("susceptibility", susceptibility, count, infinite=True),
+        curves if each else curves[0],
     )
 
 
-def _curves(curve, count: int) -> list:
-    """Return the curve of all balls, or those of each of ``count``."""
-    each = isinstance(curve, (tuple, list)) and len(curve) == count and count > 0
-    return [measured("curve", one) for one in curve] if each else [measured("curve", curve)]
-
-
-def _materials(curves: list, saturation, susceptibility):
-    """Return saturations and susceptibilities, measured ones in the place of those that are given."""
-    tables = np.array([isinstance(one, MagnetizationCurve) for one in curves])
-    if tables.all() and (saturation is not None or not np.array_equal(susceptibility, math.inf)):
-        which = "saturation" if saturation is not None else "susceptibility"
-        raise InputError(f"{which}: a measured curve says it, give one or the other")
-    if saturation is None and not tables.all():
-        raise InputError("saturation: must be given, unless all curves are measured")
-    if not tables.any():
-        return saturation, susceptibility
-    given = [host_scalars("saturation", 1.0 if saturation is None else saturation, len(curves))]
-    given.append(host_scalars("susceptibility", susceptibility, len(curves), infinite=True))
-    own = [[getattr(one, name) if of_table else 1.0 for one, of_table in zip(curves, tables, strict=True)]
-           for name in ("saturation", "susceptibility")]  # fmt: skip
-    found = [np.where(tables, *pair) for pair in zip(own, given, strict=True)]
-    return (found[0][0], found[1][0]) if len(curves) == 1 else tuple(found)
-
-
-def _by_name(balls: _Balls, positions, external_field, sources, initial) -> dict:
-    """Return the arrays that the caller has given, by the names that messages call them."""
-    source_positions, source_moments = (None, None) if sources is None else sources
-    return {
-        "positions": positions,
-        "radii": balls.radii,
-        "saturation": balls.saturation,
-        "external_field": external_field,
-        "sources: positions": source_positions,
-        "sources: moments": source_moments,
-        "initial": initial,
-    }
-
-
-def _read_result(kind: Kind, system: MomentSystem, balls: _Balls, given: dict) -> InductionResult:
-    """Return what a solve ended with, and warn if it did not converge.
+def _read_result(context: CallContext, system: MomentSystem, n: int, arguments: dict) -> InductionResult:
+    """Return the result of a solve of n balls, and warn if it did not converge.
 
     Raises:
-        InputError: The result is not finite, or was not to be resolved.
+        InputError: The result is not finite, or the field is too weak or strong for ``dtype``.
     """
-    n = balls.count
-    m, h = (kind.finish(array, n) for array in (system.magnetizations(), system.h))
-    _check_finite(kind, n, given, magnetization=m, field=h)
+    m, h = (context.result(array, n) for array in (system.magnetizations(), system.h))
+    _check_finite(context.dtype, n, arguments, magnetization=m, field=h)
     error = float(system.error.numpy().max(initial=0.0))
     if not math.isfinite(error):
-        raise InputError(f"external_field, sources, saturation: the error is not finite {hint(kind.dtype)}")
+        raise InputError(f"external_field, permanent, saturation: the error is not finite {hint(context.dtype)}")
     strongest = float(np.abs(h if isinstance(h, np.ndarray) else h.numpy()).max(initial=0.0))
-    _check_strength(kind, strongest, balls.saturation)
+    _check_strength(context.dtype, strongest, arguments["saturation"])
     converged = bool(system.converged.numpy().all())
     if not converged:
-        reached = f"error {error:.2g} > rtol {system.rtol:g} after max_evaluations = {system.max_evaluations}"
-        warnings.warn(f"solve_induction: did not converge, {reached}", ConvergenceWarning, stacklevel=3)
+        limit = system.settings.max_evaluations
+        text = f"error {error:.2g} > rtol {system.rtol:g} after max_evaluations = {limit}"
+        warnings.warn(f"solve_induction: did not converge, {text}", ConvergenceWarning, stacklevel=4)
     field_error = system.field_error()
     if field_error > system.rtol:
         text = f"solve_induction: fields have an error of {field_error:.2g} > rtol {system.rtol:g}; use method direct"
-        warnings.warn(text, ConvergenceWarning, stacklevel=3)
+        warnings.warn(text, ConvergenceWarning, stacklevel=4)
     return InductionResult(
         magnetizations=m,
         h_field=h,
@@ -307,45 +313,35 @@ def _read_result(kind: Kind, system: MomentSystem, balls: _Balls, given: dict) -
         converged=converged,
         field_error=field_error,
         _system=system,
-        _kind=kind,
-        _given=given,
+        _context=context,
+        _arguments=arguments,
         _count=n,
     )
 
 
-def _sources(kind: Kind, sources, farthest):
-    """Positions and moments of permanent magnets, none if ``sources`` is None, as Warp arrays."""
-    if sources is None:
-        sources = np.zeros((0, 3)), np.zeros((0, 3))
-    if not isinstance(sources, (tuple, list)) or len(sources) != 2:
-        raise InputError(f"sources: must be (positions, moments), got {short_repr(sources)}")
-    x = kind.vectors("sources: positions", sources[0], farthest=farthest)
-    return x, kind.vectors("sources: moments", sources[1], x.shape[0])
-
-
-def _check_strength(kind: Kind, strongest: float, saturation):
-    """Raise ``InputError`` where the ``strongest`` field [A/m] is so weak or strong that a solve cannot resolve it."""
-    least, most = _FIELD_RANGE[kind.dtype]
-    tiny = float(np.finfo(name_of(kind.dtype)).tiny)  # what is smaller counts as zero
+def _check_strength(dtype, strongest: float, saturation):
+    """Raise ``InputError`` if the strongest field [A/m] is too weak or too strong for the saturations in ``dtype``."""
+    least, most = _FIELD_RANGE[dtype]
+    tiny = float(np.finfo(dtype_name(dtype)).tiny)  # smaller numbers count as zero
     weak = tiny <= strongest < least * max(1.0, saturation.max(initial=0.0))
     if weak or strongest > most * saturation.min(initial=np.inf):
-        how, of = ("weak", saturation.max()) if weak else ("strong", saturation.min())
+        adjective, limit = ("weak", saturation.max()) if weak else ("strong", saturation.min())
         raise InputError(
-            f"external_field, sources, saturation: a field of {strongest:.3g} A/m is too {how} for a saturation of "
-            f"{of:.3g} A/m {hint(kind.dtype)}"
+            f"external_field, permanent, saturation: a field of {strongest:.3g} A/m is too {adjective} for a "
+            f"saturation of {limit:.3g} A/m {hint(dtype)}"
         )
 
 
-def _check_finite(kind: Kind, count: int, given: dict, **results):
-    """Raise ``InputError`` where a row of results of the first ``count`` is not finite.
+def _check_finite(dtype, count: int, arguments: dict, **results):
+    """Raise ``InputError`` if one of the first ``count`` rows of a result is not finite.
 
-    The message names those of the ``given`` arguments that are likely to be the cause.
+    The message names the arguments whose values are unusually large or small, or all arguments.
     """
-    rows = {what: first_not_finite(array, count) for what, array in results.items()}
-    where = [f"the {what} of ball {row}" for what, row in rows.items() if row is not None]
-    if not where:
+    rows = {name: first_not_finite(array, count) for name, array in results.items()}
+    failures = [f"the {name} of ball {row}" for name, row in rows.items() if row is not None]
+    if not failures:
         return
-    least, most = _USUAL[kind.dtype]
-    sizes = {name: np.abs(real_array(name, value)) for name, value in given.items() if value is not None}
+    least, most = _USUAL[dtype]
+    sizes = {name: np.abs(real_array(name, value)) for name, value in arguments.items() if value is not None}
     unusual = [name for name, size in sizes.items() if ((size > 0.0) & ~((size > least) & (size < most))).any()]
-    raise InputError(f"{', '.join(unusual or sizes)}: {where[0]} is not finite {hint(kind.dtype)}")
+    raise InputError(f"{', '.join(unusual or sizes)}: {failures[0]} is not finite {hint(dtype)}")

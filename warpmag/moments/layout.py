@@ -1,6 +1,8 @@
-"""What each moment of a system is: its world and its body, and what it is made of."""
+"""World, body and material of each moment of a system."""
 
+import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,16 +17,16 @@ from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host
 
 @dataclass(frozen=True)
 class MomentLayout:
-    """What each moment is, NumPy arrays of shape [n].
+    """Place of each moment in the system: NumPy arrays of shape [n].
 
     Attributes:
-        radii: Radius of its ball [m].
-        worlds: Its world.
-        permanent: Whether it is permanent.
-        bodies: Its body.
-        movable: Whether the force on it is wanted.
-        lone: Whether it is an inducible ball, its body's only moment, which is parallel to the field that turns it.
-        alone: Whether it is its body's only moment.
+        radii: Radius of the moment's ball [m].
+        worlds: World of the moment.
+        permanent: True for a permanent moment.
+        bodies: Body of the moment.
+        movable: True if the force on the moment is computed.
+        single: True if the body has no other moment.
+        aligned: True for an inducible ball of a single moment, which is parallel to the field, so that its torque is 0.
     """
 
     radii: np.ndarray
@@ -32,41 +34,41 @@ class MomentLayout:
     permanent: np.ndarray
     bodies: np.ndarray
     movable: np.ndarray
-    lone: np.ndarray
-    alone: np.ndarray
+    single: np.ndarray
+    aligned: np.ndarray
 
     @property
     def balls(self) -> np.ndarray:
-        """Whether it is an inducible ball of some size, its body's only moment."""
-        return self.lone & (self.radii > 0.0)
+        """True for the aligned moments of positive radius, shape [n]."""
+        return self.aligned & (self.radii > 0.0)
 
     def ranges(self) -> list[tuple[int, int, int]]:
-        """For each world its first moment, its first permanent one, and the end."""
+        """Return (first moment, first permanent moment, end) of each world."""
         edges = self._edges()
         permanent = np.concatenate([[0], np.cumsum(self.permanent)])[edges]
         return list(
             zip(edges[:-1].tolist(), (edges[1:] - np.diff(permanent)).tolist(), edges[1:].tolist(), strict=True)
         )
 
-    def runs(self, wanted: np.ndarray) -> list[tuple[int, int, int, int]]:
-        """For each run of ``wanted`` moments in one world its first moment and its end, and those of the world."""
+    def runs(self, selected: np.ndarray) -> list[tuple[int, int, int, int]]:
+        """Return (first, end, first of the world, end of the world) of each run of selected moments in one world."""
         edges = self._edges()
-        inside = np.ones(len(wanted) + 1, bool)  # whether a moment and the one before are of one world
-        inside[edges] = False
-        padded = np.concatenate([[False], wanted, [False]])
-        first = np.flatnonzero(wanted & ~(padded[:-2] & inside[:-1]))
-        last = np.flatnonzero(wanted & ~(padded[2:] & inside[1:])) + 1
+        continues = np.ones(len(selected) + 1, bool)  # False where a world begins
+        continues[edges] = False
+        padded = np.concatenate([[False], selected, [False]])
+        first = np.flatnonzero(selected & ~(padded[:-2] & continues[:-1]))
+        last = np.flatnonzero(selected & ~(padded[2:] & continues[1:])) + 1
         world = self.worlds[first]
         columns = (first, last, edges[world], edges[world + 1])
         return list(zip(*(column.tolist() for column in columns), strict=True))
 
     def _edges(self) -> np.ndarray:
-        """First moment of each world, and the end of the last."""
+        """Return the first moment of each world, and the end of the last world."""
         return np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))
 
 
 def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayout:
-    """Layout of moments, of which all but the radii may be None; see :class:`MomentSystem`."""
+    """Return the layout of moments; all arguments but the radii may be None, see :class:`MomentSystem`."""
     radii = host_radii("radii", radii, dtype)
     if radii.ndim != 1:
         raise InputError(shape_message("radii", "[n]", radii))
@@ -89,87 +91,102 @@ def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayou
         )
     check_bodies("bodies: numbers too large", int(bodies.max(initial=-1)) + 1, dtype)
     _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
-    alone = size[body] == 1
-    return MomentLayout(radii, worlds, permanent, bodies, movable, ~permanent & alone, alone)
-
-
-def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
-    """Number of each moment's curve for the kernels, shape [n], and the measured ones among them."""
-    each = isinstance(curve, (tuple, list)) and len(curve) == n
-    measured: dict[MagnetizationCurve, int] = {}
-    known: dict[int, int] = {}  # by identity, since moments of a body share a curve
-
-    def number(one) -> int:
-        if isinstance(one, MagnetizationCurve):
-            return measured.setdefault(one, FIRST_TABLE + len(measured))
-        if one == LINEAR_CURVE:
-            return LINEAR
-        check_token("curve", one, tuple(CURVE_IDS))
-        return CURVE_IDS[one]
-
-    for one in curve if each else (curve,):
-        if id(one) not in known:
-            known[id(one)] = number(one)
-    ids = [known[id(one)] for one in curve] if each else known[id(curve)]
-    return np.array(np.broadcast_to(ids, n), np.int32), list(measured)
-
-
-def change_material(material: CurveParameters, which, saturation, susceptibility, dtype):
-    """Change saturation [A/m] and susceptibility of some moments in place; see :meth:`MomentSystem.set_material`."""
-    host_positive("saturation", saturation, len(which), dtype)
-    host_positive("susceptibility", susceptibility, len(which), dtype, infinite=True)
-    slope = 3.0 / (1.0 + 3.0 / susceptibility)
-    for array, values in ((material.saturation, saturation), (material.slope, slope)):
-        whole = array.numpy().copy()
-        whole[which] = values
-        array.assign(whole)
+    single = size[body] == 1
+    return MomentLayout(radii, worlds, permanent, bodies, movable, single, ~permanent & single)
 
 
 def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
-    """The same layout, in which a body that has cells is no ball, even if it has only one."""
+    """Return the layout in which the moments of ``couplings`` are cells: not aligned, even if a body has only one."""
     cells = np.zeros(len(layout.radii), bool)
     for first, coupling in couplings:
         cells[first : first + len(coupling.start) - 1] = True
-    return replace(layout, lone=layout.lone & ~cells)
+    return replace(layout, aligned=layout.aligned & ~cells)
 
 
-def make_material(permanent, saturation, susceptibility, curve, dtype, device) -> tuple[CurveParameters, np.ndarray]:
-    """Make the material of all moments.
+@dataclass(frozen=True)
+class Material:
+    """Magnetic material of n moments. The values of permanent moments are ignored.
 
-    Args:
-        permanent: Whether a moment is permanent, shape [n].
-        saturation: Saturation magnetization [A/m], scalar or [n].
-        susceptibility: Susceptibility [dimensionless], scalar or [n].
-        curve: Curve of all, or a list of n; a measured one has its own saturation and susceptibility.
-        dtype: Warp's float32 or float64.
-        device: Warp device.
-
-    Returns:
-        What kernels want, and the susceptibility of each moment, 1 where it is permanent, shape [n].
-
-    Raises:
-        InputError: A value is out of range, or a curve unknown.
+    Attributes:
+        saturation: Saturation magnetization Ms [A/m], scalar or [n].
+        susceptibility: Susceptibility [dimensionless], scalar or [n]; may be infinite.
+        curve: Magnetization curve: one of ``magnets.CURVES``, or a measured ``MagnetizationCurve``, which has its own
+            saturation and susceptibility. A tuple or list gives each moment its own curve. ``magnets.LINEAR_CURVE`` is
+            the response of a permanent magnet of recoil permeability 1 + χ.
     """
-    n = len(permanent)
-    ids, measured = _curve_ids(curve, n)
-    saturation = np.where(permanent, 1.0, host_scalars("saturation", saturation, n))
-    susceptibility = np.where(permanent, 1.0, host_scalars("susceptibility", susceptibility, n, infinite=True))
-    for number, one in enumerate(measured):
-        of_table = (ids == FIRST_TABLE + number) & ~permanent
-        saturation[of_table], susceptibility[of_table] = one.saturation, one.susceptibility
-    host_positive("saturation", saturation, n, dtype)
-    host_positive("susceptibility", susceptibility, n, dtype, infinite=True)
 
-    def put(values, kind):
-        return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=kind, device=device)
+    saturation: Any = 1.0
+    susceptibility: Any = math.inf
+    curve: Any = "tanh"
 
-    found = np.unique(ids[~permanent])
-    material = CurveParameters(
-        inducible=put((~permanent).astype(np.int32), wp.int32),
-        saturation=put(saturation, dtype),
-        slope=put(3.0 / (1.0 + 3.0 / susceptibility), dtype),
-        curve=put(ids, wp.int32),
-        common_curve=int(found[0]) if len(found) == 1 else MIXED,
-        tables=curve_tables(measured, dtype, device),
-    )
-    return material, susceptibility
+    def parameters(self, permanent: np.ndarray, dtype, device) -> tuple[CurveParameters, np.ndarray]:
+        """Return the material for kernels, and each moment's susceptibility, which is 1 for permanent ones, shape [n].
+
+        Args:
+            permanent: True for a permanent moment, shape [n].
+            dtype: Warp scalar type.
+            device: Warp device.
+
+        Raises:
+            InputError: A value is out of range, or a curve unknown.
+        """
+        n = len(permanent)
+        ids, measured = _curve_ids(self.curve, n)
+        saturation = np.where(permanent, 1.0, host_scalars("saturation", self.saturation, n))
+        susceptibility = host_scalars("susceptibility", self.susceptibility, n, infinite=True)
+        susceptibility = np.where(permanent, 1.0, susceptibility)
+        for number, curve in enumerate(measured):
+            rows = (ids == FIRST_TABLE + number) & ~permanent
+            saturation[rows], susceptibility[rows] = curve.saturation, curve.susceptibility
+        host_positive("saturation", saturation, n, dtype)
+        host_positive("susceptibility", susceptibility, n, dtype, infinite=True)
+
+        def upload(values, warp_type):
+            return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=warp_type, device=device)
+
+        used = np.unique(ids[~permanent])
+        parameters = CurveParameters(
+            inducible=upload((~permanent).astype(np.int32), wp.int32),
+            saturation=upload(saturation, dtype),
+            slope=upload(_slope(susceptibility), dtype),
+            curve=upload(ids, wp.int32),
+            common_curve=int(used[0]) if len(used) == 1 else MIXED,
+            tables=curve_tables(measured, dtype, device),
+        )
+        return parameters, susceptibility
+
+
+def change_material(parameters: CurveParameters, moments, saturation, susceptibility, dtype):
+    """Change saturation [A/m] and susceptibility of some moments in place; see :meth:`MomentSystem.set_material`."""
+    host_positive("saturation", saturation, len(moments), dtype)
+    host_positive("susceptibility", susceptibility, len(moments), dtype, infinite=True)
+    for array, values in ((parameters.saturation, saturation), (parameters.slope, _slope(susceptibility))):
+        changed = array.numpy().copy()
+        changed[moments] = values
+        array.assign(changed)
+
+
+def _slope(susceptibility):
+    """Return the initial slope M/H of a ball in its applied field, 3χ/(3 + χ)."""
+    return 3.0 / (1.0 + 3.0 / susceptibility)
+
+
+def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
+    """Return the kernels' number of each moment's curve, shape [n], and the list of measured curves."""
+    each = isinstance(curve, (tuple, list)) and len(curve) == n
+    measured: dict[MagnetizationCurve, int] = {}
+    known: dict[int, int] = {}  # by identity, because the moments of a body share a curve
+
+    def number(curve) -> int:
+        if isinstance(curve, MagnetizationCurve):
+            return measured.setdefault(curve, FIRST_TABLE + len(measured))
+        if curve == LINEAR_CURVE:
+            return LINEAR
+        check_token("curve", curve, tuple(CURVE_IDS))
+        return CURVE_IDS[curve]
+
+    for item in curve if each else (curve,):
+        if id(item) not in known:
+            known[id(item)] = number(item)
+    ids = [known[id(item)] for item in curve] if each else known[id(curve)]
+    return np.array(np.broadcast_to(ids, n), np.int32), list(measured)

@@ -1,6 +1,6 @@
-"""Sums over pairs for one-shot calls on arrays: on a CPU what a call allocates and records serves the next one like it.
+"""Sums over pairs for calls on arrays, with buffers and recorded launches kept for the next call of the same shape.
 
-To make all of that afresh takes a millisecond, as long as a core sums two thousand moments.
+They are kept on a CPU only. Making them takes a millisecond, in which a core sums the field of two thousand moments.
 """
 
 import os
@@ -18,27 +18,27 @@ from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 from warpmag.moments.arrays import vec3_type
 from warpmag.moments.fmm import FastSums
-from warpmag.moments.ranks import ranks
+from warpmag.moments.ranks import current_ranks
 
 _MOST_KEPT, _MOST_MOMENTS_KEPT = 4, 40_000
-"""Sums that are kept, and the most moments and targets of one: half a kilobyte each."""
+"""Number of sums that are kept, and the largest number of moments and targets of one; each takes half a kilobyte."""
 _kept: "OrderedDict[SumsShape, PairSums]" = OrderedDict()
 
 
 @dataclass(frozen=True)
 class SumsShape:
-    """What sums are made for.
+    """Shape and options of sums, by which they are kept.
 
     Attributes:
-        quantity: What is summed, ``FIELD`` or ``WRENCH``.
-        device: Its alias in Warp.
+        quantity: Summed quantity, ``FIELD`` or ``WRENCH``.
+        device: Alias of the Warp device.
         dtype: Warp scalar type.
         count: Number of moments.
-        radius: Their largest radius [m].
+        radius: Largest radius of the moments [m].
         target_count: Number of targets; None means the moments themselves.
         target_radius: Largest radius of the targets [m].
-        reference: Whether the plain loop is to be used.
-        smoothing: Length [m] of the paper's smoothing.
+        reference: True for the plain loop.
+        smoothing: Smoothing length [m] of Kim and Han 2022, section 5.
     """
 
     quantity: Quantity
@@ -53,18 +53,18 @@ class SumsShape:
 
 
 class PairSums:
-    """Buffers and launches of sums over all pairs of targets and moments.
+    """Buffers and launches of sums over all pairs of a target and a moment.
 
     Attributes:
-        moments: The packed moments.
-        targets: The packed targets, the same object if they are the moments.
-        base: Field [A/m] to start from, or that turns moments, too, shape [targets]; zero.
+        moments: Packed moments.
+        targets: Packed targets; the same object as ``moments`` if these are the targets.
+        base: Field [A/m] that is added to the sums, or that also exerts torques, shape [targets]; 0 at first.
         out: Field [A/m] or forces [N], shape [targets].
-        torques: Torques [N·m], with ``WRENCH``, shape [targets].
+        torques: Torques [N·m], shape [targets]; None for ``FIELD``.
     """
 
     def __init__(self, shape: SumsShape):
-        """Allocate; radii are zero."""
+        """Allocate all buffers; radii are 0."""
         self.threads = _threads()
 
         def packed(count, radius):
@@ -82,15 +82,15 @@ class PairSums:
         self._turned, self._shape, self._all_pairs = turned, shape, None
 
     def launch(self, fmm_rtol: float | None = None) -> None:
-        """Launch the sums of what is packed; the plain loop finds overlapping pairs by itself.
+        """Launch the sums of the packed moments at the packed targets.
 
         Args:
-            fmm_rtol: Relative error to sum by the fast multipole method; None means over all pairs.
+            fmm_rtol: Relative error of the fast multipole method; None means sums over all pairs.
         """
         others = None if self.targets is self.moments else self.targets
-        if not self._shape.reference:
+        if not self._shape.reference:  # the plain loop finds overlapping pairs itself
             self.targets.find_overlaps(None if others is None else self.moments)
-        if fmm_rtol is not None:  # its cells are of these places
+        if fmm_rtol is not None:  # the boxes depend on the positions, so that nothing is kept
             fast = FastSums(self.moments, fmm_rtol, others)
             fast.build()
             self._evaluation(fast.sums(self._shape.quantity)).launch()
@@ -104,14 +104,14 @@ class PairSums:
         return PairEvaluation(
             shape.quantity, [(0, count, 0, shape.count)], self.targets, self.moments, self.base, self.out,
             turned=self._turned, torques=self.torques, form=REFERENCE if shape.reference else None,
-            smoothing=shape.smoothing, sums=sums, ranks=ranks(),
+            smoothing=shape.smoothing, sums=sums, ranks=current_ranks(),
         )  # fmt: skip
 
 
 @contextmanager
 def pair_sums(shape: SumsShape) -> Iterator[PairSums]:
-    """Sums of a shape for a call; results are to be copied, unless it fails the next call overwrites them."""
-    sums = _kept.pop(shape, None)  # so that calls of several threads never share one
+    """Yield sums of a shape for one call, which must copy the results before the next call overwrites them."""
+    sums = _kept.pop(shape, None)  # removed, so that threads never share sums
     if sums is None or sums.threads != _threads():
         sums = PairSums(shape)
     yield sums
@@ -122,9 +122,9 @@ def pair_sums(shape: SumsShape) -> Iterator[PairSums]:
 
 
 def _threads() -> int:
-    """Most threads that launches recorded now may use."""
+    """Return the largest number of threads that launches recorded now may use."""
     return threads_for(MOST_THREADS, 1)
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_kept.clear)  # the threads that launches were recorded with
+    os.register_at_fork(after_in_child=_kept.clear)  # a child lacks the threads of the recorded launches

@@ -1,4 +1,4 @@
-"""Field of a system's moments at points, again and again."""
+"""Field of a system's moments at points, in buffers allocated once."""
 
 from itertools import pairwise
 
@@ -17,31 +17,31 @@ from warpmag.moments.arrays import shape_message, vec3_type
 from warpmag.moments.system import MomentSystem
 
 _NO_BODY = -2
-"""Body label of points, which no moment has, and nothing that fills up packed rows either."""
+"""Body label of points: neither a moment nor the padding of packed rows has it."""
 
 
 class FieldProbe:
-    """Field and flux density of a system's moments at points of its worlds, inside bodies and out.
+    """Field and flux density of a system's moments at points, inside and outside of bodies.
 
-    :meth:`measure` only launches kernels, and can be captured in a graph.
+    :meth:`measure` only launches kernels, so that a graph can capture it.
 
     Args:
         system: The moments.
         count: Number of points p.
-        worlds: World of each point, counted as the system's, shape [p]; None means the first for all. Points of one
-            world are best together.
-        gradients: Whether gradients are wanted, which cost three more sums over pairs.
+        worlds: World of each point, shape [p]; None means the first for all. Points of one world should be adjacent,
+            because each run of them is summed separately.
+        gradients: True to compute gradients, which takes three more sums over pairs.
 
     Raises:
-        InputError: ``worlds`` is of another shape, or the system has no such world.
+        InputError: ``worlds`` has a wrong shape, or the system lacks a world.
 
     Attributes:
         points: The points [m], shape [p]; written by the caller before :meth:`measure`.
-        h: Field H [A/m], shape [p]: the external field, that of sources (``kernels.applied``), and that of all moments
-            (Kim and Han 2022, Eq. 1); inside a ball that of a uniformly magnetized one.
+        h: Field H [A/m], shape [p]: the sum of the external field, the field of sources (``kernels.applied``), and the
+            field of all moments (Kim and Han 2022, Eq. 1). A moment is a uniformly magnetized ball inside its radius.
         b: Flux density B = μ0 (H + M) [T], shape [p].
-        gradient: Rows ∇H_x, ∇H_y, ∇H_z of the field's gradient [A/m²], shape [p], matrices, that of sources included;
-            the external field, which is uniform, has none. None if it is not wanted.
+        gradient: Gradient of the field [A/m²], matrices with rows ∇H_x, ∇H_y, ∇H_z, shape [p]. It includes sources, but
+            not the external field, which is uniform. None without ``gradients``.
     """
 
     def __init__(
@@ -63,16 +63,16 @@ class FieldProbe:
         self._targets = PackedMoments(radii, largest_radius=0.0, labels=np.full(count, _NO_BODY), groups=worlds)
         runs = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1))
         segments = [(begin, end, *ranges[worlds[begin]][::2]) for begin, end in pairwise(runs)]
-        # of its own, since a search by others disturbs the system's lists
-        self._sources = sources = PackedMoments(
+        # packed separately, because a search from the points would overwrite the system's neighbor lists
+        self._moments = moments = PackedMoments(
             system.radii, largest_radius=float(system.radii.numpy().max(initial=0.0)), groups=system.worlds
         )
-        base, self._applied = self._base, None
+        base, self._source_field = self._base, None
         if system.sources is not None:
-            self._applied = AppliedField(system.sources, self._targets, worlds, self._base, points=True)
-            base = self._applied.field
-        self._field = PairEvaluation(Quantity.FIELD, segments, self._targets, sources, base, self.h)
-        self._nothing = wp.zeros(count, dtype=vec3, device=device)
+            self._source_field = AppliedField(system.sources, self._targets, worlds, self._base, points=True)
+            base = self._source_field.field
+        self._field = PairEvaluation(Quantity.FIELD, segments, self._targets, moments, base, self.h)
+        self._zeros = wp.zeros(count, dtype=vec3, device=device)
         self.gradient = None
         self._gradients: list[PairEvaluation] = []
         if gradients:
@@ -81,7 +81,7 @@ class FieldProbe:
             self._gradients = [self._derivative(axis, segments) for axis in range(3)]
 
     def _derivative(self, axis: int, segments) -> PairEvaluation:
-        """Derivative of H along an axis: the force μ0 (e·∇)H on a moment e of 1/μ0 along it."""
+        """Return the derivative of H along an axis: the force μ0 (e·∇)H on a moment e of 1/μ0 along the axis."""
         count = self._targets.count
         unit = np.zeros((3, count))
         unit[axis] = 1.0 / MU0
@@ -89,30 +89,30 @@ class FieldProbe:
             Quantity.FORCE,
             segments,
             self._targets,
-            self._sources,
+            self._moments,
             self._base,
             self._rows[axis],
             effective=wp.array(unit, dtype=self._system.dtype, device=self._system.device),
             turned=wp.zeros(count, dtype=wp.int32, device=self._system.device),
-            torques=self._nothing,
+            torques=self._zeros,
         )
 
     def measure(self) -> None:
-        """Launch the measurement at :attr:`points`, of the moments as the last solve left them."""
+        """Launch the computation of the fields at :attr:`points`, from the moments of the last solve."""
         system, targets = self._system, self._targets
         if targets.count == 0:
             return
-        targets.pack(self.points, self._nothing)
-        self._sources.pack(system.positions, system.moments)
-        targets.find_overlaps(self._sources)
+        targets.pack(self.points, self._zeros)
+        self._moments.pack(system.positions, system.moments)
+        targets.find_overlaps(self._moments)
         launch_field_of_worlds(system.external_field, self._first, self._base)
-        if self._applied is not None:
-            self._applied.launch()
+        if self._source_field is not None:
+            self._source_field.launch()
         self._field.launch()
-        launch_flux_density(self.points, targets, self._sources, self.h, self.b)
+        launch_flux_density(self.points, targets, self._moments, self.h, self.b)
         for evaluation in self._gradients:
             evaluation.launch()
         if self._gradients:
             launch_store_gradients(self._rows, self.gradient)
-        if self._applied is not None:
-            self._applied.add_to_probe(self.b, self.gradient)
+        if self._source_field is not None:
+            self._source_field.add_to_probe(self.b, self.gradient)

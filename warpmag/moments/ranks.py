@@ -1,15 +1,15 @@
-"""Ranks: processes that ``mpirun`` starts, and that share out the sums over pairs of one simulation.
+"""Ranks: processes started by ``mpirun`` that share the sums over pairs of one simulation.
 
-Each rank has all moments, and on a host with GPUs one of these. It sums its part of the work list of all pairs, and
-gets what the others summed; all that is small it does as they do. The work list is that of one process, so that the
-results are its bits. A process by itself has no ranks, and imports nothing for them.
+Each rank holds all moments, and on a host with GPUs uses one of them. It computes its share of the list of pairs and
+then receives the sums of the other ranks. Everything small is computed by every rank. The list of pairs is that of a
+single process, so that results are bitwise the same. A single process imports nothing for this.
 
-A rank stores sums where the others have zeros. Bits are merged, not numbers: to add zeros as integers keeps a number as
-it is, whatever the order. ``mpi4py`` does that on CPUs and across hosts, and between GPUs NVIDIA's NCCL, whose library
-is called directly: it is captured in a CUDA graph with the kernels before and after.
+Sums are merged as integers: each rank stores its own sums and zeros elsewhere, and adding zeros to the bits of a number
+keeps them in any order. ``mpi4py`` merges arrays of CPUs and across hosts. NVIDIA's NCCL merges arrays of GPUs; its
+library is called directly, so that a CUDA graph captures it between kernels.
 
-Whatever may go wrong on one rank alone is exchanged before anybody waits for sums: the arguments of calls, what the
-first rank does for all, and what a sweep ends with. All then raise the same line.
+An error of one rank is exchanged before any rank waits for sums: for the arguments of calls, for work that the first
+rank does for all, and at the end of a sweep. All ranks then raise the same message.
 """
 
 import ctypes
@@ -33,22 +33,21 @@ from warpmag.declarations.checks import check_count
 from warpmag.errors import InputError, SimulationError, extra, one_line
 
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")
-"""What launchers tell their processes: how many they are."""
+"""Environment variables in which launchers give the number of processes."""
 _GRACE = 5.0
-"""Time [s] in which ranks that fail alike all do."""
+"""Time [s] within which all ranks fail that fail for the same reason."""
 _ID_BYTES, _INT32, _SUM = 128, 2, 0
-"""Size of NCCL's unique identifier, and its numbers of a type and an operation (``nccl.h``)."""
-
+"""NCCL's size of a unique identifier [bytes], type ``ncclInt32`` and operation ``ncclSum`` (``nccl.h``)."""
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_alone = 0
-"""In how many :func:`alone` this process is."""
+_disabled = 0
+"""Number of :func:`without_ranks` contexts that are open."""
 
 
 @cache
-def launched() -> "Ranks | None":
-    """The ranks that this process is one of; None where it is by itself.
+def launched_ranks() -> "Ranks | None":
+    """Return the ranks that a launcher started, or None in a single process.
 
     Raises:
         InputError: A launcher has started several processes, but ``mpi4py`` is not installed.
@@ -62,25 +61,25 @@ def launched() -> "Ranks | None":
     return Ranks(MPI) if MPI.COMM_WORLD.size > 1 else None
 
 
-def ranks() -> "Ranks | None":
-    """The ranks with which this process shares out what it is told to compute now; None where it does all itself."""
-    return None if _alone else launched()
+def current_ranks() -> "Ranks | None":
+    """Return the ranks that share the sums of objects made now, or None if this process computes them all."""
+    return None if _disabled else launched_ranks()
 
 
 @contextmanager
-def alone() -> Iterator[None]:
-    """Share out nothing; what is made meanwhile never does."""
-    global _alone  # of all threads: one that shared would wait for ranks that do not
-    _alone += 1
+def without_ranks() -> Iterator[None]:
+    """Let this process compute everything itself, also later for objects made in this context."""
+    global _disabled  # for all threads, because a thread that shared sums would wait for the other ranks
+    _disabled += 1
     try:
         yield
     finally:
-        _alone -= 1
+        _disabled -= 1
 
 
 @contextmanager
-def agreed(all_ranks: "Ranks | None") -> Iterator[None]:
-    """Have all ranks raise what one raises meanwhile; they may exchange, but merge nothing."""
+def errors_on_all_ranks(all_ranks: "Ranks | None") -> Iterator[None]:
+    """Raise an error of one rank on all ranks. The ranks may exchange values in this context, but not merge arrays."""
     if all_ranks is None:
         yield
         return
@@ -93,86 +92,93 @@ def agreed(all_ranks: "Ranks | None") -> Iterator[None]:
     all_ranks.exchange(None)
 
 
-def is_first(all_ranks: "Ranks | None") -> bool:
-    """Whether this process is the one that writes and prints: the first rank, or one by itself."""
+def is_first_rank(all_ranks: "Ranks | None") -> bool:
+    """Return True on the rank that writes files and prints: the first one, or a single process."""
     return all_ranks is None or all_ranks.rank == 0
 
 
-def by_first(do: Callable[[], Any], all_ranks: "Ranks | None") -> Any:
-    """Return what ``do`` returns; of several ranks the first does it for all, and all raise what it raises."""
+def on_first_rank(function: Callable[[], Any], all_ranks: "Ranks | None") -> Any:
+    """Call a function on the first rank only; return its result, or raise its error, on all ranks."""
     if all_ranks is None:
-        return do()
-    with agreed(all_ranks):
-        return all_ranks.exchange(do() if is_first(all_ranks) else None)[0]
+        return function()
+    with errors_on_all_ranks(all_ranks):
+        return all_ranks.exchange(function() if is_first_rank(all_ranks) else None)[0]
 
 
-def alike(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Let ranks compare the arguments before they call a function, which then fails on all or none."""
+def compare_arguments(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a function to raise ``InputError`` on all ranks if its arguments differ between ranks."""
     signature = inspect.signature(function)
 
     @wraps(function)
     def compared(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        if (all_ranks := ranks()) is not None:
-            given = signature.bind(*args, **kwargs).arguments
-            given.pop("device", None)  # each has its own
-            all_ranks.check_alike(given)
+        if (all_ranks := current_ranks()) is not None:
+            arguments = signature.bind(*args, **kwargs).arguments
+            arguments.pop("device", None)  # each rank has its own
+            all_ranks.check_equal(arguments)
         return function(*args, **kwargs)
 
     return compared
 
 
 def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -> list[_R]:
-    """Simulate the worlds of a sweep, some of them together; ranks of ``mpirun`` share them out.
+    """Simulate many worlds in groups, which the ranks of ``mpirun`` share.
 
-    Each rank simulates its worlds by itself, and gets what the others found at the end. Which worlds are together does
-    not depend on the number of ranks: worlds of one model may have their substeps and the form of their sums in common,
-    so that results have the bits of one process on any device.
+    Each rank simulates its groups on its own. At the end all ranks receive all results. The groups do not depend on the
+    number of ranks. Worlds of one model may share their substeps and the form of their sums, so that results are
+    bitwise those of a single process on any device.
 
     Args:
-        simulate: Called with the numbers of worlds that it is to simulate together; what it returns goes to all ranks,
-            and has to be what :mod:`pickle` takes, such as NumPy arrays.
+        simulate: Function of the numbers of the worlds of a group. Its result is sent to all ranks and must be
+            picklable, such as NumPy arrays.
         world_count: Number of worlds.
-        together: Worlds of a call, of the last one fewer; rank r of R has every R-th call from the r-th on.
+        together: Worlds of a group; the last group may have fewer. Rank r of R simulates every R-th group from the
+            r-th on.
 
     Returns:
-        What each call returned, in the order of worlds; the same on all ranks.
+        The result of each group, in the order of worlds; the same on all ranks.
 
     Raises:
-        InputError: A number is none, or differs between ranks. What ``simulate`` raises on one rank, all raise.
+        InputError: ``world_count`` or ``together`` is not a whole number from 1 on, or differs between ranks. An error
+            of ``simulate`` on one rank is raised on all ranks.
+
+    Example:
+        >>> import warpmag
+        >>> warpmag.sweep(lambda worlds: [world**2 for world in worlds], 5, together=2)
+        [[0, 1], [4, 9], [16]]
     """
     check_count("world_count", world_count)
     check_count("together", together)
-    calls = [range(first, min(first + together, world_count)) for first in range(0, world_count, together)]
-    all_ranks = ranks()
+    groups = [range(first, min(first + together, world_count)) for first in range(0, world_count, together)]
+    all_ranks = current_ranks()
     if all_ranks is None:
-        return [simulate(worlds) for worlds in calls]
-    all_ranks.check_alike({"world_count": world_count, "together": together})
-    with agreed(all_ranks):
-        found = []
-        with alone():
-            for worlds in calls[all_ranks.rank :: all_ranks.size]:
+        return [simulate(worlds) for worlds in groups]
+    all_ranks.check_equal({"world_count": world_count, "together": together})
+    with errors_on_all_ranks(all_ranks):
+        own = []
+        with without_ranks():
+            for worlds in groups[all_ranks.rank :: all_ranks.size]:
                 if all_ranks.has_failed():
                     break
-                found.append(pickle.dumps(simulate(worlds)))  # here, so that what cannot be is told to all
-        each = all_ranks.exchange(found)
-    return [pickle.loads(each[call % all_ranks.size][call // all_ranks.size]) for call in range(len(calls))]
+                own.append(pickle.dumps(simulate(worlds)))  # here, so that all ranks raise an error of pickling
+        results = all_ranks.exchange(own)
+    return [pickle.loads(results[group % all_ranks.size][group // all_ranks.size]) for group in range(len(groups))]
 
 
 def _checksum(value: Any, before: int = 0) -> int:
-    """Checksum of an argument that is the same in all processes that were given the same; of objects by their type."""
+    """Return a checksum of an argument that is equal in all processes for equal values; objects count by their type."""
     if hasattr(value, "numpy"):
         value = value.numpy()
     if isinstance(value, (list, tuple)):
         try:
             array = np.asarray(value)
-        except Exception:  # rows of different lengths, or what fails to become an array
+        except Exception:  # rows of different lengths, or an object that raises
             array = np.zeros((), object)
         value = value if array.dtype.hasobject else array
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = [getattr(value, one.name) for one in dataclasses.fields(value)]
+        value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, (list, tuple)):
-        for one in value:
-            before = _checksum(one, before)
+        for item in value:
+            before = _checksum(item, before)
         return zlib.crc32(b"[]", before)
     if isinstance(value, (np.ndarray, np.generic)) and not value.dtype.hasobject:
         data = np.ascontiguousarray(value)
@@ -183,16 +189,16 @@ def _checksum(value: Any, before: int = 0) -> int:
 
 
 class Ranks:
-    """The processes of one program.
+    """Processes of one program that MPI connects.
 
     Attributes:
-        size: How many they are.
-        rank: Which of them this is, from 0.
-        local_rank: The same among those of this host.
+        size: Number of processes.
+        rank: Number of this process, from 0.
+        local_rank: Number of this process among those of its host, from 0.
     """
 
     def __init__(self, mpi):
-        """Join those that the launcher started; ``mpi`` is the module ``mpi4py.MPI``."""
+        """Join the processes that the launcher started; ``mpi`` is the module ``mpi4py.MPI``."""
         self._mpi, self._all = mpi, mpi.COMM_WORLD
         self.size, self.rank = self._all.size, self._all.rank
         host = self._all.Split_type(mpi.COMM_TYPE_SHARED)
@@ -201,27 +207,27 @@ class Ranks:
         self._show, sys.excepthook = sys.excepthook, self._end
 
     def share(self, count: int) -> tuple[int, int]:
-        """Begin and end of this rank's part of ``count`` pieces of work."""
+        """Return begin and end of this rank's share of ``count`` pieces of work."""
         return count * self.rank // self.size, count * (self.rank + 1) // self.size
 
     def merge(self, array) -> None:
-        """Give each rank what any of them has in a contiguous Warp array, where the others have zeros.
+        """Add a contiguous Warp array over all ranks, of which one at most has bits that are not 0 in each word.
 
         Raises:
-            InputError: A graph of a CPU is being captured, which would not do this when it is launched.
+            InputError: A graph is being captured on a CPU, which cannot contain this.
         """
         if array.device.is_cuda:
             self._gpus = self._gpus or _Nccl(self, array.device)
             self._gpus.merge(array)
             return
         if array.device.is_capturing:
-            raise InputError("device: what ranks exchange is in no graph of a CPU; launch without one")
+            raise InputError("device: a graph of a CPU cannot exchange arrays between ranks; launch without a graph")
         self._all.Allreduce(self._mpi.IN_PLACE, array.numpy().reshape(-1).view(np.int32), self._mpi.SUM)
 
     def exchange(self, value: Any, error: Exception | None = None) -> list:
-        """Return what each rank has; where some have an error instead, all raise that of the first of these."""
+        """Return the values of all ranks; if ranks have an error, all raise the error of the first of them."""
         others = range(self.size) if error is not None else ()
-        told = [self._failures.isend(None, other) for other in others if other != self.rank]
+        notices = [self._failures.isend(None, other) for other in others if other != self.rank]
         kind = type(error) if isinstance(error, (InputError, SimulationError)) else RuntimeError
         text = str(error) if kind is type(error) else f"{type(error).__name__}: {error}"
         each = self._all.allgather((None if error is None else (kind, text), value))
@@ -229,8 +235,8 @@ class Ranks:
         for rank in failed:
             if rank != self.rank:
                 self._failures.recv(source=rank)
-        for request in told:
-            request.wait()
+        for notice in notices:
+            notice.wait()
         if not failed:
             return [value for _, value in each]
         kind, text = each[failed[0]][0]
@@ -241,52 +247,54 @@ class Ranks:
         raise shared from error
 
     def has_failed(self) -> bool:
-        """Whether one of them has an error, and waits to exchange it."""
+        """Return True if another rank waits in :meth:`exchange` with an error."""
         return self._failures.iprobe()
 
-    def check_alike(self, given: dict[str, Any], what: str = "") -> None:
-        """Raise ``InputError`` on all ranks where a value differs between them.
+    def check_equal(self, values: dict[str, Any], prefix: str = "") -> None:
+        """Raise ``InputError`` on all ranks if a value differs between them.
 
         Args:
-            given: Values by the names that the message has for them.
-            what: What the message begins with.
+            values: Values by their names in messages.
+            prefix: Beginning of the message.
         """
-        each = self.exchange({name: _checksum(value) for name, value in given.items()})
+        each = self.exchange({name: _checksum(value) for name, value in values.items()})
         for rank, other in enumerate(each):
             for name in (*each[0], *other):
                 if each[0].get(name) != other.get(name):
-                    told = f"rank {rank} was given another value than rank 0; ranks share out one calculation"
-                    raise InputError(f"{what}{name}: {told}")
+                    reason = (
+                        f"differs between rank {rank} and rank 0; the ranks of one calculation need equal arguments"
+                    )
+                    raise InputError(f"{prefix}{name}: {reason}")
 
-    def fail(self, line: str, code: int, tell) -> None:
-        """Tell of a failure once: by rank 0 where all ranks fail alike, else by this one, and end the others.
+    def fail(self, line: str, code: int, show) -> None:
+        """Report a failure once and end: rank 0 reports if all ranks fail, else this rank, which ends the others.
 
         Args:
-            line: What is wrong.
+            line: Message.
             code: Exit code.
-            tell: Prints a line.
+            show: Function that prints a line.
         """
         everyone, until = self._failures.Ibarrier(), time.monotonic() + _GRACE
         while not everyone.Test():
             if time.monotonic() > until:
-                tell(f"rank {self.rank}: {line}")
+                show(f"rank {self.rank}: {line}")
                 sys.stdout.flush()
                 self._all.Abort(code)
             time.sleep(0.01)
         if self.rank == 0:
-            tell(line)
+            show(line)
 
     def _end(self, kind, error, trace) -> None:
-        """Show what nobody has caught, and end the other ranks, which would wait for this one."""
+        """Show an uncaught exception, and end the other ranks, which would wait for this one."""
         self.fail(str(error), 1, lambda _: self._show(kind, error, trace))
 
 
 class _Nccl:
-    """NVIDIA's library for GPUs of several ranks."""
+    """NVIDIA's library NCCL, which merges arrays on the GPUs of several ranks."""
 
     def __init__(self, others: Ranks, device):
-        """Make a communicator of the Warp devices of all ranks."""
-        import warp as wp  # noqa: PLC0415 - the command asks for ranks before it quiets Warp
+        """Make a communicator of all ranks, each with its Warp device."""
+        import warp as wp  # noqa: PLC0415 - the command reads the ranks before it silences Warp
 
         try:
             self._library = library = ctypes.CDLL(_nccl_path())
@@ -303,11 +311,11 @@ class _Nccl:
             self._check(
                 library.ncclCommInitRank(ctypes.byref(self._communicator), others.size, identifier, others.rank)
             )
-            self.merge(wp.zeros(1, dtype=wp.int32, device=device))  # connects, which a graph cannot
+            self.merge(wp.zeros(1, dtype=wp.int32, device=device))  # connects the ranks, which a graph cannot
             wp.synchronize_device(device)
 
     def merge(self, array) -> None:
-        """Launch :meth:`Ranks.merge` on the device's stream."""
+        """Launch :meth:`Ranks.merge` on the stream of the device."""
         words = ctypes.c_size_t(array.shape[0] * array.strides[0] // 4)
         place, stream = ctypes.c_void_p(array.ptr), ctypes.c_void_p(array.device.stream.cuda_stream)
         with self._current(array.device):
@@ -316,7 +324,7 @@ class _Nccl:
     def _check(self, result: int) -> None:
         if result:
             text = self._library.ncclGetErrorString(result).decode()
-            raise InputError(f"device: NCCL between the ranks' GPUs fails ({text}): has each one of its own?")
+            raise InputError(f"device: NCCL between the ranks' GPUs failed ({text}); each rank needs a GPU of its own")
 
 
 class _Identifier(ctypes.Structure):
@@ -324,7 +332,7 @@ class _Identifier(ctypes.Structure):
 
 
 def _nccl_path() -> str:
-    """The library: of the package ``nvidia-nccl-cu12`` or ``-cu13``, else the system's."""
+    """Return the path of NCCL in the package ``nvidia-nccl-cu12`` or ``-cu13``, or its name in the system."""
     try:
         spec = find_spec("nvidia.nccl")
     except ModuleNotFoundError:

@@ -49,7 +49,7 @@ class BodyEddies:
             if not ball or (one.body >= 0 and bodies.count(one.body) > 1):
                 where = model.shape_label[one.shapes[0]]
                 raise InputError(f"{where}: conductivity: only of a ball of one moment, its body's only magnet")
-        system.conduct(np.repeat(conductivity, moments_of), step)
+        system.set_conductivity(np.repeat(conductivity, moments_of), step)
 
     def gather(self, state: newton.State) -> None:
         """Tell the system how the bodies of ``state`` move."""
@@ -57,5 +57,5 @@ class BodyEddies:
         if system.eddy is None or state.body_qd is None:
             return
         gather_motion(self._moments, self._model, state, system.positions, system.eddy.motion)
-        if system.applied is not None:
-            self._sources.gather_motion(state, system.applied.source_motion)
+        if system.source_interaction is not None:
+            self._sources.gather_motion(state, system.source_interaction.source_motion)

@@ -6,13 +6,21 @@ import numpy as np
 from warpmag.declarations.magnets import LINEAR_CURVE, MagneticSettings
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.kernels.applied.solids import SolidMagnet
-from warpmag.moments.system import MomentSystem
+from warpmag.moments.layout import Material
+from warpmag.moments.system import MomentSystem, SolverSettings
 
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 
 def make_system(
-    model: newton.Model, magnets: list[BodyMagnet], settings: MagneticSettings, *, curve, **others
+    model: newton.Model,
+    magnets: list[BodyMagnet],
+    settings: MagneticSettings,
+    *,
+    curve,
+    sources,
+    method,
+    max_evaluations,
 ) -> tuple[MomentSystem, list[int], list[int]]:
     """Make the system of all moments of some magnets.
 
@@ -21,7 +29,9 @@ def make_system(
         magnets: The magnets, in the order of the system.
         settings: How they are to be solved.
         curve: Magnetization curve of all that are inducible; None means their own.
-        others: More of what :class:`MomentSystem` takes.
+        sources: Coils and field maps, as :class:`MomentSystem` takes them.
+        method: Summation method of :class:`SolverSettings`.
+        max_evaluations: Largest number of field evaluations of a solve.
 
     Returns:
         The system, the bodies of its couplings, and those of its solids.
@@ -52,17 +62,20 @@ def make_system(
         radii=np.concatenate([one.lattice.radii for one in magnets]),
         bodies=body_of,
         movable=moves,
-        saturation=spread([one.saturation for one in made_of]),
-        susceptibility=spread(
-            [one.recoil_permeability - 1.0 if one.recoils else one.susceptibility for one in made_of]
+        material=Material(
+            spread([one.saturation for one in made_of]),
+            spread([one.recoil_permeability - 1.0 if one.recoils else one.susceptibility for one in made_of]),
+            [curve for curve, count in zip(curves, counts, strict=True) for _ in range(count)],
         ),
-        curve=[one for one, count in zip(curves, counts, strict=True) for _ in range(count)],
+        external_field=settings.external_field,
+        settings=SolverSettings(
+            settings.force, settings.dynamics, settings.contact_model, method, settings.rtol, max_evaluations
+        ),
         couplings=[(k, one.lattice.coupling) for k, one in celled],
         solids=[solid for _, solid in solids],
         body_extent=_largest_extent(magnets, body_of, moves),
+        sources=sources,
         device=model.device,
-        **vars(settings),
-        **others,
     )
     return system, [one.body for _, one in celled], [body for body, _ in solids]
 

@@ -29,10 +29,16 @@ from warpmag.kernels.rigid.bodies import (
     set_magnetization,
     sum_moments,
 )
-from warpmag.moments import snapshot
-from warpmag.moments.arrays import Kind, Numbers, farthest_place, host_array
+from warpmag.moments.arrays import (
+    CallContext,
+    Numbers,
+    host_array,
+    largest_coordinate,
+    restore_snapshot,
+    take_snapshot,
+)
 from warpmag.moments.probe import FieldProbe
-from warpmag.moments.ranks import ranks
+from warpmag.moments.ranks import current_ranks
 from warpmag.terminal import collection_paused
 
 
@@ -90,9 +96,9 @@ class Magnetics:
                 felt in several.
         """
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
-        if (all_ranks := ranks()) is not None:
+        if (all_ranks := current_ranks()) is not None:
             more = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "step": step}
-            all_ranks.check_alike(vars(settings) | more | magnetic_arrays(model), "Magnetics: ")
+            all_ranks.check_equal(vars(settings) | more | magnetic_arrays(model), "Magnetics: ")
         settings.check("Magnetics")
         check_positive("Magnetics: step", step)
         if curve is not None:
@@ -102,7 +108,7 @@ class Magnetics:
         self._sources = ModelSources(model, self._worlds)
         self._induced = False
         self.system, celled, solid = make_system(
-            model, self.magnets, settings, applied=self._sources.applied, curve=curve,
+            model, self.magnets, settings, sources=self._sources.applied, curve=curve,
             method=method, max_evaluations=max_evaluations,
         )  # fmt: skip
         self._celled, self._solid_bodies = (
@@ -340,8 +346,8 @@ class Magnetics:
                 raise InputError(f"{name}: must be a Warp array of vec3 on {self._model.device}")
             found = value
         else:
-            kind = Kind(wp.get_device(self._model.device), wp.float32, warp_out=False)
-            found = kind.vectors(name, np.atleast_2d(host_array(name, value)))
+            context = CallContext(wp.get_device(self._model.device), wp.float32, warp_out=False)
+            found = context.vectors(name, np.atleast_2d(host_array(name, value)))
         if len(found) not in counts:
             wanted = " or ".join(f"[{count}, 3]" for count in dict.fromkeys(counts))
             raise InputError(f"{name}: shape must be [3] or {wanted}, got {list(np.shape(value))}")
@@ -360,8 +366,8 @@ class Magnetics:
                 magnets.
         """
         largest = max(float(one.lattice.radii.max()) for one in self.magnets)
-        kind = Kind(self.system.device, self.system.dtype, warp_out=False)
-        points = kind.vectors("points", points, farthest=farthest_place(self.system.dtype, largest))
+        context = CallContext(self.system.device, self.system.dtype, warp_out=False)
+        points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
         probe = FieldProbe(self.system, len(points), worlds=self._numbers_of(worlds, len(points)), gradients=gradients)
         wp.copy(probe.points, points)
         return probe
@@ -437,10 +443,10 @@ class Magnetics:
             Total moment of each magnetic shape in equilibrium at these poses [A·m²], world frame, shape [n, 3].
         """
         carried = self.system.carried()
-        before = snapshot.save(carried)
+        before = take_snapshot(carried)
         self.induce(state)
         moments = self.shape_moments().copy()
-        snapshot.load(carried, before)
+        restore_snapshot(carried, before)
         return moments
 
     def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:

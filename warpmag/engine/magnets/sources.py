@@ -84,7 +84,7 @@ class ModelSources:
     def add_reactions(self, state: newton.State) -> None:
         """Add the forces of the moments on the sources to the forces on their bodies."""
         if self.applied:
-            frames, wrenches = self._system.sources.frames, self._system.applied.wrenches
+            frames, wrenches = self._system.sources.frames, self._system.source_interaction.wrenches
             add_reactions(self._shapes, self._model, state, frames, wrenches)
 
     def set_strength(self, name: str, which: int | str, value) -> None:

@@ -15,7 +15,7 @@ from warpmag.engine.stepping.scene import ImportedScene
 from warpmag.engine.stepping.statistics import Statistics
 from warpmag.engine.stepping.stepper import Stepper
 from warpmag.errors import InputError
-from warpmag.moments.ranks import Ranks, agreed, by_first, is_first
+from warpmag.moments.ranks import Ranks, errors_on_all_ranks, is_first_rank, on_first_rank
 from warpmag.usd import CacheWriter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -74,8 +74,8 @@ class Recorder:
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
         self._ranks, self.written = ranks, None
         self._writer: CacheWriter | _NoWriter = _NoWriter()
-        with agreed(ranks):
-            if is_first(ranks):
+        with errors_on_all_ranks(ranks):
+            if is_first_rank(ranks):
                 self._writer = CacheWriter(
                     scene.stage,
                     output,
@@ -102,7 +102,7 @@ class Recorder:
             InputError: What is there cannot be resumed.
         """
         with _interrupts_held():
-            found = by_first(self._writer.resume, self._ranks)
+            found = on_first_rank(self._writer.resume, self._ranks)
         if found is None or (found.state is None and found.time <= 0.0):
             return False, False  # nothing there, or no more than the first frame
         done, output = round(found.time / step_size), Path(self._output)

@@ -31,7 +31,7 @@ from warpmag.engine.stepping.statistics import Statistics, find_held
 from warpmag.engine.stepping.stepper import Stepper
 from warpmag.errors import InputError, SimulationError
 from warpmag.moments.arrays import resolve_device
-from warpmag.moments.ranks import agreed, ranks
+from warpmag.moments.ranks import current_ranks, errors_on_all_ranks
 from warpmag.terminal import collection_paused
 
 DEFAULT_STEP = 1e-3
@@ -104,11 +104,11 @@ class Simulation:
         check_solver(solver)
         for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
-        self.device, self._ranks = resolve_device(device), ranks()
+        self.device, self._ranks = resolve_device(device), current_ranks()
         graphs &= self._ranks is None  # what merges the sums of ranks is in no graph of a step
         own = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
         how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
-        with agreed(self._ranks):
+        with errors_on_all_ranks(self._ranks):
             builder, settings, own_step = self._open(scene, visuals=visuals, articulations=not SOLVERS[solver].maximal)
             self.step_size = _time_step(step, own_step)
             self.model = self._finalize(builder, solver, scene)
@@ -117,7 +117,7 @@ class Simulation:
             self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
             self._options = self._options_of(settings, solver, **how)
             if self._ranks is not None:
-                self._ranks.check_alike(self._options | {"scene": list(self._stepper.save().values())})
+                self._ranks.check_equal(self._options | {"scene": list(self._stepper.save().values())})
 
     def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
         """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""

@@ -27,7 +27,7 @@ from warpmag.errors import SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
 from warpmag.kernels.rigid.newton_views import view_bodies
-from warpmag.moments import snapshot
+from warpmag.moments.arrays import restore_snapshot, snapshot_views
 
 TRAVEL_LIMIT = 0.25
 """How far a body may glide along another, or forces may pull it, in a substep, in parts of its thickness; see
@@ -293,7 +293,7 @@ class Stepper:
     def save(self) -> dict[str, np.ndarray]:
         """Return all that the next step depends on, on a CPU valid until then; :meth:`look` first."""
         numbers = {"steps": np.array(self.steps), "buffers": self._solver.limits()}
-        return numbers | snapshot.contents(self._carried())
+        return numbers | snapshot_views(self._carried())
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
         """Go on from where :meth:`save` was called, in another run of the same model.
@@ -303,7 +303,7 @@ class Stepper:
         """
         self._solver.set_limits(saved["buffers"])
         self._prepare()
-        snapshot.load(self._carried(), saved)
+        restore_snapshot(self._carried(), saved)
         self.steps = self._reported = int(saved["steps"])
 
     def _carried(self) -> dict[str, wp.array]:
