@@ -264,6 +264,14 @@ def test_results_are_the_callers(device):
     assert np.array_equal(kelvin, before)
 
 
+def test_sources_is_a_deprecated_name(device):
+    dipole = [[0.0, 0.0, 0.05]], [[0.0, 0.0, 1.0]]
+    expected = call("solve_induction", device, permanent=dipole)
+    with pytest.warns(DeprecationWarning, match="sources is deprecated, use permanent"):
+        found = warpmag.solve_induction(**CALLS["solve_induction"], sources=dipole, device=device)
+    assert np.array_equal(found.magnetizations, expected[0])
+
+
 @pytest.mark.parametrize("gap", [-0.02, 0.05, 0.3])
 def test_permanent_moment_beside_near_contacts(gap, device):
     """A far, weak permanent moment beside balls that touch, in one vector of a CPU, changes nothing."""

@@ -206,7 +206,7 @@ BALLS = {
 def test_induction_has_the_solution_of_all_pairs(name, device):
     places = 0.005 * BALLS[name]
     magnet = np.array([[-0.02, 0.01, 0.0]]), np.array([[3.0, 1.0, 0.0]])
-    options = {"saturation": 1.7e6, "external_field": (0.0, 1e4, 2e4), "sources": magnet, "device": device}
+    options = {"saturation": 1.7e6, "external_field": (0.0, 1e4, 2e4), "permanent": magnet, "device": device}
     exact = warpmag.solve_induction(places, 0.0015, method="direct", rtol=1e-5, **options)
     result = warpmag.solve_induction(places, 0.0015, method="fmm", rtol=1e-3, **options)
     assert result.converged

@@ -102,10 +102,10 @@ CASES = {
         fcc_block((3, 3, 3)), arguments={"saturation": np.logspace(-6, 9, 108)}
     ),
     "a magnet 1,000 times too strong, in contact": lambda: Case(
-        fcc_block((3, 3, 3)), arguments={"sources": (np.array([[0.0, 0.0, -0.01]]), np.array([[0.0, 0.0, 3e3]]))}
+        fcc_block((3, 3, 3)), arguments={"permanent": (np.array([[0.0, 0.0, -0.01]]), np.array([[0.0, 0.0, 3e3]]))}
     ),
     "a source inside a ball": lambda: Case(
-        fcc_block((2, 2, 2)), arguments={"sources": (np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))}
+        fcc_block((2, 2, 2)), arguments={"permanent": (np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))}
     ),
 }
 
@@ -129,8 +129,8 @@ def true_residual(case, found):
     m = np.asarray(found.magnetizations, float)
     h = np.broadcast_to(np.asarray(case.applied, float), (n, 3)).copy()
     h += oracle.h_field(case.positions, m * (4.0 / 3.0 * np.pi * radii**3)[:, None], radii=radii)
-    if "sources" in case.arguments:
-        h += oracle.h_field(*case.arguments["sources"], case.positions, target_radii=radii)
+    if "permanent" in case.arguments:
+        h += oracle.h_field(*case.arguments["permanent"], case.positions, target_radii=radii)
     saturation = np.broadcast_to(case.arguments.get("saturation", MS), n)
     susceptibility = np.broadcast_to(case.arguments.get("susceptibility", np.inf), n)
     wanted, _ = oracle.magnetization(h, saturation, susceptibility)
