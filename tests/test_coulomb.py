@@ -14,7 +14,7 @@ import warp as wp
 from tests.test_engine_xpbd import CAPACITY, CONTACT, DT, NewtonsXPBD, heap, substep
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
 from warpmag.kernels.contacts.solve import PUSH_OUT
-from warpmag.kernels.shared.passes import CHUNK
+from warpmag.kernels.shared.native import CHUNK
 
 G = 9.81  # m/s²
 SETTINGS = {"rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}

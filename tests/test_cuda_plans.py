@@ -160,7 +160,7 @@ QUANTITIES = Quantity.FIELD, Quantity.FORCE, Quantity.MUTUAL_FORCE, Quantity.WRE
 
 def finish_of(sums, launch, parts: int):
     """Check the kernel that adds up so many partial sums: a group of threads for each target row."""
-    assert launch.name == "passes"
+    assert launch.name == "finish"
     assert launch.threads == 8 * sums.count
     assert sums.partial.shape == (parts, sums.count, WIDTHS[sums._finished])
     assert tuple(launch.arguments[-1].partial.shape[:3]) == sums.partial.shape
@@ -284,18 +284,18 @@ SYSTEMS = {
 
 
 EXPECTED = {
-    "balls": {"sum_and_finish", "begin_flow", "sweep", "check_convergence", "advance", "brake", "passes"},
+    "balls": {"sum_and_finish", "begin_flow", "sweep", "check_convergence", "advance", "brake", "eddy_passes"},
     "paper": {"sum_and_finish", "begin_worlds", "step_pairs", "check_convergence", "zeeman_moments"},
     "gilbert": {"sum_and_finish", "begin_worlds", "step_pairs", "check_convergence"},
-    "near": {"pair_loop_cuda", "passes", "begin_flow"},
-    "turned": {"pair_loop_cuda", "passes", "begin_flow"},
-    "yielding": {"pair_loop_cuda", "passes", "begin_flow", "add_bias"},
-    "cells": {"sum_and_finish", "passes", "sweep"},
-    "whole": {"sum_and_finish", "passes", "respond"},
-    "coils": {"pair_loop_cuda", "passes", "push", "add_to_probe", "brake"},
-    "solids": {"sum_and_finish", "passes", "push", "add_to_probe", "brake"},
+    "near": {"sum_tile", "make_passes", "begin_flow"},
+    "turned": {"sum_tile", "finish", "begin_flow"},
+    "yielding": {"sum_tile", "finish", "begin_flow", "add_bias"},
+    "cells": {"sum_and_finish", "add_couplings", "sweep"},
+    "whole": {"sum_and_finish", "add_couplings", "respond"},
+    "coils": {"sum_tile", "apply_sources", "push", "add_to_probe", "brake"},
+    "solids": {"sum_and_finish", "apply_sources", "push", "add_to_probe", "brake"},
     "fast": {"build_cells", "near_sums_cuda", "translate_cuda", "add_parts", "expand", "return_sums"},
-    "most": {"pair_loop_mirrored", "passes", "sweep", "find_neighbors"},
+    "most": {"sum_mirrored", "finish", "sweep", "list_neighbors"},
 }
 """Kernels without which a system has not taken the way of a GPU."""
 
@@ -339,7 +339,7 @@ def test_systems_of_two_processes(which, launches, monkeypatch):
     monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", 2**20)
     drive(which, "float64")
     names = {launch.name for launch in launches}
-    assert "_choose_cells" in names if which == "fast" else "pair_loop_mirrored" in names
+    assert "_choose_cells" in names if which == "fast" else "sum_mirrored" in names
     assert len(ranks.merged) > 2
 
 
@@ -348,7 +348,7 @@ def test_simulation(launches):
     advance(magnets())
     threads = {launch.name: launch.threads for launch in launches}
     assert threads["advance"] == threads["_move"] == 2
-    assert {"_watch", "_judge", "solve_contacts", "find_neighbors", "sum_and_finish", "push"} <= threads.keys()
+    assert {"_watch", "_judge", "solve_contacts", "list_neighbors", "sum_and_finish", "push"} <= threads.keys()
 
 
 def magnets() -> newton.ModelBuilder:

@@ -7,8 +7,7 @@ import warp as wp
 from bench.reference import oracle
 from warpmag.declarations import magnets
 from warpmag.kernels.material.curves import CURVE_IDS, curve_ratio, curve_slope, inverse_curve_ratio
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import CHUNK
+from warpmag.kernels.shared.native import CHUNK, native_options
 
 S = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 319)])
 """Reduced fields, a multiple of ``CHUNK``."""

@@ -16,7 +16,7 @@ from math import comb, factorial, prod
 
 import numpy as np
 
-from warpmag.kernels.shared.passes import CHUNK
+from warpmag.kernels.shared.native import CHUNK
 
 POINT_DEPTH = 0.4
 """Distance of the points from the ball's centre [radii]."""

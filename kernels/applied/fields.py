@@ -21,8 +21,7 @@ from warpmag.kernels.applied import expansion
 from warpmag.kernels.applied.sources import Sources, source_arrays_type
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import CHUNK, passes_kernel
+from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
@@ -39,11 +38,12 @@ _BODY_THREADS = 32
 @cache
 def _kernel(dtype, one: int, group: int, coils: bool, solids: bool, rates: bool, balls: tuple):
     """Kernel of pass ``one``, or of all if that is −1."""
-    call = "warpmag::apply_sources(thread, first, last, threads, team.data, arrays);"
+    call = "apply_sources(thread, first, last, threads, team.data, arrays)"
+    arguments = {**PASS_ARGUMENTS, "arrays": source_arrays_type(dtype)}
     constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
     constants |= {"PASS": one, "GROUP": group, "RATES": int(rates)}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
-    return passes_kernel(call, source_arrays_type(dtype), native_options("applied/passes.h", dtype=dtype, **constants))
+    return native_kernel(call, "applied/passes.h", arguments, dtype=dtype, **constants)
 
 
 class AppliedField:

@@ -3,7 +3,7 @@
     shape: First row and number of edges, of faces, first entry of ``begin``, first corner, first and number of points
         on edges and on faces, shape [shapes, 10].
     edge, face, corner, begin: See ``polyhedron.h``; flat.
-    edge_point, face_point: Points on edges and faces (``warpmag.shapes.polyhedra``), rows of ``passes.CHUNK`` side by
+    edge_point, face_point: Points on edges and faces (``warpmag.shapes.polyhedra``), rows of ``native.CHUNK`` side by
         side, those of each shape filled up with points of no weight; flat.
 
 Bodies refer to them:
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from warpmag.kernels.shared.passes import CHUNK
+from warpmag.kernels.shared.native import CHUNK
 
 INTEGER_TABLES = ("shape", "begin", "body")
 """Tables of whole numbers; the others have the scalar type of the moments."""

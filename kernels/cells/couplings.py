@@ -1,7 +1,7 @@
 """Couplings between the cells of bodies, and the launches that add their field.
 
 A table belongs to a shape and serves all bodies of that shape. It has a list of entries for each cell, in chunks of
-``passes.CHUNK`` cells side by side, with as many slots as the longest list of the chunk:
+``native.CHUNK`` cells side by side, with as many slots as the longest list of the chunk:
 
     slot_begin: First slot of each chunk of all tables, and the end.
     other: The cell of its body that an entry is about, shape [slots · CHUNK].
@@ -39,8 +39,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.neighbors import CAPACITY
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import CHUNK, passes_kernel
+from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
@@ -100,9 +99,9 @@ def _table(start, other, tensor):
 
 @cache
 def _kernel(dtype, group: int):
-    call = "warpmag::add_couplings(thread, first, last, threads, team.data, arrays);"
-    constants = {"CAPACITY": CAPACITY, "GROUP": group}
-    return passes_kernel(call, couplings_type(dtype), native_options("cells/couplings.h", dtype=dtype, **constants))
+    call = "add_couplings(thread, first, last, threads, team.data, arrays)"
+    arguments = {**PASS_ARGUMENTS, "arrays": couplings_type(dtype)}
+    return native_kernel(call, "cells/couplings.h", arguments, dtype=dtype, CAPACITY=CAPACITY, GROUP=group)
 
 
 class CellCouplings:

@@ -23,8 +23,7 @@ import warp as wp
 
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.rigid.newton_views import ContactView
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
@@ -187,11 +186,12 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
 
 @cache
 def _kernel(call: str, group: int):
-    options = native_options(
-        "contacts/broad_phase.h", dtype=wp.float32, CAPACITY=neighbors.CAPACITY, GROUP=group, BLOCK=_BLOCK, SKIN=_SKIN,
+    return native_kernel(
+        f"{call}(thread, threads, team.data, arrays)", "contacts/broad_phase.h",
+        {**PASS_ARGUMENTS, "arrays": BroadPhaseArrays}, dtype=wp.float32,
+        CAPACITY=neighbors.CAPACITY, GROUP=group, BLOCK=_BLOCK, SKIN=_SKIN,
         KINEMATIC=_KINEMATIC, TARGETS_AT_ONCE=_TARGETS_AT_ONCE, NOTES=_NOTES, NOTE=_NOTE,
     )  # fmt: skip
-    return passes_kernel(f"warpmag::{call}(thread, threads, team.data, arrays);", BroadPhaseArrays, options)
 
 
 def launch_find_shape_pairs(search: PairSearch) -> None:

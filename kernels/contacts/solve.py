@@ -14,8 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.rigid.newton_views import BodyView, ContactView
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import CHUNK, LINE
+from warpmag.kernels.shared.native import CHUNK, LINE, native_options
 from warpmag.kernels.shared.team import team, threads_for
 
 _GROUPS = ((100, 32), (400, 16), (6_000, 8), (20_000, 4), (2**31, 2))

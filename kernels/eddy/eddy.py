@@ -41,8 +41,7 @@ import warp as wp
 from warpmag.kernels.material.curves import CurveParameters, curve_derivative_times, curve_ratio, curve_slope
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import CHUNK, passes_kernel
+from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel, native_options
 from warpmag.kernels.shared.team import team, threads_for
 
 _RATES, _FIELDS = range(2)
@@ -73,10 +72,9 @@ def _arrays_type(dtype):
 
 @cache
 def _passes(dtype, group: int):
-    constants = {"MU0_4PI": MU0 * INVERSE_4PI, "GROUP": group}
-    options = native_options("eddy/rates.h", dtype=dtype, **constants)
-    call = "warpmag::eddy_passes(thread, first, last, threads, team.data, arrays);"
-    return passes_kernel(call, _arrays_type(dtype), options)
+    call = "eddy_passes(thread, first, last, threads, team.data, arrays)"
+    arguments = {**PASS_ARGUMENTS, "arrays": _arrays_type(dtype)}
+    return native_kernel(call, "eddy/rates.h", arguments, dtype=dtype, MU0_4PI=MU0 * INVERSE_4PI, GROUP=group)
 
 
 @cache

@@ -10,8 +10,7 @@ import warp as wp
 
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.work_list import tile_size
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
 from warpmag.kernels.shared.team import team, threads_for
 
 _LEAVES_PER_THREAD = 16
@@ -74,11 +73,9 @@ def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_b
 
 @cache
 def _cpu_kernel(dtype, quantity: Quantity):
-    return passes_kernel(
-        f"warpmag::cpu::sum_near<warpmag::Quantity({quantity:d})>(arrays, threads, team.data);",
-        _arrays_type(dtype),
-        native_options("fmm/near.h", dtype=dtype, TILE_SIZE=tile_size(dtype)),
-    )
+    call = f"cpu::sum_near<warpmag::Quantity({quantity:d})>(arrays, threads, team.data)"
+    arguments = {**PASS_ARGUMENTS, "arrays": _arrays_type(dtype)}
+    return native_kernel(call, "fmm/near.h", arguments, dtype=dtype, TILE_SIZE=tile_size(dtype))
 
 
 @cache

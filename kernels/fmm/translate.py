@@ -9,8 +9,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
 from warpmag.kernels.shared.team import team, threads_for
 
 _BOXES_PER_THREAD = 64
@@ -186,11 +185,9 @@ def _used_rows(classes: np.ndarray) -> int:
 
 @cache
 def _cpu_kernel(dtype, constants):
-    return passes_kernel(
-        "warpmag::cpu::translate(arrays, threads, team.data);",
-        _arrays_type(dtype),
-        native_options("fmm/translate_cpu.h", dtype=dtype, **dict(constants)),
-    )
+    arguments = {**PASS_ARGUMENTS, "arrays": _arrays_type(dtype)}
+    call = "cpu::translate(arrays, threads, team.data)"
+    return native_kernel(call, "fmm/translate_cpu.h", arguments, dtype=dtype, **dict(constants))
 
 
 @cache

@@ -34,8 +34,7 @@ import warp as wp
 from warpmag.kernels.induction.solve_state import DEPTH, state_type
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import CHUNK
+from warpmag.kernels.shared.native import CHUNK, native_options
 from warpmag.kernels.shared.team import team, threads_for
 
 MOST_CELLS = 64

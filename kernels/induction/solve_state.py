@@ -46,7 +46,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.neighbors import CAPACITY
-from warpmag.kernels.shared.passes import CHUNK, LINE
+from warpmag.kernels.shared.native import CHUNK, LINE
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5
@@ -54,7 +54,7 @@ DEPTH = 5
 COLUMNS = 7 + DEPTH + DEPTH * (DEPTH + 1) // 2
 """Sums over the moments of a chunk or world; as in ``theta_step.h``."""
 BLOCK_CHUNK = 128
-"""Moments in a chunk on a GPU, each of them for a thread of a block; on a CPU a chunk has ``passes.CHUNK``."""
+"""Moments in a chunk on a GPU, each of them for a thread of a block; on a CPU a chunk has ``native.CHUNK``."""
 
 
 @wp.struct

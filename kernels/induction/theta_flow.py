@@ -57,8 +57,7 @@ from warpmag.kernels.induction.solve_state import BLOCK_CHUNK, COLUMNS, DEPTH, s
 from warpmag.kernels.material.curves import inverse_curve_ratio
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
@@ -71,16 +70,21 @@ _RESIDENT = {wp.float32: (3, 5), wp.float64: (2, 3)}
 """Blocks of 256 threads that a multiprocessor is to hold at the start and in sweeps: compilers take more registers."""
 
 
-def _options(dtype, group: int, responding: bool) -> dict:
+def _constants(group: int, responding: bool) -> dict:
     constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH, "RESPONDING": int(responding)}
-    return native_options("induction/theta_flow.h", dtype=dtype, INVERSE_4PI=INVERSE_4PI, **constants)
+    return constants | {"INVERSE_4PI": INVERSE_4PI}
+
+
+def _options(dtype, group: int, responding: bool) -> dict:
+    return native_options("induction/theta_flow.h", dtype=dtype, **_constants(group, responding))
 
 
 @cache
 def _passes_kernel(dtype, responding: bool):
     """Kernel of passes on a CPU."""
-    call = "warpmag::theta_flow(first, last, threads, team.data, arrays);"
-    return passes_kernel(call, state_type(dtype), _options(dtype, 1, responding))
+    call = "theta_flow(first, last, threads, team.data, arrays)"
+    arguments = {**PASS_ARGUMENTS, "arrays": state_type(dtype)}
+    return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(1, responding))
 
 
 @cache

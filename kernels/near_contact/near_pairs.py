@@ -58,8 +58,7 @@ from warpmag.kernels.near_contact import contact_table, uneven
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import CHUNK, LINE, passes_kernel
+from warpmag.kernels.shared.native import CHUNK, LINE, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
 MOST_KINDS = 16
@@ -315,9 +314,9 @@ def _pair_arrays(balls: int, dtype, device) -> dict[str, wp.array]:
 def kernel(dtype, passes: str):
     """Kernel that makes passes ``Places``, ``Pairs``, ``Sweeps``, ``Forces`` or ``Uneven``."""
     headers = {"Places": "select", "Pairs": "tabulate", "Sweeps": "sweeps", "Forces": "forces", "Uneven": "uneven"}
-    options = native_options(f"near_contact/{headers[passes]}.h", dtype=dtype, **_constants())
-    call = f"warpmag::make_passes<warpmag::{passes}>(thread, first, last, threads, team.data, arrays);"
-    return passes_kernel(call, ContactArrays, options)
+    call = f"make_passes<warpmag::{passes}>(thread, first, last, threads, team.data, arrays)"
+    header, arguments = f"near_contact/{headers[passes]}.h", {**PASS_ARGUMENTS, "arrays": ContactArrays}
+    return native_kernel(call, header, arguments, dtype=dtype, **_constants())
 
 
 def _launch(b: NearContactBuffers, passes: str, first: int, last: int):

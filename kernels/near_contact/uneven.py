@@ -43,7 +43,7 @@ import warp as wp
 
 from warpmag.kernels.applied.expansion import EXPANSION_ROWS, TENSOR_ROWS
 from warpmag.kernels.near_contact import contact_table
-from warpmag.kernels.shared.passes import CHUNK
+from warpmag.kernels.shared.native import CHUNK
 
 RESPONSE_ROWS = 24
 """Numbers of a ball's response, of which 22 are used."""

@@ -27,7 +27,6 @@ from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
-from warpmag.kernels.pairs.sums_cpu import pair_loop_kernel
 from warpmag.kernels.pairs.work_list import (
     PAIRS_PER_THREAD,
     arrays_type,
@@ -36,11 +35,11 @@ from warpmag.kernels.pairs.work_list import (
     loop_tiles,
     pair_count,
     target_rows,
+    tile_size,
     tiles_of_rank,
 )
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.shared.native import native_options
-from warpmag.kernels.shared.passes import passes_kernel
+from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
@@ -152,7 +151,7 @@ class PairEvaluation:
         if self._ranks is not None:
             tiles, shares = tiles_of_rank(tiles, shares, self._ranks)
         self._arrays.shares = wp.array(shares, dtype=wp.int32, device=device)
-        pair_loop = pair_loop_kernel(targets.dtype, quantity)
+        pair_loop = _cpu_loop_kernel(targets.dtype, quantity)
         self._launch_sums = lambda _: self._launch_pass(pair_loop, threads)
         return parts, tiles
 
@@ -207,32 +206,30 @@ def _are_mutual(segments, count: int) -> bool:
 
 @cache
 def _finish_kernel(dtype, quantity: Quantity, group: int):
-    return passes_kernel(
-        f"warpmag::finish<warpmag::Quantity({quantity:d})>(thread, threads, team.data, arrays);",
-        arrays_type(dtype),
-        native_options("pairs/finish.h", dtype=dtype, GROUP=group, **_CONSTANTS),
-    )
+    call = f"finish<warpmag::Quantity({quantity:d})>(thread, threads, team.data, arrays)"
+    arguments = {**PASS_ARGUMENTS, "arrays": arrays_type(dtype)}
+    return native_kernel(call, "pairs/finish.h", arguments, dtype=dtype, GROUP=group, **_CONSTANTS)
+
+
+@cache
+def _cpu_loop_kernel(dtype, quantity: Quantity):
+    call = f"cpu::sum_tiles<warpmag::Quantity({quantity:d})>(arrays, threads, team.data)"
+    arguments = {**PASS_ARGUMENTS, "arrays": arrays_type(dtype)}
+    return native_kernel(call, "pairs/sums_cpu.h", arguments, dtype=dtype, TILE_SIZE=tile_size(dtype))
 
 
 @cache
 def _fused_kernel(dtype, quantity: Quantity, shape):
-    sums_arrays = arrays_type(dtype)
     numbers = f"{shape.held}, {shape.lanes}, {shape.warps}, {shape.unrolled}"
-
-    @wp.func_native(f"warpmag::sum_and_finish<warpmag::Quantity({quantity:d}), {numbers}>(arrays);")
-    def run(arrays: sums_arrays): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=(shape.threads, 1),
-        module_options=native_options("pairs/fused_finish_cuda.h", dtype=dtype, GROUP=shape.shares, **_CONSTANTS),
+    return native_kernel(
+        f"sum_and_finish<warpmag::Quantity({quantity:d}), {numbers}>(arrays)",
+        "pairs/fused_finish_cuda.h",
+        {"arrays": arrays_type(dtype)},
+        dtype=dtype,
+        launch={"grid_stride": False, "launch_bounds": (shape.threads, 1)},
+        GROUP=shape.shares,
+        **_CONSTANTS,
     )
-    def sum_and_finish(arrays: sums_arrays):
-        run(arrays)
-
-    return sum_and_finish
 
 
 def _launch_fused(quantity: Quantity, shape, arrays):

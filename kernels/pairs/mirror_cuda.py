@@ -13,7 +13,7 @@ import warp as wp
 
 from warpmag.kernels.pairs.pair_terms import Quantity
 from warpmag.kernels.pairs.sums_cuda import launch_time
-from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.native import native_kernel
 
 
 @dataclass(frozen=True)
@@ -144,49 +144,32 @@ def _choose_splits(shape: MirrorShape, tiles: int, walk: int, multiprocessors: i
 
 @cache
 def _kernel(dtype, quantity: Quantity, shape: MirrorShape):
-    @wp.func_native(
-        f"warpmag::sum_mirrored<warpmag::Quantity({quantity:d}), {shape.moments}, {shape.warps}, {shape.unrolled}>"
-        "(block, thread, packed, tiles, nearest, partial_out);"
+    bounds = 32 * shape.warps, shape.blocks if dtype is wp.float32 else 1
+    numbers = f"{shape.moments}, {shape.warps}, {shape.unrolled}"
+    return native_kernel(
+        f"sum_mirrored<warpmag::Quantity({quantity:d}), {numbers}>"
+        "(first_block + blockIdx.x, threadIdx.x, packed, tiles, nearest, partial_out)",
+        "pairs/mirror_cuda.h",
+        {
+            "packed": wp.array2d[dtype],
+            "tiles": MirrorTiles,
+            **dict.fromkeys(("first_block", "nearest"), int),
+            "partial_out": wp.array3d[dtype],
+        },
+        dtype=dtype,
+        launch={"grid_stride": False, "launch_bounds": bounds},
     )
-    def sum_mirrored(
-        block: int,
-        thread: int,
-        packed: wp.array2d[dtype],
-        tiles: MirrorTiles,
-        nearest: int,
-        partial_out: wp.array3d[dtype],
-    ): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=(32 * shape.warps, shape.blocks if dtype is wp.float32 else 1),
-        module_options=native_options("pairs/mirror_cuda.h", dtype=dtype),
-    )
-    def pair_loop_mirrored(
-        # inputs:
-        packed: wp.array2d[dtype],
-        tiles: MirrorTiles,
-        first_block: int,
-        nearest: int,
-        # outputs:
-        partial_out: wp.array3d[dtype],
-    ):
-        block, thread = wp.tid()
-        sum_mirrored(first_block + block, thread, packed, tiles, nearest, partial_out)
-
-    return pair_loop_mirrored
 
 
 def launch_pair_loop_mirrored(m: Mirror, packed, partial):
     """Sum a quantity over all pairs; see ``evaluate``."""
+    block = 32 * m.shape.warps
     for first_block, blocks, nearest in m.passes:
-        wp.launch_tiled(
+        wp.launch(
             _kernel(partial.dtype, m.quantity, m.shape),
-            dim=[blocks],
+            dim=block * blocks,
             inputs=[packed, m.tiles, first_block, nearest],
             outputs=[partial],
-            block_dim=32 * m.shape.warps,
+            block_dim=block,
             device=partial.device,
         )

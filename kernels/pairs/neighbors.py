@@ -17,7 +17,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.native import native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
@@ -123,33 +123,9 @@ def carried_lists(lists) -> dict:
 
 @cache
 def _kernel(call: str, header: str, dtype, capacity: int, group: int):
-    lists = lists_type(dtype)
-
-    @wp.func_native(f"warpmag::{call};")
-    def run(
-        thread: int,
-        targets: lists,
-        sources: lists,
-        threads: int,
-        team: wp.array2d[wp.uint64],
-    ): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        module_options=native_options(header, dtype=dtype, CAPACITY=capacity, GROUP=group, BLOCK=_BLOCK),
-    )
-    def find_neighbors(
-        # inputs:
-        threads: int,
-        team: wp.array2d[wp.uint64],
-        # in and out:
-        targets: lists,
-        sources: lists,
-    ):
-        run(wp.tid(), targets, sources, threads, team)
-
-    return find_neighbors
+    arguments = {"threads": int, "team": wp.array2d[wp.uint64]}
+    arguments |= dict.fromkeys(("targets", "sources"), lists_type(dtype))
+    return native_kernel(call, header, arguments, dtype=dtype, CAPACITY=capacity, GROUP=group, BLOCK=_BLOCK)
 
 
 def _launch(call: str, targets, sources, dim: int = 1):

@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.pairs.pair_terms import Quantity
-from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.native import native_kernel
 
 
 @dataclass(frozen=True)
@@ -81,38 +81,19 @@ def launch_time(blocks: int, together: int, work: float, multiprocessors: int) -
 
 @cache
 def _kernel(dtype, quantity: Quantity, shape: LoopShape):
-    @wp.func_native(
-        f"warpmag::sum_tile<warpmag::Quantity({quantity:d}), {shape.targets}, {shape.warps}>"
-        "(thread, tiles, targets, sources, effective, partial_out);"
+    bounds = 32 * shape.warps, shape.blocks if dtype is wp.float32 else 1
+    return native_kernel(
+        f"sum_tile<warpmag::Quantity({quantity:d}), {shape.targets}, {shape.warps}>"
+        "(thread, tiles, targets, sources, effective, partial_out)",
+        "pairs/sums_cuda.h",
+        {
+            "tiles": wp.array2d[int],
+            **dict.fromkeys(("targets", "sources", "effective"), wp.array2d[dtype]),
+            "partial_out": wp.array3d[dtype],
+        },
+        dtype=dtype,
+        launch={"grid_stride": False, "launch_bounds": bounds},
     )
-    def sum_tile(
-        thread: int,
-        tiles: wp.array2d[int],
-        targets: wp.array2d[dtype],
-        sources: wp.array2d[dtype],
-        effective: wp.array2d[dtype],
-        partial_out: wp.array3d[dtype],
-    ): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=(32 * shape.warps, shape.blocks if dtype is wp.float32 else 1),
-        module_options=native_options("pairs/sums_cuda.h", dtype=dtype),
-    )
-    def pair_loop_cuda(
-        # inputs:
-        tiles: wp.array2d[int],
-        targets: wp.array2d[dtype],
-        sources: wp.array2d[dtype],
-        effective: wp.array2d[dtype],
-        # outputs:
-        partial_out: wp.array3d[dtype],
-    ):
-        sum_tile(wp.tid(), tiles, targets, sources, effective, partial_out)
-
-    return pair_loop_cuda
 
 
 def launch_pair_loop_cuda(quantity: Quantity, shape: LoopShape, targets, sources, effective, tiles, partial):

@@ -1,17 +1,53 @@
-"""C++ headers of this package beside kernels: the options under which Warp compiles them into a kernel's module.
+"""C++ headers beside kernels: the kernels that call them, and the options under which Warp compiles them.
 
-A header is found by its path from ``kernels/``, such as ``pairs/pair_law.h``, and includes others by theirs. It may use
-``Real``, the scalar type of the module, and the constants that its launcher passes; all of it is in namespace
-``warpmag``. What a kernel calls of it stands in a ``wp.func_native`` of one line.
+A header is named by its path from ``kernels/``, such as ``pairs/pair_law.h``, and includes others by theirs. All of it
+is in namespace ``warpmag``. It may use ``Real``, the scalar type of the module, and the constants that its kernel sets.
 """
 
+import linecache
 import re
 from pathlib import Path
 
 import warp as wp
 
+CHUNK = 16
+"""Lanes of the widest vectors of a CPU; as in ``lanes.h``. Arrays of balls are padded to a multiple of it."""
+LINE = 16
+"""Numbers in a ball's cache line; as in ``lanes.h``. A CPU transposes lines into vectors, which beats gathering."""
+PASS_ARGUMENTS = {"first": int, "last": int, "threads": int, "team": wp.array2d[wp.uint64]}
+"""Arguments of a kernel that makes passes ``first`` to ``last`` over balls, before the struct of its arrays.
+
+A pass is written once for both devices. On a CPU it works on a vector of balls, and ``threads`` threads of the ``team``
+share the balls. On a GPU a group of threads shares a ball.
+"""
 _FOLDER = Path(__file__).resolve().parents[1]
 _INCLUDE = re.compile(r'^#include "(.+)"$', re.MULTILINE)
+
+
+def native_kernel(call: str, header: str, arguments: dict, *, dtype, launch: dict | None = None, **constants):
+    """Kernel in which each thread calls a C++ function.
+
+    Args:
+        call: The call, of a function in namespace ``warpmag``, which also names the kernel. It may use the kernel's
+            arguments and ``thread``, the index of the thread.
+        header: Path of the header from ``kernels/``.
+        arguments: Warp types of the kernel's arguments, by name.
+        dtype: Warp scalar type that ``Real`` is.
+        launch: Options of ``wp.kernel``, such as ``launch_bounds``.
+        constants: Integers and reals that the header uses, by their names there.
+    """
+    function, names = re.findall(r"\w+(?=[<(])", call)[0], ", ".join(arguments)
+    source = f"def native(thread, {names}): ...\ndef {function}({names}):\n    native(wp.tid(), {names})\n"
+    # Warp reads the source of a function from the line cache
+    file = f"<native_kernel {function}({names})>"
+    linecache.cache[file] = len(source), None, source.splitlines(keepends=True), file
+    scope = {"__name__": __name__, "wp": wp}
+    exec(compile(source, file, "exec"), scope)
+    scope["native"].__annotations__, scope[function].__annotations__ = {"thread": int, **arguments}, arguments
+    scope["native"] = wp.func_native(f"warpmag::{call};")(scope["native"])
+    options = native_options(header, dtype=dtype, **constants)
+    kernel = wp.kernel(module="unique", enable_backward=False, module_options=options, **launch or {})
+    return kernel(scope[function])
 
 
 def native_options(*headers: str, dtype, **constants: int | float) -> dict:

@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.shared.cores import cores
-from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.native import native_kernel
 
 MOST_THREADS = 64
 """Threads that may work on one launch."""
@@ -32,18 +32,12 @@ _GONE, _ASLEEP = 0, 2
 """Place of a member's state among its words, how many these are, and two of its values; as in ``team.h``."""
 
 
-@wp.func_native("warpmag::start_members(count, team.data);")
-def _start(count: int, team: wp.array2d[wp.uint64]): ...
-
-
-@wp.kernel(module="unique", enable_backward=False, module_options=native_options("shared/team.h", dtype=wp.float32))
-def _start_members(
-    # inputs:
-    count: int,
-    # outputs:
-    team: wp.array2d[wp.uint64],
-):
-    _start(count, team)
+_start_members = native_kernel(
+    "start_members(count, team.data)",
+    "shared/team.h",
+    {"count": int, "team": wp.array2d[wp.uint64]},
+    dtype=wp.float32,
+)
 
 
 def threads_for(count: int, each: int) -> int:
