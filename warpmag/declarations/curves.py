@@ -1,10 +1,10 @@
-"""Magnetization curves that were measured: tables of B or M over H, from arrays, from a file, or of a named material.
+"""Measured magnetization curves: tables of B or M over H, from arrays, from a file, or of a named material.
 
-Between the points M(H) is interpolated without overshoot by cubics (PCHIP: F. N. Fritsch and J. Butland, "A method for
-constructing local monotone piecewise cubic interpolants", 1984) through the points and their mirror images, so that the
-curve is odd. It never falls, so that induction has one solution. Beyond the last point M approaches saturation as the
-law M = Ms (1 − a/H) through the last two has it (R. M. Bozorth, Ferromagnetism, 1951). Where Ms is given, H is counted
-from elsewhere, so that the curve goes on with the same slope.
+Cubics without overshoot interpolate M(H) between the points (PCHIP: F. N. Fritsch and J. Butland, "A method for
+constructing local monotone piecewise cubic interpolants", 1984). They pass through the points and their mirror images,
+so the curve is odd. M never falls, so induction has one solution. Beyond the last point M approaches saturation by the
+law M = Ms (1 − a/H) through the last two points (R. M. Bozorth, Ferromagnetism, 1951). If Ms is given, H in that law
+is shifted so that the slope at the last point is continuous.
 """
 
 import csv
@@ -21,12 +21,14 @@ from warpmag.errors import InputError
 
 MU0 = 1.2566370614359173e-06
 """Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
-_STRONGEST = 2.5
-"""Polarization [T] that no material has: iron-cobalt, the strongest, has 2.45 T."""
-_ROUNDED = 1e-3
-"""Part of the largest magnetization by which M may fall and is taken for level: B is printed with three or four digits,
-and where a curve is saturated all it says is μ0 H."""
-_MOST_POINTS = 4096
+_LARGEST_POLARIZATION = 2.5
+"""Limit of the polarization [T], above that of every material: iron-cobalt reaches 2.45 T."""
+_LEVEL_TOLERANCE = 1e-3
+"""Largest fall of M that counts as level, as a fraction of the largest M.
+
+Tables print B with three or four digits, and near saturation B is little more than μ0 H.
+"""
+_LARGEST_COUNT = 4096
 _UNITS = {
     "h": {"A/m": 1.0, "kA/m": 1e3, "Oe": 1e3 / (4.0 * math.pi)},
     "b": {"T": 1.0, "mT": 1e-3, "G": 1e-4, "kG": 0.1},
@@ -42,9 +44,9 @@ class MagnetizationCurve:
 
     Attributes:
         fields: Field H inside the material at the points [A/m], rising from 0.
-        magnetizations: Magnetization M there [A/m], never falling, from 0.
-        saturation: Magnetization Ms [A/m] that it approaches beyond the last point.
-        name: What messages call it.
+        magnetizations: Magnetization M at the points [A/m], never falling, from 0.
+        saturation: Saturation magnetization Ms [A/m], the limit beyond the last point.
+        name: Name of the curve in messages.
     """
 
     fields: tuple[float, ...]
@@ -64,17 +66,17 @@ class MagnetizationCurve:
         """Return the curve of flux densities B [T] at fields H [A/m], each of shape [points].
 
         Args:
-            fields: H inside the material [A/m], rising; the origin is added where it is missing.
+            fields: H inside the material [A/m], rising; a missing origin is added.
             flux_densities: B [T].
-            saturation: Ms [A/m]; by default what the last two points lead to.
-            name: What messages call the curve.
+            saturation: Ms [A/m]; by default extrapolated from the last two points.
+            name: Name of the curve in messages.
 
         Raises:
             InputError: The points are no magnetization curve; the message has the reason and the point.
         """
         h, b = _numbers(name, "fields", fields), _numbers(name, "flux densities", flux_densities)
         _check_count(name, h, b)
-        return cls._made(name, h, b / MU0 - h, saturation)
+        return cls._from_points(name, h, b / MU0 - h, saturation)
 
     @classmethod
     def from_mh(
@@ -88,29 +90,29 @@ class MagnetizationCurve:
         """Return the curve of magnetizations M [A/m] at fields H [A/m]; see :meth:`from_bh`."""
         h, m = _numbers(name, "fields", fields), _numbers(name, "magnetizations", magnetizations)
         _check_count(name, h, m)
-        return cls._made(name, h, m, saturation)
+        return cls._from_points(name, h, m, saturation)
 
     @classmethod
     def from_csv(cls, path: str | os.PathLike, *, saturation: float | None = None) -> Self:
-        """Return the curve of a file with two columns, the first line of which says what they are.
+        """Return the curve of a file with two columns.
 
-        Such as ``H [A/m], B [T]``. The second may be the flux density B, the polarization J or the magnetization M.
-        Units are A/m, kA/m or Oe of H; T, mT, G or kG of B and J; A/m, kA/m or MA/m of M. Lines that begin with #
-        are skipped.
+        The first line names quantities and units, such as ``H [A/m], B [T]``. The second quantity is the flux density
+        B, the polarization J or the magnetization M. Units are A/m, kA/m or Oe for H; T, mT, G or kG for B and J; A/m,
+        kA/m or MA/m for M. Lines that begin with # are skipped.
 
         Raises:
             InputError: The file cannot be read, or the points are no magnetization curve.
         """
         name = os.path.basename(os.fspath(path))
-        (_, of_h), (quantity, of_second), rows = _read_csv(path, name)
-        h, second = rows[:, 0] * of_h, rows[:, 1] * of_second
+        (_, h_unit), (quantity, second_unit), rows = _read_csv(path, name)
+        h, second = rows[:, 0] * h_unit, rows[:, 1] * second_unit
         if quantity == "m":
             return cls.from_mh(h, second, saturation=saturation, name=name)
         return cls.from_bh(h, second if quantity == "b" else second + MU0 * h, saturation=saturation, name=name)
 
     @classmethod
-    def _made(cls, name, h, m, saturation):
-        """Check points and complete the curve."""
+    def _from_points(cls, name, h, m, saturation):
+        """Return the curve through checked points; add the origin and the saturation where missing."""
         if h[0] != 0.0:
             h, m = np.append(0.0, h), np.append(0.0, m)
         _check_points(name, h, m)
@@ -133,16 +135,16 @@ class MagnetizationCurve:
 
     @property
     def susceptibility(self) -> float:
-        """The largest susceptibility dM/dH anywhere [dimensionless]."""
+        """Largest susceptibility dM/dH of the curve [dimensionless]."""
         slope = np.array(self.slopes)
         secant = np.diff(self.magnetizations) / np.diff(self.fields)
-        # the derivative of a cubic is a parabola in t: begin + t (2 b + 3 t c), largest at an end or at its vertex
+        # the derivative of a cubic is a parabola, slope + t (2 b + 3 t c): the maximum is at an end or at the vertex
         b, c = 3.0 * secant - 2.0 * slope[:-1] - slope[1:], slope[:-1] + slope[1:] - 2.0 * secant
         vertex = np.clip(np.divide(-b, 3.0 * c, out=np.zeros_like(b), where=c < 0.0), 0.0, 1.0)
         return float(max(slope.max(), (slope[:-1] + vertex * (2.0 * b + 3.0 * vertex * c)).max()))
 
     def magnetization(self, fields: npt.ArrayLike) -> np.ndarray:
-        """Return the magnetization M [A/m] at fields H ≥ 0 inside the material [A/m], NumPy, any shape."""
+        """Return the magnetization M [A/m] at internal fields H ≥ 0 [A/m], NumPy, any shape."""
         h, m, d = np.array(self.fields), np.array(self.magnetizations), np.array(self.slopes)
         x = np.asarray(fields, float)
         k = np.clip(np.searchsorted(h, x, "right") - 1, 0, len(h) - 2)
@@ -156,7 +158,10 @@ class MagnetizationCurve:
 
 
 def _slopes(h, m):
-    """Slopes at the points by PCHIP, the curve mirrored at the origin; at the last that of the law through two."""
+    """Return the slopes dM/dH at the points: by PCHIP, at the last point by the law of the approach to saturation.
+
+    At the origin the slope is that of the curve with its mirror image.
+    """
     span, secant = np.diff(h), np.diff(m) / np.diff(h)
     slope = np.empty(len(h))
     slope[0] = secant[0]
@@ -168,27 +173,28 @@ def _slopes(h, m):
     return slope
 
 
-def _numbers(name: str, what: str, values) -> np.ndarray:
+def _numbers(name: str, quantity: str, values) -> np.ndarray:
+    """Return values as a one-dimensional array of finite numbers."""
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "iuf":
             raise TypeError
         array = array.astype(float)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name}: {what} must be real numbers") from None
+        raise InputError(f"{name}: {quantity} must be real numbers") from None
     if array.ndim != 1:
-        raise InputError(f"{name}: {what} must be a list of numbers, shape [points], got {list(array.shape)}")
+        raise InputError(f"{name}: {quantity} must be a list of numbers, shape [points], got {list(array.shape)}")
     wrong = np.flatnonzero(~np.isfinite(array))
     if len(wrong):
-        raise InputError(f"{name}: {what} must be finite, got {array[wrong[0]]:g} at point {wrong[0] + 1}")
+        raise InputError(f"{name}: {quantity} must be finite, got {array[wrong[0]]:g} at point {wrong[0] + 1}")
     return array
 
 
 def _check_count(name: str, h, other) -> None:
     if len(h) != len(other):
         raise InputError(f"{name}: {len(h)} fields, but {len(other)} values at them")
-    if not 2 <= len(h) <= _MOST_POINTS:
-        raise InputError(f"{name}: a curve has 2 to {_MOST_POINTS} points, got {len(h)}")
+    if not 2 <= len(h) <= _LARGEST_COUNT:
+        raise InputError(f"{name}: a curve has 2 to {_LARGEST_COUNT} points, got {len(h)}")
 
 
 def _check_points(name: str, h, m) -> None:
@@ -199,13 +205,13 @@ def _check_points(name: str, h, m) -> None:
         k = where[0]
         raise InputError(f"{name}: H must rise from 0, but {h[k + 1]:g} A/m follows {h[k]:g} A/m")
     strongest = float(MU0 * m.max())
-    if strongest > _STRONGEST:
+    if strongest > _LARGEST_POLARIZATION:
         k = int(m.argmax())
         raise InputError(
             f"{name}: at H = {h[k]:g} A/m the polarization B − μ0 H is {strongest:.3g} T, which no material reaches: "
             "H is in A/m, B in T"
         )
-    where = np.flatnonzero(np.diff(m) < -_ROUNDED * strongest / MU0)
+    where = np.flatnonzero(np.diff(m) < -_LEVEL_TOLERANCE * strongest / MU0)
     if len(where):
         k = where[0]
         raise InputError(
@@ -227,7 +233,7 @@ def _check_saturation(name: str, h, m, slope: float, saturation) -> None:
         raise InputError(f"{name}: saturation {saturation:g} A/m is less than the last point's M, {m[-1]:g} A/m")
     if slope == 0.0 and saturation > m[-1] * (1.0 + 1e-9):
         raise InputError(f"{name}: saturation {saturation:g} A/m is not reached, the curve ends flat at {m[-1]:g} A/m")
-    if MU0 * saturation > _STRONGEST:
+    if MU0 * saturation > _LARGEST_POLARIZATION:
         raise InputError(
             f"{name}: it would saturate at {MU0 * saturation:.3g} T, which no material does: H is in A/m, B in T; "
             "where a curve ends far from saturation, give the saturation"
@@ -235,16 +241,16 @@ def _check_saturation(name: str, h, m, slope: float, saturation) -> None:
 
 
 def _read_csv(path, name: str):
-    """Return what the two columns of a file are, each with the factor to SI, and the rows."""
+    """Return quantity and factor to SI of each of the two columns of a file, and the rows."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             lines = [row for row in csv.reader(line for line in file if line.strip() and line.lstrip()[0] != "#")]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{name}: cannot be read ({error})") from None
-    found = [_COLUMN.fullmatch(cell) for cell in lines[0]] if lines else []
-    if len(found) != 2 or None in found:
+    matches = [_COLUMN.fullmatch(cell) for cell in lines[0]] if lines else []
+    if len(matches) != 2 or None in matches:
         raise InputError(f"{name}: its first line must say what the two columns are, as 'H [A/m], B [T]'")
-    columns = [_unit(name, *match.groups()) for match in found if match]
+    columns = [_unit(name, *match.groups()) for match in matches if match]
     if columns[0][0] != "h" or columns[1][0] == "h":
         raise InputError(f"{name}: the first column must be H, the second B, J or M")
     try:
@@ -257,7 +263,7 @@ def _read_csv(path, name: str):
 
 
 def _unit(name: str, quantity: str, unit: str) -> tuple[str, float]:
-    """Return a quantity and the factor of its unit to SI."""
+    """Return a quantity in lower case and the factor of its unit to SI."""
     units = _UNITS[quantity.lower()]
     if unit not in units:
         raise InputError(f"{name}: {quantity} in {unit} is not known, only in {', '.join(units)}")

@@ -1,6 +1,6 @@
-"""Values that keys give over time, and motions made of them: plain data, read from a stage and followed on a device.
+"""Values keyed over time, and motions of keyed transforms: read from a stage, interpolated on a device.
 
-Neither Warp, Newton nor USD is imported here.
+No Warp, Newton or USD is imported here.
 """
 
 import json
@@ -11,11 +11,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Keys:
-    """Values at some times: between two of them interpolated, before the first and after the last held.
+    """Values keyed over time: interpolated between keys, constant before the first and after the last.
 
     Attributes:
-        times: Times, rising, shape [k]: [s] since the start, or time codes of a stage as long as it is being read.
-        values: Numbers of each, float64, shape [k, width].
+        times: Rising times, shape [k]: time codes while a stage is read, then seconds since the start.
+        values: Value of each key, float64, shape [k, width].
         interpolation: ``linear``, ``held``, or ``slerp`` for quaternions x y z w.
     """
 
@@ -25,11 +25,16 @@ class Keys:
 
     @classmethod
     def constant(cls, values) -> "Keys":
-        """Return values that never change, shape [width]."""
+        """Return keys of a constant value, shape [width]."""
         return cls(np.zeros(1), np.reshape(np.asarray(values, dtype=float), (1, -1)))
 
     def in_seconds(self, start: float, rate: float) -> "Keys":
-        """Return keys at time codes, ``rate`` of which make a second, as keys at seconds since the code ``start``."""
+        """Return the keys with times in seconds since the start in place of time codes.
+
+        Args:
+            start: Time code of the start.
+            rate: Time codes per second.
+        """
         return replace(self, times=(self.times - start) / rate)
 
     def to_text(self) -> str:
@@ -38,20 +43,20 @@ class Keys:
 
     @classmethod
     def from_text(cls, text: str) -> "Keys":
-        """Return the keys that :meth:`to_text` wrote."""
-        found = json.loads(text)
-        return cls(np.array(found["times"]), np.array(found["values"]), found["interpolation"])
+        """Return the keys of a text that :meth:`to_text` wrote."""
+        fields = json.loads(text)
+        return cls(np.array(fields["times"]), np.array(fields["values"]), fields["interpolation"])
 
 
 @dataclass(frozen=True)
 class Operation:
-    """One transform of those that together place something.
+    """One keyed transform of a stack.
 
     Attributes:
-        kind: ``translate``, ``scale``, ``orient``, ``matrix``, or ``rotate`` with the order of its axes, ``rotateXYZ``:
-            about x first. A matrix has 16 numbers by rows, and acts on rows, as USD's do.
-        keys: Its numbers; of rotations three angles [degrees].
-        inverse: Whether it is undone instead.
+        kind: ``translate``, ``scale``, ``orient``, ``matrix``, or ``rotate`` with the order of its axes: ``rotateXYZ``
+            rotates about x first. A matrix has 16 numbers by rows, for row vectors, as in USD.
+        keys: Numbers of the transform; of rotations three angles [degrees].
+        inverse: Whether the inverse of the transform applies.
     """
 
     kind: str
@@ -61,26 +66,26 @@ class Operation:
 
 @dataclass(frozen=True)
 class Motion:
-    """How something moves in the world.
+    """Motion of a frame in the world.
 
     Attributes:
-        operations: Transforms, the outermost first: the last acts on points first.
+        operations: Stack of transforms, the outermost first: the last acts on points first.
     """
 
     operations: tuple[Operation, ...]
 
     def in_seconds(self, start: float, rate: float) -> "Motion":
-        """Return the motion with its keys at seconds, see :meth:`Keys.in_seconds`."""
-        return Motion(tuple(replace(one, keys=one.keys.in_seconds(start, rate)) for one in self.operations))
+        """Return the motion with its keys in seconds, see :meth:`Keys.in_seconds`."""
+        return Motion(tuple(replace(step, keys=step.keys.in_seconds(start, rate)) for step in self.operations))
 
 
 @dataclass(frozen=True)
 class SceneKeys:
-    """All of a scene that follows keys, their times in seconds since the start.
+    """All keyed values of a scene, times in seconds since the start.
 
     Attributes:
-        motions: Motion of kinematic bodies, by body.
-        magnetizations: Magnetizations of permanent shapes [A/m], in the frames of the shapes, by shape.
+        motions: Motions of kinematic bodies, by body.
+        magnetizations: Magnetizations of permanent magnets [A/m], in the frames of their shapes, by shape.
         currents: Ampere-turns of coils [A], by shape.
         field: External field [A/m], None where it is constant.
     """

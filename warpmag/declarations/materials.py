@@ -1,9 +1,9 @@
 """Magnetic materials by name.
 
-Values are typical ones at room temperature; a data sheet of the very part is better. The susceptibility is the initial
-one, of small fields: that of a ball hardly matters above 100, for its own demagnetizing field limits it to 3. Some have
-a measured curve (``measured.py``) in the place of both, which has the knee right. Densities are those of Bozorth's
-table and of makers' data sheets, rounded.
+Values are typical at room temperature; the data sheet of a part is better. The susceptibility is the initial one, for
+small fields. Above 100 it hardly matters for a ball: the demagnetizing field limits the response of a ball to 3. Some
+materials have a measured curve in place of saturation and susceptibility (``measured.py``), which gets the knee right.
+Densities are from Bozorth's table and makers' data sheets, rounded.
 """
 
 import math
@@ -29,13 +29,13 @@ class Material:
         name: Its name.
         kind: ``inducible`` or ``permanent``.
         polarization: Saturation polarization μ0·Ms of an inducible, remanence Br of a permanent material [T].
-        permeability: Initial relative permeability of an inducible material [dimensionless].
+        permeability: Initial relative permeability of an inducible material [dimensionless], the largest permeability
+            of a measured curve.
         density: Mass density [kg/m³].
-        source: Where the numbers are from.
-        curve: Measured magnetization curve of an inducible material, None where it has none. Saturation and
-            permeability are then what it leads to, and the largest.
-        conductivity: Electrical conductivity [S/m], 0 where the source has none. A magnet does not take it by itself:
-            only balls do (``add_inducible(..., conductivity=...)``), and it costs a sum over pairs.
+        source: Source of the numbers.
+        curve: Measured magnetization curve of an inducible material, or None.
+        conductivity: Electrical conductivity [S/m], 0 where the source has none. Magnets do not take it from the
+            material: pass it to ``add_inducible(..., conductivity=...)``, for balls. It costs a sum over pairs.
     """
 
     name: str
@@ -79,8 +79,8 @@ def _permanent(name, remanence, density, source):
 
 
 MATERIALS = {
-    one.name: one
-    for one in (
+    entry.name: entry
+    for entry in (
         _inducible("iron", 2.15, 200.0, 7870.0, 1e-7, f"{_BOZORTH}; 99.91 % Fe"),
         _inducible("mild-steel", 2.10, 180.0, 7870.0, 1e-7, f"{_BOZORTH}; cold-rolled steel, 98.5 % Fe"),
         _inducible("silicon-steel", 1.97, 500.0, 7650.0, 6e-7, f"{_BOZORTH}; 4 % Si"),
@@ -113,50 +113,51 @@ def material(name: str) -> Material:
 
 
 def inducible(owner: str, name: str) -> dict:
-    """Return saturation [A/m] and susceptibility of an inducible material, or its curve, as arguments of a magnet.
+    """Return saturation [A/m] and susceptibility of an inducible material, or its curve, as fields of a ``Magnet``.
 
     Args:
-        owner: Who asks, for the message.
+        owner: Prim or argument, for the message.
         name: The material.
 
     Raises:
         InputError: There is no such material, or it is a permanent one.
     """
-    found = _look_up(owner, name, "inducible")
-    if found.curve is not None:
-        return {"curve": found.curve}
-    return {"saturation": found.saturation, "susceptibility": found.susceptibility}
+    entry = _look_up(owner, name, "inducible")
+    if entry.curve is not None:
+        return {"curve": entry.curve}
+    return {"saturation": entry.saturation, "susceptibility": entry.susceptibility}
 
 
-def inducible_from(material: str | None, curve, given: dict) -> dict:
-    """Return what a material, a curve and numbers make of an inducible magnet, as its arguments.
+def inducible_from(material: str | None, curve, numbers: dict) -> dict:
+    """Return the fields of an inducible ``Magnet`` from a material, a curve and numbers.
 
     Args:
         material: Name of a material, or None.
-        curve: What :func:`measured` takes, or None.
-        given: Saturation [A/m] and susceptibility, where they are given.
+        curve: A curve as :func:`measured` takes it, or None.
+        numbers: Saturation [A/m] and susceptibility, without those that are not given.
 
     Raises:
-        InputError: Two say the same.
+        InputError: Two of the arguments set the same field.
     """
-    values = given if curve is None else {**given, "curve": measured("curve", curve)}
-    table = isinstance(values.get("curve"), MagnetizationCurve)
-    brought = {} if material is None else inducible("material", material)
-    says = ("saturation", "susceptibility", "curve") if table or "curve" in brought else tuple(brought)
-    twice = [name for name in values if name in says and (material is not None or name != "curve")]
-    if twice and (material is not None or table):
-        who = f"material: {short_repr(material)}" if material is not None else "curve: it"
-        raise InputError(f"{who} says what {' and '.join(twice)} are, give one or the other")
-    return {**values, **brought}
+    values = numbers if curve is None else {**numbers, "curve": measured("curve", curve)}
+    has_table = isinstance(values.get("curve"), MagnetizationCurve)
+    from_material = {} if material is None else inducible("material", material)
+    is_measured = has_table or "curve" in from_material
+    set_fields = ("saturation", "susceptibility", "curve") if is_measured else tuple(from_material)
+    twice = [name for name in values if name in set_fields and (material is not None or name != "curve")]
+    if twice and (material is not None or has_table):
+        owner = f"material: {short_repr(material)}" if material is not None else "curve: it"
+        raise InputError(f"{owner} says what {' and '.join(twice)} are, give one or the other")
+    return {**values, **from_material}
 
 
 def measured(owner: str, curve):
-    """Return a magnetization curve: one with a token as it is, a measured one, or that of a material by its name.
+    """Return a magnetization curve: a token or a measured curve as it is, a measured curve for a material's name.
 
     Raises:
-        InputError: It is none of them.
+        InputError: The value is none of these.
     """
-    known = [one.name for one in MATERIALS.values() if one.curve is not None]
+    known = [entry.name for entry in MATERIALS.values() if entry.curve is not None]
     if isinstance(curve, str) and curve in known:
         return MATERIALS[curve].curve
     check_curve(owner, curve, tuple(known))
@@ -164,32 +165,33 @@ def measured(owner: str, curve):
 
 
 def name_of_curve(curve: MagnetizationCurve) -> str | None:
-    """Return the material that has a curve, None if none has."""
-    return next((one.name for one in MATERIALS.values() if one.curve == curve), None)
+    """Return the name of the material with a measured curve, None where no material has it."""
+    return next((entry.name for entry in MATERIALS.values() if entry.curve == curve), None)
 
 
 def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the magnetization [A/m] of a permanent material along a direction of any length.
 
     Args:
-        owner: Who asks, for the message.
+        owner: Prim or argument, for the message.
         name: The material.
-        direction: Where it is magnetized to.
+        direction: Direction of the magnetization.
 
     Raises:
         InputError: There is no such material, it is an inducible one, or the direction has no length.
     """
-    found = _look_up(owner, name, "permanent")
+    entry = _look_up(owner, name, "permanent")
     length = math.hypot(*direction)
     if not (length > 0.0 and math.isfinite(length)):
         raise InputError(f"{owner}: magnetization: must have a direction for {name} to be magnetized in")
-    x, y, z = (found.magnetization * component / length for component in direction)
+    x, y, z = (entry.magnetization * component / length for component in direction)
     return x, y, z
 
 
 def _look_up(owner: str, name: str, kind: str | None = None) -> Material:
-    known = [one.name for one in MATERIALS.values() if kind in (None, one.kind)]
+    """Return a material by its name; raise :class:`InputError` where none of the kind has it."""
+    known = [entry.name for entry in MATERIALS.values() if kind in (None, entry.kind)]
     if not isinstance(name, str) or name not in known:
-        which = f"{kind} material" if kind else "material"
-        raise InputError(f"{owner}: {short_repr(name)} is no {which} known here, which are {', '.join(known)}")
+        sought = f"{kind} material" if kind else "material"
+        raise InputError(f"{owner}: {short_repr(name)} is no {sought} known here, which are {', '.join(known)}")
     return MATERIALS[name]

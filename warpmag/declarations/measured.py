@@ -1,8 +1,8 @@
-"""Measured B-H curves of named materials, H [A/m] and B [T], as published.
+"""Published B-H curves of named materials, H [A/m] and B [T].
 
-Points of the material library of FEMM 4.2 (D. Meeker, Finite Element Method Magnetics; its file ``matlib.dat``, in the
-repository cenit/FEMM ``bin/matlib.dat`` at commit 544172c): all of them where they are few, otherwise so many that the
-curve through them stays within 0.5 % of the rest in B.
+The points are from the material library of FEMM 4.2 (D. Meeker, Finite Element Method Magnetics; file ``matlib.dat``,
+``bin/matlib.dat`` of the repository cenit/FEMM at 544172c). Long tables are thinned: the curve through the points that
+remain is within 0.5 % in B of those left out.
 """
 
 MEASURED_CURVES = {
@@ -38,4 +38,4 @@ MEASURED_CURVES = {
         ((32902.232516, 1.667548), (92585.397305, 1.789509), (160685.354903, 1.878209), (318310.0, 2.08)),
     ),
 }
-"""Of each material its source, and rows of points (H, B)."""
+"""Source and rows of points (H, B) of each material."""

@@ -1,4 +1,4 @@
-"""Paths that USD can name."""
+"""Paths of files, as USD can name them."""
 
 import os
 import re
@@ -8,14 +8,14 @@ from warpmag.errors import InputError
 
 _ARGUMENTS = ":SDF_FORMAT_ARGS:"
 _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-"""Control characters, ends of lines, and what Python makes of bytes that are no UTF-8."""
+"""Control characters, ends of lines, and the surrogates that Python decodes from bytes that are no UTF-8."""
 
 
 def usable_path(path: str | os.PathLike) -> Path:
-    """Return a path as USD takes it, ``~`` expanded.
+    """Return a path that USD can name, ``~`` expanded.
 
     Raises:
-        InputError: USD cannot name it, neither in a layer nor in a message.
+        InputError: USD cannot name the path in a layer or in a message.
     """
     text = os.fsdecode(path)
     if not text:
@@ -25,27 +25,31 @@ def usable_path(path: str | os.PathLike) -> Path:
     if _ARGUMENTS in text:
         raise InputError(f"{text}: USD takes what follows {_ARGUMENTS} for arguments")
     try:
-        found = Path(text).expanduser()
+        expanded = Path(text).expanduser()
     except RuntimeError:
         raise InputError(f"{text}: no such home folder") from None
-    if "\\" in os.path.abspath(found):
+    if "\\" in os.path.abspath(expanded):
         raise InputError(f"{text}: USD takes a backslash for a slash")
-    return found
+    return expanded
 
 
 def full_path(path: Path) -> Path:
-    """Return the full path of a file; links to it stay, those on the way to a folder above them are resolved.
+    """Return the absolute path of a file.
 
-    USD takes ``link/..`` for the folder that holds the link; it is the folder above the one that it points to.
+    A link to the file stays. Links of folders are resolved if the path contains ``..``: USD reads ``link/..`` as the
+    folder that holds the link, the file system as the folder above the link's target.
     """
     return (path.parent.resolve() if ".." in path.parts else Path(os.path.abspath(path.parent))) / path.name
 
 
 def path_between(layer: Path, target: Path) -> str:
-    """Return by which path ``layer`` names ``target``: relative to it, also where a link leads to its folder."""
+    """Return the path by which ``layer`` names ``target``: relative where possible, otherwise absolute.
+
+    The relative path must hold from the layer's folder and from a link to that folder.
+    """
     short = os.path.relpath(full_path(target), layer.parent.resolve())
     for folder in (layer.parent.resolve(), full_path(layer).parent):
-        found = os.path.normpath(os.path.join(folder, short))
-        if not (os.path.exists(found) and os.path.samefile(found, target)):
+        joined = os.path.normpath(os.path.join(folder, short))
+        if not (os.path.exists(joined) and os.path.samefile(joined, target)):
             return str(full_path(target))
     return short if short.startswith("..") else f"./{short}"

@@ -1,4 +1,4 @@
-"""The one way to an attribute's value: of the type that its schema says, finite and in range, or one line about it."""
+"""Values of USD attributes, checked: of the type of the schema, finite and in range; otherwise an error of one line."""
 
 import contextlib
 import math
@@ -13,16 +13,16 @@ from pxr import Gf, Tf, Usd, UsdUtils, Vt
 from warpmag.errors import InputError, one_line
 
 LARGEST = float(np.finfo(np.float32).max)
-"""What lies beyond single precision cannot reach Newton."""
+"""Largest number that Newton can hold, in single precision."""
 SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
-"""Sizes of shapes [m] whose volumes, inertias and moments single precision holds."""
+"""Range of sizes of shapes [m]: single precision holds their volumes, inertias and moments."""
 LARGEST_COORDINATE = 1e8
-"""Limit of every coordinate [m], so that squares and fourth powers of distances stay in single precision."""
+"""Largest coordinate [m]: single precision holds squares and fourth powers of distances."""
 _LIGHTEST, _HEAVIEST = 1e-20, 1e20
 _FASTEST = 1e6
 _SIZE, _COORDINATE = (SMALLEST_SIZE, LARGEST_SIZE, False), (-LARGEST_COORDINATE, LARGEST_COORDINATE, False)
 _COEFFICIENT = (0.0, 1e6, False)
-_RANGES = {  # lowest, highest, and whether 0 stands for "not given"
+_RANGES = {  # least, largest, and whether 0 means "not given"
     **dict.fromkeys(("radius", "radiusTop", "radiusBottom", "size", "height"), _SIZE),
     **dict.fromkeys(("points", "physics:centerOfMass"), _COORDINATE),
     **dict.fromkeys(("physics:localPos0", "physics:localPos1"), _COORDINATE),
@@ -51,8 +51,11 @@ _TOKENS = {
     "orientation": ("rightHanded", "leftHanded"),
 }
 _TURNS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
-_INERTIA = 1e-2
-"""Inertias are often rounded: by this part of their sum the largest may exceed the others."""
+_INERTIA_TOLERANCE = 1e-2
+"""Largest excess of a moment of inertia over the sum of the other two, as a fraction of the sum of all three.
+
+Moments of inertia are often rounded.
+"""
 _READ = ("physics:", "newton:", "mjc:", "drive:", "limit:")
 _SHAPES = {
     "Sphere": ("radius",),
@@ -68,7 +71,7 @@ _OF_SCHEMAS = (
     *("physics:staticFriction", "physics:dynamicFriction", "physics:restitution"),
     *("physics:velocity", "physics:angularVelocity", "physics:kinematicEnabled"),
 )
-"""What counts only where its schema is applied, one of the first few below."""
+"""Attributes without effect where none of their schemas is applied, which are the first four of ``_SCHEMAS``."""
 _SCHEMAS = (
     *("PhysicsMassAPI", "PhysicsMaterialAPI", "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"),
     *("NewtonSceneAPI", "NewtonMaterialAPI", "NewtonMeshCollisionAPI", "NewtonCollisionAPI"),
@@ -83,19 +86,19 @@ _DECLARED = {
         *("tendon", "tendon_guide", "tendon_segment", "curve", "surface", "volume"),
     ),
 }
-"""What the customData of an attribute have to say by which a scene declares it to Newton."""
+"""Keys and values of the customData by which an attribute of a scene is declared to Newton."""
 _OPTIONS = ("newton:joint_drive_gains_scaling", "newton:collapse_fixed_joints")
-"""What Newton reads of a scene besides, though no schema has it."""
+"""Other attributes of a scene that Newton reads, though no schema has them."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something wrong with a stage.
+    """An error or a warning about a stage.
 
     Attributes:
         where: Path of the prim, or the name of the stage.
-        message: What is wrong with it.
-        severity: ``error`` (a run refuses the stage) or ``warning``.
+        message: The fault.
+        severity: ``error`` (a run does not start) or ``warning``.
     """
 
     where: str
@@ -103,13 +106,13 @@ class Finding:
     severity: str = "error"
 
     def __str__(self) -> str:
-        """One line that names the prim."""
+        """Return one line that names the prim."""
         return one_line(f"{self.where}: {self.message}")
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep what USD has to say off stderr; its errors are raised all the same."""
+    """Keep USD's messages off stderr; USD still raises its errors."""
     silencer = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
@@ -118,7 +121,7 @@ def quiet() -> Iterator[None]:
 
 
 def finding_of(where: str, error: InputError) -> Finding:
-    """Return what an :class:`InputError` about ``where`` says as a finding."""
+    """Return the finding of an :class:`InputError` about ``where``."""
     return Finding(where, str(error).removeprefix(f"{where}: "))
 
 
@@ -126,8 +129,8 @@ def value_of(prim: Usd.Prim, name: str):
     """Return the default value of an attribute, None where it has none.
 
     Raises:
-        InputError: The value is not what the schema says it is, not finite or out of range. Infinities that are the
-            schema's own defaults, of a limit say, are right.
+        InputError: The value is not of the schema's type, not finite or out of range. Infinities are valid where they
+            are the schema's defaults, such as those of limits.
     """
     attribute = prim.GetAttribute(name)
     if not attribute:
@@ -145,17 +148,17 @@ def value_of(prim: Usd.Prim, name: str):
     if name in _TOKENS and value not in _TOKENS[name]:
         raise InputError(f"{prim.GetPath()}: {name} must be one of {', '.join(_TOKENS[name])}, got {_shown(value)}")
     _check_numbers(prim, name, value, fallback)
-    if message := _shape_of_value(name, value):
+    if message := _broken_condition(name, value):
         raise InputError(f"{prim.GetPath()}: {name} {message}, got {_shown(value)}")
     return value
 
 
 def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
-    """Yield what is wrong with those attributes of a prim that Newton's importer reads, transforms left out.
+    """Yield errors and warnings about the attributes of a prim that Newton's importer reads, without transforms.
 
     Args:
         prim: Any prim.
-        shape: Whether its shape counts, too.
+        shape: Whether to check the attributes of its shape, too.
     """
     names = [name for name in prim.GetAuthoredPropertyNames() if name.startswith(_READ)]
     for name in (*names, *(_SHAPES.get(prim.GetTypeName(), ()) if shape else ())):
@@ -169,31 +172,32 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
         if finding := instance_finding(attribute):
             yield finding
         if name in _OF_SCHEMAS and name not in prim.GetPrimDefinition().GetPropertyNames():
-            schemas = " or ".join(one for one in _SCHEMAS[:4] if name in _defaults(one))
+            schemas = " or ".join(schema for schema in _SCHEMAS[:4] if name in _defaults(schema))
             yield Finding(str(prim.GetPath()), f"{name} has no effect: the prim has no {schemas}", "warning")
 
 
 def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
-    """Yield what is wrong with properties of a scene that no schema has: Newton takes them for declarations."""
-    path, schemas = str(scene.GetPath()), {*scene.GetPrimDefinition().GetPropertyNames(), *_of_newton(), *_OPTIONS}
-    for one in scene.GetAuthoredPropertiesInNamespace("newton"):
-        name = one.GetName()
-        if name in schemas:
+    """Yield errors and warnings about ``newton`` properties of a scene in no schema: Newton reads them as declarations."""
+    path = str(scene.GetPath())
+    known = {*scene.GetPrimDefinition().GetPropertyNames(), *_newton_attributes(), *_OPTIONS}
+    for attribute in scene.GetAuthoredPropertiesInNamespace("newton"):
+        name = attribute.GetName()
+        if name in known:
             continue
-        if not isinstance(one, Usd.Attribute):
+        if not isinstance(attribute, Usd.Attribute):
             yield Finding(path, f"{name} is a relationship, but in no schema: Newton takes it for an attribute")
             continue
-        given = {key: one.GetCustomDataByKey(key) for key in _DECLARED}
-        for key, value in given.items():
+        declaration = {key: attribute.GetCustomDataByKey(key) for key in _DECLARED}
+        for key, value in declaration.items():
             if value and not isinstance(value, str):
                 yield Finding(path, f"{name} has the {key} {_shown(value)} in its customData, which must be text")
-        if any(str(given[key]).lower() not in allowed for key, allowed in _DECLARED.items()):
+        if any(str(declaration[key]).lower() not in allowed for key, allowed in _DECLARED.items()):
             message = "no schema has it, and its customData do not declare it with an assignment and a frequency"
             yield Finding(path, f"{name} has no effect: {message}", "warning")
 
 
 def instance_finding(attribute: Usd.Attribute) -> Finding | None:
-    """Return what is wrong with time samples where no value can be held: inside an instance, from which all read."""
+    """Return the error about time samples inside an instance, where no value can be held; None where there are none."""
     prim = attribute.GetPrim()
     if not (prim.IsInstanceProxy() and attribute.GetNumTimeSamples()):
         return None
@@ -210,11 +214,11 @@ def instance_finding(attribute: Usd.Attribute) -> Finding | None:
 
 
 def number(name: str, value) -> float:
-    """Return a number, the shortest decimal that its single precision stands for: 0.001, not 0.0010000000475.
+    """Return the shortest decimal that rounds to a number in single precision: 0.001, not 0.0010000000475.
 
     Args:
         name: Prim and attribute, for the message.
-        value: What the attribute holds, whatever type a hand-written file gave it.
+        value: Value of the attribute; hand-written files can give it any type.
     """
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         raise InputError(f"{name}: {_shown(value)} is not a float")
@@ -226,7 +230,7 @@ def vector(name: str, value) -> tuple[float, float, float]:
     """Return a vector of three numbers as :func:`number` gives them."""
     if not isinstance(value, _VECTORS):
         raise InputError(f"{name}: {_shown(value)} is not a vector")
-    x, y, z = (number(name, one) for one in value)
+    x, y, z = (number(name, component) for component in value)
     return x, y, z
 
 
@@ -265,40 +269,40 @@ def point_array(name: str, value) -> tuple[tuple[float, float, float], ...]:
 
 
 def check_type(prim: Usd.Prim, name: str, value, example) -> None:
-    """Raise :class:`InputError` unless ``value`` is of the type of ``example``, which None leaves open."""
+    """Raise :class:`InputError` unless ``value`` has the type of ``example``; None allows every type."""
     if example is not None and type(value) is not type(example):
         raise InputError(f"{prim.GetPath()}: {name} must be {_kind(example)}, got {_shown(value)}")
 
 
 def declared(attribute: Usd.Attribute):
-    """Return a value of the type that an attribute is declared with, None where that type is unknown."""
+    """Return a value of the declared type of an attribute, None where that type is unknown."""
     return attribute.GetTypeName().defaultValue if attribute.GetTypeName() else None
 
 
 @cache
 def _known() -> dict[str, object]:
-    """Defaults of what Newton reads by name alone, applied schema or not."""
+    """Return the defaults of attributes that Newton reads by name, with the schema applied or not."""
     return {name: value for schema in _SCHEMAS for name, value in _defaults(schema).items()}
 
 
 @cache
-def _of_newton() -> frozenset[str]:
-    """Attributes of all of Newton's schemas that can be applied, some of which it reads where they are not."""
+def _newton_attributes() -> frozenset[str]:
+    """Return the attributes of all of Newton's API schemas; Newton reads some where the schema is not applied."""
     types = Tf.Type.FindByName("UsdAPISchemaBase").GetAllDerivedTypes()
-    names = [str(Usd.SchemaRegistry.GetSchemaTypeName(one)) for one in types]
+    names = [str(Usd.SchemaRegistry.GetSchemaTypeName(schema)) for schema in types]
     return frozenset(attribute for name in names if name.startswith("Newton") for attribute in _defaults(name))
 
 
 @cache
 def _defaults(schema: str) -> dict[str, object]:
-    """Attributes of an applied schema and their defaults."""
+    """Return the defaults of an API schema, by attribute."""
     definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema)
     names = definition.GetPropertyNames() if definition else ()
     return {name: definition.GetAttributeFallbackValue(name) for name in names}
 
 
 def _expected(prim, attribute):
-    """Return a value of the right type, and the schema's default or None."""
+    """Return a value of the right type for an attribute, and the schema's default or None."""
     name = attribute.GetName()
     fallback = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
     if fallback is None:
@@ -307,17 +311,18 @@ def _expected(prim, attribute):
 
 
 def _check_numbers(prim, name, value, fallback) -> None:
+    """Raise :class:`InputError` unless the numbers of a value are finite and in range, or the infinite default."""
     given = _numbers(value)
     if given is None or not given.size:
         return
-    usual = None if fallback is None else _numbers(fallback)
-    if usual is not None and np.isinf(usual).all() and np.array_equal(given, usual):
+    default = None if fallback is None else _numbers(fallback)
+    if default is not None and np.isinf(default).all() and np.array_equal(given, default):
         return
     where = f"{prim.GetPath()}: {name}"
     lowest, highest, zero = _RANGES.get(name, (-LARGEST, LARGEST, True))
     if lowest > 0.0 and not (np.isfinite(given) & ((given > 0.0) | (zero & (given == 0.0)))).all():
-        wanted = "not be negative and must be finite" if zero else "be positive and finite"
-        raise InputError(f"{where} must {wanted}, got {_shown(value)}")
+        condition = "not be negative and must be finite" if zero else "be positive and finite"
+        raise InputError(f"{where} must {condition}, got {_shown(value)}")
     if not np.isfinite(given).all():
         raise InputError(f"{where} must be finite, got {_shown(value)}")
     wrong = (given < lowest) | (given > highest)
@@ -326,13 +331,13 @@ def _check_numbers(prim, name, value, fallback) -> None:
         raise InputError(f"{where} must be {unless}from {lowest:g} to {highest:g}, got {_shown(value)}")
 
 
-def _shape_of_value(name, value) -> str:
-    """Return what the numbers of a value must be together, empty where they are."""
+def _broken_condition(name, value) -> str:
+    """Return the condition that the numbers of a value break together, empty where they break none."""
     if name in _TURNS:
         norm = float(np.linalg.norm(_numbers(value)))
         if abs(norm - 1.0) > 1e-2 and not (norm == 0.0 and name == "physics:principalAxes"):
             return "must be a quaternion of length 1"
-    if name == "physics:diagonalInertia" and 2.0 * max(value) > (1.0 + _INERTIA) * sum(value):
+    if name == "physics:diagonalInertia" and 2.0 * max(value) > (1.0 + _INERTIA_TOLERANCE) * sum(value):
         return "must be the inertia of a body: none of three more than the sum of the others"
     return ""
 
@@ -350,6 +355,7 @@ def _numbers(value) -> np.ndarray | None:
 
 
 def _kind(example) -> str:
+    """Return the type of a value with its article, for a message."""
     if isinstance(example, str):
         return "a token"
     name = type(example).__name__
@@ -357,7 +363,7 @@ def _kind(example) -> str:
 
 
 def _shown(value) -> str:
-    """Return a value in a few words, however long it is."""
+    """Return a value as short text, for a message."""
     if isinstance(value, float):
         return f"{value:g}" if math.isfinite(value) else str(value)
     if isinstance(value, _VECTORS):

@@ -1,4 +1,4 @@
-"""Many balls at once: Newton copies one that its own calls made, so that nothing of what it knows is repeated here."""
+"""Adding many balls at once: Newton's own calls make one ball, and Newton copies it."""
 
 import math
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ from warpmag.moments.arrays import host_array, host_radii, host_scalars, shape_m
 from warpmag.terminal import collection_paused
 
 _SUFFIXES = {"body": "", "joint": "_free_joint", "articulation": "_articulation", "shape": "_shape"}
-"""What Newton's ``add_body`` appends to the label of a body for what it makes with it, and we for the shape."""
-_OWN = ("body_q", "body_qd", "body_world", "body_label", "shape_body", "shape_world", "shape_label")
-"""What a copy of a ball has of its own."""
+"""Ends of the labels of what belongs to a body: Newton's ``add_body`` appends the first three, warpmag the last."""
+_NOT_COPIED = ("body_q", "body_qd", "body_world", "body_label", "shape_body", "shape_world", "shape_label")
+"""Lists of a builder whose entries differ between copies of a ball."""
 
 
 @dataclass(frozen=True)
 class Balls:
-    """What :func:`add_balls` has added, in the order of the positions.
+    """Bodies and shapes that :func:`add_balls` has added, in the order of the positions.
 
     Attributes:
         bodies: The bodies.
-        shapes: Their shapes, one each.
+        shapes: Their shapes, one for each body.
     """
 
     bodies: range
@@ -57,14 +57,14 @@ def add_balls(
 ) -> Balls:
     """Add many free balls, each of which is one magnet.
 
-    The model is that of ``add_body``, ``add_shape_sphere`` and :func:`add_inducible` or :func:`add_permanent` for each,
-    in some microseconds each. What is not said of shapes is that of ``builder.default_shape_cfg``.
+    The model equals that of ``add_body``, ``add_shape_sphere`` and :func:`add_inducible` or :func:`add_permanent` for
+    each ball. A ball takes some microseconds. Other properties of shapes are those of ``builder.default_shape_cfg``.
 
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
-        positions: Centres [m], shape [n, 3].
+        positions: Centers [m], shape [n, 3].
         radius: Radius of all, or of each, shape [n] [m].
-        orientations: Rotations, unit quaternions x y z w, shape [n, 4]; by default none is turned.
+        orientations: Rotations, unit quaternions x y z w, shape [n, 4]; by default the identity.
         density: Density [kg/m³].
         friction: Coefficient of friction [dimensionless].
         material: Name of a material of :mod:`warpmag.declarations.materials`: inducible, or permanent with
@@ -76,14 +76,13 @@ def add_balls(
             only its direction counts.
         recoil_permeability: As :func:`add_permanent` takes it.
         color: Color of all, RGB from 0 to 1; by default one of Newton's palette.
-        label: What labels begin with, followed by ``_`` and the number of the ball; by default Newton's.
+        label: Prefix of labels, before ``_`` and the number of the ball; by default Newton's labels.
 
     Returns:
         The bodies and the shapes.
 
     Raises:
-        InputError: The attributes are not declared, a position or a value is out of range, or arrays do not fit each
-            other.
+        InputError: The attributes are not declared, a position or a value is out of range, or lengths of arrays differ.
     """
     check_registered(builder)
     poses = _poses(positions, orientations)
@@ -91,8 +90,8 @@ def add_balls(
         check_vector("color", color)
     count = len(poses)
     radii = _radii(radius, count)
-    given = {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
-    magnet = _magnet(material, given, magnetization, recoil_permeability)
+    response = {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
+    magnet = _magnet(material, response, magnetization, recoil_permeability)
     magnet.check("add_balls")
     bodies = range(builder.body_count, builder.body_count + count)
     shapes = range(builder.shape_count, builder.shape_count + count)
@@ -109,22 +108,25 @@ def add_balls(
 def copy_ball(
     builder: newton.ModelBuilder, body: int, poses: np.ndarray, velocities: np.ndarray, first: str, others: list[str]
 ) -> Balls:
-    """Add balls that are like one that a builder has: what it says of body and shape, magnets included, but the pose.
+    """Add copies of a ball of the builder, magnet included, at other poses.
 
     Args:
         builder: The builder.
         body: A free body with one shape, a ball.
         poses: Positions [m] and quaternions x y z w, shape [n, 7].
-        velocities: Linear [m/s] and angular velocities [rad/s], world, shape [n, 6].
-        first: What labels of the body and of what belongs to it begin with.
-        others: What those of each new one begin with in its place.
+        velocities: Linear [m/s] and angular velocities [rad/s], world frame, shape [n, 6].
+        first: Prefix of the labels of the body and its shape.
+        others: Prefix of the labels of each copy.
+
+    Returns:
+        The bodies and the shapes of the copies.
     """
     (shape,) = builder.body_shapes[body]
     rows, count = {"body": body, "shape": shape}, len(poses)
     template = _template(builder, builder.shape_scale[shape][0], builder.default_shape_cfg, None)
     for name, values in vars(template).items():
         kind = name.partition("_")[0]
-        if kind in rows and name not in _OWN and isinstance(values, list) and len(values) == 1:
+        if kind in rows and name not in _NOT_COPIED and isinstance(values, list) and len(values) == 1:
             values[0] = getattr(builder, name)[rows[kind]]
     new = {
         "body": range(builder.body_count, builder.body_count + count),
@@ -139,8 +141,8 @@ def copy_ball(
     for kind, row in rows.items():
         labels = getattr(builder, f"{kind}_label")
         end = labels[row].removeprefix(first)
-        labels[-count:] = [f"{one}{end}" for one in others]
-    builder.articulation_label[-count:] = builder.body_label[-count:]  # as in an import
+        labels[-count:] = [f"{prefix}{end}" for prefix in others]
+    builder.articulation_label[-count:] = builder.body_label[-count:]  # as Newton's import of stages names them
     for attribute in builder.custom_attributes.values():
         kind = getattr(attribute.frequency, "name", "").lower()
         values: Any = attribute.values
@@ -150,7 +152,7 @@ def copy_ball(
 
 
 def _poses(positions, orientations) -> np.ndarray:
-    """Positions and unit quaternions, checked, shape [n, 7]."""
+    """Return checked positions and unit quaternions, shape [n, 7]."""
     places = host_array("positions", positions)
     if places.ndim != 2 or places.shape[1] != 3:
         raise InputError(shape_message("positions", "[n, 3]", places))
@@ -163,7 +165,7 @@ def _poses(positions, orientations) -> np.ndarray:
         if turns.shape != (len(places), 4):
             raise InputError(shape_message("orientations", f"[{len(places)}, 4]", turns))
         lengths = np.linalg.norm(turns, axis=1)
-        if (np.abs(lengths - 1.0) > 1e-3).any():  # what rounding to few digits leaves
+        if (np.abs(lengths - 1.0) > 1e-3).any():  # components are often rounded to few digits
             worst = int(np.argmax(np.abs(lengths - 1.0)))
             raise InputError(
                 f"orientations: must be unit quaternions, that of ball {worst} has length {lengths[worst]:g}"
@@ -173,6 +175,7 @@ def _poses(positions, orientations) -> np.ndarray:
 
 
 def _radii(radius, count: int) -> np.ndarray:
+    """Return the checked radius of each ball [m], shape [n]."""
     radii = host_scalars("radius", host_radii("radius", radius, wp.float32), count)
     if not (radii > 0.0).all():
         raise InputError("radius: must be positive")
@@ -180,6 +183,7 @@ def _radii(radius, count: int) -> np.ndarray:
 
 
 def _config(builder: newton.ModelBuilder, density, friction) -> newton.ModelBuilder.ShapeConfig:
+    """Return the builder's properties of shapes with another density and friction, where given."""
     config = builder.default_shape_cfg.copy()
     if density is not None:
         check_positive("density", density)
@@ -190,15 +194,16 @@ def _config(builder: newton.ModelBuilder, density, friction) -> newton.ModelBuil
     return config
 
 
-def _magnet(material, given: dict, magnetization, recoil_permeability: float) -> Magnet:
-    said = {name: value for name, value in given.items() if value is not None}
+def _magnet(material, response: dict, magnetization, recoil_permeability: float) -> Magnet:
+    """Return the magnet of the arguments of :func:`add_balls`; ``response`` are those of inducible magnets."""
+    fields = {name: value for name, value in response.items() if value is not None}
     if magnetization is None:
         if recoil_permeability != 1.0:
             raise InputError("recoil_permeability: is of permanent magnets only, which have a magnetization")
-        curve = said.pop("curve", None)
-        return Magnet("inducible", **materials.inducible_from(material, curve, said))
-    if said:
-        raise InputError(f"{next(iter(said))}: is of inducible magnets only, and magnetization makes permanent ones")
+        curve = fields.pop("curve", None)
+        return Magnet("inducible", **materials.inducible_from(material, curve, fields))
+    if fields:
+        raise InputError(f"{next(iter(fields))}: is of inducible magnets only, and magnetization makes permanent ones")
     check_vector("magnetization", magnetization)
     if material is not None:
         magnetization = materials.permanent("material", material, magnetization)
@@ -206,7 +211,7 @@ def _magnet(material, given: dict, magnetization, recoil_permeability: float) ->
 
 
 def _empty_like(builder: newton.ModelBuilder) -> newton.ModelBuilder:
-    """A builder without anything, that Newton can merge into ``builder`` without changing what that one says."""
+    """Return an empty builder that Newton can merge into ``builder`` without changing its settings."""
     empty = newton.ModelBuilder(up_axis=builder.up_axis)
     empty.rigid_gap = builder.rigid_gap
     world = builder.current_world
@@ -215,7 +220,7 @@ def _empty_like(builder: newton.ModelBuilder) -> newton.ModelBuilder:
 
 
 def _template(builder: newton.ModelBuilder, radius: float, config, color) -> newton.ModelBuilder:
-    """A builder with one ball, as Newton's own calls make it."""
+    """Return a builder with one ball, made by Newton's own calls."""
     template = _empty_like(builder)
     body = template.add_body()
     template.add_shape_sphere(body, radius=float(radius), cfg=config, color=color)
@@ -223,8 +228,10 @@ def _template(builder: newton.ModelBuilder, radius: float, config, color) -> new
 
 
 def _add_copies(builder: newton.ModelBuilder, template: newton.ModelBuilder, count: int) -> None:
-    """Add copies of a builder with one ball: a row of them, and that row many times, since Newton loops over copies but
-    not over what is in one."""
+    """Add ``count`` copies of a builder with one ball: a row of copies, and many copies of that row.
+
+    Newton loops over copies in Python, but adds the contents of one copy as a whole: n copies take about 2√n passes.
+    """
     row_length = math.isqrt(count)
     row = _empty_like(template)
     row.replicate(template, row_length, separate_worlds=False)
@@ -233,24 +240,24 @@ def _add_copies(builder: newton.ModelBuilder, template: newton.ModelBuilder, cou
 
 
 def _place(builder: newton.ModelBuilder, poses: np.ndarray) -> None:
-    """Put the last bodies, and the free joints that hold them, where they are."""
+    """Set the poses of the last bodies and of their free joints."""
     poses = np.ascontiguousarray(poses, np.float32)
     builder.body_q[-len(poses) :] = map(wp.transform.from_buffer_copy, poses)
     builder.joint_q[-poses.size :] = poses.ravel().tolist()
 
 
 def _resize(builder: newton.ModelBuilder, radii: np.ndarray, config: Any) -> None:
-    """Give the last balls, of several sizes, what Newton computes from each radius, once for each that there is."""
-    sizes, which = np.unique(radii, return_inverse=True)
+    """Set scale, mass and inertia of the last balls where radii differ, computed by Newton once for each radius."""
+    sizes, size_of = np.unique(radii, return_inverse=True)
     if len(sizes) == 1:
         return
     density, solid, margin = config.density, config.is_solid, config.margin
-    kind, which = newton.GeoType.SPHERE, which.tolist()
+    kind, size_of = newton.GeoType.SPHERE, size_of.tolist()
     scales = [(float(size), 0.0, 0.0) for size in sizes]
-    found = [newton.geometry.compute_inertia_shape(kind, scale, None, density, solid, margin) for scale in scales]
-    masses, inertias = [mass for mass, _, _ in found], [inertia for _, _, inertia in found]
+    properties = [newton.geometry.compute_inertia_shape(kind, scale, None, density, solid, margin) for scale in scales]
+    masses, inertias = [mass for mass, _, _ in properties], [inertia for _, _, inertia in properties]
     about_axis = [float(np.array(inertia).flat[0]) for inertia in inertias]  # the same about every axis
-    inverses = [wp.mat33(*(np.eye(3) * (1.0 / one if one else 0.0)).ravel().tolist()) for one in about_axis]
+    inverses = [wp.mat33(*(np.eye(3) * (1.0 / value if value else 0.0)).ravel().tolist()) for value in about_axis]
     for name, values in (
         ("body_mass", masses),
         ("body_inv_mass", [1.0 / mass if mass else 0.0 for mass in masses]),
@@ -259,11 +266,11 @@ def _resize(builder: newton.ModelBuilder, radii: np.ndarray, config: Any) -> Non
         ("shape_scale", scales),
         ("shape_collision_radius", [scale[0] for scale in scales]),
     ):
-        getattr(builder, name)[-len(which) :] = [values[size] for size in which]
+        getattr(builder, name)[-len(size_of) :] = [values[size] for size in size_of]
 
 
 def _name(builder: newton.ModelBuilder, count: int, label: str | None) -> None:
-    """Give the last balls, and all that belongs to them, the labels that they would have if each were added alone."""
+    """Label the last balls, their joints and shapes as if each ball had been added alone."""
     for kind, suffix in _SUFFIXES.items():
         labels = getattr(builder, f"{kind}_label")
         before = len(labels) - count

@@ -1,4 +1,4 @@
-"""The magnets of a Newton model: which of its marked shapes are one, and in which world."""
+"""The magnets of a Newton model: groups of shapes that are one magnet each, with their worlds and sampled moments."""
 
 from dataclasses import dataclass, replace
 
@@ -14,13 +14,13 @@ from warpmag.errors import InputError
 
 @dataclass(frozen=True)
 class BodyMagnet:
-    """Shapes of one body that are one magnet.
+    """One magnet: shapes of one body with the same material and magnetization.
 
     Attributes:
         magnet: The material, magnetization in the frame of the body.
         body: The body, -1 for a magnet fixed in the world.
         shapes: The shapes, together one volume.
-        world: The world, counted among those that hold magnets.
+        world: Index of the world among those that hold magnets.
         lattice: The sampled moments in the frame of the body, grouped by shape.
     """
 
@@ -32,74 +32,77 @@ class BodyMagnet:
 
 
 def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
-    """Group the marked shapes of ``model`` into magnets and sample them, in the order that the system wants.
+    """Group the shapes of ``model`` that carry magnets, and sample the groups.
 
     Args:
         model: The model.
 
     Returns:
-        The magnets, and the Newton worlds that hold them, -1 where there are none.
+        The magnets, by world, then inducible before permanent ones, then by body; and the Newton worlds that hold
+        them, [-1] for a model without worlds.
     """
-    marked = marked_shapes(model)
-    shapes, stored = np.array(list(marked)), list(marked.values())
-    _, first, which = np.unique(list(map(id, stored)), return_index=True, return_inverse=True)
+    magnet_of_shape = marked_shapes(model)
+    shapes, stored = np.array(list(magnet_of_shape)), list(magnet_of_shape.values())
+    _, first, stored_of = np.unique(list(map(id, stored)), return_index=True, return_inverse=True)
     body_of = model.shape_body.numpy()[shapes]
-    # few materials and rotations, of many shapes
-    rows, turned = unique_rows(np.column_stack([which, model.shape_transform.numpy()[shapes, 3:]]))
-    magnets = [_turned(stored[first[int(row[0])]], row[1:].tolist()) for row in rows]
-    members = _group(body_of, turned, magnets)
-    lead = np.array([one[0] for one in members])
+    # many shapes share few materials and rotations: each pair is turned into the body's frame once
+    pairs, pair_of = unique_rows(np.column_stack([stored_of, model.shape_transform.numpy()[shapes, 3:]]))
+    magnets = [_in_body_frame(stored[first[int(pair[0])]], pair[1:].tolist()) for pair in pairs]
+    groups = _group(body_of, pair_of, magnets)
+    lead = np.array([rows[0] for rows in groups])
     worlds, held = _number_worlds(model, shapes[lead])
-    sampler, single = ShapeSampler(model), np.array([len(one) == 1 for one in members])
-    several = -1 - np.arange(len(members))  # magnets of several shapes are looked at one by one
-    kinds = np.where(single, sampler.kinds[shapes[lead]], several)
-    _, first, of_lattice = np.unique(np.stack([turned[lead], kinds]), axis=1, return_index=True, return_inverse=True)
-    lattices = [_sampled(sampler, shapes[members[group]].tolist(), magnets[turned[lead[group]]]) for group in first]
-    fixed = np.array([one.fixed for one in magnets])[turned[lead]]
+    # magnets of one shape share a lattice with others of the same shape and material
+    sampler, single = ShapeSampler(model), np.array([len(rows) == 1 for rows in groups])
+    own_kind = -1 - np.arange(len(groups))
+    kinds = np.where(single, sampler.kinds[shapes[lead]], own_kind)
+    _, first, lattice_of = np.unique(np.stack([pair_of[lead], kinds]), axis=1, return_index=True, return_inverse=True)
+    lattices = [_sampled(sampler, shapes[groups[group]].tolist(), magnets[pair_of[lead[group]]]) for group in first]
+    fixed = np.array([magnet.fixed for magnet in magnets])[pair_of[lead]]
     order = np.lexsort((shapes[lead], body_of[lead], fixed, worlds))
-    columns = (turned[lead], body_of[lead], worlds, of_lattice.ravel())
-    found = zip(order.tolist(), *(column[order].tolist() for column in columns), strict=True)
-    listed = shapes.tolist()
+    columns = (pair_of[lead], body_of[lead], worlds, lattice_of.ravel())
+    table = zip(order.tolist(), *(column[order].tolist() for column in columns), strict=True)
+    shape_of = shapes.tolist()
     return [
-        BodyMagnet(magnets[own], body, tuple(listed[one] for one in members[group]), world, lattices[lattice])
-        for group, own, body, world, lattice in found
+        BodyMagnet(magnets[pair], body, tuple(shape_of[row] for row in groups[group]), world, lattices[lattice])
+        for group, pair, body, world, lattice in table
     ], held
 
 
-def _group(bodies: np.ndarray, turned: np.ndarray, magnets: list[Magnet]) -> list[list[int]]:
-    """Return which marked shapes are one magnet each: those of one body that are of one material; by their rows.
+def _group(bodies: np.ndarray, magnet_of: np.ndarray, magnets: list[Magnet]) -> list[list[int]]:
+    """Return groups of rows: the shapes of one body with the same material and magnetization.
 
     Args:
-        bodies: Body of each, shape [n]; a shape without one is a magnet of its own.
-        turned: Which of ``magnets`` each is, shape [n].
-        magnets: Materials, magnetizations in the frame of the body.
+        bodies: Body of each shape, shape [n]; a shape without a body is a group of its own.
+        magnet_of: Index into ``magnets`` of each shape, shape [n].
+        magnets: Magnets, magnetizations in the frame of the body.
     """
     _, body, sizes = np.unique(bodies, return_inverse=True, return_counts=True)
     alone = (bodies < 0) | (sizes[body] == 1)
     groups = np.flatnonzero(alone)[:, None].tolist()
-    of_body: dict[int, list[list[int]]] = {}
+    groups_of_body: dict[int, list[list[int]]] = {}
     for row in np.flatnonzero(~alone).tolist():
-        known = of_body.setdefault(int(bodies[row]), [])
-        mine = magnets[turned[row]]
-        group = next((one for one in known if _alike(magnets[turned[one[0]]], mine)), None)
+        own_groups = groups_of_body.setdefault(int(bodies[row]), [])
+        magnet = magnets[magnet_of[row]]
+        group = next((group for group in own_groups if _same_magnet(magnets[magnet_of[group[0]]], magnet)), None)
         if group is None:
-            known.append(group := [])
+            own_groups.append(group := [])
         group.append(row)
-    return groups + [one for known in of_body.values() for one in known]
+    return groups + [group for own_groups in groups_of_body.values() for group in own_groups]
 
 
 def _sampled(sampler: ShapeSampler, shapes: list[int], magnet: Magnet) -> BodyLattice:
+    """Return the sampled moments of shapes that are one magnet."""
     return sampler.sample(shapes, magnet.moment_spacing, magnet.fixed, magnet.kind == "permanent")
 
 
-def _turned(magnet: Magnet, rotation: list[float]) -> Magnet:
-    """Return a magnet of a shape in the frame of its body."""
-    turned = wp.quat_rotate(wp.quat(*rotation), wp.vec3(*magnet.magnetization))
-    return replace(magnet, magnetization=tuple(turned))
+def _in_body_frame(magnet: Magnet, rotation: list[float]) -> Magnet:
+    """Return a magnet in the frame of its body; ``rotation`` is that of the shape, a quaternion x y z w."""
+    magnetization = wp.quat_rotate(wp.quat(*rotation), wp.vec3(*magnet.magnetization))
+    return replace(magnet, magnetization=tuple(magnetization))
 
 
-def _alike(a: Magnet, b: Magnet) -> bool:
-    """Return whether two magnets of one body are the same material, magnetized alike up to rounding."""
+def _same_magnet(a: Magnet, b: Magnet) -> bool:
+    """Return whether two magnets of one body have the same material, and the same magnetization up to rounding."""
     if a is b:
         return True
     if replace(a, magnetization=b.magnetization) != b:
@@ -109,9 +112,10 @@ def _alike(a: Magnet, b: Magnet) -> bool:
 
 
 def _number_worlds(model: newton.Model, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the world of each shape, counted among the worlds that hold magnets, and these, -1 if there are no worlds.
+    """Return the index of each shape's world among the worlds that hold magnets, and these worlds.
 
-    A magnet outside all worlds belongs to the only one that holds magnets, if there is only one.
+    A model without worlds has the worlds [-1]. A magnet outside all worlds belongs to the world that holds magnets; an
+    error is raised if there are several.
     """
     worlds = model.shape_world.numpy()[shapes]
     held = np.unique(worlds[worlds >= 0])

@@ -5,11 +5,12 @@ A source of a field moves with the nearest rigid body at or above its prim.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from pxr import Gf, Usd, UsdGeom
 
-from warpmag.declarations.attributes import Schema
+from warpmag.declarations.attributes import Schema, attributes_of
 from warpmag.declarations.coils import Coil, FieldMap, check_strength
 from warpmag.declarations.keys import Keys
 from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
@@ -21,6 +22,7 @@ from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.schemas import author_schema, has_api, read_fields, world_matrix
 from warpmag.usd.values import Finding, finding_of, instance_finding, number
 
+Source = TypeVar("Source", Coil, FieldMap)
 _AMPERE_TURNS = COIL_SCHEMA.usd_name("ampere_turns")
 _BORDER_WARNING = 0.05
 """Largest field on the boundary of a map without a warning, as a fraction of its largest field."""
@@ -84,13 +86,13 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
             yield Finding(path, f"keys move it within its rigid body {body}: a run holds it still there", "warning")
         if has_api(prim, COIL_SCHEMA.name):
             currents = keys.keys(prim, _AMPERE_TURNS, _current)
-            yield PlacedSource(path, _scaled_coil(coil_of(prim), scale), body, position, rotation, currents)
+            yield PlacedSource(path, _scaled(coil_of(prim), scale), body, position, rotation, currents)
         if has_api(prim, FIELD_MAP_SCHEMA.name):
             field_map = field_map_of(prim)
             if (ratio := field_map.border_ratio()) > _BORDER_WARNING:
                 message = f"the field is up to {100.0 * ratio:.0f} % of its largest where the map ends, and zero beyond"
                 yield Finding(path, message, "warning")
-            yield PlacedSource(path, _scaled_map(field_map, scale), body, position, rotation)
+            yield PlacedSource(path, _scaled(field_map, scale), body, position, rotation)
     except InputError as error:
         yield finding_of(path, error)
 
@@ -169,19 +171,15 @@ def _changes(attribute: Usd.Attribute) -> bool:
     return any(spec.layer.GetNumTimeSamplesForPath(spec.path) > 1 for spec in attribute.GetPropertyStack())
 
 
-def _scaled_coil(coil: Coil, scale: float) -> Coil:
-    points = tuple(map(tuple, (scale * np.array(coil.points, float).reshape(-1, 3)).tolist()))
-    sizes = {name: scale * getattr(coil, name) for name in ("radius", "length", "wire_radius")}
-    return replace(coil, points=points, **sizes)
+def _scaled(source: Source, scale: float) -> Source:
+    """Return a source with all its lengths scaled."""
+    lengths = [row.field for row in attributes_of(type(source)) if row.unit == "distance"]
+    return replace(source, **{field: _times(scale, getattr(source, field)) for field in lengths})
 
 
-def _scaled_map(field_map: FieldMap, scale: float) -> FieldMap:
-    return replace(field_map, origin=_times(scale, field_map.origin), spacing=_times(scale, field_map.spacing))
-
-
-def _times(scale: float, numbers) -> tuple[float, float, float]:
-    x, y, z = (scale * component for component in numbers)
-    return x, y, z
+def _times(scale: float, value: Any) -> Any:
+    """Return a number, a vector or vectors times a scale."""
+    return tuple(_times(scale, part) for part in value) if isinstance(value, tuple) else scale * value
 
 
 def _frame(prim):
