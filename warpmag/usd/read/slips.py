@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 
 from pxr import Usd
 
-from warpmag.declarations.attributes import NAMESPACE
+from warpmag.declarations.attributes import NAMESPACE, attributes_of
 from warpmag.declarations.magnets import Magnet
 from warpmag.declarations.schemas import SCHEMAS
 from warpmag.usd.schemas import MATERIAL, has_api
@@ -44,14 +44,15 @@ def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Fi
         magnet: The magnet of the prim.
         keyed: Whether keys change the magnetization.
     """
-    path, magnetized = str(prim.GetPath()), keyed or any(magnet.magnetization)
-    if magnet.kind == "permanent" and not magnetized:
+    path = str(prim.GetPath())
+    if magnet.kind == "permanent" and not (keyed or any(magnet.magnetization)):
         message = f"a permanent magnet without magnetization: warpmag:magnetization says it, or {MATERIAL} its strength"
         yield Finding(path, message, "warning")
     if magnet.kind == "inducible":
-        for name, used in (("magnetization", magnetized), ("recoilPermeability", magnet.recoil_permeability > 1.0)):
-            if used:
-                message = f"warpmag:{name} has no effect on an inducible magnet: warpmag:kind says what it is"
+        for row in attributes_of(Magnet):
+            used = getattr(magnet, row.field) != row.default or (keyed and row.field == "magnetization")
+            if row.kind == "permanent" and used:
+                message = f"{row.usd_name} has no effect on an inducible magnet: warpmag:kind says what it is"
                 yield Finding(path, message, "warning")
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 
+from warpmag.declarations.schemas import SCHEMAS
 from warpmag.errors import InputError
 from warpmag.usd.read.session import UNITS, add_layer, new_layer, release_instances
 
@@ -51,9 +52,7 @@ _POWERS = {
     "newton:xpbd:jointAngularCompliance": (-2, -1),
     **dict.fromkeys(("newton:vbd:rigid:jointLinearStiffness", "newton:vbd:rigid:jointLinearDamping"), _STIFFNESS),
     **dict.fromkeys(("newton:vbd:rigid:jointAngularStiffness", "newton:vbd:rigid:jointAngularDamping"), _TORQUE),
-    **dict.fromkeys(("warpmag:momentSpacing", "warpmag:coil:radius", "warpmag:coil:length"), _LENGTH),
-    **dict.fromkeys(("warpmag:coil:points", "warpmag:coil:wireRadius"), _LENGTH),
-    **dict.fromkeys(("warpmag:fieldMap:origin", "warpmag:fieldMap:spacing"), _LENGTH),
+    **{row.usd_name: _LENGTH for schema in SCHEMAS for row in schema.attributes if row.unit == "distance"},
 }
 _OF_JOINTS = {
     **dict.fromkeys(("physics:lowerLimit", "physics:upperLimit"), (_LENGTH, _NONE)),
