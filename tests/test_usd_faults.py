@@ -83,7 +83,7 @@ REFUSED = {
     "axis of no name": (ball('uniform token axis = "W"', kind="Cone"), "/Ball: axis must be one of X, Y, Z, got 'W'"),
     "NaN that a kind has no use for": (
         ball("vector3f warpmag:magnetization = (nan, 0, 0)"),
-        "/Ball: warpmag:magnetization: must be finite",
+        "/Ball: magnetization: must be finite",
     ),
     "collider that is no shape": (ball(kind="Xform"), "/Ball: a magnet without colliders that are solid"),
     "magnet as large as a country": (ball(radius="double radius = 1e5"), "/Ball: radius 100000 scaled by 1 to 1 must"),

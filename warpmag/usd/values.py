@@ -177,7 +177,7 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
 
 
 def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
-    """Yield errors and warnings about a scene's ``newton`` properties in no schema, which Newton reads as declarations."""
+    """Yield findings about a scene's ``newton`` properties that no schema has: Newton takes them for declarations."""
     path = str(scene.GetPath())
     known = {*scene.GetPrimDefinition().GetPropertyNames(), *_newton_attributes(), *_OPTIONS}
     for attribute in scene.GetAuthoredPropertiesInNamespace("newton"):
