@@ -1,5 +1,5 @@
-"""Measurements: of this library against the paper, its rivals and its peers."""
+"""Benchmarks of warpmag: against the paper, exact references and other libraries."""
 
 import warp as wp
 
-wp.config.enable_backward = False  # as the command does, before Newton is imported: half the time to compile
+wp.config.enable_backward = False  # before Newton is imported, as the command does: halves the time to compile

@@ -1,20 +1,19 @@
-"""How far an answer is from the truth, and what it costs: ``python -m bench.accuracy [--device cuda:0] [-o DIR]``.
+"""Errors of results and their cost: ``python -m bench.accuracy [ERROR ...] [--device cuda:0] [-o DIR]``.
 
-Four errors, each against its own reference and each on its own axis, the same of box magnets, and what the near-contact
-model costs:
+Each error has its own reference:
 
-| error | of what | reference |
+| error | quantity | reference |
 |---|---|---|
 | rounding | fields and forces in float32 and float64 | the float64 oracle |
 | iteration | magnetizations at a tolerance | a float64 Newton solution |
-| model | forces of two permeable balls as dipoles, or with the near-contact model | their exact multipole solution |
+| model | forces of two permeable balls as dipoles, or with the near-contact model | exact multipole solution |
 | clusters | the same of three balls in a row and of thirteen, and their moments | ``bench.reference.clusters`` |
 | time step | energy of two balls that fall towards each other | conservation |
-| boxes | forces of two box magnets, sampled as they come | ``bench.reference.magnet_pairs`` |
+| boxes | forces of two box magnets | ``bench.reference.magnet_pairs`` |
 | price | time of the near-contact model in a touching pile | dipoles alone |
-| arrangements | magnetizations of many arrangements, and what the solve says of them | a float64 Newton solution |
+| arrangements | magnetizations of many arrangements, and the estimate of the solve | a float64 Newton solution |
 
-Prints a table of each, or of those named, and writes ``accuracy.jsonl`` and, of all, ``accuracy.png``.
+Prints a table of each error, or of the named ones, and writes ``accuracy.jsonl``; of all errors also ``accuracy.png``.
 """
 
 import argparse
@@ -32,7 +31,7 @@ from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
 from bench.reference import clusters, magnet_pairs, oracle, spheres
 from bench.reference.fall import DURATION, fall
-from bench.run import RUNNERS, make_system
+from bench.run import RUNNERS, make_system, relative
 from bench.systems import moment_system
 from bench.timing import measure
 from warpmag.declarations.magnets import CONTACT_MODELS
@@ -41,14 +40,14 @@ from warpmag.moments.system import MomentSystem
 SIZES = (243, 1032, 2560, 10000)
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 BLOCK = 1000
-"""Balls of the pile whose iteration error is measured: as many as the dense Newton solution can do."""
+"""Balls of the pile whose iteration error is measured: the most that the dense Newton solution can solve."""
 PERMEABILITIES = (2.0, 4.0, 10.0, 1000.0, np.inf)
 GAPS = (0.01, 0.03, 0.1, 0.3, 0.5, 0.9, 1.2, 3.0)
 """Gaps between two balls over their radius."""
 SIDE, BOX_GAPS, MAGNETIZATION = 0.02, (0.0, 0.01, 0.05, 0.2, 0.5, 1.0, 2.0), 1e6
 """Longest edge of box magnets [m], gaps between two of them over it, and their magnetization along z [A/m]."""
 PILES = (2500, 10000)
-"""Balls of the piles on which the near-contact model's price is taken."""
+"""Balls of the piles on which the near-contact model is timed."""
 STEPS = (4e-4, 2e-4, 1e-4, 5e-5)
 """Time steps [s]."""
 
@@ -61,13 +60,13 @@ def rounding(device) -> Iterator[dict]:
                 system = make_system(count, dtype, device)
                 system.solve()
                 system.apply_forces()
-                found = RUNNERS[quantity](system, device)
-                milliseconds = 1e3 * found["seconds"]
-                yield {"of": quantity, "dtype": dtype, "balls": count, "ms": milliseconds, "error": found["error"]}
+                result = RUNNERS[quantity](system, device)
+                milliseconds = 1e3 * result["seconds"]
+                yield {"of": quantity, "dtype": dtype, "balls": count, "ms": milliseconds, "error": result["error"]}
 
 
 def iteration(device) -> Iterator[dict]:
-    """Magnetizations of a pile in a field that half saturates it: error, evaluations and time of a cold solve."""
+    """Magnetizations of a pile in a field of half its saturation: error, evaluations and time of a cold solve."""
     x = touching_pile(BLOCK).astype(float)
     field = [0.0, 0.0, 0.5 * SATURATION]
     exact = oracle.equilibrium(x, float(np.float32(RADIUS)), field, saturation=SATURATION).magnetizations
@@ -84,30 +83,30 @@ def iteration(device) -> Iterator[dict]:
                 system.solve()
 
             milliseconds = 1e3 * measure(cold, device)
-            error = _relative(system.magnetizations().numpy(), exact)
+            error = relative(system.magnetizations().numpy(), exact)
             evaluations = int(system.evaluations.numpy()[0])
             yield {"dtype": dtype, "rtol": rtol, "evaluations": evaluations, "ms": milliseconds, "error": error}
 
 
 def arrangements(device) -> Iterator[dict]:
-    """Cold solves of ``bench.arrangements``: their error and what they say of it, both over rtol.
+    """Cold solves of ``bench.arrangements``: their error and its estimate, both over rtol.
 
-    Besides the evaluations, those after which the residual alone would have ended the solve.
+    "to residual" is the number of evaluations after which the residual alone would have ended the solve.
     """
     for name, make in ARRANGEMENTS.items():
-        one = make()
-        exact = oracle.equilibrium(one.positions, one.radii, one.applied, **one.material).magnetizations
+        balls = make()
+        exact = oracle.equilibrium(balls.positions, balls.radii, balls.applied, **balls.material).magnetizations
         for rtol in TOLERANCES[1:]:
-            system = arranged(one, rtol=rtol, device=device)
+            system = arranged(balls, rtol=rtol, device=device)
             residuals = trace(system)
             enough = 1 + int(np.argmax(residuals <= rtol))
             row = {"arrangement": name, "balls": len(exact), "rtol": rtol, "evaluations": len(residuals)}
-            found, said = _relative(system.magnetizations().numpy(), exact), float(system.error.numpy()[0])
-            yield {**row, "to residual": enough, "error": found / rtol, "said": said / rtol}
+            error, estimate = relative(system.magnetizations().numpy(), exact), float(system.error.numpy()[0])
+            yield {**row, "to residual": enough, "error": error / rtol, "estimate": estimate / rtol}
 
 
 def model(device) -> Iterator[dict]:
-    """Forces of two permeable balls, in line with a weak field and across it, over those of the exact solution."""
+    """Forces of two permeable balls, in line with a weak field and across it, over the exact ones."""
     field = 1e3  # A/m, so weak that nothing saturates
     for m, (name, direction) in enumerate((("in line", (0.0, 0.0, 1.0)), ("across", (1.0, 0.0, 0.0)))):
         for permeability in PERMEABILITIES:
@@ -115,12 +114,12 @@ def model(device) -> Iterator[dict]:
                 x = RADIUS * np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0 + gap]])
                 h0 = field * np.array(direction)
                 exact = _exact_pair_force(RADIUS * (2.0 + gap), permeability, m, field)
-                ratios = {one: _pair_force(x, h0, permeability, one, device) / exact for one in CONTACT_MODELS}
+                ratios = {kind: _pair_force(x, h0, permeability, kind, device) / exact for kind in CONTACT_MODELS}
                 yield {"field": name, "permeability": permeability, "gap": gap, **ratios}
 
 
 def _exact_pair_force(distance, permeability, m, field) -> float:
-    """Force [N] that draws the balls apart; the field is along their axis (``m`` 0) or across it (1)."""
+    """Force [N] on the second ball along the axis; the field is along the axis (``m`` = 0) or across it (1)."""
     pair = spheres.pair(distance, (RADIUS, RADIUS), (permeability, permeability))
     moments = np.linalg.solve(pair.resistance[m], [field, field])
     return float(-0.5 * oracle.MU0 * moments @ pair.slope[m] @ moments)
@@ -131,7 +130,7 @@ def _pair_force(positions, field, permeability, contact_model, device) -> float:
 
 
 def _solve(positions, field, permeability, contact_model, device) -> MomentSystem:
-    """Balls of ``RADIUS`` with their moments and forces."""
+    """Solved system of balls of ``RADIUS``, with forces."""
     system = moment_system(
         radii=np.full(len(positions), RADIUS), saturation=SATURATION, susceptibility=permeability - 1.0,
         external_field=field, rtol=1e-10, dtype="float64", contact_model=contact_model, device=device,
@@ -142,44 +141,40 @@ def _solve(positions, field, permeability, contact_model, device) -> MomentSyste
     return system
 
 
-def cluster(device) -> Iterator[dict]:
-    """Moments and forces of all balls of a cluster in a weak field: relative L2 error, forces with either model."""
+def cluster_errors(device) -> Iterator[dict]:
+    """Relative L2 errors of moments and forces of clusters in a weak field; forces with either model."""
     field = 1e3
     for row in clusters.load():
         exact = field**2 * RADIUS**2 * np.array(row["forces"])
         key = {name: row[name] for name in ("cluster", "gap", "permeability", "field")}
         x = RADIUS * clusters.positions(row["cluster"], row["gap"])
         h0 = field * np.array(clusters.FIELDS[row["cluster"]][row["field"]])
-        for one in CONTACT_MODELS:
-            system = _solve(x, h0, row["permeability"], one, device)
-            key[one] = _relative(system.forces.numpy(), exact)
+        for kind in CONTACT_MODELS:
+            system = _solve(x, h0, row["permeability"], kind, device)
+            key[kind] = relative(system.forces.numpy(), exact)
         exact = field * RADIUS**3 * np.array(row["moments"])
-        yield {**key, "moments": _relative(system.moments.numpy(), exact)}
-
-
-def _relative(found, exact) -> float:
-    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+        yield {**key, "moments": relative(system.moments.numpy(), exact)}
 
 
 def time_step(device) -> Iterator[dict]:
     """Energy and momentum of two balls that fall towards each other."""
     for dt in STEPS:
-        found = fall(2, dt, device)
-        yield {"dt": dt, "steps": round(DURATION / dt), "error": found.drift, "momentum": found.momentum}
+        result = fall(2, dt, device)
+        yield {"dt": dt, "steps": round(DURATION / dt), "error": result.drift, "momentum": result.momentum}
 
 
 def boxes(device, names=tuple(magnet_pairs.PAIRS)) -> Iterator[dict]:
-    """Forces of two box magnets: relative error, and the moments that both are sampled with."""
+    """Forces of two box magnets: relative error, and the number of moments of both."""
     for name in names:
         for gap in BOX_GAPS:
             half1, half2, offset = magnet_pairs.box_pair(name, gap, SIDE)
             exact = magnet_pairs.box_force(half1, half2, offset, MAGNETIZATION, MAGNETIZATION)
-            found, moments = _box_force(half1, half2, offset, device)
-            yield {"boxes": name, "gap": gap, "moments": moments, "error": _relative(found, exact)}
+            force, moments = _box_force(half1, half2, offset, device)
+            yield {"boxes": name, "gap": gap, "moments": moments, "error": relative(force, exact)}
 
 
 def _box_force(half1, half2, offset, device) -> tuple[np.ndarray, int]:
-    """Force [N] on the second of two boxes magnetized along z, and the number of all moments."""
+    """Force [N] on the second of two boxes magnetized along z, and the number of moments of both."""
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
     for half, place in ((half1, np.zeros(3)), (half2, offset)):
@@ -194,9 +189,9 @@ def _box_force(half1, half2, offset, device) -> tuple[np.ndarray, int]:
 
 
 def price(device) -> Iterator[dict]:
-    """Time of the parts of a step of a touching pile [ms] with either model, in turns, and their ratio: medians."""
+    """Median times [ms] of the parts of a step of a touching pile with either model, in turns, and their ratio."""
     for count in PILES:
-        systems = [make_system(count, "float32", device, one) for one in CONTACT_MODELS]
+        systems = [make_system(count, "float32", device, kind) for kind in CONTACT_MODELS]
         for system in systems:
             system.solve()
             system.apply_forces()
@@ -207,24 +202,25 @@ def price(device) -> Iterator[dict]:
             ratio = np.median(laps[:, 1] / laps[:, 0])
             yield {"balls": count, "part": part, "dipole": dipole, "multipole": multipole, "ratio": ratio}
         for start in ("cold", "warm"):
-            found = []
+            evaluations = []
             for system in systems:
                 if start == "cold":
                     system.start_cold()
                 system.solve()
-                found.append(int(system.evaluations.numpy()[0]))
-            names = dict(zip(CONTACT_MODELS, found, strict=True))
-            yield {"balls": count, "part": f"evaluations, {start}", **names, "ratio": found[1] / found[0]}
+                evaluations.append(int(system.evaluations.numpy()[0]))
+            names = dict(zip(CONTACT_MODELS, evaluations, strict=True))
+            ratio = evaluations[1] / evaluations[0]
+            yield {"balls": count, "part": f"evaluations, {start}", **names, "ratio": ratio}
 
 
 ERRORS = {
-    "rounding": rounding, "iteration": iteration, "model": model, "clusters": cluster, "time step": time_step,
+    "rounding": rounding, "iteration": iteration, "model": model, "clusters": cluster_errors, "time step": time_step,
     "boxes": boxes, "price": price, "arrangements": arrangements,
 }  # fmt: skip
 
 
 def print_table(rows: list[dict]) -> None:
-    """Print rows with the same keys."""
+    """Print rows with equal keys as a table."""
     head = list(rows[0])
     cells = [
         head,
@@ -262,11 +258,12 @@ def _draw_model(axis, rows) -> None:
 
 def _draw_clusters(axis, rows) -> None:
     for kind, style in zip(CONTACT_MODELS, ("--", "-"), strict=True):
-        for which in clusters.FIELDS:
+        for cluster in clusters.FIELDS:
             worst = [
-                max(row[kind] for row in rows if (row["cluster"], row["gap"]) == (which, gap)) for gap in clusters.GAPS
+                max(row[kind] for row in rows if (row["cluster"], row["gap"]) == (cluster, gap))
+                for gap in clusters.GAPS
             ]
-            axis.loglog(clusters.GAPS, worst, style, label=f"{kind}, {which}, the worst of μr and fields")
+            axis.loglog(clusters.GAPS, worst, style, label=f"{kind}, {cluster}, the worst of μr and fields")
     axis.set(xlabel="gap over radius", ylabel="relative error of forces")
 
 
@@ -276,8 +273,8 @@ def _draw_drift(axis, rows) -> None:
 
 
 def draw(results: dict[str, list[dict]], path: Path) -> None:
-    """Draw error against cost, a panel for each of the first five of ``ERRORS``."""
-    import matplotlib.pyplot as plt  # noqa: PLC0415 - slow to import, and --help does without it
+    """Draw error against cost, one panel for each of the first five ``ERRORS``."""
+    import matplotlib.pyplot as plt  # noqa: PLC0415 - slow to import, and not needed by --help
 
     panels = (_draw_rounding, _draw_iteration, _draw_model, _draw_clusters, _draw_drift)
     figure, axes = plt.subplots(2, 3, figsize=(14.0, 8.0), layout="constrained")
@@ -293,7 +290,7 @@ def draw(results: dict[str, list[dict]], path: Path) -> None:
 
 
 def _label_part_of_a_decade(axis) -> None:
-    """Label 1, 2 and 5 on a logarithmic axis that has few powers of ten, whose own labels touch each other."""
+    """Label 1, 2 and 5 of each decade on a logarithmic axis of few decades, where the default labels overlap."""
     from matplotlib import ticker  # noqa: PLC0415 - as above
 
     low, high = axis.get_view_interval()
@@ -304,7 +301,7 @@ def _label_part_of_a_decade(axis) -> None:
 
 
 def main() -> None:
-    """Measure what the command line asks for."""
+    """Measure the errors named on the command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.accuracy", description=__doc__.partition("\n")[0])
     parser.add_argument("errors", nargs="*", metavar="ERROR", help=f"of {', '.join(ERRORS)}; all if none is named")
     parser.add_argument("--device", default="cpu")

@@ -1,7 +1,7 @@
-"""Arrangements of iron balls in fields from weak to saturating, on which the error of a solve is compared with truth.
+"""Arrangements of iron balls in fields from weak to saturating, for errors of a solve against an exact solution.
 
-They are of the kinds that magnetic balls come in: chains, rings, shells, packings, heaps and loose balls; touching,
-apart and overlapping; in uniform fields and under a dipole, where one end saturates and the other hardly notices.
+There are chains, rings, shells, packings, heaps and loose balls; touching, apart and overlapping; in uniform fields and
+under a dipole, where one end saturates and the other is hardly magnetized.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from bench.systems import moment_system
 from warpmag.moments.system import MomentSystem
 
 TILTED = np.array([0.48, 0.6, 0.64])
-"""Direction of uniform fields, along no axis of an arrangement."""
+"""Direction of uniform fields, oblique to all axes of an arrangement."""
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class Arrangement:
     """Balls in a field.
 
     Attributes:
-        positions: Centres [m], shape [n, 3], which float32 holds.
+        positions: Centers [m], shape [n, 3], exact in float32.
         applied: Applied field [A/m], shape [n, 3].
         radii: Radii [m], scalar or [n].
-        material: Arguments of a solve that say what the balls are made of.
+        material: Material arguments of a solve.
     """
 
     positions: np.ndarray
@@ -45,7 +45,7 @@ def _ring(count):
 
 
 def _shell(count):
-    """Balls on a spiral over a sphere, the nearest two touching."""
+    """Balls on a spiral over a sphere; the nearest two touch."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     angle, across = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count), np.sqrt(1.0 - z * z)
     unit = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
@@ -59,7 +59,7 @@ def _grid(*counts):
 
 
 def _packing(cells):
-    """Face-centred cubic packing of touching balls."""
+    """Face-centered cubic packing of touching balls."""
     basis = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]])
     corners = _grid(*cells).reshape(-1, 1, 3) / (2.0 * RADIUS)
     return (2.0 * np.sqrt(2.0) * RADIUS * (corners + basis)).reshape(-1, 3)
@@ -74,26 +74,26 @@ def _heap(count):
 
 
 def _heap_with_ten_in_one():
-    """A heap, the last balls of which are where another one is."""
+    """A heap whose last ten balls share the place of another ball."""
     x = _heap(120)
     x[-10:] = x[20]
     return x
 
 
 def _loose(count, extent, seed=0):
-    """Balls thrown into a cube, with no regard for one another."""
+    """Balls at random in a cube, some of them overlapping."""
     return extent * np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
 
 
 def _uniform(positions, strength, radii=RADIUS, **material):
-    """Arrangement in a tilted field of a ``strength`` over the saturation."""
+    """Arrangement in a tilted uniform field, ``strength`` times the saturation."""
     x = np.asarray(positions, np.float32).astype(float)
     applied = np.broadcast_to(strength * SATURATION * TILTED, x.shape)
     return Arrangement(x, applied, radii, {"saturation": SATURATION, **material})
 
 
 def _dipole(positions, moment, **material):
-    """Arrangement under a dipole [A·m²], two centimetres above its top and beside its middle."""
+    """Arrangement under a dipole [A·m²], two centimeters above its top and off its middle."""
     x = np.asarray(positions, np.float32).astype(float)
     middle = x.mean(axis=0)
     place = np.array([middle[0] + 0.003, middle[1] + 0.001, x[:, 2].max() + 0.02])
@@ -102,7 +102,7 @@ def _dipole(positions, moment, **material):
 
 
 def _mixed():
-    """Balls of three sizes and of all materials."""
+    """Balls of three sizes and of random materials."""
     rng = np.random.default_rng(5)
     x = 1.2 * _grid(5, 5, 5)
     saturation, susceptibility = rng.uniform(0.3, 2.0, len(x)) * 1e6, 10.0 ** rng.uniform(-1.0, 3.0, len(x))
@@ -136,11 +136,11 @@ ARRANGEMENTS: dict[str, Callable[[], Arrangement]] = {
 }
 
 
-def arranged(one: Arrangement, **settings) -> MomentSystem:
-    """Balls that are arranged, with more arguments of the system."""
-    radii = np.broadcast_to(one.radii, len(one.positions))
-    system = moment_system(radii=radii, external_field=one.applied, **one.material, **settings)
-    system.positions.assign(one.positions)
+def arranged(balls: Arrangement, **settings) -> MomentSystem:
+    """System of an arrangement; ``settings`` are more arguments of the system."""
+    radii = np.broadcast_to(balls.radii, len(balls.positions))
+    system = moment_system(radii=radii, external_field=balls.applied, **balls.material, **settings)
+    system.positions.assign(balls.positions)
     return system
 
 

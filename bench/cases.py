@@ -1,4 +1,4 @@
-"""What is measured: arrangements of balls and the sizes to run them at, as data."""
+"""Benchmark cases as data: arrangements of balls, and the sizes to run them at."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ SATURATION = 1.7e6
 
 @dataclass(frozen=True)
 class Case:
-    """One thing to measure.
+    """One benchmark.
 
     Attributes:
-        name: As given on the command line.
-        summary: What is timed.
+        name: Name on the command line.
+        summary: Quantity that is timed.
         sizes: Numbers of balls on a CPU and on a GPU.
         dtypes: Precisions.
     """
@@ -43,12 +43,12 @@ CASES = {
         ),
         Case(
             "induction",
-            "a cold and a warm induction solve to 1e-3, neighbour search included",
+            "a cold and a warm induction solve to 1e-3, neighbor search included",
             {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768)},
         ),
         Case(
             "worlds",
-            "a warm solve and forces in 1,024 worlds (32 on a CPU) of so many balls that move",
+            "a warm solve and forces in 1,024 worlds (32 on a CPU) of moving balls",
             {"cpu": (64,), "cuda": (8, 27, 64, 125, 216)},
         ),
         Case(
@@ -74,7 +74,7 @@ PILES = {
     2500: {"columns": 25, "rows": 25, "layers": 4, "height": 0.0611},
     10000: {"columns": 50, "rows": 50, "layers": 4, "height": 0.0611},
 }
-"""Balls Up by its number of balls: the bundled scene, and wider piles with the magnet as high above their top."""
+"""Parameters of Balls Up by number of balls: the bundled scene, and wider piles with the same gap to the magnet."""
 
 
 def touching_pile(count: int, seed: int = 0) -> np.ndarray:

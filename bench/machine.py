@@ -1,9 +1,16 @@
-"""Where a measurement was made: what every result line carries."""
+"""Machine, versions and commit of a measurement, and the JSON lines that carry them."""
 
+import json
 import os
 import platform
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+
+CLOCKS = {"NVIDIA H200": 1.98e9}
+"""Clock of GPUs under load [Hz]."""
+_LANES = 128
+"""Float32 operations that a multiprocessor of these GPUs starts per cycle."""
 
 
 def describe(device) -> dict:
@@ -21,10 +28,19 @@ def describe(device) -> dict:
     }
 
 
-CLOCKS = {"NVIDIA H200": 1.98e9}
-"""Clock of GPUs under load [Hz]."""
-_LANES = 128
-"""Float32 operations that a multiprocessor of them starts in a cycle."""
+def line_writer(device, output: Path | None = None) -> Callable[[dict], None]:
+    """Return a function that prints a dict and its machine as a JSON line, and appends the line to ``output``."""
+    machine = describe(device)
+
+    def write(line: dict) -> None:
+        text = json.dumps(line | machine)
+        print(text, flush=True)
+        if output:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            with output.open("a") as file:
+                file.write(text + "\n")
+
+    return write
 
 
 def operations_per_second(device) -> float | None:
@@ -42,7 +58,7 @@ def _processor() -> str:
 
 
 def _commit() -> str:
-    """Short hash of the checkout, ``+`` where it has changes; in a copy without one, ``WARPMAG_COMMIT``."""
+    """Short hash of the checkout, with ``+`` for uncommitted changes; outside a checkout ``WARPMAG_COMMIT``."""
     folder = Path(__file__).parent
 
     def git(*arguments):

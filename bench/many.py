@@ -1,14 +1,12 @@
-"""Time and error over the number of moments, of all pairs and of the fast multipole method: ``python -m bench.many``.
+"""Time and error over the number of moments, by all pairs and by the fast multipole method: ``python -m bench.many``.
 
-Field, and force with torque, of moments of random directions in a jittered cubic lattice that fills a cube, data in
-place, the making of the cells included. Errors are of some moments, against sums over all pairs in float64. One JSON
-line a measurement; ``--draw`` makes a picture of such lines. Peers are fast multipole methods of dipoles or, where
-they know none, of point charges, which take less; their errors are against the sums that they replace.
+Timed are field, and force with torque, of moments of random directions in a jittered cubic lattice that fills a cube,
+with data in place; building the cells is included. Errors are those of some moments relative to sums over all pairs in
+float64. Each measurement is one JSON line; ``--draw`` draws such lines. Peers are fast multipole methods for dipoles
+or, if they have none, for point charges, which are cheaper; their errors are relative to the sums that they replace.
 """
 
 import argparse
-import importlib
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -17,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from bench.machine import describe
+from bench.machine import line_writer
 from bench.peers import PEERS, Peer
 from bench.report import machine_of, read
 from bench.timing import measure
@@ -32,15 +30,15 @@ SIZES = {
     "cuda": (1_000, 4_913, 10_648, 21_952, 32_768, 50_653, 97_336, 205_379, 512_000, 1_000_000, 2_048_383, 4_019_679),
 }
 RTOLS = (None, 1e-3, 1e-5)
-"""Relative errors asked for; None means all pairs."""
+"""Requested relative errors; None means all pairs."""
 _SPACING = 0.005
-"""Edge of the lattice [m]."""
+"""Lattice spacing [m]."""
 _CHECKED = 100
-"""Moments at which errors are measured."""
+"""Number of moments at which errors are measured."""
 
 
 class Moments:
-    """Moments on a device, and what their sums are written to.
+    """Moments on a device, and the arrays of their sums.
 
     Args:
         places: Positions [m], shape [n, 3].
@@ -50,16 +48,16 @@ class Moments:
     """
 
     def __init__(self, places, moments, dtype, device):
-        """Copy them to the device."""
+        """Copy the arrays to the device."""
         n, vec3 = len(places), wp.types.vector(3, dtype)
-        x, m = (wp.array(one, dtype=vec3, device=device) for one in (places, moments))
+        x, m = (wp.array(values, dtype=vec3, device=device) for values in (places, moments))
         self.packed = PackedMoments(wp.zeros(n, dtype=dtype, device=device), largest_radius=0.0, moving=False)
         self.packed.pack(x, m)
         self._base, self.out, self._torques = (wp.zeros_like(x) for _ in range(3))
         self._turned = wp.ones(n, dtype=int, device=device)
 
     def evaluation(self, quantity: Quantity, rows=None, sums=None) -> PairEvaluation:
-        """Evaluation of a quantity to ``out``, at some rows only, or by ``sums`` in place of all pairs."""
+        """Evaluation of a quantity into ``out``: at some rows only, or by ``sums`` in place of all pairs."""
         n = self.packed.count
         segments = [(0, n, 0, n)] if rows is None else [(row, row + 1, 0, n) for row in rows]
         return PairEvaluation(
@@ -68,9 +66,9 @@ class Moments:
         )  # fmt: skip
 
     def parts(self, quantity: Quantity, rtol: float | None) -> tuple[Callable[[], None], Callable[[], None]]:
-        """What makes cells of moments that have moved, and what evaluates a quantity to ``out`` by them.
+        """Functions that build the cells of moments that have moved, and that evaluate a quantity into ``out``.
 
-        Where ``rtol`` is None, no cells, and all pairs.
+        If ``rtol`` is None there are no cells, and the evaluation sums over all pairs.
         """
         if rtol is None:
             return (lambda: None), self.evaluation(quantity).launch
@@ -78,7 +76,7 @@ class Moments:
         return fast.build, self.evaluation(quantity, sums=fast.sums(quantity)).launch
 
     def work(self, quantity: Quantity, rtol: float | None) -> Callable[[], None]:
-        """What evaluates a quantity to ``out``, for moments that have moved; by all pairs where ``rtol`` is None."""
+        """Function that does both parts."""
         build, evaluate = self.parts(quantity, rtol)
 
         def build_and_evaluate():
@@ -89,33 +87,33 @@ class Moments:
 
 
 def repetitions(count: int) -> dict:
-    """How often work on so many moments is repeated: few times where a graph's own launch does not show."""
+    """Arguments of ``measure`` for a number of moments: few repetitions where the launch of a graph is negligible."""
     return {"repeats": 2, "chained": 1} if count > 200_000 else {}
 
 
 def lattice(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [m] and moments [A·m²] of the first ``count`` sites, alike in every run, float32, shape [n, 3]."""
+    """Positions [m] and moments [A·m²] of the first ``count`` sites, the same in every run, float32, shape [n, 3]."""
     random, side = np.random.default_rng(1), int(np.ceil(count ** (1 / 3) - 1e-9))
     sites = np.stack(np.meshgrid(*3 * [np.arange(side)], indexing="ij"), axis=-1).reshape(-1, 3)[:count]
     places = _SPACING * (sites + random.uniform(-0.15, 0.15, sites.shape))
     return places.astype(np.float32), random.normal(size=sites.shape).astype(np.float32)
 
 
-def errors(found, expected) -> dict:
-    """Relative error of vectors at some moments, and the largest one over their mean, shape [rows, 3] both."""
-    apart = np.linalg.norm(found - expected, axis=1)
+def errors(values, expected) -> dict:
+    """RMS error and largest error of vectors, shape [rows, 3], over the RMS of the expected ones."""
+    distance = np.linalg.norm(values - expected, axis=1)
     mean = np.sqrt((expected**2).sum() / len(expected))
-    return {"error": float(np.sqrt((apart**2).mean()) / mean), "largest_error": float(apart.max() / mean)}
+    return {"error": float(np.sqrt((distance**2).mean()) / mean), "largest_error": float(distance.max() / mean)}
 
 
 def run_size(count: int, device, slowest: float, seconds: dict):
-    """Yield what there is to say of each quantity and method at one size.
+    """Yield the values of each quantity and method at one size.
 
     Args:
         count: Number of moments.
         device: Warp device.
-        slowest: Time [s] beyond which a sum over all pairs is not tried.
-        seconds: Times of all pairs so far, by quantity and count; more are added.
+        slowest: Expected time [s] beyond which sums over all pairs are skipped.
+        seconds: Times of all pairs by quantity and count; the measured ones are added.
     """
     places, moments = lattice(count)
     rows = np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
@@ -137,22 +135,19 @@ def run_size(count: int, device, slowest: float, seconds: dict):
             if rtol is None:
                 seconds[quantity, count] = taken
             line = {"quantity": quantity.name.lower(), "method": "direct" if rtol is None else "fmm", "rtol": rtol}
-            yield (
-                line
-                | {"count": count, "seconds": taken, **errors(own.out.numpy()[rows], expected)}
-                | {"first_call_seconds": first}
-            )
+            line |= {"count": count, "seconds": taken, **errors(own.out.numpy()[rows], expected)}
+            yield line | {"first_call_seconds": first}
 
 
 def run_peer(peer: Peer, count: int, device) -> dict:
-    """What there is to say of a peer at one size; ``failed`` where its library is missing, or fails."""
-    line = {"quantity": "field", "method": peer.name.removeprefix("with_"), "rtol": None, "count": count}
+    """The values of a peer at one size; ``failed`` if the peer fails or its library is missing."""
+    line = {"quantity": "field", "method": peer.name, "rtol": None, "count": count}
     places, moments = lattice(count)
-    given = np.ascontiguousarray(moments[:, 0]) if peer.charges else moments
+    strengths = np.ascontiguousarray(moments[:, 0]) if peer.charges else moments
     rows = np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
     try:
         began = time.perf_counter()
-        evaluation = importlib.import_module(f"bench.peers.{peer.name}").prepare(places, given, str(device))
+        evaluation = peer.prepare(places, strengths, str(device))
         evaluation.run()
         evaluation.wait()
         first, times = time.perf_counter() - began, []
@@ -161,18 +156,16 @@ def run_peer(peer: Peer, count: int, device) -> dict:
             evaluation.run()
             evaluation.wait()
             times.append(time.perf_counter() - began)
-        found = evaluation.result()[rows]
+        fields = evaluation.result()[rows]
     except Exception as problem:  # a peer's failure is a result: the others go on
         return line | {"failed": f"{type(problem).__name__}: {problem}".splitlines()[0][:200]}
-    expected = field_of_charges(places, given, rows) if peer.charges else field_of_dipoles(places, given, rows, device)
-    return line | {"seconds": float(np.median(times)), **errors(found, expected), "first_call_seconds": first}
-
-
-def field_of_dipoles(places, moments, rows, device) -> np.ndarray:
-    """Field [A/m] at some moments, shape [rows, 3]."""
-    exact = Moments(places.astype(float), moments.astype(float), wp.float64, device)
-    exact.evaluation(Quantity.FIELD, rows).launch()
-    return exact.out.numpy()[rows]
+    if peer.charges:
+        expected = field_of_charges(places, strengths, rows)
+    else:
+        exact = Moments(places.astype(float), moments.astype(float), wp.float64, device)
+        exact.evaluation(Quantity.FIELD, rows).launch()
+        expected = exact.out.numpy()[rows]
+    return line | {"seconds": float(np.median(times)), **errors(fields, expected), "first_call_seconds": first}
 
 
 def field_of_charges(places, charges, rows) -> np.ndarray:
@@ -188,7 +181,7 @@ def field_of_charges(places, charges, rows) -> np.ndarray:
 
 def draw(lines, path: Path) -> None:
     """Draw time and error over the number of moments."""
-    import matplotlib  # noqa: PLC0415 - a run goes without it
+    import matplotlib  # noqa: PLC0415 - only drawing needs it
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt  # noqa: PLC0415
@@ -218,8 +211,8 @@ def draw(lines, path: Path) -> None:
 
 
 def main(arguments=None) -> None:
-    """Measure, or draw what was measured, as the command line asks for."""
-    fast = {p.name.removeprefix("with_"): p for p in PEERS if p.charges or p.name == "with_fmm3d"}
+    """Measure, or draw measured lines."""
+    fast = {peer.name: peer for peer in PEERS if peer.charges or peer.name == "fmm3d"}
     parser = argparse.ArgumentParser(prog="python -m bench.many", description=__doc__.partition("\n")[0])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--sizes", type=int, nargs="+", help="numbers of moments; default by device")
@@ -228,30 +221,25 @@ def main(arguments=None) -> None:
         "--slowest", type=float, default=2.0, help="seconds beyond which all pairs and peers get no larger sizes (2)"
     )
     parser.add_argument("--draw", type=Path, nargs="+", help="draw these files instead of measuring")
-    parser.add_argument("-o", "--output", type=Path, help="file that lines are added to, or the picture")
+    parser.add_argument("-o", "--output", type=Path, help="file that lines are appended to, or the picture")
     options = parser.parse_args(arguments)
     if options.draw:
-        kept = {(x["method"], x["rtol"], x["quantity"], x["count"]): x for x in read(options.draw)}  # the last of each
+        kept = {
+            (x["method"], x["rtol"], x["quantity"], x["count"]): x for x in read(options.draw)
+        }  # the last line of each
         draw(list(kept.values()), options.output or Path("bench_out/many.png"))
         return
     wp.config.log_level = wp.LOG_WARNING
     device, seconds = wp.get_device(options.device), {}
-    kind, machine = "cpu" if device.is_cpu else "cuda", describe(device)
+    kind, write = "cpu" if device.is_cpu else "cuda", line_writer(device, options.output)
     peers = [fast[name] for name in options.peers if kind in fast[name].devices]
-
-    def emit(line):
-        text = json.dumps({"case": "many"} | line | machine)
-        print(text, flush=True)
-        if options.output:
-            with options.output.open("a") as file:
-                file.write(text + "\n")
 
     for count in options.sizes or SIZES[kind]:
         for line in run_size(count, device, options.slowest, seconds):
-            emit(line)
+            write({"case": "many"} | line)
         for peer in list(peers):
             line = run_peer(peer, count, device)
-            emit(line)
+            write({"case": "many"} | line)
             if "failed" in line:
                 print(f"{line['method']} at {count}: {line['failed']}", file=sys.stderr)
             if line.get("seconds", np.inf) > options.slowest:

@@ -1,10 +1,10 @@
-"""Draw what was measured: ``python -m bench.report FILE... [-o bench_out/report]``.
+"""Draws results: ``python -m bench.report FILE... [-o bench_out/report]``.
 
-Reads the JSON lines of ``bench.compare`` and ``bench.run``. For each device it draws, from the comparison, speed
-against error at every size, and the share of the device's limit against the size; and it writes a Markdown table.
+Reads the JSON lines of ``bench.compare`` and ``bench.run``. For each device it draws speed against error at every size,
+and the share of the device's limit against the size, and writes a Markdown table.
 
-The limit is the rate of pairs at 20 operations a pair, which is what a separation, its inverse powers and the sums of
-a field take, if every pair is evaluated once for each of its ends. A loop that serves both ends at once may pass it.
+The limit is the rate of pairs at 20 operations a pair: a separation, its inverse powers and the sums of a field, if
+each pair is evaluated once for each of its ends. A loop that evaluates both ends at once may exceed the limit.
 """
 
 import argparse
@@ -19,27 +19,27 @@ import matplotlib.pyplot as plt
 from matplotlib.lines import Line2D
 
 OPERATIONS_PER_PAIR = 20
-"""Operations that the limit is reckoned with."""
+"""Operations of a pair in the limit."""
 
 
 def read(paths) -> list[dict]:
-    """All result lines of some files."""
+    """All JSON lines of the files."""
     return [json.loads(line) for path in paths for line in Path(path).read_text().splitlines() if line.startswith("{")]
 
 
 def latest(lines) -> list[dict]:
-    """The last line of each measurement, for files that several runs were added to."""
+    """The last line of each measurement: files may contain several runs."""
     kept = {(x["device"], x["case"], x.get("peer", ""), x.get("dtype", ""), x["count"]): x for x in lines}
     return list(kept.values())
 
 
 def machine_of(line: dict) -> str:
-    """What a line was measured on."""
+    """Device of a line, or the machine for a CPU."""
     return line["device"] if line["device"] != "cpu" else line["machine"]
 
 
 def draw_pareto(lines, path: Path) -> None:
-    """Draw speed against error of every peer, a panel for each size."""
+    """Draw speed against error of every peer, one panel per size."""
     sizes = sorted({x["count"] for x in lines})
     columns = min(4, len(sizes))
     rows = -(-len(sizes) // columns)
@@ -60,7 +60,7 @@ def draw_pareto(lines, path: Path) -> None:
         axis.grid(True, alpha=0.3)
     axes[0, 0].invert_xaxis()
     figure.supxlabel("relative error of the field (smaller to the right)")
-    figure.supylabel("pairs a second")
+    figure.supylabel("pairs per second")
     handles = [Line2D([], [], color=colors[p], marker="o", linestyle="", label=p) for p in peers]
     figure.legend(handles=handles, loc="outside right upper")
     figure.suptitle(machine_of(lines[0]))
@@ -69,13 +69,13 @@ def draw_pareto(lines, path: Path) -> None:
 
 
 def limit_of(line: dict) -> float | None:
-    """Pairs a second at the limit of the device; None where its clock is not known."""
+    """Pairs per second at the limit of the device; None if its clock is unknown."""
     operations = line.get("operations_per_second")
     return operations / OPERATIONS_PER_PAIR if operations else None
 
 
 def draw_roofline(lines, path: Path) -> None:
-    """Draw the share of the limit that each peer reaches against the size."""
+    """Draw each peer's share of the limit against the size."""
     figure, axis = plt.subplots(figsize=(7.0, 4.5), layout="constrained")
     series = defaultdict(list)
     for x in lines:
@@ -111,13 +111,13 @@ def table(lines) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time in a unit that suits it."""
+    """A time with a unit that makes it readable."""
     scale, unit = next(((s, u) for s, u in ((1.0, "s"), (1e3, "ms")) if seconds * s >= 1.0), (1e6, "µs"))
     return f"{seconds * scale:.3g} {unit}"
 
 
 def main(arguments=None) -> None:
-    """Write pictures and table of the files on the command line."""
+    """Write pictures and tables of the files on the command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.report", description=__doc__.partition("\n")[0])
     parser.add_argument("files", nargs="+", type=Path, help="JSON lines of bench.compare or bench.run")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench_out/report"), help="folder (bench_out/report)")

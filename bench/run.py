@@ -1,20 +1,18 @@
-"""Check, then time: ``python -m bench.run CASE [--device cuda:0] [--sizes 243 2560]``.
+"""Checks and times warpmag: ``python -m bench.run CASE [--device cuda:0] [--sizes 243 2560]``.
 
-Each size is compared with the float64 oracle on some targets before it is timed; induction and scenes give the error
-of the solve itself, ``writing`` compares runs with and without output, and ``swarm`` measures what very many balls take
-to start and to be written. One JSON line a measurement, with machine, commit, error and the time of the first call,
-which compiles.
+Each size is compared with the float64 oracle at some targets, then timed. Induction and scenes report the error of the
+solve itself, ``writing`` compares runs with and without output, ``swarm`` times the start and the writing of very many
+balls. Each measurement is one JSON line with machine, commit, error and the time of the first call, which compiles.
 """
 
 import argparse
-import json
 import time
 
 import numpy as np
 import warp as wp
 
 from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
-from bench.machine import describe
+from bench.machine import line_writer
 from bench.reference import oracle
 from bench.scene import run_bundled, run_scene
 from bench.swarm import run_swarm
@@ -26,11 +24,11 @@ from warpmag.scenes_usd import bundled
 
 _WORLDS = {"cpu": 32, "cuda": 1024}
 _CHECKED = 64
-"""Targets compared with the oracle."""
+"""Number of targets compared with the oracle."""
 
 
 def make_system(count: int, dtype: str, device, contact_model: str = "dipole") -> MomentSystem:
-    """A touching pile of iron balls in a field of half their saturation, positions set."""
+    """System of a touching pile of iron balls in a field of half their saturation."""
     system = moment_system(
         radii=np.full(count, RADIUS), saturation=SATURATION, external_field=[0.0, 0.0, 0.5 * SATURATION],
         contact_model=contact_model, dtype=dtype, device=device,
@@ -40,7 +38,7 @@ def make_system(count: int, dtype: str, device, contact_model: str = "dipole") -
 
 
 def oracle_at(system: MomentSystem, rows) -> tuple[np.ndarray, np.ndarray]:
-    """The oracle's field [A/m], external field left out, and force [N] on some of a system's moments."""
+    """The oracle's field [A/m], without the external field, and force [N] on the moments ``rows`` of a system."""
     x, m = (a.numpy().astype(float) for a in (system.positions, system.moments))
     radius = float(system.radii.numpy()[0])
     h, force = np.empty((len(rows), 3)), np.empty((len(rows), 3))
@@ -53,13 +51,13 @@ def oracle_at(system: MomentSystem, rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def run_field(system, device) -> dict:
-    """Time one field evaluation, and check the field it leaves."""
+    """Time one field evaluation, and check its field."""
     rows = np.linspace(0, system.count - 1, min(_CHECKED, system.count)).astype(int)
     expected, _ = oracle_at(system, rows)
     system.h.zero_()
     seconds = measure(system.evaluate, device)
-    found = system.h.numpy()[rows] - system.external_field.numpy()[rows]
-    return {"seconds": seconds, "pairs_per_second": system.count**2 / seconds, "error": _relative(found, expected)}
+    error = relative(system.h.numpy()[rows] - system.external_field.numpy()[rows], expected)
+    return {"seconds": seconds, "pairs_per_second": system.count**2 / seconds, "error": error}
 
 
 def run_force(system, device) -> dict:
@@ -67,12 +65,12 @@ def run_force(system, device) -> dict:
     rows = np.linspace(0, system.count - 1, min(_CHECKED, system.count)).astype(int)
     _, expected = oracle_at(system, rows)
     seconds = measure(system.apply_forces, device)
-    error = _relative(system.forces.numpy()[rows], expected)
+    error = relative(system.forces.numpy()[rows], expected)
     return {"seconds": seconds, "pairs_per_second": system.count**2 / seconds, "error": error}
 
 
 def run_induction(system, device) -> dict:
-    """Time a cold and a warm solve; the error is the solve's own residual."""
+    """Time a cold and a warm solve; the error is the estimate of the solve."""
 
     def cold():
         system.start_cold()
@@ -92,7 +90,7 @@ def run_induction(system, device) -> dict:
 
 
 def make_worlds(worlds: int, count: int, device) -> tuple[MomentSystem, list[wp.array]]:
-    """As many piles of ``make_system`` in a world each, and their positions before and after a little motion [m]."""
+    """System of one pile of ``make_system`` in each world, and its positions before and after a small motion [m]."""
     system = moment_system(
         radii=np.full(worlds * count, RADIUS), worlds=np.repeat(np.arange(worlds), count), saturation=SATURATION,
         external_field=[0.0, 0.0, 0.5 * SATURATION], device=device,
@@ -100,11 +98,11 @@ def make_worlds(worlds: int, count: int, device) -> tuple[MomentSystem, list[wp.
     start = np.concatenate([touching_pile(count, seed) for seed in range(worlds)])
     motion = 1e-3 * RADIUS * np.random.default_rng(1).normal(size=start.shape)
     kind = system.positions.dtype
-    return system, [wp.array(one, dtype=kind, device=device) for one in (start, start + motion)]
+    return system, [wp.array(places, dtype=kind, device=device) for places in (start, start + motion)]
 
 
 def run_worlds(count: int, device) -> dict:
-    """Time the magnetics of a step of many worlds, whose balls move by 1e-3 radii, its parts, and check one world."""
+    """Time a magnetic step of many worlds whose balls move by 1e-3 radii, and its parts; check one world."""
     worlds = _WORLDS["cpu" if device.is_cpu else "cuda"]
     began = time.perf_counter()
     system, places = make_worlds(worlds, count, device)
@@ -126,7 +124,7 @@ def run_worlds(count: int, device) -> dict:
         oracle.gradient_at(np.delete(x, i, 0), np.delete(m, i, 0), x[i : i + 1], radii=RADIUS, target_radii=RADIUS)
         for i in range(count)
     ]
-    expected = np.concatenate([oracle.kelvin_force(m[i : i + 1], one) for i, one in enumerate(gradients)])
+    expected = np.concatenate([oracle.kelvin_force(m[i : i + 1], gradient) for i, gradient in enumerate(gradients)])
     return {
         "worlds": worlds,
         "seconds": seconds,
@@ -134,7 +132,7 @@ def run_worlds(count: int, device) -> dict:
         "field_seconds": field,
         "force_seconds": force,
         "evaluations": float(system.evaluations.numpy().mean()),
-        "error": _relative(system.forces.numpy()[own], expected),
+        "error": relative(system.forces.numpy()[own], expected),
         "converged": bool(system.converged.numpy().all()),
         "first_call_seconds": first,
     }
@@ -144,7 +142,7 @@ RUNNERS = {"field": run_field, "force": run_force, "induction": run_induction}
 
 
 def run_system(case: Case, count: int, dtype: str, device) -> dict:
-    """Measure a case that is one part of a step, alone."""
+    """Measure a case that is one part of a step."""
     began = time.perf_counter()
     system = make_system(count, dtype, device)
     system.solve()
@@ -154,15 +152,16 @@ def run_system(case: Case, count: int, dtype: str, device) -> dict:
     return {**RUNNERS[case.name](system, device), "first_call_seconds": first}
 
 
-def _relative(found, expected) -> float:
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+def relative(values, expected) -> float:
+    """L2 error of values over the L2 norm of the expected ones."""
+    return float(np.linalg.norm(values - expected) / np.linalg.norm(expected))
 
 
 def run_case(case: Case, device, sizes, frames: int | None, scenes=()) -> None:
     """Print a JSON line for each size and precision of a case, or for each of the bundled scenes."""
-    machine = describe(device)
+    write = line_writer(device)
     for name in scenes:
-        print(json.dumps({"case": case.name, "scene": name, **run_bundled(name, device), **machine}), flush=True)
+        write({"case": case.name, "scene": name, **run_bundled(name, device)})
     if scenes:
         return
     for dtype in case.dtypes:
@@ -175,7 +174,7 @@ def run_case(case: Case, device, sizes, frames: int | None, scenes=()) -> None:
                 result = run_swarm(count, device, frames)
             else:
                 result = (run_worlds if case.name == "worlds" else run_scene)(count, device)
-            print(json.dumps({"case": case.name, "dtype": dtype, "count": count, **result, **machine}), flush=True)
+            write({"case": case.name, "dtype": dtype, "count": count, **result})
 
 
 def main() -> None:
@@ -190,7 +189,7 @@ def main() -> None:
         nargs="+",
         default=(),
         choices=sorted(bundled()),
-        help="bundled scenes, for scene, in place of Balls Up by size",
+        help="bundled scenes, for the case scene, in place of Balls Up by size",
     )
     options = parser.parse_args()
     if options.scenes and options.case != "scene":

@@ -1,4 +1,4 @@
-"""A running scene: what its steps cost on the device and on the host, and what they did."""
+"""Times of the steps of a running scene on the device and on the host, and their statistics."""
 
 import contextlib
 import copy
@@ -17,68 +17,56 @@ from warpmag.engine.pile_xpbd.capture import without_allocations
 from warpmag.scenes_usd import balls_up, bundled
 
 _SETTLING, _STEPS = 32, 60
-"""Steps before the measurement, in which the balls start to move, and steps measured."""
+"""Steps before the measurement, in which the balls start to move, and number of measured steps."""
 _AHEAD = 10
-"""Steps that the host may be ahead: beyond 20 or so graphs a GPU makes it wait, which is no work of its own."""
+"""Steps that the host may be ahead of the device: beyond about 20 graphs a GPU makes the host wait."""
 
 
 def run_scene(count: int, device) -> dict:
     """Run Balls Up with ``count`` balls and measure its steps."""
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Path(folder) / "pile.usdc"
-        balls_up.author(stage, conductivity=0.0, **PILES[count])
-        began = time.perf_counter()
-        simulation = Simulation(stage, device=str(device))
+    began = time.perf_counter()
+    simulation = _balls_up(device, **PILES[count])
     simulation.step()
     wp.synchronize_device(device)
     first = time.perf_counter() - began
     for _ in range(_SETTLING - 1):
         simulation.step()
-    before = copy.deepcopy(simulation.statistics)
-
     reports = []
     with wp.ScopedMemoryTracker("steps", report_func=reports.append) as tracker:
         tracker.clear()
-        seconds, host = _time_steps(simulation, _STEPS, device)
-    after = simulation.statistics
-    induction, force, rigid = after.milliseconds_since(before.steps)
-    return {
-        "seconds": seconds,
-        "ti_ms": induction,
-        "tf_ms": force,
-        "tr_ms": rigid,
-        **parts_of_a_substep(simulation),
-        "magnetics_share": (induction + force) / rigid,
+        values, host = _measured(simulation, _STEPS, device)
+    return values | {
+        "magnetics_share": (values["ti_ms"] + values["tf_ms"]) / values["tr_ms"],
         "capture_failure": simulation.capture_failure,
         "host_us": 1e6 * float(np.median(host)),
         "host_us_max": 1e6 * max(host),
         "allocations": sum(int(n) for n in re.findall(r"^\s+(?:cpu|pinned|cuda:\d+)\s+(\d+) \(", reports[0], re.M)),
-        "substeps": (after.substeps - before.substeps) / _STEPS,
-        "repeated": after.repeated - before.repeated,
-        "evaluations": float(np.median(after.evaluations[before.steps :])),
-        "error": after.error,
-        "unconverged": after.unconverged,
-        "overlap": after.overlap,
+        "evaluations": float(np.median(simulation.statistics.evaluations[_SETTLING:])),
+        "error": simulation.statistics.error,
+        "unconverged": simulation.statistics.unconverged,
         "first_call_seconds": first,
     }
 
 
 def run_bundled(name: str, device) -> dict:
-    """Run a bundled scene for its first second, Balls Up without eddy currents, and measure what a step takes in all.
-
-    Parts of a substep are those of its end.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        stage = bundled()[name]
-        if name == "balls_up":
-            stage = Path(folder) / "pile.usdc"
-            balls_up.author(stage, conductivity=0.0)
-        simulation = Simulation(stage, device=str(device))
+    """Run a bundled scene for its first second, Balls Up without eddy currents, and measure the mean step."""
+    simulation = _balls_up(device) if name == "balls_up" else Simulation(bundled()[name], device=str(device))
     simulation.step()
     wp.synchronize_device(device)
+    return _measured(simulation, round(1.0 / simulation.step_size), device)[0]
+
+
+def _balls_up(device, **parameters) -> Simulation:
+    with tempfile.TemporaryDirectory() as folder:
+        stage = Path(folder) / "pile.usdc"
+        balls_up.author(stage, conductivity=0.0, **parameters)
+        return Simulation(stage, device=str(device))
+
+
+def _measured(simulation: Simulation, steps: int, device) -> tuple[dict, list[float]]:
+    """Return the means of the next steps, the parts of a substep at their end, and the host's time of each step [s]."""
     before = copy.deepcopy(simulation.statistics)
-    steps = round(1.0 / simulation.step_size)
-    seconds, _ = _time_steps(simulation, steps, device)
+    seconds, host = _time_steps(simulation, steps, device)
     after = simulation.statistics
     induction, force, rigid = after.milliseconds_since(before.steps)
     return {
@@ -91,11 +79,11 @@ def run_bundled(name: str, device) -> dict:
         "repeated": after.repeated - before.repeated,
         "evaluations": sum(after.evaluations[before.steps :]) / steps,
         "overlap": after.overlap,
-    }
+    }, host
 
 
 def _time_steps(simulation: Simulation, steps: int, device) -> tuple[float, list[float]]:
-    """Return the seconds of a step, and what the host took for each of them."""
+    """Return the mean time of a step, and the host's time of each step [s]."""
     host, began = [], time.perf_counter()
     for step in range(steps):
         if step % _AHEAD == 0:
@@ -108,11 +96,11 @@ def _time_steps(simulation: Simulation, steps: int, device) -> tuple[float, list
 
 
 def parts_of_a_substep(simulation: Simulation) -> dict:
-    """Measure what rigid bodies cost in a substep of the present state, each part alone.
+    """Measure the parts of a substep of rigid bodies in the present state, each alone.
 
     Returns:
-        Times of the search for pairs (and for contacts of balls with it), of Newton's narrow phase and of the solver
-        [ms], contacts and iterations.
+        Times [ms] of the broad phase (with contacts of balls), of Newton's narrow phase and of the solver; numbers of
+        contacts and iterations.
     """
     solver, stepper, device = simulation._solver, simulation._stepper, simulation.model.device
     now, then, dt = stepper.state, stepper._other, stepper._longest

@@ -1,4 +1,4 @@
-"""What very many balls of one instancer take: from the stage to the first step, and to be written in frames."""
+"""Cost of very many balls of one PointInstancer: time from stage to first step, and time to write frames."""
 
 import resource
 import tempfile
@@ -15,15 +15,15 @@ from warpmag.scenes_usd import sakura_tree
 
 _FRAMES = 240
 _RATE = 60.0
-"""Frames a second [Hz]."""
+"""Frames per second [Hz]."""
 _POSES = 8
-"""States of the balls that the frames show in turn."""
+"""Number of states of the balls, which the frames show in turn."""
 
 
 def run_swarm(count: int, device, frames: int | None = None) -> dict:
-    """Read, build and step Sakura Tree with ``count`` balls once, then write balls that are moved without physics.
+    """Read, build and step Sakura Tree with ``count`` balls once, then write balls that move without physics.
 
-    Memory is what the process has of the machine beyond what it had when the first step was done, and at most.
+    ``growth_mb`` is the growth of resident memory after the first step, the larger of current and peak values.
     """
     frames = frames or _FRAMES
     with tempfile.TemporaryDirectory() as folder:
@@ -47,12 +47,12 @@ def run_swarm(count: int, device, frames: int | None = None) -> dict:
             "seconds": seconds,
             "cpu_seconds": writing,
             "growth_mb": max(max(memory) - before, _peak() - peak),
-            "file_mb": 1e-6 * sum(one.stat().st_size for one in Path(folder).glob("out*")),
+            "file_mb": 1e-6 * sum(file.stat().st_size for file in Path(folder).glob("out*")),
         }
 
 
 def _write(simulation: Simulation, output: Path, frames: int) -> tuple[float, list[float]]:
-    """Write frames of moving balls; return the seconds that took, and the memory after each frame [MB]."""
+    """Write frames of moving balls; return the seconds taken, and the memory after each frame [MB]."""
     rng, memory, seconds = np.random.default_rng(0), [], -time.perf_counter()
     recorder: Recorder = simulation._open_recorder(output, False, frames)
     seconds += time.perf_counter()
@@ -71,5 +71,5 @@ def _write(simulation: Simulation, output: Path, frames: int) -> tuple[float, li
 
 
 def _peak() -> float:
-    """Return the most memory that this process has had of the machine [MB]."""
+    """Return the peak resident memory of this process [MB]."""
     return 1e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

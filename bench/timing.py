@@ -1,4 +1,4 @@
-"""Times of work on a device."""
+"""Times of kernel launches on a device."""
 
 import time
 
@@ -6,14 +6,14 @@ import numpy as np
 import warp as wp
 
 _CHAINED = 10
-"""Pieces of work in a captured graph."""
+"""Repetitions of the work in one captured graph."""
 
 
 def measure(work, device, *, seconds: float = 1.0, repeats: int = 5, chained: int = _CHAINED) -> float:
-    """Median time [s] of ``work``, which only launches kernels.
+    """Median time [s] of ``work``, a function that only launches kernels.
 
-    On a GPU it is captured ``chained`` times in one graph, between two events: a graph's own launch takes 5 µs, which
-    a step in a simulation's graph does not pay.
+    On a GPU the work is captured ``chained`` times in one graph between two events. So the launch of a graph, 5 µs, is
+    spread over all repetitions: a step of a simulation is part of a longer graph, too.
     """
     work()
     if device.is_cpu:

@@ -1,4 +1,4 @@
-"""What writing costs a run: runs with and without output in turns, and how their memory grows."""
+"""Cost of writing: runs with and without output in turns, and the growth of their memory."""
 
 import os
 import statistics
@@ -11,14 +11,15 @@ from warpmag import Simulation
 from warpmag.scenes_usd import balls_up
 
 _FRAMES = {"cpu": 20, "cuda": 600}
-"""Frames of a run, at 60 a second, unless a number is given."""
+"""Default number of frames of a run, at 60 per second."""
 _PAIRS = 3
+"""Number of runs with output, and of runs without."""
 _SETTLED = 10
-"""Frames after which memory holds what every run takes, and fewest frames of a run."""
+"""Frames after which the memory of a run without output stays constant; a run has at least one more."""
 
 
 def run_writing(count: int, device, frames: int | None = None) -> dict:
-    """Run Balls Up with ``count`` balls, every other time with output, after two short runs that do not count."""
+    """Run Balls Up with ``count`` balls in turns with and without output, after two short runs that are not timed."""
     frames = max(frames or _FRAMES["cpu" if device.is_cpu else "cuda"], _SETTLED + 1)
     walls: dict[bool, list[float]] = {True: [], False: []}
     growth = []
@@ -45,7 +46,7 @@ def run_writing(count: int, device, frames: int | None = None) -> dict:
 
 
 def _run(stage: Path, device, frames: int, output: Path | None) -> tuple[float, list[float]]:
-    """Return the seconds of a run, opening and closing its files included, and the memory after each frame [MB]."""
+    """Return the seconds of a run, including opening and closing its files, and the memory after each frame [MB]."""
     memory = []
     simulation = Simulation(stage, device=str(device))
     began = time.perf_counter()
@@ -54,5 +55,5 @@ def _run(stage: Path, device, frames: int, output: Path | None) -> tuple[float, 
 
 
 def resident() -> float:
-    """Return the memory that this process has of the machine [MB], as Linux tells it."""
+    """Return the resident memory of this process [MB], from /proc."""
     return 1e-6 * os.sysconf("SC_PAGE_SIZE") * int(Path("/proc/self/statm").read_text().split()[1])

@@ -14,7 +14,7 @@ from bench.peers import Peer
 @pytest.fixture
 def lines(tmp_path, device, monkeypatch, capsys):
     """Lines of two peers at two sizes, and of one that is not there, twice in the file."""
-    monkeypatch.setattr(compare, "PEERS", (*compare.PEERS, Peer("with_nothing", "", ("cpu", "cuda"))))
+    monkeypatch.setattr(compare, "PEERS", (*compare.PEERS, Peer("nothing", "with_nothing", "", ("cpu", "cuda"))))
     arguments = ["--device", device, "--sizes", "70", "130", "--seconds", "0.01", "-o", str(tmp_path / "lines.jsonl")]
     for _ in range(2):
         compare.main([*arguments, "--peers", "warpmag", "warp_plain", "nothing"])

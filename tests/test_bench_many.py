@@ -13,7 +13,7 @@ from bench.peers import Evaluation, Peer
 from bench.timing import measure
 
 
-def prepare(positions, charges, device):
+def exact(positions, charges, device):
     """A peer that is exact."""
     return Evaluation(lambda: None, lambda: None, lambda: many.field_of_charges(positions, charges, range(729)))
 
@@ -22,12 +22,12 @@ def test_both_ways_and_peers(tmp_path, device, monkeypatch, capsys):
     monkeypatch.setattr(many, "RTOLS", (None, 1e-3))
     monkeypatch.setattr(many, "measure", lambda work, device: measure(work, device, seconds=0.01))
     kinds = "cpu", "cuda"
-    peers = Peer("with_nothing", "", kinds, charges=True), Peer("with_exact", "", kinds, charges=True)
+    peers = [Peer(name, f"with_{name}", "", kinds, charges=True) for name in ("nothing", "exact")]
     monkeypatch.setattr(many, "PEERS", peers)
     monkeypatch.setitem(sys.modules, "bench.peers.with_exact", sys.modules[__name__])
     many.main(["--device", device, "--sizes", "729", "--peers", "nothing", "exact", "-o", str(tmp_path / "lines")])
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    own, (missing, exact) = lines[:4], lines[4:]
+    own, (missing, single) = lines[:4], lines[4:]
     expected = [(q, m) for q in ("field", "wrench") for m in ("direct", "fmm")]
     assert [(line["quantity"], line["method"]) for line in own] == expected
     for line in own:
@@ -36,7 +36,7 @@ def test_both_ways_and_peers(tmp_path, device, monkeypatch, capsys):
         assert line["error"] < (4e-5 if line["method"] == "direct" else 1e-3)
         assert line["error"] <= line["largest_error"]
     assert "with_nothing" in missing["failed"]
-    assert exact["error"] == 0.0
+    assert single["error"] == 0.0
     many.main(["--draw", str(tmp_path / "lines"), "-o", str(tmp_path / "lines.png")])
     assert (tmp_path / "lines.png").stat().st_size > 10_000
 

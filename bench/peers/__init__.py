@@ -1,10 +1,12 @@
-"""Other ways to the same sum: the field of n dipoles at each other, as one would write it with each library.
+"""Peers of warpmag: the field of n dipoles at each other, as users of other libraries would write it.
 
-Every module has one function ``prepare(positions, moments, device)``, which takes float32 NumPy arrays of shape [n, 3]
-and the name of a Warp device, puts them where the library wants them and returns an :class:`Evaluation`. A module whose
-library is not installed fails to import; ``compare`` skips it.
+A peer is a function of its name in a module of this folder, ``peer(positions, moments, device)``. It takes float32
+NumPy arrays of shape [n, 3] and the name of a Warp device, moves them where the library needs them, and returns an
+:class:`Evaluation`. Peers for point charges take charges of shape [n] in place of moments. ``compare`` reports a peer
+whose library is not installed as failed.
 """
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,9 +19,9 @@ class Evaluation:
 
     Attributes:
         run: Starts one evaluation.
-        wait: Returns when all that were started have ended.
-        result: Field [A/m] of the last one, shape [n, 3].
-        kept: What has to live as long as this does: a captured graph does not hold the arrays that it works on.
+        wait: Returns after all evaluations that were started.
+        result: Returns the field [A/m] of the last evaluation, shape [n, 3].
+        kept: Objects that must live as long as this one: a captured graph does not hold the arrays that it uses.
     """
 
     run: Callable[[], object]
@@ -28,36 +30,52 @@ class Evaluation:
     kept: object = None
 
 
+def evaluation_of(compute, *, wait=lambda value: None, result=np.asarray) -> Evaluation:
+    """Evaluation of a function that returns its result; ``wait`` and ``result`` take the last one."""
+    last = []
+
+    def run():
+        last[:] = [compute()]
+
+    return Evaluation(run, lambda: wait(last[0]), lambda: result(last[0]))
+
+
 @dataclass(frozen=True)
 class Peer:
-    """A module of this folder.
+    """A function of a module of this folder.
 
     Attributes:
-        name: Module name.
-        summary: What it is.
-        devices: Where it runs, ``cpu``, ``cuda`` or both.
-        charges: Whether it sums the field of point charges, shape [n], and knows no dipoles; ``many`` alone runs it.
+        name: Name of the function.
+        module: Name of the module.
+        summary: Library and method.
+        devices: Devices that it runs on, ``cpu``, ``cuda`` or both.
+        charges: True if it sums the field of point charges, shape [n]; only ``many`` runs such peers.
     """
 
     name: str
+    module: str
     summary: str
     devices: tuple[str, ...]
     charges: bool = False
 
+    def prepare(self, positions, moments, device) -> Evaluation:
+        """Call the function; an error if its library is not installed."""
+        return getattr(importlib.import_module(f"bench.peers.{self.module}"), self.name)(positions, moments, device)
+
 
 PEERS = (
-    Peer("with_warpmag", "warpmag: native loop and overlap pass, captured in a graph", ("cpu", "cuda")),
-    Peer("with_h_field", "warpmag.h_field of points, the whole call", ("cpu",)),
-    Peer("with_warp_plain", "Warp: one thread a target, the textbook loop, in a graph", ("cpu", "cuda")),
-    Peer("with_warp_tile", "Warp: its tile n-body example turned to dipoles, in a graph", ("cuda",)),
-    Peer("with_torch", "PyTorch: broadcast over blocks of targets, torch.compile", ("cpu", "cuda")),
-    Peer("with_jax", "JAX: broadcast over blocks of targets, jit", ("cpu", "cuda")),
-    Peer("with_numba_cpu", "Numba: parallel, fastmath loop", ("cpu",)),
-    Peer("with_numba_cuda", "Numba CUDA: sources staged in shared memory", ("cuda",)),
-    Peer("with_cupy", "CuPy: broadcast over blocks of targets", ("cuda",)),
-    Peer("with_pykeops", "KeOps: symbolic matrix, reduced without being stored", ("cpu", "cuda")),
-    Peer("with_magpylib", "magpylib: its dipole formula over all pairs, float64", ("cpu",)),
-    Peer("with_fmm3d", "FMM3D: fast multipole method, eps 1e-3, float64", ("cpu",)),
-    Peer("with_jaxfmm", "jaxFMM: fast multipole method, error 2e-3, tree kept", ("cpu", "cuda"), charges=True),
-    Peer("with_jzfmm", "jz-FMM: fast multipole method, order 5", ("cuda",), charges=True),
+    Peer("warpmag", "with_warp", "warpmag: native loop and overlap pass, captured in a graph", ("cpu", "cuda")),
+    Peer("h_field", "with_warp", "warpmag.h_field of points, the whole call", ("cpu",)),
+    Peer("warp_plain", "with_warp", "Warp: one thread a target, the textbook loop, in a graph", ("cpu", "cuda")),
+    Peer("warp_tile", "with_warp", "Warp: its tile n-body example adapted to dipoles, in a graph", ("cuda",)),
+    Peer("torch", "with_torch", "PyTorch: broadcast over blocks of targets, torch.compile", ("cpu", "cuda")),
+    Peer("jax", "with_jax", "JAX: broadcast over blocks of targets, jit", ("cpu", "cuda")),
+    Peer("numba_cpu", "with_numba", "Numba: parallel, fastmath loop", ("cpu",)),
+    Peer("numba_cuda", "with_numba", "Numba CUDA: sources staged in shared memory", ("cuda",)),
+    Peer("cupy", "with_arrays", "CuPy: broadcast over blocks of targets", ("cuda",)),
+    Peer("pykeops", "with_arrays", "KeOps: symbolic matrix, reduced without being stored", ("cpu", "cuda")),
+    Peer("magpylib", "with_arrays", "magpylib: its dipole formula over all pairs, float64", ("cpu",)),
+    Peer("fmm3d", "with_arrays", "FMM3D: fast multipole method, eps 1e-3, float64", ("cpu",)),
+    Peer("jaxfmm", "with_jax", "jaxFMM: fast multipole method, error 2e-3, tree kept", ("cpu", "cuda"), charges=True),
+    Peer("jzfmm", "with_jax", "jz-FMM: fast multipole method, order 5", ("cuda",), charges=True),
 )

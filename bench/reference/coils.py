@@ -1,18 +1,18 @@
 """Reference fields of coils in plain NumPy, float64: the law of Biot and Savart summed along the wire.
 
-Independent of the closed forms of ``kernels.applied``: a loop by the trapezoidal rule, which converges exponentially
-there, a solenoid and straight pieces by Gauss and Legendre's. Nothing here is fast; points must not be on the wire.
+Independent of the closed forms of ``warpmag.kernels.applied``. Loops use the trapezoidal rule, which converges
+exponentially for them; solenoids and straight pieces use Gauss-Legendre quadrature. Points must not be on the wire.
 """
 
 import numpy as np
 
 
 def wire_field(places, steps, points):
-    """Field of pieces of wire of one ampere, ∫ dl × r / (4π r³).
+    """Field of short pieces of wire that carry one ampere, ∫ dl × r / (4π r³).
 
     Args:
-        places: Where the pieces are [m], shape [k, 3].
-        steps: Their lengths along the current [m], shape [k, 3].
+        places: Places of the pieces [m], shape [k, 3].
+        steps: Lengths of the pieces along the current [m], shape [k, 3].
         points: Field points [m], shape [p, 3].
 
     Returns:
@@ -23,7 +23,7 @@ def wire_field(places, steps, points):
 
 
 def loop_field(radius, points, *, height=0.0, count=2000):
-    """Field [A/m], shape [p, 3], of a loop of one ampere about the z axis, by ``count`` pieces."""
+    """Field [A/m], shape [p, 3], of a loop of one ampere about the z axis, made of ``count`` pieces."""
     angle = 2.0 * np.pi * np.arange(count) / count
     places = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)], axis=1)
     steps = 2.0 * np.pi * radius / count * np.stack([-np.sin(angle), np.cos(angle), np.zeros(count)], axis=1)
@@ -31,7 +31,7 @@ def loop_field(radius, points, *, height=0.0, count=2000):
 
 
 def solenoid_field(radius, length, points, *, count=600, loops=60):
-    """Field [A/m], shape [p, 3], of a solenoid of one ampere-turn about the z axis, by ``loops`` loops."""
+    """Field [A/m], shape [p, 3], of a solenoid of one ampere-turn about the z axis, made of ``loops`` loops."""
     nodes, weights = np.polynomial.legendre.leggauss(loops)
     parts = (
         0.5 * weight * loop_field(radius, points, height=0.5 * length * node, count=count)

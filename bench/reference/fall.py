@@ -1,8 +1,8 @@
-"""Soft balls that attract each other without contact: what becomes of their energy and momentum in a step's length.
+"""Energy and momentum of soft balls that fall towards each other, for errors of the time step.
 
-The energy is kinetic plus the free energy of soft magnets at equilibrium, from the float64 oracle. The integrator is
-symplectic Euler, in which velocities stand half a step ahead: those at the time of the positions are the mean before
-and after the step. Energy then errs by the second order of the step, positions by the first.
+The energy is kinetic plus the free energy of soft magnets in equilibrium, from the float64 oracle. The integrator is
+symplectic Euler, whose velocities are half a step ahead: velocities at the time of the positions are the mean of those
+before and after the step. The error of the energy is of second order in the step, that of positions of first order.
 """
 
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from bench.reference import oracle
 
 RADIUS, SATURATION, DENSITY = 0.005, 1.7e6, 7870.0
 FIELD = np.array([2e5, 0.0, 1e5])
-"""Applied field [A/m]; the balls come to be magnetized to a third of their saturation."""
+"""Applied field [A/m]; it magnetizes the balls to a third of their saturation."""
 DURATION = 0.01
-"""Time [s] in which two balls come from 4.4 to 3.1 radii."""
+"""Time [s] in which the distance of two balls falls from 4.4 to 3.1 radii."""
 BALLS = RADIUS * np.array([[0.0, 0.0, 0.0], [4.4, 0.0, 0.0], [1.32, 3.96, 0.88]])
 
 
 @dataclass(frozen=True)
 class Fall:
-    """What became of a fall.
+    """Result of a fall.
 
     Attributes:
         drift: Largest change of the total energy over the kinetic energy gained.
         momentum: Largest total momentum over the sum of the balls' momenta.
-        positions: Where the balls end [m], shape [count, 3].
+        positions: Final positions of the balls [m], shape [count, 3].
     """
 
     drift: float
@@ -39,8 +39,8 @@ class Fall:
 
 def free_energy(positions) -> float:
     """Magnetic free energy [J] of soft balls in equilibrium, whose gradient is the Kelvin force."""
-    found = oracle.equilibrium(positions, RADIUS, FIELD, saturation=SATURATION)
-    m, g = found.magnetizations, oracle.coupling_matrix(positions, RADIUS)
+    solution = oracle.equilibrium(positions, RADIUS, FIELD, saturation=SATURATION)
+    m, g = solution.magnetizations, oracle.coupling_matrix(positions, RADIUS)
     s = np.linalg.norm(m, axis=1) / SATURATION
     stored = SATURATION**2 / 3.0 * np.sum(s * np.arctanh(s) + 0.5 * np.log1p(-(s**2)))
     mutual, applied = 0.5 * m.ravel() @ g @ m.ravel(), np.sum(m * FIELD)
@@ -58,7 +58,7 @@ def fall(count: int, dt: float, device, *, force: str = "kelvin") -> Fall:
         warpmag.add_inducible(builder, body)
     model = builder.finalize(device=device)
     magnetics = warpmag.Magnetics(model, external_field=tuple(FIELD), rtol=2e-6, force=force)
-    # XPBD sets speeds below 0.1 mm/s to zero, which short steps would never leave
+    # XPBD sets speeds below 0.1 mm/s to zero, so with short steps balls would never start to move
     solver, now, then = newton.solvers.SolverSemiImplicit(model), model.state(), model.state()
     mass = model.body_mass.numpy().astype(float)[:, None]
     kinetic, total, momentum = [], [], []

@@ -1,6 +1,6 @@
-"""Dense reference of the near-contact model, in float64 with NumPy; ``warpmag.kernels.near_contact`` has the model.
+"""Dense reference of the near-contact model that ``warpmag.kernels.near_contact`` describes, in float64 with NumPy.
 
-Tests compare the device with it, and with the exact solutions of ``bench.reference``. Names are those of the model.
+Tests compare the device with it, and it with exact solutions of other references. Names are those of the model.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ from warpmag.kernels.near_contact.contact_table import (
 
 
 def log_gap(gap):
-    """Logarithm of the gap [radii] at which the table is read, and its derivative; levels off near contact."""
+    """Logarithm of the gap [radii] at which the table is read, and its derivative; bounded below near contact."""
     depth = np.minimum(gap - SMALLEST_GAP, 0.0) / SOFTNESS
     outside = np.maximum(gap, SMALLEST_GAP)
     value = np.log(outside) + SOFTNESS / SMALLEST_GAP * depth / np.sqrt(1.0 + depth**2)
@@ -40,14 +40,14 @@ def smoothstep(x):
 
 
 def window(gap, far=CONTACT_GAP, deep=DEEPEST):
-    """Factor that fades from a gap ``far[0]`` to ``far[1]`` and in an overlap from ``deep[0]`` on, its derivative."""
+    """Factor that fades from gap ``far[0]`` to ``far[1]`` and in overlaps beyond ``deep[0]``, and its derivative."""
     outer, outer_slope = smoothstep((far[1] - gap) / (far[1] - far[0]))
     inner, inner_slope = smoothstep((deep[1] + gap) / (deep[1] - deep[0]))
     return outer * inner, outer * inner_slope / (deep[1] - deep[0]) - inner * outer_slope / (far[1] - far[0])
 
 
 def quadrupole_window(distance, radius_i, radius_j):
-    """Factor by which the quadrupoles of two balls take part, and its derivative by their distance."""
+    """Weight of the quadrupoles of two balls, and its derivative with respect to their distance."""
     unit = 0.5 * (radius_i + radius_j)
     far = (QUADRUPOLE_REACH[0] - 2.0, QUADRUPOLE_REACH[1] - 2.0)
     value, slope = window(distance / unit - 2.0, far, QUADRUPOLE_OVERLAP)
@@ -55,12 +55,12 @@ def quadrupole_window(distance, radius_i, radius_j):
 
 
 def conductances(gap, own, other):
-    """The 14 functions A to P of pairs, and their derivatives by the gap.
+    """The 14 functions A to P of pairs, and their derivatives with respect to the gap.
 
     Args:
         gap: Gap between the surfaces over the radius, shape [p].
         own: :func:`hardness` of the ball, shape [p].
-        other: That of the other, shape [p].
+        other: :func:`hardness` of the other ball, shape [p].
 
     Returns:
         Functions and derivatives [dimensionless], shape [p, 14] each.
@@ -79,20 +79,20 @@ def conductances(gap, own, other):
 
 
 def similarity(radius_i, radius_j):
-    """Factor that fades the pair's part of balls of unlike size, for which the table of equal ones is no guide."""
+    """Weight of a pair of unequal balls, for which the table of equal balls is less accurate."""
     ratio = np.minimum(radius_i, radius_j) / np.maximum(radius_i, radius_j)
     return smoothstep((ratio - LEAST_RATIO[0]) / (LEAST_RATIO[1] - LEAST_RATIO[0]))[0]
 
 
 def shared_volume(distance, a, b):
-    """Volume that two balls share over the geometric mean of theirs."""
+    """Common volume of two balls over the geometric mean of their volumes."""
     d = np.clip(distance, np.abs(a - b) + 1e-9 * (a + b), a + b)
     lens = (a + b - d) ** 2 * (d**2 + 2.0 * d * (a + b) - 3.0 * (a - b) ** 2) / (16.0 * d)
     return lens / (a * b) ** 1.5
 
 
 def crowding_weight(shared):
-    """Factor that takes balls out of the model that share the volume ``shared`` with others."""
+    """Weight of a ball that shares the volume ``shared`` with others: 0 removes it from the model."""
     return 1.0 - smoothstep((shared - MOST_SHARED[0]) / (MOST_SHARED[1] - MOST_SHARED[0]))[0]
 
 
@@ -109,13 +109,13 @@ def long_range(distance, radius_i, radius_j):
 
 
 def long_range_self(radius):
-    """U_lr of a ball on itself [1/m], and of its dipole on itself [1/m³]."""
+    """U_lr of a ball's source at the ball itself [1/m], and of its dipole [1/m³]."""
     b = 0.5 * RANGE * radius
     return 1.2 / b, 1.0 / b**3
 
 
 def averaged_potential(d, a, b):
-    """Mean potential U [1/m] of a homogeneous ball of radius b over one of radius a."""
+    """Mean potential U [1/m] of a homogeneous ball of radius b over another one of radius a."""
     s, p, delta2 = a + b, a * b, (a - b) ** 2
     k = 5.0 * delta2**2 * (delta2 + 6.0 * p)
     u1, u2, u3 = 45.0 * s**2 * delta2, -40.0 * s * (delta2 + p), 15.0 * (delta2 + 2.0 * p)
@@ -141,14 +141,14 @@ _BASIS = np.array(
         np.diag([_HALF_ROOT, -_HALF_ROOT, 0.0]),
     ]
 )
-"""Quadrupoles Θ of which a ball of unit radius and infinite permeability has the energy 1/2, shape [5, 3, 3]."""
+"""Basis of quadrupoles Θ: the energy of each in a ball of unit radius and infinite permeability is 1/2."""
 
 
 def saturation_weight(h, saturation, susceptibility, curve):
-    """Factor by which a ball's part in ΔC falls as it saturates, shape [n], from its field H [A/m], shape [n, 3].
+    """Weight of a ball in ΔC, which falls as the ball saturates, shape [n], from its field H [A/m], shape [n, 3].
 
-    What a contact adds are the higher multipoles of a ball, of polarizability 2χ/(2χ + 5) for the lowest. At a finite
-    magnetization they feel the differential susceptibility 1/χ_d = dH/dM − 1/3 of the curve; a saturated ball has none.
+    A contact adds the higher multipoles of a ball; the lowest has the polarizability 2χ/(2χ + 5). At a finite
+    magnetization χ is the differential susceptibility, 1/χ_d = dH/dM − 1/3 of the curve; it is 0 in saturation.
     """
     k = oracle.curve_slope(susceptibility)
     _, slope = oracle.reduced_curve(k * np.linalg.norm(h, axis=1) / saturation, curve)
@@ -160,7 +160,7 @@ class NearContacts:
     """The near pairs of n balls and their matrices, sources interleaved: q, m_x, m_y, m_z, Θ of each ball."""
 
     def __init__(self, positions, radii, susceptibility, weights=1.0):
-        """Find the pairs and their ΔC, of balls whose part is scaled by ``weights`` (:func:`saturation_weight`)."""
+        """Find the pairs and their ΔC; ``weights`` are those of :func:`saturation_weight`."""
         self.positions = np.asarray(positions, float)
         n = self.count = len(self.positions)
         self.radii = np.broadcast_to(np.asarray(radii, float), n)
@@ -175,7 +175,7 @@ class NearContacts:
         a, b = self.radii[i], self.radii[j]
         length = np.linalg.norm(self.separation, axis=1)
         self.direction = self.separation / np.maximum(length, np.finfo(float).tiny)[:, None]
-        self.distance = np.maximum(length, 1e-12 * (a + b))  # powers of 1/d that nothing comes of stay finite
+        self.distance = np.maximum(length, 1e-12 * (a + b))  # keeps powers of 1/d with zero weight finite
         self.scale = 2.0 * a * b / (a + b)  # the curvature of the gap
         both = shared_volume(self.distance, a, b)
         crowding = crowding_weight(np.bincount(i, both, n) + np.bincount(j, both, n))
@@ -184,14 +184,14 @@ class NearContacts:
         alike = self.present * similarity(a, b)
         self.quadrupole = [alike * factor for factor in quadrupole_window(self.distance, a, b)]
         share = (w[i] * w[j] * alike)[:, None]
-        functions = [conductances(gap, y[one], y[other]) for one, other in ((i, j), (j, i))]
+        functions = [conductances(gap, y[ball], y[other]) for ball, other in ((i, j), (j, i))]
         self.value = [share * self.scale[:, None] * value for value, _ in functions]  # of ball i and of ball j
         self.slope = [share * slope for _, slope in functions]
         self.short_range = self._short_range()
         self.conductance = self._conductance()
 
     def _factors(self):
-        """U_sr and its radial factors g1, g2, g3 of the pairs, as far as both balls take part."""
+        """U_sr and its radial factors g1, g2, g3 of the pairs, times the weight of the pair."""
         a, b, d = self.radii[self.i], self.radii[self.j], self.distance
         near = averaged_potential(d, a, b), *oracle.radial_factors(d, a, b)
         return [self.present * (x - y) for x, y in zip(near, long_range(d, a, b), strict=True)]
@@ -236,23 +236,24 @@ class NearContacts:
         """ΔC, shape [9n, 9n]."""
         n = self.count
         matrix = np.zeros((n, 9, n, 9))
-        for side, one, other, sign in ((0, self.i, self.j, 1), (1, self.j, self.i, -1)):
-            own, its = self._axes(one, sign), self._axes(other, -sign)
+        for side, ball, other, sign in ((0, self.i, self.j, 1), (1, self.j, self.i, -1)):
+            own, others = self._axes(ball, sign), self._axes(other, -sign)
             a, b, c, d, e, f, g, h, i, j, k, l, o, p = self.value[side].T  # noqa: E741
             _, _, _, d_j, _, _, _, _, _, j_j, _, l_j, _, _ = self.value[1 - side].T
             among = np.array([[a, c, i], [c, e, k], [i, k, o]])
             cross = np.array([[b, d, j], [d_j, f, l], [j_j, l_j, p]])
-            across = (np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]) * self.radii[one, None, None]
+            across = np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]
+            across = across * self.radii[ball, None, None]
             block = np.einsum("uvp,pua,pvb->pab", among, own, own)
-            block[:, 1:4, 1:4] += (g * self.radii[one])[:, None, None] * across
-            np.add.at(matrix, (one, slice(None), one), block)
-            block = np.einsum("uvp,pua,pvb->pab", cross, own, its)
+            block[:, 1:4, 1:4] += (g * self.radii[ball])[:, None, None] * across
+            np.add.at(matrix, (ball, slice(None), ball), block)
+            block = np.einsum("uvp,pua,pvb->pab", cross, own, others)
             block[:, 1:4, 1:4] += (h * self.radii[other])[:, None, None] * across
-            matrix[one, :, other, :] = block
+            matrix[ball, :, other, :] = block
         return matrix.reshape(9 * n, 9 * n)
 
     def _axes(self, ball, sign):
-        """Sources q, m, Θ that are of unit strength on the axis towards the other ball, shape [pairs, 3, 9]."""
+        """Sources q, m, Θ of unit strength on the axis towards the other ball, shape [pairs, 3, 9]."""
         axes = np.zeros((len(ball), 3, 9))
         axes[:, 0, 0] = 1.0
         axes[:, 1, 1:4] = sign * self.radii[ball, None] * self.direction
@@ -292,23 +293,17 @@ class NearContacts:
         return oracle.MU0 / (4.0 * np.pi) * forces
 
     def _conductance_force(self, drive):
-        """Derivative of ½ e ΔC e of each pair by the position of ball j."""
+        """Derivative of ½ e ΔC e of each pair with respect to the position of ball j."""
         unit = self.direction
         radial, turn = 0.0, 0.0
-        for side, one, other, sign in ((0, self.i, self.j, 1.0), (1, self.j, self.i, -1.0)):
-            own, its = self._at_contact(drive, one, sign), self._at_contact(drive, other, -sign)
+        for side, ball, other, sign in ((0, self.i, self.j, 1.0), (1, self.j, self.i, -1.0)):
+            own, others = self._at_contact(drive, ball, sign), self._at_contact(drive, other, -sign)
             phi, alpha, gamma, field, pull, square = own
-            phi_j, alpha_j, gamma_j, field_j, _, _ = its
-            # what both share counts half for each
+            phi_j, alpha_j, gamma_j, field_j, _, _ = others
+            # terms of both balls count half for each
             mixed = np.sum(field * field_j, 1) + alpha * alpha_j
-            energy = [
-                0.5 * phi**2,
-                0.5 * phi * phi_j,
-                phi * alpha,
-                phi * alpha_j,
-                0.5 * alpha**2,
-                0.5 * alpha * alpha_j,
-            ]
+            energy = [0.5 * phi**2, 0.5 * phi * phi_j, phi * alpha, phi * alpha_j]
+            energy += [0.5 * alpha**2, 0.5 * alpha * alpha_j]
             energy += [0.5 * square, 0.5 * mixed, phi * gamma, phi * gamma_j, alpha * gamma, alpha * gamma_j]
             energy += [0.5 * gamma**2, 0.5 * gamma * gamma_j]
             radial += np.einsum("pf,fp->p", self.slope[side], np.array(energy))
@@ -321,7 +316,7 @@ class NearContacts:
         return radial[:, None] * unit + turn / self.distance[:, None]
 
     def _at_contact(self, drive, ball, sign):
-        """φ, α and γ of a ball of each pair, its field R e_m, the vector R² e_Θ n, and what of R e_m is across."""
+        """φ, α and γ of a ball of each pair, R e_m, R² e_Θ n, and the square of R e_m perpendicular to the axis."""
         size = self.radii[ball]
         field = size[:, None] * drive[ball, 1:4]
         alpha = sign * np.sum(field * self.direction, 1)
@@ -352,7 +347,7 @@ class NearContacts:
 
         s_i, s_j = dot(v_i, n), dot(v_j, n)
         _, _, g2, g3 = self._factors()
-        # energies over g2 d²/3, d⁴ and d⁵, and their derivatives by the direction
+        # energies over g2 d²/3, d⁻⁴ and d⁻⁵, and their derivatives with respect to the direction
         energy_3 = q_i * s_j + q_j * s_i
         turn_3 = 2.0 * (q_i[:, None] * v_j + q_j[:, None] * v_i)
         energy_4, turn_4 = 0.0, 0.0
@@ -377,7 +372,7 @@ class NearContacts:
 def equilibrium(positions, radii, h0, *, saturation, susceptibility=np.inf, curve="tanh", iterations=60):
     """Magnetic equilibrium and Kelvin forces of balls in uniform fields, with the near-contact model.
 
-    Arguments are those of ``oracle.equilibrium``. The weights that follow the balls' saturation are found by iteration.
+    Arguments are those of ``oracle.equilibrium``. The weights of the balls' saturation are iterated.
 
     Returns:
         The equilibrium (``oracle.Equilibrium``) and the forces [N], shape [n, 3].
@@ -388,13 +383,13 @@ def equilibrium(positions, radii, h0, *, saturation, susceptibility=np.inf, curv
     weights = np.ones(n)
     for _ in range(iterations):
         near = NearContacts(positions, radii, susceptibility, weights)
-        found = oracle.equilibrium(
+        solution = oracle.equilibrium(
             positions, radii, h0, saturation=saturation, susceptibility=susceptibility, curve=curve,
             extra_coupling=near.coupling() * np.repeat(volumes, 3),
         )  # fmt: skip
-        last, weights = weights, saturation_weight(found.h, saturation, susceptibility, curve)
+        last, weights = weights, saturation_weight(solution.h, saturation, susceptibility, curve)
         if np.abs(weights - last).max() < 1e-10:
             break
-    moments = volumes[:, None] * found.magnetizations
+    moments = volumes[:, None] * solution.magnetizations
     gradients = oracle.field_gradient(positions, moments, radii=radii)
-    return found, oracle.kelvin_force(moments, gradients) + near.forces(moments)
+    return solution, oracle.kelvin_force(moments, gradients) + near.forces(moments)

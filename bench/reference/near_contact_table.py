@@ -1,11 +1,11 @@
-"""Writes the table of the near-contact model: ``python -m bench.reference.near_contact_table``.
+"""Computes the table of the near-contact model: ``python -m bench.reference.near_contact_table``.
 
 For two equal balls of unit radius the exact solution is reduced to sources, dipoles and, on the axis, quadrupoles,
-driven by potentials and fields that a conducting surface would have: K = M_LL − M_LH (M_HH + δ)⁻¹ M_HL, where M is the
-matrix of two perfect conductors in multipoles, H the degrees beyond, and δ_l = (2l+1)/(l(μr−1)) what a finite
-permeability adds. Less the long-range part this is the short-range resistance of the pair. K₂ is what of it the model
-has anyway: no degrees beyond 2, and sources and quadrupoles blind to each other. The pair's conductance is
-ΔC = (K − M_lr)⁻¹ − (K₂ − M_lr)⁻¹.
+driven by the potentials and fields of a conducting surface: K = M_LL − M_LH (M_HH + δ)⁻¹ M_HL. M is the matrix of two
+perfect conductors in multipoles, L are these low degrees, H the higher ones, and δ_l = (2l+1)/(l(μr−1)) is the part of
+a finite permeability. K minus the long-range part M_lr is the short-range resistance of the pair. K₂ is the part of K
+that the model has without the table: no degrees beyond 2, no coupling of sources with quadrupoles. The conductance of
+the pair is ΔC = (K − M_lr)⁻¹ − (K₂ − M_lr)⁻¹.
 """
 
 import math
@@ -22,9 +22,9 @@ from warpmag.kernels.near_contact.contact_table import FUNCTIONS, HARDNESSES, LO
 def reduced_resistance(
     distance: float, permeabilities, m: int, highest: int, order: int, source_quadrupole=1.0
 ) -> np.ndarray:
-    """K of two balls of unit radius for order m, degrees up to ``highest`` of both balls, those up to ``order`` solved.
+    """K of two balls of unit radius for order m, reduced to degrees up to ``highest``, with degrees up to ``order``.
 
-    A ball has a source where m = 0, which sees the other's quadrupole ``source_quadrupole`` times as strong as it is.
+    For m = 0 a ball has a source; its coupling to the other's quadrupole is scaled by ``source_quadrupole``.
     """
     degree = np.arange(m, order + 1)
     rows, columns = degree[:, None], degree[None, :]
@@ -43,9 +43,9 @@ def reduced_resistance(
 
 
 def pair_conductance(distance: float, permeabilities, tolerance: float = 1e-7) -> np.ndarray:
-    """The functions of the first of two balls of unit radius and given μr, in the order of the table."""
+    """Functions of the first of two balls of unit radius and given μr, in the order of the table."""
     u, g1, g2, _ = long_range(np.array(distance), 1.0, 1.0)
-    # what U_sr leaves of 3/d³, with which a source and a quadrupole see each other
+    # part of 3/d³, the coupling of a source with a quadrupole, that U_sr leaves
     left = 1.0 - g2 * distance**5 / 3.0
     self_source, self_dipole = long_range_self(1.0)
     # potential of a dipole and field of a source on the axis have the radial derivative U' = g1 d
@@ -71,7 +71,7 @@ def pair_conductance(distance: float, permeabilities, tolerance: float = 1e-7) -
 
 
 def spline_coefficients(values: np.ndarray) -> np.ndarray:
-    """Uniform cubic B-spline coefficients, two more than values along the first axis; not-a-knot ends."""
+    """Coefficients of a uniform cubic B-spline with not-a-knot ends, two more than values along the first axis."""
     n = len(values)
     matrix = np.zeros((n + 2, n + 2))
     for k in range(n):

@@ -1,14 +1,14 @@
-"""Reference implementation of warpmag's physics in plain NumPy, float64.
+"""Reference implementation of warpmag's physics in NumPy, float64.
 
-Every kernel is tested against this module, and it is kept for good: short, slow, and without Warp. Where a formula
-can be written in a form that is independent of the kernels', it is.
+Every kernel is tested against this module. It is short, slow and does not use Warp. Formulas have a form that is
+independent of the kernels' where there is one.
 
 | symbol | shape | unit | meaning |
 |---|---|---|---|
-| positions | [n, 3] | m | where the moments are |
+| positions | [n, 3] | m | positions of the moments |
 | moments | [n, 3] | A·m² | m = V M |
-| radii | [n] | m | ball over which a moment is spread; 0 is a point dipole |
-| h | [n, 3] | A/m | field, self excluded |
+| radii | [n] | m | radius of the uniformly magnetized ball of a moment; 0 is a point dipole |
+| h | [n, 3] | A/m | field without that of the moment itself |
 | gradients | [n, 3, 3] | A/m² | ∂H_k/∂x_l |
 
 References: Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation", Eqs. 1, 4, 7, 10, 13, 14.
@@ -31,11 +31,11 @@ MU0 = 4e-7 * math.pi
 def radial_factors(distance, radius_i, radius_j, smoothing=0.0):
     """Radial factors g1, g2, g3 of the pair law.
 
-    With r = x_i − x_j a moment m at j makes at i the field H = (g1 m + g2 r (r·m)) / 4π, and the gradient
+    With r = x_i − x_j, a moment m at j has at i the field H = (g1 m + g2 r (r·m)) / 4π, and the gradient
     ∂H_k/∂x_l = (g2 [r_k m_l + m_k r_l + δ_kl r·m] + g3 (r·m) r_k r_l) / 4π.
 
     For a potential U(d), g1 = U'/d, g2 = g1'/d, g3 = g2'/d. Balls that do not overlap are point dipoles, U = 1/d.
-    Overlapping balls take the field of one averaged over the other,
+    For overlapping balls the field of one is averaged over the other,
     U = 1/d + (a+b−d)⁴ (5a² − 20ab + 5b² − 4(a+b)d − d²) / (160 a³b³d), and −1/A³ where the smaller lies inside the
     larger of radius A.
 
@@ -57,7 +57,7 @@ def radial_factors(distance, radius_i, radius_j, smoothing=0.0):
     g1, g2, g3 = -1.0 / safe**3, 3.0 / safe**5, -15.0 / safe**7
     g1, g2, g3 = (np.where(d > 0.0, g, 0.0) for g in (g1, g2, g3))
 
-    # a point inside a ball sees −m/A³, the same limit as a small ball inside a large one
+    # a point inside a ball has g1 = −1/A³, as has a small ball inside a large one
     inside = (d <= np.abs(a - b)) & (np.maximum(a, b) > 0.0)
     large = np.where(inside, np.maximum(a, b), 1.0)
     g1 = np.where(inside, -1.0 / large**3, g1)
@@ -80,8 +80,8 @@ def _overlap_factors(d, a, b):
     g1 = c * (-k / d**3 + u1 / d + 2.0 * u2 + 3.0 * u3 * d - 5.0 * d**3)
     g2 = c * (3.0 * k / d**5 - u1 / d**3 + 3.0 * u3 / d - 15.0 * d)
     g3 = c * (-15.0 * k / d**7 + 3.0 * u1 / d**5 - 3.0 * u3 / d**3 - 15.0 / d)
-    # the printed form, for d near a + b and for very different radii, where the polynomial cancels; its q is
-    # q0/d − 4s − d, which cancels
+    # the printed form, for d near a + b and for very different radii, where the polynomial cancels; q is q0/d − 4s − d
+    # without cancellation
     e, q0 = s - d, 5.0 * a**2 - 20.0 * p + 5.0 * b**2
     q, q1, q2, q3 = (6.0 * s * e - 30.0 * p - e**2) / d, -q0 / d**2 - 1.0, 2.0 * q0 / d**3, -6.0 * q0 / d**4
     w1 = -4.0 * e**3 * q + e**4 * q1
@@ -95,7 +95,7 @@ def _overlap_factors(d, a, b):
 
 
 def _pairs(positions, targets, radii, target_radii, smoothing, exclude):
-    """Separations [t, n, 3] and radial factors [t, n] of every target and source, excluded pairs zeroed."""
+    """Separations [t, n, 3] and radial factors [t, n] of all targets and sources; excluded pairs are zero."""
     r = targets[:, None, :] - positions[None, :, :]
     d = np.sqrt(np.einsum("tnk,tnk->tn", r, r))
     g1, g2, g3 = radial_factors(d, target_radii[:, None], radii[None, :], smoothing)
@@ -116,17 +116,17 @@ def _prepare(positions, moments, targets, radii, target_radii, bodies):
 
 
 def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, bodies=None, smoothing=0.0, chunk=256):
-    """Field of moments at targets, or at one another (Eq. 1 with the ball-averaged law where balls overlap).
+    """Field of moments at targets, or at each other (Eq. 1, with the ball-averaged law for overlapping balls).
 
     Args:
         positions: Moment positions [m], shape [n, 3].
         moments: Moments [A·m²], shape [n, 3].
-        targets: Field points [m], shape [t, 3]; None means the moments themselves, self excluded.
+        targets: Field points [m], shape [t, 3]; None means the moments themselves, without their own fields.
         radii: Radii of the moments' balls [m], scalar or [n]; None means point dipoles.
         target_radii: Radii of the balls over which the field at a target is averaged [m]; None means points.
         bodies: Body of each moment, shape [n]; moments of one body do not act on each other. Only without targets.
         smoothing: Length ℓ [m], see :func:`radial_factors`.
-        chunk: Targets evaluated at a time.
+        chunk: Number of targets evaluated at a time.
 
     Returns:
         H [A/m], shape [t, 3].
@@ -146,7 +146,7 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
 
 
 def field_gradient(positions, moments, *, radii=None, bodies=None, smoothing=0.0, chunk=256):
-    """Gradient ∂H_k/∂x_l [A/m²], shape [n, 3, 3], of the moments' field at one another; see :func:`h_field`."""
+    """Gradient ∂H_k/∂x_l [A/m²], shape [n, 3, 3], of the moments' field at each other; see :func:`h_field`."""
     positions, moments, targets, radii, target_radii, exclude = _prepare(positions, moments, None, radii, None, bodies)
     gradients = np.empty((len(targets), 3, 3))
     for start in range(0, len(targets), chunk):
@@ -186,7 +186,7 @@ def curve_slope(susceptibility):
 def reduced_curve(s, curve):
     """Reduced magnetization ‖M‖/Ms of a reduced field s = k‖H‖/Ms, and its derivative.
 
-    ``curve`` is one of the curves, or a function of s that returns both.
+    ``curve`` is the name of a curve, or a function of s that returns both.
     """
     s = np.asarray(s, float)
     if callable(curve):
@@ -260,7 +260,7 @@ class Equilibrium:
 
 
 def coupling_matrix(positions, radii):
-    """Matrix G, shape [3n, 3n], with H = G M for uniformly magnetized balls, self excluded [dimensionless]."""
+    """Matrix G [dimensionless], shape [3n, 3n], with H = G M for uniformly magnetized balls; own fields are left out."""
     positions = np.asarray(positions, float)
     n = len(positions)
     radii = np.broadcast_to(np.asarray(radii, float), n)
@@ -285,21 +285,21 @@ def equilibrium(
 ):
     """Magnetic equilibrium M = f(H0 + G M) by damped Newton iterations on the dense system.
 
-    The residual R(H) = H − H0 − G f(H) is driven to zero in H, which stays well conditioned when M saturates.
+    Solves R(H) = H − H0 − G f(H) = 0 for H, which is well conditioned when M saturates.
 
     Args:
-        positions: Ball centres [m], shape [n, 3].
+        positions: Ball centers [m], shape [n, 3].
         radii: Ball radii [m], scalar or [n].
         h0: Applied field [A/m], shape [3] or [n, 3].
         saturation: Saturation magnetization Ms [A/m], scalar or [n].
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
         curve: Magnetization curve, see :func:`reduced_curve`.
-        extra_coupling: Added to the dipoles' coupling G, shape [3n, 3n]; None adds nothing.
+        extra_coupling: Matrix added to the dipoles' coupling G, shape [3n, 3n]; None adds nothing.
         tolerance: Relative residual at which to stop.
-        iterations: Newton iterations at the most.
+        iterations: Largest number of Newton iterations.
 
     Returns:
-        The equilibrium. ``residual`` tells how far it was reached.
+        The equilibrium, with its residual.
     """
     g = coupling_matrix(positions, radii) + (0.0 if extra_coupling is None else extra_coupling)
     n = len(g) // 3
@@ -337,19 +337,19 @@ def equilibrium(
 
 
 def eddy_coefficient(radii, conductivity):
-    """c = (2π/15) σ R⁵ [S·m⁴], the power of eddy currents in a ball over |dB/dt|² inside; Landau and Lifshitz, §59."""
+    """c = (2π/15) σ R⁵ [S·m⁴]: power of eddy currents in a ball over |dB/dt|² inside (Landau and Lifshitz, §59)."""
     return 2.0 * math.pi / 15.0 * np.asarray(conductivity, float) * np.asarray(radii, float) ** 5
 
 
 def flux_rates(positions, moments, radii, velocities, spins, derivatives, field=None, *, time=1e-6):
-    """dB/dt [T/s] inside balls, in frames that turn with them, shape [n, 3], by central differences of fields.
+    """dB/dt [T/s] inside balls in co-rotating frames, shape [n, 3], by central differences of fields.
 
     Args:
-        positions, moments, radii: The moments, which are fixed in their bodies.
-        velocities: Their velocities [m/s], shape [n, 3].
+        positions, moments, radii: The moments, fixed in their bodies.
+        velocities: Velocities of the moments [m/s], shape [n, 3].
         spins: Angular velocities of their bodies [rad/s], shape [n, 3].
-        derivatives: ∂M/∂H of each ball, zero of a permanent one, shape [n, 3, 3].
-        field: Function of positions: applied field [A/m]; None means none.
+        derivatives: ∂M/∂H of each ball, zero for permanent ones, shape [n, 3, 3].
+        field: Function of positions that returns the applied field [A/m]; None means no field.
         time: Half the time between the differences [s].
     """
 
@@ -362,14 +362,14 @@ def flux_rates(positions, moments, radii, velocities, spins, derivatives, field=
 
 
 def eddy_wrench(coefficients, rates):
-    """Forces [N] and torques [N·m] of eddy currents, minus the slopes of ½ Σ c |dB/dt|² by velocities and spins.
+    """Forces [N] and torques [N·m] of eddy currents: minus the gradient of ½ Σ c |dB/dt|² in velocities and spins.
 
     Args:
         coefficients: c of each ball, shape [n].
-        rates: Function of velocities and spins, both of shape [n, 3]: :func:`flux_rates`, which are linear in them.
+        rates: :func:`flux_rates` as a function of velocities and spins, both of shape [n, 3]; linear in them.
 
     Returns:
-        Power [W], forces and torques, shape [n, 3], as a function of velocities and spins.
+        Function of velocities and spins that returns power [W], forces and torques, shape [n, 3].
     """
     n = len(coefficients)
     unit = np.eye(6 * n).reshape(6 * n, 2, n, 3)

@@ -1,16 +1,16 @@
-"""Permeable balls in a uniform field, exactly: multipole expansions in plain NumPy, float64.
+"""Exact solution of permeable balls in a uniform field: multipole expansions in NumPy, float64.
 
-The scalar potential around ball i (H = −∇ψ) is a sum of its own irregular solid harmonics and of regular ones from
-everything else,
+The scalar potential around ball i (H = −∇ψ) is a sum of its own irregular solid harmonics and of regular ones of all
+other sources,
 
     ψ = Σ_lm a_lm C_lm(r̂)/r^(l+1) + b_lm r^l C_lm(r̂),    a_lm = −p_l b_lm,    p_l = R^(2l+1) l(μr−1)/(l μr + l+1),
 
-C_lm in Racah's normalisation. Harmonics about one centre are translated to another by the addition theorem,
+C_lm in Racah's normalization. Harmonics about one center are translated to another by the addition theorem,
 b = b0 + T a, which leaves the symmetric positive definite system (1/p + T) a = −b0. Moments are m = 4π a_1, and since
 the free energy is U = −½ μ0 Σ m·H0, forces are F = −∂U/∂x = −2π μ0 aᵀ (∂T/∂x) a, exact for the truncated system too.
 
-Cutting the expansions at order L leaves an error of about exp(−2ξL), cosh ξ = 1 + gap/2R for equal balls: images
-converge to the foci of the bispherical coordinates, exp(−ξ) of a radius off the centres. Near contact L must grow as
+Truncating the expansions at order L leaves an error of about exp(−2ξL), cosh ξ = 1 + gap/2R for equal balls: images
+converge to the foci of the bispherical coordinates, exp(−ξ) of a radius off the centers. Near contact L must grow as
 √(R/gap); :func:`sufficient_order` gives it.
 
 References: Jackson, Classical Electrodynamics, 3rd ed., sections 3.6 and 4.1; Steinborn and Ruedenberg 1973, "Rotation
@@ -36,10 +36,10 @@ class Solution:
         moments: Moments [A·m²], shape [n, 3].
         forces: Forces [N], shape [n, 3].
         multipoles: Coefficients of the real irregular harmonics around each ball [A m^(l+1)], l = 1..L, m = −l..l,
-            sines where m < 0, cosines where m > 0, shape [n, L (L + 2)]; the potential they make is ψ.
+            sines for m < 0, cosines for m > 0, shape [n, L (L + 2)]; their potential is ψ.
         energy: Free energy −½ μ0 Σ m·H0 [J], whose gradient the forces are.
         truncation: Relative change of the forces against two thirds of the order: an upper bound of their error.
-        order: Order L that the expansions were cut at.
+        order: Order L of the expansions.
     """
 
     moments: np.ndarray
@@ -60,7 +60,7 @@ def log_polarizabilities(order: int, radius: float, permeability: float) -> np.n
 
 
 def sufficient_order(distance: float, radius_i: float, radius_j: float, tolerance: float) -> int:
-    """Order L that cuts two balls' expansions at about a relative ``tolerance``."""
+    """Order L at which the truncation error of two balls is about a relative ``tolerance``."""
     xi = min(
         math.acosh(max((distance**2 + a**2 - b**2) / (2.0 * distance * a), 1.0 + 1e-9))
         for a, b in ((radius_i, radius_j), (radius_j, radius_i))
@@ -92,11 +92,11 @@ def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pai
     """Solve two balls.
 
     Args:
-        distance: Distance d of the centres [m].
+        distance: Distance d of the centers [m].
         radii: The two radii [m].
         permeabilities: The two relative permeabilities μr > 1, may be infinite.
         order: Order of the expansions; None chooses it by ``tolerance``.
-        tolerance: Relative truncation error aimed at.
+        tolerance: Target relative truncation error.
     """
     unit = math.sqrt(radii[0] * radii[1])
     d, a, b = distance / unit, radii[0] / unit, radii[1] / unit
@@ -108,7 +108,7 @@ def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pai
     for m in (0, 1):
         norm = -0.5 * (gammaln(degree + m + 1.0) + gammaln(degree - m + 1.0))
         size = gammaln(rows + columns + 1.0) + norm[:, None] + norm[None, :] - (rows + columns + 1.0) * np.log(d)
-        # target second ball, source first: t = +d ẑ, scaled so that a ball alone has the unit matrix
+        # target second ball, source first: t = +d ẑ, scaled so that an isolated ball has the unit matrix
         coupling = (-1.0) ** (rows + m) * np.exp(size + 0.5 * q[:, None] + 0.5 * p[None, :])
         system = np.block([[np.eye(order), coupling.T], [coupling, np.eye(order)]])
         change = -(rows + columns + 1.0) / d * coupling
@@ -117,7 +117,7 @@ def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pai
         root = np.exp(0.5 * np.array([p[0], q[0]]))
         inverse = np.linalg.inv(y[[0, order]])
         resistance[m] = inverse / np.outer(root, root) / (4.0 * np.pi * unit**3)
-        # at given moments the energy changes by that of the coupling alone
+        # at constant moments only the energy of the coupling changes
         slope[m] = inverse @ (y.T @ change @ y) @ inverse / np.outer(root, root) / (4.0 * np.pi * unit**4)
     return Pair(resistance, slope, order)
 
@@ -131,12 +131,12 @@ def spheres(positions, radii, permeability, field, *, order=None, tolerance=1e-4
     """Solve n balls that do not touch.
 
     Args:
-        positions: Centres [m], shape [n, 3].
+        positions: Centers [m], shape [n, 3].
         radii: Radii [m], scalar or [n].
         permeability: Relative permeability μr > 1, scalar or [n], may be infinite.
         field: Applied field H0 [A/m], shape [3].
         order: Order L of the expansions; None chooses it for the narrowest gap by ``tolerance``.
-        tolerance: Relative truncation error aimed at.
+        tolerance: Target relative truncation error.
         estimate: Whether to estimate the truncation error, by a second solution.
     """
     return spheres_in_fields(
@@ -145,17 +145,17 @@ def spheres(positions, radii, permeability, field, *, order=None, tolerance=1e-4
 
 
 def spheres_in_fields(positions, radii, cases, *, order=None, tolerance=1e-4, estimate=True) -> list[Solution]:
-    """Solve the same n balls of several permeabilities in several fields, as :func:`spheres` does one.
+    """Solve the same n balls for several permeabilities and fields, see :func:`spheres`.
 
-    Time is that of translating expansions of L (L + 2) terms, once for each displacement between two balls: balls on a
-    lattice have few.
+    Most time goes into translations of expansions of L (L + 2) terms, one per displacement between two balls: balls on
+    a lattice have few displacements.
 
     Args:
-        positions: Centres [m], shape [n, 3].
+        positions: Centers [m], shape [n, 3].
         radii: Radii [m], scalar or [n].
-        cases: Permeability, scalar or [n], and field [A/m], shape [3], of each.
+        cases: Permeability, scalar or [n], and field [A/m], shape [3], of each case.
         order: Order of the expansions; None chooses it for the narrowest gap by ``tolerance``.
-        tolerance: Relative truncation error aimed at.
+        tolerance: Target relative truncation error.
         estimate: Whether to estimate the truncation error, by a second solution.
     """
     x = np.asarray(positions, float)
@@ -176,16 +176,18 @@ def spheres_in_fields(positions, radii, cases, *, order=None, tolerance=1e-4, es
         truncation = np.linalg.norm(coarse - forces, axis=(1, 2)) / np.maximum(size, np.finfo(float).tiny)
     moments = 4.0 * np.pi * a[:, :, [2, 0, 1]]
     energies = -0.5 * MU0 * np.einsum("kni,ki->k", moments, fields)
-    return [Solution(*found, order) for found in zip(moments, forces, a, map(float, energies), truncation, strict=True)]
+    return [
+        Solution(*values, order) for values in zip(moments, forces, a, map(float, energies), truncation, strict=True)
+    ]
 
 
 def _solve(x, radii, mu, fields, order):
-    """Multipoles and forces of balls in several cases, shape [cases, n, ...], expansions cut at ``order``."""
+    """Multipoles and forces of balls in several cases, shape [cases, n, ...], with expansions up to ``order``."""
     n, degrees = len(x), _Degrees(order)
     unit = float(np.exp(np.mean(np.log(radii))))
     x, radii = x / unit, radii / unit
     scale = np.array([[log_polarizabilities(order, *ball) for ball in zip(radii, case, strict=True)] for case in mu])
-    scale = np.exp(0.5 * scale)[:, :, degrees.l - 1]  # so that a ball alone has the unit matrix
+    scale = np.exp(0.5 * scale)[:, :, degrees.l - 1]  # an isolated ball has the unit matrix
     displaced: dict[tuple, list] = {}
     for i in range(n):
         for j in range(i):
@@ -212,41 +214,36 @@ def _solve(x, radii, mu, fields, order):
     forces = np.zeros((len(mu), n, 3))
     for t, target, source in pairs:
         for axis, gradient in enumerate(degrees.translation_gradient(t)):
-            pull = (
-                -4.0
-                * np.pi
-                * MU0
-                * unit**2
-                * np.sum(np.tensordot(a[:, target], gradient, (2, 0)) * a[:, source], axis=2)
-            )
+            energy = np.sum(np.tensordot(a[:, target], gradient, (2, 0)) * a[:, source], axis=2)
+            pull = -4.0 * np.pi * MU0 * unit**2 * energy
             np.add.at(forces[:, :, axis], (slice(None), target), pull)
             np.add.at(forces[:, :, axis], (slice(None), source), -pull)
     return a * unit ** (degrees.l + 2.0), forces
 
 
 def _conjugate_gradients(apply, right):
-    """Solve a symmetric positive definite system for several right sides, shape [sides, ...], to rounding."""
+    """Solve a symmetric positive definite system for several right-hand sides, shape [sides, ...], to rounding."""
     axes = tuple(range(1, right.ndim))
 
     def dot(u, v):
         return np.sum(u * v, axis=axes, keepdims=True)
 
-    found, residual, direction = np.zeros_like(right), right.copy(), right.copy()
+    solution, residual, direction = np.zeros_like(right), right.copy(), right.copy()
     size, goal = dot(residual, residual), 1e-29 * dot(right, right)
     while np.any(size > goal):
         image = apply(direction)
         step = size / np.maximum(dot(direction, image), np.finfo(float).tiny)
-        found += step * direction
+        solution += step * direction
         residual -= step * image
         last, size = size, dot(residual, residual)
         direction = residual + size / np.maximum(last, np.finfo(float).tiny) * direction
-    return found
+    return solution
 
 
 def _irregular(t, order):
     """Irregular solid harmonics S_lm = (l−m)! P_lm(cos θ) e^(imφ)/t^(l+1) up to an order, and the column of m = 0.
 
-    Rows are degrees l; one more row and two more columns than harmonics are zero.
+    Rows are degrees l; one row and two columns beyond the harmonics are zero.
     """
     x, y, z = t
     t2 = x * x + y * y + z * z
@@ -264,7 +261,7 @@ def _irregular(t, order):
 
 
 class _Degrees:
-    """Indices of the harmonics up to an order, in the sequence (l, m = −l..l), and the passage to real ones."""
+    """Indices of the harmonics up to an order, in the sequence (l, m = −l..l), and the transform to real ones."""
 
     def __init__(self, order):
         self.order = order
