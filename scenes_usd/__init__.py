@@ -1,4 +1,4 @@
-"""The bundled scenes of warpmag: USD stages, and the scripts that author them."""
+"""Bundled scenes of warpmag: USD stages, and the scripts that author them."""
 
 import importlib
 import inspect
@@ -8,7 +8,7 @@ from warpmag.errors import InputError
 
 _SUFFIXES = (".usd", ".usda", ".usdc")
 MADE = ("million",)
-"""Scenes too large to be bundled: they are authored when they are wanted."""
+"""Scenes too large to be bundled: they are authored on demand."""
 
 
 def bundled() -> dict[str, Path]:
@@ -17,7 +17,7 @@ def bundled() -> dict[str, Path]:
 
 
 def summary(name: str) -> str:
-    """Return what a scene of :data:`MADE` shows, in a line."""
+    """Return a description of a scene of :data:`MADE` in one line."""
     return (inspect.getdoc(_module(name)) or "").partition("\n")[0].rstrip(".")
 
 
@@ -26,14 +26,14 @@ def make(name: str, folder: Path, balls: int | None = None) -> Path:
 
     Args:
         name: A bundled scene, or one of :data:`MADE`.
-        folder: Where to write it.
-        balls: The number; None means the scene's own.
+        folder: Folder of the file.
+        balls: The number of balls; None means the scene's own.
 
     Returns:
-        The file, whose name tells the number.
+        The file; its name contains the number.
 
     Raises:
-        InputError: The scene has no such number, it is out of range, or the file cannot be written.
+        InputError: The scene has no number of balls, the number is out of range, or the file cannot be written.
     """
     module = _module(name)
     parameter = inspect.signature(module.author).parameters.get("balls")

@@ -1,6 +1,6 @@
-"""Alphabets: letters drawn together by an invisible moment in their midst (Kim and Han 2022, Fig. 4).
+"""Alphabets: an invisible moment in the middle draws letters together (Kim and Han 2022, Fig. 4).
 
-``python -m warpmag.scenes_usd.alphabets -o alphabets.usdc``, with Matplotlib for the outlines (the extra ``plots``).
+``python -m warpmag.scenes_usd.alphabets -o alphabets.usdc``; outlines need Matplotlib (the extra ``plots``).
 """
 
 import itertools
@@ -24,14 +24,15 @@ PAINTS = {
     "Ink": (0.08, 0.17, 0.5),
     "Plum": (0.4, 0.1, 0.38),
 }
-"""Linear RGB of the letters, in turn."""
+"""Linear RGB of the letters, used in turn."""
 
 _GAP = 1.12
-"""Distance of neighbouring letters over their largest size along that axis."""
+"""Distance of neighboring letters over their largest size along the axis."""
 _SKIN = 0.03
-"""Rounding of what collides over the thickness of the letters. It keeps the boxes themselves apart, so that the
-direction of a contact is that between their nearest points, which never jumps: boxes that overlap may be pushed apart
-along another axis all at once, which shoots letters out."""
+"""Collision margin over the thickness of the letters.
+
+The margin keeps the boxes apart, so that a contact has the direction between nearest points, which is continuous. The
+direction in which overlapping boxes are separated may jump to another axis, which ejects letters."""
 _BEVEL = 0.02
 """Width of the bevel over the size of a capital."""
 
@@ -61,7 +62,7 @@ def author(
         thickness: Thickness of the letters [m].
         moment_spacing: Distance between the moments of a letter [m].
         moment: The invisible moment, along z [A·m²].
-        core: Radius of the ball that it is spread over, which nothing collides with [m].
+        core: Radius of the ball over which the moment is spread; nothing collides with the ball [m].
         saturation: Saturation magnetization of the letters [A/m].
         friction: Coefficient of friction of the letters.
     """
@@ -104,16 +105,18 @@ def _class_of(letter: str) -> Sdf.Path:
 def _define_letter(
     stage: Usd.Stage, letter: str, material: UsdShade.Material, size: float, thickness: float
 ) -> tuple[np.ndarray, float]:
-    """Author what all letters of a kind inherit from their class: the mesh to see, the boxes that collide.
+    """Author the class that all copies of a letter inherit: the visible mesh and the boxes that collide.
 
-    The boxes carry ``material`` themselves, for USD's physics does not look for it on the prims above.
+    ``material`` is bound to each box, since USD's physics does not inherit material bindings.
 
     Returns:
         Width and height [m], and the volume without the bevel [m³].
     """
     root = stage.CreateClassPrim(_class_of(letter)).GetPath()
     curves = lettering.outline(letter)
-    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the letter's y is up, its face at -y
+    upright = np.array(
+        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
+    )  # the letter's y is up, its face looks to -y
     points, faces = lettering.extruded(curves, thickness / size, _BEVEL)
     shell = UsdGeom.Mesh.Define(stage, root.AppendChild("Shell"))
     author_mesh(shell, size * points @ upright, faces)
@@ -135,7 +138,7 @@ def _define_letter(
 
 
 def _add_center(stage: Usd.Stage, moment: float, core: float) -> None:
-    """Author the invisible moment: a static ball that the letters pass through."""
+    """Author the invisible moment: a static ball that collides with nothing."""
     nothing = authoring.add_material(stage, "Nothing", color=(1.0, 1.0, 1.0))
     magnetization = moment / (4.0 / 3.0 * math.pi * core**3)
     center = authoring.add_ball(
@@ -149,7 +152,7 @@ def _add_center(stage: Usd.Stage, moment: float, core: float) -> None:
     )
     UsdGeom.Imageable(center).MakeInvisible()
     ghosts = UsdPhysics.CollisionGroup.Define(stage, "/World/Ghosts")
-    ghosts.CreateInvertFilteredGroupsAttr(True)  # collides with nothing but the groups named, which are none
+    ghosts.CreateInvertFilteredGroupsAttr(True)  # collides only with the groups named: none
     ghosts.GetCollidersCollectionAPI().CreateIncludesRel().SetTargets([center.GetPath()])
 
 

@@ -1,4 +1,4 @@
-"""Building blocks of the bundled scenes: SI units, Z up, one prim per body, every attribute authored."""
+"""Building blocks of the bundled scenes: SI units, Z up, one prim per body, all attributes authored."""
 
 import argparse
 import inspect
@@ -25,35 +25,37 @@ IRON_DENSITY = 7870.0
 STEEL_COLOR = (0.55, 0.57, 0.6)
 MAGNET_COLOR = (0.75, 0.08, 0.06)
 GROUND_COLOR = (0.32, 0.33, 0.35)
+"""Linear RGB."""
 
 CONTACT_PATCH = 1e-4
-"""Depth and width of what gives way where two bodies touch [m]: what rolling and spinning cost where there is friction
-(Newton's default for rolling; without it balls circle a magnet for good)."""
+"""Size of the contact patch of two bodies [m], the coefficient of rolling and torsional friction.
+
+Newton's default for rolling; without it balls circle a magnet forever."""
 
 BALL_SPACING = 2.002
-"""Distance of neighbouring balls in radii: a gap of a thousandth, so that rounding never makes them overlap."""
+"""Distance of neighboring balls in radii: a gap of a thousandth, so that rounding never makes them overlap."""
 
 DYNAMIC, KINEMATIC, STATIC = "dynamic", "kinematic", "static"
-"""How a shape moves: as a body of its own, as one that is held in place, or with whatever it belongs to."""
+"""Motion of a shape: a body of its own, a body held in place, or a part of its ancestor."""
 
 _FILM, _F_STOP = 0.036, 8.0
-"""Width of the camera's film [m], and the focal length over the aperture."""
+"""Width of the camera's film [m], and focal length over aperture."""
 _SOFT_BOXES = (
     ("Key", (-0.75, -0.4, 1.0), 0.8, 9.0, (1.0, 0.96, 0.9)),
     ("Rim", (0.9, 0.9, 0.6), 0.6, 8.0, (0.9, 0.95, 1.0)),
 )
-"""Name, place and side over the distance of the camera, radiance, and linear RGB."""
+"""Name, place and side over the camera's distance, radiance, and linear RGB of each light."""
 
 _METRICS = {"metersPerUnit": 1.0, "kilogramsPerUnit": 1.0, "upAxis": "Z"}
 
 
 def new_stage(documentation: str, *, seconds: float, frames_per_second: float = 60.0) -> Usd.Stage:
-    """Return an empty stage in metres and kilograms with Z up and the default prim ``/World``.
+    """Return an empty stage in meters and kilograms with Z up and the default prim ``/World``.
 
     Args:
-        documentation: What the scene shows; the first line is what ``warpmag scenes`` prints.
+        documentation: Description of the scene; ``warpmag scenes`` prints the first line.
         seconds: Length of the scene [s].
-        frames_per_second: Output rate [Hz], also the time codes per second.
+        frames_per_second: Output rate [Hz], and time codes per second.
     """
     stage = Usd.Stage.CreateInMemory()
     for key, value in _METRICS.items():
@@ -71,7 +73,7 @@ def save(stage: Usd.Stage, path: str | os.PathLike) -> None:
     """Write a stage to a file.
 
     Raises:
-        InputError: It cannot be written.
+        InputError: The file cannot be written.
     """
     path = Path(path)
     with Output.errors(path):
@@ -107,7 +109,7 @@ def add_material(
     friction: float = 0.0,
     restitution: float = 0.0,
 ) -> UsdShade.Material:
-    """Author one material for physics and for looks.
+    """Author a material for physics and rendering.
 
     Args:
         stage: The stage.
@@ -116,8 +118,8 @@ def add_material(
         metallic: Metalness, 0 to 1.
         roughness: Roughness, 0 to 1.
         coat: Clear lacquer over it, 0 to 1.
-        density: Mass density [kg/m³] of the bodies that it is bound to.
-        friction: Coefficient of static and dynamic friction; if there is any, rolling and spinning meet some too.
+        density: Mass density [kg/m³] of bodies with this material.
+        friction: Coefficient of static and dynamic friction; if positive, also rolling and torsional friction are.
         restitution: Coefficient of restitution.
     """
     UsdGeom.Scope.Define(stage, "/World/Materials")
@@ -129,11 +131,32 @@ def add_material(
     if density is not None:
         physics.CreateDensityAttr(density)
     material.GetPrim().AddAppliedSchema("NewtonMaterialAPI")
-    for name in ("newton:rollingFriction", "newton:torsionalFriction"):
-        attribute = material.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False)
+    for attribute_name in ("newton:rollingFriction", "newton:torsionalFriction"):
+        attribute = material.GetPrim().CreateAttribute(attribute_name, Sdf.ValueTypeNames.Float, custom=False)
         attribute.Set(CONTACT_PATCH if friction else 0.0)
     author_surface(material, color=color, metallic=metallic, roughness=roughness, coat=coat)
     return material
+
+
+def add_iron_material(stage: Usd.Stage, *, friction: float = 0.0) -> UsdShade.Material:
+    """Author the material of iron balls."""
+    return add_material(
+        stage, "Iron", color=STEEL_COLOR, metallic=1.0, roughness=0.3, density=IRON_DENSITY, friction=friction
+    )
+
+
+def add_magnet_material(stage: Usd.Stage, *, density: float = 7500.0, friction: float = 0.0) -> UsdShade.Material:
+    """Author the material of permanent magnets."""
+    return add_material(
+        stage, "Magnet", color=MAGNET_COLOR, roughness=0.3, coat=1.0, density=density, friction=friction
+    )
+
+
+def add_gray_ground(stage: Usd.Stage, *, size: float, friction: float = 0.0) -> Usd.Prim:
+    """Author a ground with its material."""
+    return add_ground(
+        stage, add_material(stage, "Ground", color=GROUND_COLOR, roughness=0.8, friction=friction), size=size
+    )
 
 
 def add_ground(stage: Usd.Stage, material: UsdShade.Material, *, size: float, color=GROUND_COLOR) -> Usd.Prim:
@@ -164,11 +187,18 @@ def add_ball(
     magnet: Magnet | None = None,
     color: Sequence[float] = STEEL_COLOR,
 ) -> Usd.Prim:
-    """Author a ball: a sphere that is its own collider, with its centre at ``position`` [m]."""
+    """Author a ball: a sphere that is its own collider, centered at ``position`` [m]."""
     ball = UsdGeom.Sphere.Define(stage, path)
     ball.CreateRadiusAttr(radius)
     _place(ball, position)
     return _finish(ball, material, color, motion, magnet)
+
+
+def add_ball_prims(stage: Usd.Stage, positions, radius: float, material: UsdShade.Material, *, digits=4, **options):
+    """Author balls below ``/World/Balls``, with numbers of so many digits in their names; see :func:`add_ball`."""
+    UsdGeom.Scope.Define(stage, "/World/Balls")
+    for number, position in enumerate(positions):
+        add_ball(stage, f"/World/Balls/Ball_{number:0{digits}d}", position, radius, material, **options)
 
 
 def add_balls(
@@ -181,7 +211,7 @@ def add_balls(
     magnet: Magnet | None = None,
     color: Sequence[float] = STEEL_COLOR,
 ) -> Usd.Prim:
-    """Author very many balls as instances of one, with centres at ``positions`` [m], shape [n, 3]."""
+    """Author very many balls as instances of one ball, centered at ``positions`` [m], shape [n, 3]."""
     instancer = UsdGeom.PointInstancer.Define(stage, path)
     ball = f"{path}/Ball"
     add_ball(stage, ball, (0.0, 0.0, 0.0), radius, material, magnet=magnet, color=color)
@@ -194,7 +224,7 @@ def add_balls(
 
 
 def scatter(places: np.ndarray, spacing: float, apart: float, random: np.random.Generator) -> np.ndarray:
-    """Return places of a cubic lattice of ``spacing``, shape [n, 3], shifted at random so as to stay ``apart`` [m]."""
+    """Return places of a cubic lattice, shape [n, 3], with random offsets that keep a distance ``apart`` [m]."""
     return places + 0.5 * (spacing - apart) * random.uniform(-1.0, 1.0, places.shape)
 
 
@@ -243,7 +273,7 @@ def add_capsule(
 def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], *, field_of_view: float = 35.0) -> None:
     """Author a camera at ``eye`` [m] that looks at ``target`` [m], ``field_of_view`` [degrees] wide, and the lights.
 
-    Its film is 36 mm wide, whatever the unit of the stage: UsdGeom counts film and focal length in tenths of that unit.
+    The film is 36 mm wide; UsdGeom has film and focal length in tenths of the stage's unit.
     """
     camera = UsdGeom.Camera.Define(stage, "/World/Camera")
     camera.AddTransformOp().Set(_looking(eye, target))
@@ -259,10 +289,10 @@ def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], 
 
 
 def _add_lights(stage: Usd.Stage, target: Sequence[float], distance: float) -> None:
-    """Author a sky, and two soft boxes around ``target`` [m] that are as far as the camera, ``distance`` [m].
+    """Author a sky, and two soft boxes at the camera's ``distance`` [m] from ``target`` [m].
 
-    Intensities are radiances where ``inputs:normalize`` is false: they light a small scene as they do a large one. A
-    white wall that faces the key has a radiance of about 1 from all of them.
+    With ``inputs:normalize`` false, intensities are radiances and do not depend on the size of the scene. A white wall
+    that faces the key light has a radiance of about 1 from all lights.
     """
     UsdGeom.Scope.Define(stage, "/World/Lights")
     sky = UsdLux.DomeLight.Define(stage, "/World/Lights/Sky")
@@ -280,15 +310,15 @@ def _add_lights(stage: Usd.Stage, target: Sequence[float], distance: float) -> N
 
 
 def _looking(eye: Sequence[float], target: Sequence[float]) -> Gf.Matrix4d:
-    """Return the transform of what looks along its -z from ``eye`` to ``target``, z up."""
+    """Return the transform whose -z axis points from ``eye`` to ``target``, z up."""
     up = Gf.Vec3d(0.0, 0.0, 1.0)
     return Gf.Matrix4d().SetLookAt(Gf.Vec3d(*map(float, eye)), Gf.Vec3d(*map(float, target)), up).GetInverse()
 
 
 def run(author: Callable) -> None:
-    """Call ``author`` from the command line: ``-o`` is its path, every parameter an option by the same name.
+    """Call ``author`` from the command line: ``-o`` is its path, each parameter is an option of the same name.
 
-    The options' types, defaults and help texts are those of its signature and its docstring.
+    Types, defaults and help texts of the options are those of its signature and docstring.
     """
     summary, _, arguments = inspect.getdoc(inspect.getmodule(author)).partition("\n")
     arguments = dict(re.findall(r"^ {4}(\w+): (.+?)\.?$", inspect.getdoc(author) or "", re.MULTILINE))
@@ -307,7 +337,7 @@ def run(author: Callable) -> None:
 
 
 def check_count(name: str, value: int) -> None:
-    """Raise :class:`InputError` naming the parameter ``name`` unless ``value`` is a positive whole number."""
+    """Raise :class:`InputError` for the parameter ``name`` unless ``value`` is positive."""
     if not value > 0:
         raise InputError(f"{name}: must be positive, got {value}")
 
@@ -317,7 +347,7 @@ def _place(shape, position) -> None:
 
 
 def _finish(shape, material, color, motion, magnet) -> Usd.Prim:
-    """Make ``shape`` a collider that moves as told, with an extent, a material, a colour and maybe a magnet."""
+    """Make ``shape`` a collider with extent, material, color, motion and, if given, a magnet."""
     prim = shape.GetPrim()
     if motion != STATIC:
         UsdPhysics.RigidBodyAPI.Apply(prim).CreateKinematicEnabledAttr(motion == KINEMATIC)

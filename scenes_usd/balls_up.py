@@ -5,7 +5,7 @@
 
 import os
 
-from pxr import UsdGeom
+import numpy as np
 
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
@@ -36,9 +36,9 @@ def author(
         saturation: Saturation magnetization of the balls [A/m].
         magnet_size: Edge of the magnet [m].
         magnetization: Magnetization of the magnet along z [A/m].
-        height: Centre of the magnet above the ground [m].
-        conductivity: Electrical conductivity of the balls [S/m], by default that of iron at room temperature: without
-            friction, eddy currents are what stops balls that hang and swing.
+        height: Center of the magnet above the ground [m].
+        conductivity: Electrical conductivity of the balls [S/m], by default of iron at room temperature: without
+            friction, only eddy currents stop balls that hang and swing.
     """
     pitch = authoring.BALL_SPACING * radius
     top = (layers - 1) * pitch + 2.0 * radius
@@ -51,29 +51,23 @@ def author(
         seconds=3.0,
     )
     authoring.add_scene(stage, MagneticSettings())
-    iron = authoring.add_material(
-        stage, "Iron", color=authoring.STEEL_COLOR, metallic=1.0, roughness=0.3, density=authoring.IRON_DENSITY
-    )
-    magnet = authoring.add_material(
-        stage, "Magnet", color=authoring.MAGNET_COLOR, roughness=0.3, coat=1.0, density=7500.0
-    )
-    ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8)
-    authoring.add_ground(stage, ground, size=1.0)
+    iron, red = authoring.add_iron_material(stage), authoring.add_magnet_material(stage)
+    authoring.add_gray_ground(stage, size=1.0)
     authoring.add_box(
         stage,
         "/World/Magnet",
         (0.0, 0.0, height),
         (magnet_size,) * 3,
-        magnet,
+        red,
         magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
         motion=authoring.KINEMATIC,
     )
-    UsdGeom.Scope.Define(stage, "/World/Balls")
-    ball_magnet = Magnet(saturation=saturation, conductivity=conductivity)
-    places = [(x, y, z) for z in range(layers) for y in range(rows) for x in range(columns)]
-    for number, (x, y, z) in enumerate(places):
-        position = ((x - 0.5 * (columns - 1)) * pitch, (y - 0.5 * (rows - 1)) * pitch, radius + z * pitch)
-        authoring.add_ball(stage, f"/World/Balls/Ball_{number:04d}", position, radius, iron, magnet=ball_magnet)
+    positions = [
+        ((x - 0.5 * (columns - 1)) * pitch, (y - 0.5 * (rows - 1)) * pitch, radius + z * pitch)
+        for z, y, x in np.ndindex(layers, rows, columns)
+    ]
+    magnet = Magnet(saturation=saturation, conductivity=conductivity)
+    authoring.add_ball_prims(stage, positions, radius, iron, magnet=magnet)
     authoring.add_camera(stage, (0.28, -0.36, 0.2), (0.0, 0.0, 0.5 * height))
     authoring.save(stage, path)
 

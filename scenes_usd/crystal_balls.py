@@ -2,12 +2,12 @@
 
 ``python -m warpmag.scenes_usd.crystal_balls -o crystal_balls.usdc``
 
-The variant set ``strength`` of ``/World/Magnet`` has the strong and the weak magnet.
+The variant set ``strength`` of ``/World/Magnet`` selects the strong or the weak magnet.
 """
 
 import os
 
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf, Usd
 
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
@@ -36,13 +36,13 @@ def author(
         path: USD file to write.
         columns: Places along x.
         rows: Places along z.
-        bar: Places along x, in the middle, that the bar magnet takes.
-        bar_rows: Places along z that it takes.
+        bar: Places along x in the middle that the bar magnet occupies.
+        bar_rows: Places along z that the bar magnet occupies.
         radius: Radius of the balls [m].
-        spacing: Distance of neighbouring places [m].
+        spacing: Distance of neighboring places [m].
         strong: Magnetization of the strong magnet, along x [A/m].
         weak: Magnetization of the weak magnet, along x [A/m].
-        strength: The magnet that is selected, strong or weak.
+        strength: Selected magnet, strong or weak.
     """
     _check(columns, rows, bar, bar_rows, radius, spacing, strength)
     count = columns * rows - bar * bar_rows
@@ -53,28 +53,16 @@ def author(
     )
     authoring.add_scene(stage, MagneticSettings(), gravity=0.0)
     crystal = authoring.add_material(stage, "Crystal", color=CRYSTAL_COLOR, roughness=0.1, density=2650.0)
-    magnet = authoring.add_material(
-        stage, "Magnet", color=authoring.MAGNET_COLOR, roughness=0.3, coat=1.0, density=7500.0
-    )
+    red = authoring.add_magnet_material(stage)
     gap = spacing - 2.0 * radius
     sizes = (bar * spacing - gap, bar_rows * spacing - gap, bar_rows * spacing - gap)
-    prim = authoring.add_box(stage, "/World/Magnet", (0.0, 0.0, 0.0), sizes, magnet, motion=authoring.KINEMATIC)
+    prim = authoring.add_box(stage, "/World/Magnet", (0.0, 0.0, 0.0), sizes, red, motion=authoring.KINEMATIC)
     _add_strengths(prim, {"strong": strong, "weak": weak}, strength)
-    UsdGeom.Scope.Define(stage, "/World/Balls")
     places = [(x - 0.5 * (columns - 1), z - 0.5 * (rows - 1)) for z in range(rows) for x in range(columns)]
     around = [(x, z) for x, z in places if abs(x) > 0.5 * bar or abs(z) > 0.5 * bar_rows]
-    for number, (x, z) in enumerate(around):
-        position = (x * spacing, 0.0, z * spacing)
-        authoring.add_ball(
-            stage,
-            f"/World/Balls/Ball_{number:04d}",
-            position,
-            radius,
-            crystal,
-            motion=authoring.KINEMATIC,
-            magnet=Magnet(),
-            color=CRYSTAL_COLOR,
-        )
+    positions = [(x * spacing, 0.0, z * spacing) for x, z in around]
+    looks = {"motion": authoring.KINEMATIC, "magnet": Magnet(), "color": CRYSTAL_COLOR}
+    authoring.add_ball_prims(stage, positions, radius, crystal, **looks)
     reach = spacing * max(columns, 1.78 * rows)
     authoring.add_camera(stage, (0.35 * reach, -1.75 * reach, 0.3 * reach), (0.0, 0.0, 0.0))
     authoring.save(stage, path)
@@ -93,10 +81,10 @@ def _check(columns, rows, bar, bar_rows, radius, spacing, strength) -> None:
 
 
 def _add_strengths(prim: Usd.Prim, magnetizations: dict[str, float], selected: str) -> None:
-    """Author the variant set ``strength`` on a magnet, the magnetization in the variants alone."""
+    """Author the variant set ``strength`` of a magnet, with the magnetization in the variants only."""
     author_magnet(prim, Magnet(kind="permanent"))
     attribute = prim.GetAttribute("warpmag:magnetization")
-    attribute.Clear()  # what the prim itself says would be stronger than its variants
+    attribute.Clear()  # an opinion on the prim itself would override the variants
     variants = prim.GetVariantSets().AddVariantSet("strength")
     for name, magnetization in magnetizations.items():
         variants.AddVariant(name)

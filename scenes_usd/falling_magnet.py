@@ -7,7 +7,6 @@ import math
 import os
 
 import numpy as np
-from pxr import UsdGeom
 
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
@@ -32,14 +31,14 @@ def author(
     Args:
         path: USD file to write.
         balls: Number of balls.
-        layers: Layers of the stack, at most.
+        layers: Largest number of layers of the stack.
         radius: Radius of the balls [m].
         saturation: Saturation magnetization of the balls [A/m].
         magnet_radius: Radius of the magnet [m].
         magnet_density: Density of the magnet [kg/m³].
         magnetization: Magnetization of the magnet, along z [A/m].
         drop: Gap between the magnet and the top of the stack [m].
-        friction: Coefficient of friction of everything.
+        friction: Coefficient of friction of all materials.
     """
     authoring.check_count("balls", balls)
     authoring.check_count("layers", layers)
@@ -51,19 +50,18 @@ def author(
         seconds=5.0,
     )
     authoring.add_scene(stage, MagneticSettings())
-    iron, magnet = _add_materials(stage, magnet_density, friction)
+    iron = authoring.add_iron_material(stage, friction=friction)
+    red = authoring.add_magnet_material(stage, density=magnet_density, friction=friction)
+    authoring.add_gray_ground(stage, size=2.0, friction=friction)
     positions = stack(balls, layers, radius)
-    UsdGeom.Scope.Define(stage, "/World/Balls")
-    ball_magnet = Magnet(saturation=saturation)
-    for number, position in enumerate(positions):
-        authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
+    authoring.add_ball_prims(stage, positions, radius, iron, digits=5, magnet=Magnet(saturation=saturation))
     top = float(positions[:, 2].max()) + radius
     authoring.add_ball(
         stage,
         "/World/Magnet",
         (0.0, 0.0, top + drop + magnet_radius),
         magnet_radius,
-        magnet,
+        red,
         magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
         color=authoring.MAGNET_COLOR,
     )
@@ -72,55 +70,29 @@ def author(
     authoring.save(stage, path)
 
 
-def _add_materials(stage, magnet_density: float, friction: float) -> tuple:
-    """Add all materials, and the ground of its own; return those of the balls and of the magnet."""
-    iron = authoring.add_material(
-        stage,
-        "Iron",
-        color=authoring.STEEL_COLOR,
-        metallic=1.0,
-        roughness=0.3,
-        density=authoring.IRON_DENSITY,
-        friction=friction,
-    )
-    magnet = authoring.add_material(
-        stage,
-        "Magnet",
-        color=authoring.MAGNET_COLOR,
-        roughness=0.3,
-        coat=1.0,
-        density=magnet_density,
-        friction=friction,
-    )
-    ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8, friction=friction)
-    authoring.add_ground(stage, ground, size=2.0)
-    return iron, magnet
-
-
 def stack(count: int, layers: int, radius: float) -> np.ndarray:
-    """Return places for the balls of a round stack, each above the gap between four balls of the layer below.
+    """Return the positions of balls in a round stack, each above the gap between four balls of the layer below.
 
-    Of all such places those are taken that lie below a cone with a slope of 45 degrees, as low a cone as holds them:
-    every ball then has the four that it rests on.
+    The balls fill the lowest cone with a slope of 45 degrees that holds them, so each ball has the four below it.
 
     Args:
         count: Number of balls.
-        layers: Layers, at most.
+        layers: Largest number of layers.
         radius: Radius of the balls [m].
 
     Returns:
-        Centres [m], shape [count, 3], from the ground up.
+        Centers [m], shape [count, 3], from the ground up.
     """
     pitch = authoring.BALL_SPACING * radius
     rise = pitch / math.sqrt(2.0)
-    side = int(2.0 * math.sqrt(count)) + 4  # more than enough for a disc of all of them
+    side = int(2.0 * math.sqrt(count)) + 4  # more than enough for all balls in one layer
     places = []
     for layer in range(layers):
         line = (np.arange(side) - 0.5 * (side - 1) + 0.5 * (layer % 2)) * pitch
         x, y = np.meshgrid(line, line)
         places.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, radius + layer * rise)], axis=1))
     places = np.concatenate(places)
-    # Ties are settled by height and angle, so that the choice does not hang on rounding.
+    # height and angle break ties, so that the choice does not depend on rounding
     height_of_cone = np.round((np.linalg.norm(places[:, :2], axis=1) + places[:, 2]) / radius, 6)
     angle = np.round(np.arctan2(places[:, 1], places[:, 0]), 6)
     chosen = places[np.lexsort((angle, places[:, 2], height_of_cone))[:count]]

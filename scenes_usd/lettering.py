@@ -1,7 +1,7 @@
-"""Letters as solids: outlines of a font, a mesh that shows them, and boxes along their strokes that stand for them.
+"""Letters as solids: outlines of a font, a mesh for rendering, and boxes along the strokes for collisions.
 
-Everything is in the plane of the letter, x to the right and y up, in units of the height of a capital. The outlines are
-those of DejaVu Sans Bold, which comes with Matplotlib (the extra ``plots``).
+Coordinates are in the plane of the letter, x to the right and y up, in units of the height of a capital. The font is
+DejaVu Sans Bold, which is part of Matplotlib (the extra ``plots``).
 """
 
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ import numpy as np
 from warpmag.errors import InputError
 
 _UNITS = 2048
-"""Units per em of the font: its points have whole coordinates, half ones between two control points."""
+"""Units per em of the font: its points have integer coordinates, or half-integer ones between control points."""
 _CAPITAL = 1493
-"""Height of its capitals in the same units."""
+"""Height of the font's capitals in the same units."""
 _CELLS = 48
-"""Cells across a capital when boxes are fitted."""
+"""Number of cells across a capital in the fit of boxes."""
 _ANGLES = 12
-"""Directions in which boxes are fitted, over a quarter turn, besides those of the straight strokes."""
+"""Number of directions of boxes over a quarter turn, besides those of straight strokes."""
 _STRAIGHT = 0.3
-"""Edges of a letter longer than this belong to straight strokes."""
+"""Smallest length of the edges of straight strokes."""
 _COVERED, _WORTH = 0.96, 0.025
-"""Boxes are added until they cover this part of the letter, or until the next would add less than that part."""
+"""Boxes are added until they cover the first part of the letter, or the next one would add less than the second."""
 _THINNEST = 0.16
-"""No side of a box is shorter: strokes are 0.19 wide, and a thin box would ask for short time steps."""
+"""Smallest side of a box: strokes are 0.19 wide, and thin boxes require short time steps."""
 _OUT = 0.015
-"""Boxes may stick out of a letter by this much, and by half a cell: curved strokes need fewer then."""
+"""Largest overhang of a box beyond the letter, besides half a cell: curved strokes then need fewer boxes."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Box:
     """A rectangle in the plane of a letter.
 
     Attributes:
-        center: Centre, shape [2].
-        half: Half of its sides, shape [2].
-        angle: Turn against the axes, counterclockwise [rad].
+        center: Center, shape [2].
+        half: Half sides, shape [2].
+        angle: Rotation, counterclockwise [rad].
     """
 
     center: np.ndarray
@@ -43,23 +43,23 @@ class Box:
     angle: float
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which of the points, shape [n, 2], lie inside."""
+        """Return true for points inside, shape [n, 2]."""
         return np.max(np.abs(_turned(points - self.center, -self.angle)) - self.half, axis=1) <= 0.0
 
 
 def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
-    """Return the closed curves that bound a letter, the material on their left.
+    """Return the closed curves that bound a letter, with the material on their left.
 
     Args:
         letter: One character.
-        segments: Straight pieces of each curved one.
+        segments: Number of straight pieces of each curved piece.
 
     Returns:
-        Corners of each curve, shape [n, 2], without the first repeated at the end. The origin is the middle of the
-        bounding box.
+        Corners of each curve, shape [n, 2]; the first corner is not repeated. The origin is the middle of the bounding
+        box.
 
     Raises:
-        InputError: Matplotlib is missing, or the letter shows nothing.
+        InputError: Matplotlib is missing, or the letter has no outline.
     """
     if not letter.strip():
         raise InputError(f"letters: {letter!r} has no outline")
@@ -71,7 +71,7 @@ def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
     path = TextPath((0.0, 0.0), letter, size=_UNITS, prop=FontProperties(family="DejaVu Sans", weight="bold"))
     curves, corners = [], []
     for points, code in path.iter_segments(simplify=False, curves=True):
-        ends = (np.rint(2.0 * points) / 2.0 / _CAPITAL).reshape(-1, 2)  # undoes the rounding of the rasteriser
+        ends = (np.rint(2.0 * points) / 2.0 / _CAPITAL).reshape(-1, 2)  # reverts the rounding of the rasterizer
         if code == path.CURVE3:
             t = np.linspace(0.0, 1.0, segments + 1)[1:, None]
             corners += list((1.0 - t) ** 2 * corners[-1] + 2.0 * t * (1.0 - t) * ends[0] + t**2 * ends[1])
@@ -81,53 +81,52 @@ def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
             curves.append(_cleaned(np.array(corners)))
             corners = []
     middle = 0.5 * (np.concatenate(curves).min(axis=0) + np.concatenate(curves).max(axis=0))
-    if sum(map(_area, curves)) < 0.0:  # TrueType goes round the other way
+    if sum(map(_area, curves)) < 0.0:  # TrueType has the opposite orientation
         curves = [curve[::-1] for curve in curves]
     return [curve - middle for curve in curves]
 
 
 def area(curves: list[np.ndarray]) -> float:
-    """Return the area that an outline bounds."""
+    """Return the area of an outline."""
     return sum(map(_area, curves))
 
 
 def triangles(curves: list[np.ndarray]) -> np.ndarray:
-    """Triangulate the inside of an outline by cutting off ears, each hole joined to what surrounds it by a bridge.
+    """Triangulate the inside of an outline by cutting off ears; bridges join holes to the curves around them.
 
     Returns:
-        Indices into all corners of the curves, one curve after the other, counterclockwise, shape [n, 3].
+        Indices into the concatenated corners of the curves, counterclockwise, shape [n, 3].
     """
     points = np.concatenate(curves)
     loops = [list(range(start, start + len(curve))) for start, curve in zip(_starts(curves), curves, strict=True)]
     outer = [loop for loop, curve in zip(loops, curves, strict=True) if _area(curve) > 0.0]
     holes = [loop for loop, curve in zip(loops, curves, strict=True) if _area(curve) < 0.0]
-    found = []
+    cut = []
     for loop in outer:
         inside = [hole for hole in holes if _inside(points[hole[:1]], [points[loop]])[0]]
-        for hole in sorted(inside, key=lambda one: -points[one, 0].max()):
+        for hole in sorted(inside, key=lambda hole: -points[hole, 0].max()):
             loop = _bridged(points, loop, hole)
-        found += _ears(points, loop)
-    return np.array(found)
+        cut += _ears(points, loop)
+    return np.array(cut)
 
 
 def extruded(curves: list[np.ndarray], depth: float, bevel: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return a closed mesh: the outline with thickness, its edges bevelled.
+    """Return a closed mesh: the outline with thickness and beveled edges.
 
     Args:
         curves: The outline.
         depth: Thickness.
-        bevel: Width of the bevel, small against the strokes.
+        bevel: Width of the bevel, small compared with the strokes.
 
     Returns:
-        Points, shape [n, 3], z across the letter and zero in its middle; and the faces as indices, counterclockwise
-        seen from outside.
+        Points, shape [n, 3], z across the letter, zero in its middle; faces as indices, counterclockwise from outside.
     """
     insets = [_inset(curve, bevel) for curve in curves]
     rims, inner = np.concatenate(curves), np.concatenate(insets)
     count = len(rims)
     rings = [(inner, 0.5 * depth), (rims, 0.5 * depth - bevel), (rims, bevel - 0.5 * depth), (inner, -0.5 * depth)]
     points = np.concatenate([np.c_[ring, np.full(count, z)] for ring, z in rings])
-    caps = triangles(insets)  # the outline's triangles would fold at the ends of curved strokes
+    caps = triangles(insets)  # triangles of the outline would fold at the ends of curved strokes
     following = np.concatenate(
         [start + np.roll(np.arange(len(curve)), -1) for start, curve in zip(_starts(curves), curves, strict=True)]
     )
@@ -140,24 +139,24 @@ def extruded(curves: list[np.ndarray], depth: float, bevel: float) -> tuple[np.n
 
 
 def boxes(curves: list[np.ndarray]) -> list[Box]:
-    """Cover a letter with few boxes along its strokes, the one that adds most first; they overlap."""
+    """Cover a letter with few overlapping boxes along its strokes, in the order of the area that they add."""
     grids = [_Grid(curves, angle) for angle in _directions(curves)]
-    found: list[Box] = []
+    chosen: list[Box] = []
     whole = area(curves)
     covered = 0.0
     while covered < _COVERED * whole:
-        gain, box = max((grid.best() for grid in grids), key=lambda one: one[0])
+        gain, box = max((grid.best() for grid in grids), key=lambda pair: pair[0])
         if gain < _WORTH * whole:
             break
         covered += gain
-        found.append(box)
+        chosen.append(box)
         for grid in grids:
             grid.cover(box)
-    return found
+    return chosen
 
 
 def _directions(curves) -> np.ndarray:
-    """Return the angles at which boxes may lie, in [0, π/2)."""
+    """Return the allowed angles of boxes, in [0, π/2)."""
     quarter = 0.5 * np.pi
     edges = np.concatenate([np.roll(curve, -1, axis=0) - curve for curve in curves])
     long = edges[np.linalg.norm(edges, axis=1) > _STRAIGHT]
@@ -166,7 +165,7 @@ def _directions(curves) -> np.ndarray:
 
 
 class _Grid:
-    """Cells over a letter in one direction: where boxes may lie, and which cells none of them covers yet."""
+    """Cells over a letter in one direction: cells where boxes may lie, and cells that no box covers yet."""
 
     def __init__(self, curves, angle):
         self._angle = angle
@@ -186,10 +185,10 @@ class _Grid:
         self._open &= ~box.contains(self._centers).reshape(self._open.shape)
 
     def best(self) -> tuple[float, Box]:
-        """Return the box that covers most of what is open, and how much that is.
+        """Return the area of open cells under the best box, and that box.
 
-        All rows from ``first`` to ``last`` are tried at once over ``first``; within them the best run of columns that
-        are inside throughout ends where the open cells since the last column outside are most.
+        For each last row, all first rows are tried at once. The best run of columns inside the letter ends where the
+        number of open cells since the last column outside is largest.
         """
         rows, columns = self._inside.shape
         thinnest = int(_THINNEST / self._cell)
@@ -215,7 +214,7 @@ class _Grid:
 
 
 def _run_sums(values, whole) -> np.ndarray:
-    """Sum ``values`` along each row since the last place that is not ``whole``."""
+    """Return sums of ``values`` along each row since the last column that is not ``whole``."""
     sums = np.cumsum(values, axis=1)
     return sums - np.maximum.accumulate(np.where(whole, 0, sums), axis=1)
 
@@ -235,12 +234,12 @@ def _turned(points, angle) -> np.ndarray:
 
 
 def _cleaned(curve) -> np.ndarray:
-    """Drop corners that repeat the one before, or the first one at the end."""
+    """Remove corners that repeat the corner before them."""
     return curve[np.linalg.norm(curve - np.roll(curve, 1, axis=0), axis=1) > 1e-9]
 
 
 def _inset(curve, width) -> np.ndarray:
-    """Move every edge of ``curve`` to its left by ``width``; corners sharper than a right angle are cut short."""
+    """Move every edge of ``curve`` to its left by ``width``; corners sharper than a right angle are truncated."""
     before, after = curve - np.roll(curve, 1, axis=0), np.roll(curve, -1, axis=0) - curve
     normals = [np.stack([-e[:, 1], e[:, 0]], axis=1) / np.linalg.norm(e, axis=1)[:, None] for e in (before, after)]
     bisector = normals[0] + normals[1]
@@ -248,7 +247,7 @@ def _inset(curve, width) -> np.ndarray:
 
 
 def _inside(points, curves) -> np.ndarray:
-    """Which of the points, shape [n, 2], lie inside the curves, by the edges that a ray to the right meets."""
+    """Return true for points, shape [n, 2], inside the curves: a ray to the right meets an odd number of edges."""
     result = np.zeros(len(points), bool)
     x, y = points.T
     for curve in curves:
@@ -264,7 +263,7 @@ def _cross(o, a, b) -> float:
 
 def _bridged(points, loop, hole) -> list[int]:
     """Join ``hole`` to ``loop`` by the shortest bridge that crosses neither."""
-    edges = [(one[k - 1], one[k]) for one in (loop, hole) for k in range(len(one))]
+    edges = [(curve[k - 1], curve[k]) for curve in (loop, hole) for k in range(len(curve))]
     distances = np.linalg.norm(points[loop][:, None] - points[hole], axis=2)
     for place in np.argsort(distances, axis=None, kind="stable"):
         a, b = np.unravel_index(place, distances.shape)
@@ -281,26 +280,26 @@ def _crosses(points, a, b, c, d) -> bool:
 
 
 def _ears(points, loop) -> list[list[int]]:
-    """Cut a simple loop into triangles, always at the ear whose sharpest angle is widest."""
-    loop, found = list(loop), []
+    """Cut a simple loop into triangles, always at the ear of the highest quality."""
+    loop, cut = list(loop), []
     while len(loop) > 3:
         ears = [(_quality(points, loop, k), k) for k in range(len(loop))]
         quality, k = max(ears)
         if quality <= 0.0:
             raise ValueError("outline: crosses itself")
-        found.append([loop[k - 1], loop[k], loop[(k + 1) % len(loop)]])
+        cut.append([loop[k - 1], loop[k], loop[(k + 1) % len(loop)]])
         del loop[k]
-    return [*found, loop]
+    return [*cut, loop]
 
 
 def _quality(points, loop, k) -> float:
-    """Return twice the area over the longest side squared of the ear at place ``k``, at most zero if it is none."""
+    """Return twice the area over the longest side squared of the ear at corner ``k``; 0 if it is not an ear."""
     names = loop[k - 1], loop[k], loop[(k + 1) % len(loop)]
     a, b, c = points[list(names)]
     double = _cross(a, b, c)
     if double <= 1e-12:
         return 0.0
-    others = points[[one for one in loop if one not in names]]
+    others = points[[corner for corner in loop if corner not in names]]
     if len(others):
         sides = np.stack([_cross(p, q, others.T) for p, q in ((a, b), (b, c), (c, a))])
         if (sides >= -1e-12).all(axis=0).any():

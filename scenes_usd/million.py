@@ -13,7 +13,7 @@ from warpmag.errors import InputError
 from warpmag.scenes_usd import authoring
 
 _CELLS = 12
-"""Moments along an edge of the magnet, at most."""
+"""Largest number of moments along an edge of the magnet."""
 
 
 def author(
@@ -35,11 +35,11 @@ def author(
         balls: Number of balls.
         radius: Radius of the balls [m].
         saturation: Saturation magnetization of the balls [A/m].
-        spacing: Mean distance of neighbouring balls [m].
+        spacing: Mean distance of neighboring balls [m].
         magnet: Edge of the magnet, a cube, over the radius of the cloud.
         magnetization: Magnetization of the magnet, along z [A/m].
-        friction: Coefficient of friction of everything.
-        seed: Seed of where the balls are.
+        friction: Coefficient of friction of all materials.
+        seed: Seed of the positions of the balls.
     """
     authoring.check_count("balls", balls)
     if not 0.0 < magnet < 1.0:
@@ -55,10 +55,9 @@ def author(
         seconds=1.0,
     )
     authoring.add_scene(stage, MagneticSettings(), gravity=0.0)
-    looks = {"density": authoring.IRON_DENSITY, "friction": friction}
-    iron = authoring.add_material(stage, "Iron", color=authoring.STEEL_COLOR, metallic=1.0, roughness=0.3, **looks)
-    red = authoring.add_material(stage, "Magnet", color=authoring.MAGNET_COLOR, roughness=0.3, coat=1.0, **looks)
-    # cells not much larger than balls: what touches must be near, and is summed pair by pair
+    iron = authoring.add_iron_material(stage, friction=friction)
+    red = authoring.add_magnet_material(stage, density=authoring.IRON_DENSITY, friction=friction)
+    # cells hardly larger than balls: bodies in contact must be near pairs, which are summed one by one
     cell = max(edge / _CELLS, 2.0 * radius)
     authoring.add_box(
         stage,
@@ -76,10 +75,10 @@ def author(
 
 
 def cloud(count: int, radius: float, spacing: float, edge: float, random: np.random.Generator) -> np.ndarray:
-    """Return places of balls around a cube with edges of ``edge`` [m], from the middle out.
+    """Return the positions of balls around a cube with edges of ``edge`` [m], from the middle outwards.
 
     Returns:
-        Centres [m], shape [count, 3], no two of which are nearer than 2.1 radii.
+        Centers [m], shape [count, 3], at least 2.1 radii apart.
     """
     free = 0.5 * edge + radius + 0.5 * spacing
     reach = math.ceil(np.cbrt(0.75 * (count + (2.0 * free / spacing) ** 3) / math.pi)) + 2

@@ -2,8 +2,8 @@
 
 ``python -m warpmag.scenes_usd.sakura_tree -o sakura_tree.usdc``
 
-The tree grows by space colonization (Runions, Lane and Prusinkiewicz 2007): twigs grow a step at a time towards the
-points of a crown that are nearest to them, until they reach them.
+The tree grows by space colonization (Runions, Lane and Prusinkiewicz 2007): twigs grow in steps towards the points of a
+crown that are nearest to them, until they reach these points.
 """
 
 import itertools
@@ -12,7 +12,6 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import UsdGeom
 
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
@@ -24,34 +23,34 @@ BUD_COLOR = (0.9, 0.35, 0.5)
 _STEP, _REACHED = 0.032, 0.04
 """Length of a step of growth, and the distance at which a point of the crown is reached, over the tree's height."""
 _UPWARD = 0.15
-"""What draws every twig upward, over the pull of one point."""
+"""Upward pull on every twig, over the pull of one point."""
 _APART = 0.068
-"""Least distance of the points of the crown over the tree's height."""
+"""Smallest distance of the points of the crown over the tree's height."""
 _TWIG = 0.7
-"""Radius of a twig at its end over that of its bud."""
+"""Radius of a twig at its end over the radius of its bud."""
 _PIPES = 2.9
-"""Exponent n of the radii where a branch forks, r^n = Σ r_k^n (da Vinci: 2)."""
+"""Exponent n of the radii at a fork, r^n = Σ r_k^n (da Vinci: 2)."""
 _TAPER = 1.015
-"""Growth of the radius from one segment to the one below it."""
+"""Ratio of the radii of a segment and the segment above it."""
 _BALLS_APART = 0.75
-"""Least distance of the balls in the sky over their mean spacing; beyond 0.9 no such rain would be found."""
+"""Smallest distance of the balls in the sky over their mean spacing; beyond 0.9 random places run out."""
 _USUAL = 2500
-"""Balls of which the rain falls on the crown; more of them make a rain that is wider and higher alike."""
+"""Number of balls whose rain is as wide as the crown; more balls make the rain wider and higher in proportion."""
 _MANY = 10_000
-"""Balls beyond which they are instances, in a rain that is drawn at once."""
+"""Number of balls beyond which they are instances, at places of a jittered lattice."""
 _CROWN_CENTER, _CROWN = (0.0, 0.0, 0.66), (0.56, 0.56, 0.34)
-"""Centre and semi-axes of the ellipsoid that the crown fills, over the tree's height."""
+"""Center and semi-axes of the ellipsoid of the crown, over the tree's height."""
 _TRUNK = ((0.0, 0.0, 0.0), (0.01, -0.006, 0.05), (0.012, -0.014, 0.1), (0.002, -0.018, 0.15), (-0.012, -0.01, 0.2))
 """The trunk below the first fork, over the tree's height."""
 
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree of straight segments, each from the node above it, in the sense of its growth, to its own node.
+    """A tree of straight segments, each from the node's parent to the node.
 
     Attributes:
         nodes: Positions [m], shape [n, 3].
-        parents: The node that each grew from, of smaller index; -1 for the root. Shape [n].
+        parents: Parent of each node, of smaller index; -1 for the root. Shape [n].
         radii: Radius of the segment that ends at each node [m], shape [n].
     """
 
@@ -61,7 +60,7 @@ class Tree:
 
     @property
     def tips(self) -> np.ndarray:
-        """The nodes that nothing grew from."""
+        """Nodes without children."""
         return np.setdiff1d(np.arange(len(self.nodes)), self.parents)
 
 
@@ -84,14 +83,14 @@ def author(
     Args:
         path: USD file to write.
         balls: Number of balls.
-        branches: Ends of branches, at most: fewer where the crown has no room.
+        branches: Largest number of ends of branches; fewer if the crown has no room.
         radius: Radius of the balls [m].
         saturation: Saturation magnetization of the balls [A/m].
         height: Height of the tree [m].
         bud_radius: Radius of the magnets at the ends of the branches [m].
         magnetization: Magnetization of these magnets, along the branch [A/m].
-        spacing: Mean distance of neighbouring balls in the sky [m].
-        friction: Coefficient of friction of everything.
+        spacing: Mean distance of neighboring balls in the sky [m].
+        friction: Coefficient of friction of all materials.
         seed: Seed of the tree and of the rain.
     """
     authoring.check_count("balls", balls)
@@ -105,32 +104,21 @@ def author(
     authoring.add_scene(stage, MagneticSettings())
     bark = authoring.add_material(stage, "Bark", color=BARK_COLOR, roughness=0.9, density=700.0, friction=friction)
     bud = authoring.add_material(stage, "Bud", color=BUD_COLOR, roughness=0.4, density=7500.0, friction=friction)
-    iron = authoring.add_material(
-        stage,
-        "Iron",
-        color=authoring.STEEL_COLOR,
-        metallic=1.0,
-        roughness=0.3,
-        density=authoring.IRON_DENSITY,
-        friction=friction,
-    )
-    ground = authoring.add_material(stage, "Ground", color=authoring.GROUND_COLOR, roughness=0.8, friction=friction)
-    authoring.add_ground(stage, ground, size=10.0 * height)
+    iron = authoring.add_iron_material(stage, friction=friction)
+    authoring.add_gray_ground(stage, size=10.0 * height, friction=friction)
     _add_tree(stage, tree, bark, bud, bud_radius, magnetization)
     ball_magnet = Magnet(saturation=saturation)
     positions = rain(balls, radius, spacing, height, np.random.default_rng(seed))
     if balls > _MANY:
         authoring.add_balls(stage, "/World/Balls", positions, radius, iron, magnet=ball_magnet)
     else:
-        UsdGeom.Scope.Define(stage, "/World/Balls")
-        for number, position in enumerate(positions):
-            authoring.add_ball(stage, f"/World/Balls/Ball_{number:05d}", position, radius, iron, magnet=ball_magnet)
+        authoring.add_ball_prims(stage, positions, radius, iron, digits=5, magnet=ball_magnet)
     authoring.add_camera(stage, (1.3 * height, -4.6 * height, 1.2 * height), (0.0, 0.0, 0.8 * height))
     authoring.save(stage, path)
 
 
 def _add_tree(stage, tree, bark, bud, bud_radius, magnetization) -> None:
-    """Author the tree as one body that is held in place, so that what clings to it clings to a magnet."""
+    """Author the tree as one kinematic body, so that balls that cling to it cling to a magnet."""
     authoring.add_body(stage, "/World/Tree", (0.0, 0.0, 0.0), kinematic=True)
     for node in range(1, len(tree.nodes)):
         start, end = tree.nodes[tree.parents[node]], tree.nodes[node]
@@ -156,10 +144,10 @@ def grow(branches: int, height: float, bud_radius: float, random: np.random.Gene
     """Grow a tree.
 
     Args:
-        branches: Points of the crown to grow to, at most.
+        branches: Largest number of points of the crown.
         height: Height [m].
-        bud_radius: Radius of the buds [m]; none of them touch each other.
-        random: Where the points of the crown come from.
+        bud_radius: Radius of the buds [m], which do not touch each other.
+        random: Generator of the points of the crown.
     """
     if not 0.0 < bud_radius < 0.5 * _STEP * height:
         raise InputError(f"bud_radius: must be positive and below {0.5 * _STEP * height:g} m, got {bud_radius:g}")
@@ -174,13 +162,13 @@ def grow(branches: int, height: float, bud_radius: float, random: np.random.Gene
             pulls = goals[nearest == place] - nodes[node]
             direction = (pulls / np.linalg.norm(pulls, axis=1, keepdims=True)).sum(axis=0)
             direction[2] += _UPWARD
-            # Rounded, so that the same tree grows on every machine.
+            # rounded, so that the same tree grows on every machine
             new = np.round(nodes[node] + _STEP * direction / np.linalg.norm(direction), 6)
             if np.linalg.norm(np.array(nodes) - new, axis=1).min() > 0.6 * _STEP:
                 nodes.append(new)
                 parents.append(int(node))
         if len(nodes) == grown:
-            break  # pulled to and fro between points: those stay without a twig
+            break  # points that pull a twig to and fro remain unreached
         near = np.linalg.norm(goals[:, None] - nodes[grown:], axis=2).min(axis=1)
         goals = goals[near > _REACHED]
     nodes, parents = np.array(nodes), np.array(parents)
@@ -189,7 +177,7 @@ def grow(branches: int, height: float, bud_radius: float, random: np.random.Gene
 
 
 def _crown(count: int, random: np.random.Generator) -> np.ndarray:
-    """Return points in the upper part of the crown's ellipsoid, no two of them close together, shape [n, 3]."""
+    """Return points in the upper part of the crown's ellipsoid, at least ``_APART`` apart, shape [n, 3]."""
     points = np.empty((0, 3))
     for _ in range(200 * count):
         point = random.uniform(-1.0, 1.0, 3)
@@ -204,7 +192,7 @@ def _crown(count: int, random: np.random.Generator) -> np.ndarray:
 
 
 def _without_close_tips(nodes, parents, apart) -> tuple[np.ndarray, np.ndarray]:
-    """Take off twigs, each down to where it forks off, whose ends are closer than ``apart`` to another node's."""
+    """Remove twigs whose ends are closer than ``apart`` to another node, each down to its fork."""
     while True:
         forks = np.bincount(parents[1:], minlength=len(nodes))
         tips = np.flatnonzero(forks == 0)
@@ -214,16 +202,16 @@ def _without_close_tips(nodes, parents, apart) -> tuple[np.ndarray, np.ndarray]:
                 break
         else:
             return nodes, parents
-        taken = [tip]
-        while forks[parents[taken[-1]]] == 1:
-            taken.append(parents[taken[-1]])
-        keep = np.setdiff1d(np.arange(len(nodes)), taken)
+        twig = [tip]
+        while forks[parents[twig[-1]]] == 1:
+            twig.append(parents[twig[-1]])
+        keep = np.setdiff1d(np.arange(len(nodes)), twig)
         parents = np.concatenate([[-1], np.searchsorted(keep, parents[keep[1:]])])
         nodes = nodes[keep]
 
 
 def _radii(parents, twig) -> np.ndarray:
-    """Return the radius of each segment: branches are as thick as what grows from them, and taper."""
+    """Return the radius of each segment from the radii of its children (``_PIPES``) and the taper."""
     sums = np.zeros(len(parents))
     radii = np.full(len(parents), twig)
     for node in reversed(range(len(parents))):
@@ -235,17 +223,17 @@ def _radii(parents, twig) -> np.ndarray:
 
 
 def rain(count: int, radius: float, spacing: float, height: float, random: np.random.Generator) -> np.ndarray:
-    """Return random places for the balls above the tree, no two of them close together.
+    """Return random positions of balls above the tree, at least ``_BALLS_APART * spacing`` apart.
 
     Args:
         count: Number of balls.
         radius: Radius of the balls [m].
-        spacing: Edge of the cube that a ball has for itself on average [m].
+        spacing: Edge of the mean volume per ball [m].
         height: Height of the tree [m].
-        random: Where the places come from.
+        random: Generator of the positions.
 
     Returns:
-        Centres [m], shape [count, 3], from the lowest up.
+        Centers [m], shape [count, 3], from the lowest up.
     """
     apart = _BALLS_APART * spacing
     if apart < authoring.BALL_SPACING * radius:
@@ -261,16 +249,16 @@ def rain(count: int, radius: float, spacing: float, height: float, random: np.ra
     around = list(itertools.product((-1, 0, 1), repeat=3))
     while len(places) < count:
         place = np.round(random.uniform((-reach, -reach, bottom), (reach, reach, bottom + depth)), 6).tolist()
-        x, y, z = (int(one // apart) for one in place)
-        near = [one for a, b, c in around for one in cells.get((x + a, y + b, z + c), ())]
-        if math.hypot(*place[:2]) <= reach and all(math.dist(one, place) > apart for one in near):
+        x, y, z = (int(coordinate // apart) for coordinate in place)
+        near = [ball for a, b, c in around for ball in cells.get((x + a, y + b, z + c), ())]
+        if math.hypot(*place[:2]) <= reach and all(math.dist(ball, place) > apart for ball in near):
             places.append(place)
             cells.setdefault((x, y, z), []).append(place)
     return np.array(sorted(places, key=lambda place: place[2]))
 
 
 def _lattice_rain(count: int, reach: float, spacing: float, random: np.random.Generator) -> np.ndarray:
-    """Return places above z = 0 within ``reach`` of the z axis, from the lowest up, shape [count, 3]."""
+    """Return positions above z = 0 within ``reach`` of the z axis, from the lowest up, shape [count, 3]."""
     side = math.ceil(reach / spacing)
     axis = np.arange(-side, side + 1) * spacing
     disc = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)

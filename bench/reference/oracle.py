@@ -260,7 +260,7 @@ class Equilibrium:
 
 
 def coupling_matrix(positions, radii):
-    """Matrix G [dimensionless], shape [3n, 3n], with H = G M for uniformly magnetized balls; own fields are left out."""
+    """Matrix G [dimensionless], shape [3n, 3n], with H = G M for uniformly magnetized balls, without own fields."""
     positions = np.asarray(positions, float)
     n = len(positions)
     radii = np.broadcast_to(np.asarray(radii, float), n)

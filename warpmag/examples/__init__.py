@@ -1,8 +1,8 @@
-"""Examples after the pattern of Newton's: ``python -m warpmag.examples NAME``.
+"""Examples in the pattern of Newton's: ``python -m warpmag.examples NAME``.
 
-Each is a module with a class ``Example``: its constructor builds the scene, ``step`` advances one frame, ``render``
-shows it, ``test_final`` compares what came out with physics. ``--test`` does that at the end, ``--headless`` draws
-nothing.
+Each is a module with a class ``Example``: the constructor builds the scene, ``step`` advances one frame, ``render``
+shows it, ``test_final`` compares the result with physics, ``summary`` returns a line about it. ``--test`` calls
+``test_final`` at the end, ``--headless`` draws nothing.
 """
 
 import argparse
@@ -25,7 +25,7 @@ def create_parser(frames: int) -> argparse.ArgumentParser:
     """Return Newton's parser of the options that all examples take.
 
     Args:
-        frames: Frames that the example runs, unless ``--num-frames`` says otherwise.
+        frames: Default of ``--num-frames``.
     """
     parser = newton.examples.create_parser()
     parser.set_defaults(num_frames=frames)
@@ -36,7 +36,7 @@ def create_parser(frames: int) -> argparse.ArgumentParser:
 
 
 def init(parser: argparse.ArgumentParser):
-    """Read the options and open the viewer they ask for.
+    """Parse the options and open the viewer.
 
     Returns:
         The viewer and the options.
@@ -49,7 +49,7 @@ def init(parser: argparse.ArgumentParser):
         sys.argv += ["--viewer", "null"]
     level = max(wp.config.log_level, wp.LOG_WARNING)
     quiet_warp()
-    wp.config.log_level = level  # what Warp warns of is worth reading where one learns
+    wp.config.log_level = level  # keeps warnings of Warp, which are useful to learners
     try:
         return newton.examples.init(parser)
     except Exception as error:  # each viewer fails in its own way
@@ -57,17 +57,17 @@ def init(parser: argparse.ArgumentParser):
 
 
 def run(example, options) -> None:
-    """Run an example to its end and print what it found.
+    """Run an example to its end and print its summary.
 
     Raises:
-        AssertionError: With ``--test``, what came out is not what physics says.
+        AssertionError: With ``--test``, the result does not agree with physics.
     """
     newton.examples.run(example, options)
     print(example.summary())
 
 
 def get_examples() -> dict[str, str]:
-    """Return the first line of what each example is about, by its name."""
+    """Return the first line of each example's docstring, by its name."""
     lines = {}
     for path in sorted(Path(__file__).parent.glob("*.py")):
         if not path.stem.startswith("_"):
@@ -77,7 +77,7 @@ def get_examples() -> dict[str, str]:
 
 
 def main() -> int:
-    """Run the example that the command line names, or list them; return the exit code."""
+    """Run the example named on the command line, or list all examples; return the exit code."""
     examples = get_examples()
     name = sys.argv[1] if len(sys.argv) > 1 else None
     if name in examples:
@@ -89,7 +89,7 @@ def main() -> int:
         except InputError as error:
             print(f"warpmag: {error}", file=sys.stderr)
             return 2
-        except ImportError as error:  # of Newton's solvers, which name it
+        except ImportError as error:  # a solver of Newton, whose message names the package
             reason = " ".join(str(error.__cause__ or error).split())
             print(f"warpmag: {name} needs {extra('sim')}: {reason}", file=sys.stderr)
             return 2

@@ -1,7 +1,7 @@
 """A MuJoCo arm with an electromagnet picks up a steel ball and puts it down elsewhere.
 
-Two links turn about upright axes, a slide carries the coil. A held ball hangs on the slide with all its weight, since
-what the coil does to the ball, the ball does to the coil.
+Two links turn about vertical axes, and a slide carries the coil. The slide carries the whole weight of a held ball,
+since the forces of coil and ball on each other are opposite.
 """
 
 import math
@@ -18,18 +18,18 @@ RADIUS = 0.005  # m, of the ball
 COIL = {"shape": "solenoid", "radius": 0.015, "length": 0.01, "label": "gripper"}
 AMPERE_TURNS = 2500.0
 STIFFNESS = 2000.0  # N/m, of the slide's drive
-START, END = (0.15, 0.1), (0.12, -0.12)  # m, where the ball is taken and put
-ABOVE, UP = 0.014, 0.03  # m, of the pad over the ground, and how far it is lifted
-TIMES = (0.0, 0.3, 0.5, 1.2, 1.4, 1.6)  # s: wait, taken, lifted, turned, lowered, let go
-# MuJoCo's contacts are springs: with Newton's 2500 the pulled ball sinks 0.9 mm into the pad, with this a hundredth of
-# that. Steps must not be longer than 2/sqrt(ke), 4 ms.
+START, END = (0.15, 0.1), (0.12, -0.12)  # m, places where the ball is picked up and put down
+ABOVE, UP = 0.014, 0.03  # m, height of the pad above the ground, and of the lift
+TIMES = (0.0, 0.3, 0.5, 1.2, 1.4, 1.6)  # s: wait, picked up, lifted, turned, lowered, released
+# MuJoCo's contacts are springs: with Newton's 2500 N/m the pulled ball sinks 0.9 mm into the pad, with this stiffness
+# a hundredth of that. Steps must not exceed 2/sqrt(ke), 4 ms.
 HARD = {"ke": 2.5e5, "kd": 1e3}
 
-ROLLING = {"mujoco:condim": 6}  # or nothing stops a ball that rolls
+ROLLING = {"mujoco:condim": 6}  # rolling friction, else a rolling ball never stops
 
 
 def joints_at(x: float, y: float) -> tuple[float, float]:
-    """Angles of both links [rad] that put the coil at (x, y)."""
+    """Return the angles of both links [rad] for the coil at (x, y)."""
     elbow = math.acos((x * x + y * y) / (2.0 * LINK**2) - 1.0)
     return math.atan2(y, x) - 0.5 * elbow, elbow
 
@@ -99,11 +99,11 @@ class Example:
 
     @staticmethod
     def create_parser():
-        """Return the parser of its options."""
+        """Return the parser of the example's options."""
         return warpmag.examples.create_parser(frames=160)
 
     def simulate(self):
-        """Four steps of 3 ms."""
+        """Run four steps of 3 ms."""
         for _ in range(4):
             self.state_0.clear_forces()
             self.magnetics.apply(self.state_0)
@@ -130,16 +130,16 @@ class Example:
         self.display.show(self.time, self.state_0)
 
     def place(self) -> np.ndarray:
-        """Where the ball is [m]."""
+        """Return the position of the ball [m]."""
         return self.state_0.body_q.numpy()[self.ball, :3].astype(float)
 
     def held_weight(self) -> float:
-        """What the slide carries more with the ball than without it [N]."""
+        """Return the increase of the slide's load by the ball [N]."""
         times, forces, _ = np.array(self.loads).T
         return float(forces[(times > 0.27) & (times < TIMES[1])].mean() - forces[(times > 0.1) & (times < 0.2)].mean())
 
     def test_final(self):
-        """The ball was lifted, hung with its weight on the arm, lies where it was put, and sank into nothing."""
+        """Check that the ball was lifted, loaded the arm with its weight, lies at the end, and penetrated nothing."""
         assert max(height for *_, height in self.loads) > UP
         weight = 9.81 * float(self.model.body_mass.numpy()[self.ball])
         np.testing.assert_allclose(self.held_weight(), weight, rtol=0.02)
@@ -149,11 +149,11 @@ class Example:
         assert min(height for *_, height in self.loads) > 0.98 * RADIUS
 
     def summary(self) -> str:
-        """What it shows."""
+        """Return the result in one line."""
         off = 1e3 * np.linalg.norm(self.place()[:2] - END)
         weight = 9.81 * float(self.model.body_mass.numpy()[self.ball])
         held = 1e3 * self.held_weight()
-        return f"put down {off:.2g} mm off; it hung on the arm with {held:.2f} mN, it weighs {1e3 * weight:.2f} mN"
+        return f"put down {off:.2g} mm off; the arm carried {held:.2f} mN, the ball weighs {1e3 * weight:.2f} mN"
 
 
 if __name__ == "__main__":

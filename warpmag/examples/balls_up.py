@@ -1,7 +1,7 @@
-"""Iron balls jump to a magnet above them, by the Python API alone.
+"""Iron balls jump to a magnet above them, built with the Python API.
 
-Kim and Han 2022, Fig. 3, which ``warpmag run balls_up`` reads from a stage. Nothing but impacts takes energy from the
-balls: there is no friction.
+Kim and Han 2022, Fig. 3; ``warpmag run balls_up`` reads the same scene from a stage. There is no friction, so only
+impacts dissipate energy.
 """
 
 import newton
@@ -13,7 +13,7 @@ import warpmag.examples
 
 RADIUS = 0.005  # m
 MAGNET = 0.04  # m, edge
-HEIGHT = 0.051  # m, of the magnet's centre above the ground
+HEIGHT = 0.051  # m, of the magnet's center above the ground
 
 
 class Example:
@@ -43,7 +43,7 @@ class Example:
 
     @staticmethod
     def create_parser():
-        """Return the parser of its options."""
+        """Return the parser of the example's options."""
         parser = warpmag.examples.create_parser(frames=100)
         parser.add_argument("--columns", type=int, default=9, help="Balls along x and along y.")
         parser.add_argument("--layers", type=int, default=3, help="Balls along z.")
@@ -60,7 +60,7 @@ class Example:
         self.display.show(self.simulation.time, self.simulation.state)
 
     def energy(self) -> float:
-        """Magnetic, kinetic and potential energy of all balls [J]."""
+        """Return the magnetic, kinetic and potential energy of all balls [J]."""
         state, masses = self.simulation.state, self.simulation.model.body_mass.numpy()
         speeds = np.linalg.norm(state.body_qd.numpy()[:, :3], axis=1)
         mechanical = masses @ (0.5 * speeds**2 + 9.81 * state.body_q.numpy()[:, 2])
@@ -68,14 +68,14 @@ class Example:
         return float(mechanical + self.simulation.magnetics.energy()[0])
 
     def test_final(self):
-        """Energy is lost in impacts and never won, balls do not overlap, and those that fly up stay at the magnet."""
+        """Check that energy never grows, balls do not overlap, and some hang at the magnet."""
         gained, lost = max(np.diff(self.energies)), self.energies[0] - self.energies[-1]
         assert lost > 0.0 and gained < 0.01 * lost, f"energy rose by {gained:g} J in a frame, of {lost:g} J lost"
         figures = self.simulation.finish()
         assert figures.held > 0 and figures.final_overlap < 0.05
 
     def summary(self) -> str:
-        """What it shows."""
+        """Return the result in one line."""
         figures = self.simulation.finish()
         lost = self.energies[0] - self.energies[-1]
         return f"{figures.held} of {figures.magnets} balls hang at the magnet, impacts took {lost:.3g} J"

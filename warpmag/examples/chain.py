@@ -1,6 +1,6 @@
 """A bar magnet on a rotating arm drags a chain of magnetic balls over a table.
 
-Nothing but magnetism holds the chain together, and the motor turns against the friction under the balls.
+Only magnetism holds the chain together. The motor works against the friction under the balls.
 """
 
 import newton
@@ -24,7 +24,7 @@ class Example:
         warpmag.register_custom_attributes(builder)
         rough = newton.ModelBuilder.ShapeConfig(mu=2.0 * FRICTION, mu_rolling=0.0, mu_torsional=0.0)
         smooth = newton.ModelBuilder.ShapeConfig(density=DENSITY, mu=0.0, mu_rolling=0.0, mu_torsional=0.0)
-        builder.add_ground_plane(cfg=rough)  # Newton takes the mean of two shapes: there is friction on the table alone
+        builder.add_ground_plane(cfg=rough)  # Newton takes the mean of two shapes: only the table has friction
         rotor = builder.add_link()
         bar = wp.transform((ARM, 0.0, RADIUS), wp.quat_identity())
         builder.add_shape_box(rotor, xform=bar, hx=RADIUS, hy=HALF_LENGTH, hz=0.9 * RADIUS, cfg=smooth)
@@ -47,7 +47,7 @@ class Example:
 
     @staticmethod
     def create_parser():
-        """Return the parser of its options."""
+        """Return the parser of the example's options."""
         parser = warpmag.examples.create_parser(frames=150)
         parser.add_argument("--balls", type=int, default=8, help="Balls in the chain.")
         return parser
@@ -64,7 +64,7 @@ class Example:
         self.display.show(self.simulation.time, self.simulation.state)
 
     def friction_torque(self) -> float:
-        """Torque of the friction under all balls about the axis [N·m], as Coulomb has it: against their slip."""
+        """Return the torque of Coulomb friction under all balls about the axis [N·m], opposite to their slip velocities."""
         state, weights = self.simulation.state, 9.81 * self.simulation.model.body_mass.numpy()[1:]
         places, speeds = state.body_q.numpy()[1:, :2].astype(float), state.body_qd.numpy()[1:].astype(float)
         slip = speeds[:, :2] + RADIUS * np.stack([-speeds[:, 4], speeds[:, 3]], axis=1)
@@ -72,12 +72,12 @@ class Example:
         return float(FRICTION * weights @ (places[:, 0] * slip[:, 1] - places[:, 1] * slip[:, 0]))
 
     def mean_torques(self) -> tuple[float, float]:
-        """Torques of the motor and of friction [N·m], means of the second half of the run."""
+        """Return the torques of the motor and of friction [N·m], means over the second half of the run."""
         motor, friction = np.mean(self.torques[len(self.torques) // 2 :], axis=0)
         return float(motor), float(friction)
 
     def test_final(self):
-        """The chain holds, points head to tail, goes around, and the motor turns against its friction alone."""
+        """Check that the chain holds, points head to tail, and that friction alone balances the motor."""
         poses = self.simulation.state.body_q.numpy()[1:].astype(float)
         links = np.diff(poses[:, :3], axis=0)
         np.testing.assert_allclose(np.linalg.norm(links, axis=1), 2.0 * RADIUS, rtol=0.02)
@@ -86,11 +86,11 @@ class Example:
         along = -np.sum(moments[:-1] * links, axis=1) / np.linalg.norm(links, axis=1)
         assert along.min() > 0.9, f"a ball of the chain points across it, {along}"
         motor, friction = self.mean_torques()
-        np.testing.assert_allclose(motor, friction, rtol=0.2)  # which swing, and lean on each other
+        np.testing.assert_allclose(motor, friction, rtol=0.2)  # the balls swing and touch each other
 
     def summary(self) -> str:
-        """What it shows."""
-        motor, friction = (1e3 * one for one in self.mean_torques())
+        """Return the result in one line."""
+        motor, friction = (1e3 * torque for torque in self.mean_torques())
         return f"the motor turns with {motor:.3g} mN·m, against {friction:.3g} mN·m of friction under the chain"
 
 

@@ -1,8 +1,8 @@
 """Compass needles in oil follow a rotating field, or slip behind it when it turns too fast.
 
-The torque of the field against that of the oil, c dα/dt = μ0 m H sin(ωt - α), holds a needle at the angle
-arcsin(ω/ωc) behind the field as long as ω < ωc = μ0 m H/c. Above that it falls behind again and again and turns on
-average by ω - √(ω² - ωc²) (Adler's equation). A row of the swarm has one H, which grows from row to row.
+The torques of field and oil balance: c dα/dt = μ0 m H sin(ωt - α). A needle lags by the angle arcsin(ω/ωc) as long as
+ω < ωc = μ0 m H/c. In faster fields it slips, with a mean speed of ω - √(ω² - ωc²) (Adler's equation). Each row of the
+swarm has one H, which grows from row to row.
 """
 
 import math
@@ -15,27 +15,27 @@ import warpmag
 import warpmag.examples
 
 MU0 = 4e-7 * math.pi  # T·m/A
-EXTENT = (0.01, 0.0015, 0.001)  # m, half of it
+EXTENT = (0.01, 0.0015, 0.001)  # m, half extents of a needle
 MAGNETIZATION = 8e5  # A/m
-PITCH = 0.3  # m, far enough for needles to feel the field alone
+PITCH = 0.3  # m, so far that needles do not act on each other
 SPEED = 16.0 * math.pi  # rad/s
 MOMENT = MAGNETIZATION * 8.0 * math.prod(EXTENT)  # A·m²
 
 
 class Example:
-    """Rows of needles, one world each, so that every row can have a field of its own."""
+    """Rows of needles; each row is a world with its own field."""
 
     def __init__(self, viewer, args):
         """Build the scene."""
         row = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         warpmag.register_custom_attributes(row)
         self.fields = np.linspace(500.0, 2000.0, args.rows)  # A/m
-        self.damping = MU0 * MOMENT * 1000.0 / SPEED  # N·m·s: in 1000 A/m needles are about to slip
+        self.damping = MU0 * MOMENT * 1000.0 / SPEED  # N·m·s: needles begin to slip in 1000 A/m
         for column in range(args.columns):
             place = wp.transform((column * PITCH, 0.0, 0.0), wp.quat_identity())
             needle = row.add_link(xform=place)
             row.add_shape_box(needle, hx=EXTENT[0], hy=EXTENT[1], hz=EXTENT[2])
-            # one moment is all that others feel of a needle so far away; by default it would be 252
+            # one moment is enough for needles so far away; the default would be 252
             warpmag.add_permanent(row, needle, magnetization=(MAGNETIZATION, 0.0, 0.0), moment_spacing=2.0 * EXTENT[0])
             hinge = row.add_joint_revolute(
                 -1, needle, parent_xform=place, axis=(0.0, 0.0, 1.0), target_kd=self.damping,
@@ -53,14 +53,14 @@ class Example:
 
     @staticmethod
     def create_parser():
-        """Return the parser of its options."""
+        """Return the parser of the example's options."""
         parser = warpmag.examples.create_parser(frames=200)
         parser.add_argument("--rows", type=int, default=10, help="Rows of needles.")
         parser.add_argument("--columns", type=int, default=10, help="Needles in a row.")
         return parser
 
     def field_angle(self) -> float:
-        """How far the field has turned [rad]."""
+        """Return the angle of the field [rad]."""
         return SPEED * self.simulation.time
 
     def step(self):
@@ -77,22 +77,22 @@ class Example:
         self.display.show(self.simulation.time, self.simulation.state)
 
     def angle(self) -> np.ndarray:
-        """Angle of each needle [rad], modulo a turn, shape [rows, columns]."""
+        """Return the angle of each needle [rad], modulo 2π, shape [rows, columns]."""
         q = self.simulation.state.body_q.numpy().astype(float)
         return (2.0 * np.arctan2(q[:, 5], q[:, 6])).reshape(len(self.fields), -1)
 
     def follow(self) -> tuple[np.ndarray, np.ndarray]:
-        """Angle behind the field at the end [rad] and mean speed [rad/s] of the first needle of each row."""
+        """Return the final lag behind the field [rad] and mean speed [rad/s] of the first needle of each row."""
         times = np.linspace(0.0, self.simulation.time, len(self.angles))
         behind = np.unwrap(SPEED * times[:, None] - np.array(self.angles)[:, :, 0], axis=0)
         slips = []
-        for one in behind.T:
-            ends = np.flatnonzero(np.diff(np.floor(one / (2.0 * math.pi))))
+        for lag in behind.T:
+            ends = np.flatnonzero(np.diff(np.floor(lag / (2.0 * math.pi))))
             slips.append(np.polyfit(times[ends], np.arange(len(ends)), 1)[0] if len(ends) > 1 else 0.0)
         return np.remainder(behind[-1] + math.pi, 2.0 * math.pi) - math.pi, SPEED - 2.0 * math.pi * np.array(slips)
 
     def test_final(self):
-        """Rows in strong fields turn with the field at the angle behind it that the torques ask for, weak ones slip."""
+        """Check the lag of rows in strong fields and the speed of slipping rows against Adler's equation."""
         critical = MU0 * MOMENT * self.fields / self.damping
         behind, speeds = self.follow()
         locked = critical > 1.05 * SPEED
@@ -100,19 +100,19 @@ class Example:
         np.testing.assert_array_equal(speeds[locked], SPEED)
         slipping = critical < 0.8 * SPEED
         slow = SPEED - np.sqrt(SPEED**2 - critical[slipping] ** 2)
-        np.testing.assert_allclose(speeds[slipping], slow, atol=0.05 * SPEED)  # slips are seen by the frame
+        np.testing.assert_allclose(speeds[slipping], slow, atol=0.05 * SPEED)  # slips are resolved by frames
         order = np.abs(np.exp(1j * np.array(self.angles[-1])).mean(axis=1))
         assert order.min() > 0.999, f"needles of one row point apart, order {order.min():g}"
 
     def summary(self) -> str:
-        """What it shows."""
+        """Return the result in one line."""
         behind, speeds = self.follow()
         follows = speeds > 0.9 * SPEED
         angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(behind[follows]))
         parts = ", ".join(f"{part:.2f}" for part in speeds[~follows] / SPEED)
-        told = [f"{follows.sum()} rows follow the field, {angles} degrees behind it"] if angles else []
-        told += [f"{(~follows).sum()} slip and turn at {parts} of its speed"] if parts else []
-        return ", ".join(told)
+        locked = [f"{follows.sum()} rows follow the field, {angles} degrees behind it"] if angles else []
+        slipping = [f"{(~follows).sum()} slip and turn at {parts} of its speed"] if parts else []
+        return ", ".join([*locked, *slipping])
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Two floating connectors with permanent magnets in them find each other and mate.
+"""Two floating connectors with permanent magnets attract each other and mate.
 
-Each has a north and a south pole in its face, so that they mate in one way only: the one that starts twisted turns. As
-nothing else acts on the two, neither their momentum nor their angular momentum changes.
+Each has a north and a south pole in its face, so they mate in one orientation only, and the twisted one turns. No other
+forces act, so momentum is conserved.
 """
 
 import math
@@ -20,7 +20,7 @@ GAP = 0.02  # m, between the faces at the start
 
 
 class Example:
-    """Two connectors, the second one shifted, tilted and twisted."""
+    """Two connectors; the second is shifted, tilted and twisted."""
 
     def __init__(self, viewer, args):
         """Build the scene."""
@@ -37,22 +37,24 @@ class Example:
 
     @staticmethod
     def add_connector(builder, place, face):
-        """Add a housing with two magnets of opposite direction in its face."""
+        """Add a housing with two opposite magnets in its face."""
         body = builder.add_body(xform=place)
         plastic = newton.ModelBuilder.ShapeConfig(density=1200.0, mu=0.02, mu_torsional=0.0)
         builder.add_shape_box(body, hx=HALF[0], hy=HALF[1], hz=HALF[2], cfg=plastic)
         for side in (1.0, -1.0):
             pole = wp.transform((face * (HALF[0] - POLE), side * 0.007, 0.0), wp.quat_identity())
-            # the plastic weighs its part there, too
+            # plus the density of the plastic in the same place
             heavy = newton.ModelBuilder.ShapeConfig(density=6300.0, mu=0.02, mu_torsional=0.0)
             shape = builder.add_shape_box(body, xform=pole, hx=POLE, hy=POLE, hz=POLE, cfg=heavy)
             warpmag.add_permanent(builder, shape=shape, material="N42", magnetization=(side, 0.0, 0.0))
 
     @staticmethod
     def create_parser():
-        """Return the parser of its options."""
+        """Return the parser of the example's options."""
         parser = warpmag.examples.create_parser(frames=60)
-        parser.add_argument("--twist", type=float, default=40.0, help="Twist of the second one about its axis [°].")
+        parser.add_argument(
+            "--twist", type=float, default=40.0, help="Twist of the second connector about its axis [°]."
+        )
         return parser
 
     def step(self):
@@ -65,13 +67,13 @@ class Example:
         self.display.show(self.simulation.time, self.simulation.state)
 
     def mating(self) -> tuple[np.ndarray, float]:
-        """Where the second one is in the frame of the first [m], and by how much it is turned [rad]."""
+        """Return the position of the second connector in the frame of the first [m], and its rotation [rad]."""
         first, second = (wp.transform(*pose) for pose in self.simulation.state.body_q.numpy())
         relative: Any = wp.transform_multiply(wp.transform_inverse(first), second)
         return np.array(relative.p), 2.0 * math.acos(min(1.0, abs(relative.q[3])))
 
     def test_final(self):
-        """Assert that they sit face to face as they are made to, and that their common momentum is still zero.
+        """Check that the connectors are mated, and that their total momentum is still zero.
 
         Momentum is conserved to rounding. Contact impulses are opposite to the last bit. Forces are sums over 500
         moments, each rounded to float32, and their root sum of squares is ten times the resultant: 10 · 6e-8 of it.
@@ -89,7 +91,7 @@ class Example:
         assert np.linalg.norm(masses @ speeds[:, :3]) < 2e-6 * impulse
 
     def summary(self) -> str:
-        """What it shows."""
+        """Return the result in one line."""
         place, angle = self.mating()
         off = 1e3 * np.linalg.norm(place - np.array((2 * HALF[0], 0.0, 0.0)))
         return f"mated within {off:.2g} mm and {math.degrees(angle):.2g} degrees"

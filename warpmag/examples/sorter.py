@@ -1,7 +1,7 @@
-"""Coils that are switched one after another lift steel balls out of a tray, carry them along, and drop them.
+"""Coils switched one after another lift steel balls out of a tray, carry them along, and drop them.
 
-Brass balls stay where they are. A coil lifts a ball of steel when its current is above that of a closed form
-(see ``worlds``), which is 1,180 ampere-turns here.
+Brass balls stay in place. A coil lifts a steel ball if its current exceeds that of a closed form (see ``worlds``), here
+1,180 ampere-turns.
 """
 
 import newton
@@ -13,7 +13,7 @@ import warpmag.examples
 
 RADIUS = 0.005  # m, of the balls
 PITCH = 0.022  # m, between coils
-CEILING, COIL_HEIGHT = 0.014, 0.02  # m, of the plate that carried balls slide along, and of the coils above it
+CEILING, COIL_HEIGHT = 0.014, 0.02  # m, of the plate along which carried balls slide, and of the coils
 AMPERE_TURNS = 3000.0
 HOLD = 0.2  # s, from one coil to the next
 
@@ -51,7 +51,7 @@ class Example:
 
     @staticmethod
     def create_parser():
-        """Return the parser of its options."""
+        """Return the parser of the example's options."""
         parser = warpmag.examples.create_parser(frames=60)
         parser.add_argument("--coils", type=int, default=4, help="Coils in the row.")
         parser.add_argument("--balls", type=int, default=4, help="Balls in the tray, half of them of steel.")
@@ -70,19 +70,19 @@ class Example:
         self.display.show(self.simulation.time, self.simulation.state)
 
     def places(self) -> np.ndarray:
-        """Where the balls are [m], shape [balls, 3]."""
+        """Return the positions of the balls [m], shape [balls, 3]."""
         return self.simulation.state.body_q.numpy()[:, :3].astype(float)
 
     def test_final(self):
-        """All steel lies under the last coil, all brass where it lay."""
+        """Check that all steel lies under the last coil, and all brass in its initial place."""
         places = self.places()
         last = (self.coils - 1) * PITCH
         assert (np.abs(places[self.steel, 0] - last) < 0.5 * PITCH).all(), places[self.steel]
         np.testing.assert_allclose(places[self.brass], self.start[self.brass], atol=1e-4)
-        np.testing.assert_allclose(places[:, 2], RADIUS, rtol=0.01)  # all of them down again
+        np.testing.assert_allclose(places[:, 2], RADIUS, rtol=0.01)  # all balls lie on the ground
 
     def summary(self) -> str:
-        """What it shows."""
+        """Return the result in one line."""
         moved = 1e3 * np.linalg.norm(self.places() - self.start, axis=1)
         return f"steel was carried {moved[self.steel].round(1)} mm, brass {moved[self.brass].round(1)} mm"
 
