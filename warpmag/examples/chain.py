@@ -64,7 +64,7 @@ class Example:
         self.display.show(self.simulation.time, self.simulation.state)
 
     def friction_torque(self) -> float:
-        """Return the torque of Coulomb friction under all balls about the axis [N·m], opposite to their slip velocities."""
+        """Return the torque of Coulomb friction, opposite to slip velocities, under all balls about the axis [N·m]."""
         state, weights = self.simulation.state, 9.81 * self.simulation.model.body_mass.numpy()[1:]
         places, speeds = state.body_q.numpy()[1:, :2].astype(float), state.body_qd.numpy()[1:].astype(float)
         slip = speeds[:, :2] + RADIUS * np.stack([-speeds[:, 4], speeds[:, 3]], axis=1)
