@@ -144,11 +144,18 @@ def arranged(balls: Arrangement, **settings) -> MomentSystem:
     return system
 
 
-def trace(system: MomentSystem) -> np.ndarray:
-    """Solve, and return the residual after each field evaluation."""
-    residuals = []
+def trace(system: MomentSystem, *, to_residual: bool = False) -> np.ndarray:
+    """Solve, and return the residual e_M (Eq. 12) after each field evaluation.
+
+    Args:
+        system: The system.
+        to_residual: End when the residual is at most ``rtol``, or not finite, in place of the solve's own criterion.
+    """
+    residuals, ended = [], False
     system.begin()
-    while not residuals or (not system.converged.numpy()[0] and len(residuals) < system.settings.max_evaluations):
+    while not ended and len(residuals) < system.settings.max_evaluations:
         system.iterate()
         residuals.append(float(system.residual.numpy()[0]))
+        reached = residuals[-1] <= system.rtol or not np.isfinite(residuals[-1])
+        ended = reached if to_residual else bool(system.converged.numpy()[0])
     return np.array(residuals)

@@ -27,45 +27,25 @@ class Case:
     dtypes: tuple[str, ...] = ("float32",)
 
 
+def _sizes(cpu: tuple[int, ...], *more: int) -> dict[str, tuple[int, ...]]:
+    return {"cpu": cpu, "cuda": (*cpu, *more)}
+
+
+_USUAL, _BOTH = (243, 1032, 2560, 10000), ("float32", "float64")
 CASES = {
     case.name: case
     for case in (
-        Case(
-            "field",
-            "one all-pairs field evaluation, overlaps included",
-            {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768, 131072)},
-            ("float32", "float64"),
-        ),
-        Case(
-            "force",
-            "field gradient, forces and torques of all balls",
-            {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768, 131072)},
-        ),
-        Case(
-            "induction",
-            "a cold and a warm induction solve to 1e-3, neighbor search included",
-            {"cpu": (243, 1032, 2560, 10000), "cuda": (243, 1032, 2560, 10000, 32768)},
-        ),
+        Case("field", "one all-pairs field evaluation, overlaps included", _sizes(_USUAL, 32768, 131072), _BOTH),
+        Case("force", "field gradient, forces and torques of all balls", _sizes(_USUAL, 32768, 131072)),
+        Case("induction", "a cold and a warm induction solve to 1e-3, neighbor search included", _sizes(_USUAL, 32768)),
         Case(
             "worlds",
             "a warm solve and forces in 1,024 worlds (32 on a CPU) of moving balls",
             {"cpu": (64,), "cuda": (8, 27, 64, 125, 216)},
         ),
-        Case(
-            "scene",
-            "steps of Balls Up while it runs: induction, forces, rigid bodies, host",
-            {"cpu": (243, 2500), "cuda": (243, 2500, 10000)},
-        ),
-        Case(
-            "writing",
-            "runs of Balls Up with and without output, in turns; memory",
-            {"cpu": (243,), "cuda": (2500,)},
-        ),
-        Case(
-            "swarm",
-            "Sakura Tree of very many balls: seconds to the first step, and to write them without physics; memory",
-            {"cpu": (100_000,), "cuda": (100_000,)},
-        ),
+        Case("scene", "steps of Balls Up: induction, forces, rigid bodies, host", _sizes((243, 2500), 10000)),
+        Case("writing", "runs of Balls Up with and without output, in turns", {"cpu": (243,), "cuda": (2500,)}),
+        Case("swarm", "Sakura Tree of very many balls: start, and writing without physics", _sizes((100_000,))),
     )
 }
 

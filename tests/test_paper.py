@@ -11,6 +11,7 @@ from arrangements import relative
 from bench.reference import oracle
 
 sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
+from bench.arrangements import trace
 from bench.paper import __main__ as command
 from bench.paper import crystal_balls
 from bench.paper.output import ORDER, Output
@@ -26,7 +27,7 @@ def course(dynamics, bar, device, iterations=300, curve="tanh"):
     )
     if dynamics != "theta":
         crystal_balls.set_pairs(system, "across")
-    return crystal_balls.trace(system, iterations)
+    return trace(system, to_residual=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from warpmag.errors import InputError
 
 def main(arguments: list[str] | None = None) -> int:
     """Run experiments and return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m bench.paper", description="Run the paper's experiments again.")
+    parser = argparse.ArgumentParser(prog="python -m bench.paper", description="Repeat the paper's experiments.")
     parser.add_argument("experiment", choices=(*ORDER, "all"))
     parser.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     parser.add_argument("--small", action="store_true", help="coarser grids and fewer repetitions, for CI")

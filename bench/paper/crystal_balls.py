@@ -1,8 +1,8 @@
 """The crystal balls of the paper's Fig. 7: 178 fixed inducible balls around a bar magnet.
 
-The paper gives the count and the picture, neither sizes nor strengths. Here the balls fill a plane grid of 16 × 13
-cells, out of which the bar takes the middle 10 × 3, as in the bundled scene; second choice, 14 × 13 cells and a bar of
-4 × 1, where the fields at the balls differ by more. Two strengths of the bar:
+The paper states the count and shows the picture, but no sizes or strengths. Here the balls fill a plane grid of 16 × 13
+cells except the middle 10 × 3, where the bar is, as in the bundled scene. The second choice is 14 × 13 cells and a bar
+of 4 × 1, with a wider range of fields at the balls. Strengths of the bar:
 
 * weak, 1e6 A/m, neodymium: no ball of iron saturates, ‖H‖ is 0.8 to 20 % of Ms;
 * strong, 4e7 A/m, "excessively strong" as in the paper's scenes: ‖H‖ is 0.3 to 8 Ms.
@@ -11,7 +11,6 @@ cells, out of which the bar takes the middle 10 × 3, as in the bundled scene; s
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 
 import warpmag
 from bench.systems import moment_system
@@ -21,17 +20,15 @@ from warpmag.moments.system import MomentSystem
 from warpmag.shapes import lattice
 
 BALL_RADIUS = 0.005
-"""[m]"""
+"""Radius of the balls [m]."""
 PITCH = 0.011
-"""Distance of neighbours [m]; the balls do not touch."""
+"""Distance of neighbors [m]; the balls do not touch."""
 CELLS, OTHER_CELLS = (16, 13, 10, 3), (14, 13, 4, 1)
-"""Cells of the grid along x and y, and those of the bar; the other choice."""
+"""Cells of the grid along x and y, and cells of the bar; the first and the second choice."""
 STRENGTHS = {"weak": 1e6, "strong": 4e7}
 """Magnetization of the bar, along its length [A/m]."""
 PAIRS = ("across", "in plane", "random")
-"""Starts M1 = −M2 of the pairs: across the plane of the balls; in it, across the length of the bar; in a random
-direction at each ball."""
-
+"""Initial directions M1 = −M2 of the pairs: normal to the plane of the balls; in the plane, across the bar; random."""
 
 @dataclass(frozen=True)
 class Layout:
@@ -41,18 +38,16 @@ class Layout:
     bar_half_extents: tuple[float, float, float]
     bar: lattice.Lattice
 
-
 def layout(cells: tuple[int, int, int, int] = CELLS) -> Layout:
-    """Return where everything is."""
+    """Return the positions of balls and bar."""
     columns, rows, length, width = cells
     places = [(i - 0.5 * (columns - 1), j - 0.5 * (rows - 1), 0.0) for j in range(rows) for i in range(columns)]
     balls = [(x, y, z) for x, y, z in places if abs(x) > 0.5 * length or abs(y) > 0.5 * width]
     half = (0.5 * length * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4)
     return Layout(PITCH * np.array(balls), half, lattice.fill([lattice.box(half)], 0.5 * PITCH))
 
-
 def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **settings) -> MomentSystem:
-    """Return the balls, first, and the bar's moments, ready to solve.
+    """Return a system of the balls, followed by the bar's moments.
 
     Args:
         strength: Magnetization of the bar [A/m].
@@ -78,7 +73,6 @@ def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **s
     system.moments.assign(moments)
     return system
 
-
 def applied_field(strength: float) -> np.ndarray:
     """Return the field at the balls [A/m] of a bar of magnetization ``strength`` [A/m], shape [178, 3]."""
     place = layout()
@@ -93,9 +87,8 @@ def applied_field(strength: float) -> np.ndarray:
         device="cpu",
     )
 
-
 def set_pairs(system: MomentSystem, start: str, seed: int = 0):
-    """Let the pairs of a system start in one of :data:`PAIRS`."""
+    """Set the pairs of a system to one of the directions :data:`PAIRS`."""
     if start == "random":
         axis = np.random.default_rng(seed).normal(size=(system.count, 3))
     else:
@@ -103,25 +96,10 @@ def set_pairs(system: MomentSystem, start: str, seed: int = 0):
     axis /= np.linalg.norm(axis, axis=1)[:, None]
     _pairs(system).set_pairs(axis, -axis)
 
-
 def directions(system: MomentSystem) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions of M1 and M2 of a system's pairs, each of shape [n, 3]."""
     return _pairs(system).first.numpy(), _pairs(system).second.numpy()
 
-
 def _pairs(system: MomentSystem) -> SubmagnetizationPairs:
     assert isinstance(system.dynamics, SubmagnetizationPairs)
     return system.dynamics
-
-
-def trace(system: MomentSystem, iterations: int) -> np.ndarray:
-    """Solve, and return the magnetization error e_M (Eq. 12) after each field evaluation, at most ``iterations``."""
-    errors = []
-    system.begin()
-    for _ in range(min(iterations, system.settings.max_evaluations)):
-        system.iterate()
-        errors.append(float(system.residual.numpy()[0]))
-        if errors[-1] <= system.rtol or not np.isfinite(errors[-1]):
-            break
-    wp.synchronize_device(system.device)
-    return np.array(errors)

@@ -1,10 +1,10 @@
-"""Fig. 10: magnetic force field over the cross-section of a uniformly magnetized spherical magnet, both force laws.
+"""Fig. 10: magnetic force field over the cross-section of a uniformly magnetized sphere, both force laws.
 
-The paper gives neither sizes nor what the force acts on. Two readings are measured:
+The paper states neither sizes nor the body on which the force acts. Two readings are evaluated:
 
-* inside: the sphere is inducible, sampled by a cubic lattice of moments, and a uniform field magnetizes it; shown is
-  the force density on the moments of its middle layer, from all others. Only the lattice's grain and the surface make
-  a gradient, since the field of a uniformly magnetized sphere is uniform within;
+- inside: the sphere is inducible, sampled by a cubic lattice of moments, and a uniform field magnetizes it. The figure
+  shows the force density on the moments of the middle layer. The gradient is due to the lattice and the surface only,
+  since the field inside a uniformly magnetized sphere is uniform;
 - outside: the sphere is a permanent magnet, and the force acts on a small inducible ball at each point around it.
 """
 
@@ -20,9 +20,9 @@ from warpmag.moments.system import MomentSystem
 from warpmag.shapes import lattice
 
 RADIUS = 0.02
-"""Of the sphere [m]."""
+"""Radius of the sphere [m]."""
 BALL_RADIUS = 0.0005
-"""Of the small ball outside [m]."""
+"""Radius of the small ball outside [m]."""
 LAWS = {"kelvin": "(a) Kim et al. 2018 (Kelvin, Eq. 13)", "zeeman": "(b) the paper (Zeeman, Eq. 4)"}
 LEVELS = {"weak": 0.1, "strong": 0.99}
 """Magnetization of the sphere over Ms: weak, and close to saturation."""
@@ -38,7 +38,7 @@ def run(output: Output):
         points, densities, pitch = reading(LEVELS[level], output)
         sizes = {law: np.linalg.norm(density, axis=1) for law, density in densities.items()}
         _draw_row(row, f"{name}, {level} magnet", points, densities, sizes, pitch)
-        felt = sizes["kelvin"] > 1e-3 * sizes["kelvin"].mean()  # in the middle there is none, only rounding
+        felt = sizes["kelvin"] > 1e-3 * sizes["kelvin"].mean()  # the force in the middle is rounding
         ratio = sizes["zeeman"][felt] / sizes["kelvin"][felt]
         values = {
             "mean_kelvin": float(sizes["kelvin"].mean()),
@@ -79,8 +79,8 @@ def _inside(level: float, output: Output):
 def _outside(level: float, output: Output):
     """Return points [m] around the magnet, force densities [N/m³] by law, and the distance of points [m].
 
-    Every ball shares a world with the magnet alone: balls do not act on one another. A uniformly magnetized sphere is
-    one ball-averaged moment, exactly.
+    Every ball is alone with the magnet in a world, so balls do not act on each other. A uniformly magnetized sphere is
+    exactly one ball-averaged moment.
     """
     count = 31 if output.small else 61
     index = np.linspace(-2.5 * RADIUS, 2.5 * RADIUS, count)
@@ -118,8 +118,8 @@ def _draw_row(row, title, points, densities, sizes, pitch):
     for axis, law in zip(row, LAWS, strict=False):
         _draw(axis, points, sizes[law], pitch, norm, "force density [N/m³]")
         unit = densities[law] / np.maximum(sizes[law], 1e-300)[:, None]
-        some = slice(None, None, max(1, len(points) // 400))
-        axis.quiver(*points[some, :2].T, *unit[some, :2].T, scale=45, width=0.002, color="k", alpha=0.6)
+        sparse = slice(None, None, max(1, len(points) // 400))
+        axis.quiver(*points[sparse, :2].T, *unit[sparse, :2].T, scale=45, width=0.002, color="k", alpha=0.6)
         axis.set_title(f"{LAWS[law]}\n{title}", fontsize=9)
     _draw(row[2], points, sizes["zeeman"] / sizes["kelvin"], pitch, Normalize(1.0, 8.0), "ratio")
     row[2].set_title(f"Zeeman over Kelvin\n{title}", fontsize=9)

@@ -4,15 +4,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Circle, Rectangle
 
+from bench.arrangements import trace
 from bench.paper import crystal_balls
 from bench.paper.output import Output, table
 from warpmag.declarations.magnets import SATURATION_OF_IRON
 
 METHODS = {"llg": ("clamped", "Kim et al. 2018"), "theta-euler": ("tanh", "the paper"), "theta": ("tanh", "warpmag")}
-"""Dynamics, its curve and whose it is."""
+"""Curve and author of each dynamics."""
 ITERATIONS = 100
 _TILT = np.array([[1.0, 0.0, 0.45], [0.0, 1.0, 0.3]])
-"""Oblique projection onto the page, so that what stands across the plane of the balls is seen."""
+"""Oblique projection onto the page, which shows directions normal to the plane of the balls."""
 
 
 def run(output: Output):
@@ -21,11 +22,11 @@ def run(output: Output):
     figure, axes = plt.subplots(len(crystal_balls.STRENGTHS), columns, figsize=(5.0 * columns, 8.6), squeeze=False)
     rows = []
     for row, (name, strength) in zip(axes, crystal_balls.STRENGTHS.items(), strict=True):
-        for axis, (dynamics, (curve, whose)) in zip(row[1:], METHODS.items(), strict=True):
+        for axis, (dynamics, (curve, author)) in zip(row[1:], METHODS.items(), strict=True):
             pairs, error, evaluations = _settle(dynamics, curve, strength, output.device)
-            _draw(axis, pairs, f"{whose} ({dynamics}), {name} bar\n$e_M$ = {error:.1e} after {evaluations} iterations")
+            _draw(axis, pairs, f"{author} ({dynamics}), {name} bar\n$e_M$ = {error:.1e} after {evaluations} iterations")
             output.record(strength=name, dynamics=dynamics, curve=curve, error=error, iterations=evaluations)
-            rows.append([name, whose, f"`{dynamics}`", evaluations, f"{error:.1e}"])
+            rows.append([name, author, f"`{dynamics}`", evaluations, f"{error:.1e}"])
         _draw(row[0], _before(output.device), f"before, {name} bar")
     figure.tight_layout()
     output.report(
@@ -35,7 +36,7 @@ def run(output: Output):
 dynamics "quickly converges" (c).
 
 **Here:** 178 balls around a bar, M1 red and M2 blue, after at most {ITERATIONS} iterations at one step for both
-strengths. Where the two lie on each other, the ball is saturated.
+strengths. Where the two coincide, the ball is saturated.
 
 {output.save(figure)}
 
@@ -55,7 +56,7 @@ def _settle(dynamics: str, curve: str, strength: float, device: str):
     system = crystal_balls.make_system(strength, dynamics, device, curve=curve, max_evaluations=ITERATIONS)
     if dynamics != "theta":
         crystal_balls.set_pairs(system, "across")
-    errors = crystal_balls.trace(system, ITERATIONS)
+    errors = trace(system, to_residual=True)
     if dynamics == "theta":
         pairs = _symmetric_pair(system.magnetizations().numpy() / SATURATION_OF_IRON)
     else:
@@ -64,7 +65,7 @@ def _settle(dynamics: str, curve: str, strength: float, device: str):
 
 
 def _symmetric_pair(reduced: np.ndarray):
-    """Return the pair that the θ flow stands for: ‖M‖ = Ms cos θ, M1 and M2 in the plane of M and the page's normal."""
+    """Return the pair of a state of the θ flow: ‖M‖ = Ms cos θ, M1 and M2 in the plane of M and the page's normal."""
     cosine = np.minimum(np.linalg.norm(reduced, axis=1), 1.0)[:, None]
     half = np.sqrt(1.0 - cosine**2) * np.array([0.0, 0.0, 1.0])
     return reduced + half, reduced - half

@@ -3,6 +3,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
+from bench.arrangements import trace
 from bench.paper import crystal_balls
 from bench.paper.output import Output, table
 from warpmag.moments.dynamics import STEP
@@ -19,18 +20,18 @@ STEPS = (0.01, 0.03, 0.1, STEP, 1.0, 2.0)
 BARS = (1e6, 1e7, 4e7, 1e8)
 """Second choices: steps κ, and magnetizations of the bar [A/m]."""
 PATIENCE = 5000
-"""Iterations after which a second choice is given up."""
+"""Largest number of iterations of a second choice."""
 
 
 def run(output: Output):
     """Run the experiment."""
     figure, axes = plt.subplots(1, len(PANELS), figsize=(15.0, 4.4), sharey=True)
-    found = {}
+    courses = {}
     for axis, (title, methods) in zip(axes, PANELS, strict=True):
         for dynamics, curve in methods:
             for name in crystal_balls.STRENGTHS:
                 errors = _errors(dynamics, curve, name, output)
-                found[dynamics, name] = errors
+                courses[dynamics, name] = errors
                 style = {"color": COLORS[name], "ls": "-" if dynamics != "theta-euler" else "--"}
                 marker = "o" if dynamics == "theta" else None
                 label = f"{dynamics}, {name} bar"
@@ -41,7 +42,7 @@ def run(output: Output):
     axes[0].set_ylabel("$e_M$ (Eq. 12)")
     figure.tight_layout()
     others = "" if output.small else _second_choices(output)
-    output.report(_text(output.save(figure), found, others))
+    output.report(_text(output.save(figure), courses, others))
     plt.close(figure)
 
 
@@ -56,9 +57,9 @@ def _make_system(dynamics, curve, bar, device, iterations, *, step=STEP, start="
 
 
 def _errors(dynamics, curve, strength, output):
-    """Return and record the course of the error."""
+    """Return and record the error after each iteration."""
     system = _make_system(dynamics, curve, crystal_balls.STRENGTHS[strength], output.device, ITERATIONS)
-    errors = crystal_balls.trace(system, ITERATIONS)
+    errors = trace(system, to_residual=True)
     output.record(
         strength=strength,
         dynamics=dynamics,
@@ -75,7 +76,7 @@ def _outcome(iterations, error) -> str:
 
 
 def _second_choices(output: Output) -> str:
-    """Other steps, strengths and starts than the figure's."""
+    """Return the section about other steps, strengths, arrangements and starts than the figure's."""
     methods = [method for _, panel in PANELS for method in panel]
     explicit = [method for method in methods if method[0] != "theta"]
     strengths = crystal_balls.STRENGTHS
@@ -84,7 +85,7 @@ def _second_choices(output: Output) -> str:
         cells = []
         for choice in choices:
             system = _make_system(dynamics, curve, device=output.device, iterations=PATIENCE, **choice)
-            errors = crystal_balls.trace(system, PATIENCE)
+            errors = trace(system, to_residual=True)
             iterations, error = len(errors), float(errors[-1])
             output.record(dynamics=dynamics, curve=curve, **choice, iterations=iterations, error=error)
             cells.append(_outcome(iterations, error))
@@ -106,10 +107,11 @@ def _second_choices(output: Output) -> str:
         for name, bar in strengths.items()
     ]
     columns, rows, length, width = crystal_balls.OTHER_CELLS
-    return f"""**Does it hang on the constants left open?** Iterations, or (error left after {PATIENCE:,}).
+    return f"""**Does the result depend on the constants that the paper leaves open?** Iterations, or (error after
+{PATIENCE:,}).
 
-Other steps. A step small enough saves damping-only LLG and even LLG under the strong bar, at the price of hundreds and
-thousands of iterations; a step too large loses `theta-euler` there, too:
+Other steps. With small steps damping-only LLG and even LLG converge under the strong bar, in hundreds and thousands of
+iterations. With large steps `theta-euler` does not converge there:
 
 {table(["dynamics", "bar", *(f"κ = {step:g}" for step in STEPS)], steps)}
 
@@ -121,14 +123,14 @@ Another arrangement, {columns} × {rows} cells and a bar of {length} × {width},
 
 {table(["dynamics", *(f"{bar:g} A/m" for bar in BARS)], layouts)}
 
-Other starts of the pairs, κ = {STEP:g}. Where M1 = −M2 lies along the field to come, every dynamics of pairs crawls: a
-submagnetization only ever moves across itself, so M along the pair's axis grows from nothing. `theta` has no pairs:
+Other starts of the pairs, κ = {STEP:g}. Where M1 = −M2 is along the field, every dynamics of pairs is slow: a
+submagnetization moves only perpendicular to itself, so M along the pair's axis grows from zero. `theta` has no pairs:
 
 {table(["dynamics", "bar", *crystal_balls.PAIRS], starts)}"""
 
 
-def _text(image, found, others) -> str:
-    rows = [[f"`{dynamics}`", name, _outcome(len(errors), errors[-1])] for (dynamics, name), errors in found.items()]
+def _text(image, courses, others) -> str:
+    rows = [[f"`{dynamics}`", name, _outcome(len(errors), errors[-1])] for (dynamics, name), errors in courses.items()]
     return f"""## Fig. 8: magnetization error over iterations
 
 **Paper:** (a) Kim et al. 2018 do not converge under the strong bar and slowly under the weak one; (b) the paper's

@@ -1,4 +1,4 @@
-"""What an experiment leaves behind: JSON lines, figures and its section of the report."""
+"""Output of an experiment: JSON lines, figures and its section of the report."""
 
 import json
 import re
@@ -10,7 +10,7 @@ from bench.machine import describe
 ORDER = ("fig7", "fig8", "fig9", "fig10", "uniqueness", "stability", "table1")
 """The experiments, in the order of the report."""
 _MARK = "<!-- section {} -->"
-_HEAD = """# The paper's experiments, run again
+_HEAD = """# The paper's experiments, repeated
 
 Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation". Each section gives what the paper shows, in its
 words or numbers (its images are not redistributed here), beside what was measured. Written by `python -m bench.paper`.
@@ -19,13 +19,13 @@ words or numbers (its images are not redistributed here), beside what was measur
 
 @dataclass
 class Output:
-    """One experiment's results.
+    """Results of one experiment.
 
     Attributes:
         name: The experiment.
-        folder: Where files go.
+        folder: Folder of the files.
         device: Name of the Warp device.
-        small: Whether to run the small version, for continuous integration.
+        small: True for the small version, for continuous integration.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Output:
     _started: bool = False
 
     def record(self, **values):
-        """Append a JSON line; print it without the machine and without long lists."""
+        """Write a JSON line; print it without the machine and without lists."""
         self._machine = self._machine or describe(self.device)
         line = {"experiment": self.name, "small": self.small, **values}
         print(json.dumps({key: value for key, value in line.items() if not isinstance(value, list)}))
@@ -51,7 +51,7 @@ class Output:
         return f"![{self.name}]({path.name})"
 
     def report(self, text: str, part: str = ""):
-        """Set this experiment's section of the report, or one part of it; all others stay."""
+        """Replace this experiment's section of the report, or one part of it; keep all other sections."""
         self._machine = self._machine or describe(self.device)
         path = self.folder / "report.md"
         sections = _read_sections(path)

@@ -1,8 +1,8 @@
 """Table 1: times per step of induction Ti, magnetic forces Tf and rigid bodies Tr.
 
-The paper measures "frames" of one 1 ms step each, over 1,000 of them. A step here may hold several substeps, each with
-its own induction and forces; the times are those of the whole step. Pairs that crawl cost seconds a step, so every case
-has the same time to itself, and its row says how many steps it did in it.
+The paper measures 1,000 "frames" of one 1 ms step each. A step here may have several substeps, each with its own
+induction and forces; times are those of the whole step. Slow pairs cost seconds a step, so every case has the same wall
+time, and its row states the number of steps.
 """
 
 from bench.paper.output import Output, table
@@ -11,9 +11,9 @@ from warpmag.declarations.magnets import PRESETS
 
 SECONDS, SMALL_SECONDS = 1.0, 0.05
 RTOL = 1e-2
-"""Magnetization error at which induction ends: below it the pairs of ``theta-euler`` crawl in a pile of balls."""
+"""Magnetization error at which induction ends: below it ``theta-euler`` converges slowly in a pile of balls."""
 PATIENCE = {"cpu": 55.0, "gpu": 4.0}
-"""Time after which a run is ended [s]: the twelve take a quarter of an hour on two cores, two minutes on a GPU."""
+"""Time after which a run is ended [s]: the twelve runs take 15 minutes on two cores, two minutes on a GPU."""
 PAPERS_TIMES = {
     ("balls_up", "kim2018"): (20, 3.5, 14),
     ("balls_up", "paper"): (1.8, 3.8, 14),
@@ -58,12 +58,12 @@ def _text(rows, kind) -> str:
 
 **Paper:** milliseconds per 1 ms step on an Intel i7-8700, 1,000 steps; its rigid bodies are Bullet's.
 
-**Here:** rigid bodies are Newton's XPBD, and all three methods share every line of code but the dynamics, the curve and
-the force law. On a CPU each run has two cores. Times are means over the steps done; a case ends after
-{round(1000 * SECONDS):,} steps or {PATIENCE[kind]:g} s, and its last columns tell what had become of the scene by then.
+**Here:** rigid bodies are Newton's XPBD, and all three methods differ only in dynamics, curve and force law. On a CPU
+each run has two cores. Times are means over the steps done; a case ends after
+{round(1000 * SECONDS):,} steps or {PATIENCE[kind]:g} s, and its last columns describe the scene at that time.
 
-Induction ends at an error of {RTOL:g} or after 1,000 evaluations. The paper does not say at which error it calls a
-magnetization converged; "until every M converges" may well mean that it stopped moving, which a pair that crawls does
-long before it is right. In weak fields, before a magnet has come near, pairs do not reach the relative error at all.
+Induction ends at an error of {RTOL:g} or after 1,000 evaluations. The paper does not state at which error a
+magnetization is converged; "until every M converges" may mean that M stopped moving, which slow pairs do long before
+their error is small. In weak fields, before a magnet has come near, pairs do not reach the relative error at all.
 
 {table(head, rows)}"""

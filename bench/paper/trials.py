@@ -1,7 +1,7 @@
-"""Runs of the bundled scenes by one method or another, each in a process of its own.
+"""Runs of the bundled scenes by published methods, each in its own process.
 
-On a CPU each process is pinned to two cores, and as many run at once as there are pairs of cores; on a GPU they run one
-after the other, or several at once where nobody looks at the time.
+On a CPU each process is pinned to two cores, and one process runs per pair of cores. On a GPU they run one after the
+other, or several at once if their times are not reported.
 """
 
 import multiprocessing
@@ -26,7 +26,11 @@ SCENES = ("balls_up", "alphabets", "falling_magnet", "sakura_tree")
 _CORES = 2
 """Cores of a trial on a CPU."""
 _AS_PUBLISHED = {"balls_up": {"conductivity": 0.0}}
-"""Parameters of scenes that are bundled with what the paper has not."""
+"""Parameters that remove features which the paper does not have."""
+
+
+_FIGURES = "magnets held held_rms_speed held_median_speed rms_speed peak_speed overlap farthest".split()
+"""Statistics of a run that are reported."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +42,12 @@ class Trial:
         method: Name of a published method, of :data:`warpmag.declarations.magnets.PRESETS`.
         seconds: Simulated time [s].
         device: Name of the Warp device.
-        patience: Time after which the run is ended [s], the first step not counted.
+        patience: Time after which the run is ended [s], without the first step.
         rtol: Magnetization error at which induction ends.
-        max_evaluations: Field evaluations after which it ends at the latest.
+        max_evaluations: Largest number of field evaluations of an induction.
         pair_step: Step κ of pairs of submagnetizations, see ``warpmag.moments.dynamics``.
-        force: Force law in place of the method's own.
-        parameters: Parameters of the scene's script, where it is not to be as bundled.
+        force: Force law in place of the method's own; None keeps it.
+        parameters: Parameters of the scene's script that differ from the bundled scene.
     """
 
     scene: str
@@ -62,8 +66,8 @@ def run_trials(trials: Sequence[Trial], workers: int = 1) -> Iterator[tuple[Tria
     """Run trials and yield each with its outcome, in their order.
 
     Args:
-        trials: What to run, all on one device.
-        workers: How many at once on a GPU.
+        trials: The trials, all on one device.
+        workers: Number of trials at once on a GPU.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if trials and trials[0].device == "cpu":
@@ -83,10 +87,10 @@ def _pin(shares) -> None:
 
 
 def run_trial(trial: Trial) -> dict:
-    """Run a trial and return what became of the scene, ready for a JSON line."""
+    """Run a trial and return the values of its JSON line."""
     with tempfile.TemporaryDirectory() as folder:
         simulation = _load(trial, Path(folder))
-    simulation.frame_rate = 1.0 / simulation.step_size  # looks after every step whether patience has ended
+    simulation.frame_rate = 1.0 / simulation.step_size  # checks the patience after every step
     simulation.run(1)  # compiles kernels, grows buffers and captures graphs
     ended, began = "", time.perf_counter()
     steps = max(1, round(trial.seconds / simulation.step_size))
@@ -108,25 +112,18 @@ def run_trial(trial: Trial) -> dict:
         "tr_ms": rigid,
         "evaluations_per_substep": sum(figures.evaluations) / max(figures.substeps, 1),
         "unconverged": figures.unconverged / max(figures.substeps, 1),
-        "magnets": figures.magnets,
-        "held": figures.held,
-        "held_rms_speed": figures.held_rms_speed,
-        "held_median_speed": figures.held_median_speed,
-        "rms_speed": figures.rms_speed,
-        "peak_speed": figures.peak_speed,
-        "overlap": figures.overlap,
-        "farthest": figures.farthest,
+        **{name: getattr(figures, name) for name in _FIGURES},
     }
 
 
 def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
-    """Load a trial's scene, authored in ``folder`` if it is not the bundled one."""
+    """Load the scene of a trial, authored in ``folder`` if it differs from the bundled one."""
     stage, method = bundled()[trial.scene], PRESETS[trial.method]
     parameters = _AS_PUBLISHED.get(trial.scene, {}) | trial.parameters
     if parameters:
         stage = folder / f"{trial.scene}.usdc"
         import_module(f"warpmag.scenes_usd.{trial.scene}").author(stage, **parameters)
-    with mock.patch.object(dynamics, "STEP", trial.pair_step):  # a scene leaves it at its default
+    with mock.patch.object(dynamics, "STEP", trial.pair_step):  # scenes have no attribute for it
         return warpmag.Simulation(
             stage,
             dynamics=method.dynamics,
@@ -141,20 +138,12 @@ def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
 def outcome_head() -> list[str]:
     """Column heads of :func:`outcome_cells`."""
     head = ["substeps per step", "field evaluations per substep", "substeps not converged", "held"]
-    return [
-        *head,
-        "RMS speed of these [cm/s]",
-        "median",
-        "of all, RMS",
-        "peak [m/s]",
-        "farthest [m]",
-        "penetration",
-        "end",
-    ]
+    head += ["RMS speed of these [cm/s]", "median", "of all, RMS", "peak [m/s]"]
+    return [*head, "farthest [m]", "penetration", "end"]
 
 
 def outcome_cells(values: dict) -> list[str]:
-    """What became of a scene, as cells of a table."""
+    """Outcome of a scene as cells of a table."""
     return [
         f"{values['substeps']:.1f}",
         f"{values['evaluations_per_substep']:.1f}",

@@ -1,4 +1,4 @@
-"""Section 6.3: whatever converges, converges to the same magnetization."""
+"""Section 6.3: all methods that converge agree in the magnetization."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def run(output: Output):
         f"""## Section 6.3: uniqueness
 
 **Paper:** the mean of ‖M_K − M_O‖/‖M_K‖ between Kim et al. 2018 and the paper's method is {PAPERS_DEVIATION:g} under
-the weak bar. The two have different curves, so part of it is the curves' and not the dynamics'.
+the weak bar. The two have different curves, so part of the difference is due to the curves.
 
 **Here:** on one curve each, in float64, to a residual of {RTOL:g}; "from Newton" is ‖M − M_N‖/‖M_N‖ against a float64
 Newton solution that shares no code with the kernels, "from `theta`" the same against the library's method. At most
@@ -82,7 +82,7 @@ def _agreement(strength: str, curve: str, output: Output) -> list[list]:
 
 
 def _curves_apart(bar: float, output: Output) -> list[str]:
-    """The paper's own comparison, which mixes curves."""
+    """Return the row of the paper's own comparison, which mixes curves."""
     _, kim = _solve("llg", bar, "clamped", output.device, rtol=1e-6)
     _, ours = _solve("theta", bar, "tanh", output.device, rtol=1e-6)
     deviation = float(np.mean(np.linalg.norm(kim - ours, axis=1) / np.linalg.norm(kim, axis=1)))
