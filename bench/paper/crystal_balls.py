@@ -30,6 +30,7 @@ STRENGTHS = {"weak": 1e6, "strong": 4e7}
 PAIRS = ("across", "in plane", "random")
 """Initial directions M1 = −M2 of the pairs: normal to the plane of the balls; in the plane, across the bar; random."""
 
+
 @dataclass(frozen=True)
 class Layout:
     """Positions [m] of the balls, shape [178, 3], half extents [m] of the bar, and its moments."""
@@ -38,6 +39,7 @@ class Layout:
     bar_half_extents: tuple[float, float, float]
     bar: lattice.Lattice
 
+
 def layout(cells: tuple[int, int, int, int] = CELLS) -> Layout:
     """Return the positions of balls and bar."""
     columns, rows, length, width = cells
@@ -45,6 +47,7 @@ def layout(cells: tuple[int, int, int, int] = CELLS) -> Layout:
     balls = [(x, y, z) for x, y, z in places if abs(x) > 0.5 * length or abs(y) > 0.5 * width]
     half = (0.5 * length * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4)
     return Layout(PITCH * np.array(balls), half, lattice.fill([lattice.box(half)], 0.5 * PITCH))
+
 
 def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **settings) -> MomentSystem:
     """Return a system of the balls, followed by the bar's moments.
@@ -73,6 +76,7 @@ def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **s
     system.moments.assign(moments)
     return system
 
+
 def applied_field(strength: float) -> np.ndarray:
     """Return the field at the balls [A/m] of a bar of magnetization ``strength`` [A/m], shape [178, 3]."""
     place = layout()
@@ -87,6 +91,7 @@ def applied_field(strength: float) -> np.ndarray:
         device="cpu",
     )
 
+
 def set_pairs(system: MomentSystem, start: str, seed: int = 0):
     """Set the pairs of a system to one of the directions :data:`PAIRS`."""
     if start == "random":
@@ -96,9 +101,11 @@ def set_pairs(system: MomentSystem, start: str, seed: int = 0):
     axis /= np.linalg.norm(axis, axis=1)[:, None]
     _pairs(system).set_pairs(axis, -axis)
 
+
 def directions(system: MomentSystem) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions of M1 and M2 of a system's pairs, each of shape [n, 3]."""
     return _pairs(system).first.numpy(), _pairs(system).second.numpy()
+
 
 def _pairs(system: MomentSystem) -> SubmagnetizationPairs:
     assert isinstance(system.dynamics, SubmagnetizationPairs)

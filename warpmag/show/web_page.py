@@ -123,10 +123,9 @@ def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
         )
         scales = _values(instancer.GetScalesAttr(), codes, Vt.Vec3fArray, np.ones((count, 3)))[..., 0]
         for number in range(len(groups)):
-            members = group[kinds[0]] == number
+            own = group[kinds[0]] == number
             points, faces = shapes[int(np.argmax(group == number))]
-            arrays = (values[:, members] for values in (positions, turns, scales))
-            yield _Batch(points, faces, *arrays, palette, kinds[:, members])
+            yield _Batch(points, faces, positions[:, own], turns[:, own], scales[:, own], palette, kinds[:, own])
 
 
 def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
