@@ -9,6 +9,6 @@ from warpmag.moments.system import MomentSystem, SolverSettings
 def moment_system(**arguments) -> MomentSystem:
     """Return a system from the arguments of :class:`MomentSystem` and the fields of its records."""
     for name, record in (("material", Material), ("settings", SolverSettings)):
-        given = {field.name for field in fields(record)} & arguments.keys()
-        arguments[name] = record(**{field: arguments.pop(field) for field in given})
+        names = {field.name for field in fields(record)} & arguments.keys()
+        arguments[name] = record(**{field: arguments.pop(field) for field in names})
     return MomentSystem(**arguments)

@@ -150,7 +150,7 @@ def _text(image, rows) -> str:
 **Here the opposite holds**: Eq. 4 is Eq. 13 plus f'(H) ∇H (2M + H), which is nowhere against it. Up to eight times
 Kelvin's force in weak fields, it is equal in saturation, where f' vanishes. Inside, on the moments of a sampled
 inducible sphere that a uniform field magnetizes; outside, on a small ball around a permanent sphere. Magnetization is
-horizontal; both laws share a colour scale.
+horizontal; both laws share a color scale.
 
 {image}
 

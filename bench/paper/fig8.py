@@ -79,33 +79,27 @@ def _second_choices(output: Output) -> str:
     """Return the section about other steps, strengths, arrangements and starts than the figure's."""
     methods = [method for _, panel in PANELS for method in panel]
     explicit = [method for method in methods if method[0] != "theta"]
-    strengths = crystal_balls.STRENGTHS
 
-    def outcomes(dynamics, curve, choices):
-        cells = []
-        for choice in choices:
-            system = _make_system(dynamics, curve, device=output.device, iterations=PATIENCE, **choice)
-            errors = trace(system, to_residual=True)
-            iterations, error = len(errors), float(errors[-1])
-            output.record(dynamics=dynamics, curve=curve, **choice, iterations=iterations, error=error)
-            cells.append(_outcome(iterations, error))
-        return cells
+    def outcome(dynamics, curve, choice):
+        system = _make_system(dynamics, curve, device=output.device, iterations=PATIENCE, **choice)
+        errors = trace(system, to_residual=True)
+        iterations, error = len(errors), float(errors[-1])
+        output.record(dynamics=dynamics, curve=curve, **choice, iterations=iterations, error=error)
+        return _outcome(iterations, error)
 
-    steps = [
-        [f"`{d}`", name, *outcomes(d, c, [{"bar": bar, "step": step} for step in STEPS])]
-        for d, c in explicit
-        for name, bar in strengths.items()
-    ]
-    bars = [[f"`{d}`", *outcomes(d, c, [{"bar": bar} for bar in BARS])] for d, c in methods]
-    layouts = [
-        [f"`{d}`", *outcomes(d, c, [{"bar": bar, "cells": crystal_balls.OTHER_CELLS} for bar in BARS])]
-        for d, c in methods
-    ]
-    starts = [
-        [f"`{d}`", name, *outcomes(d, c, [{"bar": bar, "start": start} for start in crystal_balls.PAIRS])]
-        for d, c in explicit
-        for name, bar in strengths.items()
-    ]
+    def rows_of(methods, name, values):
+        """Return a row of outcomes over the ``values`` of a setting for each method and strength."""
+        return [
+            [f"`{d}`", label, *(outcome(d, c, {"bar": bar, name: value}) for value in values)]
+            for d, c in methods
+            for label, bar in crystal_balls.STRENGTHS.items()
+        ]
+
+    def rows_of_bars(**choice):
+        return [[f"`{d}`", *(outcome(d, c, {"bar": bar, **choice}) for bar in BARS)] for d, c in methods]
+
+    steps, starts = rows_of(explicit, "step", STEPS), rows_of(explicit, "start", crystal_balls.PAIRS)
+    bars, layouts = rows_of_bars(), rows_of_bars(cells=crystal_balls.OTHER_CELLS)
     columns, rows, length, width = crystal_balls.OTHER_CELLS
     return f"""**Does the result depend on the constants that the paper leaves open?** Iterations, or (error after
 {PATIENCE:,}).

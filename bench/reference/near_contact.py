@@ -181,9 +181,9 @@ class NearContacts:
         crowding = crowding_weight(np.bincount(i, both, n) + np.bincount(j, both, n))
         gap = (self.distance - a - b) / self.scale
         self.present = crowding[i] * crowding[j]
-        alike = self.present * similarity(a, b)
-        self.quadrupole = [alike * factor for factor in quadrupole_window(self.distance, a, b)]
-        share = (w[i] * w[j] * alike)[:, None]
+        weight = self.present * similarity(a, b)
+        self.quadrupole = [weight * factor for factor in quadrupole_window(self.distance, a, b)]
+        share = (w[i] * w[j] * weight)[:, None]
         functions = [conductances(gap, y[ball], y[other]) for ball, other in ((i, j), (j, i))]
         self.value = [share * self.scale[:, None] * value for value, _ in functions]  # of ball i and of ball j
         self.slope = [share * slope for _, slope in functions]
