@@ -46,7 +46,7 @@ def oracle_at(system: MomentSystem, rows) -> tuple[np.ndarray, np.ndarray]:
         others = np.arange(len(x)) != i
         near = {"radii": radius, "target_radii": radius}
         h[k] = oracle.h_field(x[others], m[others], x[i : i + 1], **near)
-        force[k] = oracle.kelvin_force(m[i : i + 1], oracle.gradient_at(x[others], m[others], x[i : i + 1], **near))
+        force[k] = oracle.kelvin_force(m[i : i + 1], oracle.field_gradient(x[others], m[others], x[i : i + 1], **near))
     return h, force
 
 
@@ -121,7 +121,7 @@ def run_worlds(count: int, device) -> dict:
     own = slice((worlds - 1) * count, worlds * count)
     x, m = (a.numpy()[own].astype(float) for a in (system.positions, system.moments))
     gradients = [
-        oracle.gradient_at(np.delete(x, i, 0), np.delete(m, i, 0), x[i : i + 1], radii=RADIUS, target_radii=RADIUS)
+        oracle.field_gradient(np.delete(x, i, 0), np.delete(m, i, 0), x[i : i + 1], radii=RADIUS, target_radii=RADIUS)
         for i in range(count)
     ]
     expected = np.concatenate([oracle.kelvin_force(m[i : i + 1], gradient) for i, gradient in enumerate(gradients)])

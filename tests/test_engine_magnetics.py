@@ -89,7 +89,7 @@ def test_balls_that_nearly_touch_pull_harder_than_dipoles(device):
     dipoles, _, _ = wrenches(model, external_field=tuple(field), rtol=1e-5)
     applied = field + oracle.h_field([[0.0, 0.0, 0.1]], [[0.0, 0.0, M * VOLUME]], x)
     exact, near = contact_oracle.equilibrium(x, R, applied, saturation=SATURATION_OF_IRON)
-    pull = oracle.gradient_at([[0.0, 0.0, 0.1]], [[0.0, 0.0, M * VOLUME]], x)
+    pull = oracle.field_gradient([[0.0, 0.0, 0.1]], [[0.0, 0.0, M * VOLUME]], x)
     near += oracle.kelvin_force(VOLUME * exact.magnetizations, pull)
     np.testing.assert_allclose(forces[:3], near, atol=1e-3 * np.abs(near).max())  # of rtol, some ten times amplified
     assert np.abs(forces[:3]).max() > 2.0 * np.abs(dipoles[:3]).max()

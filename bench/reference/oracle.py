@@ -145,23 +145,21 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
     return h
 
 
-def field_gradient(positions, moments, *, radii=None, bodies=None, smoothing=0.0, chunk=256):
-    """Gradient ∂H_k/∂x_l [A/m²], shape [n, 3, 3], of the moments' field at each other; see :func:`h_field`."""
-    positions, moments, targets, radii, target_radii, exclude = _prepare(positions, moments, None, radii, None, bodies)
+def field_gradient(
+    positions, moments, targets=None, *, radii=None, target_radii=None, bodies=None, smoothing=0.0, chunk=256
+):
+    """Gradient ∂H_k/∂x_l [A/m²] of the moments' field, shape [t, 3, 3]; arguments as of :func:`h_field`."""
+    positions, moments, targets, radii, target_radii, exclude = _prepare(
+        positions, moments, targets, radii, target_radii, bodies
+    )
     gradients = np.empty((len(targets), 3, 3))
     for start in range(0, len(targets), chunk):
         rows = slice(start, start + chunk)
-        pairs = _pairs(positions, targets[rows], radii, target_radii[rows], smoothing, exclude[rows])
+        pairs = _pairs(
+            positions, targets[rows], radii, target_radii[rows], smoothing, None if exclude is None else exclude[rows]
+        )
         gradients[rows] = _sum_gradients(moments, *pairs)
     return gradients
-
-
-def gradient_at(positions, moments, targets, *, radii=None, target_radii=None):
-    """Gradient ∂H_k/∂x_l [A/m²], shape [t, 3, 3], of the moments' field at targets; see :func:`h_field`."""
-    positions, moments, targets, radii, target_radii, _ = _prepare(
-        positions, moments, targets, radii, target_radii, None
-    )
-    return _sum_gradients(moments, *_pairs(positions, targets, radii, target_radii, 0.0, None))
 
 
 def _sum_gradients(moments, r, _, g2, g3):
