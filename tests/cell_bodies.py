@@ -6,8 +6,7 @@ import numpy as np
 
 from bench.reference import oracle
 from bench.systems import moment_system
-from warpmag.shapes import demagnetization, lattice
-from warpmag.shapes import uniform_response as even_field
+from warpmag.shapes import demagnetization, lattice, uniform_response
 
 FAINT = 1e12  # A/m, a saturation far above any field here
 TURN = np.array([0.2, -0.4, 0.1, 0.8]) / np.linalg.norm([0.2, -0.4, 0.1, 0.8])
@@ -68,7 +67,7 @@ def demagnetizing_matrix(body, coupling=None):
     t[np.arange(n), np.arange(n)] = -np.eye(3) / (3.0 * body.volumes[:, None, None])
     i = np.repeat(np.arange(n), np.diff(coupling.start))
     t[i, coupling.other] += full(coupling.tensor)
-    fields = demagnetization.common_fields(coupling.places)
+    fields = demagnetization.common_fields(coupling.scaled_positions)
     t += np.einsum("ipk,kl,jql->ijpq", fields, coupling.common, fields)
     t *= -np.sqrt(body.volumes[:, None] * body.volumes)[..., None, None]
     return t.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
@@ -76,4 +75,4 @@ def demagnetizing_matrix(body, coupling=None):
 
 def coupled(body, solids):
     """Coupling of a body's cells, as a model has it."""
-    return even_field.corrected(demagnetization.coupling(body, body.radii), body, solids)
+    return uniform_response.with_surface_response(demagnetization.coupling(body, body.radii), body, solids)

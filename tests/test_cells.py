@@ -26,8 +26,7 @@ from scipy.spatial.transform import Rotation
 import warpmag
 from bench.reference import oracle, plate, surface_integrals
 from bench.systems import moment_system
-from warpmag.shapes import demagnetization, lattice
-from warpmag.shapes import uniform_response as even_field
+from warpmag.shapes import demagnetization, lattice, uniform_response
 
 SIDES = np.array([1.0, 0.7, 0.4])
 
@@ -55,7 +54,7 @@ def test_the_potential_of_a_tiny_facet_beside_a_large_one():
     """In the middle of a square of edge a it is 4 a ln(1 + √2) / 4π."""
     square = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     tiny = np.array([1.0, 0.3, 0.2])
-    found = even_field.potentials(tiny[None], np.stack([square, 1e-9 * square + tiny]))
+    found = uniform_response.potentials(tiny[None], np.stack([square, 1e-9 * square + tiny]))
     # coordinates of order one place the corners of the tiny facet to 1e-7 of its edge
     assert found[0, 1] == pytest.approx(1e-9 * math.log(1.0 + math.sqrt(2.0)) / math.pi, rel=1e-6)
 

@@ -166,7 +166,9 @@ class CellCouplings:
             if id(coupling) not in found:
                 found[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.tensor))
-                places.append(np.pad(coupling.places.T, ((0, 0), (0, -len(coupling.places) % CHUNK))))
+                places.append(
+                    np.pad(coupling.scaled_positions.T, ((0, 0), (0, -len(coupling.scaled_positions) % CHUNK)))
+                )
             count, row = len(coupling.start) - 1, CHUNK * len(chunks)
             self.rows[number] = row
             starts = range(0, count, CHUNK)

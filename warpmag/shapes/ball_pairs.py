@@ -1,4 +1,4 @@
-"""Pair law of two uniformly magnetized balls, each averaged over the other's field, in float64.
+"""Pair law of two uniformly magnetized balls, from the field of one averaged over the other, in float64.
 
 A moment m at separation r gives the field H = (g1 m + g2 r (r·m)) / 4π. Balls that do not overlap are point dipoles,
 U = 1/d. Overlapping balls of radii a and b take
@@ -16,7 +16,7 @@ def radial_factors(distance: np.ndarray, radius_i: np.ndarray, radius_j: np.ndar
     """Return the radial factors g1 [1/m³] and g2 [1/m⁵] of the pair law.
 
     Args:
-        distance: Distances d of the centers [m], any shape. Both factors are 0 for point dipoles at distance 0.
+        distance: Distances d between the centers [m], any shape. Both factors are 0 for point dipoles at distance 0.
         radius_i: Target radii [m], broadcastable; 0 for a point.
         radius_j: Source radii [m], broadcastable.
 
@@ -38,7 +38,7 @@ def radial_factors(distance: np.ndarray, radius_i: np.ndarray, radius_j: np.ndar
 
 
 def _overlap_factors(d, a, b):
-    """Factors of partially overlapping balls, |a − b| < d < a + b."""
+    """Return the factors of partially overlapping balls, |a − b| < d < a + b."""
     s, p, delta2 = a + b, a * b, (a - b) ** 2
     c = 1.0 / (160.0 * p**3)
     # Laurent polynomial in d: exact at small d, where the printed form cancels

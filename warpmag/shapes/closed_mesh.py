@@ -1,4 +1,4 @@
-"""Closed triangle meshes: whether they are closed, and what is inside."""
+"""Closed triangle meshes: check that they are closed, and winding numbers of points."""
 
 from collections.abc import Callable
 
@@ -7,11 +7,11 @@ import numpy as np
 from warpmag.errors import InputError
 
 _CHUNK = 1 << 18
-"""Pairs of point and triangle that are evaluated at a time (some tens of MB)."""
+"""Pairs of a point and a triangle evaluated at a time (some tens of MB)."""
 
 
 def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh, equal vertices joined, triangles that lost a corner dropped."""
+    """Return the vertices and triangles of a mesh with equal vertices joined and degenerate triangles dropped."""
     points, triangles = np.asarray(vertices, float), np.asarray(faces)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError(f"mesh: vertices must be finite and of shape [n, 3], got shape {points.shape}")
@@ -32,10 +32,10 @@ def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def check_closed(triangles: np.ndarray) -> None:
-    """Raise unless every edge is passed as often one way as the other."""
+    """Raise ``InputError`` unless the triangles pass every edge equally often in both directions."""
     start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
-    edges, which = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0, return_inverse=True)
-    balance = np.bincount(which.reshape(-1), np.where(start < end, 1.0, -1.0))
+    edges, edge = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0, return_inverse=True)
+    balance = np.bincount(edge.reshape(-1), np.where(start < end, 1.0, -1.0))
     if balance.any():
         open_edges = int(np.count_nonzero(balance))
         raise InputError(
@@ -44,11 +44,11 @@ def check_closed(triangles: np.ndarray) -> None:
 
 
 def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Winding number of a closed mesh as a function of points, from the triangles that a ray along +z passes.
+    """Return a function of points that returns the winding number of a closed mesh about each of them.
 
-    A ray through an edge or a vertex counts exactly once: the side of an edge on which a point lies is computed from
-    the edge's end points in the order of their indices, so that both of its triangles see the same answer. Triangles
-    are sorted into square columns of the xy plane, a point meets those of its own column only.
+    It counts the triangles that a ray along +z crosses. A ray through an edge or a vertex counts exactly once: the side
+    of an edge is computed from its end points in the order of their indices, and is thus the same for both triangles.
+    Triangles are sorted into square columns of the xy plane, so that a point tests only those of its own column.
     """
     corners = points[triangles]
     flat = corners[:, :, :2]
@@ -58,7 +58,7 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.nd
     first = np.minimum(((flat.min(axis=1) - lower) / width).astype(int), columns - 1)
     spans = np.minimum(((flat.max(axis=1) - lower) / width).astype(int), columns - 1) - first + 1
     entries = np.repeat(np.arange(len(triangles)), spans.prod(axis=1))
-    rank = _ranks(spans.prod(axis=1))
+    rank = _counters(spans.prod(axis=1))
     column = (first[entries, 0] + rank // spans[entries, 1]) * columns + first[entries, 1] + rank % spans[entries, 1]
     entries = entries[np.argsort(column, kind="stable")]
     sizes = np.bincount(column, minlength=columns * columns)
@@ -69,36 +69,35 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.nd
     forward = triangles == low
     origin, along = points[low, :2], points[high, :2] - points[low, :2]
 
-    def turns(p: np.ndarray) -> np.ndarray:
-        cell = ((p[:, :2] - lower) / width).astype(int)
-        cell = np.clip(cell, 0, columns - 1)
-        cell = cell[:, 0] * columns + cell[:, 1]
+    def winding(p: np.ndarray) -> np.ndarray:
+        xy = np.clip(((p[:, :2] - lower) / width).astype(int), 0, columns - 1)
+        column = xy[:, 0] * columns + xy[:, 1]
         result = np.zeros(len(p), int)
-        ends = np.cumsum(sizes[cell])
+        ends = np.cumsum(sizes[column])
         begin = 0
         while begin < len(p):
             done = ends[begin - 1] if begin else 0
             stop = max(begin + 1, int(np.searchsorted(ends, done + _CHUNK, side="right")))
             rows = np.arange(begin, stop)
-            who = np.repeat(rows, sizes[cell[rows]])
-            t = entries[starts[cell[who]] + _ranks(sizes[cell[rows]])]
-            away = p[who, None, :2] - origin[t]
+            point = np.repeat(rows, sizes[column[rows]])
+            t = entries[starts[column[point]] + _counters(sizes[column[rows]])]
+            away = p[point, None, :2] - origin[t]
             side = along[t, :, 0] * away[:, :, 1] - along[t, :, 1] * away[:, :, 0]
             left = (side >= 0.0) == forward[t]
             up, down = left.all(axis=1), ~left.any(axis=1)
-            met = np.flatnonzero(up | down)
-            opposite = np.abs(side[met][:, [1, 2, 0]])  # edge k, from corner k to k + 1, faces corner k + 2
+            crossed = np.flatnonzero(up | down)
+            opposite = np.abs(side[crossed][:, [1, 2, 0]])  # edge k, from corner k to k + 1, faces corner k + 2
             total = opposite.sum(axis=1)
-            height = (opposite * corners[t[met], :, 2]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
-            above = height > p[who[met], 2]
-            sign = np.where(up[met], 1, -1) * above
-            result[begin:stop] = np.bincount(who[met] - begin, sign, minlength=stop - begin).astype(int)
+            height = (opposite * corners[t[crossed], :, 2]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+            above = height > p[point[crossed], 2]
+            sign = np.where(up[crossed], 1, -1) * above
+            result[begin:stop] = np.bincount(point[crossed] - begin, sign, minlength=stop - begin).astype(int)
             begin = stop
         return result
 
-    return turns
+    return winding
 
 
-def _ranks(counts: np.ndarray) -> np.ndarray:
-    """0 … counts[0] − 1, 0 … counts[1] − 1, and so on, in one array."""
+def _counters(counts: np.ndarray) -> np.ndarray:
+    """Return 0 … counts[0] − 1, 0 … counts[1] − 1, and so on, in one array."""
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -1,18 +1,18 @@
-"""Demagnetizing tensors of the cells that a solid is divided into.
+"""Demagnetizing tensors between the cells of a solid, and their difference from the sums over pairs of balls.
 
-A lattice (``lattice.py``) divides a solid into cells, each uniformly magnetized. Averaged over each other, they make an
-operator H_i = −Σ_j N_ij M_j that is symmetric and positive, with eigenvalues between 0 and 1: it is the true one
-restricted to such magnetizations. Ellipsoids are therefore exact up to rounding of their shape, and anything else comes
-out a little too stiff: a cube of 9³ cells and χ = ∞ takes a moment of 3.58 V H0 of 3.64 V H0.
+A lattice (``lattice.py``) divides a solid into cells of uniform magnetization. Fields averaged over cells give the
+operator H_i = −Σ_j N_ij M_j. It is the exact operator restricted to such magnetizations: symmetric and positive, with
+eigenvalues between 0 and 1. Ellipsoids are exact, except for the resolution of their surface. Other bodies take a
+slightly too small moment: a cube of 9³ cells and χ = ∞ takes 3.58 V H0 instead of 3.64 V H0.
 
-The tensor of two equal cuboids on one grid is that of Newell, Williams and Dunlop, "A generalization of the
-demagnetizing tensor for nonuniform magnetization" (1993), Eqs. 27, 28 and 32. Where a surface cuts a cell, only what
-lies inside counts: cells are resolved by a grid of subcells, and their tensors added up. That is what makes curved
-bodies right: of whole cells, which leave steps, a sphere takes 10 % too much however fine they are.
+The tensor of two equal cuboids on a grid is from Newell, Williams and Dunlop, "A generalization of the demagnetizing
+tensor for nonuniform magnetization" (1993), Eqs. 27, 28 and 32. A cell that the surface cuts is resolved by subcells,
+and the tensors of its filled subcells are added. Without subcells, a sphere of any resolution has steps and takes a
+moment 10 % too large.
 
-The sums over all pairs already give each pair of cells as two balls (``kernels/pairs/pair_law.py``). A coupling is what
-is to be added to that: for cells nearer than :data:`EXACT_REACH` the exact tensor less that of the balls, and for a
-cell itself less the 1/3 that the magnetization law of a ball contains.
+The sums over all pairs treat each cell as a ball (``kernels/pairs/pair_law.py``). A :class:`Coupling` holds the
+correction: for cells nearer than :data:`EXACT_REACH`, the exact tensor minus that of the balls. For a cell itself,
+the 1/3 that the magnetization curve of a ball contains is subtracted instead.
 """
 
 from dataclasses import dataclass
@@ -24,42 +24,42 @@ from warpmag.shapes.ball_pairs import radial_factors
 from warpmag.shapes.lattice import Lattice, Pieces, grid
 
 EXACT_REACH = 3.0
-"""Distance up to which two cells of a body are exact, in longest sides of its cells (see ``tests/test_cells.py``)."""
+"""Distance up to which pairs of cells are corrected, in longest sides of a cell (see ``tests/test_cells.py``)."""
 
 _SUBCELLS = 8
-"""Subcells that resolve a cell which the surface cuts, along each axis, at most."""
+"""Largest number of subcells along each axis of a cell that the surface cuts, for cells that touch."""
 
-_FAR_SUBCELLS = 4
-"""The same for cells that do not touch."""
+_DISTANT_SUBCELLS = 4
+"""Largest number of subcells along each axis, for cells that do not touch."""
 
-_FAR = 4.0
-"""Distance up to which moments lack more than a dipole, in :data:`EXACT_REACH`."""
+_FAR_REACH = 4.0
+"""Distance up to which quadrupoles of cells are corrected, in :data:`EXACT_REACH`."""
 
-_WIDEST = 0.15
-"""Norm of a moment's second moments that counts, at most, in squares of a cell's longest side; two cells have 0.2."""
+_LARGEST_SPREAD = 0.15
+"""Bound on the norm of a moment's traceless second moments, in squares of a cell's longest side; two cells have 0.2."""
 
-PLACES = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
-"""Rows and columns of the six numbers of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
+COMPONENTS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+"""Rows and columns of the six components of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
 
-_STEPS = 20
-"""Steps of Lanczos's iteration, at most; the largest eigenvalue is right to 3 % then."""
+_LANCZOS_STEPS = 20
+"""Largest number of Lanczos steps; they give the largest eigenvalue to 3 %."""
 
 _BATCH = 1 << 22
-"""Numbers in a temporary array (tens of MB)."""
+"""Largest number of entries of a temporary array (tens of MB)."""
 
 
 @dataclass(frozen=True)
 class Coupling:
-    """What the pair sums lack between moments of one body, in its frame: H_i += Σ T_ij m_j.
+    """Correction of the pair sums between the moments of one body, in its frame: H_i += Σ T_ij m_j.
 
     Attributes:
         start: First entry of each moment, and the end, shape [n + 1].
         other: Moment j of each entry, ascending, shape [entries].
         tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
-        common: What moments make of fields that they all have in common (``even_field.py``): of amounts Σ E_i^T m_i the
-            strengths of these fields [1/m³], shape [8, 8].
-        positions: Where the moments are [m], shape [n, 3].
-        radii: Radii of their balls [m], shape [n].
+        common: Matrix C [1/m³] of the fields that all moments have in common (``uniform_response.py``), which adds
+            H_i += E_i C Σ_j E_jᵀ m_j, shape [8, 8].
+        positions: Positions of the moments [m], shape [n, 3].
+        radii: Radii of the moments' balls [m], shape [n].
     """
 
     start: np.ndarray
@@ -70,28 +70,28 @@ class Coupling:
     radii: np.ndarray
 
     @cached_property
-    def centre(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """Mean of the positions [m], shape [3]."""
         return self.positions.mean(axis=0)
 
     @cached_property
     def extent(self) -> float:
-        """Largest distance from there [m], or the radius if there is but one moment."""
-        return float(np.linalg.norm(self.positions - self.centre, axis=1).max()) or float(self.radii.max())
+        """Largest distance of a moment from the center [m], or the radius of a single moment."""
+        return float(np.linalg.norm(self.positions - self.center, axis=1).max()) or float(self.radii.max())
 
     @property
-    def places(self) -> np.ndarray:
-        """Positions about their mean in extents, shape [n, 3]."""
-        return (self.positions - self.centre) / self.extent
+    def scaled_positions(self) -> np.ndarray:
+        """Positions relative to the center, over the extent, shape [n, 3]."""
+        return (self.positions - self.center) / self.extent
 
     @cached_property
     def hardening(self) -> float:
-        """Demagnetizing factor that the moments lack to be as hard as balls in their places [dimensionless].
+        """Largest eigenvalue of √V_i T_ij √V_j with the common fields [dimensionless], by Lanczos with all vectors.
 
-        The largest eigenvalue of √V_i T_ij √V_j, with the common fields, by Lanczos's iteration with all vectors kept.
+        It is the demagnetizing factor that makes every magnetization of the cells as stiff as that of balls.
         """
         root = np.sqrt(4.0 / 3.0 * np.pi * self.radii**3)[:, None]
-        near, common = full_tensors(self.tensor), common_fields(self.places)
+        near, common = full_tensors(self.tensor), common_fields(self.scaled_positions)
 
         def apply(m):
             m = root * m.reshape(-1, 3)
@@ -101,7 +101,7 @@ class Coupling:
         basis = np.random.default_rng(0).normal(size=(1, 3 * len(root)))
         basis /= np.linalg.norm(basis)
         images = np.empty((0, basis.shape[1]))
-        while len(images) < min(_STEPS, basis.shape[1]):
+        while len(images) < min(_LANCZOS_STEPS, basis.shape[1]):
             images = np.append(images, [apply(basis[-1])], axis=0)
             rest = images[-1] - (basis @ images[-1]) @ basis
             rest -= (basis @ rest) @ basis
@@ -113,29 +113,29 @@ class Coupling:
 
     @cached_property
     def dense(self) -> np.ndarray:
-        """Tensors between all moments [1/m³], whole ones, and those of the pair sums, shape [2, n, n, 6].
+        """Tensors between all moments [1/m³], corrected ones and those of the pair sums, shape [2, n, n, 6].
 
-        Only for moments without common fields but the even ones: other tensors are not symmetric.
+        Only for couplings whose common fields are uniform: with linear fields the tensors are not symmetric.
         """
         n = len(self.radii)
         i, j = np.divmod(np.arange(n * n), n)
         law = _pair_law(self.positions[i] - self.positions[j], self.radii[i], self.radii[j], i == j)
-        law[i == j] = 0.0  # a ball's own field is in its curve
+        law[i == j] = 0.0  # the magnetization curve contains a ball's own field
         whole = law.reshape(n, n, 6).copy()
         whole[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
-        whole += self.common[PLACES]
+        whole += self.common[COMPONENTS]
         return np.stack([whole, law.reshape(n, n, 6)])
 
 
 def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Demagnetizing tensors of equal cuboids, one averaged over the other (Newell, Williams and Dunlop 1993).
+    """Return the demagnetizing tensors between equal cuboids on a grid (Newell, Williams and Dunlop 1993).
 
     Args:
-        offsets: From one centre to the other in sides, whole numbers, shape [n, 3].
+        offsets: Vectors between the centers in sides, whole numbers, shape [n, 3].
         sides: Sides of the cuboids, shape [3].
 
     Returns:
-        N, xx, yy, zz, xy, xz, yz, of H = −N M, shape [n, 6].
+        N of the averaged field H = −N M as xx, yy, zz, xy, xz, yz, shape [n, 6].
     """
     offsets = np.asarray(offsets).astype(int)
     signs, places = np.where(offsets < 0, -1.0, 1.0), np.abs(offsets)
@@ -145,16 +145,16 @@ def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 
 def _tensor_table(counts: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """:func:`cuboid_tensors` of all offsets from 0 on, ``counts`` along each axis, shape [a, b, c, 6]."""
+    """Return :func:`cuboid_tensors` for all offsets below ``counts`` along each axis, shape [a, b, c, 6]."""
     unit = np.asarray(sides, float) / np.max(sides)
     x, y, z = np.ix_(*(step * np.arange(-1, count + 1) for step, count in zip(unit, counts, strict=True)))
     parts = (
         _diagonal(x, y, z),
         _diagonal(y, x, z),
         _diagonal(z, y, x),
-        _mixed(x, y, z),
-        _mixed(x, z, y),
-        _mixed(y, z, x),
+        _off_diagonal(x, y, z),
+        _off_diagonal(x, z, y),
+        _off_diagonal(y, z, x),
     )
     total = np.stack(parts)
     for _ in range(3):  # second differences along each axis
@@ -163,7 +163,7 @@ def _tensor_table(counts: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 
 def _diagonal(x, y, z):
-    """f of Newell, Williams and Dunlop, Eq. 27, without terms that cancel."""
+    """Return f of Newell, Williams and Dunlop, Eq. 27, without the terms that cancel."""
     x, y, z = np.abs(x), np.abs(y), np.abs(z)
     r = np.sqrt(x * x + y * y + z * z)
     return (
@@ -174,8 +174,8 @@ def _diagonal(x, y, z):
     )
 
 
-def _mixed(x, y, z):
-    """g of Newell, Williams and Dunlop, Eq. 32."""
+def _off_diagonal(x, y, z):
+    """Return g of Newell, Williams and Dunlop, Eq. 32."""
     r = np.sqrt(x * x + y * y + z * z)
     return (
         x * y * z * _arsinh(z, np.hypot(x, y))
@@ -189,22 +189,22 @@ def _mixed(x, y, z):
 
 
 def _arsinh(a, b):
-    """Inverse hyperbolic sine of a/b; what multiplies it vanishes with b."""
+    """Return arsinh(a/b), or 0 where b = 0, because its factor vanishes there."""
     return np.where(b > 0.0, np.arcsinh(a / np.where(b > 0.0, b, 1.0)), 0.0)
 
 
 def _arctan(a, b):
-    """Inverse tangent of a/b; what multiplies it vanishes with b."""
+    """Return arctan(a/b), or 0 where b = 0, because its factor vanishes there."""
     return np.where(b != 0.0, np.arctan(a / np.where(b != 0.0, b, 1.0)), 0.0)
 
 
 def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) -> Coupling:
-    """What the pair sums lack between the moments of one body.
+    """Return the correction of the pair sums between the moments of one body.
 
     Args:
-        lattice: Its moments with their cells. Moments in cells of different grids are left to the pair sums.
-        radii: Radii of the balls that the pair sums take them for [m], shape [n].
-        reach: Distance up to which pairs are exact, in longest sides of the cells.
+        lattice: Moments with their cells. Pairs of cells of different grids are not corrected.
+        radii: Radii of the balls in the pair sums [m], shape [n].
+        reach: Distance up to which pairs are corrected, in longest sides of the cells.
     """
     x, volumes = lattice.positions, lattice.volumes
     entries, tensors = [np.empty((2, 0), int)], [np.empty((0, 6))]
@@ -220,15 +220,18 @@ def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) ->
 
 
 def _pair_law(r, a, b, same):
-    """H = T m of the pair sums, in six numbers [1/m³]; of a moment itself −M/3, which the curve of a ball contains."""
+    """Return T of the pair sums' field H = T m [1/m³], shape [n, 6]; for a moment itself that of a ball, H = −M/3."""
     g1, g2 = radial_factors(np.linalg.norm(r, axis=1), a, b)
     g1, g2 = np.where(same, -1.0 / a**3, g1), np.where(same, 0.0, g2)
-    products = r[:, PLACES[0]] * r[:, PLACES[1]]
+    products = r[:, COMPONENTS[0]] * r[:, COMPONENTS[1]]
     return (g1[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) + g2[:, None] * products) / (4.0 * np.pi)
 
 
 def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (i, j) of near moments of one grid, shape [2, pairs], and N_ij √(V_i V_j) over V in six numbers."""
+    """Return pairs (i, j) of near moments of one grid, shape [2, pairs], and N_ij √(V_i V_j)/V, shape [pairs, 6].
+
+    V is the volume of a cell.
+    """
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     reach = reach * float(part.sides.max())
@@ -237,53 +240,57 @@ def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndar
     order = np.argsort(part.moment, kind="stable")
     piece, share = part.piece[order], part.share[order]
     begin = np.searchsorted(part.moment[order] - first, np.arange(count + 1))
-    held = np.diff(begin)
-    # every pair of pieces of a pair of moments
-    pairs = held[i] * held[j]
+    pieces = np.diff(begin)
+    # every pair of pieces of each pair of moments
+    pairs = pieces[i] * pieces[j]
     pair = np.repeat(np.arange(len(i)), pairs)
     rank = np.arange(len(pair)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
-    a, b = begin[i[pair]] + rank // held[j[pair]], begin[j[pair]] + rank % held[j[pair]]
+    a, b = begin[i[pair]] + rank // pieces[j[pair]], begin[j[pair]] + rank % pieces[j[pair]]
     p, q = piece[a], piece[b]
-    key, which = np.unique(np.minimum(p, q) * len(part.index) + np.maximum(p, q), return_inverse=True)
-    values = _piece_tensors(part, key // len(part.index), key % len(part.index))[which]
+    key, inverse = np.unique(np.minimum(p, q) * len(part.index) + np.maximum(p, q), return_inverse=True)
+    values = _piece_tensors(part, key // len(part.index), key % len(part.index))[inverse]
     weight = share[a] * share[b]
     sums = np.stack([np.bincount(pair, weight * values[:, c], len(i)) for c in range(6)], axis=1)
     sums /= np.sqrt(volume[i] * volume[j])[:, None]
-    sums[i == j] += _lack_from_afar(local, part.sides.prod() * volume, _spreads(part, first, volume), reach)[i[i == j]]
+    own, spreads = i == j, _second_moments(part, first, volume)
+    sums[own] += _far_corrections(local, part.sides.prod() * volume, spreads, reach)[i[own]]
     both = i != j
     pairs = np.concatenate([np.stack([i, j]), np.stack([j[both], i[both]])], axis=1) + first
-    return pairs, _turned(np.concatenate([sums, sums[both]]), part.rotation)
+    return pairs, _rotated(np.concatenate([sums, sums[both]]), part.rotation)
 
 
-def _spreads(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
-    """Second moments of each moment's pieces about their centroid, over volume, less their trace, shape [n, 3, 3]."""
+def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
+    """Return the traceless second moments of each moment's volume about its centroid, over volume, shape [n, 3, 3]."""
     split = np.array(part.filled.shape[1:])
     points, weights = (grid(split) + 0.5) / split * part.sides, part.filled.reshape(len(part.filled), -1) / split.prod()
-    corner, held = part.index * part.sides, weights.sum(axis=1)[:, None]
-    ones = weights @ points
-    twos = np.stack([weights @ (points[:, [k]] * points) for k in range(3)], axis=1)
-    twos += held[..., None] * np.diag((part.sides / split) ** 2 / 12.0)
-    twos += ones[:, :, None] * corner[:, None] + corner[:, :, None] * (ones + held * corner)[:, None]
-    ones += held * corner
-    sums = np.concatenate([ones, twos.reshape(-1, 9)], axis=1)[part.piece] * part.share[:, None]
+    corner, zeroth = part.index * part.sides, weights.sum(axis=1)[:, None]
+    first_moments = weights @ points
+    second_moments = np.stack([weights @ (points[:, [k]] * points) for k in range(3)], axis=1)
+    second_moments += zeroth[..., None] * np.diag((part.sides / split) ** 2 / 12.0)
+    second_moments += (
+        first_moments[:, :, None] * corner[:, None] + corner[:, :, None] * (first_moments + zeroth * corner)[:, None]
+    )
+    first_moments += zeroth * corner
+    sums = np.concatenate([first_moments, second_moments.reshape(-1, 9)], axis=1)[part.piece] * part.share[:, None]
     sums = np.stack([np.bincount(part.moment - first, x, len(volume)) for x in sums.T], axis=1) / volume[:, None]
-    centre = sums[:, :3]
-    spread = sums[:, 3:].reshape(-1, 3, 3) - centre[:, :, None] * centre[:, None]
+    center = sums[:, :3]
+    spread = sums[:, 3:].reshape(-1, 3, 3) - center[:, :, None] * center[:, None]
     spread -= np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3.0
-    size, most = np.linalg.norm(spread, axis=(1, 2)), _WIDEST * part.sides.max() ** 2
+    size, most = np.linalg.norm(spread, axis=(1, 2)), _LARGEST_SPREAD * part.sides.max() ** 2
     return spread * np.minimum(1.0, most / np.maximum(size, np.finfo(float).tiny))[:, None, None]
 
 
-def _lack_from_afar(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray, reach: float) -> np.ndarray:
-    """What moments beyond the reach lack as dipoles, if they are magnetized as the one that they act on, shape [n, 6].
+def _far_corrections(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray, reach: float) -> np.ndarray:
+    """Return the field of quadrupoles beyond the reach, as tensors on each moment itself, shape [n, 6].
 
-    It falls off with the fifth power of the distance, and is taken up to ``_FAR`` times the reach. What would make the
-    operator softer is left out, which thin plates with flat cells would not stay positive with.
+    Distant cells are dipoles in the pair sums. The correction assumes that they are magnetized like the moment itself.
+    It falls off with the fifth power of the distance and ends at ``_FAR_REACH`` times the reach. Negative eigenvalues
+    are dropped, because with them the operator of thin plates with flat cells would not stay positive.
     """
     total = np.zeros((6, len(points)))
-    if np.abs(spreads).max() < 1e-9 * reach * reach:  # of cubes
+    if np.abs(spreads).max() < 1e-9 * reach * reach:  # cubes have none
         return total.T
-    pairs = np.stack(_near_pairs(points, _FAR * reach))
+    pairs = np.stack(_near_pairs(points, _FAR_REACH * reach))
     step = _BATCH // 64
     for start in range(0, pairs.shape[1], step):
         i, j = pairs[:, start : start + step]
@@ -292,69 +299,69 @@ def _lack_from_afar(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray
         far = square > reach * reach * (1.0 + 1e-9)
         i, j, r, d = i[far], j[far], r[far], np.sqrt(square[far])[:, None]
         spread = spreads[i] + spreads[j]
-        turned = np.einsum("nkl,nl->nk", spread, r)
-        along = (turned * r).sum(axis=1)[:, None]
-        rows, columns = PLACES
-        mixed = r[:, rows] * turned[:, columns] + turned[:, rows] * r[:, columns]
-        one = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-        found = 105.0 * along * r[:, rows] * r[:, columns] / d**9 - 15.0 * (along * one + 2.0 * mixed) / d**7
-        found = (found + 6.0 * spread[:, rows, columns] / d**5) / (-8.0 * np.pi)
+        product = np.einsum("nkl,nl->nk", spread, r)
+        along = (product * r).sum(axis=1)[:, None]
+        rows, columns = COMPONENTS
+        mixed = r[:, rows] * product[:, columns] + product[:, rows] * r[:, columns]
+        identity = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+        tensor = 105.0 * along * r[:, rows] * r[:, columns] / d**9 - 15.0 * (along * identity + 2.0 * mixed) / d**7
+        tensor = (tensor + 6.0 * spread[:, rows, columns] / d**5) / (-8.0 * np.pi)
         for k in range(6):
-            total[k] += np.bincount(i, volumes[j] * found[:, k], len(points))
-            total[k] += np.bincount(j, volumes[i] * found[:, k], len(points))
+            total[k] += np.bincount(i, volumes[j] * tensor[:, k], len(points))
+            total[k] += np.bincount(j, volumes[i] * tensor[:, k], len(points))
     values, vectors = np.linalg.eigh(full_tensors(total.T))
     stiffer = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
-    return stiffer[:, *PLACES]
+    return stiffer[:, *COMPONENTS]
 
 
 def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs i ≤ j of points not farther apart than ``reach``."""
-    found = []
+    """Return the pairs i ≤ j of points at most ``reach`` apart."""
+    pairs = []
     step = max(1, _BATCH // max(1, 3 * len(points)))
     for begin in range(0, len(points), step):
         apart = points[begin : begin + step, None] - points
         i, j = np.nonzero((apart**2).sum(axis=2) <= reach * reach * (1.0 + 1e-9))
-        found.append(np.stack([i + begin, j]))
-    i, j = np.concatenate(found, axis=1)
+        pairs.append(np.stack([i + begin, j]))
+    i, j = np.concatenate(pairs, axis=1)
     return i[i <= j], j[i <= j]
 
 
 def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """∫∫ over two pieces of cells, over the volume of a cell, of the demagnetizing kernel, shape [pairs, 6]."""
+    """Return ∫∫ of the demagnetizing kernel over pairs of pieces, over the volume of a cell, shape [pairs, 6]."""
     apart = part.index[p] - part.index[q]
     full = part.filled.min(axis=(1, 2, 3)) == 1.0
     whole, touching = full[p] & full[q], (np.abs(apart) <= 1).all(axis=1)
     near, far = np.flatnonzero(~whole & touching), np.flatnonzero(~whole & ~touching)
     result = np.empty((len(p), 6))
-    offsets, which = np.unique(apart[whole], axis=0, return_inverse=True)
-    result[whole] = cuboid_tensors(offsets, part.sides)[which.reshape(-1)]
+    offsets, inverse = np.unique(apart[whole], axis=0, return_inverse=True)
+    result[whole] = cuboid_tensors(offsets, part.sides)[inverse.reshape(-1)]
     if len(near):
-        filled = _sharp(_coarser(part.filled, _SUBCELLS))
+        filled = _binary(_coarsened(part.filled, _SUBCELLS))
         result[near] = _cut_tensors(part.sides, filled, p[near], q[near], apart[near])
     if len(far):
-        result[far] = _cut_tensors(part.sides, _coarser(part.filled, _FAR_SUBCELLS), p[far], q[far], apart[far])
+        result[far] = _cut_tensors(part.sides, _coarsened(part.filled, _DISTANT_SUBCELLS), p[far], q[far], apart[far])
     return result
 
 
 def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarray:
-    """The same for pieces that are cut, from the tensors of their subcells.
+    """Return :func:`_piece_tensors` of pieces that the surface cuts, from the tensors of their subcells.
 
-    The sum over pairs of subcells is one of tensors times the correlation of what is filled, taken in Fourier's space.
+    The sum over pairs of subcells is a sum of tensors times the correlation of the filled shares, by Fourier transform.
     """
     split = np.array(filled.shape[1:])
     reach = (np.abs(apart).max(axis=0) + 1) * split
     table = _tensor_table(reach, sides / split)
     period, size = tuple(2 * split), len(filled)
     filled = np.fft.rfftn(filled, period, axes=(1, 2, 3))
-    twice = np.where(np.arange(split[2] + 1) % split[2] == 0, 1.0, 2.0)  # other halves of the spectrum are conjugate
+    twice = np.where(np.arange(split[2] + 1) % split[2] == 0, 1.0, 2.0)  # the other half of the spectrum is conjugate
     twice = np.broadcast_to(twice, filled.shape[1:]).reshape(-1)
     filled = filled.reshape(size, -1)
-    between = (grid(2 * split) + split) % (2 * split) - split
+    between = (grid(2 * split) + split) % (2 * split) - split  # offset between subcells, in subcells
     valid = np.all(between > -split, axis=1)
     result = np.empty((len(p), 6))
-    offsets, which = np.unique(apart, axis=0, return_inverse=True)
-    order = np.argsort(which.reshape(-1), kind="stable")
-    ends = np.append(0, np.cumsum(np.bincount(which.reshape(-1))))
+    offsets, inverse = np.unique(apart, axis=0, return_inverse=True)
+    order = np.argsort(inverse.reshape(-1), kind="stable")
+    ends = np.append(0, np.cumsum(np.bincount(inverse.reshape(-1))))
     for k, offset in enumerate(offsets):
         steps = offset * split + between
         tensors = np.where(valid[:, None], table[tuple(np.minimum(np.abs(steps), reach - 1).T)], 0.0)
@@ -369,14 +376,14 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarr
     return result / (split.prod() * np.prod(period))
 
 
-def _sharp(filled: np.ndarray) -> np.ndarray:
-    """Subcells that are full or empty, with the same mean."""
+def _binary(filled: np.ndarray) -> np.ndarray:
+    """Return shares with subcells either empty or equally filled, with the same mean."""
     inside = (filled >= np.minimum(0.5, filled.max(axis=(1, 2, 3), keepdims=True))).astype(float)
     return inside * (filled.mean(axis=(1, 2, 3)) / inside.mean(axis=(1, 2, 3)))[:, None, None, None]
 
 
-def _coarser(filled: np.ndarray, most: int) -> np.ndarray:
-    """Filled shares of fewer subcells, at most ``most`` along an axis; where there are more, that divides them."""
+def _coarsened(filled: np.ndarray, most: int) -> np.ndarray:
+    """Return the filled shares of at most ``most`` subcells along each axis; ``most`` must divide a larger number."""
     for axis, size in enumerate(filled.shape[1:], start=1):
         if size > most:
             shape = (*filled.shape[:axis], most, size // most, *filled.shape[axis + 1 :])
@@ -384,27 +391,29 @@ def _coarser(filled: np.ndarray, most: int) -> np.ndarray:
     return filled
 
 
-def common_fields(places: np.ndarray) -> np.ndarray:
-    """Fields that all cells of a body may have in common, at places in extents: three even ones, then five of even
-    gradient (see ``even_field.common_potentials``), shape [n, 3, 8]."""
-    x, y, z = places.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
+def common_fields(points: np.ndarray) -> np.ndarray:
+    """Return the common fields at scaled positions: three uniform and five linear ones, shape [n, 3, 8].
+
+    They are the gradients of ``uniform_response.common_potentials``.
+    """
+    x, y, z = points.T
+    zero, unit = np.zeros_like(x), np.ones_like(x)
     rows = (
-        (one, zero, zero, x, zero, y, z, zero),
-        (zero, one, zero, zero, y, x, zero, z),
-        (zero, zero, one, -z, -z, zero, x, y),
+        (unit, zero, zero, x, zero, y, z, zero),
+        (zero, unit, zero, zero, y, x, zero, z),
+        (zero, zero, unit, -z, -z, zero, x, y),
     )
     return np.moveaxis(np.array(rows), 2, 0)
 
 
 def full_tensors(six: np.ndarray) -> np.ndarray:
-    """Symmetric tensors of their six numbers, shape [n, 3, 3]."""
-    rows, columns = PLACES
+    """Return symmetric tensors from their six components, shape [n, 3, 3]."""
+    rows, columns = COMPONENTS
     full = np.empty((len(six), 3, 3))
     full[:, rows, columns] = full[:, columns, rows] = six
     return full
 
 
-def _turned(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Symmetric tensors in six numbers, turned."""
-    return (rotation @ full_tensors(six) @ rotation.T)[:, *PLACES]
+def _rotated(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return the six components of rotated symmetric tensors."""
+    return (rotation @ full_tensors(six) @ rotation.T)[:, *COMPONENTS]

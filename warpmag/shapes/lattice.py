@@ -1,14 +1,14 @@
-"""Volume-filling lattices of moments: how a solid body is sampled for the dipole sums.
+"""Lattices of moments that fill a solid body.
 
-A body that is not a small ball is replaced by moments of volume Vᵢ at xᵢ such that ΣVᵢ is its volume and ΣVᵢxᵢ/ΣVᵢ its
-centroid. Each shape's bounding box is divided into near-cubic cells that fit it exactly. A cell's moment sits at the
-centroid of the part of the cell that the shape fills; cells filled by less than half join their nearest neighbour, so
-that a curved surface leaves neither steps nor slivers. What a cell holds is found by testing a fine grid of points in
-it, which also finds where several shapes of one body overlap: there every point counts once.
+A body that is not a ball is replaced by moments of volume Vᵢ at xᵢ. ΣVᵢ is the volume of the body, and ΣVᵢxᵢ/ΣVᵢ its
+centroid. The bounding box of each shape is divided into nearly cubic cells that fit it exactly. The moment of a cell is
+at the centroid of the part that the shape fills. Cells filled by less than half join their nearest neighbor, so that a
+curved surface has neither steps nor slivers. The filled part is found from a fine grid of test points. Where shapes of
+a body overlap, each test point counts once.
 
-Accuracy, which sets :data:`AUTOMATIC_COUNT`. Uniformly magnetized cube of side L as n³ point dipoles, relative L2 error
-of the field over all points at distance d from the surface, and of the force on an iron ball that touches a face
-(radius L/8, the 5 mm ball at the 40 mm cube; linear and saturated ball alike):
+The accuracy determines :data:`AUTOMATIC_COUNT`. The table has errors of a uniformly magnetized cube of side L as n³
+point dipoles: the relative L2 error of the field over all points at distance d from the surface, and the error of the
+force on an iron ball of radius L/8 in contact (5 mm at a cube of 40 mm). It is the same for linear and saturated balls.
 
 ====  =====  ==============  ============  ==============  ============
 n     n³     field, d=0.2 L  field, d=L/8  force, d=0.2 L  force, d=L/8
@@ -20,18 +20,18 @@ n     n³     field, d=0.2 L  field, d=L/8  force, d=0.2 L  force, d=L/8
 10    1000   1e-4            7e-4          7e-4            9.5e-3
 ====  =====  ==============  ============  ==============  ============
 
-729 is thus the smallest cube number that keeps the force at contact within 2 %. A cylinder as wide as high, 621
-moments then, has 2e-3 in the field at 0.2 L and 5e-3 at L/8. The error falls off as exp(−2πd/a) with the cell side a.
-Permanent boxes and cylinders, whose fields are closed forms close up (``kernels/applied``), have points of Gauss
-instead (``polyhedra.py``), which are fewer.
+729 is the smallest cube number that keeps the force at contact within 2 %. A cylinder as wide as high has 621 moments,
+and errors of the field of 2e-3 at 0.2 L and 5e-3 at L/8. The error falls off as exp(−2πd/a) with the side a of a cell.
+The near fields of permanent boxes and cylinders are closed forms (``kernels/applied``). At a distance they are replaced
+by moments at Gauss points (``polyhedra.py``), which are fewer.
 
-Which radius a moment's ball gets matters where another ball touches the body. Balls of the moments' own volumes
-(:attr:`Lattice.radii`) stick out of the body by 0.12 a, and averaging over that overlap puts the force above 14 to 22 %
-off (n of 12 to 8). An inducible lattice needs them, for its equilibrium to stay unique. A permanent one does not: with
-balls inscribed in the cells (:attr:`Lattice.inner_radii`) a touching ball sees the point dipoles of the table.
+The radius of a moment's ball matters if another ball touches the body. Balls of the moments' own volumes
+(:attr:`Lattice.radii`) protrude from the body by 0.12 a. Averaging over that overlap changes the force by 14 to 22 % (n
+of 12 to 8). Inducible bodies need these balls, because with them the equilibrium is unique. Permanent bodies use balls
+inscribed in the cells (:attr:`Lattice.inner_radii`), so that a touching ball is in the field of the table.
 
-The moments of an inducible body act on each other as what they are, parts of cells (``demagnetization.py``), which
-:class:`Pieces` describe. Its cells are flatter than wide where it is thin, so that it is :data:`LEAST_ACROSS` across.
+The moments of an inducible body act on each other as parts of cells (``demagnetization.py``), which :class:`Pieces`
+describe. A thin body gets flat cells, so that it has :data:`LEAST_ACROSS` across its thickness.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,35 +47,35 @@ from warpmag.shapes.closed_mesh import check_closed, welded, winding_number
 from warpmag.shapes.solids import Solid, Values, grid
 
 AUTOMATIC_COUNT = 729
-"""Moments of one body at automatic spacing, at most (see the table above): 9³, a cube's."""
+"""Largest number of moments of a body at automatic spacing: 9³, see the table above."""
 
 LEAST_ACROSS = 3
-"""Cells across an inducible shape at automatic spacing, at least. A ferrite cube of 20 mm pulls a plate of 40:40:5 mm
-with 4 % too little at 0.5 mm, of two across with 6 %. With more, which are flatter, solves take longer."""
+"""Smallest number of cells across an inducible shape at automatic spacing. The force of a ferrite cube of 20 mm on a
+plate of 40:40:5 mm at 0.5 mm is 4 % too small with 3 cells across, and 6 % with 2. More are flatter and slower."""
 
 LARGEST_COUNT = 20_000
-"""Moments of one body at any spacing; a smaller spacing is refused as a mistake."""
+"""Largest number of moments of a body at any spacing; a smaller spacing raises an error."""
 
 _FINE_POINTS = 32
-"""Test points across a shape, along each axis, at least."""
+"""Test points along each axis of a mesh's bounding box."""
 
 _CHUNK = 1 << 18
 """Pairs of cells evaluated at a time (some tens of MB)."""
 
 _NOTHING = np.empty((0, 3)), np.empty(0), (np.empty(0, int), np.empty(0, int), np.empty(0))
-"""Moments of a shape that lies within others."""
+"""Moments of a shape that lies inside others: positions, weights and joined cells."""
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """What shapes fill of the cells of a grid, a piece for each cell of each, and the moments that stand for it.
+    """Parts of shapes in the cells of a grid, one piece per shape and cell, and the moments that represent them.
 
     Attributes:
         sides: Sides of a cell [m], shape [3].
-        index: Place of each piece's cell in the grid, shape [p, 3].
-        filled: Share of each subcell that the piece fills, shape [p, a, b, c].
+        index: Index of each piece's cell in the grid, shape [p, 3].
+        filled: Filled share of each subcell, shape [p, a, b, c].
         piece, moment, share: Piece, moment, and the share of the piece that belongs to the moment, shape [entries].
-        position, rotation: Origin of the grid's frame in the body's [m], and rotation to it, shapes [3] and [3, 3].
+        position, rotation: Pose of the grid in the body's frame: origin [m], shape [3], and rotation, shape [3, 3].
     """
 
     sides: np.ndarray
@@ -90,13 +90,13 @@ class Pieces:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Moments that stand for one solid body.
+    """Moments that represent one solid body.
 
     Attributes:
         positions: Positions of the moments [m], body frame, shape [n, 3].
         volumes: Volumes of the moments [m³], shape [n]; their sum is the volume of the body.
-        owners: Index of the shape that each moment belongs to, non-decreasing, shape [n].
-        pieces: The parts of cells that they stand for, of each grid; none of a ball.
+        owners: Index of each moment's shape, non-decreasing, shape [n].
+        pieces: Parts of cells that the moments represent, one entry per grid; empty for a ball.
     """
 
     positions: np.ndarray
@@ -116,20 +116,20 @@ class Lattice:
 
 
 def box(half_extents: Values) -> Solid:
-    """A box of half sides ``half_extents`` [m], shape [3], centred at the origin."""
+    """Return a box of half sides ``half_extents`` [m], shape [3], centered at the origin."""
     h = _lengths("box: half_extents", half_extents, 3)
     inside, surface = (lambda p: np.abs(p / h).max(axis=1) <= 1.0), partial(facets.box, h)
     return Solid("box", -h, h, float(8.0 * h.prod()), np.zeros(3), inside, surface)
 
 
 def sphere(radius: float) -> Solid:
-    """A sphere of ``radius`` [m], centred at the origin."""
+    """Return a sphere of ``radius`` [m], centered at the origin."""
     (r,) = _lengths("sphere: radius", [radius], 1)
     return replace(ellipsoid([r, r, r]), name="sphere")
 
 
 def ellipsoid(semi_axes: Values) -> Solid:
-    """An ellipsoid of ``semi_axes`` [m], shape [3], centred at the origin."""
+    """Return an ellipsoid of ``semi_axes`` [m], shape [3], centered at the origin."""
     a = _lengths("ellipsoid: semi_axes", semi_axes, 3)
     volume = 4.0 / 3.0 * np.pi * float(a.prod())
     inside, surface = (lambda p: ((p / a) ** 2).sum(axis=1) <= 1.0), partial(facets.ellipsoid, a)
@@ -137,7 +137,7 @@ def ellipsoid(semi_axes: Values) -> Solid:
 
 
 def capsule(radius: float, half_height: float) -> Solid:
-    """A capsule along z: a cylinder of ``radius`` and ``half_height`` [m] with half a sphere on each end."""
+    """Return a capsule along z: a cylinder of ``radius`` and ``half_height`` [m] with a hemisphere at each end."""
     r, h = _lengths("capsule: radius and half_height", [radius, half_height], 2)
 
     def inside(p):
@@ -149,7 +149,7 @@ def capsule(radius: float, half_height: float) -> Solid:
 
 
 def cylinder(radius: float, half_height: float) -> Solid:
-    """A cylinder along z of ``radius`` and ``half_height`` [m], centred at the origin."""
+    """Return a cylinder along z of ``radius`` and ``half_height`` [m], centered at the origin."""
     r, h = _lengths("cylinder: radius and half_height", [radius, half_height], 2)
 
     def inside(p):
@@ -161,7 +161,7 @@ def cylinder(radius: float, half_height: float) -> Solid:
 
 
 def cone(radius: float, half_height: float) -> Solid:
-    """A cone along z of base ``radius`` [m], its base at z = −``half_height`` [m], its tip at +``half_height``."""
+    """Return a cone along z: base of ``radius`` [m] at z = −``half_height`` [m], tip at +``half_height``."""
     r, h = _lengths("cone: radius and half_height", [radius, half_height], 2)
 
     def inside(p):
@@ -174,19 +174,22 @@ def cone(radius: float, half_height: float) -> Solid:
 
 
 def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
-    """The solid that a closed triangle mesh bounds.
+    """Return the solid that a closed triangle mesh bounds.
 
-    Vertices at the same place are joined first. Every edge must then be passed as often one way as the other by its
-    triangles; both orientations of the whole mesh are accepted. Shells may intersect: what lies in several counts once.
+    Vertices at the same position are joined first. The triangles must then pass every edge equally often in both
+    directions; either orientation of the whole mesh is accepted. Shells may intersect; shared volume counts once.
 
     Args:
         vertices: Vertices [m], shape [n, 3].
         faces: Indices of each triangle's vertices, shape [m, 3] or flat.
+
+    Raises:
+        InputError: The mesh is not closed or encloses no volume.
     """
     points, triangles = welded(vertices, faces)
     check_closed(triangles)
     corners = points[triangles]
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))  # tetrahedra from there keep the digits of a far mesh
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))  # apex of tetrahedra: digits of a far mesh are kept
     local = corners - middle
     parts = np.einsum("nk,nk->n", local[:, 0], np.cross(local[:, 1], local[:, 2])) / 6.0
     volume, lower, upper = float(parts.sum()), points.min(axis=0), points.max(axis=0)
@@ -196,23 +199,23 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     winding = winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
     surface = partial(facets.mesh, corners if volume > 0.0 else corners[:, ::-1])
     solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda p: winding(p) != 0, surface)
-    turns, samples = _turns(solid, winding)
-    if np.isin(turns, (0, 1)).all():
+    windings, samples = _sampled_windings(solid, winding)
+    if np.isin(windings, (0, 1)).all():
         return solid
-    inside = turns != 0  # intersecting shells: the integrals above count the shared part more than once
+    inside = windings != 0  # intersecting shells: the integrals above count shared volume repeatedly
     return replace(
-        solid, volume=abs(volume) * float(inside.sum()) / float(turns.sum()), centroid=samples[inside].mean(axis=0)
+        solid, volume=abs(volume) * float(inside.sum()) / float(windings.sum()), centroid=samples[inside].mean(axis=0)
     )
 
 
 def ball(radius: float) -> Lattice:
-    """The one moment of a ball of ``radius`` [m]: exact for a uniformly magnetized ball."""
+    """Return the single moment of a ball of ``radius`` [m], which is exact for a uniformly magnetized ball."""
     (r,) = _lengths("ball: radius", [radius], 1)
     return Lattice(np.zeros((1, 3)), np.array([4.0 / 3.0 * np.pi * r**3]), np.zeros(1, int))
 
 
 def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
-    """Whether a body whose shapes have these bounding boxes [m] gets no more than :data:`LARGEST_COUNT` moments."""
+    """Return False if a body with these bounding boxes [m] surely needs more than :data:`LARGEST_COUNT` moments."""
     with np.errstate(over="ignore"):
         return not sum(np.prod(box / spacing) for box in boxes) > 4.0 * LARGEST_COUNT
 
@@ -221,15 +224,18 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
     """Fill a body with moments.
 
     Args:
-        solids: The shapes of one body, posed in its frame. Where they overlap, the earlier one fills the place.
-        spacing: Distance between moments [m]; 0 chooses one that needs about, and at most,
-            :data:`AUTOMATIC_COUNT` moments. A spacing larger than a shape gives that shape one moment.
-        across: Cells across a shape at automatic spacing, at least; they are as much flatter where that is more.
-        together: Whether all shapes share the cells of one grid, in the frame of the largest, as tensors between them
-            need. A cell that several shapes reach into is then a moment of each.
+        solids: Shapes of one body, posed in its frame. Overlap belongs to the earlier shape.
+        spacing: Distance between moments [m]; 0 chooses it for about, and at most, :data:`AUTOMATIC_COUNT` moments. A
+            shape smaller than the spacing gets one moment.
+        across: Smallest number of cells across a shape at automatic spacing, with flatter cells where necessary.
+        together: True if all shapes share one grid, in the frame of the largest, as tensors between them require. A
+            cell that several shapes reach into is then a moment of each.
 
     Returns:
-        The lattice. Its volume is exact if no two shapes overlap, else known to the fine test grid, about 1 %.
+        The lattice. Its volume is exact if shapes do not overlap, else it has the error of the test grid, about 1 %.
+
+    Raises:
+        InputError: There is no shape, the spacing is too small or negative, or a shape is too thin.
     """
     parts = [solids] if isinstance(solids, Solid) else list(solids)
     if not parts:
@@ -250,12 +256,13 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
 
 
 def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -> Lattice:
+    """Return the lattice of shapes at a spacing [m]."""
     grids = _grids(parts, spacing, across, together)
-    filled = [_fill_part(one, k) for one in grids for k in range(one.earlier, len(one.solids))]
+    filled = [_fill_part(cells, k) for cells in grids for k in range(cells.earlier, len(cells.solids))]
     counts = [len(volumes) for _, volumes, _ in filled]
     firsts = np.cumsum(counts) - counts
-    moved = [replace(one, moment=one.moment + first) for (_, _, one), first in zip(filled, firsts, strict=True)]
-    pieces = [_side_by_side(moved)] if together else [one for one in moved if len(one.index)]
+    parts_pieces = [replace(p, moment=p.moment + first) for (_, _, p), first in zip(filled, firsts, strict=True)]
+    pieces = [_concatenated(parts_pieces)] if together else [p for p in parts_pieces if len(p.index)]
     return Lattice(
         np.concatenate([positions for positions, _, _ in filled]),
         np.concatenate([volumes for _, volumes, _ in filled]),
@@ -265,43 +272,43 @@ def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -
 
 
 def _grids(parts: Sequence[Solid], spacing: float, across: int, together: bool) -> list[CellGrid]:
-    """The one grid of all shapes, or that of each."""
+    """Return one grid for all shapes, or one for each shape."""
     if together:
         return [cells_over(parts, [], spacing, across)]
     return [cells_over([part], parts[:k], spacing, across) for k, part in enumerate(parts)]
 
 
-def _side_by_side(pieces: list[Pieces]) -> Pieces:
-    """Pieces of several shapes in the cells of one grid, as of one shape."""
-    before = np.cumsum([0, *(len(one.index) for one in pieces)])
+def _concatenated(pieces: list[Pieces]) -> Pieces:
+    """Return the pieces of several shapes in one grid as one record."""
+    before = np.cumsum([0, *(len(p.index) for p in pieces)])
     return replace(
         pieces[0],
-        index=np.concatenate([one.index for one in pieces]),
-        filled=np.concatenate([one.filled for one in pieces]),
-        piece=np.concatenate([one.piece + first for one, first in zip(pieces, before, strict=False)]),
-        moment=np.concatenate([one.moment for one in pieces]),
-        share=np.concatenate([one.share for one in pieces]),
+        index=np.concatenate([p.index for p in pieces]),
+        filled=np.concatenate([p.filled for p in pieces]),
+        piece=np.concatenate([p.piece + first for p, first in zip(pieces, before, strict=False)]),
+        moment=np.concatenate([p.moment for p in pieces]),
+        share=np.concatenate([p.share for p in pieces]),
     )
 
 
 def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]:
-    """Positions, in the body's frame, and volumes of the moments of what shape ``k`` adds to those before it."""
-    part, found = cells.solids[k], cells.filled(k)
-    if found.whole == 0.0:
+    """Return positions, body frame, and volumes of the moments of shape ``k`` outside of earlier shapes, and pieces."""
+    part, filled = cells.solids[k], cells.filled(k)
+    if filled.whole == 0.0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
-    positions, weights, (piece, moment, share) = _joined(found) if len(found.index) else _NOTHING
-    if found.weights.sum() == found.whole:  # nothing taken away: the exact centroid is known
+    positions, weights, (piece, moment, share) = _joined(filled) if len(filled.index) else _NOTHING
+    if filled.weights.sum() == filled.whole:  # no overlap: the exact centroid is known
         positions = positions + part.to_body(part.centroid[None]) - weights @ positions / weights.sum()
-    pieces = Pieces(cells.sides, found.index, found.shares, piece, moment, share, cells.position, cells.rotation)
-    return positions @ cells.rotation.T + cells.position, weights * (part.volume / found.whole), pieces
+    pieces = Pieces(cells.sides, filled.index, filled.shares, piece, moment, share, cells.position, cells.rotation)
+    return positions @ cells.rotation.T + cells.position, weights * (part.volume / filled.whole), pieces
 
 
-def _joined(found: Filled) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """Centroids and weights of the cells, those filled by less than half joined with their nearest neighbours.
+def _joined(filled: Filled) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """Return centroids and weights of moments, after cells filled by less than half joined their nearest neighbors.
 
-    Also returned are which cell is joined with which, and the share of it.
+    The third result has cell, moment, and the share of the cell that belongs to the moment.
     """
-    hits, sums = found.weights, found.sums
+    hits, sums = filled.weights, filled.sums
     centroids = sums / hits[:, None]
     full = hits >= 0.5 * hits.max()
     weights, moments = hits[full], sums[full]
@@ -312,16 +319,17 @@ def _joined(found: Filled) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ..
         rows = scattered[start : start + step]
         distances = ((centroids[rows, None, :] - centroids[full]) ** 2).sum(axis=2)
         nearest = distances.min(axis=1, keepdims=True)
-        shares = (distances <= nearest * (1.0 + 1e-6)).astype(float)  # ties are shared, which keeps symmetry
+        shares = (distances <= nearest * (1.0 + 1e-6)).astype(float)  # equal distances share, to keep symmetry
         shares /= shares.sum(axis=1, keepdims=True)
         weights = weights + hits[rows] @ shares
         moments = moments + shares.T @ sums[rows]
-        given, taker = np.nonzero(shares)
-        joined.append((rows[given], taker, shares[given, taker]))
-    return moments / weights[:, None], weights, tuple(np.concatenate(one) for one in zip(*joined, strict=True))
+        row, moment = np.nonzero(shares)
+        joined.append((rows[row], moment, shares[row, moment]))
+    return moments / weights[:, None], weights, tuple(np.concatenate(column) for column in zip(*joined, strict=True))
 
 
 def _lengths(name: str, values: Values, count: int) -> np.ndarray:
+    """Return ``count`` positive lengths [m] as an array; raises ``InputError`` for other values."""
     array = np.asarray(values, float)
     if array.shape != (count,) or not (np.isfinite(array).all() and (array > 0.0).all()):
         got = values if count > 1 else values[0]
@@ -329,8 +337,8 @@ def _lengths(name: str, values: Values, count: int) -> np.ndarray:
     return array
 
 
-def _turns(solid: Solid, winding: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Winding numbers at a grid of points in the bounding box, and the points."""
+def _sampled_windings(solid: Solid, winding: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return winding numbers at a grid of points in the bounding box, and the points."""
     counts = np.full(3, _FINE_POINTS)
     points = solid.lower + (grid(counts) + 0.5) * ((solid.upper - solid.lower) / counts)
     return winding(points), points

@@ -1,19 +1,19 @@
-"""How a body answers to an even field and to one of even gradient, from its surface, and what its cells lack for that.
+"""Response of a body to uniform and linear fields, from a surface integral, and the correction of its cells for it.
 
-Cells of uniform magnetization take too little moment (``demagnetization.py``): one or two across a sheet or a letter up
-to a third. What they take in a field is known at once, by conjugate gradients; what the body takes, if it is ideally
-permeable, is known from its surface alone, which is at one potential then: (1/4π) ∫ σ/‖x − y‖ dA = ψ, where ψ is H0·x
-in an even field, and the moment is ∫ σ x dA. σ is taken as constant on facets (``facets.py``), whose potentials are
-closed forms (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276).
+Cells of uniform magnetization (``demagnetization.py``) take too small a moment: with one or two cells across a sheet or
+a letter by up to a third. The response of an ideally permeable body follows from its surface alone, which is at one
+potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a uniform field H0, ψ = H0·x, and the moment is ∫ σ x dA. The charge σ is taken
+as constant on facets (``facets.py``), whose potentials are closed forms (Wilton et al., IEEE Trans. Antennas Propag. 32
+(1984) 276). The response of the cells is computed by conjugate gradients.
 
-With polarizabilities P of the cells and Q of the surface the operator of the cells N is replaced by N − E C Eᵀ,
-C = P⁻¹ − Q⁻¹, E an even field: all cells feel C times the moment of the body on top. By Woodbury's formula the body
-then takes Q in an even field; and since Q is positive the operator stays positive, which a change of the cells' own
-tensors would not leave it.
+Let P be the polarizability of the cells, Q that of the surface, and N the operator of the cells. The correction
+replaces N by N − E C Eᵀ, where C = P⁻¹ − Q⁻¹ and the columns of E are uniform fields. It adds a field of C times the
+moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is positive,
+the operator stays positive, which it would not if the cells' own tensors were changed instead.
 
-The same holds for more fields at once. The columns of E are gradients of harmonic polynomials ψ_k, and P and Q matrices
-of what each gives of each, Q_kl = ∫ σ_k ψ_l dA. Beside the three even fields there are five of even gradient, which a
-magnet nearby makes most of the rest of: a plate below one lacks 2 to 4 % of the force without them.
+The same holds for more fields. The columns of E are gradients of harmonic polynomials ψ_k, and P and Q are matrices,
+Q_kl = ∫ σ_k ψ_l dA. Three uniform fields and five linear ones are used. A nearby magnet excites mostly these: without
+the linear fields, the force on a plate below a magnet is 2 to 4 % too small.
 """
 
 from collections.abc import Sequence
@@ -27,215 +27,225 @@ from warpmag.shapes.demagnetization import Coupling, common_fields, full_tensors
 from warpmag.shapes.lattice import Lattice
 from warpmag.shapes.solids import Solid
 
-FIELDS = 8
-"""Fields that all cells of a body may have in common: three even ones and five of even gradient."""
+FIELD_COUNT = 8
+"""Largest number of fields that the cells of a body have in common: three uniform and five linear ones."""
 
-_UNEVEN = 65, 2500
-"""Cells of bodies that get the fields of even gradient, too: with fewer they are tensors that are not symmetric, which
-bodies that respond as wholes do not know; with more cells lack little, and as many more fields take as much longer."""
+_LINEAR_FIELD_CELLS = 65, 2500
+"""Smallest and largest number of cells of bodies that get the linear fields, too. Bodies of fewer cells may respond as
+wholes, for which the tensors with linear fields are not symmetric. Bodies of more cells need little correction, which
+takes time in proportion to their number."""
 
 FACETS = 600
-"""Facets of a body, about; from these and a quarter as many its moment is extrapolated, to 0.3 % for a cube."""
+"""Approximate number of facets of a body. Extrapolation from it and a quarter of it gives a cube's moment to 0.3 %."""
 
-_FACETS_OF_PART = 150
-"""The same of each shape, at least: a quarter as many are then the fewest that ``facets.py`` gives."""
+_FACETS_PER_SHAPE = 150
+"""Smallest number of facets per shape: a quarter of it is the smallest number that ``facets.py`` makes."""
 
 MOST_FACETS = 1500
-"""A mesh of more triangles is left as its cells are."""
+"""Largest number of facets. Bodies of more facets, such as meshes of many triangles, are not corrected."""
 
 MOST_MOMENTS = 6200
-"""A body of more moments is left as its cells are: arrays of their pairs take 0.6 GB."""
+"""Largest number of moments of a corrected body: arrays of their pairs take 0.6 GB."""
 
-_RATIOS = 0.9, 4.0
-"""Moments of surfaces over those of cells: others come from surfaces that nearly meet, which facets do not resolve."""
+_POLARIZABILITY_RATIOS = 0.9, 4.0
+"""Smallest and largest plausible ratio of the surface's polarizability to that of the cells. Other ratios come from
+surfaces that nearly meet, which facets do not resolve."""
 
-_NEAR = 6.0
-"""Distance up to which the potential of a facet is that of its area, in distances from its middle to its corners."""
+_NEAR_DISTANCE = 6.0
+"""Distance up to which a facet's potential is integrated, in distances from its center to its corners."""
 
 _ON_EDGE = 1e-15
-"""What rounding leaves of r1 + r2 − l on an edge of length l, over r1 + r2; its logarithm there is multiplied by 0."""
+"""Relative rounding error of r1 + r2 − l on an edge of length l. It bounds a logarithm whose factor is 0 there."""
 
 _RESIDUAL = 1e-3
-"""Relative residual of the cells' magnetization; the error of the moment is its square over the least eigenvalue."""
+"""Relative residual of the cells' magnetization. The error of the moment is its square over the smallest eigenvalue."""
 
 _MOST_STEPS = 1000
-"""Steps of conjugate gradients; rods of 1:10 take some 60."""
+"""Largest number of steps of conjugate gradients; rods of 1:10 take about 60."""
 
 _CHUNK = 1 << 18
 """Pairs of facets evaluated at a time (some tens of MB)."""
 
 
-def corrected(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
-    """The coupling with the fields that all cells have in common, which bring the body's answer to that of its surface.
+def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
+    """Return the coupling with common fields that give the body the response of its surface.
 
-    Bodies in parts that are apart have none, nor those of which surface or cells are too many, nor two parts in the
-    same place, whose facets all lie on each other.
+    The coupling is returned as it is if the body consists of separate parts, if its surface or its cells are too many,
+    or if shapes coincide, because their facets then coincide, too.
     """
-    if len(lattice.volumes) > MOST_MOMENTS or not _hangs_together(coupling):
+    if len(lattice.volumes) > MOST_MOMENTS or not _is_connected(coupling):
         return coupling
-    most = max(FACETS, _FACETS_OF_PART * len(solids))
+    most = max(FACETS, _FACETS_PER_SHAPE * len(solids))
     coarse, fine = (facets.of_body(solids, count) for count in (most // 4, most))
     if not len(coarse) or len(fine) > MOST_FACETS:
         return coupling
-    of_surface, of_cells = extrapolated_moments(coupling, coarse, fine), cell_moments(coupling, lattice)
-    for count in range(len(of_cells), 0, -FIELDS + 3):
+    of_surface = extrapolated_polarizability(coupling, coarse, fine)
+    of_cells = cell_polarizability(coupling, lattice)
+    for count in range(len(of_cells), 0, -FIELD_COUNT + 3):
         cells, surface = of_cells[:count, :count], of_surface[:count, :count]
-        parts = np.linalg.eigvals(np.linalg.solve(surface, cells)).real
-        if parts.min() > 1.0 / _RATIOS[1] and parts.max() < 1.0 / _RATIOS[0]:
-            common = np.zeros((FIELDS, FIELDS))
+        ratios = np.linalg.eigvals(np.linalg.solve(surface, cells)).real
+        if ratios.min() > 1.0 / _POLARIZABILITY_RATIOS[1] and ratios.max() < 1.0 / _POLARIZABILITY_RATIOS[0]:
+            common = np.zeros((FIELD_COUNT, FIELD_COUNT))
             common[:count, :count] = np.linalg.inv(cells) - np.linalg.inv(surface)
             return replace(coupling, common=common)
     return coupling
 
 
-def common_potentials(places: np.ndarray) -> np.ndarray:
-    """Potentials x, y, z, (x² − z²)/2, (y² − z²)/2, xy, xz, yz at places in extents, shape [n, 8]."""
-    x, y, z = places.T
+def common_potentials(points: np.ndarray) -> np.ndarray:
+    """Return x, y, z, (x² − z²)/2, (y² − z²)/2, xy, xz, yz at points, shape [n, 8]; ``common_fields`` are gradients."""
+    x, y, z = points.T
     return np.stack([x, y, z, 0.5 * (x * x - z * z), 0.5 * (y * y - z * z), x * y, x * z, y * z], axis=1)
 
 
-def extrapolated_moments(coupling: Coupling, coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
-    """:func:`surface_moments` for ever more facets, of which the error goes as one over their number."""
-    found = surface_moments(coupling, fine)
+def extrapolated_polarizability(coupling: Coupling, coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
+    """Return :func:`surface_polarizability`, extrapolated from two surfaces: its error is inverse to their facets."""
+    result = surface_polarizability(coupling, fine)
     if len(fine) < 2 * len(coarse):
-        return found
-    return found + (found - surface_moments(coupling, coarse)) / (len(fine) / len(coarse) - 1.0)
+        return result
+    return result + (result - surface_polarizability(coupling, coarse)) / (len(fine) / len(coarse) - 1.0)
 
 
-def surface_moments(coupling: Coupling, surface: np.ndarray) -> np.ndarray:
-    """What an ideally permeable body takes of common fields in each of them [m³], in even fields moments, shape [k, k].
+def surface_polarizability(coupling: Coupling, surface: np.ndarray) -> np.ndarray:
+    """Return the polarizability matrix Q_kl [m³] of an ideally permeable body for its common fields, shape [k, k].
+
+    The entries of the uniform fields are the moments in them.
 
     Args:
-        coupling: The coupling of its cells, of which the number tells which fields count.
-        surface: Its facets [m], shape [m, 4, 3].
+        coupling: Coupling of the body's cells; their number decides which fields are used.
+        surface: Facets of the body [m], shape [m, 4, 3].
     """
     middles, (_, areas) = facets.middles(surface), facets.measures(surface)
     count = _field_count(coupling)
-    at = coupling.extent * common_potentials((middles - coupling.centre) / coupling.extent)[:, :count]
-    matrix = np.zeros((len(at) + 1, len(at) + 1))
-    step = max(1, _CHUNK // len(at))
-    for start in range(0, len(at), step):
-        matrix[start : min(start + step, len(at)), :-1] = potentials(middles[start : start + step], surface)
-    matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # the potential of the body is free, its charge is zero
-    charges = np.linalg.solve(matrix, np.append(at, np.zeros((1, count)), axis=0))[:-1]
-    found = (charges * areas[:, None]).T @ at
-    return 0.5 * (found + found.T)
+    potential = coupling.extent * common_potentials((middles - coupling.center) / coupling.extent)[:, :count]
+    matrix = np.zeros((len(potential) + 1, len(potential) + 1))
+    step = max(1, _CHUNK // len(potential))
+    for start in range(0, len(potential), step):
+        matrix[start : min(start + step, len(potential)), :-1] = potentials(middles[start : start + step], surface)
+    matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # unknown potential of the body, whose charge is zero
+    charges = np.linalg.solve(matrix, np.append(potential, np.zeros((1, count)), axis=0))[:-1]
+    result = (charges * areas[:, None]).T @ potential
+    return 0.5 * (result + result.T)
 
 
 def _field_count(coupling: Coupling) -> int:
-    return FIELDS if _UNEVEN[0] <= len(coupling.radii) <= _UNEVEN[1] else 3
+    """Return the number of common fields for the cells of a body."""
+    return FIELD_COUNT if _LINEAR_FIELD_CELLS[0] <= len(coupling.radii) <= _LINEAR_FIELD_CELLS[1] else 3
 
 
 def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """(1/4π) ∫ dA/‖x − y‖ of each facet at each point [m], shape [points, facets].
+    """Return (1/4π) ∫ dA/‖x − y‖ of each facet at each point [m], shape [points, facets].
 
-    From afar, where that differs by less than 0.3 %, that of its area in its middle.
+    Far from a facet, its area at its center stands for it, with an error below 0.3 %.
     """
-    origin = surface.mean(axis=(0, 1))  # about which heights keep their digits
+    origin = surface.mean(axis=(0, 1))  # distances from planes near the origin keep their digits
     points, surface = points - origin, surface - origin
     middles, (_, areas) = facets.middles(surface), facets.measures(surface)
-    square = _squares(points, middles)
-    extent2 = ((surface - middles[:, None]) ** 2).sum(axis=2).max(axis=1)
-    near = square < _NEAR**2 * extent2
-    square[near] = 1.0
-    result = areas / np.sqrt(square)
+    squares = _squared_distances(points, middles)
+    size2 = ((surface - middles[:, None]) ** 2).sum(axis=2).max(axis=1)
+    near = squares < _NEAR_DISTANCE**2 * size2
+    squares[near] = 1.0
+    result = areas / np.sqrt(squares)
     result[near] = _near_potentials(points, surface, near)
     return result / (4.0 * np.pi)
 
 
-def _squares(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Squares of the distances between points, shape [points, others]."""
-    apart = points[:, None] - others  # the squares of places would lose the digits of small facets far out
+def _squared_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the squared distances between points, shape [points, others]."""
+    apart = points[:, None] - others  # x² − 2xy + y² would lose the digits of small facets far from the origin
     return np.einsum("nmk,nmk->nm", apart, apart)
 
 
 def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """∫ dA/‖x − y‖ for the pairs of a point and a facet that ``near`` marks.
+    """Return ∫ dA/‖x − y‖ for the pairs of a point and a facet that ``near`` marks.
 
-    Of each edge the distance in the plane from the point times the logarithm of its ends' distances, less the height
-    over the plane times the solid angle: that of two triangles (van Oosterom and Strackee 1983), whose scalar triple
-    products are heights times areas.
+    It is a sum over edges minus the height over the plane times the solid angle. An edge contributes its distance from
+    the point's projection times a logarithm of the distances of its ends. The solid angle is that of two triangles (van
+    Oosterom and Strackee 1983), whose scalar triple products are heights times areas.
     """
     normals, _ = facets.measures(surface)
-    square = [_squares(points, surface[:, k])[near] for k in range(4)]
-    away = [np.sqrt(one) for one in square]
+    squares = [_squared_distances(points, surface[:, k])[near] for k in range(4)]
+    distances = [np.sqrt(square) for square in squares]
     height = np.abs(points @ normals.T - np.einsum("mk,mk->m", normals, surface[:, 0]))[near]
     lengths = np.linalg.norm(np.roll(surface, -1, axis=1) - surface, axis=2)
     diagonals = np.linalg.norm(surface[:, 2] - surface[:, 0], axis=1)
-    which = np.broadcast_to(np.arange(len(surface)), near.shape)[near]
+    facet = np.broadcast_to(np.arange(len(surface)), near.shape)[near]
     total = np.zeros_like(height)
     for k in range(4):
         side, length = surface[:, (k + 1) % 4] - surface[:, k], lengths[:, k]
         outward = np.cross(side, normals) / np.maximum(length, np.finfo(float).tiny)[:, None]
         across = (np.einsum("mk,mk->m", outward, surface[:, k]) - points @ outward.T)[near]
-        both, length = away[k] + away[(k + 1) % 4], length[which]
+        both, length = distances[k] + distances[(k + 1) % 4], length[facet]
         total += across * np.log((both + length) / np.maximum(both - length, _ON_EDGE * both))
-    turned = np.ones(len(height), complex)
+    angle = np.ones(len(height), complex)
     for k in (1, 2):
         corners = surface[:, 0], surface[:, k], surface[:, k + 1]
-        double = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]), axis=1)[which]
+        double_area = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]), axis=1)[facet]
         sides = (lengths[:, 0], lengths[:, 1], diagonals) if k == 1 else (diagonals, lengths[:, 2], lengths[:, 3])
-        (a, b, c), (a2, b2, c2) = (away[0], away[k], away[k + 1]), (square[0], square[k], square[k + 1])
-        ab, bc, ca = (one[which] ** 2 for one in sides)
+        a, b, c = distances[0], distances[k], distances[k + 1]
+        a2, b2, c2 = squares[0], squares[k], squares[k + 1]
+        ab, bc, ca = (side[facet] ** 2 for side in sides)
         real = a * b * c + 0.5 * ((a2 + b2 - ab) * c + (b2 + c2 - bc) * a + (c2 + a2 - ca) * b)
-        turned *= real + 1j * height * double
-    return total - 2.0 * height * np.angle(turned)
+        angle *= real + 1j * height * double_area
+    return total - 2.0 * height * np.angle(angle)
 
 
-def cell_moments(coupling: Coupling, lattice: Lattice) -> np.ndarray:
-    """The same of the cells of a body, of which those without a coupling are dipoles to each other."""
-    apply, root = _operator(coupling, lattice), np.sqrt(lattice.volumes)[:, None, None]
-    fields = root * common_fields(coupling.places)[:, :, : _field_count(coupling)]
-    found, rest = np.zeros_like(fields), fields
-    search, size = rest, (rest**2).sum(axis=(0, 1))
+def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
+    """Return the polarizability matrix P_kl [m³] of a body's cells for its common fields, shape [k, k].
+
+    Cells without a coupling act on each other as dipoles.
+    """
+    apply, root = _cell_operator(coupling, lattice), np.sqrt(lattice.volumes)[:, None, None]
+    fields = root * common_fields(coupling.scaled_positions)[:, :, : _field_count(coupling)]
+    solution, residual = np.zeros_like(fields), fields
+    search, size = residual, (residual**2).sum(axis=(0, 1))
     goal = _RESIDUAL**2 * size
     for _ in range(_MOST_STEPS):
-        going = size > goal
-        if not going.any():
+        unfinished = size > goal
+        if not unfinished.any():
             break
         image = apply(search)
-        step = np.where(going, size / np.where(going, (search * image).sum(axis=(0, 1)), 1.0), 0.0)
-        found, rest = found + step * search, rest - step * image
-        size, before = (rest**2).sum(axis=(0, 1)), size
-        search = rest + np.where(going, size / before, 0.0) * search
-    moments = np.einsum("nkl,nkm->lm", found, fields + rest)  # second order in the residual
+        step = np.where(unfinished, size / np.where(unfinished, (search * image).sum(axis=(0, 1)), 1.0), 0.0)
+        solution, residual = solution + step * search, residual - step * image
+        size, before = (residual**2).sum(axis=(0, 1)), size
+        search = residual + np.where(unfinished, size / before, 0.0) * search
+    moments = np.einsum("nkl,nkm->lm", solution, fields + residual)  # second order in the residual
     return 0.5 * (moments + moments.T)
 
 
-def _operator(coupling: Coupling, lattice: Lattice):
-    """N of the cells, symmetrized by their volumes, as a function of magnetizations, shape [n, 3, fields].
+def _cell_operator(coupling: Coupling, lattice: Lattice):
+    """Return the operator N of the cells, symmetrized by their volumes: a function of arrays [n, 3, fields].
 
-    Of r(r·m), r = x − y, each factor is a sum over y that a product of matrices makes.
+    r = x − y separates each term of r(r·m) into sums over y, which are products of matrices.
     """
     unit, n = float(lattice.radii.max()), len(lattice.volumes)
     x, radii = (lattice.positions - lattice.positions.mean(axis=0)) / unit, lattice.radii / unit
     root, tensors = np.sqrt(lattice.volumes / unit**3), full_tensors(coupling.tensor) * unit**3
-    even, odd = np.empty((2, n, n))
+    isotropic, dipolar = np.empty((2, n, n))  # factors of m and of r (r·m)
     step = max(1, _CHUNK // n)
     for start in range(0, n, step):
         rows = slice(start, start + step)
-        apart = np.linalg.norm(x[rows, None] - x, axis=2)
-        even[rows], odd[rows] = radial_factors(apart, radii[rows, None], radii)
-    even[np.arange(n), np.arange(n)], odd[np.arange(n), np.arange(n)] = -1.0 / radii**3, 0.0
+        distances = np.linalg.norm(x[rows, None] - x, axis=2)
+        isotropic[rows], dipolar[rows] = radial_factors(distances, radii[rows, None], radii)
+    isotropic[np.arange(n), np.arange(n)], dipolar[np.arange(n), np.arange(n)] = -1.0 / radii**3, 0.0
 
     def apply(scaled: np.ndarray) -> np.ndarray:
         m = scaled * root[:, None, None]
         along = np.einsum("nk,nkf->nf", x, m)
         products = (x[:, k, None, None] * m for k in range(3))
         parts = np.concatenate([m, along[:, None], *products, x[:, :, None] * along[:, None]], axis=1)
-        sums = (odd @ parts.reshape(n, -1)).reshape(n, 16, -1)
+        sums = (dipolar @ parts.reshape(n, -1)).reshape(n, 16, -1)
         inner = np.einsum("nk,nkf->nf", x, sums[:, :3]) - sums[:, 3]
         outer = np.einsum("nklf,nl->nkf", sums[:, 4:13].reshape(n, 3, 3, -1), x) - sums[:, 13:]
-        near = (even @ m.reshape(n, -1)).reshape(m.shape)
-        field = (near + x[:, :, None] * inner[:, None] - outer) / (4.0 * np.pi)
+        field = (isotropic @ m.reshape(n, -1)).reshape(m.shape)
+        field = (field + x[:, :, None] * inner[:, None] - outer) / (4.0 * np.pi)
         field += np.add.reduceat(tensors @ m[coupling.other], coupling.start[:-1], axis=0)
         return -field * root[:, None, None]
 
     return apply
 
 
-def _hangs_together(coupling: Coupling) -> bool:
-    """Whether each cell is coupled with each other one, over others."""
+def _is_connected(coupling: Coupling) -> bool:
+    """Return True if the couplings connect all cells, directly or over other cells."""
     group, before = np.arange(len(coupling.start) - 1), None
     while before is None or (group != before).any():
         before, group = group, np.minimum.reduceat(group[coupling.other], coupling.start[:-1])

@@ -14,7 +14,7 @@ from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.polyhedra import Polyhedron
 from warpmag.shapes.solids import boxes_meet
-from warpmag.shapes.uniform_response import corrected
+from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0
 """How far the closed form of a permanent magnet reaches where it is a lattice from afar, in cells."""
@@ -113,7 +113,7 @@ class ShapeSampler:
         )
         if permanent:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
-        cells = corrected(coupling(filled, filled.radii), filled, solids)
+        cells = with_surface_response(coupling(filled, filled.radii), filled, solids)
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts)
 
     def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:
