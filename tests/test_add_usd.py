@@ -25,19 +25,19 @@ def by_newton(stage):
     return model, {model.shape_label[shape]: magnet for shape, magnet in marked_shapes(model).items()}
 
 
-def compare(found, expected):
-    assert found.keys() == expected.keys()
+def compare(imported, expected):
+    assert imported.keys() == expected.keys()
     for label, magnet in expected.items():
-        other = found[label]
+        other = imported[label]
         assert (other.kind, other.curve) == (magnet.kind, magnet.curve)
-        numbers = [(one.saturation, one.susceptibility, one.moment_spacing) for one in (other, magnet)]
+        numbers = [(each.saturation, each.susceptibility, each.moment_spacing) for each in (other, magnet)]
         np.testing.assert_array_equal(*numbers)
         size = np.linalg.norm(magnet.magnetization)  # turned by quaternions in float32
         np.testing.assert_allclose(other.magnetization, magnet.magnetization, rtol=0, atol=1e-6 * size)
 
 
 QUICK = ("balls_up", "crystal_balls")
-SCENES = [pytest.param(one, marks=() if one in QUICK else pytest.mark.long) for one in bundled()]
+SCENES = [pytest.param(scene, marks=() if scene in QUICK else pytest.mark.long) for scene in bundled()]
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -76,17 +76,17 @@ def stage(tmp_path):
 
 
 def test_magnets_of_bodies_and_colliders(stage):
-    model, found = by_newton(stage)
-    assert found.keys() == {"/Body/Group/Capsule", "/Box", "/Static"}
-    assert found["/Static"] == Magnet()
-    assert found["/Box"].saturation == 1e6
+    model, magnets = by_newton(stage)
+    assert magnets.keys() == {"/Body/Group/Capsule", "/Box", "/Static"}
+    assert magnets["/Static"] == Magnet()
+    assert magnets["/Box"].saturation == 1e6
     shape = model.shape_label.index("/Body/Group/Capsule")
     turn = wp.quat(*model.shape_transform.numpy()[shape, 3:].tolist())
     assert abs(turn[3]) < 0.9
-    magnetization = wp.quat_rotate(turn, wp.vec3(*found["/Body/Group/Capsule"].magnetization))
+    magnetization = wp.quat_rotate(turn, wp.vec3(*magnets["/Body/Group/Capsule"].magnetization))
     np.testing.assert_allclose(magnetization, (1e5, 2e5, 3e5), rtol=1e-5)
     theirs = import_scene(stage).builder.finalize(device="cpu")
-    compare(found, {theirs.shape_label[shape]: magnet for shape, magnet in marked_shapes(theirs).items()})
+    compare(magnets, {theirs.shape_label[shape]: magnet for shape, magnet in marked_shapes(theirs).items()})
     assert len(warpmag.Magnetics(model).magnets) == 3
 
 
@@ -124,19 +124,21 @@ def test_coils_and_field_maps_come_in(coils, turned):
     builder.add_usd(str(coils), xform=moved if turned else None)
     model = builder.finalize(device="cpu")
     theirs = warpmag.Magnetics(model)
-    states = [one._model.state() for one in (ours, theirs)]
+    states = [magnetics._model.state() for magnetics in (ours, theirs)]
     whole = moved * wp.transform((0.0, 0.0, 0.0), newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.Y))
     whole = whole if turned else wp.transform_identity()
-    for one, state in zip((ours, theirs), states, strict=True):
-        one.induce(state)
-    names = [[one._model.shape_label[shape] for shape in one._sources.shapes] for one in (ours, theirs)]
+    for magnetics, state in zip((ours, theirs), states, strict=True):
+        magnetics.induce(state)
+    names = [
+        [magnetics._model.shape_label[shape] for shape in magnetics._sources.shapes] for magnetics in (ours, theirs)
+    ]
     assert names[0] == names[1] == ["/Body/Coil", "/Lift", "/Earth"]
-    frames, found = (one.system.sources.frames.numpy() for one in (ours, theirs))
-    for frame, other in zip(frames, found, strict=True):
+    frames, others = (magnetics.system.sources.frames.numpy() for magnetics in (ours, theirs))
+    for frame, other in zip(frames, others, strict=True):
         expected = np.array(whole * wp.transform(frame[:3], frame[3:]))
         np.testing.assert_allclose(other[:3], expected[:3], atol=1e-5)
         assert abs(abs(expected[3:] @ other[3:]) - 1.0) < 1e-5
-    strengths = [one.system.sources.strengths.numpy() for one in (ours, theirs)]
+    strengths = [magnetics.system.sources.strengths.numpy() for magnetics in (ours, theirs)]
     np.testing.assert_array_equal(*strengths)
 
 

@@ -175,7 +175,7 @@ def _size_of(kind, scale, source):
 
 
 def test_sizes_of_bodies_are_those_of_their_shapes():
-    """Of all kinds of shapes, several on a body, with the largest and the smallest of them anywhere."""
+    """Sizes of bodies from shapes of all kinds, several on a body, the largest and the smallest anywhere."""
     rng, builder = np.random.default_rng(5), newton.ModelBuilder()
     tetrahedron = newton.Mesh(np.eye(4, 3), np.array([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]))
     for number in range(20):

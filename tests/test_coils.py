@@ -139,10 +139,10 @@ def test_a_coil_is_switched_in_a_graph(device):
     for value in (200.0, 0.0, -400.0):
         current.assign([value])
         wp.capture_launch(capture.graph)
-        found = magnetics.shape_moments()[0, 2], state.body_f.numpy()[0, 2]
+        moment_and_force = magnetics.shape_moments()[0, 2], state.body_f.numpy()[0, 2]
         # the force is m dH/dz, of m = 3 V H: H'/H = -3 z/(A² + z²)
         force = oracle.MU0 * 3.0 * VOLUME * (per_ampere * value) ** 2 * -1.5 / (1.25 * A)
-        np.testing.assert_allclose(found, (3.0 * VOLUME * per_ampere * value, force), rtol=1e-4)
+        np.testing.assert_allclose(moment_and_force, (3.0 * VOLUME * per_ampere * value, force), rtol=1e-4)
 
 
 def test_fixed_bodies_and_fixed_maps(device):
@@ -170,8 +170,8 @@ def test_fixed_bodies_and_fixed_maps(device):
     for k, current in enumerate((50.0, 0.0)):
         dipole = oracle.h_field(np.array([[0.0, 0.0, 0.5 * A]]), moments[k : k + 1], np.array([[0.0, 0.0, -0.5 * A]]))
         expected = dipole[0] + [60.0, 0.0, current / (2.0 * 1.25**1.5 * A)]
-        found = sensor.flux_density.numpy()[k] / oracle.MU0
-        np.testing.assert_allclose(found, expected, atol=SINGLE * np.abs(expected).max())
+        field = sensor.flux_density.numpy()[k] / oracle.MU0
+        np.testing.assert_allclose(field, expected, atol=SINGLE * np.abs(expected).max())
 
 
 def test_records_survive_as_text():
@@ -247,7 +247,7 @@ WILD = {
 @pytest.mark.parametrize("name", WILD)
 @given(st.data())
 def test_any_source(name, data):
-    """What is taken makes a record of finite numbers."""
+    """Valid arguments make a record of finite numbers."""
     builder, right = new_builder(), {"radius": A} if name == "add_coil" else {
         "origin": (0.0, 0.0, 0.0), "spacing": 1.0, "values": np.ones((2, 2, 2, 3))
     }  # fmt: skip

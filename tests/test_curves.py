@@ -71,5 +71,5 @@ def test_langevins_steepness_is_fitted_to_the_oracle(evaluate):
     c, slope = oracle.reduced_curve(s, "langevin")
     fit = np.polyfit(2.0 * c - 1.0, slope / cohen(c), 12)
     c, _ = oracle.reduced_curve(S, "langevin")
-    found, tolerance = evaluate("langevin", c)
-    assert np.abs(found[4] - cohen(c) * np.polyval(fit, 2.0 * c - 1.0)).max() < tolerance
+    magnetizations, tolerance = evaluate("langevin", c)
+    assert np.abs(magnetizations[4] - cohen(c) * np.polyval(fit, 2.0 * c - 1.0)).max() < tolerance

@@ -31,9 +31,9 @@ def test_a_magnet_covers_all_colliding_shapes_of_its_body(builder, device):
     builder.add_shape_box(body, hx=0.1, hy=0.1, hz=0.1, cfg=unseen)
     add_ball(builder)
     warpmag.add_inducible(builder, body, saturation=4e5, susceptibility=3.0, curve="langevin", moment_spacing=0.002)
-    found = marked_shapes(builder.finalize(device=device))
-    assert set(found) == {0, 1}
-    magnet = found[1]
+    magnets = marked_shapes(builder.finalize(device=device))
+    assert set(magnets) == {0, 1}
+    magnet = magnets[1]
     assert (magnet.kind, magnet.saturation, magnet.susceptibility, magnet.curve) == ("inducible", 4e5, 3.0, "langevin")
     assert magnet.moment_spacing == pytest.approx(0.002, rel=1e-6)  # stored in float32
 

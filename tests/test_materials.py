@@ -29,18 +29,20 @@ def test_grades_are_named_after_their_energy_product(name):
 def test_the_page_of_materials_has_all_of_them():
     page = (Path(__file__).parents[1] / "docs" / "materials.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")][1:]
-    assert {row[0]: row[2] for row in rows} == {name: f"{one.polarization:.4g}" for name, one in MATERIALS.items()}
-    assert {row[0]: float(row[4]) for row in rows} == {name: one.density for name, one in MATERIALS.items()}
+    assert {row[0]: row[2] for row in rows} == {
+        name: f"{material.polarization:.4g}" for name, material in MATERIALS.items()
+    }
+    assert {row[0]: float(row[4]) for row in rows} == {name: material.density for name, material in MATERIALS.items()}
 
 
 def test_materials_are_within_what_matter_does():
-    for name, one in MATERIALS.items():
-        assert one.name == name and one.source
-        assert one.kind in ("inducible", "permanent")
-        assert 0.3 < one.polarization < 2.45  # iron-cobalt, the strongest there is
-        assert one.saturation * MU0 == pytest.approx(one.polarization, rel=1e-9)
-        if one.kind == "inducible":
-            assert one.susceptibility > 100.0
+    for name, material in MATERIALS.items():
+        assert material.name == name and material.source
+        assert material.kind in ("inducible", "permanent")
+        assert 0.3 < material.polarization < 2.45  # iron-cobalt, the strongest there is
+        assert material.saturation * MU0 == pytest.approx(material.polarization, rel=1e-9)
+        if material.kind == "inducible":
+            assert material.susceptibility > 100.0
 
 
 def ball(**magnet):
@@ -103,12 +105,12 @@ PERMANENT = {"kind": (Sdf.ValueTypeNames.Token, "permanent")}
 
 
 def test_prims_of_named_materials():
-    found = read_magnets(stage_with("soft-ferrite")).magnets["/Ball"]
+    magnet = read_magnets(stage_with("soft-ferrite")).magnets["/Ball"]
     ferrite = warpmag.material("soft-ferrite")
-    assert (found.saturation, found.susceptibility) == (ferrite.saturation, ferrite.susceptibility)
+    assert (magnet.saturation, magnet.susceptibility) == (ferrite.saturation, ferrite.susceptibility)
     along = {"magnetization": (Sdf.ValueTypeNames.Vector3f, Gf.Vec3f(0.0, 2.0, 0.0))}
-    found = read_magnets(stage_with("hard-ferrite", **PERMANENT, **along)).magnets["/Ball"]
-    np.testing.assert_allclose(found.magnetization, (0.0, 0.385 / MU0, 0.0), rtol=1e-9)
+    magnet = read_magnets(stage_with("hard-ferrite", **PERMANENT, **along)).magnets["/Ball"]
+    np.testing.assert_allclose(magnet.magnetization, (0.0, 0.385 / MU0, 0.0), rtol=1e-9)
 
 
 def test_a_stage_written_with_the_numbers_reads_the_same():

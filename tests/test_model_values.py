@@ -92,11 +92,13 @@ def test_a_material_that_was_told_of_counts(device, captured):
     for _ in range(3):
         work()
     magnetics.check_model()
-    found, expected = state.body_f.numpy(), stepped(warpmag.Magnetics(model_of(device, **material), rtol=1e-5), model)
+    forces, expected = state.body_f.numpy(), stepped(warpmag.Magnetics(model_of(device, **material), rtol=1e-5), model)
     scale = np.abs(expected).max()
     assert np.abs(before - expected).max() > 0.1 * scale
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 * scale)  # ten times rtol
-    assert {one.magnet.saturation for one in magnetics.magnets if one.magnet.kind == "inducible"} == {np.float32(3e5)}
+    np.testing.assert_allclose(forces, expected, rtol=0, atol=1e-4 * scale)  # ten times rtol
+    assert {entry.magnet.saturation for entry in magnetics.magnets if entry.magnet.kind == "inducible"} == {
+        np.float32(3e5)
+    }
 
 
 @pytest.mark.parametrize("name", CHANGES)

@@ -128,19 +128,19 @@ def test_balls_of_several_materials(dtype, device):
     h0 = np.repeat(fields, len(curves))
     system = moment_system(
         radii=np.full(len(each), 0.005), worlds=np.arange(len(each)), saturation=1.7e6, susceptibility=300.0,
-        curve=[MATERIALS[one].curve if one in NAMES else one for one in each], dtype=dtype, device=device,
+        curve=[MATERIALS[curve].curve if curve in NAMES else curve for curve in each], dtype=dtype, device=device,
         external_field=np.outer(h0, [0.6, 0.0, -0.8]),
     )  # fmt: skip
     system.solve()
-    found = system.magnetizations().numpy() @ [0.6, 0.0, -0.8]
+    magnetizations = system.magnetizations().numpy() @ [0.6, 0.0, -0.8]
     laws = {name: reference(name)[0] for name in NAMES}
-    for one, field, m in zip(each, h0, found, strict=True):
-        if one in NAMES:
-            exact = ball_in(laws[one], field)[1]
+    for curve, field, m in zip(each, h0, magnetizations, strict=True):
+        if curve in NAMES:
+            exact = ball_in(laws[curve], field)[1]
         else:
-            exact = oracle.magnetization(np.array([[field, 0.0, 0.0]]), 1.7e6, 300.0, one)[0][0, 0]
+            exact = oracle.magnetization(np.array([[field, 0.0, 0.0]]), 1.7e6, 300.0, curve)[0][0, 0]
         # Langevin's coth x - 1/x loses a digit just above where its series ends
-        rounding = {"float32": 6e-6 if one == "langevin" else 3e-6, "float64": 1e-12}[dtype]
+        rounding = {"float32": 6e-6 if curve == "langevin" else 3e-6, "float64": 1e-12}[dtype]
         assert m == pytest.approx(exact, rel=rounding)
 
 
@@ -163,7 +163,7 @@ def test_many_curves_are_each_one_of_its_own(contact_model, device):
         h, m = np.asarray(both.h_field, float)[balls], np.asarray(both.magnetizations, float)[balls]
         norm = np.linalg.norm(h, axis=1)
         if curve is None:
-            exact = np.array([ball_in(law, one)[1] for one in norm])
+            exact = np.array([ball_in(law, size)[1] for size in norm])
         else:
             exact = np.linalg.norm(oracle.magnetization(h, 1.7e6, math.inf, curve)[0], axis=1)
         np.testing.assert_allclose(np.linalg.norm(m, axis=1), exact, rtol=1e-5)
@@ -181,7 +181,7 @@ def steel_oracle(name):
 
     def reduced(s):
         flat = np.ravel(s)
-        inside = np.array([ball_in(law, one * saturation / k)[0] if one > 0.0 else 0.0 for one in flat])
+        inside = np.array([ball_in(law, size * saturation / k)[0] if size > 0.0 else 0.0 for size in flat])
         m, slope = law(inside)
         return (m / saturation).reshape(s.shape), (slope / (1.0 + slope / 3.0) / k).reshape(s.shape)
 
@@ -194,13 +194,13 @@ def test_a_pile_of_steel_against_newton(dynamics, device):
     # LLG's explicit steps settle in weak fields alone where a curve has a knee, as on the clamped one
     h0 = (0.3 if dynamics == "llg" else 1.0) * np.array([2e5, 3e5, -1e5])
     exact = oracle.equilibrium(x, 0.005, h0, **steel_oracle("M-19"))
-    found = warpmag.solve_induction(
+    result = warpmag.solve_induction(
         x, 0.005, curve="M-19", external_field=h0, dynamics=dynamics, rtol=1e-6, dtype="float64", device=device,
         max_evaluations=5000,
     )  # fmt: skip
-    assert exact.residual < 1e-10 and found.converged
+    assert exact.residual < 1e-10 and result.converged
     # explicit dynamics stop at a residual, which is the error over the slowest mode's rate: 1/3 at most here
-    error = np.linalg.norm(found.magnetizations - exact.magnetizations) / np.linalg.norm(exact.magnetizations)
+    error = np.linalg.norm(result.magnetizations - exact.magnetizations) / np.linalg.norm(exact.magnetizations)
     assert error < (1e-6 if dynamics == "theta" else 1e-5)
 
 
@@ -239,7 +239,7 @@ def test_forces_follow_the_table(force, device):
 
 
 def test_the_default_curve_is_low_at_the_knee_of_steel(device):
-    """What a measured curve is for: balls of 1010 steel in fields that bring them to the points of the table."""
+    """Balls of 1010 steel in fields that bring them to the points of the table: its curve against the default."""
     h, b = points_of("1010-steel")
     knee = (h > 2e3) & (h < 6e4)
     m = (b / MU0 - h)[knee]
@@ -372,16 +372,16 @@ def test_two_curves_in_one_model(how, device):
     builder.add_builder(builder_with(**given))  # curves survive copies
     model = builder.finalize(device=device)
     curve = own if how == "curve" else MATERIALS["M-19"].curve
-    assert [one.curve for one in marked_shapes(model).values()] == ["tanh", curve]
+    assert [magnet.curve for magnet in marked_shapes(model).values()] == ["tanh", curve]
     magnetics = warpmag.Magnetics(model, external_field=(0.0, 0.0, 4e5))
     state = model.state()
     magnetics.apply(state)
-    found = magnetics.system.magnetizations().numpy()
+    magnetizations = magnetics.system.magnetizations().numpy()
     expected = warpmag.solve_induction(
         [[0.0, 0, 0], [0.011, 0, 0]], 0.005, curve=["tanh", curve], saturation=[1.7e6, 1.0],
         external_field=(0.0, 0.0, 4e5), device=device,
     )  # fmt: skip
-    np.testing.assert_allclose(found, expected.magnetizations, rtol=2e-3)  # each within rtol
+    np.testing.assert_allclose(magnetizations, expected.magnetizations, rtol=2e-3)  # each within rtol
 
 
 @pytest.mark.parametrize(
@@ -400,7 +400,7 @@ def test_bodies_that_contradict(magnet, message):
 
 
 def test_a_changed_number_does_not_bend_a_measured_curve(device):
-    """What a model says beside a table is no material; a named error, not a table with the wrong saturation."""
+    """A change of saturation beside a measured curve raises an error that names it."""
     model = builder_with(material="M-19").finalize(device=device)
     magnetics = warpmag.Magnetics(model, external_field=(0.0, 0.0, 4e5))
     saturation = model.warpmag.saturation.numpy()

@@ -122,6 +122,6 @@ def test_a_body_of_several_parts_weighs_what_each_is_made_of(tmp_path):
 
 
 def test_densities_are_those_of_matter():
-    """Of iron 7,874 kg/m³ (CRC Handbook), of alloys and oxides of it 3,000 to 9,000."""
+    """Density of iron: 7,874 kg/m³ (CRC Handbook), of its alloys and oxides 3,000 to 9,000."""
     assert MATERIALS["pure-iron"].density == pytest.approx(7874.0, rel=1e-3)
-    assert all(3e3 < one.density < 9e3 for one in MATERIALS.values())
+    assert all(3e3 < material.density < 9e3 for material in MATERIALS.values())

@@ -55,18 +55,18 @@ def test_every_attribute_survives_the_round_trip(tmp_path, suffix):
     path = tmp_path / f"coils.{suffix}"
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    for name, one in COILS.items():
-        author_coil(UsdGeom.Xform.Define(stage, name).GetPrim(), one)
+    for name, source in COILS.items():
+        author_coil(UsdGeom.Xform.Define(stage, name).GetPrim(), source)
     author_field_map(UsdGeom.Xform.Define(stage, "/Map").GetPrim(), MAP)
     stage.Save()
-    found = survey(open_stage(path)).sources
-    assert list(found) == [*COILS, "/Map"]
-    for name, one in COILS.items():
-        assert [placed.source for placed in found[name]] == [one]
-    read = found["/Map"][0].source
+    sources = survey(open_stage(path)).sources
+    assert list(sources) == [*COILS, "/Map"]
+    for name, source in COILS.items():
+        assert [placed.source for placed in sources[name]] == [source]
+    read = sources["/Map"][0].source
     assert (read.origin, read.spacing, read.factor) == (MAP.origin, MAP.spacing, MAP.factor)
     np.testing.assert_array_equal(read.values, VALUES)
-    authored = {one.GetName() for one in stage.GetPrimAtPath("/Loop").GetAuthoredAttributes()}
+    authored = {attribute.GetName() for attribute in stage.GetPrimAtPath("/Loop").GetAuthoredAttributes()}
     assert authored == {row.usd_name for row in COIL_SCHEMA.attributes}
 
 
@@ -181,7 +181,7 @@ UNEVEN = "float3 xformOp:scale = (1, 2, 1)", 'uniform token[] xformOpOrder = ["x
 def test_what_is_refused(tmp_path, body, text):
     path = write(tmp_path, body)
     report = check(path)
-    assert any(text in str(one) for one in report.errors), list(map(str, report.errors))
+    assert any(text in str(finding) for finding in report.errors), list(map(str, report.errors))
     with pytest.raises(InputError, match="Thing") as error:
         warpmag.Simulation(path)
     assert "\n" not in str(error.value)
@@ -196,22 +196,22 @@ def test_a_coil_that_keys_move_without_a_body_follows_them(tmp_path, device):
         'uniform token[] xformOpOrder = ["xformOp:translate"]',
     )
     path = write(tmp_path, moved)
-    assert not any("keys move" in str(one) for one in check(path).warnings)
+    assert not any("keys move" in str(finding) for finding in check(path).warnings)
     path.write_text(path.read_text().replace("metersPerUnit", "timeCodesPerSecond = 2400\n    metersPerUnit"))
     simulation = warpmag.Simulation(path, device=device, step=1e-3, rtol=1e-5)
     for step in range(1, 13):
         simulation.step()
         z = 0.1 + 0.2 * min(2400.0 * 1e-3 * step / 24.0, 1.0)
         simulation.magnetics.induce(simulation.state)
-        found = simulation.magnetics.h_field([[0.0, 0.0, z]])[0]
-        np.testing.assert_allclose(found, [0.0, 0.0, 100.0 / 0.08], atol=5.0)  # the ball adds a little
+        field = simulation.magnetics.h_field([[0.0, 0.0, z]])[0]
+        np.testing.assert_allclose(field, [0.0, 0.0, 100.0 / 0.08], atol=5.0)  # the ball adds a little
 
 
 def test_attributes_for_nothing_are_told(tmp_path):
     lone = 'def Xform "Lone" {\nfloat warpmag:fieldMap:factor = 2\n}'
     report = check(write(tmp_path, coil("float warpmag:coil:radius = 1", "float warpmag:coil:ampereturns = 5"), lone))
-    told = [str(one) for one in report.warnings if "no effect" in str(one)]
-    assert told == [
+    messages = [str(finding) for finding in report.warnings if "no effect" in str(finding)]
+    assert messages == [
         "/Thing: warpmag:coil:ampereturns has no effect: no schema has it, the nearest is warpmag:coil:ampereTurns",
         "/Lone: warpmag:fieldMap:factor has no effect: the prim has no WarpmagFieldMapAPI",
     ]

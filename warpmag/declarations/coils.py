@@ -107,61 +107,40 @@ class Coil:
     Loops and solenoids are about the z axis. A positive current makes a field along z inside them.
     """
 
-    shape: Annotated[
-        str,
-        Attribute(
-            "coil:shape", "token", "Shape",
-            "Shape of the coil: a circular loop, a sheet of current around a cylinder (solenoid), or straight pieces "
-            "of wire (polyline).",
-            tokens=COIL_SHAPES, uniform=True,
-        ),
-    ] = "loop"  # fmt: skip
-    radius: Annotated[
-        float,
-        Attribute(
-            "coil:radius", "float", "Radius", "Radius of a loop or a solenoid.",
-            unit="distance", range=_SIZE_TEXT, check=check_size, uniform=True,
-        ),
-    ] = 0.0  # fmt: skip
-    length: Annotated[
-        float,
-        Attribute(
-            "coil:length", "float", "Length", "Length of a solenoid; its middle is the origin of the prim.",
-            unit="distance", range=_SIZE_TEXT, check=check_size, uniform=True,
-        ),
-    ] = 0.0  # fmt: skip
-    points: Annotated[
-        tuple[Vector, ...],
-        Attribute(
-            "coil:points", "point3f[]", "Points", "Corners of a polyline, in the direction of a positive current.",
-            unit="distance", check=partial(checked_vectors, most=LARGEST_POINT), uniform=True,
-        ),
-    ] = ()  # fmt: skip
-    closed: Annotated[
-        bool,
-        Attribute(
-            "coil:closed", "bool", "Closed",
-            "Whether a wire joins the last corner of a polyline to the first. An open polyline is a part of a circuit.",
-            check=check_flag, uniform=True,
-        ),
-    ] = True  # fmt: skip
-    wire_radius: Annotated[
-        float,
-        Attribute(
-            "coil:wireRadius", "float", "Wire Radius",
-            "Radius of the wire; inside the wire the field falls to zero. 0 means a hundredth of the coil's radius, or "
-            "of the diagonal of the box around a polyline.",
-            unit="distance", range="[0, half the coil's radius or length]", check=real_number, uniform=True,
-        ),
-    ] = 0.0  # fmt: skip
-    ampere_turns: Annotated[
-        float,
-        Attribute(
-            "coil:ampereTurns", "float", "Ampere-Turns",
-            "Current times turns; a positive current makes a field along z inside a loop or a solenoid.",
-            unit="ampere", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
-        ),
-    ] = 0.0  # fmt: skip
+    shape: Annotated[str, Attribute(
+        "coil:shape", "token", "Shape",
+        "Shape of the coil: a circular loop, a sheet of current around a cylinder (solenoid), or straight pieces "
+        "of wire (polyline).",
+        tokens=COIL_SHAPES, uniform=True,
+    )] = "loop"  # fmt: skip
+    radius: Annotated[float, Attribute(
+        "coil:radius", "float", "Radius", "Radius of a loop or a solenoid.",
+        unit="distance", range=_SIZE_TEXT, check=check_size, uniform=True,
+    )] = 0.0  # fmt: skip
+    length: Annotated[float, Attribute(
+        "coil:length", "float", "Length", "Length of a solenoid; its middle is the origin of the prim.",
+        unit="distance", range=_SIZE_TEXT, check=check_size, uniform=True,
+    )] = 0.0  # fmt: skip
+    points: Annotated[tuple[Vector, ...], Attribute(
+        "coil:points", "point3f[]", "Points", "Corners of a polyline, in the direction of a positive current.",
+        unit="distance", check=partial(checked_vectors, most=LARGEST_POINT), uniform=True,
+    )] = ()  # fmt: skip
+    closed: Annotated[bool, Attribute(
+        "coil:closed", "bool", "Closed",
+        "Whether a wire joins the last corner of a polyline to the first. An open polyline is a part of a circuit.",
+        check=check_flag, uniform=True,
+    )] = True  # fmt: skip
+    wire_radius: Annotated[float, Attribute(
+        "coil:wireRadius", "float", "Wire Radius",
+        "Radius of the wire; inside the wire the field falls to zero. 0 means a hundredth of the coil's radius, or "
+        "of the diagonal of the box around a polyline.",
+        unit="distance", range="[0, half the coil's radius or length]", check=real_number, uniform=True,
+    )] = 0.0  # fmt: skip
+    ampere_turns: Annotated[float, Attribute(
+        "coil:ampereTurns", "float", "Ampere-Turns",
+        "Current times turns; a positive current makes a field along z inside a loop or a solenoid.",
+        unit="ampere", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
+    )] = 0.0  # fmt: skip
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
@@ -223,36 +202,24 @@ class FieldMap:
     ``values`` has the shape [nx, ny, nz, 3], with at least two nodes along each axis.
     """
 
-    origin: Annotated[
-        Vector,
-        Attribute(
-            "fieldMap:origin", "point3f", "Origin", "Position of the first node.",
-            unit="distance", check=check_vector, uniform=True, default=(0.0, 0.0, 0.0),
-        ),
-    ]  # fmt: skip
-    spacing: Annotated[
-        Vector,
-        Attribute(
-            "fieldMap:spacing", "vector3f", "Spacing", "Distance between nodes along each axis.",
-            unit="distance", range=_SIZE_TEXT, check=check_spacing, uniform=True,
-        ),
-    ]  # fmt: skip
-    values: Annotated[
-        np.ndarray,
-        Attribute(
-            "fieldMap:values", "vector3f[]", "Values",
-            "Field H at the nodes, in the frame of the prim. The index along z runs fastest, then y, then x.",
-            unit="ampere / meter", check=partial(checked_vectors, most=STRONGEST_FIELD), uniform=True,
-        ),
-    ]  # fmt: skip
-    factor: Annotated[
-        float,
-        Attribute(
-            "fieldMap:factor", "float", "Factor", "Factor of the field.",
-            unit="dimensionless", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
-            uniform=True,
-        ),
-    ] = 1.0  # fmt: skip
+    origin: Annotated[Vector, Attribute(
+        "fieldMap:origin", "point3f", "Origin", "Position of the first node.",
+        unit="distance", check=check_vector, uniform=True, default=(0.0, 0.0, 0.0),
+    )]  # fmt: skip
+    spacing: Annotated[Vector, Attribute(
+        "fieldMap:spacing", "vector3f", "Spacing", "Distance between nodes along each axis.",
+        unit="distance", range=_SIZE_TEXT, check=check_spacing, uniform=True,
+    )]  # fmt: skip
+    values: Annotated[np.ndarray, Attribute(
+        "fieldMap:values", "vector3f[]", "Values",
+        "Field H at the nodes, in the frame of the prim. The index along z runs fastest, then y, then x.",
+        unit="ampere / meter", check=partial(checked_vectors, most=STRONGEST_FIELD), uniform=True,
+    )]  # fmt: skip
+    factor: Annotated[float, Attribute(
+        "fieldMap:factor", "float", "Factor", "Factor of the field.",
+        unit="dimensionless", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
+        uniform=True,
+    )] = 1.0  # fmt: skip
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""

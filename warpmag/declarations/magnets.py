@@ -85,77 +85,53 @@ class Magnet:
     ``magnetization`` is in the frame of whatever carries the magnet.
     """
 
-    kind: Annotated[
-        str,
-        Attribute(
-            "kind", "token", "Kind",
-            "Whether the applied field magnetizes the magnet (inducible), or it is magnetized for good (permanent).",
-            tokens=KINDS, uniform=True,
-        ),
-    ] = "inducible"  # fmt: skip
-    saturation: Annotated[
-        float,
-        Attribute(
-            "saturationMagnetization", "float", "Saturation Magnetization",
-            "Saturation magnetization Ms of an inducible magnet.",
-            unit="ampere / meter", range=_MATERIAL_TEXT, check=check_material, kind="inducible",
-            model_change="notified",
-        ),
-    ] = SATURATION_OF_IRON  # fmt: skip
-    susceptibility: Annotated[
-        float,
-        Attribute(
-            "susceptibility", "float", "Susceptibility",
-            "Magnetic susceptibility of an inducible magnet; infinite for an ideally permeable one.",
-            unit="dimensionless", range=f"{_MATERIAL_TEXT}, or inf", check=partial(check_material, infinite=True),
-            kind="inducible", model_change="notified",
-        ),
-    ] = math.inf  # fmt: skip
-    curve: Annotated[
-        str | MagnetizationCurve,
-        Attribute(
-            "curve", "token", "Magnetization Curve",
-            "Magnetization curve of an inducible magnet: a formula, or the measured curve of a material. A measured "
-            "curve replaces saturation magnetization and susceptibility.",
-            tokens=(*CURVES, *MEASURED_CURVES), check=check_curve, uniform=True, kind="inducible",
-        ),
-    ] = "tanh"  # fmt: skip
-    magnetization: Annotated[
-        tuple[float, float, float],
-        Attribute(
-            "magnetization", "vector3f", "Magnetization",
-            "Magnetization of a permanent magnet in the frame of the prim. With a recoil permeability above 1 it is "
-            "the remanent magnetization, at zero internal field.",
-            unit="ampere / meter", check=check_vector, kind="permanent", model_change="substep",
-        ),
-    ] = (0.0, 0.0, 0.0)  # fmt: skip
-    recoil_permeability: Annotated[
-        float,
-        Attribute(
-            "recoilPermeability", "float", "Recoil Permeability",
-            "Relative permeability mu of a permanent magnet, M = Mr + (mu - 1) H with the internal field H. At 1 no "
-            "field changes the magnetization.",
-            unit="dimensionless", range=f"1, or [{_RECOIL_RANGE[0]:g}, {_RECOIL_RANGE[1]:g}]", check=check_recoil,
-            kind="permanent", optional=True,
-        ),
-    ] = 1.0  # fmt: skip
-    moment_spacing: Annotated[
-        float,
-        Attribute(
-            "momentSpacing", "float", "Moment Spacing",
-            "Distance between the moments that sample the magnet; 0 means one moment for a ball, automatic otherwise.",
-            unit="distance", range="[0, inf)", check=check_not_negative,
-        ),
-    ] = 0.0  # fmt: skip
-    conductivity: Annotated[
-        float,
-        Attribute(
-            "conductivity", "float", "Conductivity",
-            "Electrical conductivity of a ball of one moment that is its body's only magnet. Eddy currents brake such "
-            "a ball; 0 means no eddy currents.",
-            unit="siemens / meter", range="[0, inf)", check=check_not_negative, optional=True,
-        ),
-    ] = 0.0  # fmt: skip
+    kind: Annotated[str, Attribute(
+        "kind", "token", "Kind",
+        "Whether the applied field magnetizes the magnet (inducible), or it is magnetized for good (permanent).",
+        tokens=KINDS, uniform=True,
+    )] = "inducible"  # fmt: skip
+    saturation: Annotated[float, Attribute(
+        "saturationMagnetization", "float", "Saturation Magnetization",
+        "Saturation magnetization Ms of an inducible magnet.",
+        unit="ampere / meter", range=_MATERIAL_TEXT, check=check_material, kind="inducible",
+        model_change="notified",
+    )] = SATURATION_OF_IRON  # fmt: skip
+    susceptibility: Annotated[float, Attribute(
+        "susceptibility", "float", "Susceptibility",
+        "Magnetic susceptibility of an inducible magnet; infinite for an ideally permeable one.",
+        unit="dimensionless", range=f"{_MATERIAL_TEXT}, or inf", check=partial(check_material, infinite=True),
+        kind="inducible", model_change="notified",
+    )] = math.inf  # fmt: skip
+    curve: Annotated[str | MagnetizationCurve, Attribute(
+        "curve", "token", "Magnetization Curve",
+        "Magnetization curve of an inducible magnet: a formula, or the measured curve of a material. A measured "
+        "curve replaces saturation magnetization and susceptibility.",
+        tokens=(*CURVES, *MEASURED_CURVES), check=check_curve, uniform=True, kind="inducible",
+    )] = "tanh"  # fmt: skip
+    magnetization: Annotated[tuple[float, float, float], Attribute(
+        "magnetization", "vector3f", "Magnetization",
+        "Magnetization of a permanent magnet in the frame of the prim. With a recoil permeability above 1 it is "
+        "the remanent magnetization, at zero internal field.",
+        unit="ampere / meter", check=check_vector, kind="permanent", model_change="substep",
+    )] = (0.0, 0.0, 0.0)  # fmt: skip
+    recoil_permeability: Annotated[float, Attribute(
+        "recoilPermeability", "float", "Recoil Permeability",
+        "Relative permeability mu of a permanent magnet, M = Mr + (mu - 1) H with the internal field H. At 1 no "
+        "field changes the magnetization.",
+        unit="dimensionless", range=f"1, or [{_RECOIL_RANGE[0]:g}, {_RECOIL_RANGE[1]:g}]", check=check_recoil,
+        kind="permanent", optional=True,
+    )] = 1.0  # fmt: skip
+    moment_spacing: Annotated[float, Attribute(
+        "momentSpacing", "float", "Moment Spacing",
+        "Distance between the moments that sample the magnet; 0 means one moment for a ball, automatic otherwise.",
+        unit="distance", range="[0, inf)", check=check_not_negative,
+    )] = 0.0  # fmt: skip
+    conductivity: Annotated[float, Attribute(
+        "conductivity", "float", "Conductivity",
+        "Electrical conductivity of a ball of one moment that is its body's only magnet. Eddy currents brake such "
+        "a ball; 0 means no eddy currents.",
+        unit="siemens / meter", range="[0, inf)", check=check_not_negative, optional=True,
+    )] = 0.0  # fmt: skip
 
     def __post_init__(self):
         """Set saturation and susceptibility to those of a measured curve."""
@@ -165,12 +141,12 @@ class Magnet:
 
     @property
     def recoils(self) -> bool:
-        """Whether the magnet is permanent and the field changes its magnetization."""
+        """True for a permanent magnet with recoil: the field changes its magnetization."""
         return self.kind == "permanent" and self.recoil_permeability > 1.0
 
     @property
     def fixed(self) -> bool:
-        """Whether no field changes the magnetization."""
+        """True for a permanent magnet without recoil: no field changes its magnetization."""
         return self.kind == "permanent" and not self.recoils
 
     def check(self, name: str, *, unused: bool = False) -> None:
@@ -189,47 +165,32 @@ class Magnet:
 class MagneticSettings:
     """Settings of a scene's magnetic solve; each field is a row of the table of attributes."""
 
-    external_field: Annotated[
-        tuple[float, float, float],
-        Attribute(
-            "externalField", "vector3f", "External Field", "Uniform applied field H0 in the world frame.",
-            unit="ampere / meter", check=check_vector,
-        ),
-    ] = (0.0, 0.0, 0.0)  # fmt: skip
-    force: Annotated[
-        str,
-        Attribute(
-            "force", "token", "Force Law",
-            "Force law of the field on a moment: kelvin (Eqs. 13 and 14 of Kim and Han 2022) or zeeman (Eq. 4).",
-            tokens=FORCES, uniform=True,
-        ),
-    ] = "kelvin"  # fmt: skip
-    dynamics: Annotated[
-        str,
-        Attribute(
-            "dynamics", "token", "Magnetization Dynamics",
-            "Scheme that brings the moments to equilibrium: the exact flow, accelerated (theta), its explicit Euler "
-            "step (theta-euler), or LLG (Eq. 6) with and without precession (llg, llg-damping).",
-            tokens=DYNAMICS, uniform=True,
-        ),
-    ] = "theta"  # fmt: skip
-    contact_model: Annotated[
-        str,
-        Attribute(
-            "contactModel", "token", "Contact Model",
-            "Interaction of balls that nearly touch: their dipoles alone, or also the higher multipoles of the exact "
-            "solution of two balls. The latter requires the force law kelvin.",
-            tokens=CONTACT_MODELS, uniform=True,
-        ),
-    ] = "dipole"  # fmt: skip
-    rtol: Annotated[
-        float,
-        Attribute(
-            "rtol", "float", "Relative Tolerance",
-            "Relative error of the magnetization at which the induction of a step ends.",
-            unit="dimensionless", range=f"[{ACCURACY['float32']:g}, inf)", check=check_rtol,
-        ),
-    ] = 1e-3  # fmt: skip
+    external_field: Annotated[tuple[float, float, float], Attribute(
+        "externalField", "vector3f", "External Field", "Uniform applied field H0 in the world frame.",
+        unit="ampere / meter", check=check_vector,
+    )] = (0.0, 0.0, 0.0)  # fmt: skip
+    force: Annotated[str, Attribute(
+        "force", "token", "Force Law",
+        "Force law of the field on a moment: kelvin (Eqs. 13 and 14 of Kim and Han 2022) or zeeman (Eq. 4).",
+        tokens=FORCES, uniform=True,
+    )] = "kelvin"  # fmt: skip
+    dynamics: Annotated[str, Attribute(
+        "dynamics", "token", "Magnetization Dynamics",
+        "Scheme that brings the moments to equilibrium: the exact flow, accelerated (theta), its explicit Euler "
+        "step (theta-euler), or LLG (Eq. 6) with and without precession (llg, llg-damping).",
+        tokens=DYNAMICS, uniform=True,
+    )] = "theta"  # fmt: skip
+    contact_model: Annotated[str, Attribute(
+        "contactModel", "token", "Contact Model",
+        "Interaction of balls that nearly touch: their dipoles alone, or also the higher multipoles of the exact "
+        "solution of two balls. The latter requires the force law kelvin.",
+        tokens=CONTACT_MODELS, uniform=True,
+    )] = "dipole"  # fmt: skip
+    rtol: Annotated[float, Attribute(
+        "rtol", "float", "Relative Tolerance",
+        "Relative error of the magnetization at which the induction of a step ends.",
+        unit="dimensionless", range=f"[{ACCURACY['float32']:g}, inf)", check=check_rtol,
+    )] = 1e-3  # fmt: skip
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` if a value is out of range, or values do not go together."""
