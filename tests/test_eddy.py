@@ -263,7 +263,7 @@ def test_a_magnet_and_its_coil_move(device):
 def test_only_balls_conduct(device):
     builder = _ball_at_a_magnet(lambda body, place: (np.zeros(3), np.zeros(3)))
     warpmag.add_permanent(builder, 0, magnetization=(0.0, 0.0, 8e5), conductivity=1e6)
-    with pytest.raises(InputError, match="shape_0: conductivity: only of a ball"):
+    with pytest.raises(InputError, match="shape_0: conductivity: only balls"):
         warpmag.Magnetics(builder.finalize(device=device))
     with pytest.raises(InputError, match="conductivity: must be zero or positive"):
         warpmag.add_inducible(builder, 1, conductivity=-1.0)

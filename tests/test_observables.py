@@ -126,7 +126,7 @@ def test_each_point_sees_the_magnets_of_its_world(device):
     magnetics = warpmag.Magnetics(model)
     magnetics.set_magnetization((0.0, 0.0, -2.0 * M), body=1)
     points = [[0.0, 0.0, 0.02]] * 4
-    with pytest.raises(warpmag.InputError, match=r"nothing is to be measured yet, call apply\(state\)"):
+    with pytest.raises(warpmag.InputError, match=r"there is no field yet, call apply\(state\)"):
         magnetics.h_field(points, worlds=0)
     magnetics.induce(model.state())
     field = magnetics.h_field(points, worlds=[2, 1, 0, 1])[:, 2]
@@ -305,9 +305,9 @@ def test_magnetometers_that_cannot_be(device):
     ball = model.shape_label[0]
     for arguments, text in (
         ({"sites": "nothing"}, "sites: no label matches"),
-        ({"sites": ball}, "is no site"),
-        ({"sites": [0]}, "sites: 0 is no site"),
-        ({"sites": [99]}, "sites: 99 is no site"),
+        ({"sites": ball}, "is not a site"),
+        ({"sites": [0]}, "sites: 0 is not a site"),
+        ({"sites": [99]}, "sites: 99 is not a site"),
         ({"sites": []}, "sites: no label matches"),
         ({"sites": "*hall*", "noise": -1.0}, "noise"),
         ({"sites": "*hall*", "saturation": 0.0}, "saturation"),

@@ -1,4 +1,4 @@
-"""Eddy currents on a Newton model: which balls conduct, and how what they see moves."""
+"""Eddy currents on a Newton model: which balls conduct, and the motion of balls and sources."""
 
 import newton
 import numpy as np
@@ -12,18 +12,18 @@ from warpmag.moments.system import MomentSystem
 
 
 class BodyEddies:
-    """Eddy currents of the conducting balls of a model; without such, nothing is allocated and nothing launched.
+    """Eddy currents of the conducting balls of a model. Without such balls nothing is allocated or launched.
 
     Args:
         model: The model.
         magnets: Its magnets, in the order of their moments.
-        moments: How these belong to bodies.
+        moments: The bodies of the moments.
         sources: Its sources of fields.
-        system: The moments, which are given their conductivity.
-        step: Longest time [s] for which forces count.
+        system: The moments; their conductivities are set.
+        step: Longest time between evaluations of forces [s].
 
     Raises:
-        InputError: A magnet conducts that is no ball, or not its body's only magnet.
+        InputError: A conducting magnet is not a ball of one moment, or not the only magnet of its body.
     """
 
     def __init__(
@@ -37,22 +37,24 @@ class BodyEddies:
     ):
         """Find the balls that conduct."""
         self._model, self._moments, self._sources, self._system = model, moments, sources, system
-        conductivity = [one.magnet.conductivity for one in magnets]
+        conductivity = [magnet.magnet.conductivity for magnet in magnets]
         if not any(conductivity):
             return
-        moments_of = [len(one.lattice.volumes) for one in magnets]
-        kinds, bodies = model.shape_type.numpy(), [one.body for one in magnets]
-        for one, count in zip(magnets, moments_of, strict=True):
-            if one.magnet.conductivity == 0.0:
+        counts = [len(magnet.lattice.volumes) for magnet in magnets]
+        kinds, bodies = model.shape_type.numpy(), [magnet.body for magnet in magnets]
+        for magnet, count in zip(magnets, counts, strict=True):
+            if magnet.magnet.conductivity == 0.0:
                 continue
-            ball = count == 1 and kinds[one.shapes[0]] == newton.GeoType.SPHERE
-            if not ball or (one.body >= 0 and bodies.count(one.body) > 1):
-                where = model.shape_label[one.shapes[0]]
-                raise InputError(f"{where}: conductivity: only of a ball of one moment, its body's only magnet")
-        system.set_conductivity(np.repeat(conductivity, moments_of), step)
+            ball = count == 1 and kinds[magnet.shapes[0]] == newton.GeoType.SPHERE
+            if not ball or (magnet.body >= 0 and bodies.count(magnet.body) > 1):
+                label = model.shape_label[magnet.shapes[0]]
+                raise InputError(
+                    f"{label}: conductivity: only balls of one moment that are their body's only magnet may conduct"
+                )
+        system.set_conductivity(np.repeat(conductivity, counts), step)
 
     def gather(self, state: newton.State) -> None:
-        """Tell the system how the bodies of ``state`` move."""
+        """Write the velocities of balls and sources at ``state`` to the system."""
         system = self._system
         if system.eddy is None or state.body_qd is None:
             return

@@ -1,4 +1,4 @@
-"""The moments that stand for the magnets of a Newton model, as a system that can be solved."""
+"""The :class:`MomentSystem` of the magnets of a Newton model."""
 
 import newton
 import numpy as np
@@ -22,76 +22,84 @@ def make_system(
     method,
     max_evaluations,
 ) -> tuple[MomentSystem, list[int], list[int]]:
-    """Make the system of all moments of some magnets.
+    """Return the system of all moments of the magnets of a model.
 
     Args:
-        model: Their model.
+        model: The model.
         magnets: The magnets, in the order of the system.
-        settings: How they are to be solved.
-        curve: Magnetization curve of all that are inducible; None means their own.
+        settings: Force law, dynamics, contact model, tolerance, external field.
+        curve: Magnetization curve of all inducible magnets; None stands for their own.
         sources: Coils and field maps, as :class:`MomentSystem` takes them.
         method: Summation method of :class:`SolverSettings`.
         max_evaluations: Largest number of field evaluations of a solve.
 
     Returns:
-        The system, the bodies of its couplings, and those of its solids.
+        The system, the bodies of its couplings, and the bodies of its solids.
     """
-    counts = [len(one.lattice.volumes) for one in magnets]
+    counts = [len(magnet.lattice.volumes) for magnet in magnets]
 
-    def spread(values, dtype=float):
+    def per_moment(values, dtype=float):
         return np.repeat(np.asarray(values, dtype=dtype), counts)
 
     first = (np.cumsum(counts) - counts).tolist()
-    celled = [(k, one) for k, one in zip(first, magnets, strict=True) if one.lattice.coupling is not None]
-    made_of = [one.magnet for one in magnets]
+    celled = [(k, magnet) for k, magnet in zip(first, magnets, strict=True) if magnet.lattice.coupling is not None]
+    materials = [magnet.magnet for magnet in magnets]
     flags = model.body_flags  # None in a model without bodies
     kinematic = [] if flags is None else ((flags.numpy() & KINEMATIC) != 0).tolist()
-    fixed = np.cumsum([one.body < 0 for one in magnets]) + model.body_count
-    bodies = [one.body if one.body >= 0 else own for one, own in zip(magnets, fixed.tolist(), strict=True)]
-    movable = [one.body >= 0 and not kinematic[one.body] for one in magnets]
-    body_of, moves = spread(bodies, int), spread(movable, bool)
+    # a static magnet counts as a body of its own, behind the bodies of the model
+    static = np.cumsum([magnet.body < 0 for magnet in magnets]) + model.body_count
+    bodies = [magnet.body if magnet.body >= 0 else own for magnet, own in zip(magnets, static.tolist(), strict=True)]
+    movable = [magnet.body >= 0 and not kinematic[magnet.body] for magnet in magnets]
+    moment_bodies, moments_move = per_moment(bodies, int), per_moment(movable, bool)
     solids = [
-        (one.body, _solid(k, one, move, part))
-        for k, one, move in zip(first, magnets, movable, strict=True)
-        for part in one.lattice.solids
+        (magnet.body, _solid_magnet(k, magnet, can_move, part))
+        for k, magnet, can_move in zip(first, magnets, movable, strict=True)
+        for part in magnet.lattice.solids
     ]
-    curves = [LINEAR_CURVE if one.recoils else curve or one.curve for one in made_of]
+    curves = [LINEAR_CURVE if material.recoils else curve or material.curve for material in materials]
     system = MomentSystem(
-        worlds=spread([one.world for one in magnets], int),
-        permanent=spread([one.fixed for one in made_of], bool),
-        radii=np.concatenate([one.lattice.radii for one in magnets]),
-        bodies=body_of,
-        movable=moves,
+        worlds=per_moment([magnet.world for magnet in magnets], int),
+        permanent=per_moment([material.fixed for material in materials], bool),
+        radii=np.concatenate([magnet.lattice.radii for magnet in magnets]),
+        bodies=moment_bodies,
+        movable=moments_move,
         material=Material(
-            spread([one.saturation for one in made_of]),
-            spread([one.recoil_permeability - 1.0 if one.recoils else one.susceptibility for one in made_of]),
-            [curve for curve, count in zip(curves, counts, strict=True) for _ in range(count)],
+            per_moment([material.saturation for material in materials]),
+            per_moment(
+                [
+                    material.recoil_permeability - 1.0 if material.recoils else material.susceptibility
+                    for material in materials
+                ]
+            ),
+            [own for own, count in zip(curves, counts, strict=True) for _ in range(count)],
         ),
         external_field=settings.external_field,
         settings=SolverSettings(
             settings.force, settings.dynamics, settings.contact_model, method, settings.rtol, max_evaluations
         ),
-        couplings=[(k, one.lattice.coupling) for k, one in celled],
+        couplings=[(k, magnet.lattice.coupling) for k, magnet in celled],
         solids=[solid for _, solid in solids],
-        body_extent=_largest_extent(magnets, body_of, moves),
+        body_extent=_largest_extent(magnets, moment_bodies, moments_move),
         sources=sources,
         device=model.device,
     )
-    return system, [one.body for _, one in celled], [body for body, _ in solids]
+    return system, [magnet.body for _, magnet in celled], [body for body, _ in solids]
 
 
-def _solid(first: int, one: BodyMagnet, movable: bool, part) -> SolidMagnet:
-    """What the system has to know of a part that has a closed form, of a magnet with the moments from ``first`` on."""
-    volume, response = float(one.lattice.volumes[part.first]), 3.0 - 9.0 / (2.0 + one.magnet.recoil_permeability)
-    return SolidMagnet(first + part.first, part.count, volume, one.world, part.reach, part.shape, movable, response)
+def _solid_magnet(first: int, magnet: BodyMagnet, movable: bool, part) -> SolidMagnet:
+    """Return the record of a part with a closed form. ``first`` is the first moment of its magnet in the system."""
+    lattice, response = magnet.lattice, 3.0 - 9.0 / (2.0 + magnet.magnet.recoil_permeability)
+    volume, first = float(lattice.volumes[part.first]), first + part.first
+    return SolidMagnet(first, part.count, volume, magnet.world, part.reach, part.shape, movable, response)
 
 
 def _largest_extent(magnets: list[BodyMagnet], bodies: np.ndarray, movable: np.ndarray) -> float:
-    """Distance that no two moments of a body that may move exceed [m]; zero where each has a single one."""
+    """Return an upper bound of the distances of moments in one movable body [m]; 0 if each has one moment."""
     if not movable.any():
         return 0.0
     order = np.flatnonzero(movable)[np.argsort(bodies[movable], kind="stable")]
-    places, bodies = np.concatenate([one.lattice.positions for one in magnets])[order], bodies[order]
+    positions = np.concatenate([magnet.lattice.positions for magnet in magnets])[order]
+    bodies = bodies[order]
     begin = np.flatnonzero(np.diff(bodies, prepend=bodies[0] - 1))
-    low, high = np.minimum.reduceat(places, begin), np.maximum.reduceat(places, begin)
+    low, high = np.minimum.reduceat(positions, begin), np.maximum.reduceat(positions, begin)
     return float(np.linalg.norm(high - low, axis=1).max())

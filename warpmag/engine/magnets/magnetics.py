@@ -43,20 +43,23 @@ from warpmag.terminal import collection_paused
 
 
 class Magnetics:
-    """The magnets of a Newton model: finds the moments, brings the inducible ones to equilibrium, adds the forces.
+    """The magnets of a Newton model: their induction, forces and fields.
 
-    A ball is one moment, any other shape a lattice of moments whose total is exact. Moments of one body exert no force
-    on each other, magnets of different worlds none either. Works with any solver that reads ``State.body_f``::
+    A ball is one moment. Any other shape is a lattice of moments with the exact total. Moments of one body exert no
+    forces on each other, and magnets of different worlds do not interact. Use any solver that reads ``State.body_f``::
 
+        magnetics = warpmag.Magnetics(model)
+        ...
         state.clear_forces()
         magnetics.apply(state)
         solver.step(state, state_out, None, contacts, dt)
 
     Attributes:
-        magnets: The magnets found, in the order of their moments.
+        magnets: The magnets, in the order of their moments.
         system: The moments on the device.
-        shapes: The shapes that :meth:`shape_moments` reports, [n].
-        shape_volumes: Magnetic volume of each of them [m³], what it shares with an earlier one left out, [n].
+        shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
+        shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. A volume that shapes of a body share
+            counts for the first of them.
     """
 
     @collection_paused()
@@ -74,26 +77,27 @@ class Magnetics:
         curve: str | MagnetizationCurve | None = None,
         step: float = 1e-3,
     ):
-        """Sample the magnets of ``model`` and allocate everything that :meth:`apply` needs.
+        """Sample the magnets of ``model`` and allocate all buffers.
 
         Args:
-            model: A finished model with shapes marked by :func:`warpmag.add_inducible`, :func:`warpmag.add_permanent`.
-            force: ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
+            model: A finalized model with shapes marked by :func:`warpmag.add_inducible`,
+                :func:`warpmag.add_permanent`.
+            force: Force law, ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
             dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
                 ``llg-damping`` (Eq. 6, with and without precession).
-            contact_model: ``dipole``, or ``multipole``, which adds what balls of one moment lack where they nearly
-                touch.
-            method: How fields and forces are summed: ``direct``, over all pairs; ``fmm``, by the fast multipole
-                method, to an error that ``rtol`` allows; or ``auto``, the faster one.
+            contact_model: ``dipole``, or ``multipole``, which adds higher multipoles of balls that nearly touch.
+            method: Summation of fields and forces: ``direct`` over all pairs, ``fmm`` by the fast multipole method
+                with an error within ``rtol``, or ``auto`` for the faster one.
             rtol: Relative magnetization error at which induction ends.
             external_field: Uniform applied field H0 [A/m], world frame.
-            max_evaluations: Field evaluations after which induction gives up.
-            curve: Magnetization curve of all magnets, as :func:`warpmag.add_inducible` takes it; by default their own.
-            step: Longest time [s] between calls of :meth:`apply`, in which eddy currents stop nothing that conducts.
+            max_evaluations: Field evaluations after which induction ends without convergence.
+            curve: Magnetization curve of all magnets, as in :func:`warpmag.add_inducible`; by default their own.
+            step: Longest time between calls of :meth:`apply` [s]. Drag by eddy currents is limited so that it stops no
+                body within this time.
 
         Raises:
-            InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would be
-                felt in several.
+            InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would act
+                in several.
         """
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         if (all_ranks := current_ranks()) is not None:
@@ -112,7 +116,7 @@ class Magnetics:
             method=method, max_evaluations=max_evaluations,
         )  # fmt: skip
         self._celled, self._solid_bodies = (
-            wp.array(one, dtype=wp.int32, device=model.device) for one in (celled, solid)
+            wp.array(bodies, dtype=wp.int32, device=model.device) for bodies in (celled, solid)
         )
         self._sources.bind(self.system)
         self._map_bodies()
@@ -150,29 +154,28 @@ class Magnetics:
 
     @property
     def needs_velocities(self) -> bool:
-        """Whether forces depend on velocities, ``State.body_qd``: they do where eddy currents flow."""
+        """True if forces depend on velocities, ``State.body_qd``, because a magnet conducts."""
         return self.system.eddy is not None
 
     def field_error(self) -> float:
-        """Return the relative error of the last field by the fast multipole method; 0 for sums over all pairs.
+        """Return the relative error of the last field by the fast multipole method; 0 without that method.
 
-        Measured at 256 random magnets by sums over all pairs; waits for the device.
+        The reference is the sum over all pairs at 256 random magnets. Waits for the device.
         """
         return self.system.field_error()
 
     def _map_bodies(self) -> None:
-        """List for the kernels which moments belong to which body and to which shape."""
+        """Copy to the device which moments belong to each body and to each shape."""
         device = self._model.device
-        lattices = [one.lattice for one in self.magnets]
-        counts = [len(one.volumes) for one in lattices]
-        body = np.repeat([one.body for one in self.magnets], counts)
-        permanent = np.repeat([one.magnet.fixed for one in self.magnets], counts)
-        self._volumes = np.concatenate([one.volumes for one in lattices])
-        self.shapes = np.concatenate([one.shapes for one in self.magnets])
-        of_shape = np.concatenate([one.counts for one in lattices])
+        lattices, magnets = [magnet.lattice for magnet in self.magnets], [magnet.magnet for magnet in self.magnets]
+        counts = [len(lattice.volumes) for lattice in lattices]
+        run_body = np.array([magnet.body for magnet in self.magnets])
+        body, permanent = np.repeat(run_body, counts), np.repeat([magnet.fixed for magnet in magnets], counts)
+        self._volumes = np.concatenate([lattice.volumes for lattice in lattices])
+        self.shapes = np.concatenate([magnet.shapes for magnet in self.magnets])
+        shape_counts = np.concatenate([lattice.counts for lattice in lattices])
 
         start = np.concatenate([[0], np.cumsum(counts)])
-        run_body = np.array([one.body for one in self.magnets])
         order = np.argsort(run_body, kind="stable")
         bodies, first = np.unique(run_body[order], return_index=True)
         dynamic = bodies >= 0
@@ -182,29 +185,27 @@ class Magnetics:
 
         self._body_moments = moments = BodyMoments()
         moments.body, moments.permanent = put(body, wp.int32), put(permanent, wp.bool)
-        moments.local_positions = put(np.concatenate([one.positions for one in lattices]), wp.vec3)
-        moments.volumes, moments.shape = put(self._volumes, float), put(np.repeat(self.shapes, of_shape), wp.int32)
+        moments.local_positions = put(np.concatenate([lattice.positions for lattice in lattices]), wp.vec3)
+        moments.volumes, moments.shape = put(self._volumes, float), put(np.repeat(self.shapes, shape_counts), wp.int32)
         moments.shape_frames = self._model.shape_transform
         moments.magnetizations = getattr(self._model, NAMESPACE).magnetization
-        recoil = np.repeat([one.magnet.recoil_permeability - 1.0 for one in self.magnets], counts)
-        recoils = np.flatnonzero(np.repeat([one.magnet.recoils for one in self.magnets], counts))
-        self._recoiling, self._coercivity = put(recoils, wp.int32), put(1.0 / recoil[recoils], float)
+        susceptibility = np.repeat([magnet.recoil_permeability - 1.0 for magnet in magnets], counts)
+        recoiling = np.flatnonzero(np.repeat([magnet.recoils for magnet in magnets], counts))
+        self._recoiling, self._bias_factors = put(recoiling, wp.int32), put(1.0 / susceptibility[recoiling], float)
         moments.body_list = put(bodies[dynamic], wp.int32)
         moments.body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
         moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
         moments.kinematic_flag = KINEMATIC
 
-        self._parts = np.concatenate([[0], np.cumsum(of_shape)])
+        self._parts = np.concatenate([[0], np.cumsum(shape_counts)])
         volume = np.concatenate([[0.0], np.cumsum(self._volumes)])
         self.shape_volumes = np.diff(volume[self._parts])
         self._part_start = put(self._parts, wp.int32)
         self._totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=device)
         self._newton_world = put(np.maximum(self._worlds, 0)[self.system.worlds], wp.int32)
-        fixed = np.repeat(
-            [one.magnet.kind == "permanent" for one in self.magnets], [len(one.shapes) for one in self.magnets]
-        )
+        fixed = [magnet.magnet.kind == "permanent" for magnet in self.magnets for _ in magnet.shapes]
         shape_body = self._model.shape_body.numpy()
-        shapes = self.shapes[fixed]
+        shapes = self.shapes[np.array(fixed)]
         shapes = shapes[np.argsort(shape_body[shapes], kind="stable")]
         self._permanent_shapes, self._permanent_list = shapes, put(shapes, wp.int32)
         self._permanent_bodies = shape_body[shapes]
@@ -213,16 +214,17 @@ class Magnetics:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
 
         Args:
-            state: State with poses ``body_q``; its ``body_f`` is added to, not cleared.
+            state: State with poses ``body_q``. Forces are added to ``body_f``, which is not cleared. Conducting magnets
+                also need velocities, ``body_qd``.
 
         Raises:
-            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; on a GPU some steps later.
+            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`. A GPU raises it some calls later.
         """
         self.induce(state)
         self.add_forces(state)
 
     def induce(self, state: newton.State) -> None:
-        """Bring the inducible magnets to equilibrium at the poses of ``state``, starting from where they were."""
+        """Bring the inducible magnets to equilibrium at the poses of ``state``, from their last magnetizations."""
         values, system = self._values, self.system
         self._induced = True
         gather_moments(
@@ -236,136 +238,143 @@ class Magnetics:
         if len(self._solid_bodies):
             gather_frames(state.body_q, self._solid_bodies, self.system.sources.solid_frames)
         if len(self._recoiling):
-            gather_bias(state.body_q, self._body_moments, self._recoiling, self._coercivity, self.system.bias)
+            gather_bias(state.body_q, self._body_moments, self._recoiling, self._bias_factors, self.system.bias)
         self._eddies.gather(state)
         self.system.solve()
 
     def add_forces(self, state: newton.State) -> None:
-        """Add the forces of the present moments to ``state.body_f``: the second half of :meth:`apply`."""
+        """Add the forces on the present moments to ``state.body_f``: the second half of :meth:`apply`."""
         self.system.apply_forces()
         system = self.system
         add_wrenches(self._body_moments, self._model, state, system.positions, system.forces, system.torques)
         self._sources.add_reactions(state)
 
     def notify_model_changed(self, flags: newton.ModelFlags | int = newton.ModelFlags.SHAPE_PROPERTIES) -> None:
-        """Take over what was changed in ``model.warpmag``, as Newton's solvers do for what they keep.
+        """Read changed saturations and susceptibilities from ``model.warpmag``; captured graphs stay valid.
 
-        Saturations and susceptibilities can be changed so; graphs that were captured stay right. A change of which
-        nobody tells is refused at the next step. Magnetizations count in any case.
+        Without this call the next step raises an error. Changes of magnetizations need no call.
 
         Args:
-            flags: What was changed: nothing happens without ``SHAPE_PROPERTIES``.
+            flags: Kinds of changes, as for Newton's solvers. Nothing happens without ``SHAPE_PROPERTIES``.
 
         Raises:
-            InputError: A material is out of range, the contact model has tables of it, or what cannot be changed was:
-                which shapes are magnets, of which kind, with which curve, or how far their moments are apart.
+            InputError: A value is out of range, or the contact model has tables for the old one. Or another attribute
+                was changed, such as the kind, the curve or the moment spacing of a magnet.
         """
         if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
             return
         changed = self._values.changed_materials()
         moment_shapes = self._body_moments.shape.numpy()
-        made = np.isin(moment_shapes, changed) & ~self._body_moments.permanent.numpy()
-        made[self._recoiling.numpy()] = False
-        moments = np.flatnonzero(made)
+        affected = np.isin(moment_shapes, changed) & ~self._body_moments.permanent.numpy()
+        affected[self._recoiling.numpy()] = False
+        moments = np.flatnonzero(affected)
         self.system.set_material(moments, *self._values.material(moment_shapes[moments]))
-        self.magnets = [self._with_material(one) for one in self.magnets]
+        self.magnets = [self._with_material(magnet) for magnet in self.magnets]
         self._values.take()
 
-    def _with_material(self, one: BodyMagnet) -> BodyMagnet:
-        """The same magnet, of the material that its first shape has now."""
-        (saturation,), (susceptibility,) = self._values.material(list(one.shapes[:1]))
-        magnet = replace(one.magnet, saturation=float(saturation), susceptibility=float(susceptibility))
-        return replace(one, magnet=magnet)
+    def _with_material(self, body_magnet: BodyMagnet) -> BodyMagnet:
+        """Return the magnet with the present material of its first shape."""
+        (saturation,), (susceptibility,) = self._values.material(list(body_magnet.shapes[:1]))
+        magnet = replace(body_magnet.magnet, saturation=float(saturation), susceptibility=float(susceptibility))
+        return replace(body_magnet, magnet=magnet)
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays by which a later step goes on as it would, by name: what was set, and what a solve left."""
-        given, system = getattr(self._model, NAMESPACE), self.system
-        values = {"magnetization": given.magnetization, "strength": given.strength, "field": system.external_field}
+        """Return the arrays that the next step depends on, by name: values set by the user, and the last solution."""
+        attributes, system = getattr(self._model, NAMESPACE), self.system
+        values = {"magnetization": attributes.magnetization, "strength": attributes.strength}
+        values["field"] = system.external_field
         return values | self._values.carried() | system.carried()
 
     def check_model(self) -> None:
-        """Raise :class:`InputError` if ``model.warpmag`` has changed meanwhile; waits for the device."""
+        """Raise :class:`InputError` if ``model.warpmag`` was changed without a notification; waits for the device."""
         self._values.check(wait=True)
 
     def set_external_field(self, external_field: Numbers) -> None:
-        """Set the uniform applied field of all worlds, or of each; capturable in a graph if given as a Warp array.
+        """Set the uniform applied field. Capturable in a graph with a Warp array.
 
         Args:
-            external_field: H0 [A/m], world frame, shape [3] or [worlds, 3], rows by the model's worlds; NumPy, or a
-                Warp array of vectors on the model's device, shape [1] or [worlds], whose values are not checked.
+            external_field: H0 [A/m], world frame, shape [3] for all worlds, or [worlds, 3]. Or a Warp array of vectors
+                on the model's device, shape [1] or [worlds]; its values are not checked.
 
         Raises:
-            InputError: It is of another shape, or not finite.
+            InputError: The field has another shape, or is not finite.
         """
         field = self._vectors("external_field", external_field, (1, max(self._model.world_count, 1)))
         set_external_field(field, self._newton_world, self.system.external_field)
 
     def set_current(self, coil: int | str, ampere_turns: Numbers) -> None:
-        """Set the current of coils; after a first call capturable in a graph, if given as a Warp array.
+        """Set the current of coils. After a first call capturable in a graph with a Warp array.
 
-        It is the model's attribute ``model.warpmag.strength`` that is set. Who writes there has the same effect. Of a
-        field map it is the factor of its field.
+        The values are written to ``model.warpmag.strength``, where a program may write as well. For a field map, the
+        value is the factor of its field.
 
         Args:
-            coil: The coil, as :func:`warpmag.add_coil` returned it if the model has no other builder's, or a pattern of
-                labels as in a shell: coils of replicated worlds have one label, and are in the order of worlds.
-            ampere_turns: Current times turns [A], one number, or one for each of the coils, shape [coils]; NumPy, or a
-                Warp array of float32 on the model's device, whose values are not checked.
+            coil: Index of the coil's shape in the model, or a pattern of labels as in a shell. The index is the return
+                value of :func:`warpmag.add_coil`, unless builders were combined. Coils of replicated worlds have the
+                same label, in the order of the worlds.
+            ampere_turns: Current times turns [A], one number or shape [coils]. Or a Warp array of float32 on the
+                model's device; its values are not checked.
 
         Raises:
-            InputError: There is no such coil, or there are other numbers than coils, or one is not finite.
+            InputError: No coil matches, the number of values differs from that of coils, or a value is not finite.
         """
         self._sources.set_strength("set_current", coil, ampere_turns)
 
     def set_magnetization(self, magnetization: Numbers, *, body: int = -1, shape: int | None = None) -> None:
-        """Set what a permanent magnet is magnetized to; capturable in a graph if given as a Warp array.
+        """Set the magnetization of a permanent magnet. Capturable in a graph with a Warp array.
 
-        It is the model's attribute ``model.warpmag.magnetization`` that is set, in the frame of each shape. Who writes
-        there has the same effect.
+        The value is written to ``model.warpmag.magnetization``, in the frame of each shape, where a program may write
+        as well.
 
         Args:
-            magnetization: M [A/m] in the frame of the body, of the shape if that is static, shape [3]; NumPy, or a Warp
-                array of one vector on the model's device, whose value is not checked.
-            body: The body, with all its permanent shapes.
-            shape: Instead of these only this one.
+            magnetization: M [A/m] in the frame of the body, or of a static shape, shape [3]. Or a Warp array of one
+                vector on the model's device; its value is not checked.
+            body: The body; all its permanent shapes are set.
+            shape: The only shape to set, in place of ``body``.
 
         Raises:
-            InputError: There is no such permanent magnet, or the magnetization is of another shape, or not finite.
+            InputError: The body or shape has no permanent magnet, or the magnetization has another shape or is not
+                finite.
         """
-        which = self._permanent_bodies == body if shape is None else self._permanent_shapes == shape
-        found = np.flatnonzero(which)
-        if not len(found) or (shape is None and body < 0):
+        selected = self._permanent_bodies == body if shape is None else self._permanent_shapes == shape
+        rows = np.flatnonzero(selected)
+        if not len(rows) or (shape is None and body < 0):
             raise InputError(f"set_magnetization: {'body' if shape is None else 'shape'} has no permanent magnet")
-        shapes = self._permanent_list[int(found[0]) : int(found[-1]) + 1]
+        shapes = self._permanent_list[int(rows[0]) : int(rows[-1]) + 1]
         set_magnetization(self._vectors("magnetization", magnetization, (1,)), shapes, self._model, self._body_moments)
 
     def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
-        """Vectors on the model's device, as many as one of ``counts``, from a Warp array or from numbers."""
-        if isinstance(value, wp.array):  # only looked at from outside: it may be in a graph
+        """Return ``value`` as vectors on the model's device; their number must be one of ``counts``."""
+        if isinstance(value, wp.array):  # values are not read: this may run in a graph capture
             if value.dtype is not wp.vec3 or value.ndim != 1 or value.device != self._model.device:
                 raise InputError(f"{name}: must be a Warp array of vec3 on {self._model.device}")
-            found = value
+            vectors = value
         else:
             context = CallContext(wp.get_device(self._model.device), wp.float32, warp_out=False)
-            found = context.vectors(name, np.atleast_2d(host_array(name, value)))
-        if len(found) not in counts:
-            wanted = " or ".join(f"[{count}, 3]" for count in dict.fromkeys(counts))
-            raise InputError(f"{name}: shape must be [3] or {wanted}, got {list(np.shape(value))}")
-        return found
+            vectors = context.vectors(name, np.atleast_2d(host_array(name, value)))
+        if len(vectors) not in counts:
+            allowed = " or ".join(f"[{count}, 3]" for count in dict.fromkeys(counts))
+            raise InputError(f"{name}: shape must be [3] or {allowed}, got {list(np.shape(value))}")
+        return vectors
 
     def probe(self, points: Numbers, *, worlds: npt.ArrayLike | None = None, gradients: bool = False) -> FieldProbe:
-        """Return what measures the field at points; :meth:`FieldProbe.measure` is capturable in a graph.
+        """Return a probe of the field at points; its :meth:`FieldProbe.measure` is capturable in a graph::
+
+            probe = magnetics.probe([[0.0, 0.0, 0.1]])
+            magnetics.apply(state)
+            probe.measure()
+            flux_density = probe.b.numpy()
 
         Args:
-            points: The points [m], shape [p, 3], NumPy, or a Warp array of vectors on the model's device.
-            worlds: World of the model that each is in, a number or shape [p]; None means the only one with magnets.
-            gradients: Whether gradients are wanted.
+            points: The points [m], shape [p, 3], or a Warp array of vectors on the model's device.
+            worlds: World of each point, a number or shape [p]; None stands for the only world with magnets.
+            gradients: Measure gradients as well.
 
         Raises:
-            InputError: A point is not finite, or too far away (see ``warpmag.moments.arrays``), or its world holds no
+            InputError: A point is not finite or too far away (see ``warpmag.moments.arrays``), or its world holds no
                 magnets.
         """
-        largest = max(float(one.lattice.radii.max()) for one in self.magnets)
+        largest = max(float(magnet.lattice.radii.max()) for magnet in self.magnets)
         context = CallContext(self.system.device, self.system.dtype, warp_out=False)
         points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
         probe = FieldProbe(self.system, len(points), worlds=self._numbers_of(worlds, len(points)), gradients=gradients)
@@ -373,7 +382,7 @@ class Magnetics:
         return probe
 
     def _numbers_of(self, worlds, count: int) -> np.ndarray:
-        """Number of each point's world among those that hold magnets, shape [count]."""
+        """Return the index of each point's world among the worlds with magnets, shape [count]."""
         if worlds is None:
             if len(self._worlds) > 1:
                 raise InputError(f"worlds: must be given, {len(self._worlds)} worlds hold magnets")
@@ -383,37 +392,37 @@ class Magnetics:
             raise InputError(
                 f"worlds: must be whole numbers, one or {count}, got {worlds.dtype} of {list(worlds.shape)}"
             )
-        strangers = worlds[~np.isin(worlds, self._worlds)]
-        if strangers.size:
-            raise InputError(f"worlds: world {strangers.flat[0]} holds no magnets")
+        unknown = worlds[~np.isin(worlds, self._worlds)]
+        if unknown.size:
+            raise InputError(f"worlds: world {unknown.flat[0]} holds no magnets")
         return np.broadcast_to(np.searchsorted(self._worlds, worlds), count)
 
     def h_field(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
-        """Return the field H [A/m] at points, shape [p, 3], as :meth:`probe` measures it."""
+        """Return the field H [A/m] at points, shape [p, 3]; arguments and errors as :meth:`probe`."""
         return self._measured(points, worlds).h.numpy()
 
     def b_field(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
-        """Return the flux density B [T] at points, inside bodies too, shape [p, 3], as :meth:`probe` measures it."""
+        """Return the flux density B [T] at points, also inside bodies, shape [p, 3]; arguments as :meth:`probe`."""
         return self._measured(points, worlds).b.numpy()
 
     def field_gradient(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
-        """Return the gradient ∂H_i/∂x_k [A/m²] at points, shape [p, 3, 3], as :meth:`probe` measures it."""
+        """Return the gradient ∂H_i/∂x_k [A/m²] at points, shape [p, 3, 3]; arguments as :meth:`probe`."""
         gradient = self._measured(points, worlds, gradients=True).gradient
         assert gradient is not None
         return gradient.numpy()
 
     def _measured(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
         if not self._induced:
-            raise InputError("Magnetics: nothing is to be measured yet, call apply(state) or induce(state) first")
+            raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
         probe = self.probe(points, worlds=worlds, gradients=gradients)
         self.check_model()
         probe.measure()
         return probe
 
     def energy(self) -> np.ndarray:
-        """Return the energy of the magnets of each world as they are now [J], shape [worlds]; zero without magnets.
+        """Return the present energy of the magnets of each world [J], shape [worlds]; 0 without magnets.
 
-        See :meth:`MomentSystem.energy`: its gradient by positions is minus Kelvin's force.
+        Its negative gradient by positions is the Kelvin force, see :meth:`MomentSystem.energy`.
         """
         self.check_model()
         energies = np.zeros(max(self._model.world_count, 1))
@@ -421,39 +430,40 @@ class Magnetics:
         return energies
 
     def shape_moments(self) -> np.ndarray:
-        """Return the total moment of each magnetic shape [A·m²], world frame, rows as :attr:`shapes`, shape [n, 3].
+        """Return the total moment of each magnetic shape [A·m²], world frame, in the order of :attr:`shapes`, [n, 3].
 
-        Where shapes of one body overlap, the common volume belongs to the first of them.
+        Where shapes of one body overlap, the common volume belongs to the first of them. Waits for the device.
         """
         self.check_model()
         return self.sum_moments().numpy()
 
     def sum_moments(self) -> wp.array:
-        """Return what :meth:`shape_moments` does, on the device, in an array that the next call overwrites."""
+        """Return :meth:`shape_moments` as a Warp array, which the next call overwrites; capturable in a graph."""
         sum_moments(self._part_start, self.system.moments, self._totals)
         return self._totals
 
     def moments_at(self, state: newton.State) -> np.ndarray:
-        """Return what :meth:`shape_moments` is once :meth:`induce` has been called; nothing goes on differently for it.
+        """Return the total moments in equilibrium at a state, without an effect on later steps.
 
         Args:
             state: State with poses ``body_q``.
 
         Returns:
-            Total moment of each magnetic shape in equilibrium at these poses [A·m²], world frame, shape [n, 3].
+            Total moment of each magnetic shape [A·m²], world frame, shape [n, 3].
         """
-        carried = self.system.carried()
-        before = take_snapshot(carried)
+        arrays = self.system.carried()
+        saved = take_snapshot(arrays)
         self.induce(state)
         moments = self.shape_moments().copy()
-        restore_snapshot(carried, before)
+        restore_snapshot(arrays, saved)
         return moments
 
     def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:
-        """Let induction start from given magnetizations.
+        """Set the magnetizations that the next induction starts from.
 
         Args:
-            magnetizations: Magnetization [A/m], world frame, of inducible shapes; of the others zero.
+            magnetizations: Magnetization [A/m], world frame, shape [3], by index of inducible shape. The other shapes
+                start from zero.
         """
         start = np.zeros((len(self._volumes), 3))
         inducible = ~self._body_moments.permanent.numpy()

@@ -15,7 +15,7 @@ from warpmag.kernels.rigid.sites import Sites, find_sites, read_sites
 
 
 class SensorMagnetometer:
-    """Measures flux density at sites of a model, in their frames: a compass, a Hall sensor.
+    """Magnetometers at sites of a model, such as compasses and Hall sensors: flux density in the frames of the sites.
 
     ::
 
@@ -26,11 +26,11 @@ class SensorMagnetometer:
         magnetometer.update(state)
         flux_density = magnetometer.flux_density.numpy()
 
-    It sees the external field and all magnets of its world, those of its own body, too.
+    The readings include the external field and all magnets of the world, those of the sensor's own body too.
 
     Attributes:
-        flux_density: Readings B [T] in the frames of the sites, shape [s].
-        sites: Shapes that are the sites, [s].
+        flux_density: Readings B [T] in the frames of the sites, on the device, vectors of shape [s].
+        sites: Shape indices of the sites, [s].
     """
 
     def __init__(
@@ -43,26 +43,27 @@ class SensorMagnetometer:
         saturation: float = math.inf,
         seed: int = 0,
     ):
-        """Find the sites and allocate everything that :meth:`update` needs.
+        """Find the sites and allocate all buffers.
 
         Args:
             model: The model.
             magnetics: Its magnets.
-            sites: Pattern of labels as in a shell, several, a regular expression that matches whole labels, or indices.
+            sites: Pattern of labels as in a shell, or a list of patterns, or a regular expression for whole labels, or
+                a list of shape indices.
             noise: Standard deviation of Gaussian noise on each component [T].
-            saturation: Largest size of a component that is read [T].
+            saturation: Largest magnitude of a component of a reading [T].
             seed: Seed of the noise.
 
         Raises:
-            InputError: No site is found, something else than a site is, a site's world holds no magnets, or a number is
-                out of range.
+            InputError: No site matches, a match is not a site, the world of a site holds no magnets, or a number is out
+                of range.
         """
         check_not_negative("noise", noise)
         check_whole("seed", seed)
         if not saturation > 0.0:
             raise InputError(f"saturation: must be positive, got {short_repr(saturation)}")
         self.sites = _find_sites(model, sites)
-        self._noise, self._most, self._seed = float(noise), float(saturation), int(seed)
+        self._noise, self._saturation, self._seed = float(noise), float(saturation), int(seed)
         worlds = np.maximum(model.shape_world.numpy()[self.sites], 0) if model.world_count > 1 else None
         self._probe = magnetics.probe(np.zeros((len(self.sites), 3)), worlds=worlds)
         device = wp.get_device(model.device)
@@ -73,7 +74,11 @@ class SensorMagnetometer:
         self.flux_density = wp.zeros(len(self.sites), dtype=wp.vec3, device=device)
 
     def update(self, state: newton.State) -> None:
-        """Read the sensors at the poses of ``state``, of moments as :meth:`Magnetics.apply` left them; capturable."""
+        """Read the sensors at the poses of ``state``; capturable in a graph.
+
+        Args:
+            state: State with poses ``body_q``. The magnetizations are those of the last :meth:`Magnetics.apply`.
+        """
         find_sites(state.body_q, self._sites, self._probe.points)
         self._probe.measure()
         read_sites(
@@ -81,31 +86,31 @@ class SensorMagnetometer:
             self._sites,
             self._probe.b,
             noise=self._noise,
-            most=self._most,
+            most=self._saturation,
             seed=self._seed,
             reading_count=self._count,
             readings=self.flux_density,
         )
 
 
-def _find_sites(model: newton.Model, wanted) -> list[int]:
-    """Return the sites of ``model`` that are wanted, in its order, or as they are listed."""
+def _find_sites(model: newton.Model, sites) -> list[int]:
+    """Return the shape indices of the sites, in the order of the model or of the list of indices."""
     flags = model.shape_flags.numpy()
-    if isinstance(wanted, list) and wanted and not isinstance(wanted[0], str):
-        for index in wanted:
+    if isinstance(sites, list) and sites and not isinstance(sites[0], str):
+        for index in sites:
             check_whole("sites", index)
             if not 0 <= index < model.shape_count or not flags[index] & newton.ShapeFlags.SITE:
-                raise InputError(f"sites: {short_repr(index)} is no site")
-        return [int(index) for index in wanted]
-    if isinstance(wanted, re.Pattern):
-        matches = wanted.fullmatch
+                raise InputError(f"sites: {short_repr(index)} is not a site")
+        return [int(index) for index in sites]
+    if isinstance(sites, re.Pattern):
+        matches = sites.fullmatch
     else:
-        patterns = [wanted] if isinstance(wanted, str) else list(wanted)
+        patterns = [sites] if isinstance(sites, str) else list(sites)
         matches = re.compile("|".join(fnmatch.translate(pattern) for pattern in patterns) or r"(?!)").match
-    found = [index for index, label in enumerate(model.shape_label) if matches(label)]
-    for index in found:
+    indices = [index for index, label in enumerate(model.shape_label) if matches(label)]
+    for index in indices:
         if not flags[index] & newton.ShapeFlags.SITE:
-            raise InputError(f"sites: {model.shape_label[index]} is no site")
-    if not found:
-        raise InputError(f"sites: no label matches {short_repr(getattr(wanted, 'pattern', wanted))}")
-    return found
+            raise InputError(f"sites: {model.shape_label[index]} is not a site")
+    if not indices:
+        raise InputError(f"sites: no label matches {short_repr(getattr(sites, 'pattern', sites))}")
+    return indices

@@ -1,4 +1,4 @@
-"""From Newton's shapes to the moments that stand for them."""
+"""Samples Newton's shapes with moments."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,17 +17,17 @@ from warpmag.shapes.solids import boxes_meet
 from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0
-"""How far the closed form of a permanent magnet reaches where it is a lattice from afar, in cells."""
+"""Reach of the closed form of a magnet that is a lattice of cells farther away, in cells."""
 
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """One shape of a permanent magnet whose field is a closed form close up.
+    """A shape of a permanent magnet with a closed form of its near field.
 
     Attributes:
-        first, count: Its moments among those of the magnet.
-        shape: What bounds it, in the frame of the body.
-        reach: Distance up to which the closed form counts [m].
+        first, count: First moment of the shape in its magnet, and number of moments.
+        shape: Surface of the shape, in the frame of the body.
+        reach: Distance up to which the closed form is used [m].
     """
 
     first: int
@@ -43,10 +43,10 @@ class BodyLattice:
     Attributes:
         positions: Positions [m], shape [n, 3].
         volumes: Volumes [m³], shape [n].
-        radii: Radii of the balls that the moments are averaged over [m], shape [n].
-        counts: Moments of each shape, in the order of the shapes.
-        coupling: What inducible moments lack among themselves as balls; None of permanent ones, and of balls apart.
-        solids: The parts of a permanent magnet whose fields are closed forms close up; none of others, and of balls.
+        radii: Radii of the balls over which the fields of moments are averaged [m], shape [n].
+        counts: Number of moments of each shape.
+        coupling: Interaction of inducible cells, less that of balls; None for permanent magnets and separate balls.
+        solids: Closed forms of the near field of a permanent magnet; empty for inducible magnets and balls.
     """
 
     positions: np.ndarray
@@ -58,7 +58,7 @@ class BodyLattice:
 
 
 class ShapeSampler:
-    """Samples shapes of one model; shapes that are alike, in many worlds say, are sampled once."""
+    """Samples the shapes of one model. Equal shapes, for example of replicated worlds, are sampled once."""
 
     def __init__(self, model: newton.Model):
         """Read the geometry of ``model``."""
@@ -68,35 +68,35 @@ class ShapeSampler:
         self._frames = model.shape_transform.numpy().astype(float)
         numbers = np.column_stack([self._types, _number_sources(self._sources), self._scales, self._frames])
         self.kinds = unique_rows(numbers)[1]
-        self._known: dict[tuple, BodyLattice] = {}
+        self._lattices: dict[tuple, BodyLattice] = {}
 
     def sample(self, shapes: list[int], spacing: float, permanent: bool, closed: bool) -> BodyLattice:
         """Return the moments of one magnet.
 
-        Balls apart from each other are one moment each if ``spacing`` is 0. Everything else is filled with moments,
-        as one solid: volume that shapes have in common is counted once, for the first of them.
+        Separate balls are one moment each if ``spacing`` is 0. All other shapes are filled with moments as one solid:
+        a volume that shapes share is counted once, for the first of them.
 
         Args:
             shapes: Shapes of one body, or one static shape.
             spacing: Distance between moments [m]; 0 for automatic.
-            permanent: Whether the moments are fixed: their field is not averaged over more than their cells then.
-            closed: Whether closed forms stand for them close up, where there are some.
+            permanent: The moments are fixed. Their fields are averaged over no more than their cells.
+            closed: Use closed forms of the near field, where the shapes have them.
         """
         key = (spacing, permanent, closed, *self.kinds[shapes].tolist())
-        if key not in self._known:
+        if key not in self._lattices:
             try:
-                self._known[key] = _within_range(self._sample(shapes, spacing, permanent, closed))
+                self._lattices[key] = _within_range(self._sample(shapes, spacing, permanent, closed))
             except InputError as error:
                 raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
-        return self._known[key]
+        return self._lattices[key]
 
     def _sample(self, shapes: list[int], spacing: float, permanent: bool, closed: bool) -> BodyLattice:
         if spacing == 0.0 and self._are_balls_apart(shapes):
             balls = [lattice.ball(self._scales[shape, 0]) for shape in shapes]
             return BodyLattice(
                 np.concatenate([self._frames[shape, None, :3] for shape in shapes]),
-                np.concatenate([one.volumes for one in balls]),
-                np.concatenate([one.radii for one in balls]),
+                np.concatenate([ball.volumes for ball in balls]),
+                np.concatenate([ball.radii for ball in balls]),
                 np.ones(len(shapes), dtype=int),
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
@@ -108,8 +108,8 @@ class ShapeSampler:
         counts = np.bincount(filled.owners, minlength=len(solids))
         ends, grids = np.cumsum(counts), filled.pieces if permanent else filled.pieces * len(solids)
         parts = tuple(
-            ClosedForm(int(end - count), int(count), shape, _REACH * float(one.sides.max()))
-            for end, count, shape, one in zip(ends, counts, bounds, grids, strict=bool(bounds))
+            ClosedForm(int(end - count), int(count), shape, _REACH * float(grid.sides.max()))
+            for end, count, shape, grid in zip(ends, counts, bounds, grids, strict=bool(bounds))
         )
         if permanent:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
@@ -117,28 +117,30 @@ class ShapeSampler:
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts)
 
     def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:
-        """What bounds boxes and cylinders apart from each other, in the frame of their body; nothing for others."""
-        kinds, found = newton.GeoType, []
+        """Return the surfaces of separate boxes and cylinders, in the frame of the body; empty for other shapes."""
+        kinds, surfaces = newton.GeoType, []
         for shape, solid in zip(shapes, solids, strict=True):
             kind, scale = self._types[shape], self._scales[shape]
-            if kind not in (kinds.BOX, kinds.CYLINDER) or any(boxes_meet(solid, one) for one in solids[: len(found)]):
+            if kind not in (kinds.BOX, kinds.CYLINDER) or any(
+                boxes_meet(solid, other) for other in solids[: len(surfaces)]
+            ):
                 return []
-            own = polyhedra.box(scale) if kind == kinds.BOX else polyhedra.cylinder(scale[0], scale[1])
-            found.append(own.posed(solid.position, solid.rotation))
-        return found
+            surface = polyhedra.box(scale) if kind == kinds.BOX else polyhedra.cylinder(scale[0], scale[1])
+            surfaces.append(surface.posed(solid.position, solid.rotation))
+        return surfaces
 
     def _close_up(self, shapes: list[int], solids: list[lattice.Solid], closed: list[Polyhedron]) -> BodyLattice:
-        """Moments of permanent boxes and cylinders, which are closed forms close up."""
+        """Return the moments of permanent boxes and cylinders, which have closed forms of their near fields."""
         places, volumes, radii, parts, first = [], [], [], [], 0
         for shape, solid, bound in zip(shapes, solids, closed, strict=True):
             scale = self._scales[shape]
             box = self._types[shape] == newton.GeoType.BOX
-            found = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
-            places.append(solid.to_body(found.places))
-            volumes.append(found.volumes)
-            radii.append(np.minimum(0.5 * np.cbrt(found.volumes), found.depths))
-            parts.append(ClosedForm(first, len(found.volumes), bound, found.reach))
-            first += len(found.volumes)
+            moments = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
+            places.append(solid.to_body(moments.places))
+            volumes.append(moments.volumes)
+            radii.append(np.minimum(0.5 * np.cbrt(moments.volumes), moments.depths))
+            parts.append(ClosedForm(first, len(moments.volumes), bound, moments.reach))
+            first += len(moments.volumes)
         counts = np.array([part.count for part in parts])
         return BodyLattice(
             np.concatenate(places), np.concatenate(volumes), np.concatenate(radii), counts, solids=tuple(parts)
@@ -168,26 +170,27 @@ class ShapeSampler:
         if kind in (kinds.MESH, kinds.CONVEX_MESH):
             source: Any = self._sources[shape]
             return lattice.mesh(np.asarray(source.vertices, float) * scale, np.asarray(source.indices).reshape(-1, 3))
-        raise InputError("a cylinder with a barrel side cannot be magnetized")
+        raise InputError("a cylinder with a barrel-shaped side cannot be magnetized")
 
 
 def _number_sources(sources: list) -> list[int]:
-    """Number what shapes are made of: 0 for nothing, and one number for all meshes of the same points and triangles."""
-    of_contents: dict[Any, int] = {}
-    of_object: dict[int, int] = {id(None): 0}
+    """Return a number for each source: 0 for None, and the same for meshes of equal points and triangles."""
+    number_of_contents: dict[Any, int] = {}
+    number_of_object: dict[int, int] = {id(None): 0}
     for source in sources:
-        if id(source) not in of_object:
+        if id(source) not in number_of_object:
             contents = id(source)
             if hasattr(source, "vertices"):
                 contents = tuple(np.asarray(array).tobytes() for array in (source.vertices, source.indices))
-            of_object[id(source)] = of_contents.setdefault(contents, 1 + len(of_contents))
-    return [of_object[id(source)] for source in sources]
+            number_of_object[id(source)] = number_of_contents.setdefault(contents, 1 + len(number_of_contents))
+    return [number_of_object[id(source)] for source in sources]
 
 
 def _within_range(sampled: BodyLattice) -> BodyLattice:
-    """Return moments, which a simulation has in single precision; ``InputError`` if they are out of its range."""
+    """Return ``sampled``; raise :class:`InputError` if single precision does not hold its radii."""
     (least, most), radii = RADIUS_RANGE[wp.float32], sampled.radii
     if not ((radii >= least) & (radii <= most)).all():
-        found = f"{radii.min():.3g} to {radii.max():.3g} m"
-        raise InputError(f"its moments have radii of {found}, not of {least:g} to {most:g}")
+        raise InputError(
+            f"its moments have radii of {radii.min():.3g} to {radii.max():.3g} m, not of {least:g} to {most:g}"
+        )
     return sampled
