@@ -381,7 +381,7 @@ def test_bad_scenes_are_refused(device):
         Simulation(pile(), device=device, step=0.0)
     with pytest.raises(warpmag.InputError, match="device: no 'cuda:99' here"):
         Simulation(pile(), device="cuda:99")
-    with pytest.raises(warpmag.InputError, match="only a scene that came from a stage"):
+    with pytest.raises(warpmag.InputError, match="only a scene from a stage"):
         Simulation(pile(), device=device).run(1, output="out.usda")
 
 

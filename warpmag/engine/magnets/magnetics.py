@@ -218,7 +218,7 @@ class Magnetics:
                 also need velocities, ``body_qd``.
 
         Raises:
-            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`. A GPU raises it some calls later.
+            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`. On a GPU some calls later.
         """
         self.induce(state)
         self.add_forces(state)

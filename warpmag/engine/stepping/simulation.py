@@ -1,4 +1,4 @@
-"""Simulates a scene of magnets: a USD stage, or a Newton builder."""
+"""Simulates a scene with magnets, from a USD stage or a Newton builder."""
 
 import contextlib
 import math
@@ -35,29 +35,39 @@ from warpmag.moments.ranks import current_ranks, errors_on_all_ranks
 from warpmag.terminal import collection_paused
 
 DEFAULT_STEP = 1e-3
-"""Time step [s] where neither the user nor the stage gives one: the paper's."""
+"""Default time step [s], the paper's."""
 LONGEST_SUBSTEP = 5e-4
-"""Upper limit of a substep [s]: with XPBD's 60 iterations piles of 5 mm balls then come to rest."""
+"""Upper limit of a substep [s]. With it and XPBD's 60 iterations piles of 5 mm balls come to rest."""
 _OVERLAP = 1e-4
-"""Bodies that overlap at the start by more than this part of their thickness are worth a warning."""
+"""Overlap at the start that causes a warning, over the thickness."""
 _TOUCHING = 0.05
-"""Bodies closer than this part of their thickness touch, for the count of held ones."""
+"""Largest gap of touching bodies over their thickness, for the count of held bodies."""
 _FRAME_RATE = 60.0
-"""Output frames per second [Hz] of a scene that is no stage."""
+"""Output frame rate of a builder [Hz]."""
 _AHEAD = 16
-"""Steps that a GPU is given before the host writes the frame before them; a GPU makes it wait from some 20 on."""
+"""Steps launched on a GPU before the host writes the last frame. Launches block from about 20 steps on."""
 _STRONGEST_FIELD = 1e8
-"""Field, magnetization [A/m] or current [A] that is named where a run ends; the strongest are ten times less."""
+"""Field, magnetization [A/m] or current [A] that an error names as its cause, ten times the strongest real ones."""
 
 
 class Simulation:
-    """A scene of magnets that moves.
+    """A simulation of a scene with magnets::
+
+        simulation = warpmag.Simulation("balls_up.usda")
+        statistics = simulation.run(60, output="out.usda")
+
+    A program may also step by itself, with a USD file or a ``newton.ModelBuilder``::
+
+        simulation = warpmag.Simulation(builder, step=1e-3)
+        for _ in range(1000):
+            simulation.step()
+        poses = simulation.state.body_q.numpy()
 
     Attributes:
         model: Newton's model.
         step_size: Time step [s].
         frame_rate: Output frames per second [Hz].
-        frame_count: Output frames that the stage asks for, the first excluded; None where it has no time range.
+        frame_count: Output frames of the stage without the first; None if it has no time range.
     """
 
     @collection_paused()
@@ -79,48 +89,49 @@ class Simulation:
         graphs: bool = True,
         visuals: bool = False,
     ):
-        """Import the scene and get ready to step.
+        """Import the scene and prepare the first step.
 
         Args:
-            scene: USD file, or a builder with magnets added to it, which gets the articulations and colours that
-                ``solver`` asks for.
-            step: Time step [s]; by default the stage's, else 1 ms. It is split into substeps as motion demands.
-            solver: Newton's solver: ``xpbd``, ``steel``, ...
+            scene: USD file, or a builder with magnets. Articulations and colors that ``solver`` needs are added to a
+                builder.
+            step: Time step [s]; by default the stage's, else 1 ms. Fast motion splits it into substeps.
+            solver: Newton's solver: ``xpbd``, ``steel``, ``mujoco``, ``semi-implicit``, ``featherstone``, ``kamino`` or
+                ``vbd``.
             force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
-            method: How pairs are summed: ``direct``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
+            method: Summation method: ``direct``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
             rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
-            max_evaluations: Field evaluations after which induction gives up.
+            max_evaluations: Field evaluations after which induction ends without convergence.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
             curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
             device: Warp device; by default Warp's.
-            graphs: Replay captured graphs instead of launching kernels one by one.
-            visuals: Also import what is only seen, for a viewer.
+            graphs: Replay captured graphs, in place of launching each kernel.
+            visuals: Also import shapes that are only drawn, for a viewer.
 
         Raises:
-            InputError: Something about the scene or an argument is wrong; the message names it.
+            InputError: The scene or an argument is invalid; the message names the prim or the argument.
         """
         check_solver(solver)
         for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
         self.device, self._ranks = resolve_device(device), current_ranks()
-        graphs &= self._ranks is None  # what merges the sums of ranks is in no graph of a step
+        graphs &= self._ranks is None  # sums over ranks cannot be captured
         own = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
-        how = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
+        solve = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
         with errors_on_all_ranks(self._ranks):
             builder, settings, own_step = self._open(scene, visuals=visuals, articulations=not SOLVERS[solver].maximal)
             self.step_size = _time_step(step, own_step)
             self.model = self._finalize(builder, solver, scene)
             settings = settings.replaced(external_field=external_field, **own)
-            self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **how, **vars(settings))
+            self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **solve, **vars(settings))
             self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
-            self._options = self._options_of(settings, solver, **how)
+            self._options = self._options_of(settings, solver, **solve)
             if self._ranks is not None:
                 self._ranks.check_equal(self._options | {"scene": list(self._stepper.save().values())})
 
     def _open(self, scene: str | os.PathLike | newton.ModelBuilder, **choices) -> tuple:
-        """Import a stage; return its builder, its magnetic settings and its time step [s], None where it has none."""
+        """Import a scene; return its builder, its magnetic settings, and its time step [s] or None."""
         self._scene, self.frame_rate, self.frame_count = None, _FRAME_RATE, None
         if isinstance(scene, newton.ModelBuilder):
             return scene, MagneticSettings(), None
@@ -136,22 +147,22 @@ class Simulation:
         return self._scene.builder, self._scene.magnets.settings, clock.step
 
     def _options_of(self, settings: MagneticSettings, solver: str, **others) -> dict[str, str]:
-        """Return by what a run differs from others of its scene, in words: only an equal one can be resumed."""
+        """Return the options of the run as text. Only a run with equal options can be resumed."""
         kind = "cuda" if self._magnetics.device.is_cuda else "cpu"
         options = {**vars(settings), **others, "step": self.step_size, "solver": solver, "device": kind}
         options["external_field"] = tuple(np.asarray(settings.external_field, dtype=float).tolist())
         return {name.replace("_", " "): str(value) for name, value in options.items()}
 
     def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
-        """Make the model."""
+        """Return the model."""
         articulate(builder, solver)
-        if not builder.body_count:  # Newton allocates nothing for bodies then; one without shapes changes nothing
-            whole = newton.ModelBuilder()
-            whole.add_builder(builder)
-            whole.add_link(is_kinematic=True)
-            builder = whole
+        if not builder.body_count:  # Newton needs a body; one without shapes has no effect
+            extended = newton.ModelBuilder()
+            extended.add_builder(builder)
+            extended.add_link(is_kinematic=True)
+            builder = extended
         if solver == "vbd":
-            builder.color()  # VBD moves bodies that touch nothing in common at once
+            builder.color()  # VBD moves bodies of one color at once
         with wp.ScopedDevice(self.device), self._refusals(scene):
             model = builder.finalize(device=self.device, skip_validation_joints=SOLVERS[solver].maximal)
         check_model(model, solver, LONGEST_SUBSTEP)
@@ -159,7 +170,7 @@ class Simulation:
         return model
 
     def _drive(self, solver: str, own_field: bool) -> Drive | None:
-        """Return what lets the model follow the keys of its stage, those of the field if that is the stage's own."""
+        """Return the keyed values of the stage, without the external field unless ``own_field``; None without keys."""
         if self._scene is None:
             return None
         keys = self._scene.keys if own_field else replace(self._scene.keys, field=None)
@@ -168,7 +179,7 @@ class Simulation:
         return Drive(self.model, self._magnetics, keys, ends_closed=SOLVERS[solver].ends_closed)
 
     def _prepare(self, solver: str, graphs: bool, drive: Drive | None) -> None:
-        """Set up what moves the bodies, and look at how they start."""
+        """Set up solver and stepper, and measure overlaps at the start."""
         self._sizes = sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver)
         self._stepper = Stepper(
@@ -181,9 +192,8 @@ class Simulation:
             graphs=graphs,
             drive=drive,
         )
-        self._moving = np.array(
-            sorted({one.body for one in self._magnetics.magnets if one.body >= 0 and self._moves(one.body)}), dtype=int
-        )
+        bodies = {magnet.body for magnet in self._magnetics.magnets}
+        self._moving = np.array(sorted(body for body in bodies if self._moves(body)), dtype=int)
         self._statistics = Statistics(magnets=len(self._moving))
         if self._scene:
             self._start_from_stage()
@@ -193,7 +203,7 @@ class Simulation:
         self._statistics.coarseness = self._coarseness()
 
     def _refusals(self, scene):
-        """Return what makes one line of Newton's errors about a stage; those about a builder stay as they are."""
+        """Return a context that turns Newton's errors about a stage into one line; none for a builder."""
         if self._scene is None:
             return contextlib.nullcontext()
         from warpmag.usd import newton_errors  # noqa: PLC0415 - a builder can do without USD
@@ -201,10 +211,10 @@ class Simulation:
         return newton_errors(str(scene), "use")
 
     def _moves(self, body: int) -> bool:
-        return math.isfinite(self._sizes.thickness[body])
+        return body >= 0 and math.isfinite(self._sizes.thickness[body])
 
     def _coarseness(self) -> float:
-        """Return the distance of neighbouring single-precision positions over the thickness of the thinnest body."""
+        """Return the spacing of single-precision positions over the thickness of the thinnest body."""
         moving = np.isfinite(self._sizes.thickness)
         if not moving.any():
             return 0.0
@@ -212,32 +222,32 @@ class Simulation:
         return float(np.spacing(farthest) / self._sizes.thickness[moving].min())
 
     def _start_from_stage(self) -> None:
-        """Let induction start from the moments that the stage holds, of an earlier run say."""
-        given = {}
+        """Start induction from the moments of the stage, for example of an earlier run."""
+        magnetizations = {}
         volumes = dict(zip(self._magnetics.shapes.tolist(), self._magnetics.shape_volumes.tolist(), strict=True))
         for prim, moment in self._scene.magnets.initial_moments.items():
             shapes = self._scene.magnet_shapes[prim]
             volume = sum(volumes[shape] for shape in shapes)
-            given |= dict.fromkeys(shapes, np.array(moment) / volume)
-        if given:
-            self._magnetics.start_from(given)
+            magnetizations |= dict.fromkeys(shapes, np.array(moment) / volume)
+        if magnetizations:
+            self._magnetics.start_from(magnetizations)
 
     @property
     def state(self) -> newton.State:
         """The present state; waits for the device.
 
         Raises:
-            SimulationError: The state was not finite any more; it is that of the last step that held.
+            SimulationError: A step led to a state that is not finite. The state is that of the last accepted step.
         """
         self._look()
         return self._stepper.state
 
     @property
     def control(self) -> newton.Control:
-        """Forces and targets of joints, as the scene has them at first; what a step in a graph reads, too.
+        """Forces and targets of joints, initially those of the scene.
 
-        Assign to its arrays between steps, ``simulation.control.joint_target_q.assign(...)``, or write into them by
-        kernels of your own. Another control of this model may be put in its place, which makes a graph anew.
+        Change its arrays between steps, by ``simulation.control.joint_target_q.assign(...)`` or by kernels. Captured
+        steps read them too. If another control of this model is assigned, the step is captured again.
         """
         return self._stepper.control
 
@@ -250,30 +260,30 @@ class Simulation:
 
     @property
     def magnetics(self) -> Magnetics:
-        """Its magnets, as of the present state; waits as :attr:`state` does."""
+        """The magnets at the present state; waits for the device."""
         self._look()
         return self._magnetics
 
     @property
     def statistics(self) -> Statistics:
-        """Figures of the run so far, those of the end filled in by :meth:`finish`; waits as :attr:`state` does."""
+        """Statistics of the run so far; :meth:`finish` adds those of the end. Waits for the device."""
         self._look()
         return self._statistics
 
     def warnings(self) -> list[str]:
-        """Return what the user should know about the stage and the run so far, a line each; waits as :attr:`state`."""
-        known = self._scene.warnings if self._scene else tuple(joint_gap_warnings(self._joint_gaps))
-        known += tuple(solver_warnings(self._options["solver"]))
+        """Return the warnings about the scene and the run so far, a line each; waits for the device."""
+        scene_warnings = self._scene.warnings if self._scene else tuple(joint_gap_warnings(self._joint_gaps))
+        scene_warnings += tuple(solver_warnings(self._options["solver"]))
         lines, figures, rtol = [], self.statistics, self._magnetics.rtol
         if figures.field_error > rtol:
             lines = [
-                f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; sum by method direct"
+                f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; use method direct"
             ]
-        return [*known, *figures.warnings(), *lines]
+        return [*scene_warnings, *figures.warnings(), *lines]
 
     @property
     def capture_failure(self) -> str:
-        """Why steps are launched from Python, which is slower, and not as one graph; empty where they are a graph."""
+        """Reason why steps are launched from Python, which is slower than a graph; empty for a graph."""
         return self._stepper.capture_failure
 
     @property
@@ -282,10 +292,10 @@ class Simulation:
         return self._stepper.steps * self.step_size
 
     def step(self) -> None:
-        """Advance by one step; on a GPU without waiting for it.
+        """Advance by one step; a GPU is not waited for.
 
         Raises:
-            SimulationError: The state is not finite any more; on a GPU up to 64 steps later.
+            SimulationError: A step led to a state that is not finite. On a GPU raised up to 64 steps later.
         """
         self._stepper.advance()
         if self._stepper.due:
@@ -302,18 +312,18 @@ class Simulation:
             raise SimulationError(f"{error}; {cause}") from None
 
     def _cause(self) -> str:
-        """Return why the state may have left all finite numbers, as far as the start and the run so far tell."""
+        """Return the probable cause of a state that is not finite; empty if unknown."""
         if self._statistics.overlapping:
-            return "bodies overlapped at the start, and pushing them apart may turn them faster and faster"
+            return "bodies overlapped at the start, and pushing them apart may make them spin ever faster"
         if self._joint_gaps:
-            return f"the ends of the joint {next(iter(self._joint_gaps))} were apart at the start, and it pulls at them"
+            return f"the ends of the joint {next(iter(self._joint_gaps))} were apart at the start, and it pulls"
         if self._statistics.capped:
-            return "bodies were moving too fast for the shortest substep before"
-        given = getattr(self.model, NAMESPACE)
+            return "bodies had been too fast for the shortest substep"
+        attributes = getattr(self.model, NAMESPACE)
         strengths = {
             "an applied field of {:.3g} A/m": self._magnetics.external_field.numpy(),
-            "a magnetization of {:.3g} A/m": given.magnetization.numpy(),
-            "a coil's current [A] or a field map's factor of {:.3g}": given.strength.numpy(),
+            "a magnetization of {:.3g} A/m": attributes.magnetization.numpy(),
+            "a coil's current [A] or a field map's factor of {:.3g}": attributes.strength.numpy(),
         }
         for name, values in strengths.items():
             strongest = float(np.abs(values).max(initial=0.0))
@@ -333,30 +343,31 @@ class Simulation:
         resume: bool = False,
         on_frame: Callable[[int], bool | None] | None = None,
     ) -> Statistics:
-        """Simulate, and record the frames on a USD stage.
+        """Simulate, and record frames on a USD stage.
 
-        A frame is taken at the step nearest to its time and stands at the time of that step. Frames are written as they
-        come, so that the stage has them whatever ends the process.
+        A frame is recorded at the step nearest to its time, with the time of that step. Frames are written one by one,
+        so that they survive an interruption.
 
         Args:
             frames: Output frames after the first; by default those of the stage, else one second.
-            output: USD file to write; only for a scene that came from a stage.
-            copy_scene: Copy the scene beside the output instead of pointing to it; one with unsaved edits always is.
-            resume: Go on with the run at the output, of the same scene with the same options, if there is one; on a CPU
-                it ends with the bits of a run that was never interrupted.
-            on_frame: Called after each frame with its number, from 0; returning False ends the run.
+            output: USD file to write; only for a scene from a stage.
+            copy_scene: Copy the scene beside the output, in place of a reference to it. A scene with unsaved edits is
+                always copied.
+            resume: Continue the run at the output, of the same scene with the same options, if there is one. On a CPU
+                the result is bitwise identical to an uninterrupted run.
+            on_frame: Called after each frame with its number, from 0; the run ends if it returns False.
 
         Returns:
-            The statistics, :meth:`finish` done.
+            The statistics, after :meth:`finish`.
 
         Raises:
-            InputError: The output cannot be written, or what is there cannot be resumed.
-            SimulationError: The state is not finite any more.
+            InputError: The output cannot be written, or its run cannot be resumed.
+            SimulationError: A step led to a state that is not finite.
         """
         frames = self.frames_of(frames)
         recorder = None if output is None else self._open_recorder(output, copy_scene, frames)
         if resume and recorder is None:
-            raise InputError("resume: only a run with an output can be resumed")
+            raise InputError("resume: needs an output")
         if resume and self._stepper.steps:
             raise ValueError("only a simulation that has not begun can resume another")
         if resume and not SOLVERS[self._options["solver"]].resumable:
@@ -373,20 +384,20 @@ class Simulation:
                     recorder.close(complete)
         except (KeyboardInterrupt, InputError, SimulationError) as end:
             if recorder and recorder.written is not None:
-                known = f"{output} has the frames up to {round(recorder.written * self.frame_rate)}"
-                end.args = (", ".join(filter(None, (str(end), known))),)
+                frames_so_far = f"{output} has the frames up to {round(recorder.written * self.frame_rate)}"
+                end.args = (", ".join(filter(None, (str(end), frames_so_far))),)
             raise
         return self.finish()
 
     def _run_frames(self, frames: int, recorder, on_frame: Callable[[int], bool | None] | None, resumed: bool) -> bool:
-        """Simulate and record, the first frame unless ``resumed``; return whether all frames are done."""
+        """Simulate and record, without the first frame if ``resumed``; return true if all frames are done."""
         figures, before = self._statistics, self._statistics.wall_seconds
         began = time.perf_counter()
         try:
             for frame in range(frames + 1):
                 target = self._steps_at(frame)
                 if target <= self._stepper.steps and (frame or resumed):
-                    continue  # done before, or steps are longer than frames: several would stand at one time
+                    continue  # already recorded; or steps are longer than frames, and two frames would have one time
                 ahead = min(self._stepper.steps + _AHEAD, target)
                 while self._stepper.steps < target:
                     self.step()
@@ -404,7 +415,11 @@ class Simulation:
             figures.wall_seconds = before + time.perf_counter() - began
 
     def frames_of(self, frames: int | None) -> int:
-        """Return how many frames a run of ``frames`` has, which may be None for the scene's own number."""
+        """Return the number of frames of a run; None stands for that of the scene.
+
+        Raises:
+            InputError: ``frames`` is not a positive whole number.
+        """
         if frames is None:
             frames = self.frame_count if self.frame_count is not None else round(self.frame_rate)
         if not (isinstance(frames, int) and frames > 0):
@@ -413,7 +428,7 @@ class Simulation:
 
     def _open_recorder(self, output: str | os.PathLike, copy_scene: bool, frames: int):
         if self._scene is None:
-            raise InputError(f"{Path(output)}: only a scene that came from a stage can be written to one")
+            raise InputError(f"{Path(output)}: only a scene from a stage can be written to a stage")
         from warpmag.engine.stepping.recording import Recorder  # noqa: PLC0415 - a builder can do without USD
 
         return Recorder(
@@ -430,7 +445,7 @@ class Simulation:
         )
 
     def _steps_at(self, frame: int) -> int:
-        """Return how many steps are done at a frame."""
+        """Return the number of steps before a frame."""
         return round(frame / (self.frame_rate * self.step_size))
 
     def _follow(self, state: newton.State) -> None:
@@ -439,7 +454,7 @@ class Simulation:
             self._statistics.farthest = max(self._statistics.farthest, float(distance))
 
     def finish(self) -> Statistics:
-        """Fill in the figures of the end and return the statistics."""
+        """Return the statistics with those of the end; waits for the device."""
         figures = self.statistics
         figures.field_error = self._magnetics.field_error()
         figures.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
@@ -453,13 +468,14 @@ class Simulation:
         return figures
 
     def _held(self) -> np.ndarray:
-        """Return which bodies a magnet holds; behind the bodies stand the static shapes, each for itself."""
+        """Return true for each body that a magnet holds, shape [body_count]."""
         model, contacts = self.model, self._solver.contacts
         shape_body = model.shape_body.numpy()
+        # static shapes count as bodies of their own, behind the bodies of the model
         node = np.where(shape_body >= 0, shape_body, model.body_count + np.arange(model.shape_count))
         fixed = np.ones(model.body_count + model.shape_count, dtype=bool)
         fixed[: model.body_count] = ~np.isfinite(self._sizes.thickness)
-        permanent = [one.magnet.kind == "permanent" for one in self.magnetics.magnets for _ in one.shapes]
+        permanent = [magnet.magnet.kind == "permanent" for magnet in self.magnetics.magnets for _ in magnet.shapes]
         holds = np.zeros_like(fixed)
         holds[node[self.magnetics.shapes[fixed[node[self.magnetics.shapes]] | permanent]]] = True
 
@@ -470,8 +486,8 @@ class Simulation:
         return find_held(pairs[touching], holds, fixed)[: model.body_count]
 
 
-def _time_step(given: float | None, own: float | None) -> float:
-    """Return the time step [s]: the one that is given, else the scene's own, else the default."""
-    step = next(one for one in (given, own, DEFAULT_STEP) if one is not None)
+def _time_step(argument: float | None, scene_step: float | None) -> float:
+    """Return the time step [s]: the argument, else the step of the scene, else the default."""
+    step = next(value for value in (argument, scene_step, DEFAULT_STEP) if value is not None)
     check_positive("step", step)
     return float(step)

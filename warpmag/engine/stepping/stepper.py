@@ -1,13 +1,15 @@
-"""Advances a model by the step that the user asked for, in as many substeps as its motion needs.
+"""Advances a model by the user's time step, in as many substeps as its motion needs.
 
-A substep is: clear forces, induction, magnetic forces, collision, solver; substeps shorter than the longest ones share
-their forces with others. A step is attempted and then judged: if a body moved too far in a substep, or bodies were
-pressed into each other, the state is restored and the step done again with shorter substeps. All of that is decided on
-the device (``kernels.rigid.stepping``), so that a step is one graph that the host launches and does not wait for. The
-host looks every so many steps. Where it has to act, because a buffer overflowed or the state is not finite any more,
-the device has halted, and steps launched since did nothing.
+A substep clears the forces, solves the induction, adds magnetic forces, finds contacts and runs the rigid-body solver.
+Substeps shorter than the longest ones share their forces with others.
 
-What cannot be captured in a graph is launched from Python, by the same code.
+A step is attempted and then judged. If a body moved too far in a substep, or bodies were pressed into each other, the
+state is restored and the step repeated with shorter substeps. The device makes these decisions
+(``kernels.rigid.stepping``), so that a step is one graph that the host launches without waiting. The host reads the
+reports of several steps at once. If a buffer overflows or the state is not finite, the device halts, and later steps do
+nothing until the host acts.
+
+Steps that cannot be captured in a graph are launched from Python by the same code.
 """
 
 import math
@@ -30,38 +32,37 @@ from warpmag.kernels.rigid.newton_views import view_bodies
 from warpmag.moments.arrays import restore_snapshot, snapshot_views
 
 TRAVEL_LIMIT = 0.25
-"""How far a body may glide along another, or forces may pull it, in a substep, in parts of its thickness; see
+"""Largest sliding of a body along another, or motion by forces, in a substep, over the body's thickness; see
 ``kernels.rigid.monitor``."""
 _SHARED_TRAVEL_LIMIT = 0.5
-"""The same while more than two substeps share their forces: a ball that flies alone moves two radii meanwhile."""
+"""The same limit while more than two substeps share their forces. A free ball then moves at most two radii."""
 OVERLAP_LIMIT = 0.008
-"""How deep a step may newly press one body into another, in parts of the thickness of the thinner one."""
-_EASE = 0.8
-"""Substeps double in length once the motion in twice their length would be below this part of the limit."""
-_FUTILE = 0.8
-"""Substeps of half the length that leave more than this part of a penetration do not press less, however short."""
+"""Largest new penetration in a step over the thickness of the thinner body."""
+_GROWTH_MARGIN = 0.8
+"""Substeps double when the predicted motion stays below this fraction of the limit."""
+_FUTILE_RATIO = 0.8
+"""If halved substeps leave more than this fraction of a penetration, even shorter ones are not tried."""
 _RECORDS = 64
-"""Steps that may be done before the host looks; on a CPU, which it waits for anyway, it looks after each."""
+"""Largest number of steps without a :meth:`Stepper.look`. On a CPU the host looks after each step."""
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What happened in one step.
+    """Outcome of one step.
 
     Attributes:
-        substeps: Substeps that the step was done in.
-        attempts: How often it was done, 1 if the first attempt held.
-        capped: Whether a body moved farther in a substep than allowed, with the shortest substeps there are.
-        regrown: Whether buffers had to grow.
-        travel: Farthest motion in a substep that tells, over the thickness of the body, see ``kernels.rigid.monitor``.
+        substeps: Number of substeps.
+        attempts: Number of attempts, 1 if the first one was accepted.
+        capped: A body moved farther than allowed even in the shortest substep.
+        regrown: Buffers were enlarged.
+        travel: Largest motion in a substep over the thickness of the body, see ``kernels.rigid.monitor``.
         speed: Highest speed of a body [m/s].
         overlap: Deepest penetration over the thickness of the thinner body.
         depth: Deepest penetration [m].
         error: Largest magnetization error of a substep.
         evaluations: Field evaluations of all substeps.
         unconverged: Substeps whose induction did not converge.
-        seconds: Time spent in induction, forces and rigid bodies [s], all attempts together; None where kernels were
-            compiled meanwhile.
+        seconds: Times of induction, forces and rigid bodies [s], summed over attempts; None if kernels were compiled.
     """
 
     substeps: int
@@ -82,8 +83,8 @@ class Stepper:
     """Steps one model with its magnets.
 
     Attributes:
-        steps: Steps asked for so far.
-        capture_failure: Why a step could not be captured in a graph; empty if it could, or was not tried.
+        steps: Number of calls of :meth:`advance`.
+        capture_failure: Reason why a step was not captured in a graph; empty if it was, or if that was not tried.
     """
 
     def __init__(
@@ -98,27 +99,27 @@ class Stepper:
         graphs: bool = True,
         drive: Drive | None = None,
     ):
-        """Prepare to step.
+        """Allocate states and the state machine.
 
         Args:
             model: The model.
             magnetics: Its magnets.
-            solver: Its collision and solver.
+            solver: Its collision pipeline and solver.
             sizes: Sizes of its bodies.
             step: Time step [s].
             longest_substep: Upper limit of a substep [s].
             graphs: Capture a step in a graph where the device and the solver allow it.
-            drive: What follows keys.
+            drive: Keyed values of the model.
         """
         self._model, self._magnetics, self._solver, self._drive = model, magnetics, solver, drive
         self._device = wp.get_device(model.device)
         self._step = step
-        # Even, so that a step ends in the state that it began in.
+        # an even number, so that a step ends in the state object that it began in
         self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
         self._longest = step / self._fewest
         self._state, self._other, self._saved = model.state(), model.state(), model.state()
         self._control = model.control()
-        self._shared = model.state()  # between the poses that some substeps start from, and the forces there
+        self._shared = model.state()  # poses and forces that several substeps share
         self._machine = stepping.StepMachine(
             _RECORDS,
             len(solver.buffers),
@@ -126,8 +127,8 @@ class Stepper:
             travel=TRAVEL_LIMIT,
             shared_travel=_SHARED_TRAVEL_LIMIT,
             overlap=OVERLAP_LIMIT,
-            ease=_EASE,
-            futile=_FUTILE,
+            ease=_GROWTH_MARGIN,
+            futile=_FUTILE_RATIO,
             fewest=self._fewest,
         )
         self._machine.keep(_arrays(self._state), _arrays(self._saved))
@@ -145,32 +146,32 @@ class Stepper:
         self._prepare()
 
     def _make_mirrors(self) -> dict[str, wp.array]:
-        """Return where the host reads what the device writes, by name."""
+        """Return the host's copies of the state machine's buffers, by name."""
         mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
         if self._device.is_cuda:
             mirrors = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in mirrors.items()}
         return mirrors
 
     def _prepare(self) -> None:
-        """Fit everything to the solver's buffers, whose number does not change."""
+        """Set the sizes of the solver's buffers, whose number is constant, and discard the graph."""
         self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
         self._watched.fills.assign(self._solver.fills())
         self._machine.forget_contacts()
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
-    # What the host does
+    # On the host
     # -----------------------------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> newton.State:
-        """The present state, once :meth:`look` has been called; it may be changed."""
+        """The present state; call :meth:`look` first. It may be changed."""
         self._machine.forget_contacts()
         return self._state
 
     @property
     def control(self) -> newton.Control:
-        """Forces and targets of joints; its arrays may be changed between steps, or another put in its place."""
+        """Forces and targets of joints. Change its arrays, or assign another control, between steps."""
         return self._control
 
     @control.setter
@@ -180,14 +181,14 @@ class Stepper:
 
     @property
     def due(self) -> bool:
-        """Whether :meth:`look` has to be called before the next step."""
+        """True if :meth:`look` has to be called before the next step."""
         return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
 
     def advance(self) -> None:
-        """Advance :attr:`state` by one step; on a GPU without waiting for it.
+        """Advance :attr:`state` by one step; a GPU is not waited for.
 
         Raises:
-            RuntimeError: More steps are asked for than can be reported at the next look.
+            RuntimeError: :meth:`look` was not called for too many steps.
         """
         if self.steps - self._reported >= _RECORDS:
             raise RuntimeError(f"look() must be called every {_RECORDS} steps")
@@ -195,13 +196,13 @@ class Stepper:
         self._launch()
 
     def look(self) -> Iterator[StepReport]:
-        """Wait for the steps asked for.
+        """Wait for all steps so far.
 
         Yields:
             A report of each step since the last look.
 
         Raises:
-            SimulationError: The state is not finite any more; it is that of the last step that held.
+            SimulationError: A step led to a state that is not finite. The state is that of the last accepted step.
         """
         while self.steps > self._reported:
             status = self._read("status")
@@ -218,7 +219,7 @@ class Stepper:
                     self._launch()
 
     def _reports(self, done: int) -> list[StepReport]:
-        """Read what the steps up to ``done`` logged."""
+        """Read the records of the steps up to ``done``."""
         self._clock.look()
         log = self._read("log")
         numbers = range(self._reported, done)
@@ -248,10 +249,9 @@ class Stepper:
         self.steps, number = self._reported, self._reported + 1
         for status in (stepping.STATUS_LEVEL, stepping.STATUS_ATTEMPTS):
             self._machine.set_status(status, 0)
-        self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)  # the state may be mended
-        raise SimulationError(
-            f"step {number} ({number * self._step:g} s): {self._model.body_label[body]} has left all finite numbers"
-        )
+        self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)  # the user may repair the state
+        label = self._model.body_label[body]
+        raise SimulationError(f"step {number} ({number * self._step:g} s): the state of {label} is not finite any more")
 
     def _fills(self) -> np.ndarray:
         return self._read("counts")[monitor.COUNT_CAPACITIES :]
@@ -265,7 +265,7 @@ class Stepper:
         return mirror.numpy()
 
     def _launch(self) -> None:
-        """Launch a step: from Python at first, which compiles its kernels, then, if it can be captured, as a graph."""
+        """Launch a step: the first from Python, which compiles its kernels, later ones as a graph if possible."""
         if self._graph:
             wp.capture_launch(self._graph)
             return
@@ -281,25 +281,25 @@ class Stepper:
         try:
             with wp.ScopedCapture(self._device) as capture:
                 self._run_step()
-            # the first launch makes the graph executable, or fails to; paused, it does nothing else
+            # the first launch instantiates the graph, or fails; while paused, it computes nothing
             self._machine.set_status(stepping.STATUS_HALT, stepping.PAUSED)
             wp.capture_launch(capture.graph)
             self._graph = capture.graph
-        except Exception as error:  # whatever a solver does that cannot be captured, it can still be launched
+        except Exception as error:  # steps that cannot be captured are launched from Python
             self._capture, self.capture_failure = False, " ".join(str(error).split()) or type(error).__name__
             _clear_error(self._device)
         self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return all that the next step depends on, on a CPU valid until then; :meth:`look` first."""
+        """Return the arrays that the next step depends on; call :meth:`look` first. A step may overwrite them."""
         numbers = {"steps": np.array(self.steps), "buffers": self._solver.limits()}
         return numbers | snapshot_views(self._carried())
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
-        """Go on from where :meth:`save` was called, in another run of the same model.
+        """Continue a run of the same model from the arrays that :meth:`save` returned.
 
         Raises:
-            InputError: It was called for something else.
+            InputError: The arrays belong to another model.
         """
         self._solver.set_limits(saved["buffers"])
         self._prepare()
@@ -307,7 +307,7 @@ class Stepper:
         self.steps = self._reported = int(saved["steps"])
 
     def _carried(self) -> dict[str, wp.array]:
-        """Return the arrays that a step hands on to the next one, by name."""
+        """Return the arrays that the next step depends on, by name."""
         machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
         parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
         parts["control"] = dict(enumerate(_arrays(self._control)))
@@ -315,11 +315,11 @@ class Stepper:
         return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
-        """Find the contacts of the present state; :meth:`look` first.
+        """Find the contacts of the present state; call :meth:`look` first.
 
         Returns:
-            Deepest penetration over the thickness of the thinner body, the same [m], and the number of contacts deeper
-            than ``overlap_threshold`` of the thickness.
+            Deepest penetration over the thickness of the thinner body, deepest penetration [m], and number of contacts
+            deeper than ``overlap_threshold`` over the thickness.
         """
         a = self._arrays
         while True:
@@ -336,11 +336,11 @@ class Stepper:
         return *depths, int(counts[monitor.COUNT_OVERLAPS])
 
     def begin_from(self, overlap: float) -> None:
-        """Say how deep the first state has bodies in each other, over their thickness: steps press them no deeper."""
+        """Set the deepest penetration at the start over the thickness; steps do not press bodies deeper."""
         self._arrays.last_overlap.assign(np.array([overlap, math.inf], np.float32))
 
     # -----------------------------------------------------------------------------------------------------------------
-    # What the device does: all of the following only launches kernels
+    # On the device: the following methods only launch kernels
     # -----------------------------------------------------------------------------------------------------------------
 
     def _run_step(self) -> None:
@@ -360,7 +360,7 @@ class Stepper:
         if self._drive:
             machine.tell_time(self._step, self._longest, self._drive.time)
         wp.capture_if(machine.contacts_due, self._find_first_contacts, substep=0)
-        if level == 1:  # two substeps are all that share
+        if level == 1:  # exactly two substeps share forces
             self._share_forces(dt)
         elif level > 1:
             wp.capture_if(machine.forces_due, self._share_forces, dt=dt)
@@ -377,7 +377,7 @@ class Stepper:
         machine.end_pair(level)
 
     def _move(self, now: newton.State, then: newton.State, begin: float, dt: float) -> None:
-        """Do a substep of ``dt`` [s] that begins ``begin`` [s] after the pair that it is of."""
+        """Run the solver for a substep of ``dt`` [s] that begins ``begin`` [s] after its pair of substeps."""
         if self._drive:
             self._drive.lead(now, begin, dt)
         self._solver.step(now, then, dt, self._control)
@@ -385,9 +385,9 @@ class Stepper:
             self._drive.place(then, begin + dt, self._longest)
 
     def _find_first_contacts(self, substep: int) -> None:
-        """Find the contacts that two substeps start from.
+        """Find the contacts at the start of two substeps.
 
-        They hold for the longest substep, so that those at the end of a step serve the next one, whatever its level.
+        They reach as far as the longest substep needs, so that contacts at the end of a step also serve the next one.
         """
         self._find_contacts(self._state, self._longest, substep)
 
@@ -414,28 +414,28 @@ class Stepper:
 
 
 def _clear_error(device) -> None:
-    """Clear the error that a failed graph leaves behind by sorting nothing: the next sort on a GPU does nothing."""
+    """Sort an empty array: after a failed capture the first sort on a GPU has no effect."""
     if device.is_cuda:
         nothing = wp.zeros(2, dtype=wp.int32, device=device)
         wp.utils.radix_sort_pairs(nothing, wp.zeros_like(nothing), 1)
 
 
 def _arrays(state: newton.State | newton.Control) -> list[wp.array]:
-    """Return what a state remembers, or a control holds, flat; forces on bodies are cleared before each substep."""
-    found = []
+    """Return the arrays of a state or a control, flat, without forces: each substep clears them."""
+    arrays = []
     for name, value in vars(state).items():
         if isinstance(value, newton.Model.AttributeNamespace):
-            found += _arrays(value)
+            arrays += _arrays(value)
         elif isinstance(value, wp.array) and value.size and name not in ("body_f", "particle_f"):
-            found.append(value.flatten())
-    return found
+            arrays.append(value.flatten())
+    return arrays
 
 
 class _Clock:
-    """Tells how long a tick of the device's clock is.
+    """Measures the tick of the device's clock.
 
     Attributes:
-        seconds_per_tick: Known after a :meth:`look`.
+        seconds_per_tick: Length of a tick [s], after a :meth:`look`.
     """
 
     def __init__(self, device):
@@ -449,7 +449,7 @@ class _Clock:
         return int(self._time.numpy()[0]), time.perf_counter()
 
     def look(self) -> None:
-        """Compare the device's clock with the host's; that of a GPU counts nanoseconds."""
+        """Compare the device's clock with the host's. The clock of a GPU counts nanoseconds."""
         if not self._fixed:
             ticks, seconds = np.subtract(self._read(), self._began)
             self.seconds_per_tick = float(seconds / ticks)
