@@ -294,7 +294,7 @@ def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, alw
         ([str(scene), "--frames", "6", "--force", "zeeman"], "cannot resume, it was run with another force: kelvin"),
         ([str(scene), "--frames", "6", "--rtol", "1e-4"], "another rtol: 0.001"),
         ([str(other), "--frames", "6"], "cannot resume, it was run with another scene"),
-        ([str(scene), "--frames", "2"], "has 0.05 s already, more than 2 frames"),
+        ([str(scene), "--frames", "2"], "already has 0.05 s, more than 2 frames"),
     ]:
         assert cli.main([*command, *arguments]) == 2
         printed = capsys.readouterr()
@@ -320,7 +320,7 @@ def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, alw
     assert cli.main([*command, str(scene), "--frames", "6"]) == 0
     assert "already has all 6 frames" in capsys.readouterr().out
     assert cli.main([*command, str(scene), "--frames", "7"]) == 2
-    assert "there is nothing to resume" in capsys.readouterr().err
+    assert "cannot be extended" in capsys.readouterr().err
 
 
 class Late(recording.Recorder):

@@ -254,7 +254,7 @@ def test_a_hull_without_mass(tmp_path):
         )
         for more in ("", "bool physics:kinematicEnabled = 1")
     ]
-    with pytest.raises(InputError, match=r"^/Ball: Newton finds no mass"):
+    with pytest.raises(InputError, match=r"^/Ball: its colliders have no mass"):
         import_scene(write(tmp_path, bodies[0]))
     import_scene(write(tmp_path, bodies[1]))
 

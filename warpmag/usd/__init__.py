@@ -14,7 +14,7 @@ from warpmag.usd.read.coils import author_coil, author_field_map, is_source, pla
 from warpmag.usd.read.identical_balls import MOMENTS_PRIMVAR, BallFrames, IdenticalBalls
 from warpmag.usd.read.input_errors import newton_errors, usd_errors
 from warpmag.usd.read.instancers import complete_instances
-from warpmag.usd.read.joints import GroundedJoint, enabled_joints, prepare_joints
+from warpmag.usd.read.joints import GroundedJoint, enabled_joint_paths, prepare_joints
 from warpmag.usd.read.materials import give_densities
 from warpmag.usd.read.opening import describe, first_camera, freeze, open_animated, open_deferred, open_stage
 from warpmag.usd.read.prims import has_volume
@@ -46,7 +46,7 @@ __all__ = [
     "collider_magnet",
     "complete_instances",
     "describe",
-    "enabled_joints",
+    "enabled_joint_paths",
     "first_camera",
     "freeze",
     "give_densities",

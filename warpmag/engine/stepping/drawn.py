@@ -1,4 +1,4 @@
-"""Meshes as they are drawn, where Newton lets them collide as simpler shapes (``physics:approximation``)."""
+"""Keeps the meshes of a stage that Newton replaces by simpler colliders (``physics:approximation``)."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,21 +10,21 @@ from warpmag.errors import InputError
 from warpmag.shapes import lattice
 
 _REPLACING = ("coacd", "vhacd", "convex_hull", "bounding_box", "bounding_sphere")
-"""Newton's names of the approximations that fill a mesh up; the others simplify its surface."""
+"""Newton's names of approximations that change the volume of a mesh; the others simplify its surface."""
 
-_SAME = 1e-4
-"""Relative difference of volumes up to which a shape around a mesh is the mesh, in single precision."""
+_SAME_VOLUME = 1e-4
+"""Relative difference of volumes up to which a collider is taken for the mesh, for single precision."""
 
 
 @dataclass
 class DrawnMesh:
-    """A mesh that other shapes stand for.
+    """A mesh that was replaced by other shapes.
 
     Attributes:
         mesh: The mesh.
         scale: Its scale.
-        frame: Its frame in that of its body.
-        stand_ins: The shapes that collide for it.
+        frame: Pose of the mesh in the frame of its body.
+        stand_ins: Shapes that collide in its place.
     """
 
     mesh: newton.Mesh
@@ -34,19 +34,19 @@ class DrawnMesh:
 
 
 class StageBuilder(newton.ModelBuilder):
-    """A builder that keeps the meshes that an import replaces.
+    """A builder that keeps meshes that an import replaces.
 
     Attributes:
-        drawn: The meshes by the shapes that they were.
+        drawn: The replaced meshes by shape.
     """
 
     def __init__(self):
-        """Begin an empty builder."""
+        """Make an empty builder."""
         super().__init__()
         self.drawn: dict[int, DrawnMesh] = {}
 
     def approximate_meshes(self, method: Any = "convex_hull", shape_indices=None, *args, **options) -> set[int]:
-        """Replace meshes as Newton does, and keep those that are lost."""
+        """Replace meshes as Newton does, and keep the originals."""
         meshes = {}
         if method in _REPLACING and shape_indices is not None:
             for shape in shape_indices:
@@ -57,40 +57,40 @@ class StageBuilder(newton.ModelBuilder):
         for shape in replaced & meshes.keys():
             self.drawn[shape] = meshes[shape]
             label = f"{self.shape_label[shape]}_convex_"
-            extra = [one for one in range(before, self.shape_count) if self.shape_label[one].startswith(label)]
-            self.drawn[shape].stand_ins += [one for one in extra if self.shape_body[one] == self.shape_body[shape]]
+            parts = [part for part in range(before, self.shape_count) if self.shape_label[part].startswith(label)]
+            self.drawn[shape].stand_ins += [part for part in parts if self.shape_body[part] == self.shape_body[shape]]
         return replaced
 
     def as_drawn(self, shapes: list[int]) -> list[int]:
-        """Return ``shapes`` with meshes, which do not collide, for those that stand for closed ones of other volume."""
+        """Return ``shapes`` with original closed meshes, added without collision, for colliders of another volume."""
         result = list(shapes)
         for shape in shapes:
             drawn = self.drawn.get(shape)
-            if drawn is None or not self._fills_less(drawn):
+            if drawn is None or not self._changes_volume(drawn):
                 continue
-            stands = [one for one in result if one not in drawn.stand_ins]
-            result = [*stands, self._add(shape, drawn)]
+            kept = [other for other in result if other not in drawn.stand_ins]
+            result = [*kept, self._add(shape, drawn)]
         return result
 
-    def _fills_less(self, drawn: DrawnMesh) -> bool:
+    def _changes_volume(self, drawn: DrawnMesh) -> bool:
         try:
             volume = _solid(drawn.mesh, drawn.scale).volume
-        except InputError:  # ``warpmag.usd`` has warned of it
+        except InputError:  # an open mesh; ``warpmag.usd`` warns about it
             return False
         if len(drawn.stand_ins) > 1:
             return True
         (shape,) = drawn.stand_ins
         kind, scale = self.shape_type[shape], np.asarray(self.shape_scale[shape], float)
         if kind == newton.GeoType.SPHERE:
-            around = lattice.sphere(scale[0])
+            collider = lattice.sphere(scale[0])
         elif kind == newton.GeoType.BOX:
-            around = lattice.box(scale)
+            collider = lattice.box(scale)
         else:
-            around = _solid(self.shape_source[shape], scale)
-        return abs(volume - around.volume) > _SAME * around.volume
+            collider = _solid(self.shape_source[shape], scale)
+        return abs(volume - collider.volume) > _SAME_VOLUME * collider.volume
 
     def _add(self, shape: int, drawn: DrawnMesh) -> int:
-        unseen = newton.ModelBuilder.ShapeConfig(
+        invisible = newton.ModelBuilder.ShapeConfig(
             density=0.0, has_shape_collision=False, has_particle_collision=False, is_visible=False
         )
         return self.add_shape_mesh(
@@ -98,7 +98,7 @@ class StageBuilder(newton.ModelBuilder):
             xform=drawn.frame,
             mesh=drawn.mesh,
             scale=drawn.scale,
-            cfg=unseen,
+            cfg=invisible,
             label=f"{self.shape_label[shape]}_drawn",
         )
 

@@ -1,4 +1,4 @@
-"""Records the frames of a run on a USD stage, so that it survives whatever ends it."""
+"""Records the frames of a run on a USD stage."""
 
 import contextlib
 import os
@@ -23,13 +23,13 @@ _STATISTICS = "stat."
 
 
 class Recorder:
-    """Takes the frames of a simulation.
+    """Records the frames of a simulation.
 
-    Frames are written as they come, on a GPU during the steps that follow, and the host does not wait for them. What
-    interrupts a run waits until the frame that is being written is whole.
+    Frames are written one by one. With a GPU a frame is written during the next steps. Signals that end the process are
+    delayed until a frame is complete.
 
     Attributes:
-        written: Time of the last frame that stands on the stage since its start [s]; None without any.
+        written: Time of the last written frame since the start of the stage [s]; None before the first.
     """
 
     def __init__(
@@ -46,19 +46,19 @@ class Recorder:
         resumable: bool,
         ranks: Ranks | None,
     ):
-        """Prepare to write; see :class:`warpmag.usd.CacheWriter`.
+        """Open the writer, a :class:`warpmag.usd.CacheWriter`.
 
         Args:
             scene: The scene.
             magnetics: Its magnets.
-            stepper: What moves it.
-            statistics: Figures of the run so far.
+            stepper: Its stepper.
+            statistics: Statistics of the run, saved with checkpoints.
             output: File of the root layer.
-            copy_scene: Copy the scene beside it.
-            frames: Frames that are expected.
-            options: What a run that goes on from this one must have in common with it.
-            resumable: Whether one can.
-            ranks: Processes of which the first writes; None means that there is but this one.
+            copy_scene: Copy the scene beside the output.
+            frames: Expected number of frames.
+            options: Options of the run; a resumed run needs equal ones.
+            resumable: Write checkpoints.
+            ranks: Processes of the run; the first one writes. None for a single process.
         """
         shapes = list(scene.magnet_shapes.values())
         row = {shape: index for index, shape in enumerate(magnetics.shapes.tolist())}
@@ -67,10 +67,10 @@ class Recorder:
         self._taken: tuple[float, bool, dict[str, np.ndarray] | None] | None = None
         state = stepper.state
         self._mirrors = _Mirrors((state.body_q, state.body_qd, magnetics.sum_moments()))
-        # keyed bodies have samples of their own
-        own = {prim: body for prim, body in scene.bodies.items() if body not in scene.keys.motions}
-        self._bodies = np.array(list(own.values()), dtype=int)
-        self._shapes = np.array([row[shape] for of_prim in shapes for shape in of_prim], dtype=int)
+        # keyed bodies already have time samples
+        recorded = {prim: body for prim, body in scene.bodies.items() if body not in scene.keys.motions}
+        self._bodies = np.array(list(recorded.values()), dtype=int)
+        self._shapes = np.array([row[shape] for prim_shapes in shapes for shape in prim_shapes], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
         self._ranks, self.written = ranks, None
         self._writer: CacheWriter | _NoWriter = _NoWriter()
@@ -79,7 +79,7 @@ class Recorder:
                 self._writer = CacheWriter(
                     scene.stage,
                     output,
-                    list(own),
+                    list(recorded),
                     list(scene.magnet_shapes),
                     instancers=scene.swarms,
                     copy_scene=copy_scene,
@@ -88,48 +88,48 @@ class Recorder:
                 )
 
     def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
-        """Go on with the run at the output.
+        """Continue the run at the output.
 
         Args:
-            frames: Frames that are wanted.
-            steps: Steps that are done then.
+            frames: Number of frames of the whole run.
+            steps: Number of steps of the whole run.
             step_size: Time step [s].
 
         Returns:
-            Whether there was a run, and whether it is complete.
+            True if there was a run, and true if it is complete.
 
         Raises:
-            InputError: What is there cannot be resumed.
+            InputError: The run at the output cannot be resumed.
         """
-        with _interrupts_held():
-            found = on_first_rank(self._writer.resume, self._ranks)
-        if found is None or (found.state is None and found.time <= 0.0):
-            return False, False  # nothing there, or no more than the first frame
-        done, output = round(found.time / step_size), Path(self._output)
+        with _signals_delayed():
+            earlier = on_first_rank(self._writer.resume, self._ranks)
+        if earlier is None or (earlier.state is None and earlier.time <= 0.0):
+            return False, False  # no run, or only its first frame
+        done, output = round(earlier.time / step_size), Path(self._output)
         if done > steps:
-            raise InputError(f"frames: {output} has {found.time:g} s already, more than {frames} frames")
-        if found.state is not None:
-            names = [name for name in found.state if name.startswith(_STATISTICS)]
+            raise InputError(f"frames: {output} already has {earlier.time:g} s, more than {frames} frames")
+        if earlier.state is not None:
+            names = [name for name in earlier.state if name.startswith(_STATISTICS)]
             try:
-                self._stepper.load(found.state)
-                self._statistics.load({name.removeprefix(_STATISTICS): found.state[name] for name in names})
+                self._stepper.load(earlier.state)
+                self._statistics.load({name.removeprefix(_STATISTICS): earlier.state[name] for name in names})
             except KeyError as name:
                 raise InputError(f"{output}: cannot resume, its checkpoint has no {name}") from None
             except InputError as error:
                 raise InputError(f"{output}: cannot resume, {error}") from None
         elif done < steps:
-            raise InputError(f"frames: the run of {output} ended at {found.time:g} s, there is nothing to resume")
-        self.written = found.time
-        return True, found.state is None
+            raise InputError(f"frames: the run of {output} ended at {earlier.time:g} s and cannot be extended")
+        self.written = earlier.time
+        return True, earlier.state is None
 
     def add_frame(self, time: float, state) -> None:
-        """Take a frame, and write it; on a GPU :meth:`write` does that, while the next steps run.
+        """Record a frame. With a GPU it is written by the next :meth:`write`, while steps run.
 
-        Moments are those of the last substep. Before the first step there are none: they are solved for, and forgotten.
+        The moments are those of the last substep. Before the first step they are solved without an effect on the run.
 
         Args:
             time: Time since the start [s].
-            state: Newton's state, of which no step is being done.
+            state: Newton's state between two steps.
         """
         self.write()
         if time > 0.0:
@@ -143,13 +143,13 @@ class Recorder:
             self.write()
 
     def _save(self) -> dict[str, np.ndarray]:
-        """Return all that a run has to know to go on from the present state."""
-        figures = {f"{_STATISTICS}{name}": one for name, one in self._statistics.save().items()}
+        """Return the arrays of a checkpoint of the present state."""
+        figures = {f"{_STATISTICS}{name}": value for name, value in self._statistics.save().items()}
         return self._stepper.save() | figures
 
     def write(self) -> None:
-        """Write the frame that has been taken, and a checkpoint if it is time, unless that has been done."""
-        with _interrupts_held():
+        """Write the recorded frame, and a checkpoint if one is due; nothing if that was done."""
+        with _signals_delayed():
             if self._taken is None:
                 return
             (time, due, saved), self._taken = self._taken, None
@@ -162,72 +162,72 @@ class Recorder:
                 self._writer.save(saved)
 
     def close(self, complete: bool) -> None:
-        """Close the files; unless the run is complete, and its last frame written, it can be resumed."""
+        """Close the files. A run that is not complete can be resumed."""
         written = False
         try:
             self.write()
             written = True
         finally:
-            with _interrupts_held():
+            with _signals_delayed():
                 self._writer.close(complete and written)
 
 
 class _NoWriter:
-    """Writes nothing: what ranks other than the first have."""
+    """Writer of the ranks other than the first: it writes nothing."""
 
     save_due = False
 
     def resume(self):
-        """Find nothing."""
+        """Return None: the first rank reads."""
 
     def add_frame(self, *frame):
-        """Write no frame."""
+        """Do nothing."""
 
     def save(self, state):
-        """Write no checkpoint."""
+        """Do nothing."""
 
     def close(self, complete):
-        """Close nothing."""
+        """Do nothing."""
 
 
 class _Mirrors:
-    """Copies of arrays on the host, for which it need not wait."""
+    """Copies of device arrays on the host, made without waiting."""
 
     def __init__(self, arrays: Sequence[wp.array]):
-        """Make room for copies of arrays of one device."""
+        """Allocate copies of arrays of one device."""
         self._arrays, device = arrays, arrays[0].device
         self._copies = [wp.empty_like(array, device="cpu", pinned=device.is_cuda) for array in arrays]
         self._taken = wp.Event(device) if device.is_cuda else None
 
     def take(self) -> None:
-        """Copy the arrays as they are once what has been launched so far is done."""
+        """Copy the arrays after all work launched so far."""
         for copy, array in zip(self._copies, self._arrays, strict=True):
             wp.copy(copy, array)
         if self._taken:
             self._arrays[0].device.stream.record_event(self._taken)
 
     def read(self) -> list[np.ndarray]:
-        """Return the copies, which the next :meth:`take` overwrites."""
+        """Return the copies; the next :meth:`take` overwrites them."""
         if self._taken:
             wp.synchronize_event(self._taken)
         return [copy.numpy() for copy in self._copies]
 
 
 @contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Let signals that end the process wait until what is being recorded is complete."""
+def _signals_delayed() -> Iterator[None]:
+    """Delay signals that end the process until the context is left."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     caught = []
-    before = {one: signal.getsignal(one) for one in _SIGNALS}
-    held = [one for one, handler in before.items() if handler not in (signal.SIG_IGN, None)]
-    for one in held:
-        signal.signal(one, lambda number, _: caught.append(number))
+    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+    delayed = [number for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)]
+    for number in delayed:
+        signal.signal(number, lambda number, _: caught.append(number))
     try:
         yield
     finally:
-        for one in held:
-            signal.signal(one, before[one])
-    for one in caught[:1]:
-        signal.raise_signal(one)
+        for number in delayed:
+            signal.signal(number, handlers[number])
+    for number in caught[:1]:
+        signal.raise_signal(number)

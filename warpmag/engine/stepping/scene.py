@@ -1,4 +1,4 @@
-"""From a USD stage to a Newton builder whose shapes carry the stage's magnets."""
+"""Imports a USD stage as a Newton builder with the magnets of the stage."""
 
 import os
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ from warpmag.usd import (
     StageContents,
     ball_instancers,
     complete_instances,
-    enabled_joints,
+    enabled_joint_paths,
     give_densities,
     has_volume,
     inspect,
@@ -41,18 +41,18 @@ from warpmag.usd import (
 
 @dataclass(frozen=True)
 class ImportedScene:
-    """A stage as Newton sees it.
+    """An imported stage.
 
     Attributes:
-        opened: The open stage as it was read, without prims for instances that are like others.
-        apart: Those instances.
-        builder: Bodies, shapes and joints; world frame and units are the stage's.
-        clock: How time runs on the stage.
-        magnets: What the stage says about magnets.
+        opened: The open stage, without prims for instances of equal balls.
+        apart: The instances of equal balls.
+        builder: Bodies, shapes and joints, in the world frame and the units of the stage.
+        clock: Times, frame rate and physics step of the stage.
+        magnets: Magnets and magnetic settings of the stage.
         bodies: Body of each rigid-body prim.
         magnet_shapes: Shapes of each magnet prim.
-        keys: What follows time samples.
-        warnings: What the user should know about the stage, a line each.
+        keys: Keys from time samples.
+        warnings: Warnings about the stage, a line each.
     """
 
     opened: Any
@@ -67,13 +67,13 @@ class ImportedScene:
 
     @cached_property
     def stage(self) -> Any:
-        """The open stage with a prim for each body but those of :attr:`swarms`."""
-        complete_instances([one for one in self.apart if not one.stays_instancer])
+        """The open stage with a prim for each body, except for bodies of :attr:`swarms`."""
+        complete_instances([balls for balls in self.apart if not balls.stays_instancer])
         return self.opened
 
     @cached_property
     def swarms(self) -> list[BallInstancer]:
-        """Instancers that hold too many bodies for prims."""
+        """Instancers with too many bodies to have prims."""
         return ball_instancers(self.opened, self.apart)
 
 
@@ -84,16 +84,16 @@ def import_scene(
     time_code: float | None = None,
     articulations: bool = False,
 ) -> ImportedScene:
-    """Read a stage and everything magnetic on it.
+    """Import a stage with its magnets.
 
     Args:
         path: USD file.
-        visuals: Also import what is only seen, for a viewer.
-        time_code: The moment at which bodies stand; by default the start of the stage.
-        articulations: Whether joints are wanted in trees, as solvers of generalized coordinates take them.
+        visuals: Also import shapes that are only drawn, for a viewer.
+        time_code: Time code of the poses of bodies; by default the start of the stage.
+        articulations: Keep articulations, for solvers with generalized coordinates.
 
     Raises:
-        InputError: The stage cannot be read, or Newton imports a body, a joint or a magnet of it as nothing.
+        InputError: The stage cannot be read, or Newton does not import one of its bodies, joints or magnets.
     """
     with usd_errors(str(path)):
         return _import(path, visuals, time_code, articulations)
@@ -105,21 +105,21 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     if report.errors:
         raise InputError(str(report.errors[0]))
     clock, contents = report.clock, report.contents
-    assert clock is not None, "a clock that is wrong is a reason to refuse"
+    assert clock is not None, "an invalid clock is an error of the report"
     grounded = prepare_joints(stage, articulations=articulations)
     give_densities(stage, contents.magnets)
     builder = StageBuilder()
     declare_attributes(builder)
-    found = _add_stage(builder, stage, path, visuals)
+    imported = _add_stage(builder, stage, path, visuals)
     _let_frictionless_roll(builder)
-    bodies, shapes, joints = found["path_body_map"], found["path_shape_map"], found["path_joint_map"]
+    bodies, shapes, joints = (imported[f"path_{kind}_map"] for kind in ("body", "shape", "joint"))
     for prim in contents.bodies:
         if prim not in bodies:
-            raise InputError(f"{prim}: Newton imports no body from it")
+            raise InputError(f"{prim}: Newton does not import this body")
     _check_masses(builder, stage, contents, bodies)
-    for joint in enabled_joints(stage):
-        if str(joint.GetPath()) not in joints:
-            raise InputError(f"{joint.GetPath()}: Newton imports no joint from it")
+    for joint_path in enabled_joint_paths(stage):
+        if joint_path not in joints:
+            raise InputError(f"{joint_path}: Newton does not import this joint")
     for joint in grounded:
         _place_on_ground(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
@@ -142,15 +142,15 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
 
 
 def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[str, int]) -> None:
-    """Refuse free bodies with a volume that Newton gives no mass, of an open mesh, say: they would stand still."""
+    """Raise :class:`InputError` if a free body has a volume but no mass, as with an open mesh: it would not move."""
     for path in contents.bodies:
         free = path not in contents.kinematic
         if free and not builder.body_mass[bodies[path]] > 0.0 and has_volume(stage, path):
-            raise InputError(f"{path}: Newton finds no mass of its colliders: close their meshes, or give physics:mass")
+            raise InputError(f"{path}: its colliders have no mass: close their meshes, or author physics:mass")
 
 
 def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:
-    """Let Newton import ``stage``; return which prim became what."""
+    """Import ``stage`` with Newton; return the indices of bodies, shapes and joints by prim path."""
     with newton_errors(str(path), "import"):
         return builder.add_usd(
             stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals, only_load_enabled_rigid_bodies=True
@@ -165,7 +165,7 @@ def _copy_balls(
     covered: dict[str, list[int]],
     magnets: StageMagnets,
 ) -> None:
-    """Copy what Newton has made of the first of balls that are alike, and what is known of its magnet."""
+    """Copy the body, the shapes and the magnet of the first of equal balls for the others."""
     first, others = balls.bodies()
     body = bodies[first]
     frames = BallFrames(stage, balls, np.array(builder.body_q[body], float)[3:])
@@ -173,22 +173,22 @@ def _copy_balls(
     added = copy_ball(builder, body, frames.poses(balls.arrays)[1:], speeds[1:], first, others)
     bodies |= dict(zip(others, added.bodies, strict=True))
     moments = balls.arrays[MOMENTS_PRIMVAR]
-    for prim in [one for one in covered if one == first or one.startswith(f"{first}/")]:
-        own = balls.copies_of(prim)
-        covered |= zip(own, ([shape] for shape in added.shapes), strict=True)
-        magnets.magnets.update(dict.fromkeys(own, magnets.magnets[prim]))
+    for prim in [path for path in covered if path == first or path.startswith(f"{first}/")]:
+        copies = balls.copies_of(prim)
+        covered |= zip(copies, ([shape] for shape in added.shapes), strict=True)
+        magnets.magnets.update(dict.fromkeys(copies, magnets.magnets[prim]))
         if prim in magnets.initial_moments:
-            each = moments[1:].astype(float).tolist() if len(moments) else [magnets.initial_moments[prim]] * len(own)
-            magnets.initial_moments.update({path: (x, y, z) for path, (x, y, z) in zip(own, each, strict=True)})
+            each = moments[1:].astype(float).tolist() if len(moments) else [magnets.initial_moments[prim]] * len(copies)
+            magnets.initial_moments.update({path: (x, y, z) for path, (x, y, z) in zip(copies, each, strict=True)})
 
 
 def _place_on_ground(
     builder: newton.ModelBuilder, joint: GroundedJoint, number: int, body: int, shapes: dict[str, int]
 ) -> None:
-    """Put right what Newton makes of a joint to something that does not move.
+    """Correct Newton's import of a joint between a body and a fixed prim or the world.
 
-    It takes the fixed end for one that lies where the body's end is, which a distance joint need not do, the frame of
-    a fixed prim for that of the world, and ``body0`` for the end that is fixed.
+    Newton makes three assumptions: the fixed end is at the body's end, which is wrong for a distance joint; the frame
+    of a fixed prim is the world's; and ``body0`` is the fixed end.
     """
     kind = builder.joint_type[number]
     if joint.fixed or kind == newton.JointType.DISTANCE:
@@ -209,7 +209,7 @@ def _place_on_ground(
 def _mark_magnets(
     builder: StageBuilder, stage, magnets: dict[str, Magnet], bodies: dict[str, int], shapes: dict[str, int]
 ) -> dict[str, list[int]]:
-    """Let the shapes of the magnet prims carry the magnets; return the shapes of each prim."""
+    """Mark the shapes of the magnet prims as magnets; return the shapes of each prim."""
     covered = {}
     for prim, magnet in magnets.items():
         if prim in bodies:
@@ -217,7 +217,7 @@ def _mark_magnets(
         elif prim in shapes:
             covered[prim] = magnet_shapes(builder, -1, shapes[prim])
         else:
-            raise InputError(f"{prim}: a magnet of which Newton imported neither body nor shape")
+            raise InputError(f"{prim}: Newton imports neither body nor shape of this magnet")
         covered[prim] = builder.as_drawn(covered[prim])
         for shape in covered[prim]:
             turn = _shape_turn(builder, stage, prim, shape, bodies)
@@ -228,18 +228,18 @@ def _mark_magnets(
 def _scene_keys(
     builder, stage, contents: StageContents, clock: StageClock, bodies, covered, currents: dict[int, Keys]
 ) -> SceneKeys:
-    """Return what follows time samples, in seconds and in Newton's words."""
+    """Return the keys of the stage, with times in seconds, by Newton's bodies and shapes."""
 
     def in_seconds(keys):
         return keys.in_seconds(clock.start, clock.time_codes_per_second)
 
-    def turned_back(keys: Keys, prim: str, shape: int) -> Keys:
+    def in_shape(keys: Keys, prim: str, shape: int) -> Keys:
         turn = np.array(wp.quat_to_matrix(_shape_turn(builder, stage, prim, shape, bodies))).reshape(3, 3)
         return replace(keys, values=keys.values @ turn)
 
     motions = {bodies[prim]: in_seconds(motion) for prim, motion in contents.motions.items()}
     magnetizations = {
-        shape: turned_back(in_seconds(keys), prim, shape)
+        shape: in_shape(in_seconds(keys), prim, shape)
         for prim, keys in contents.magnetization_keys.items()
         for shape in covered[prim]
     }
@@ -248,32 +248,32 @@ def _scene_keys(
 
 
 def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
-    """Return how the frame of a shape is turned from that of the magnet prim that it belongs to."""
+    """Return the rotation of a shape's frame from the frame of its magnet prim."""
     return builder.shape_transform[shape].q if prim in bodies else axis_turn(shape_axis(stage, prim))
 
 
 def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> dict[int, Keys]:
-    """Put coils and field maps of a stage on their bodies, or into the world, labelled with the paths of their prims.
+    """Add the coils and field maps of a stage to the builder, with the paths of their prims as labels.
 
     Returns:
-        Keys of the currents of those coils that have some, by the shape that stands for the coil.
+        Keys of currents, by the shape of the coil.
     """
     currents = {}
-    for one in (one for placed in sources.values() for one in placed):
-        body = -1 if one.body is None else bodies[one.body]
-        shape = add_placed_source(builder, one, body, wp.transform(one.position, one.rotation))
-        if one.currents is not None:
-            currents[shape] = one.currents
+    for source in (source for placed in sources.values() for source in placed):
+        body = -1 if source.body is None else bodies[source.body]
+        shape = add_placed_source(builder, source, body, wp.transform(source.position, source.rotation))
+        if source.currents is not None:
+            currents[shape] = source.currents
     return currents
 
 
 def _let_frictionless_roll(builder: newton.ModelBuilder) -> None:
-    """Take Newton's default torsional and rolling friction, which USD does not know, from shapes without friction."""
+    """Remove Newton's default torsional and rolling friction, which USD does not have, from frictionless shapes."""
     default = builder.default_shape_cfg
-    for values, given in (
+    for values, default_value in (
         (builder.shape_material_mu_torsional, default.mu_torsional),
         (builder.shape_material_mu_rolling, default.mu_rolling),
     ):
         for shape, mu in enumerate(builder.shape_material_mu):
-            if mu == 0.0 and values[shape] == given:
+            if mu == 0.0 and values[shape] == default_value:
                 values[shape] = 0.0

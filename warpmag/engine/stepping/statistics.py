@@ -1,4 +1,4 @@
-"""What a run reports about itself."""
+"""Statistics of a run, its summary and its warnings."""
 
 import math
 from array import array
@@ -9,40 +9,40 @@ import numpy as np
 from warpmag.engine.stepping.stepper import StepReport
 
 _COARSE = 1e-3
-"""Coarseness of positions from which on contacts tremble: they are settled to about a thousandth of the thickness."""
+"""Coarseness of positions that causes a warning. Contacts settle to about a thousandth of the thickness."""
 _UNTIMED = (math.nan,) * 3
-"""Times of a step in which kernels were compiled."""
+"""Times of a step that compiled kernels."""
 _DEEP = 0.05
-"""Penetration over the thickness that no user takes for contact."""
+"""Penetration over the thickness that causes a warning."""
 
 
 @dataclass
 class Statistics:
-    """Figures of a run, gathered step by step.
+    """Statistics of a run.
 
     Attributes:
-        magnets: Bodies with magnets that forces move.
-        steps: Steps done.
-        substeps: Substeps done, repeated ones left out.
-        repeated: Attempts at steps that were thrown away.
-        capped: Steps in which a body moved farther in a substep than allowed.
-        regrown: Steps in which contact or pair buffers had to grow.
-        unconverged: Substeps whose induction did not converge.
+        magnets: Movable bodies with magnets.
+        steps: Number of steps.
+        substeps: Number of substeps, without those of rejected attempts.
+        repeated: Number of rejected attempts at a step.
+        capped: Number of steps in which a body moved farther than allowed even in the shortest substep.
+        regrown: Number of steps in which contact or pair buffers were enlarged.
+        unconverged: Number of substeps without convergence of the induction.
         error: Largest magnetization error of any substep.
-        field_error: Relative error of the last field by the fast multipole method, measured at 256 random magnets by
-            sums over all pairs; 0 without it.
+        field_error: Relative error of the last field by the fast multipole method at 256 random magnets, compared with
+            sums over all pairs; 0 without that method.
         peak_speed: Highest speed of a body [m/s].
-        overlap: Deepest penetration over the thickness of the thinner body, a ball's radius.
+        overlap: Deepest penetration over the thickness of the thinner body; the thickness of a ball is its radius.
         depth: Deepest penetration [m].
-        final_overlap: The same as ``overlap``, at the end.
+        final_overlap: Deepest penetration at the end over the thickness of the thinner body.
         rms_speed: Root mean square speed of the magnets at the end [m/s].
-        held: Magnets held by a permanent or fixed magnet at the end, see :func:`find_held`.
-        held_rms_speed: Root mean square speed of those [m/s].
-        held_median_speed: Median speed of those [m/s]: far less where one slides on the others without friction.
-        farthest: Largest distance of a magnet from the centre of where they all started, in any frame [m].
-        overlapping: Contacts that overlap at the start.
-        coarseness: Distance of neighbouring single-precision positions at the start over the thinnest body's thickness.
-        wall_seconds: Time that the run took [s].
+        held: Bodies held by a permanent or fixed magnet at the end, see :func:`find_held`.
+        held_rms_speed: Root mean square speed of held bodies [m/s].
+        held_median_speed: Median speed of held bodies [m/s]; smaller where single bodies slide without friction.
+        farthest: Largest distance of a magnet from the mean initial position, in any frame [m].
+        overlapping: Number of overlapping contacts at the start.
+        coarseness: Spacing of single-precision positions at the start over the thickness of the thinnest body.
+        wall_seconds: Duration of the run [s].
     """
 
     magnets: int = 0
@@ -70,7 +70,7 @@ class Statistics:
     _seconds: array = field(default_factory=lambda: array("f"), repr=False)
 
     def add_step(self, report: StepReport) -> None:
-        """Take in one step."""
+        """Add the report of a step."""
         self.steps += 1
         self.substeps += report.substeps
         self.repeated += report.attempts - 1
@@ -86,49 +86,51 @@ class Statistics:
 
     @property
     def evaluations(self) -> list[int]:
-        """Field evaluations of each step."""
+        """Number of field evaluations of each step."""
         return self._evaluations.tolist()
 
     @property
     def milliseconds(self) -> tuple[float, float, float]:
-        """Mean time per step of induction Ti, magnetic forces Tf and rigid bodies Tr [ms], as the paper's Table 1."""
+        """Mean times per step of induction Ti, forces Tf and rigid bodies Tr [ms], as in Table 1 of the paper."""
         return self.milliseconds_since(0)
 
     def milliseconds_since(self, step: int) -> tuple[float, float, float]:
-        """Mean times of the steps after the first ``step``; see :attr:`milliseconds`."""
+        """Return :attr:`milliseconds` of the steps from number ``step`` on."""
         seconds = np.array(self._seconds, dtype=float).reshape(-1, len(_UNTIMED))[step:]
         timed = seconds[np.isfinite(seconds).all(axis=1)]
         return tuple((1e3 * timed.mean(axis=0)).tolist()) if len(timed) else (0.0, 0.0, 0.0)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return copies of all figures by name: they are written while steps go on."""
-        return {one.name: np.array(getattr(self, one.name)) for one in fields(self)}
+        """Return copies of all values by name; steps go on while they are written."""
+        return {entry.name: np.array(getattr(self, entry.name)) for entry in fields(self)}
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
-        """Take over the figures that :meth:`save` returned."""
-        for one in fields(self):
-            own, value = getattr(self, one.name), saved[one.name].tolist()
-            setattr(self, one.name, array(own.typecode, value) if isinstance(own, array) else value)
+        """Set the values that :meth:`save` returned."""
+        for entry in fields(self):
+            own, value = getattr(self, entry.name), saved[entry.name].tolist()
+            setattr(self, entry.name, array(own.typecode, value) if isinstance(own, array) else value)
 
     def warnings(self) -> list[str]:
-        """Return what the user should know before he trusts the run, a line each."""
+        """Return warnings about the accuracy of the run, a line each."""
         lines = []
         if self.overlapping:
             many = self.overlapping > 1
             lines.append(f"{self.overlapping} pair{'s' * many} of bodies overlap{'s' * (not many)} at the start")
         if self.coarseness > _COARSE:
             percent = 100.0 * self.coarseness
-            lines.append(f"bodies are so far from the origin that positions are known to {percent:.2g} % of a radius")
+            lines.append(
+                f"bodies are far from the origin: positions in single precision are {percent:.2g} % of a radius apart"
+            )
         if self.unconverged:
             lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
         if self.final_overlap > _DEEP:
-            lines.append(f"bodies end {100.0 * self.final_overlap:.0f} % of their radius deep in each other")
+            lines.append(f"bodies overlap by {100.0 * self.final_overlap:.0f} % of their radius at the end")
         if self.capped:
-            lines.append(f"bodies moved too fast for the shortest substep in {self.capped} of {self.steps} steps")
+            lines.append(f"bodies were too fast for the shortest substep in {self.capped} of {self.steps} steps")
         return lines
 
     def summary(self) -> list[str]:
-        """Return the run in a few lines."""
+        """Return the summary of the run, line by line."""
         if not self.steps:
             return ["no steps"]
         induction, force, rigid = self.milliseconds
@@ -144,7 +146,7 @@ class Statistics:
             f"speed          RMS {100.0 * self.rms_speed:.2f} cm/s at the end, peak {self.peak_speed:.2f} m/s",
             f"penetration    {100.0 * self.overlap:.2f} % of the radius at most ({1e3 * self.depth:.4f} mm), "
             f"{100.0 * self.final_overlap:.2f} % at the end",
-            f"farthest       {self.farthest:.3f} m from the centre of the start",
+            f"farthest       {self.farthest:.3f} m from the center of the start",
         ]
         if self.held:
             rms, median = 100.0 * self.held_rms_speed, 100.0 * self.held_median_speed
@@ -153,21 +155,20 @@ class Statistics:
 
 
 def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Return which bodies a magnet holds: those that touch it, and what hangs on them and does not stand on the ground.
+    """Return true for each body that a magnet holds.
+
+    A held body touches a holder, or it touches a held body and does not stand on the ground.
 
     Args:
         pairs: Bodies that touch, shape [n, 2].
-        holders: Whether each body is a magnet that holds others, by being permanent or by being fixed.
-        fixed: Whether each body is fixed in the world; the ground is one that is no magnet.
-
-    Returns:
-        Whether each body is held.
+        holders: True for permanent or fixed magnets, shape [bodies].
+        fixed: True for bodies fixed in the world, shape [bodies]. Fixed bodies without magnets are the ground.
     """
 
-    def neighbors(of: np.ndarray) -> np.ndarray:
+    def neighbors(bodies: np.ndarray) -> np.ndarray:
         touched = np.zeros(len(fixed), dtype=bool)
-        for one, other in (pairs.T, pairs.T[::-1]):
-            touched[other[of[one]]] = True
+        for first, second in (pairs.T, pairs.T[::-1]):
+            touched[second[bodies[first]]] = True
         return touched
 
     grounded = neighbors(fixed & ~holders)

@@ -117,6 +117,11 @@ def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:
     return [joint for joint in joints if joint.GetJointEnabledAttr().Get()]
 
 
+def enabled_joint_paths(stage: Usd.Stage) -> list[str]:
+    """Return the paths of the enabled joints of a stage, those in instances included."""
+    return [str(joint.GetPath()) for joint in enabled_joints(stage)]
+
+
 def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[GroundedJoint]:
     """Rewrite joints that Newton reads otherwise than USD means them, in the stage's session layer.
 
