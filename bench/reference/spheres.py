@@ -127,25 +127,13 @@ def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pai
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def spheres(positions, radii, permeability, field, *, order=None, tolerance=1e-4, estimate=True) -> Solution:
-    """Solve n balls that do not touch.
-
-    Args:
-        positions: Centers [m], shape [n, 3].
-        radii: Radii [m], scalar or [n].
-        permeability: Relative permeability μr > 1, scalar or [n], may be infinite.
-        field: Applied field H0 [A/m], shape [3].
-        order: Order L of the expansions; None chooses it for the narrowest gap by ``tolerance``.
-        tolerance: Target relative truncation error.
-        estimate: Whether to estimate the truncation error, by a second solution.
-    """
-    return spheres_in_fields(
-        positions, radii, [(permeability, field)], order=order, tolerance=tolerance, estimate=estimate
-    )[0]
+def spheres(positions, radii, permeability, field, **settings) -> Solution:
+    """Solve n balls for one permeability and field, see :func:`spheres_in_fields`."""
+    return spheres_in_fields(positions, radii, [(permeability, field)], **settings)[0]
 
 
 def spheres_in_fields(positions, radii, cases, *, order=None, tolerance=1e-4, estimate=True) -> list[Solution]:
-    """Solve the same n balls for several permeabilities and fields, see :func:`spheres`.
+    """Solve n balls that do not touch, for several permeabilities and fields.
 
     Most time goes into translations of expansions of L (L + 2) terms, one per displacement between two balls: balls on
     a lattice have few displacements.
@@ -153,8 +141,8 @@ def spheres_in_fields(positions, radii, cases, *, order=None, tolerance=1e-4, es
     Args:
         positions: Centers [m], shape [n, 3].
         radii: Radii [m], scalar or [n].
-        cases: Permeability, scalar or [n], and field [A/m], shape [3], of each case.
-        order: Order of the expansions; None chooses it for the narrowest gap by ``tolerance``.
+        cases: Relative permeability μr > 1 (may be infinite), scalar or [n], and field H0 [A/m], shape [3], of each.
+        order: Order L of the expansions; None chooses it for the narrowest gap by ``tolerance``.
         tolerance: Target relative truncation error.
         estimate: Whether to estimate the truncation error, by a second solution.
     """
