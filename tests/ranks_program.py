@@ -7,10 +7,11 @@ import numpy as np
 import warp as wp
 
 import warpmag
-from bench.systems import moment_system
 from warpmag import cli
 from warpmag.kernels.pairs import evaluate
+from warpmag.moments.layout import Material
 from warpmag.moments.ranks import current_ranks, on_first_rank
+from warpmag.moments.system import MomentSystem
 
 SIZES = {"cpu": (1, 7, 1001), "cuda": (1, 7, 6001)}
 """Numbers of moments; the last is shared out by all forms of the sums, which a GPU takes for thousands of them."""
@@ -70,9 +71,8 @@ def moments(n: int) -> tuple[np.ndarray, np.ndarray]:
 def several_worlds(sizes: list[int], device: str | None) -> np.ndarray:
     """Magnetizations of worlds of some sizes."""
     worlds, random = np.repeat(range(len(sizes)), sizes), np.random.default_rng(0)
-    system = moment_system(
-        radii=np.full(len(worlds), 0.4), worlds=worlds, saturation=1e6, external_field=(0, 0, 1e5), device=device
-    )
+    radii, field = np.full(len(worlds), 0.4), (0, 0, 1e5)
+    system = MomentSystem(radii=radii, worlds=worlds, material=Material(1e6), external_field=field, device=device)
     system.positions.assign(10.0 * random.random((len(worlds), 3)))
     system.solve()
     return system.magnetizations().numpy()

@@ -294,7 +294,7 @@ EXPECTED = {
     "whole": {"sum_and_finish", "add_couplings", "respond"},
     "coils": {"sum_tile", "apply_sources", "push", "add_to_probe", "brake"},
     "solids": {"sum_and_finish", "apply_sources", "push", "add_to_probe", "brake"},
-    "fast": {"build_cells", "near_sums_cuda", "translate_cuda", "add_parts", "expand", "return_sums"},
+    "fast": {"build_boxes", "near_sums_cuda", "translate_cuda", "add_parts", "expand", "return_sums"},
     "most": {"sum_mirrored", "finish", "sweep", "list_neighbors"},
 }
 """Kernels without which a system has not taken the way of a GPU."""
@@ -305,7 +305,7 @@ def drive(which: str, dtype: str) -> MomentSystem:
     magnets = moment_system(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
     if which in ("balls", "coils", "solids"):
         magnets.set_conductivity(np.full(magnets.count, 1e7), 1e-3)
-    for step in (magnets.solve, magnets.evaluate, magnets.apply_forces, magnets.forget):
+    for step in (magnets.solve, magnets.evaluate, magnets.apply_forces, magnets.start_cold):
         step()
     magnets.start_from(wp.zeros_like(magnets.moments))
     FieldProbe(magnets, 70, gradients=True).measure()
@@ -333,13 +333,13 @@ def test_systems_of_two_processes(which, launches, monkeypatch):
     """Each has half of the cells; or of the blocks of each pass, which is a run of whole splits."""
     ranks = Half()
     for module in (system, fmm):
-        monkeypatch.setattr(module, "ranks", lambda: ranks)
-    monkeypatch.setattr(sharing, "_LEAST_CELLS", {"cuda": 1})
+        monkeypatch.setattr(module, "current_ranks", lambda: ranks)
+    monkeypatch.setattr(sharing, "_LEAST_BOXES", {"cuda": 1})
     monkeypatch.setattr(evaluate, "_LEAST_SHARED", {"cuda": 1})
     monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", 2**20)
     drive(which, "float64")
     names = {launch.name for launch in launches}
-    assert "_choose_cells" in names if which == "fast" else "sum_mirrored" in names
+    assert "_choose_boxes" in names if which == "fast" else "sum_mirrored" in names
     assert len(ranks.merged) > 2
 
 

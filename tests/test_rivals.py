@@ -222,8 +222,8 @@ def test_pairs_give_up_after_max_evaluations_and_rest_without_a_field(device):
     [
         ({"dynamics": "llg", "step": -1.0}, "step: must be positive"),
         ({"dynamics": "llg", "damping": 0.0}, "damping: must be positive"),
-        ({"dynamics": "theta", "step": 0.1}, "step: the dynamics 'theta' chooses its own"),
-        ({"dynamics": "theta-euler", "damping": 0.2}, "damping: the dynamics 'theta-euler' has none"),
+        ({"dynamics": "theta", "step": 0.1}, "step: the dynamics 'theta' has an automatic step"),
+        ({"dynamics": "theta-euler", "damping": 0.2}, "damping: the dynamics 'theta-euler' has no damping"),
         ({"dynamics": "newton"}, "dynamics: 'newton' is not one of theta, theta-euler, llg, llg-damping"),
     ],
 )
