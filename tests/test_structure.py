@@ -14,8 +14,19 @@ from warpmag.declarations import magnets
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = ROOT / "kernels"
-ROOMS = ("shared", "material", "pairs", "fmm", "applied", "cells", "induction", "near_contact", "rigid")
+ROOMS = (
+    *("shared", "material", "pairs", "eddy", "fmm", "applied", "cells", "induction", "near_contact", "rigid"),
+    "contacts",
+)
 """Rooms of ``kernels/``; each may import those before it that its ``__init__`` names."""
+HOST_ROOMS = (
+    *("declarations", "shapes", "moments", "usd", "usd/read", "usd/write", "engine/magnets", "engine/pile_xpbd"),
+    *("engine/stepping", "show", "examples"),
+)
+"""Rooms of ``warpmag/``, likewise. All rooms may import the modules of ``warpmag/`` itself but the command."""
+FACADES = ("warpmag/__init__.py", "warpmag/usd/__init__.py")
+"""Modules that hand on the names of rooms after them; ``import warpmag.usd`` counts as an import of ``usd/write``."""
+MOST_ROOT_MODULES = 12
 LONGEST_FUNCTION, LONGEST_FILE, LONGEST_STRING = 60, 450, 10
 """[lines]; a longer string is text of another language, which belongs into a file of its own."""
 REPEATED = {
@@ -24,19 +35,23 @@ REPEATED = {
 }
 """Public names that several modules may have, and why."""
 OWNERS = {
-    "newton": ("warpmag/engine", "warpmag/examples", "warpmag/cli.py"),  # the command opens Newton's viewers
-    "pxr": ("warpmag/usd",),
-    "warp": (
-        "warpmag/engine",
-        "warpmag/examples",
-        "warpmag/terminal.py",  # keeps Warp quiet for commands
-        *(
-            f"warpmag/{name}.py"
-            for name in "arrays dynamics fields induction layout pair_sums probe ranks system".split()
-        ),
-    ),
+    "newton": ("warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/cli.py"),  # the command opens viewers
+    "newton._src": ("warpmag/engine/pile_xpbd",),
+    "warp._src": ("warpmag/engine/pile_xpbd",),
+    "pxr": ("warpmag/usd", "warpmag/show"),
+    "warp": ("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/terminal.py"),
+    "bench": (),
+    "tests": (),
 }
-"""What of ``warpmag/`` may import a library."""
+"""Folders and modules of ``warpmag/`` that may import a library; the terminal keeps Warp quiet for the command."""
+OPENINGS = re.compile(r"(What|How|Whether|Where|Those|Of|That|Which|Who)\b")
+"""First words of a docstring that hide its subject."""
+BRITISH = re.compile(
+    r"\b(\w*colour\w*|centre[sd]?|neighbour\w*|behaviour\w*|magnetis\w+|modell(ed|ing)|licence|\w*metres?|grey|"
+    r"favour\w*|normalis\w+|optimis\w+|symmetris\w+|initialis\w+|travell\w+)\b",
+    re.IGNORECASE,
+)
+"""British spellings."""
 
 SOURCES = {path.relative_to(KERNELS): path.read_text(encoding="utf-8") for path in sorted(KERNELS.rglob("*.py"))}
 HEADERS = {path.relative_to(KERNELS): path.read_text(encoding="utf-8") for path in sorted(KERNELS.rglob("*.h"))}
@@ -110,7 +125,7 @@ def public_names(tree):
 def rooms_named_in(docstring: str) -> set[str]:
     """Rooms that a room may import, by what its docstring says."""
     sentence = re.search(r"May import (.*?)\.(\s|$)", docstring, re.DOTALL)
-    return set(re.findall(r"``(\w+)``", sentence.group(1))) if sentence else set()
+    return set(re.findall(r"``([\w/]+)``", sentence.group(1))) if sentence else set()
 
 
 MAY_IMPORT = {room: rooms_named_in(ast.get_docstring(TREES[Path(room, "__init__.py")]) or "") for room in ROOMS}
@@ -217,9 +232,104 @@ def test_only_their_owners_import_libraries():
     wrong = []
     for path, tree in HOST_TREES.items():
         for name, line in imports(tree):
-            owners = OWNERS.get(name.partition(".")[0])
-            if owners is not None and not path.as_posix().startswith(owners):
-                wrong.append(f"{path}:{line} imports {name}")
+            for library, owners in OWNERS.items():
+                if f"{name}.".startswith(f"{library}.") and not path.as_posix().startswith(owners):
+                    wrong.append(f"{path}:{line} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def host_room(path: Path) -> str:
+    """Room of a module of ``warpmag/``, "" for its root."""
+    folder = path.parent.relative_to("warpmag").as_posix()
+    return folder if folder in HOST_ROOMS else ""
+
+
+def host_imports(tree) -> list[tuple[Path, int]]:
+    """Modules of ``warpmag/`` that a tree imports, and the lines."""
+    modules = []
+    for name, line in imports(tree):
+        if name.startswith("warpmag.") and not name.startswith(("warpmag.kernels", "warpmag.scenes_usd")):
+            parts = name.split(".")
+            places = [Path(*parts[:-1], f"{parts[-1]}.py"), Path(*parts, "__init__.py")]
+            places += [Path(*parts[:-2], f"{parts[-2]}.py"), Path(*parts[:-1], "__init__.py")]
+            modules += [(next(place for place in places if place in HOST_TREES), line)]
+    return modules
+
+
+MAY_HOST_IMPORT = {
+    room: rooms_named_in(ast.get_docstring(HOST_TREES[Path("warpmag", room, "__init__.py")]) or "")
+    for room in HOST_ROOMS
+}
+
+
+def test_host_rooms_form_a_line():
+    folders = {path.parent.relative_to("warpmag").as_posix() for path in HOST_TREES} - {".", "engine"}
+    assert folders == set(HOST_ROOMS)
+    for place, room in enumerate(HOST_ROOMS):
+        assert MAY_HOST_IMPORT[room] <= set(HOST_ROOMS[:place]), room
+
+
+def test_host_rooms_import_rooms_before_them():
+    wrong = []
+    for path, tree in HOST_TREES.items():
+        room = host_room(path)
+        if path.as_posix() in FACADES or not room:
+            continue
+        for module, line in host_imports(tree):
+            imported = "usd/write" if module == Path("warpmag/usd/__init__.py") else host_room(module)
+            if imported not in {"", room} | MAY_HOST_IMPORT[room] or module == Path("warpmag/cli.py"):
+                wrong.append(f"{path}:{line} imports {module}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_circles_in_host_code():
+    graph = {path: {module for module, _ in host_imports(tree) if module != path} for path, tree in HOST_TREES.items()}
+    graph[Path("warpmag/__init__.py")] = set()  # loads names when they are first used
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"circle: {' ← '.join(map(str, error.args[1]))}")
+
+
+def test_root_holds_little():
+    assert len([path for path in HOST_TREES if path.parent == Path("warpmag")]) <= MOST_ROOT_MODULES
+
+
+ALL_TREES = {**HOST_TREES, **OUTSIDE_TREES, **{Path("kernels", path): tree for path, tree in TREES.items()}}
+
+
+def test_docstrings_open_with_their_subject():
+    documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module
+    wrong = []
+    for path, tree in ALL_TREES.items():
+        for node in ast.walk(tree):
+            text = ast.get_docstring(node) if isinstance(node, documented) else None
+            if text and OPENINGS.match(text):
+                wrong.append(f"{path}:{getattr(node, 'lineno', 1)} {text.splitlines()[0]}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_variables_are_named_after_what_they_hold():
+    wrong = []
+    for path, tree in ALL_TREES.items():
+        for node in ast.walk(tree):
+            name = node.id if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else ""
+            name = node.arg if isinstance(node, ast.arg) else name
+            if name in ("one", "found"):
+                wrong.append(f"{path}:{node.lineno} {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_spelling_is_american():
+    texts = {path: (ROOT / path).read_text(encoding="utf-8") for path in ALL_TREES}
+    texts |= {Path("kernels", path): text for path, text in HEADERS.items()}
+    texts |= {Path(page): (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
+    wrong = [
+        f"{path}:{number} {match.group()}"
+        for path, text in texts.items()
+        for number, line in enumerate(text.splitlines(), 1)
+        for match in BRITISH.finditer(line)
+    ]
     assert not wrong, "\n".join(wrong)
 
 

@@ -1,1 +1,4 @@
-"""Declarations of magnets, materials, coils and scenes: plain data and checks. Imports NumPy only."""
+"""Declarations of magnets, materials, coils and scenes: plain data and its checks.
+
+Imports NumPy and the standard library only.
+"""

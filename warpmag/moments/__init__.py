@@ -1,1 +1,4 @@
-"""Magnetic moments on a device: fields, induction, forces. Imports Warp; neither Newton nor USD."""
+"""Magnetic moments on a device: fields, induction, forces and torques, from arrays.
+
+May import ``declarations`` and ``shapes``. Neither Newton nor USD.
+"""

@@ -1,1 +1,4 @@
-"""Shapes of bodies, their cells and the demagnetizing tensors of these. Imports NumPy and ``declarations``."""
+"""Shapes of bodies, their cells, and the demagnetizing tensors of the cells.
+
+May import ``declarations``. No Warp.
+"""

@@ -1,1 +1,4 @@
-"""Advances a Newton model with magnets in time."""
+"""Advances a Newton model with magnets in time.
+
+May import ``declarations``, ``shapes``, ``moments``, ``usd/write``, ``engine/magnets`` and ``engine/pile_xpbd``.
+"""

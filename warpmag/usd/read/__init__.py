@@ -1,1 +1,4 @@
-"""Reads magnets, scenes and motions from USD stages, and checks them."""
+"""Reads magnets, scenes and motions from USD stages, and checks them.
+
+May import ``declarations``, ``shapes`` and ``usd``.
+"""
