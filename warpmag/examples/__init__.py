@@ -2,7 +2,7 @@
 
 Each is a module with a class ``Example``: the constructor builds the scene, ``step`` advances one frame, ``render``
 shows it, ``test_final`` compares the result with physics, ``summary`` returns a line about it. ``--test`` calls
-``test_final`` at the end, ``--headless`` draws nothing.
+``test_final`` at the end, ``--headless`` draws nothing. May import ``show``.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
 Only this room and ``show`` import ``pxr``. Importing it registers the schemas of warpmag and Newton. Do so before the
 first stage is opened in a process, because USD takes no new schemas afterwards; warpmag reads its own attributes
-correctly even then.
+correctly even then. May import ``declarations``.
 """
 
 from warpmag.usd.schemas import author_magnet, author_settings, collider_magnet, magnet_of, shape_axis  # isort: skip  (registers the schemas first)

@@ -1,4 +1,4 @@
 """Magnets of a Newton model: declared on a builder, evaluated on a model.
 
-May import ``declarations``, ``shapes`` and ``moments``.
+May import ``declarations``, ``shapes``, ``moments`` and ``usd/write``.
 """
