@@ -124,7 +124,7 @@ def public_names(tree):
 
 def rooms_named_in(docstring: str) -> set[str]:
     """Rooms that a room may import, by what its docstring says."""
-    sentence = re.search(r"May import (.*?)\.(\s|$)", docstring, re.DOTALL)
+    sentence = re.search(r"May import\s(.*?)\.(\s|$)", docstring, re.DOTALL)
     return set(re.findall(r"``([\w/]+)``", sentence.group(1))) if sentence else set()
 
 
