@@ -2,13 +2,13 @@
 
 from dataclasses import fields
 
-from warpmag.moments.layout import Material
+from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.system import MomentSystem, SolverSettings
 
 
 def moment_system(**arguments) -> MomentSystem:
     """Return a system from the arguments of :class:`MomentSystem` and the fields of its records."""
-    for name, record in (("material", Material), ("settings", SolverSettings)):
+    for name, record in (("material", MomentMaterial), ("settings", SolverSettings)):
         names = {field.name for field in fields(record)} & arguments.keys()
         arguments[name] = record(**{field: arguments.pop(field) for field in names})
     return MomentSystem(**arguments)

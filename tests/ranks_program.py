@@ -9,7 +9,7 @@ import warp as wp
 import warpmag
 from warpmag import cli
 from warpmag.kernels.pairs import evaluate
-from warpmag.moments.layout import Material
+from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.ranks import current_ranks, on_first_rank
 from warpmag.moments.system import MomentSystem
 
@@ -72,7 +72,7 @@ def several_worlds(sizes: list[int], device: str | None) -> np.ndarray:
     """Magnetizations of worlds of some sizes."""
     worlds, random = np.repeat(range(len(sizes)), sizes), np.random.default_rng(0)
     radii, field = np.full(len(worlds), 0.4), (0, 0, 1e5)
-    system = MomentSystem(radii=radii, worlds=worlds, material=Material(1e6), external_field=field, device=device)
+    system = MomentSystem(radii=radii, worlds=worlds, material=MomentMaterial(1e6), external_field=field, device=device)
     system.positions.assign(10.0 * random.random((len(worlds), 3)))
     system.solve()
     return system.magnetizations().numpy()

@@ -47,7 +47,7 @@ OWNERS = {
 OPENINGS = re.compile(r"(What|How|Whether|Where|Those|Of|That|Which|Who)\b")
 """First words of a docstring that hide its subject."""
 BRITISH = re.compile(
-    r"\b(\w*colour\w*|centre[sd]?|neighbour\w*|behaviour\w*|magnetis\w+|modell(ed|ing)|licence|\w*metres?|grey|"
+    r"\b(\w*colour\w*|centre[sd]?|neighbour\w*|behaviour\w*|magnetis(e|ed|es|ing|ation)\w*|modell(ed|ing)|licence|\w*metres?|grey|"
     r"favour\w*|normalis\w+|optimis\w+|symmetris\w+|initialis\w+|travell\w+)\b",
     re.IGNORECASE,
 )

@@ -27,7 +27,7 @@ from warpmag.moments.arrays import (
     real_array,
     resolve_context,
 )
-from warpmag.moments.layout import Material
+from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.ranks import compare_arguments
 from warpmag.moments.system import MomentSystem, SolverSettings
 
@@ -215,7 +215,9 @@ class _Balls:
         """Number n of balls."""
         return self.positions.shape[0]
 
-    def make_system(self, context: CallContext, material: Material, settings: SolverSettings, initial) -> MomentSystem:
+    def make_system(
+        self, context: CallContext, material: MomentMaterial, settings: SolverSettings, initial
+    ) -> MomentSystem:
         """Return a system of the balls, followed by the permanent dipoles, ready to solve from ``initial`` or None."""
         n, k = self.count, self.permanent_positions.shape[0]
 
@@ -226,7 +228,7 @@ class _Balls:
             radii=np.append(self.radii, np.zeros(k)),
             permanent=np.arange(n + k) >= n,
             movable=np.arange(n + k) < n,
-            material=Material(
+            material=MomentMaterial(
                 padded(material.saturation),
                 padded(material.susceptibility),
                 [*material.curve, *["tanh"] * k] if isinstance(material.curve, list) else material.curve,
@@ -263,10 +265,10 @@ def _read_balls(context: CallContext, positions, radii, external_field, permanen
     return _Balls(x, radii, field, places, context.vectors("permanent: moments", permanent[1], places.shape[0]))
 
 
-def _read_material(count: int, saturation, susceptibility, curve) -> Material:
+def _read_material(count: int, saturation, susceptibility, curve) -> MomentMaterial:
     """Return the material of ``count`` balls: arrays, and one curve or a list of ``count``.
 
-    :meth:`Material.parameters` checks the values, and replaces those of measured curves.
+    :meth:`MomentMaterial.parameters` checks the values, and replaces those of measured curves.
     """
     each = isinstance(curve, (tuple, list)) and len(curve) == count and count > 0
     curves = [measured("curve", item) for item in curve] if each else [measured("curve", curve)]
@@ -276,7 +278,7 @@ def _read_material(count: int, saturation, susceptibility, curve) -> Material:
             raise InputError(f"{name}: a measured curve has its own, give one or the other")
     elif saturation is None:
         raise InputError("saturation: must be given, unless all curves are measured")
-    return Material(
+    return MomentMaterial(
         host_scalars("saturation", 1.0 if saturation is None else saturation, count),
         host_scalars("susceptibility", susceptibility, count, infinite=True),
         curves if each else curves[0],

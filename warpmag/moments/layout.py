@@ -104,7 +104,7 @@ def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
 
 
 @dataclass(frozen=True)
-class Material:
+class MomentMaterial:
     """Magnetic material of n moments. The values of permanent moments are ignored.
 
     Attributes:

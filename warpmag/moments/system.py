@@ -29,7 +29,7 @@ from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
 from warpmag.moments.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
 from warpmag.moments.dynamics import make_dynamics
 from warpmag.moments.fmm import SystemSums, fast_sums_for
-from warpmag.moments.layout import Material, MomentLayout, change_material, make_layout, with_cells
+from warpmag.moments.layout import MomentLayout, MomentMaterial, change_material, make_layout, with_cells
 from warpmag.moments.ranks import current_ranks
 from warpmag.shapes.demagnetization import Coupling
 
@@ -89,7 +89,7 @@ class MomentSystem:
         movable: True for a moment whose force is needed, shape [n]; None means all.
         body_extent: Largest distance [m] between two moments of a movable body. The method ``fmm`` needs it if such a
             body has several moments, because it sums their pairs one by one. None means unknown.
-        material: Material of the inducible moments.
+        material: MomentMaterial of the inducible moments.
         external_field: Applied field [A/m], shape [3] or [n, 3].
         settings: Settings of the solve and of the forces.
         couplings: For each body that consists of cells its first moment, and the correction of the pair sums between
@@ -146,7 +146,7 @@ class MomentSystem:
         bodies=None,
         movable=None,
         body_extent: float | None = None,
-        material: Material | None = None,
+        material: MomentMaterial | None = None,
         external_field=(0.0, 0.0, 0.0),
         settings: SolverSettings | None = None,
         couplings: Sequence[tuple[int, Coupling]] = (),
@@ -163,7 +163,7 @@ class MomentSystem:
         self.eddy, self._ranks, self._graph = None, current_ranks(), None
         near, theta = settings.contact_model == "multipole", settings.dynamics == "theta"
         self._allocate(layout, external_field)
-        material = material or Material()
+        material = material or MomentMaterial()
         self.material, susceptibility = material.parameters(layout.permanent, self.dtype, self.device)
         layout = self._make_bias(layout)
         self._make_sources(layout, sources, solids)

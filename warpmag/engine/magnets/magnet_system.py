@@ -6,7 +6,7 @@ import numpy as np
 from warpmag.declarations.magnets import LINEAR_CURVE, MagneticSettings
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.kernels.applied.solids import SolidMagnet
-from warpmag.moments.layout import Material
+from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.system import MomentSystem, SolverSettings
 
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
@@ -63,7 +63,7 @@ def make_system(
         radii=np.concatenate([magnet.lattice.radii for magnet in magnets]),
         bodies=moment_bodies,
         movable=moments_move,
-        material=Material(
+        material=MomentMaterial(
             per_moment([material.saturation for material in materials]),
             per_moment(
                 [
