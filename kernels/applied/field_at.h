@@ -23,9 +23,6 @@ CUDA_CALLABLE inline FieldAt operator+(const FieldAt& a, const FieldAt& b) {
 CUDA_CALLABLE inline FieldAt& operator+=(FieldAt& a, const FieldAt& b) { return a = a + b; }
 CUDA_CALLABLE inline FieldAt operator*(double k, const FieldAt& f) { return {k * f.h, k * f.dx, k * f.dy, k * f.dz}; }
 
-CUDA_CALLABLE inline Point cross(const Point& a, const Point& b) {
-    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
 CUDA_CALLABLE inline double norm(const Point& v) { return sqrt(dot(v, v)); }
 
 // A source: its strength, PARAMETERS numbers and a table of ``count`` vectors, as its kind understands them.

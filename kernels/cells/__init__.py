@@ -1,5 +1,5 @@
-"""Cells of one body: what moments that touch, or nearly do, lack as the balls that the sums over pairs take them for.
+"""Corrections between the cells of one body, which the sums over pairs treat as balls.
 
-May import ``shared``, ``material`` and ``pairs``. Where the cells of a rigid body are to each other never changes, so
-that what they lack is a matrix, computed once for a shape and applied in the frame of its body.
+May import ``shared``, ``material`` and ``pairs``. The relative positions of a rigid body's cells never change. So the
+corrections are a matrix, computed once per shape and applied in the frame of the body.
 """

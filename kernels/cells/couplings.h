@@ -1,23 +1,22 @@
-// Adds to the field at the cells of bodies what the sums over pairs lack between cells of one body: H_i += Σ T_ij m_j
-// with tensors T_ij of the body's frame.
+// Corrections of the field between cells of one body, H_i += Σ T_ij m_j, with tensors T_ij in the body's frame.
 //
-// Three passes: moments are turned into the frame of their body, there they make the fields that all its cells have
-// in common, and sums are turned into the world; and one before, where cells of two bodies overlap. On a CPU a pass
-// works on a vector of cells, on a GPU a group of threads has one. Takes CAPACITY and GROUP; ``Couplings``
-// is the struct of couplings.py.
+// Three passes: TURN rotates moments into the frame of their body; SHARE computes the low-order fields that all cells
+// of a body share; ADD sums the tensors' fields and rotates them into the world. At the start of a solve HARDEN treats
+// cells of different bodies that overlap. On a CPU a pass works on a vector of cells, on a GPU a group of threads has
+// one cell. From Python: CAPACITY and GROUP. ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
-#include "pairs/overlap_volume.h"
+#include "pairs/neighbor_lists.h"
 #include "shared/team.h"
 
 namespace warpmag {
 
 constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
-constexpr int COMMON = 8; // fields that all cells of a body have in common; as in couplings.py
+constexpr int COMMON = 8; // low-order fields that all cells of a body share; as in couplings.py
 
 enum CellPass { HARDEN, TURN, SHARE, ADD }; // as in couplings.py
 
-// Sum over the entries of cells that stand at ``row`` of the tables: lists of a chunk are as long as its longest.
+// Σ T_ij m_j of the cells at ``row`` of the tables. All lists of a chunk have the length of the longest.
 template <class Couplings>
 CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const moments, int row) {
     const int chunk = row / CHUNK, lane = row % CHUNK;
@@ -37,17 +36,17 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
     return group_sums(h);
 }
 
-// Fields that all cells of a body have in common, of given strengths, at places in it: even ones, and the gradients of
-// (x² − z²)/2, (y² − z²)/2, xy, xz and yz.
-CUDA_CALLABLE inline Vector common_field(const Real* a, Vector at) {
-    const Number &x = at.x, &y = at.y, &z = at.z;
+// Low-order field at places in a body: a[0..2] is a uniform field, a[3..7] are the coefficients of the linear fields
+// ∇(x² − z²)/2, ∇(y² − z²)/2, ∇xy, ∇xz and ∇yz.
+CUDA_CALLABLE inline Vector common_field(const Real* a, Vector place) {
+    const Number &x = place.x, &y = place.y, &z = place.z;
     return {a[0] + a[3] * x + a[5] * y + a[6] * z, a[1] + a[5] * x + a[4] * y + a[7] * z,
             a[2] + a[6] * x + a[7] * y - (a[3] + a[4]) * z};
 }
 
-// Strengths of these fields: the matrix of the body times what it has of each of them.
+// Coefficients of a body's low-order field: its matrix times the moments Σ m and Σ of first order.
 template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings& c, int body) {
-    const auto& rows = c.rows.data[body]; // first row of the body, and the end of them
+    const auto& rows = c.rows.data[body]; // range of the body's rows
     const int table = c.chunk.data[rows[0] / CHUNK][3] - rows[0];
     const size_t pitch = c.turned.strides[0] / sizeof(Real), places = c.place.strides[0] / sizeof(Real);
     Vector sums[3] = {};
@@ -59,38 +58,39 @@ template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings
         sums[1] += Vector{x * m.x - z * m.z, y * m.y - z * m.z, x * m.y + y * m.x};
         sums[2] += Vector{x * m.z + z * m.x, y * m.z + z * m.y, z * 0};
     }
-    for (Vector& one : sums) one = group_sums(one);
+    for (Vector& sum : sums) sum = group_sums(sum);
     if (share() != 0) return;
-    Real held[3 * 3] = {};
+    Real totals[3 * 3] = {};
     for (int lane = 0; lane < WIDTH; ++lane)
         for (int k = 0; k < 3; ++k) {
-            held[3 * k] += lane_of(sums[k].x, lane);
-            held[3 * k + 1] += lane_of(sums[k].y, lane);
-            held[3 * k + 2] += lane_of(sums[k].z, lane);
+            totals[3 * k] += lane_of(sums[k].x, lane);
+            totals[3 * k + 1] += lane_of(sums[k].y, lane);
+            totals[3 * k + 2] += lane_of(sums[k].z, lane);
         }
     const Real* const matrix = c.matrix.data + (size_t)body * (COMMON * COMMON);
     for (int k = 0; k < COMMON; ++k) {
         Real strength = 0;
-        for (int l = 0; l < COMMON; ++l) strength += matrix[COMMON * k + l] * held[l];
+        for (int l = 0; l < COMMON; ++l) strength += matrix[COMMON * k + l] * totals[l];
         c.common.data[(size_t)body * COMMON + k] = strength;
     }
 }
 
-// What the overlap of cells with those of other bodies adds to their demagnetizing factor, over their volume [1/m³].
+// Increase of cells' demagnetizing factors where they overlap cells of other bodies, over the cells' volume [1/m³].
 template <class Couplings> CUDA_CALLABLE inline Number hardness_of(const Couplings& c, int chunk, int i, int held) {
     const Real* const packed = (const Real*)c.packed.data;
     const size_t pitch = c.packed.strides[0] / sizeof(Real);
     const Real *const radii = packed + 3 * pitch, *const labels = packed + 7 * pitch;
-    auto foreign = [=](Index a, Index b) { return mask_of(collect(labels, a) != collect(labels, b)); };
-    const auto& world = c.world.data[chunk]; // its first inducible moment, and the end of them
-    const Number volume = shared_volumes(c, i, held, world[0], world[1], foreign), radius = some(radii + i, held, 1);
+    auto of_other_body = [=](Index a, Index b) { return mask_of(collect(labels, a) != collect(labels, b)); };
+    const auto& world = c.world.data[chunk]; // range of inducible moments
+    const Number volume = shared_volumes(c, i, held, world[0], world[1], of_other_body),
+                 radius = numbers_or(radii + i, held, 1);
     const Real hardening = c.hardening.data[c.body.data[chunk]];
     return hardening * Real(1 / 4.18879020478639) * volume / (radius * radius * radius);
 }
 
 // Makes a pass over the cells from ``row`` on.
 template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Couplings& c, int pass, int row) {
-    const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, how many, first row of the body and of its tables
+    const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, count, first row of the body, first row of its table
     const int offset = row % CHUNK, left = chunk[1] - offset, held = left < 0 ? 0 : left > WIDTH ? WIDTH : left;
     if (held == 0) return;
     const int i = chunk[0] + offset;

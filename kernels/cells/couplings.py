@@ -1,36 +1,14 @@
-"""Couplings between the cells of bodies, and the launches that add their field.
+"""Corrections of the field between the cells of each body, and their launches.
 
 A table belongs to a shape and serves all bodies of that shape. It has a list of entries for each cell, in chunks of
-``native.CHUNK`` cells side by side, with as many slots as the longest list of the chunk:
+``native.CHUNK`` cells side by side, each with as many slots as its longest list. :func:`couplings_type` has the arrays.
 
-    slot_begin: First slot of each chunk of all tables, and the end.
-    other: The cell of its body that an entry is about, shape [slots · CHUNK].
-    tensor: T_ij [1/m³], rows xx, yy, zz, xy, xz, yz of CHUNK numbers for each slot, flat; zero where a list has ended.
-    place: Where cells are in their body, as its common fields have it, shape [3, rows].
-
-Bodies refer to them, in as many chunks:
-
-    chunk: First moment, how many moments, first row of the body, and first row of its table, shape [chunks].
-    body: Which body it is of, shape [chunks].
-    rotation: Rotation of each body, from its frame to the world's (x, y, z, w), shape [bodies].
-    rows: First row of each body, and the end of them, shape [bodies].
-    matrix: Strengths of the fields that all cells of a body have in common, of what it has of them [1/m³], flat,
-        COMMON rows of COMMON a body.
-    common: These strengths [A/m], frame of the body, flat, COMMON a body.
-    moments: Moments [A·m²], shape [n]; those of a body follow each other.
-    turned: Moments in the frames of their bodies, shape [3, chunks · CHUNK].
-    world: First inducible moment of the chunk's world, and the end of them, shape [chunks].
-    packed, overlap, overlap_count: All moments, packed, and what overlaps each (``packing.PackedMoments``).
-    hardening: Demagnetizing factor of a body's cell that wholly lies in another body's [1], shape [bodies].
-    hardness: What is added to the demagnetizing factor, over the volume [1/m³], shape [chunks · CHUNK].
-    h: Field that is added to [A/m], shape [n].
-
-Cells of different bodies act on each other as balls. Where these overlap, balls within the bodies would, too, count as
-demagnetizing, and cells do not: the operator of bodies that intersect would be no longer positive, and induction have
-several solutions. So a cell is demagnetized besides by the part of it that it shares with cells of other bodies, times
-what the softest magnetization of its body lacks to be as hard as that of balls (``Coupling.hardening``): 0.1 for a
-cube, 0.2 for a ball, more for thin sheets. That is enough for bodies in one place, and was for all others of 140
-arrangements that were tried. Cubes that only touch share a tenth of a cell, whose demagnetizing factor grows by 0.01.
+Cells of different bodies act on each other as balls. Where bodies intersect, this would make the operator of induction
+indefinite, with several solutions. So the demagnetizing factor of a cell grows by the fraction of its volume that
+overlaps cells of other bodies, times ``Coupling.hardening``, the largest reduction of a demagnetizing factor by the
+couplings of the body. It is 0.1 for a cube, 0.2 for a ball, more for thin sheets. It was enough
+in all 140 arrangements that were tried, coincident bodies among them. Cubes that only touch overlap by a tenth of a
+cell, whose demagnetizing factor grows by 0.01.
 """
 
 from functools import cache
@@ -44,45 +22,51 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
 COMMON = 8
-"""Fields that all cells of a body have in common; as in ``couplings.h``."""
+"""Low-order fields that all cells of a body share: three uniform and five linear ones; as in ``couplings.h``."""
 HARDEN, TURN, SHARE, ADD = range(4)
 """The passes, in order; as in ``couplings.h``."""
 _CELLS_PER_THREAD = 500
-"""Cells that make another thread of a CPU worth waking."""
+"""Cells per thread of a CPU, at least."""
 
 
 @cache
 def couplings_type(dtype):
-    """Type of the couplings; the module says what its arrays are."""
+    """Struct of tables, bodies and buffers."""
     vec3, quaternion = wp.types.vector(3, dtype), wp.types.quaternion(dtype)
 
     @wp.struct
     class Couplings:
-        slot_begin: wp.array[int]
-        other: wp.array[int]
-        tensor: wp.array[dtype]
-        chunk: wp.array[wp.vec4i]
-        body: wp.array[int]
-        rotation: wp.array[quaternion]
-        rows: wp.array[wp.vec2i]
-        place: wp.array2d[dtype]
-        matrix: wp.array[dtype]
-        common: wp.array[dtype]
-        moments: wp.array[vec3]
-        turned: wp.array2d[dtype]
-        world: wp.array[wp.vec2i]
-        packed: wp.array2d[dtype]
+        # Model: tables of shapes
+        slot_begin: wp.array[int]  # first slot of each chunk of all tables, and the end
+        other: wp.array[int]  # cell of the body that an entry refers to, shape [slots · CHUNK]
+        tensor: wp.array[
+            dtype
+        ]  # T_ij [1/m³], rows xx, yy, zz, xy, xz, yz of CHUNK numbers per slot; zero after the end
+        place: wp.array2d[dtype]  # positions of cells for the low-order fields of their body, shape [3, rows]
+        # Model: bodies
+        chunk: wp.array[wp.vec4i]  # first moment, count, first row of the body, first row of its table, shape [chunks]
+        body: wp.array[int]  # body of a chunk, shape [chunks]
+        world: wp.array[wp.vec2i]  # range of the inducible moments of a chunk's world, shape [chunks]
+        rows: wp.array[wp.vec2i]  # range of rows of each body, shape [bodies]
+        matrix: wp.array[dtype]  # COMMON × COMMON matrix from moments to low-order coefficients [1/m³], per body
+        hardening: wp.array[dtype]  # demagnetizing factor of a cell entirely within another body [1], shape [bodies]
+        # Data in:
+        rotation: wp.array[quaternion]  # from each body's frame to the world (x, y, z, w), shape [bodies]
+        moments: wp.array[vec3]  # [A·m²], consecutive for a body, shape [n]
+        packed: wp.array2d[dtype]  # packed moments and their overlap lists (``packing.PackedMoments``)
         overlap: wp.array2d[int]
         overlap_count: wp.array[int]
-        hardening: wp.array[dtype]
-        hardness: wp.array[dtype]
-        h: wp.array[vec3]
+        # Data out:
+        turned: wp.array2d[dtype]  # moments in the frames of their bodies, shape [3, chunks · CHUNK]
+        common: wp.array[dtype]  # low-order coefficients in the frame of the body [A/m], COMMON per body
+        hardness: wp.array[dtype]  # added demagnetizing factor over the volume [1/m³], shape [chunks · CHUNK]
+        h: wp.array[vec3]  # field to which corrections are added [A/m], shape [n]
 
     return Couplings
 
 
 def _table(start, other, tensor):
-    """Slots of a table's chunks, and their entries: numbers of cells and tensors."""
+    """Number of slots of each chunk of a table, and the entries: cells and tensors."""
     counts = np.diff(start)
     chunks = -(-len(counts) // CHUNK)
     cell = np.repeat(np.arange(len(counts)), counts)
@@ -105,23 +89,23 @@ def _kernel(dtype, group: int):
 
 
 class CellCouplings:
-    """What one set of bodies adds to a field, again and again in the same arrays.
+    """Corrections that a set of bodies adds to a field, evaluated repeatedly in the same arrays.
 
     Args:
-        bodies: Of each body the first moment, and the coupling of its cells: ``start``, ``other`` and ``tensor``, a
-            list for each, ``places``, ``common`` and ``hardening`` (see ``warpmag.shapes.demagnetization``). Bodies
-            with one and the same coupling share its table.
-        worlds: First inducible moment of each world, and the end of them, shape [worlds, 2].
+        bodies: First moment and coupling of each body. A coupling has ``start``, ``other`` and ``tensor``, the list of
+            each cell, ``places``, ``common`` and ``hardening`` (``warpmag.shapes.demagnetization``). Bodies with the
+            same coupling object share its table.
+        worlds: Range of the inducible moments of each world, shape [worlds, 2].
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
-        whole: Of each body whether :meth:`launch_others` leaves it out, shape [bodies]; None leaves out none.
+        whole: True for bodies that :meth:`launch_others` leaves out, shape [bodies]; None leaves out none.
 
     Attributes:
-        rotations: Rotation of each body, from its frame to the world's, shape [bodies]; written by the caller.
-        hardness: What is added to the demagnetizing factor of cells, over the volume [1/m³].
-        rows: First row of each body there, shape [bodies].
-        entries: Pairs of cells that one evaluation sums.
+        rotations: Rotation from each body's frame to the world, shape [bodies]; written by the caller.
+        hardness: Added demagnetizing factor of cells over the volume [1/m³].
+        rows: First row of each body in ``hardness``, shape [bodies].
+        entries: Pairs of cells per evaluation.
     """
 
     def __init__(self, bodies, worlds, packed, moments, h, whole=None):
@@ -144,8 +128,8 @@ class CellCouplings:
 
     def _record_field(self, couplings):
         on_gpu = couplings.h.device.is_cuda
-        passes = [(one, one) for one in (TURN, SHARE, ADD)] if on_gpu else [(TURN, ADD)]
-        return [self._record(couplings, *one) for one in passes]
+        ranges = [(number, number) for number in (TURN, SHARE, ADD)] if on_gpu else [(TURN, ADD)]
+        return [self._record(couplings, first, last) for first, last in ranges]
 
     @staticmethod
     def _record(couplings, first: int, last: int):
@@ -157,14 +141,14 @@ class CellCouplings:
         return wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
 
     def _lay_out(self, bodies, whole, worlds, dtype, device) -> int:
-        """Fill the arrays; return how many chunks those bodies have that are not whole, which come first."""
-        c, found, tables, places, chunks, body, left = self._couplings, {}, [], [], [], [], 0
+        """Fill the arrays; return the number of chunks of the bodies that are not whole, which come first."""
+        c, first_rows, tables, places, chunks, body, left = self._couplings, {}, [], [], [], [], 0
         self.rows = np.zeros(len(bodies), int)
         whole = np.zeros(len(bodies), bool) if whole is None else np.asarray(whole, bool)
         for number in np.argsort(whole, kind="stable").tolist():
             first, coupling = bodies[number]
-            if id(coupling) not in found:
-                found[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
+            if id(coupling) not in first_rows:
+                first_rows[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.tensor))
                 places.append(
                     np.pad(coupling.scaled_positions.T, ((0, 0), (0, -len(coupling.scaled_positions) % CHUNK)))
@@ -172,7 +156,7 @@ class CellCouplings:
             count, row = len(coupling.start) - 1, CHUNK * len(chunks)
             self.rows[number] = row
             starts = range(0, count, CHUNK)
-            chunks += [(first + k, min(CHUNK, count - k), row, found[id(coupling)]) for k in starts]
+            chunks += [(first + k, min(CHUNK, count - k), row, first_rows[id(coupling)]) for k in starts]
             body += [number] * len(starts)
             left += 0 if whole[number] else len(starts)
         slots, others, tensors = (np.concatenate(parts) for parts in zip(*tables, strict=True))
@@ -198,15 +182,15 @@ class CellCouplings:
         return left
 
     def start(self):
-        """Begin a solve where the moments are now."""
+        """Launch the start of a solve, at the present positions of the moments."""
         self._start.launch()
 
     def launch(self):
-        """Add to the field what the couplings make of the moments."""
-        for one in self._launches:
-            one.launch()
+        """Add the corrections to the field."""
+        for launch in self._launches:
+            launch.launch()
 
     def launch_others(self):
-        """The same, save for whole bodies."""
-        for one in self._others:
-            one.launch()
+        """Add the corrections of bodies that are not whole to the field."""
+        for launch in self._others:
+            launch.launch()

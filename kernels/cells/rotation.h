@@ -1,10 +1,10 @@
-// Rotation from the frame of a body to the world's, and back.
+// Rotation from the frame of a body to the world, and back.
 #pragma once
 #include "shared/vectors.h"
 
 namespace warpmag {
 
-// Rows of the rotation of a body.
+// Rotation matrix of a body.
 struct Rotation {
     Real rows[3][3];
 };

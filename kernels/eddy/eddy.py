@@ -1,35 +1,36 @@
-"""Eddy currents in conducting balls that move through the field: what they brake by.
+"""Braking forces and torques of eddy currents in conducting balls that move through the field.
 
-**One ball.** In a field that changes slowly, with B uniform inside, a ball of conductivity σ and radius R has the
-electric field E = −½ (dB/dt) × r, and with J = σE the power and the moment (L. D. Landau and E. M. Lifshitz,
-Electrodynamics of Continuous Media, §59, in the limit of low frequency)
+**One ball.** In a slowly varying field, with B uniform inside, a ball of conductivity σ and radius R has the electric
+field E = −½ (dB/dt) × r. With J = σE follow the dissipated power and the moment (L. D. Landau and E. M. Lifshitz,
+Electrodynamics of Continuous Media, §59, in the limit of low frequency):
 
     P = ∫ J·E dV = c |dB/dt|²,    ½ ∫ r × J dV = −c dB/dt,    c = (2π/15) σ R⁵.
 
-dB/dt is that of matter, in the frame that turns with the ball at ω, and B is the one inside: H being the field of all
-else, B = μ0 (H + ⅔ M), M = f(H), so that with the curve's derivative f' (``material.curves``)
+dB/dt is taken in the frame that rotates with the ball at ω, and B is the field inside. With H the field of all other
+moments, B = μ0 (H + ⅔ M) and M = f(H). With the curve's derivative f' (``material.curves``)
 
-    dB/dt = μ0 N (dH/dt − ω × H),    N = 1 + ⅔ f'(H):
+    dB/dt = μ0 N (dH/dt − ω × H),    N = 1 + ⅔ f'(H).
 
-3 μr/(μr + 2) in weak fields, 1 where the ball is saturated, though a field that turns still turns M. A permanent ball
-has N = 1.
+N is 3 μr/(μr + 2) in weak fields, and 1 along the field of a saturated ball; a rotating field still rotates M. A
+permanent ball has N = 1.
 
-**What moves.** dH/dt is what the bodies' motion makes of the field: of moments m_j, which are fixed in their bodies,
-Σ [(v_i − v_j)·∇ H_ij + H of ω_j × m_j], and v_i·∇H of what is fixed in the world. Rayleigh's dissipation function
-D = ½ Σ c_i |dB_i/dt|² is then the same for who moves or turns along with everything, and the forces −∂D/∂v and torques
-−∂D/∂ω that follow keep momentum and angular momentum and take the power 2D. They are those of eddy moments
+**Motion.** dH/dt follows from the motion of bodies. Moments m_j, fixed in their bodies, contribute
+Σ [(v_i − v_j)·∇ H_ij + H of ω_j × m_j]; sources fixed in the world contribute v_i·∇H. Rayleigh's dissipation function
+D = ½ Σ c_i |dB_i/dt|² is then invariant under common translation and rotation of all bodies. So the forces −∂D/∂v and
+torques −∂D/∂ω conserve momentum and angular momentum, and dissipate the power 2D. They are the forces and torques of
+eddy moments
 
     e_i = −c_i N dB_i/dt
 
-in the field of all moments, and of all moments in theirs: the sums over pairs that make forces of moments get m + e.
-Only the torque on inducible balls, which the moments alone do not turn, needs a sum of its own.
+in the field of all moments, and of all moments in the field of e. So the sums over pairs that compute forces use m + e.
+Only the torque on inducible balls needs a separate sum, since the moments alone exert none.
 
-**Left out** are what neighbours' magnetizations answer to the change of the field (they move and turn with their balls
-meanwhile), skin effect, and changes of the applied field by anything but motion.
+**Left out** are the response of neighbors' magnetizations to the change of the field (they move and rotate with their
+balls), the skin effect, and changes of the applied field other than by motion.
 
-**Time steps.** Explicit forces overshoot where they would stop the ball within a step, of Δt, so that c is
-c / (1 + 2 Δt c K), in which K bounds how fast currents decay by the motion that their forces cause: |N|² times the
-squared gradients of B, over the masses of both ends of a pair, and the squares of B over their moments of inertia.
+**Time steps.** Explicit forces overshoot if they would stop the ball within a step Δt. So c is replaced by
+c / (1 + 2 Δt c K). K bounds the decay rate of the motion due to the braking forces: |N|² times the squared gradients of
+B over the masses of both moments of a pair, plus |N|² times the squares of B over their moments of inertia.
 """
 
 import itertools
@@ -47,27 +48,49 @@ from warpmag.kernels.shared.team import team, threads_for
 _RATES, _FIELDS = range(2)
 """The passes; as in ``rates.h``."""
 _SEEN_ROWS = 13
-"""4π times the field H, its rate, and its gradient xx, yy, zz, xy, yz, zx; K over |N|² but of the ball's own motion."""
+"""Rows at a conductor: 4π times H, its rate, its gradient xx, yy, zz, xy, yz, zx; the sources' part of K/|N|²."""
 MOTION_ROWS = 8
-"""Velocity [m/s] and angular velocity [rad/s] of a moment; 1/mass [1/kg] and 1/inertia [1/(kg·m²)] of its body."""
+"""Rows: velocity [m/s], angular velocity [rad/s] of a moment; 1/mass [1/kg], 1/inertia [1/(kg·m²)] of its body."""
 _GROUP = 32
 """Threads of a GPU that share a ball."""
 _PAIRS_PER_THREAD = 10000
-"""Pairs that make another thread of a CPU worth waking."""
+"""Pairs per thread of a CPU, at least."""
 
 
 @cache
 def _arrays_type(dtype):
-    kinds = (
-        (wp.array[int], "ball slot turned turned_slot number conductor inducible curve"),
-        (wp.array[wp.vec4i], "chunk turned_chunk"),
-        (wp.array[dtype], "conductivity saturation slope"),
-        (wp.array[wp.types.vector(3, dtype)], "h"),
-        (wp.array2d[dtype], "packed motion eddy seen field tables"),
-    )
-    members = {name: kind for kind, names in kinds for name in names.split()}
-    doc = "Balls in chunks of a world each, what they are made of, what they are among, and what they see."
-    return wp.struct(type("EddyArrays", (), {"__doc__": doc, "__annotations__": members}))
+    """Struct of conducting balls, the inducible balls of their worlds, and all moments."""
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.struct
+    class EddyArrays:
+        # Model: conductors (``ball``) and inducible balls (``turned``), padded to chunks of CHUNK balls of one world
+        ball: wp.array[int]  # moment of each place
+        slot: wp.array[int]  # place of each conductor
+        chunk: wp.array[wp.vec4i]  # number of balls, range of moments of their world
+        turned: wp.array[int]
+        turned_slot: wp.array[int]
+        turned_chunk: wp.array[wp.vec4i]  # number of balls, range of conductors of their world
+        conductor: wp.array[int]  # moment of each conductor
+        number: wp.array[int]  # conductor of each inducible ball, or -1
+        # Model: material of each moment
+        conductivity: wp.array[dtype]  # [S/m]
+        inducible: wp.array[int]
+        saturation: wp.array[dtype]
+        slope: wp.array[dtype]
+        curve: wp.array[int]
+        tables: wp.array2d[dtype]
+        # Data in:
+        motion: wp.array2d[dtype]  # rows of MOTION_ROWS
+        # Data in and out:
+        packed: wp.array2d[dtype]
+        # Data out:
+        seen: wp.array2d[dtype]  # rows of _SEEN_ROWS at conductors
+        h: wp.array[vec3]  # field at conductors [A/m]
+        eddy: wp.array2d[dtype]  # eddy moments [A·m²]
+        field: wp.array2d[dtype]  # 4π times the field of eddy moments at inducible balls
+
+    return EddyArrays
 
 
 @cache
@@ -79,7 +102,7 @@ def _passes(dtype, group: int):
 
 @cache
 def _seen(dtype):
-    """Warp functions: three rows of a table as a vector, and the gradient among what a ball sees, times 4π."""
+    """Warp functions that read three rows of a table as a vector, and 4π times the gradient at a conductor."""
     vec3, mat33 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
 
     @wp.func
@@ -122,9 +145,11 @@ def _brake_kernel(dtype):
         if applied_rates:
             rate += applied_rates[i]
             t += wp.matrix_from_cols(along_x[i], along_y[i], along_z[i])
+        # K/|N|² = Σ over both bodies of μ0² (|∇H|²/mass + |H|²/inertia)
         own = arrays.motion[6, i] * wp.ddot(t, t) + arrays.motion[7, i] * wp.dot(h, h)
         k = arrays.seen[12, slot] + mu0 * mu0 * own
         r = arrays.packed[3, i]
+        # e = −c N dB/dt, dB/dt = μ0 N (dH/dt − ω × H), c = (2π/15) σ R⁵
         c = coefficient * arrays.conductivity[i] * r * r * r * r * r
         e = -mu0 * rate
         if arrays.inducible[i] == 1:
@@ -179,18 +204,18 @@ def _restore_kernel(dtype):
 
 
 class EddyCurrents:
-    """Eddy currents of the balls among some moments, again and again in the same arrays.
+    """Eddy currents of the conducting balls among n moments, evaluated repeatedly in the same arrays.
 
     Args:
-        packed: The moments, packed, and placed by the caller (``packing.PackedMoments``).
-        ranges: Their first and the one after the last, of each world.
-        conductivity: Conductivity of each moment's ball [S/m], zero where there is none, shape [n].
-        turned: Whether a moment is an inducible ball whose torque is wanted, shape [n].
-        material: What the moments are made of.
-        step: Time [s] for which forces count, below which they stop no ball.
+        packed: Packed moments (``packing.PackedMoments``), whose positions the caller updates.
+        ranges: Begin and end of the moments of each world.
+        conductivity: Conductivity of each moment's ball [S/m], zero for insulators, shape [n].
+        turned: True for inducible balls whose torque is computed, shape [n].
+        material: Magnetization curves of the moments.
+        step: Time step Δt [s] of the forces.
 
     Attributes:
-        motion: How each moment moves, ``MOTION_ROWS``, shape [8, n]; written by the caller.
+        motion: Motion of each moment, ``MOTION_ROWS``, shape [8, n]; written by the caller.
     """
 
     def __init__(self, packed, ranges, conductivity, turned, material: CurveParameters, step: float):
@@ -205,7 +230,7 @@ class EddyCurrents:
         arrays.saturation, arrays.slope = material.saturation, material.slope
         arrays.inducible, arrays.curve = material.inducible, material.curve
         balls = [first + np.flatnonzero(conductivity[first:last]) for first, last in ranges]
-        wanted = [  # those of worlds with a conductor
+        turned_balls = [  # in worlds with a conductor
             first + np.flatnonzero(turned[first:last]) if len(own) else own
             for (first, last), own in zip(ranges, balls, strict=True)
         ]
@@ -213,7 +238,7 @@ class EddyCurrents:
         conductors = self._lay_out("ball", "chunk", "slot", balls, ranges)
         number = np.full(packed.count, -1)
         number[conductors] = np.arange(len(conductors))
-        also_turned = self._lay_out("turned", "turned_chunk", "turned_slot", wanted, itertools.pairwise(ends))
+        also_turned = self._lay_out("turned", "turned_chunk", "turned_slot", turned_balls, itertools.pairwise(ends))
         self._put("conductor", conductors)
         self._put("number", number[also_turned])
         arrays.seen = wp.zeros((_SEEN_ROWS, len(arrays.ball)), dtype=dtype, device=device)
@@ -226,51 +251,51 @@ class EddyCurrents:
         setattr(self._arrays, name, wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self._device))
 
     def _lay_out(self, name: str, chunks: str, slots: str, balls, sources) -> np.ndarray:
-        """Put the balls of worlds into chunks, with their sources, and list where each stands; return all balls."""
-        nothing = np.zeros(0, int)
-        places, rows, stands = [nothing], [], [nothing]
+        """Lay out the balls of all worlds in chunks with their sources, and the place of each; return all balls."""
+        empty = np.zeros(0, int)
+        places, rows, ball_slots = [empty], [], [empty]
         for own, (begin, end) in zip(balls, sources, strict=True):
             for k in range(0, len(own), CHUNK):
                 part = own[k : k + CHUNK]
-                stands.append(CHUNK * len(rows) + np.arange(len(part)))
+                ball_slots.append(CHUNK * len(rows) + np.arange(len(part)))
                 places.append(np.resize(part, CHUNK))
                 rows.append((len(part), begin, end, 0))
         self._put(name, np.concatenate(places))
         self._put(chunks, np.reshape(rows, (-1, 4)), wp.vec4i)
-        self._put(slots, np.concatenate(stands))
-        return np.concatenate([nothing, *balls])
+        self._put(slots, np.concatenate(ball_slots))
+        return np.concatenate([empty, *balls])
 
-    def _run(self, one: int, places: int):
+    def _make_pass(self, number: int, places: int):
         cuda = self._device.is_cuda
         if places:
             wp.launch(
                 _passes(self._packed.dtype, _GROUP if cuda else 1),
                 dim=_GROUP * places if cuda else 1,
-                inputs=[one, one + 1, self._threads, None if cuda else team(), self._arrays],
+                inputs=[number, number + 1, self._threads, None if cuda else team(), self._arrays],
                 device=self._device,
             )
 
     def add(self, applied, sources=None, effective=None):
-        """Add the eddy moments to the packed moments, for the sums over pairs that make forces.
+        """Add the eddy moments to the packed moments, for the sums over pairs that compute forces.
 
         Args:
-            applied: Field of what is no moment [A/m], shape [n].
-            sources: What makes it change, ``applied.fields.AppliedForces`` that follow the motion; None without such.
-            effective: Effective moments (``wrench``) that they are added to as well, shape [3, n]; or None.
+            applied: Field of external sources [A/m], shape [n].
+            sources: ``applied.fields.AppliedForces`` with the gradients and rates of that field; None if it is uniform.
+            effective: Effective moments (``wrench``) to which the eddy moments are also added, shape [3, n]; or None.
         """
-        self._run(_RATES, len(self._arrays.ball))
+        self._make_pass(_RATES, len(self._arrays.ball))
         changes = (sources.rates, *sources.along) if sources else (None,) * 4
         inputs = [self._arrays, applied, *changes, self._step, effective]
         wp.launch(_brake_kernel(self._packed.dtype), len(self._arrays.slot), inputs=inputs, device=self._device)
 
     def finish(self, moments, torques):
-        """Add the torques on inducible balls, and take the eddy moments off the packed moments.
+        """Add the torques on inducible balls, and subtract the eddy moments from the packed moments.
 
         Args:
             moments: The moments [A·m²], shape [n].
-            torques: Torques that are added to [N·m], shape [n].
+            torques: In and out, torques [N·m], shape [n].
         """
         arrays, dtype, device = self._arrays, self._packed.dtype, self._device
-        self._run(_FIELDS, len(arrays.turned))
+        self._make_pass(_FIELDS, len(arrays.turned))
         wp.launch(_turn_kernel(dtype), len(arrays.turned_slot), inputs=[arrays, torques], device=device)
         wp.launch(_restore_kernel(dtype), len(arrays.slot), inputs=[arrays, moments], device=device)

@@ -72,9 +72,9 @@ template <class Of> CUDA_CALLABLE inline void apply_whole(const Body& body, Cell
     for_cells(body, cells, [&](Cell& cell) {
         cell.field = vector(cell);
         if (share() != 0) return;
-        put_some(body.vectors + cell.number, cell.at.held, cell.field.x);
-        put_some(body.vectors + MOST_CELLS + cell.number, cell.at.held, cell.field.y);
-        put_some(body.vectors + 2 * MOST_CELLS + cell.number, cell.at.held, cell.field.z);
+        put_first(body.vectors + cell.number, cell.at.held, cell.field.x);
+        put_first(body.vectors + MOST_CELLS + cell.number, cell.at.held, cell.field.y);
+        put_first(body.vectors + 2 * MOST_CELLS + cell.number, cell.at.held, cell.field.z);
     });
     wait_for_body();
     for_cells(body, cells,
@@ -188,9 +188,9 @@ CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, 
         const int offset = held > 0 ? cell.number : 0;
         cell.at = {0, one[0] + offset, held, one[2], 0, 0};
         cell.material = material_of(state, cell.at);
-        cell.radius = some(entries(state.packed, cell.at, 3), held, 0);
+        cell.radius = numbers_or(entries(state.packed, cell.at, 3), held, 0);
         cell.scale = cell.material.slope / cell.material.saturation;
-        cell.hardness = some(bodies.hardness.data + bodies.row.data[b] + offset, held, 0);
+        cell.hardness = numbers_or(bodies.hardness.data + bodies.row.data[b] + offset, held, 0);
         cell.s = turned_back(rotation, get(state.s, cell.at));
         cell.outside = get(begin ? state.h0 : state.h, cell.at);
         if (steady) cell.outside = 1 / cell.scale * get(state.mixed_g, cell.at);

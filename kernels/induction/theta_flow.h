@@ -7,7 +7,7 @@
 #pragma once
 #include "induction/theta_step.h"
 #include "material/curves.h"
-#include "pairs/overlap_volume.h"
+#include "pairs/neighbor_lists.h"
 #include "shared/group.h"
 #include "shared/team.h"
 
@@ -68,14 +68,14 @@ CUDA_CALLABLE inline Number induced_share(const Material& material) {
     return material.curves.common == LINEAR ? material.slope : all;
 }
 template <class State> CUDA_CALLABLE inline Material material_of(const State& state, const Place& at) {
-    return {some(entries(state.saturation, at), at.held, 1), some(entries(state.slope, at), at.held, 1),
+    return {numbers_or(entries(state.saturation, at), at.held, 1), numbers_or(entries(state.slope, at), at.held, 1),
             curves_of(state.curve.data, state.common_curve, state.curve_tables.data, at.i, at.held)};
 }
 
 // Positions and radii [m].
 template <class State> CUDA_CALLABLE inline Four balls_at(const State& state, const Place& at) {
     Number x[4];
-    for (int c = 0; c < 4; ++c) x[c] = some(entries(state.packed, at, c), at.held, 0);
+    for (int c = 0; c < 4; ++c) x[c] = numbers_or(entries(state.packed, at, c), at.held, 0);
     return {x[0], x[1], x[2], x[3]};
 }
 
@@ -87,9 +87,9 @@ CUDA_CALLABLE inline Vector moments_of(Material material, Number radius, Vector 
 
 template <class State> CUDA_CALLABLE inline void store_moments(State& state, const Place& at, Vector m) {
     set(state.moments, at, m);
-    put_some(entries(state.packed, at, 4), at.held, m.x);
-    put_some(entries(state.packed, at, 5), at.held, m.y);
-    put_some(entries(state.packed, at, 6), at.held, m.z);
+    put_first(entries(state.packed, at, 4), at.held, m.x);
+    put_first(entries(state.packed, at, 5), at.held, m.y);
+    put_first(entries(state.packed, at, 6), at.held, m.z);
 }
 
 // Whether moments are cells of a body that responds as a whole (body_response.h).
@@ -153,7 +153,7 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
 // Step lengths ω of moments.
 template <class State, class World>
 CUDA_CALLABLE inline Number step_of(const State& state, const Place& at, const World& world) {
-    return (Real)world.damping * some(entries(state.step, at), at.held, 1);
+    return (Real)world.damping * numbers_or(entries(state.step, at), at.held, 1);
 }
 
 // Volume that balls share with other inducible ones, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
@@ -208,7 +208,7 @@ template <class State> CUDA_CALLABLE inline void start(State& state, const Place
     Vector near = {0, 0, 0};
     if (warm == STEADY) near = extrapolated_field(state, at, ball, ahead);
     if (share() != 0) return;
-    put_some(entries(state.step, at), at.held, omega);
+    put_first(entries(state.step, at), at.held, omega);
     const Vector h0 = get(state.h0, at);
     if (any(mask_of(length(h0) > Real(0)))) raise_flag(world.in_field);
     Vector s = get(state.s, at);
@@ -348,7 +348,7 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
     // what ends takes a whole step, where moments and field are the material's; s is the next solve's start
     const bool ended = !world.active;
     const Vector shown = ended ? (mixed + longer * r) : next;
-    const Number radius = some(entries(state.packed, at, 3), at.held, 0);
+    const Number radius = numbers_or(entries(state.packed, at, 3), at.held, 0);
     const Vector m = moments_of(material, radius, shown);
     store_moments(state, at, m);
     if (ended) {

@@ -1,7 +1,7 @@
-// Magnetization curves in reduced form (Kim and Han 2022, Eqs. 7, 10); curves.py has their table and their numbers.
+// Magnetization curves in reduced form (Kim and Han 2022, Eqs. 7, 10); curves.py lists them and their ids.
 //
-// The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments. Those
-// at the end take curves with a formula and measured ones (tables.h) alike.
+// The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments. The
+// functions at the end accept both curves with a formula and measured curves (tables.h).
 #pragma once
 #include "material/tables.h"
 
@@ -10,11 +10,11 @@ namespace warpmag {
 enum Curve { MIXED = -1, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR }; // as in curves.py
 static_assert(LINEAR + 1 == FIRST_TABLE, "tables come after curves with a formula");
 
-// tanh(s)/s, 1 at s = 0; below the root of the smallest normal number the quotient of two denormals says nothing.
+// tanh(s)/s, 1 at s = 0. Very small s are cut off, where the quotient of two denormals has no digits.
 CUDA_CALLABLE inline Real tanh_ratio(Real s) { return s < Real(1e-18) ? Real(1) : wp::tanh(s) / s; }
 #if !defined(__CUDA_ARCH__)
-// Vectors have no hyperbolic functions. In float32 the quotient of two polynomials in s², fitted up to s = 9 where tanh
-// is 1, is off by 3e-7 at most and by 4e-8 in the mean.
+// The same for vectors, which have no hyperbolic functions. In float32 it is a quotient of two polynomials in s²,
+// fitted up to s = 9, where tanh is 1. Its error is at most 3e-7, and 4e-8 on average.
 inline Number tanh_ratio(Number s) {
     if constexpr (sizeof(Real) == 8) {
         Number ratio;
@@ -31,7 +31,7 @@ inline Number tanh_ratio(Number s) {
 }
 #endif
 
-// 3 L(x)/x of Langevin's L(x) = coth x − 1/x, by its series below 0.3, where the closed form cancels.
+// 3 L(x)/x of Langevin's function L(x) = coth x − 1/x; by its series below 0.3, where the closed form cancels.
 template <class N> CUDA_CALLABLE inline N langevin_ratio(N x) {
     const N z = x * x, safe = x > Real(0.3) ? x : N(Real(0.3));
     const N series = 1 - z * (Real(1.0 / 15) - z * (Real(2.0 / 315) - z * (Real(1.0 / 1575) - z * Real(3 / 46777.5))));
@@ -66,12 +66,12 @@ CUDA_CALLABLE inline Real curve_slope(Real s, int curve) {
 // Derivative c'(s) where the reduced magnetization c(s) has a given square.
 CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
     const Number zero = reduced_square * Real(0), one = zero + 1;
-    Number steepness = one - reduced_square;                                       // of tanh
-    if (curve == CLAMPED) steepness = reduced_square < Real(0.99999) ? one : zero; // but for rounding it is Ms
+    Number steepness = one - reduced_square;                                       // of tanh: c' = 1 − c²
+    if (curve == CLAMPED) steepness = reduced_square < Real(0.99999) ? one : zero; // M = Ms up to rounding
     if (curve == LINEAR) steepness = one;
     if (curve == FROHLICH) steepness = (one - root(reduced_square)) * (one - root(reduced_square));
     if (curve == LANGEVIN) {
-        // Cohen's approximation, corrected by a polynomial in 2c − 1 that is good to 2e-4
+        // Cohen's approximation, corrected by a fitted polynomial in 2c − 1, to an error of 2e-4
         constexpr Real fitted[13] = {
             0.36476878046223565,  0.33269381936319425, -1.063990432535928,  -1.092334636112763,   0.9658571775659215,
             1.264510831049312,    -0.0960163093945858, -0.4838736226305589, -0.21565177679233247, -0.11643126163366144,
@@ -85,19 +85,19 @@ CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
     return steepness;
 }
 
-// s/c of the reduced field s that makes reduced magnetization c; a saturated one gets a large finite s.
+// s/c of the reduced field s at reduced magnetization c. Saturation gets a large finite s.
 CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve) {
     const Real bounded = c < Real(0.999999) ? c : Real(0.999999), z = bounded * bounded;
     if (bounded < Real(1e-18) || curve == CLAMPED || curve == LINEAR) return 1;
     if (curve == FROHLICH) return 1 / (1 - bounded);
     if (curve == TANH) return Real(0.5) * wp::log((1 + bounded) / (1 - bounded)) / bounded;
-    // Newton on L(3s) = c from Cohen's rational start; the curve is concave, so it converges from any start below
+    // Newton's iteration on L(3s) = c from Cohen's rational approximation; L is concave, so it converges from below
     Real x = bounded * (3 - z) / (1 - z);
     for (int step = 0; step < 8; ++step) x += (3 * bounded - x * langevin_ratio(x)) / langevin_slope(x);
     return x / (3 * bounded);
 }
 
-// Area under c from 0 to s, in double: the co-energy of a curve.
+// Area under c from 0 to s in double precision: the co-energy of a curve.
 CUDA_CALLABLE inline double curve_area(double s, int curve) {
     const double z = s * s;
     if (curve == LINEAR) return z / 2;
@@ -119,14 +119,14 @@ CUDA_CALLABLE inline double curve_area(double s, int curve) {
     return z * (0.5 - z * (1.0 / 12 - z * (1.0 / 45 - z * (17.0 / 2520 - z * 31 / 14175))));
 }
 
-// Curves of a vector of moments: the id of all, or MIXED, and of each; and all tables.
+// Curves of a vector of moments: ``common`` is the id of all, or MIXED; ``each`` is the id of each.
 struct Curves {
     int common;
     Index each;
     const Real* tables;
 };
 
-// Curves of moments from number i on, ``held`` of them, which are not all alike if ``common`` is MIXED.
+// Curves of ``held`` moments from number i on. If ``common`` is MIXED, their ids are read one by one.
 CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* tables, int i, int held) {
 #if defined(__CUDA_ARCH__)
     return {curve[i], curve[i], tables};
@@ -139,17 +139,17 @@ CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* 
 }
 
 #if !defined(__CUDA_ARCH__)
-// What moments of several curves have: by_formula(curve) and by_table(curves) of theirs.
+// Values of moments with different curves, from by_formula(curve) and by_table(curves).
 template <class ByFormula, class ByTable>
-__attribute__((noinline)) inline Number mixed(const Curves& curves, ByFormula by_formula, ByTable by_table) {
+__attribute__((noinline)) inline Number of_mixed(const Curves& curves, ByFormula by_formula, ByTable by_table) {
     Number all = 0;
     for (int curve = TANH; curve < FIRST_TABLE; ++curve) {
-        const Mask wanted = mask_of(curves.each == Index(curve));
-        if (any(wanted)) all = wanted ? by_formula(curve) : all;
+        const Mask active = mask_of(curves.each == Index(curve));
+        if (any(active)) all = active ? by_formula(curve) : all;
     }
     const auto tabled = curves.each >= Index(FIRST_TABLE);
-    const Mask wanted = mask_of(tabled);
-    return any(wanted) ? (wanted ? by_table(tabled ? curves.each : Index(FIRST_TABLE)) : all) : all;
+    const Mask active = mask_of(tabled);
+    return any(active) ? (active ? by_table(tabled ? curves.each : Index(FIRST_TABLE)) : all) : all;
 }
 #endif
 
@@ -158,7 +158,7 @@ CUDA_CALLABLE inline Number curve_ratio(Number s, const Curves& curves) {
     if (curves.common >= FIRST_TABLE) return table_ratio(s, curves.each, curves.tables);
 #if !defined(__CUDA_ARCH__)
     if (curves.common == MIXED)
-        return mixed(
+        return of_mixed(
             curves, [=](int curve) { return curve_ratio(s, curve); },
             [=](Index each) { return table_ratio(s, each, curves.tables); });
 #endif
@@ -170,14 +170,14 @@ CUDA_CALLABLE inline Number curve_steepness(Number square, const Curves& curves)
     if (curves.common >= FIRST_TABLE) return table_steepness(root(square), curves.each, curves.tables);
 #if !defined(__CUDA_ARCH__)
     if (curves.common == MIXED)
-        return mixed(
+        return of_mixed(
             curves, [=](int curve) { return curve_steepness(square, curve); },
             [=](Index each) { return table_steepness(root(square), each, curves.tables); });
 #endif
     return curve_steepness(square, curves.common);
 }
 
-// The same of one moment, for Warp functions.
+// The same for one moment, called by Warp functions.
 CUDA_CALLABLE inline Real curve_ratio(Real s, int curve, const Real* tables) {
     return curve >= FIRST_TABLE ? table_ratio(s, curve, tables) : curve_ratio(s, curve);
 }

@@ -1,17 +1,16 @@
-// Measured magnetization curves: tables of cubic pieces and what is beyond; curves.py has their rows and equations.
-//
-// The functions are templates of the number type, as those of curves.h, and of that of the curves' ids.
+// Measured magnetization curves: tables of cubic pieces and the approach to saturation; curves.py has the rows and the
+// equations. The functions are templates of the number type N, as in curves.h, and of the type I of curve ids.
 #pragma once
 #include "shared/lanes.h"
 
 namespace warpmag {
 
 constexpr int FIRST_TABLE = 5; // id of the first table's curve; as in curves.py
-// Numbers of a row, as in curves.py. The last row of a curve has no span; its KNOT_C1 and KNOT_C2 are z and a.
+// Columns of a row, as in curves.py. The last row of a curve has span 0; its KNOT_C1 and KNOT_C2 are z and a.
 enum TableColumn { KNOT_S, KNOT_C, KNOT_SPAN, KNOT_C1, KNOT_C2, KNOT_C3, KNOT_AREA, KNOT_SHEAR, TABLE_COLUMNS };
 
 #if defined(__CUDA_ARCH__)
-// as a call it leaves registers to curves that have a formula
+// not inlined, which leaves more registers to curves with a formula
 #define WARPMAG_CALLED __device__ __noinline__
 #else
 #define WARPMAG_CALLED __attribute__((noinline))
@@ -25,9 +24,10 @@ CUDA_CALLABLE inline Real table_entry(const Real* tables, int row, int column) {
     return tables[TABLE_COLUMNS * row + column];
 }
 
-// Where in [0, 1] the cubic t (a + t (b + t c)), which rises there, has a value, by Newton between bounds.
+// Solves t (a + t (b + t c)) = value for t in [0, 1], where the cubic increases, by Newton's iteration within bounds.
 template <class N> CUDA_CALLABLE inline N place_on_cubic(N value, N a, N b, N c) {
-    constexpr Real small = sizeof(Real) == 4 ? 1e-5 : 1e-9; // a step after which Newton has all digits
+    constexpr Real small =
+        sizeof(Real) == 4 ? 1e-5 : 1e-9; // relative step after which Newton's iteration has converged
     const N zero = value * 0, one = zero + 1, whole = a + b + c;
     N low = zero, high = one, t = value < whole ? value / whole : one;
     t = t > zero ? t : zero;
@@ -45,11 +45,11 @@ template <class N> CUDA_CALLABLE inline N place_on_cubic(N value, N a, N b, N c)
     return t;
 }
 
-// One row of a table: c over the reduced internal field y from a knot on, which s = y + shear c follows.
+// One row of a table: the cubic piece c(y) from a knot on. y is the reduced internal field, and s = y + shear c.
 template <class N> struct Piece {
     N s, c, span, c1, c2, c3, area, shear;
 
-    // Place t from this knot to the next of a reduced field, of a reduced magnetization.
+    // Parameter t in [0, 1] from this knot to the next, at a reduced field or a reduced magnetization.
     CUDA_CALLABLE N at_field(N field) const {
         return place_on_cubic(field - s, span + shear * c1, shear * c2, shear * c3);
     }
@@ -57,16 +57,16 @@ template <class N> struct Piece {
     // (c(t) − c(0))/t and dc/dt
     CUDA_CALLABLE N rise(N t) const { return c1 + t * (c2 + t * c3); }
     CUDA_CALLABLE N slope(N t) const { return c1 + t * (2 * c2 + 3 * t * c3); }
-    // Beyond the last knot z, y further by a constant, of a reduced field: c = 1 − a/z.
+    // z beyond the last knot, at a reduced field: c = 1 − a/z, where z is y plus a constant.
     CUDA_CALLABLE N beyond(N field) const {
         const N z = c1, a = shear * c2, w = field - s + z - a / z, size = root(w * w + 4 * a);
         return w > s * 0 ? Real(0.5) * (w + size) : 2 * a / (size - w);
     }
 };
 
-// The row in which a curve has a value of a column that grows.
+// Row of a curve whose range of an increasing column contains a value, by bisection.
 template <class N, class I> CUDA_CALLABLE inline Piece<N> piece_of(const Real* tables, I curve, N value, int column) {
-    const int rows = (int)tables[0]; // of each curve, a power of two, after a row that says so
+    const int rows = (int)tables[0]; // rows per curve, a power of two, stored in the first row
     I row = 1 + rows * (curve - FIRST_TABLE);
     for (int step = rows / 2; step > 0; step /= 2)
         row += rows_where(value >= table_entry(tables, row + step, column), step);
@@ -86,7 +86,7 @@ template <class N, class I> WARPMAG_CALLED inline N table_ratio(N s, I curve, co
     return piece.span > zero ? inside : (1 - piece.c2 / piece.beyond(s)) / s;
 }
 
-// c'(s) of a piece in which c grows by ``rise`` where y grows by ``span``.
+// c'(s) of a piece in which c increases by ``rise`` where y increases by ``span``.
 template <class N> CUDA_CALLABLE inline N sheared_slope(const Piece<N>& piece, N rise, N span) {
     return rise / (span + piece.shear * rise);
 }
@@ -108,7 +108,7 @@ template <class N, class I> WARPMAG_CALLED inline N table_steepness(N reduced, I
     return piece.span > zero ? inside : sheared_slope(piece, beyond, one);
 }
 
-// s/c of the reduced field s that makes reduced magnetization c < 1.
+// s/c of the reduced field s at reduced magnetization c < 1.
 CUDA_CALLABLE inline Real inverse_table_ratio(Real c, int curve, const Real* tables) {
     const Piece<Real> piece = piece_of(tables, curve, c, KNOT_C);
     if (piece.span == 0) return (piece.s - piece.c1 + piece.c2 / (1 - c) + piece.shear * (c - piece.c)) / c;
@@ -117,7 +117,7 @@ CUDA_CALLABLE inline Real inverse_table_ratio(Real c, int curve, const Real* tab
     return (piece.s + piece.span * t + piece.shear * (c - piece.c)) / c;
 }
 
-// Area under c from 0 to s: that over the internal field, and what the shear adds.
+// Area under c from 0 to s: ∫ c dy over the internal field plus shear c²/2.
 CUDA_CALLABLE inline double table_area(Real s, int curve, const Real* tables) {
     const Piece<Real> piece = piece_of(tables, curve, s, KNOT_S);
     if (piece.span == 0) {

@@ -1,12 +1,12 @@
-// Cells of the neighbour search and their hash table.
+// Cells of the neighbor search, and buckets of their hash table.
 #pragma once
 
 namespace warpmag {
 
-constexpr double FARTHEST_CELL = 1e9; // from the origin; beyond it a cell would be no integer
+constexpr double FARTHEST_CELL = 1e9; // from the origin; beyond it the cell's index overflows an int
 
 struct alignas(16) Cell {
-    int x, y, z, group; // −1: the moment has no cell
+    int x, y, z, group; // group −1: no cell
 };
 
 // Positions [m] and radii [m] of packed moments.
@@ -20,12 +20,12 @@ template <class Lists> CUDA_CALLABLE inline Balls balls_of(const Lists& lists) {
     return {x, x + pitch, x + 2 * pitch, x + 3 * pitch};
 }
 
-// What is near is nearer than a cell is wide, however the quotient is rounded.
+// Inverse width of a cell, which exceeds the largest distance of neighbors despite rounding.
 template <class Lists> CUDA_CALLABLE inline double cells_per_meter_of(const Lists& targets) {
     return 1.0 / ((targets.ratio + 1e-6) * targets.reach.data[0]);
 }
 
-// Cell of a moment of some group.
+// Cell of a moment of a group; no cell if it is too far away or its position is not a number.
 CUDA_CALLABLE inline Cell cell_of(const Balls& balls, int i, int group, double cells_per_meter) {
     const double place[3] = {balls.x[i] * cells_per_meter, balls.y[i] * cells_per_meter, balls.z[i] * cells_per_meter};
     int cell[3];
@@ -37,7 +37,7 @@ CUDA_CALLABLE inline Cell cell_of(const Balls& balls, int i, int group, double c
     return {cell[0], cell[1], cell[2], group};
 }
 
-// Bucket of a cell among 2ᵏ, after Teschner et al. 2003; cells above one another have buckets that follow each other.
+// Bucket of a cell among 2ᵏ, after Teschner et al. 2003; cells in a column along z have consecutive buckets.
 CUDA_CALLABLE inline int bucket_of(Cell cell, int buckets) {
     unsigned mixed = (unsigned)cell.x * 73856093u ^ (unsigned)cell.y * 19349663u ^ (unsigned)cell.group * 49979687u;
     mixed = (mixed ^ mixed >> 15) * 0x2c1b3c6du;

@@ -1,8 +1,8 @@
-// Field (Eq. 1), and force and torque (Eqs. 4, 13 and 14), from sums over pairs of moments: the partial sums of a
-// target are added up, pairs that overlap are corrected, and the results stored.
+// Field (Eq. 1), and force and torque (Eqs. 4, 13 and 14), from sums over pairs of moments. The partial sums of a
+// target are added up, overlapping pairs are corrected, and the results are stored.
 //
-// Takes INVERSE_4PI, MU0 [T·m/A], CAPACITY and GROUP from Python, see neighbor_lists.h; ``Arrays`` is the struct of
-// evaluate.py. A vector of target rows is finished at a time, on a GPU one row by a group of threads.
+// From Python: INVERSE_4PI, MU0 [T·m/A], CAPACITY and GROUP (neighbor_lists.h). ``Arrays`` is the struct of
+// work_list.py. On a CPU a vector of target rows is finished at a time, on a GPU a group of threads finishes one row.
 #pragma once
 #include "pairs/neighbor_lists.h"
 #include "pairs/pair_law.h"
@@ -12,14 +12,13 @@
 
 namespace warpmag {
 
-// Target rows: their numbers, packed columns and ranges of sources. What lanes beyond the ``held`` first have is not
-// stored.
+// Target rows: row numbers, packed columns i and ranges of sources. Only the first ``held`` lanes are stored.
 struct TargetRows {
     int first, held;
     Index row, i, begin, end;
 };
 
-// Rows of a table that has a column for each moment; that of one moment is read once for all lanes.
+// Table with a column for each moment. A scalar index is read once for all lanes.
 struct Columns {
     const Real* data;
     size_t pitch;
@@ -63,14 +62,14 @@ inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
     }
 }
 inline Mask nonzero_at(const int* values, const TargetRows& at) {
-    Index found = 0;
-    for (int l = 0; l < at.held; ++l) found[l] = values[at.i[l]];
-    return mask_of(found != 0);
+    Index value = 0;
+    for (int l = 0; l < at.held; ++l) value[l] = values[at.i[l]];
+    return mask_of(value != 0);
 }
 #endif
 
-// Three of the ROW sums of each target row, from number ``offset`` on, added up over parts; the threads of a group
-// share out the parts.
+// Totals over parts of three of the ROW sums of each target row, from number ``offset`` on. The threads of a group
+// share the parts.
 template <int ROW, class Arrays>
 CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& at, int offset) {
     Vector total = {0, 0, 0};
@@ -87,8 +86,8 @@ CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& 
     return total;
 }
 
-// Adds to 4π times the fields h and (e·∇)H f of targets what those of their overlapping sources have beyond those of
-// clamped dipoles. A force leaves out the sources of the target's body, a field the target itself.
+// Adds the corrections of overlapping sources to h, 4π times the field, and to f, 4π (e·∇)H. A force leaves out sources
+// of the target's body, a field leaves out the target itself.
 template <Quantity Q, class Arrays>
 CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arrays& arrays, const TargetRows& at) {
     const Columns targets(arrays.targets), sources(arrays.sources);
@@ -97,19 +96,19 @@ CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arr
     auto add = [&](auto j, Mask listed) {
         const Vector r = x - sources.vector(0, j);
         const Number other = sources.number(3, j), contact = radius + other;
-        Mask wanted = listed & (dot(r, r) < contact * contact);
-        if (Q != Quantity::FIELD) wanted &= label != sources.number(7, j);
-        else if (arrays.same_set) wanted &= mask_of(j != at.i);
-        if (WIDTH == 1 && !any(wanted)) return;
+        Mask active = listed & (dot(r, r) < contact * contact);
+        if (Q != Quantity::FIELD) active &= label != sources.number(7, j);
+        else if (arrays.same_set) active &= mask_of(j != at.i);
+        if (WIDTH == 1 && !any(active)) return;
         const Vector m = sources.vector(4, j);
-        auto pair = [&] { return overlap_of(r, radius, other, m, wanted); };
-        if (Q != Quantity::FIELD) add_where(wanted, f, force_of(pair(), e));
-        if (Q == Quantity::FIELD || Q == Quantity::WRENCH) add_where(wanted, h, field_of(pair()));
+        auto pair = [&] { return overlap_of(r, radius, other, m, active); };
+        if (Q != Quantity::FIELD) add_where(active, f, force_of(pair(), e));
+        if (Q == Quantity::FIELD || Q == Quantity::WRENCH) add_where(active, h, field_of(pair()));
     };
     walk_lists(arrays.overlap.data, arrays.overlap_count.data, at.i, at.held, at.begin, at.end, add);
 }
 
-// Stores the field [A/m], or force [N] and torque [N·m], from 4π times the field h and (e·∇)H f.
+// Stores the field H = base + h/4π [A/m], or the force μ0 f/4π [N] and torque μ0 e × H [N·m].
 template <Quantity Q, class Arrays>
 CUDA_CALLABLE inline void store(const Arrays& arrays, const TargetRows& at, Vector h, Vector f, Vector e, Vector base) {
     Real* const out = (Real*)arrays.out.data;
@@ -141,7 +140,7 @@ template <Quantity Q, class Arrays> CUDA_CALLABLE inline void finish_rows(const 
     store<Q>(arrays, at, group_sums(h), group_sums(f), e, base);
 }
 
-// Finishes all target rows, of which a group of threads of a GPU has one.
+// Finishes all target rows; on a GPU a group of threads finishes one.
 template <Quantity Q, class Word, class Arrays>
 CUDA_CALLABLE inline void finish(int thread, int threads, Word* team, const Arrays& arrays) {
 #if defined(__CUDA_ARCH__)

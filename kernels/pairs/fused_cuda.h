@@ -1,24 +1,24 @@
-// All-pairs sums of few moments on a GPU, for a kernel that computes the sums that it needs itself, so that no second
-// launch waits for the first: field (Eq. 1) and force (Eqs. 4, 13 and 14).
+// All-pairs sums of few moments on a GPU, computed and finished in one kernel, without a second launch: field (Eq. 1)
+// and force (Eqs. 4, 13 and 14).
 //
-// A block has a tile of a few targets. Each of its warps holds all of them, some in every lane, and as often as there
-// are lanes for it; the warps share out the sources. The sums of a warp's lanes are added up by shuffles, and the sums
-// of the warps in shared memory, in a fixed order. Other threads of the block meanwhile compute the correction of
-// overlapping pairs. Thread k of a block ends with the total of target k.
+// A block has a tile of few targets. Each warp holds all of them: a lane holds several, and groups of lanes hold
+// copies. The warps share the sources. Shuffles add up the sums of a warp's lanes; the sums of warps are added up in
+// shared memory, in a fixed order. Other threads of the block compute the corrections of overlapping pairs meanwhile.
+// Thread k of a block ends with the total of target k.
 #pragma once
 #include "pairs/tiles_cuda.h"
 
 namespace warpmag {
 
-// Numbers that a lane has to add up over the lanes LANES apart, and zeros until they can be halved as often as needed.
+// Length of ``values`` numbers, padded so that ``fold`` can halve them until one lane in ``lanes`` holds each.
 constexpr int padded(int values, int lanes) {
     int parts = 1;
     for (int step = 16; step >= lanes && parts < values; step /= 2) parts *= 2;
     return (values + parts - 1) / parts * parts;
 }
 
-// Adds up r over the lanes that are a multiple of LANES apart, in few shuffles: as long as there are several values, a
-// lane keeps half of them and gives away the others. The sums are written to out by one lane each.
+// Adds up r over the lanes that are a multiple of LANES apart, in few shuffles: while a lane has several values, it
+// keeps one half and sends the other. One lane writes each sum to ``out``.
 template <int LANES, int VALUES, int STEP = 16, int SIZE>
 CUDA_CALLABLE inline void fold(Real (&r)[SIZE], int lane, Real* out, bool writes = true) {
     const bool upper = lane & STEP;
@@ -40,7 +40,7 @@ CUDA_CALLABLE inline void fold(Real (&r)[SIZE], int lane, Real* out, bool writes
     }
 }
 
-// Sums of a warp's share of the sources of a tile, written to staging: lane l has targets l, l + LANES, ...
+// Sums over a warp's share of the sources of a tile, written to ``staging``. Lane l has targets l, l + LANES, ...
 template <Quantity Q, int HELD, int LANES, int UNROLLED>
 CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_begin, int source_end,
                                     const Table& target_rows, const Table& sources, const Table& effective_rows,
@@ -49,8 +49,8 @@ CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_
     constexpr int VALUES = padded(HELD * width(Q), LANES);
     const int column_begin = tile.column_begin, count = tile.row_end - tile.row_begin, own = lane % LANES;
     const bool same = sources.data == target_rows.data;
-    // beyond the last target others are read, and not written; but the label, which masks, and the effective moment,
-    // whose table may end, are those of the last
+    // lanes beyond the last target read other moments, and are not written. Their labels, which mask, and effective
+    // moments, whose table may end, are those of the last target
     const auto target_at = [&](int k) -> Target {
         const Moment t = target_rows.moment(column_begin + own + LANES * k);
         const int column = column_begin + min(own + LANES * k, count - 1);
@@ -67,14 +67,14 @@ CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_
     fold<LANES, VALUES>(r, lane, (Real*)staging + own * VALUES);
 }
 
-// Total of target `thread` of a tile, in the threads that have one: the sums over its sources, and a correction that
-// SHARES threads compute as correct(column, share), a vector, for the packed column of the target.
+// Total of target `thread` of a tile, in the threads that have a target: its sums plus a correction. SHARES threads
+// compute the correction as the vector correct(column, share), for the packed column of the target.
 template <Quantity Q, int HELD, int LANES, int WARPS, int UNROLLED, int SHARES, class Correct>
 CUDA_CALLABLE inline wp::vec_t<width(Q), Real>
 sum_fused(int block, int thread, const wp::array_t<int>& tiles, const wp::array_t<Real>& target_table,
           const wp::array_t<Real>& source_table, const wp::array_t<Real>& effective_table, Correct correct) {
     constexpr int WIDTH = width(Q), VALUES = padded(HELD * WIDTH, LANES);
-    // of each warp: its sources, and then its sums
+    // per warp: staged sources, at the end its sums
     __shared__ Quad staging[WARPS][LANES * VALUES > 320 ? LANES * VALUES / 4 : 80];
     __shared__ Real corrections[HELD * LANES][WIDTH];
     const TileEntry& tile = ((const TileEntry*)tiles.data)[block];

@@ -1,5 +1,5 @@
-// Sums and what follows them in one kernel, for few moments on a GPU: a block sums a tile of targets and finishes them,
-// while spare threads of the block, GROUP for a target, correct pairs that overlap.
+// Sums and their finish in one kernel, for few moments on a GPU. A block sums a tile of targets and finishes them;
+// other threads of the block, GROUP per target, correct overlapping pairs.
 #pragma once
 #include "pairs/finish.h"
 #include "pairs/fused_cuda.h"
@@ -8,13 +8,13 @@ namespace warpmag {
 
 template <Quantity Q, int HELD, int LANES, int WARPS, int UNROLLED, class Arrays>
 CUDA_CALLABLE inline void sum_and_finish(const Arrays& arrays) {
-    // Warp's own index of a thread takes a division, and all else waits for it
+    // Warp's thread index takes a division, on which everything depends
     const int block = blockIdx.x, thread = threadIdx.x;
     const TileEntry& tile = ((const TileEntry*)arrays.tiles.data)[block];
     const int i = tile.column_begin + thread;
     const bool has_target = thread < tile.row_end - tile.row_begin;
     Vector base = {0, 0, 0};
-    if (has_target) base = vectors_at((const Real*)arrays.base.data, i); // before the sums, to wait for it less
+    if (has_target) base = vectors_at((const Real*)arrays.base.data, i); // loaded early to hide its latency
     auto effective = [&](int column) -> Vector {
         if constexpr (Q == Quantity::FIELD) return {0, 0, 0};
         else return Columns(arrays.effective).vector(0, column);

@@ -1,28 +1,28 @@
-// All-pairs sums of many moments among themselves on a GPU, field (Eq. 1) or force (Eqs. 13 and 14): each pair is
-// evaluated once, for both of its ends.
+// All-pairs sums of many moments among themselves on a GPU, field (Eq. 1) or force (Eqs. 13 and 14). Each pair is
+// evaluated once, for both its moments.
 //
-// The moments are cut into an odd number of equal tiles, arranged in a circle, and each tile takes the half of the
-// others that follows it. A block of warps holds a home tile in registers, lane l its moments l, l + 32, ..., and takes
-// the others in stages of 32 moments. At step s of a stage lane l takes the moment (l + s) mod 32 with all that it
-// holds, and passes the sums of that moment on to the lane that takes it next, so that after 32 steps lane l has the
-// home tile's sums for moment l: 30 instructions for both ends of a field's pair and 41 of a force's, next to the eight
-// or so that a moment takes once for all that a lane holds.
+// The moments are cut into an odd number of equal tiles, arranged in a circle. Each tile is paired with the half of the
+// others that follows it. A block holds a home tile in registers: lane l holds its moments l, l + 32, ... The other
+// tiles are read in stages of 32 moments. At step s of a stage lane l pairs moment (l + s) mod 32 with all moments that
+// it holds. It then sends the sums of that moment to the lane that takes it next. After 32 steps lane l has the sums of
+// moment l from the home tile. A pair takes 30 instructions for both fields or 41 for both forces; loading a moment
+// takes about eight for all moments that a lane holds.
 //
-// Those go to partial sums that belong to the distance between the two tiles in the circle, to which no other block
-// writes; the sums of the home tile go to partial sums of the block's share of the walk.
+// The sums of staged moments go to partial sums of the distance between the two tiles, which no other block writes. The
+// sums of the home tile go to partial sums of the block's share of the walk around the circle.
 #pragma once
 #include "pairs/tiles_cuda.h"
 
 namespace warpmag {
 
-// The moments of a home tile that a lane holds, and their sums.
+// Moments of a home tile that a lane holds, and their sums.
 template <Quantity Q, int MOMENTS> struct HomeMoments {
     Moment held[MOMENTS];
     Vec3<Real> scaled[MOMENTS], sums[MOMENTS];
     static constexpr Real SCALE = scaled_moment(Quantity::FIELD);
 
-    // Adds a moment of another tile to the sums h of the moments held, and those to its sums g; inverse(k, d2) is the
-    // inverse distance to the k-th.
+    // Adds a moment of another tile to the sums h of the held moments, and the held moments to its sums g. inverse(k,
+    // d2) is the inverse distance to the k-th.
     template <class Inverse>
     CUDA_CALLABLE void add(Vec3<Real> (&h)[MOMENTS], Vec3<Real>& g, const Source<Real>& source, Inverse inverse) {
 #pragma unroll
@@ -33,14 +33,14 @@ template <Quantity Q, int MOMENTS> struct HomeMoments {
     }
 };
 
-// Adds a staged stage to the sums of the home tile, and returns the sums of moment `lane` of the stage. If fast, the
-// stage has one radius and no pair is masked; otherwise those of one label are, or for the field of one moment: the
-// lane's k-th is moment own + 32 k of the stage.
+// Adds a stage in shared memory to the sums of the home tile, and returns the sums of moment `lane` of the stage. A
+// fast stage has one radius and no masked pair. Otherwise a force masks pairs of one label, and a field masks a moment
+// with itself: the lane's k-th moment is moment own + 32 k of the stage.
 template <int UNROLLED, Quantity Q, int MOMENTS>
 CUDA_CALLABLE inline Vec3<Real> add_mirrored_stage(HomeMoments<Q, MOMENTS>& home, const Quad* staged, int lane,
                                                    bool fast, int own) {
     constexpr bool FIELD = Q == Quantity::FIELD;
-    // the near terms of a force outweigh the far ones so much that a sum of both would lose these: it is by stages
+    // a force is summed by stages: in one sum the large near terms would round away the far ones
     Vec3<Real> g{}, h[MOMENTS];
 #pragma unroll
     for (int k = 0; k < MOMENTS; ++k) h[k] = FIELD ? home.sums[k] : Vec3<Real>{};
@@ -77,13 +77,14 @@ CUDA_CALLABLE inline Vec3<Real> add_mirrored_stage(HomeMoments<Q, MOMENTS>& home
     return g;
 }
 
-// One thread of the block that takes stages of the tiles after a home tile. Shape of partial_out: [partial sums,
-// moments, 3], those of the distances between tiles first. Arguments as in mirror_cuda.MirrorTiles.
+// Sums the pairs of a home tile with its share of the following tiles; called by each thread of a block. Shape of
+// partial_out: [partial sums, moments, 3], partial sums of distances between tiles first. Arguments as in
+// mirror_cuda.MirrorTiles.
 template <Quantity Q, int MOMENTS, int WARPS, int UNROLLED, class Tiles>
 CUDA_CALLABLE inline void sum_mirrored(int block, int thread, const wp::array_t<Real>& packed, const Tiles& tiles,
                                        int nearest, const wp::array_t<Real>& partial_out) {
     constexpr bool FIELD = Q == Quantity::FIELD;
-    // of each warp, for the moments of a stage, twice over, and at the end for its sums
+    // per warp: the moments of a stage twice, at the end its sums
     __shared__ Quad staging[WARPS][MOMENTS > 8 ? 24 * MOMENTS : 192];
     const int lane = thread % 32, warp = thread / 32;
     const int* p = tiles.blocks.data + 4 * block;
@@ -100,7 +101,7 @@ CUDA_CALLABLE inline void sum_mirrored(int block, int thread, const wp::array_t<
     HomeMoments<Q, MOMENTS> home;
 #pragma unroll
     for (int k = 0; k < MOMENTS; ++k) {
-        // a lane that holds fewer has the last again, without a moment, which is not written
+        // lanes beyond the last moment repeat it with a zero moment, and are not written
         const int row = row_begin + lane + 32 * k;
         home.held[k] = table.moment(tiles.origin + min(row, row_end - 1), row < row_end);
         home.scaled[k] = home.SCALE * home.held[k].m;
@@ -116,7 +117,7 @@ CUDA_CALLABLE inline void sum_mirrored(int block, int thread, const wp::array_t<
         const int other = home_tile + distance < count ? home_tile + distance : home_tile + distance - count;
         const int begin = edges[other] + 32 * (at - distance * tiles.stages), end = edges[other + 1];
         if (begin >= end) continue;
-        // lanes beyond the last moment have its place, and no moment
+        // lanes beyond the last moment repeat its position, with a zero moment
         const bool there = begin + lane < end;
         const Moment s = table.moment(tiles.origin + (there ? begin + lane : end - 1), there);
         const bool fast = __all_sync(ALL_LANES, s.radius == __shfl_sync(ALL_LANES, s.radius, 0) && s.radius > 0

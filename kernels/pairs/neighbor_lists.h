@@ -1,17 +1,18 @@
-// Walks over lists of neighbours. Takes CAPACITY, the length of a list, from Python, and on a GPU GROUP, the threads
-// that share a ball.
+// Loops over lists of neighbors. From Python: CAPACITY, the length of a list, and GROUP, the threads of a GPU that
+// share a ball.
 #pragma once
+#include "pairs/pair_law.h"
 #include "shared/group.h"
 
 namespace warpmag {
 
-// Calls visit(j, listed) for one entry after the other of the lists of balls i, as far as they name sources from begin
-// to end; where a list is full, for all of these. The threads of a group take turns.
+// Calls visit(j, listed) for each entry j of the lists of balls i; ``listed`` masks the sources from begin to end. If a
+// list is full, all of these sources are visited instead. The threads of a group take turns.
 #if defined(__CUDA_ARCH__)
 template <class Visit>
 CUDA_CALLABLE inline void walk_lists(const int* lists, const int* counts, int i, int, int begin, int end, Visit visit) {
     const int* const list = lists + (size_t)CAPACITY * i;
-    const int count = counts[i], nearest = list[share()]; // read at once, whether it is an entry or not
+    const int count = counts[i], nearest = list[share()]; // read before the count is known
     const bool listed = count <= CAPACITY;
     for (int s = share(); s < (listed ? count : end - begin); s += SHARES) {
         const int j = !listed ? begin + s : s < SHARES ? nearest : list[s];
@@ -22,7 +23,8 @@ CUDA_CALLABLE inline void walk_lists(const int* lists, const int* counts, int i,
 template <class Visit>
 inline void walk_lists(const int* lists, const int* counts, Index i, int held, Index begin, Index end, Visit visit) {
     Index own = i[0], first = 0, count = 0, full = 0;
-    int longest = 0, lowest = __INT_MAX__, highest = 0; // of the lists; of the sources of balls whose list is full
+    int longest = 0, lowest = __INT_MAX__,
+        highest = 0; // longest list, and range of sources of the balls whose list is full
     for (int l = 0; l < held; ++l) {
         if (end[l] <= begin[l]) continue;
         own[l] = i[l], first[l] = begin[l];
@@ -45,4 +47,26 @@ inline void walk_lists(const int* lists, const int* counts, Index i, int held, I
     for (int j = lowest; j < highest; ++j) visit(j, mask_of((full != 0) & (j >= begin) & (j < end)));
 }
 #endif
+
+// Shared volumes Σ_j |B_i ∩ B_j|/√(V_i V_j) of ``held`` moments from i on, over sources j from begin to end that
+// accepts(i, j) selects. ``lists`` has the packed moments and the overlap lists.
+template <class Lists, class Accepts>
+CUDA_CALLABLE inline Number shared_volumes(const Lists& lists, int i, int held, int begin, int end, Accepts accepts) {
+    const Real* const packed = (const Real*)lists.packed.data;
+    const size_t pitch = lists.packed.strides[0] / sizeof(Real);
+    Index self = Index(i);
+#if !defined(__CUDA_ARCH__)
+    for (int l = 0; l < WIDTH; ++l) self[l] += l;
+#endif
+    auto row = [&](int c, Index j) { return collect(packed + c * pitch, j); };
+    const Vector x = {row(0, self), row(1, self), row(2, self)};
+    const Number radius = row(3, self);
+    Number volume = 0;
+    auto add = [&](Index j, Mask listed) {
+        const Vector r = {x.x - row(0, j), x.y - row(1, j), x.z - row(2, j)};
+        volume += shared_volume(dot(r, r), radius, row(3, j), listed & accepts(self, j));
+    };
+    walk_lists(lists.overlap.data, lists.overlap_count.data, self, held, Index(begin), Index(end), add);
+    return group_sum(volume);
+}
 }

@@ -1,7 +1,7 @@
-// The neighbour search on a CPU: candidates a vector at a time, by several threads.
+// Neighbor search on a CPU: a vector of candidates at a time, by several threads.
 //
-// A counting sort puts sources in the order of their buckets, so that a target finds its candidates in nine runs of
-// memory, columns of three cells each. Of what else is in their buckets, all that is near is of other columns.
+// A counting sort orders the sources by bucket. The candidates of a target are in nine columns of three cells each, and
+// a column is contiguous in memory. Sources of other cells in the same buckets are skipped by comparing cell columns.
 #pragma once
 #include "pairs/cells.h"
 #include "pairs/overlaps.h"
@@ -9,10 +9,11 @@
 
 namespace warpmag {
 
-constexpr int TARGETS = 64; // that a thread takes at a time
+constexpr int TARGETS = 64; // targets that a thread takes at a time
 
-// Sources in the order of their buckets, ``begin[b]`` being the first of bucket b: index, column, group, position and
-// radius; and the bucket of each source, −1 if none, in the order of sources.
+// Sources in the order of their buckets: index, column, group, position and radius. ``begin[b]`` is the first of bucket
+// b.
+// ``bucket`` is the bucket of each source, −1 if none, in the order of sources.
 struct SortedSources {
     int buckets, pitch, *begin, *index;
     Real* x;
@@ -31,7 +32,7 @@ template <class Lists> inline SortedSources sort_sources(const Lists& sources, d
         s.bucket[j] = cell.group >= 0 ? bucket_of(cell, s.buckets) : -1;
         if (s.bucket[j] >= 0) ++s.begin[s.bucket[j]];
     }
-    for (int b = 0; b < s.buckets; ++b) s.begin[b + 1] += s.begin[b]; // where each bucket ends
+    for (int b = 0; b < s.buckets; ++b) s.begin[b + 1] += s.begin[b]; // end of each bucket
     for (int j = count - 1; j >= 0; --j) {
         if (s.bucket[j] < 0) continue;
         const Cell cell = cell_of(balls, j, sources.group.data[j], cells_per_meter);
@@ -48,8 +49,8 @@ struct Target {
     int self; // index among the sources, −1 if it is none of them
 };
 
-// Puts sources ``begin`` to ``end`` of a column that are near a target into a list, of which it needs the first
-// CAPACITY, and returns how many there are with those before.
+// Appends the sources ``begin`` to ``end`` of a column that are near a target to a list, which keeps the first
+// CAPACITY. Returns the new count.
 inline int find_in_run(const SortedSources& s, const Target& t, Cell column, int begin, int end, int* list, int count) {
     for (int e = begin; e < end; e += WIDTH) {
         const Vector r = {t.x - numbers(s.x + e), t.y - numbers(s.y + e), t.z - numbers(s.z + e)};
@@ -63,13 +64,13 @@ inline int find_in_run(const SortedSources& s, const Target& t, Cell column, int
     return count;
 }
 
-// Neighbours of a target in its cell and the 26 around it, as ``find_in_run`` lists them.
+// Lists the neighbors of a target in its cell and the 26 cells around it; returns their number.
 inline int find_around(const SortedSources& s, const Target& t, Cell cell, int* list) {
     int count = 0;
     for (int c = 0; c < 9 && cell.group >= 0; ++c) {
         const Cell column = {cell.x + c / 3 - 1, cell.y + c % 3 - 1, cell.z - 1, cell.group};
         const int b = bucket_of(column, s.buckets);
-        const int run = b + 3 <= s.buckets ? 3 : 1; // the last cells of a column may be in the first buckets
+        const int run = b + 3 <= s.buckets ? 3 : 1; // a column may wrap around to the first buckets
         for (int k = b; k < b + 3; k += run) {
             const int* const begin = s.begin + (k & (s.buckets - 1));
             count = find_in_run(s, t, column, begin[0], begin[run], list, count);
@@ -78,7 +79,7 @@ inline int find_around(const SortedSources& s, const Target& t, Cell cell, int* 
     return count;
 }
 
-// Writes a list in ascending order: each entry comes behind as many as are smaller. Its last vector is filled up.
+// Writes a list in ascending order: the place of an entry is the number of smaller entries.
 inline void write_sorted(int* list, int count, int* out) {
     const int vectors = (count + WIDTH - 1) / WIDTH;
     put_indices(list + count, Index(__INT_MAX__));
@@ -89,7 +90,7 @@ inline void write_sorted(int* list, int count, int* out) {
     }
 }
 
-// Lists each target's neighbours anew if moments have moved too far.
+// Rebuilds the neighbor lists if a moment has moved too far.
 template <class Lists>
 inline void search_neighbors(const Lists& targets, const Lists& sources, int threads, Word* team) {
     targets.searching.data[0] = targets.moved.data[0];

@@ -1,6 +1,6 @@
-// Lists of the neighbours that overlap, and how lists are written.
+// Lists of the neighbors that overlap a moment.
 //
-// From Python: CAPACITY, the entries that a list has room for, and GROUP, the threads of a GPU that share a target.
+// From Python: CAPACITY, the length of a list, and GROUP, the threads of a GPU that share a target.
 #pragma once
 #include "pairs/cells.h"
 #include "shared/group.h"
@@ -8,14 +8,14 @@
 
 namespace warpmag {
 
-// append(list, j, wanted) writes those indices of a vector, or of a group's threads, that are wanted to a list, and
-// returns how many they are. On a CPU it writes WIDTH entries, and has no branches, which could not be predicted.
+// append(list, j, active) writes the indices j of the active lanes, or of the active threads of a group, to a list and
+// returns their number. On a CPU it always writes WIDTH entries, without branches that would be mispredicted.
 #if defined(__CUDA_ARCH__)
 CUDA_CALLABLE inline Index lanes() { return 0; }
 
-CUDA_CALLABLE inline int append(int* list, Index j, bool wanted) {
-    const unsigned all = __ballot_sync(group_mask(), wanted);
-    if (wanted) list[__popc(all & ((1u << threadIdx.x % 32) - 1u))] = j;
+CUDA_CALLABLE inline int append(int* list, Index j, bool active) {
+    const unsigned all = __ballot_sync(group_mask(), active);
+    if (active) list[__popc(all & ((1u << threadIdx.x % 32) - 1u))] = j;
     return __popc(all);
 }
 #else
@@ -27,16 +27,16 @@ inline Index lanes() {
 
 template <class Lanes> inline unsigned bits_of(Lanes mask) {
     typedef bool Bits __attribute__((ext_vector_type(WIDTH)));
-    const Bits wanted = __builtin_convertvector(mask, Bits);
+    const Bits active = __builtin_convertvector(mask, Bits);
     unsigned bits = 0;
-    __builtin_memcpy(&bits, &wanted, WIDTH / 8);
+    __builtin_memcpy(&bits, &active, WIDTH / 8);
     return bits;
 }
 
-template <class Places, class Lanes> inline int append(int* list, Places j, Lanes wanted) {
+template <class Places, class Lanes> inline int append(int* list, Places j, Lanes active) {
 #if defined(__AVX512F__)
     if constexpr (WIDTH == 16) {
-        const unsigned short bits = (unsigned short)bits_of(wanted);
+        const unsigned short bits = (unsigned short)bits_of(active);
         put_indices(list, __builtin_ia32_compresssi512_mask(j, j, bits));
         return __builtin_popcount(bits);
     }
@@ -44,13 +44,13 @@ template <class Places, class Lanes> inline int append(int* list, Places j, Lane
     int count = 0;
     for (int l = 0; l < WIDTH; ++l) {
         list[count] = j[l];
-        count += wanted[l] != 0;
+        count += active[l] != 0;
     }
     return count;
 }
 #endif
 
-// Lists those of target i's neighbours that overlap it; of a full list only the count is passed on.
+// Lists the neighbors of target i that overlap it. If the list of neighbors is full, only its count is copied.
 template <class Lists> CUDA_CALLABLE inline void list_overlaps(const Lists& targets, const Lists& sources, int i) {
     const Balls own = balls_of(targets), others = balls_of(sources);
     const int count = targets.count.data[i];
@@ -59,9 +59,9 @@ template <class Lists> CUDA_CALLABLE inline void list_overlaps(const Lists& targ
 #if defined(__CUDA_ARCH__)
     int* const list = overlap;
 #else
-    int list[CAPACITY + WIDTH]; // what lies behind belongs to other threads
+    int list[CAPACITY + WIDTH]; // a buffer: append() writes beyond the last entry, where another thread's list begins
 #endif
-    int found = 0;
+    int overlapping = 0;
     for (int begin = 0; begin < count && count <= CAPACITY; begin += SHARES * WIDTH) {
         const int first = begin + share();
         const auto listed = lanes() < count - first;
@@ -69,11 +69,11 @@ template <class Lists> CUDA_CALLABLE inline void list_overlaps(const Lists& targ
         const Vector r = {own.x[i] - collect(others.x, j), own.y[i] - collect(others.y, j),
                           own.z[i] - collect(others.z, j)};
         const Number contact = own.radius[i] + collect(others.radius, j);
-        found += append(list + found, j, (dot(r, r) < contact * contact) & mask_of(listed));
+        overlapping += append(list + overlapping, j, (dot(r, r) < contact * contact) & mask_of(listed));
     }
 #if !defined(__CUDA_ARCH__)
-    __builtin_memcpy(overlap, list, found * sizeof(int));
+    __builtin_memcpy(overlap, list, overlapping * sizeof(int));
 #endif
-    if (share() == 0) targets.overlap_count.data[i] = count <= CAPACITY ? found : count;
+    if (share() == 0) targets.overlap_count.data[i] = count <= CAPACITY ? overlapping : count;
 }
 }

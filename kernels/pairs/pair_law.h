@@ -1,21 +1,23 @@
-// The pair law of two magnetic moments, each spread over a ball, as far as native code needs it; pair_law.py has the
-// equations and the names. Radial factors are templates of the number type, a scalar or a vector of them.
+// Pair law of two magnetic moments, each spread over a ball; pair_law.py has the equations and the names. Radial
+// factors are templates of the number type N, a scalar or a vector of scalars.
 #pragma once
 #include "shared/inverse_root.h"
 #include "shared/vectors.h"
 
 namespace warpmag {
 
-// Radial factors g1, g2 d and g3 d³, of unit directions: they stay finite down to coincident centres.
+// Radial factors g1, g2 d and g3 d³, which multiply unit directions and stay finite down to coincident centers.
 template <class N> struct Factors {
     N g1, g2, g3;
 };
 
-// Those of overlapping balls of radii a and b, ``apart`` = |a − b|, at distance d < a + b, i1 = 1/d:
-// U = 1/d + (a+b−d)⁴ (5a² − 20ab + 5b² − 4(a+b)d − d²) / (160 a³b³d), and g1 = −1/A³ where the smaller ball lies inside
-// the larger of radius A. Two forms of the same expression: the printed one, with 6(a+b)e − 30ab − e² in the brackets,
-// e = a+b−d, keeps its digits near contact and for very different radii, the Laurent polynomial in d for nearly
-// concentric balls.
+// Factors of overlapping balls of radii a and b, with ``apart`` = |a − b|, at distance d < a + b. The potential is
+//
+//     U = 1/d + (a+b−d)⁴ (5a² − 20ab + 5b² − 4(a+b)d − d²) / (160 a³b³d),
+//
+// and g1 = −1/A³ where the smaller ball lies inside the larger of radius A. The expression is evaluated in two forms.
+// Near contact and for very different radii the printed form keeps its digits, with 6(a+b)e − 30ab − e² in the brackets
+// and e = a+b−d. For nearly concentric balls the Laurent polynomial in d does.
 template <class N> CUDA_CALLABLE inline Factors<N> averaged_factors(N d, N a, N b, N apart) {
     const N p = a * b, s = a + b, i1 = 1 / d, c = 1 / (160 * p * p * p), large = larger(a, b), zero = N(Real(0));
     const auto inside = mask_of(d <= apart), outer_half = mask_of(d > Real(0.5) * s);
@@ -41,8 +43,8 @@ template <class N> CUDA_CALLABLE inline Factors<N> averaged_factors(N d, N a, N 
     return {inside ? -1 / (large * large * large) : g1, inside ? zero : g2, inside ? zero : g3};
 }
 
-// What the clamped dipole lacks for an overlapping pair: averaged factors less those at the contact distance, with
-// lengths in units of it, a + b = 1. Balls of one radius, most of all, have U'/d = −8 + 9d − 2d³.
+// Correction of the clamped dipole for an overlapping pair: averaged factors minus dipole factors at contact, with
+// lengths in units of the contact distance, a + b = 1. Equal radii have a short form, U'/d = −8 + 9d − 2d³.
 template <class N> CUDA_CALLABLE inline Factors<N> overlap_factors(N d, N a, N b, N apart) {
     const N e = 1 - d;
     const Factors<N> same = {e * (e * (2 * e - 6) - 3), 3 * e * (3 + 2 * d), -3 * e * (3 + d * (3 + 5 * d))};
@@ -53,66 +55,67 @@ template <class N> CUDA_CALLABLE inline Factors<N> overlap_factors(N d, N a, N b
             equal ? same.g3 : other.g3 + 15 * d * d * d};
 }
 
-// Volume that two balls at squared distance d2 share, over the geometric mean of their volumes; zero where not wanted.
-CUDA_CALLABLE inline Number shared_volume(Number d2, Number a, Number b, Mask wanted) {
+// Shared volume of two balls at squared distance d2, over the geometric mean of their volumes; zero in inactive lanes.
+CUDA_CALLABLE inline Number shared_volume(Number d2, Number a, Number b, Mask active) {
     const Number p = a * b, s = a + b, large = larger(a, b), small = smaller(a, b), apart = large - small;
     const Number d = root(d2), ratio = small / large, e = s - d, zero = Number(Real(0));
     const Number lens = e * e * (d + 2 * s - 3 * apart * (apart / d)) / (16 * p * root(p));
-    return (wanted & (d2 < s * s) & (p > zero)) ? (d <= apart ? ratio * root(ratio) : lens) : zero;
+    return (active & (d2 < s * s) & (p > zero)) ? (d <= apart ? ratio * root(ratio) : lens) : zero;
 }
 
-// Distance and unit direction of a separation, however small; no direction at none.
+// Distance and unit direction of a separation, however small; the direction is zero for a zero separation.
 struct Polar {
     Number d;
     Vector u;
 };
 CUDA_CALLABLE inline Polar polar(Vector r) {
     const Number zero = Number(Real(0)), one = Number(Real(1));
-    const Mask tiny = dot(r, r) < Real(1e-20); // times 2⁶⁰, for its square to keep its digits
+    const Mask tiny = dot(r, r) < Real(1e-20); // scaled by 2⁶⁰, so that the square does not underflow
     const Vector lifted = (tiny ? Number(Real(1.152921504606847e18)) : one) * r;
     const Number d = length(lifted);
     return {d * (tiny ? Number(Real(8.673617379884035e-19)) : one), (d > zero ? one / d : zero) * lifted};
 }
 
-// An overlapping pair in units of its contact distance, in which no power of it overflows: direction u, distance d,
-// moment m and the factors of what a clamped dipole lacks.
+// An overlapping pair in units of its contact distance, so that no power overflows: direction u, distance d, moment m,
+// and the factors of the correction. ``unit`` is 1 over the contact distance.
 struct Overlap {
     Number unit, d;
     Vector u, m;
     Factors<Number> g;
 };
-CUDA_CALLABLE inline Overlap overlap_of(Vector r, Number a, Number b, Vector m, Mask wanted) {
-    const Number unit = 1 / (wanted ? a + b : Number(Real(1)));
+CUDA_CALLABLE inline Overlap overlap_of(Vector r, Number a, Number b, Vector m, Mask active) {
+    const Number unit = 1 / (active ? a + b : Number(Real(1)));
     const Polar at = polar(unit * r);
-    // |a − b| of the radii as they are: those in other units are rounded
+    // |a − b| of the unscaled radii: scaled ones are rounded
     const Factors<Number> g = overlap_factors(at.d, unit * a, unit * b, unit * larger(a - b, b - a));
     return {unit, at.d, at.u, unit * unit * unit * m, g};
 }
 
-// 4π times the field that a clamped dipole lacks.
+// Correction of 4π times the field, 4πH = g1 m + g2 d (u·m) u.
 CUDA_CALLABLE inline Vector field_of(const Overlap& p) { return p.g.g1 * p.m + p.g.g2 * p.d * dot(p.u, p.m) * p.u; }
 
-// Adds 4π times the fields of moments m at separations r, of balls of radii a and b.
-CUDA_CALLABLE inline void add_pair_field(Vector& h, Vector r, Number a, Number b, Vector m, Mask wanted) {
+// Adds to h the field 4πH = 3 (r·m) r/d⁵ − m/d³ of moments m at separations r, of balls of radii a and b; d is clamped
+// to the contact distance, and overlapping pairs are corrected.
+CUDA_CALLABLE inline void add_pair_field(Vector& h, Vector r, Number a, Number b, Vector m, Mask active) {
     const Number d2 = dot(r, r), s = a + b, s2 = s * s, c = larger(d2, s2), zero = Number(Real(0));
-    const Number i = (wanted & (c > zero)) ? Real(0.5) * twice_inverse_root(c) : zero, i2 = i * i, i3 = i2 * i;
+    const Number i = (active & (c > zero)) ? Real(0.5) * twice_inverse_root(c) : zero, i2 = i * i, i3 = i2 * i;
     const Number along = 3 * i2 * (i3 * dot(r, m));
     h.x += along * r.x - i3 * m.x;
     h.y += along * r.y - i3 * m.y;
     h.z += along * r.z - i3 * m.z;
-    const Mask overlapping = wanted & (d2 < s2);
+    const Mask overlapping = active & (d2 < s2);
     if (any(overlapping)) add_where(overlapping, h, field_of(overlap_of(r, a, b, m, overlapping)));
 }
 
-// 4π times the (e·∇)H that a clamped dipole lacks.
+// Correction of 4π (e·∇)H = g2 [(u·e) m + (u·m) e] + [g2 m·e + g3 (u·m)(u·e)] u.
 CUDA_CALLABLE inline Vector force_of(const Overlap& p, Vector e) {
-    const Number along = dot(p.u, e), of = dot(p.u, p.m);
-    const Vector across = along * p.m + of * e;
-    const Number radial = p.g.g2 * dot(p.m, e) + p.g.g3 * of * along;
-    return p.unit * (p.g.g2 * across + radial * p.u);
+    const Number ue = dot(p.u, e), um = dot(p.u, p.m);
+    const Vector mixed = ue * p.m + um * e;
+    const Number radial = p.g.g2 * dot(p.m, e) + p.g.g3 * um * ue;
+    return p.unit * (p.g.g2 * mixed + radial * p.u);
 }
 
-// Potential U of overlapping balls of radii a and b at distance d < a + b, in the forms of averaged_factors.
+// Potential U of overlapping balls of radii a and b at distance d < a + b, in the two forms of averaged_factors.
 template <class N> CUDA_CALLABLE inline N averaged_potential(N d, N a, N b, N apart) {
     const N p = a * b, s = a + b, c = 1 / (160 * p * p * p), e = s - d, e2 = e * e, d2 = d * d, i1 = 1 / d;
     const N far = (1 + e2 * e2 * (6 * s * e - 30 * p - e2) * c) * i1;

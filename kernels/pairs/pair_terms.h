@@ -1,10 +1,10 @@
-// The terms that one pair of moments adds to the sums of its target, or of both its ends: field (Eq. 1) and force
-// (Eqs. 4, 13 and 14). A number N is a scalar on a GPU and a vector of them on a CPU; Real is its scalar type.
+// Terms that one pair of moments adds to the sums of its target, or of both moments: field (Eq. 1) and force (Eqs. 4,
+// 13 and 14). A number N is a scalar on a GPU and a vector of scalars on a CPU; Real is the scalar type.
 //
-// A pair is described by its separation r from the source to the target, its inverse distance, clamped and masked by
-// the caller, the source's moment b with a multiple u of it, and for a force the target's effective moment e, or for a
-// MUTUAL_FORCE its moment m. The caller computes the inverse distance as i = W/d, for which a CPU's last Newton step is
-// shortest at W = 2. Constant factors are applied to the sums at their end:
+// A pair has a separation r from the source to the target, and an inverse distance that the caller clamps and masks.
+// The source has a moment b and a multiple u of it. For a force the target has an effective moment e, for a
+// MUTUAL_FORCE its moment m. The inverse distance is i = W/d: with W = 2 the last Newton step of a CPU is shortest.
+// Constant factors are applied to the complete sums:
 //
 // | quantity     | u     | sums over the pairs                                  | result                          |
 // |--------------|-------|------------------------------------------------------|---------------------------------|
@@ -15,16 +15,17 @@
 // | MUTUAL_FORCE |       | h = i⁵ [(r·b) m + (r·m) b + (b·m) r                  |                                 |
 // |              |       |         − 5 W⁻² i² (r·b)(r·m) r]                     | 4π(m·∇)H = 3 W⁻⁵ h              |
 //
-// The products are ordered so that no factor beyond r⁻³ leaves the float32 range before it is multiplied by r.
+// Products are ordered so that a power beyond r⁻³ is multiplied by r before it can leave the range of float32.
 #pragma once
+#include "shared/vectors.h"
 
 namespace warpmag {
 
-// What is summed: H; (e·∇)H for an effective moment e of the target; both of them; (m·∇)H for its moment m.
-// The values are those of pair_terms.Quantity.
+// Summed quantity: H; (e·∇)H for an effective moment e of the target; both; (m·∇)H for the target's moment m. As in
+// pair_law.Quantity.
 enum class Quantity { FIELD, FORCE, WRENCH, MUTUAL_FORCE };
 
-// Numbers that are stored for a target.
+// Numbers stored per target.
 constexpr int width(Quantity q) { return q == Quantity::WRENCH ? 6 : 3; }
 
 #if defined(__CUDA_ARCH__)
@@ -36,37 +37,14 @@ constexpr Real W = 2;
 // Ratio u/b of a source's scaled moment to its moment.
 constexpr Real scaled_moment(Quantity q) { return Real(double(W) * W / (q == Quantity::FIELD ? 3.0 : 5.0)); }
 
-// An entry of the work list of tiles: the target rows, the packed column of the first of them, the sources, the partial
-// sums that it is added to, and whether it stands also for the tile with sources and targets exchanged, and what that
-// is added to.
+// Tile of the work list: range of target rows, packed column of the first of them, range of sources, and index of the
+// partial sums. If ``mirrored``, the tile also stands for its mirror image, with targets and sources exchanged, which
+// is added to partial sums ``mirror_split``.
 struct TileEntry {
     int row_begin, row_end, column_begin, source_begin, source_end, split, mirrored, mirror_split;
 };
 
-template <class N> struct Vec3 {
-    N x, y, z;
-};
-
-template <class N> CUDA_CALLABLE inline Vec3<N> operator+(const Vec3<N>& a, const Vec3<N>& b) {
-    return {a.x + b.x, a.y + b.y, a.z + b.z};
-}
-
-template <class N> CUDA_CALLABLE inline Vec3<N> operator-(const Vec3<N>& a, const Vec3<N>& b) {
-    return {a.x - b.x, a.y - b.y, a.z - b.z};
-}
-
-template <class N> CUDA_CALLABLE inline Vec3<N> operator*(N factor, const Vec3<N>& v) {
-    return {factor * v.x, factor * v.y, factor * v.z};
-}
-
-template <class N> CUDA_CALLABLE inline Vec3<N>& operator+=(Vec3<N>& sum, const Vec3<N>& v) { return sum = sum + v; }
-template <class N> CUDA_CALLABLE inline Vec3<N>& operator-=(Vec3<N>& sum, const Vec3<N>& v) { return sum = sum - v; }
-
-template <class N> CUDA_CALLABLE inline N dot(const Vec3<N>& a, const Vec3<N>& b) {
-    return a.x * b.x + a.y * b.y + a.z * b.z;
-}
-
-// Sums of a target, as in the table; those that a quantity lacks stay zero and are optimized away.
+// Sums of a target, as in the table. Sums that a quantity does not use stay zero and are optimized away.
 template <class N> struct Sums {
     Vec3<N> f{}, h{}, g{};
     N a{};
@@ -100,7 +78,7 @@ CUDA_CALLABLE inline void add_pair(Sums<N>& sums, const Vec3<N>& r, N inv, const
     }
 }
 
-// Adds a pair to the sums h of its target, of moment m and scaled moment n, and to the sums g of its source.
+// Adds a pair to the sums h of its target, which has moment m and scaled moment n, and to the sums g of its source.
 template <Quantity Q, class N>
 CUDA_CALLABLE inline void add_mirrored_pair(Vec3<N>& h, Vec3<N>& g, const Vec3<N>& r, N inv, const Source<N>& source,
                                             const Vec3<N>& m, const Vec3<N>& n) {
@@ -121,7 +99,7 @@ CUDA_CALLABLE inline void add_mirrored_pair(Vec3<N>& h, Vec3<N>& g, const Vec3<N
     }
 }
 
-// Factors of h, f and g in the results.
+// Factors of h, f and g in the results: 3 W⁻⁵, 15 W⁻⁷ and W⁻³.
 constexpr double W3 = double(W) * W * W, W5 = W3 * W * W, W7 = W5 * W * W;
 constexpr Real H_FACTOR = Real(3.0 / W5), F_FACTOR = Real(15.0 / W7), G_FACTOR = Real(1.0 / W3);
 

@@ -1,14 +1,13 @@
-// All-pairs sums, field (Eq. 1) and force (Eqs. 4, 13 and 14), of a work list of tiles on a CPU: in vectors as wide as
-// the machine has them, by several threads.
+// All-pairs sums, field (Eq. 1) and force (Eqs. 4, 13 and 14), of a work list of tiles on a CPU, in vectors of the
+// machine's width and by several threads.
 //
-// Up to TILE_SIZE sources (from Python) at a time are kept in the first-level cache. The field and Kelvin's force among
-// moments are summed for both ends of a pair at once, which share the separation and its powers: 33 vector operations
-// make two fields, where one by itself takes 23, and 44 make two forces, where one takes 34. The loop is compiled for
-// what the pairs of two tiles have in common, too: radii that differ cost 3 operations more.
+// At most TILE_SIZE sources (from Python) at a time are kept in the first-level cache. The field and Kelvin's force
+// among moments are summed for both moments of a pair at once, which share the separation and its powers. Two fields
+// take 33 vector operations, a single one 23; two forces take 44, a single one 34. The loop is compiled for each kind
+// of two tiles' pairs: different radii cost 3 more operations.
 //
-// Threads take shares of the tiles, the largest first; one that starts late or is interrupted leaves more to the
-// others. No two shares add to the same partial sums of a row, and the finishing kernel adds those up in order, so that
-// results do not depend on which thread took which share.
+// Threads take shares of the tiles, the largest first. No two shares add to the same partial sums of a row, and the
+// finishing kernel adds the partial sums up in order. So results do not depend on which thread took which share.
 #pragma once
 #include "pairs/pair_terms.h"
 #include "shared/inverse_root.h"
@@ -29,19 +28,19 @@ constexpr int LANES = BYTES / (int)sizeof(Real), VECTORS = TILE_SIZE / LANES;
 typedef Real Simd __attribute__((ext_vector_type(LANES)));
 static_assert(W == 2); // inverse distances are twice_inverse_root(d²)
 
-// Whether a pair may be summed for both its ends, and what is summed otherwise.
+// MUTUAL: a pair may be summed for both its moments. ROWS: the quantity summed for one moment of a pair.
 template <Quantity Q> constexpr bool MUTUAL = Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE;
 template <Quantity Q> constexpr Quantity ROWS = Q == Quantity::MUTUAL_FORCE ? Quantity::FORCE : Q;
 
-// Which of the numbers of Sums there are, and how many.
+// Numbers of Sums that a quantity uses, and their count.
 template <Quantity Q> constexpr bool is_summed(int k) {
     if (MUTUAL<Q>) return k >= 3 && k < 6;
     return Q == Quantity::WRENCH || k < 3 || k == 9;
 }
 template <Quantity Q> constexpr int SUMS = Q == Quantity::WRENCH ? 10 : MUTUAL<Q> ? 3 : 4;
 
-// Totals over the lanes of as many vectors, in the lanes of one. To add up the lanes of each would take three times as
-// many operations.
+// Sum over the lanes of each of LANES vectors, in the lanes of one vector. Transposing first takes a third of the
+// operations of separate sums.
 inline Simd totals(Simd (&rows)[LANES]) {
     transpose<1>(rows, __make_integer_seq<Sequence, int, LANES>());
     Simd sum = 0;
@@ -53,7 +52,7 @@ inline Vec3<Simd> splat(const Vec3<Real>& v) { return {Simd(v.x), Simd(v.y), Sim
 
 inline Real& number(Simd* row, int i) { return ((Real*)row)[i]; }
 
-// Number i, and vector v, of three rows.
+// Vector of number i of three rows, and of their SIMD vector v.
 template <int N> inline Vec3<Real> numbers(Simd (*rows)[N], int i) {
     return {number(rows[0], i), number(rows[1], i), number(rows[2], i)};
 }
@@ -62,7 +61,7 @@ template <int N> inline Vec3<Simd> vectors(const Simd (*rows)[N], int v) {
     return {rows[0][v], rows[1][v], rows[2][v]};
 }
 
-// Rows of an array of packed moments, and of a tile, which has scaled moments, too.
+// Rows of packed moments; a tile also has rows of scaled moments.
 enum Row { POSITION = 0, RADIUS = 3, MOMENT = 4, LABEL = 7, PACKED_ROWS, SCALED_MOMENT = PACKED_ROWS, TILE_ROWS = 11 };
 
 struct Table {
@@ -76,7 +75,7 @@ struct Table {
     Vec3<Real> vector(int r, int column) const { return {row(r)[column], row(r + 1)[column], row(r + 2)[column]}; }
 };
 
-// Tiles that one thread sums, and partial sums, shape [parts, row_count, width(Q)].
+// Tiles that one thread sums. Shape of ``partial``: [parts, row_count, width(Q)].
 struct Share {
     Table targets, sources, effective;
     const TileEntry *begin, *end;
@@ -89,13 +88,13 @@ struct Share {
 };
 
 struct Tile {
-    Simd rows[TILE_ROWS][VECTORS + 2]; // two vectors more than are summed, for a loop that reads ahead
-    Simd sums[3][VECTORS];             // sums h at its own moments of pairs that are summed for both ends
+    Simd rows[TILE_ROWS][VECTORS + 2]; // the pipelined loop reads two vectors ahead
+    Simd sums[3][VECTORS];             // sums h of its moments from pairs summed for both moments
     int begin, count = 0, vectors = 0;
     Real radius; // of the first moment
-    bool alike;  // whether all have that radius
+    bool equal_radii;
     Real lowest_label, highest_label;
-    bool ascending; // whether labels ascend, so that no two moments are of one body
+    bool ascending; // labels ascend strictly, so that no two moments belong to one body
 
     Source<Simd> source(int v) const {
         return {cpu::vectors(rows + POSITION, v), cpu::vectors(rows + MOMENT, v),
@@ -103,13 +102,13 @@ struct Tile {
     }
 };
 
-// Finds what moments of a tile have in common.
+// Finds radii and labels that the moments of a tile have in common.
 inline void compare_radii(Tile& tile) {
     tile.radius = number(tile.rows[RADIUS], 0);
     Simd spread = 0;
     for (int v = 0; v < tile.vectors; ++v)
         spread = __builtin_elementwise_max(spread, __builtin_elementwise_abs(tile.rows[RADIUS][v] - tile.radius));
-    tile.alike = __builtin_reduce_max(spread) == 0;
+    tile.equal_radii = __builtin_reduce_max(spread) == 0;
 }
 inline void compare_labels(Tile& tile) {
     const Simd* labels = tile.rows[LABEL];
@@ -132,11 +131,11 @@ inline void append(Tile& tile, const Table& table, int begin, int end) {
     tile.count += end - begin;
 }
 
-// Finishes a tile that has its moments.
+// Computes the rest of a tile from its moments.
 template <Quantity Q> __attribute__((noinline)) void complete(Tile& tile) {
     tile.vectors = (tile.count + LANES - 1) / LANES;
     for (int r = 0; r < PACKED_ROWS; ++r) {
-        // lanes beyond the last source have its position, and no moment
+        // lanes beyond the last source repeat its position, without a moment
         const Real beyond = r >= MOMENT && r < LABEL ? 0 : number(tile.rows[r], tile.count - 1);
         for (int i = tile.count; i < (tile.vectors + 2) * LANES; ++i) number(tile.rows[r], i) = beyond;
     }
@@ -157,7 +156,7 @@ template <Quantity Q> inline void fill(Tile& tile, const Table& table, int begin
     complete<Q>(tile);
 }
 
-// While it lives, a tile has no moment that is a target itself: a moment's own field is left out.
+// While it exists, removes a target's own moment from the tile of sources: its own field is left out.
 struct Own {
     Tile& sources;
     int i;
@@ -176,25 +175,25 @@ struct Own {
     }
 };
 
-// What the pairs of two tiles have in common: they are of points, or of balls that touch at one distance, and of two
-// bodies; or nothing.
+// Kind of the pairs of two tiles. POINTS: points of different bodies. BALLS: balls of different bodies with one contact
+// distance. ANY: everything else.
 enum class Kind { POINTS, BALLS, ANY };
 
 template <Quantity Q> inline Kind kind_of(const Tile& a, const Tile& b) {
-    const bool apart = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
-    const bool distinct = Q == Quantity::FIELD || (&a == &b ? a.ascending : apart);
-    if (!(a.alike && b.alike && distinct)) return Kind::ANY;
+    const bool disjoint = a.highest_label < b.lowest_label || b.highest_label < a.lowest_label;
+    const bool distinct = Q == Quantity::FIELD || (&a == &b ? a.ascending : disjoint);
+    if (!(a.equal_radii && b.equal_radii && distinct)) return Kind::ANY;
     return a.radius + b.radius > 0 ? Kind::BALLS : Kind::POINTS;
 }
 
-// Writes the results of targets to the partial sums, from vectors of each of their sums.
+// Adds the results of targets to the partial sums, from vectors of each of their sums.
 template <Quantity Q>
 inline void add_results(const Share& share, Real* out, int column, int held, Simd (&rows)[SUMS<Q>][LANES]) {
-    Simd found[10] = {};
+    Simd summed[10] = {};
     for (int k = 0, used = 0; k < 10; ++k)
-        if (is_summed<Q>(k)) found[k] = totals(rows[used++]);
+        if (is_summed<Q>(k)) summed[k] = totals(rows[used++]);
     for (int l = 0; l < held; ++l, out += width(Q)) {
-        const auto sum = [&](int k) { return number(found + k, l); };
+        const auto sum = [&](int k) { return number(summed + k, l); };
         const auto vector = [&](int k) -> Vec3<Real> { return {sum(k), sum(k + 1), sum(k + 2)}; };
         const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column + l);
         Real numbers[width(Q)];
@@ -203,9 +202,10 @@ inline void add_results(const Share& share, Real* out, int column, int held, Sim
     }
 }
 
-// Adds each pair of two tiles to the partial sums of its target; or each pair of two tiles, or of a tile with itself,
-// to the sums of both its ends. The loop is software pipelined, so that nothing waits for its inverse root: one vector
-// of sources has its separations computed, the one before its roots, and the one before that is summed.
+// Adds each pair of two tiles to the partial sums of its target, or, if BOTH, to the sums of both moments; the two
+// tiles may then be the same. The loop is software-pipelined to hide the latency of inverse roots. Each step computes
+// the separations of one vector of sources, the inverse roots of the vector before, and the sums of the vector before
+// that.
 template <Quantity Q, Kind K, bool BOTH>
 __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile& sources, Real* out) {
     struct Separation {
@@ -229,9 +229,9 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
     };
     const auto inverse = [&](const Target& t, Simd c, int v) -> Simd {
         if (K == Kind::BALLS) return twice_inverse_root(c);
-        auto wanted = c > 0;
-        if (K == Kind::ANY && Q != Quantity::FIELD) wanted &= t.label != sources.rows[LABEL][v];
-        return wanted ? twice_inverse_root(c) : 0;
+        auto active = c > 0;
+        if (K == Kind::ANY && Q != Quantity::FIELD) active &= t.label != sources.rows[LABEL][v];
+        return active ? twice_inverse_root(c) : 0;
     };
     Separation now, next;
     Simd inv;
@@ -242,7 +242,8 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
         Sums<Simd> sums;
         int v = 0;
         if (diagonal) {
-            // pairs with earlier vectors are summed already; those within a vector are summed for each end apart
+            // pairs with earlier vectors are already summed; pairs within a vector are summed for each moment
+            // separately
             v = i / LANES;
             const Separation s = separation(t, v);
             Simd others = inverse(t, s.c, v);
@@ -295,7 +296,7 @@ template <Quantity Q, bool BOTH> inline void sum_all_pairs(const Share& share, T
     else sum_pairs<Q, Kind::POINTS, BOTH>(share, a, b, out);
 }
 
-// Adds sums of pairs that were summed for both ends to the partial sums of a tile's moments.
+// Adds the sums h of a tile's moments to their partial sums.
 __attribute__((noinline)) inline void add_tile_sums(const Tile& tile, Real* out) {
     for (int i = 0; i < tile.count; i += WIDTH, out += 3 * WIDTH) {
         const auto h = [&](int c) { return warpmag::numbers((const Real*)tile.sums[c] + i); };
@@ -304,7 +305,7 @@ __attribute__((noinline)) inline void add_tile_sums(const Tile& tile, Real* out)
     }
 }
 
-// The targets of mirrored tiles that follow each other in the work list, and their partial sums.
+// Targets that consecutive mirrored tiles of the work list share, and their partial sums.
 struct TargetTile {
     Tile tile;
     Real* out = nullptr;
@@ -315,7 +316,7 @@ struct TargetTile {
     }
 };
 
-// Sums a tile for its targets, and the tile with sources and targets exchanged.
+// Sums a tile and its mirror image, with sources and targets exchanged.
 template <Quantity Q>
 inline void sum_mirrored(const Share& share, const TileEntry& entry, TargetTile& targets, Tile& tile) {
     const int begin = entry.column_begin, end = begin + entry.row_end - entry.row_begin;
@@ -332,7 +333,7 @@ inline void sum_mirrored(const Share& share, const TileEntry& entry, TargetTile&
     add_tile_sums(tile, mirror_out);
 }
 
-// Sums a tile for its targets, about equal parts of its sources at a time.
+// Sums a tile for its targets only, in nearly equal parts of its sources.
 template <Quantity Q>
 inline void sum_sources(const Share& share, const TileEntry& entry, TargetTile& targets, Tile& tile) {
     targets.finish();
@@ -374,7 +375,7 @@ template <Quantity Q> inline void sum_share(const Share& share) {
 // Sums all tiles of ``Arrays``, the struct of work_list.py.
 template <Quantity Q, class Arrays> inline void sum_tiles(const Arrays& arrays, int threads, Word* team) {
     const TileEntry* const tiles = (const TileEntry*)arrays.tiles.data;
-    const int* const shares = arrays.shares.data; // the tile that each begins with
+    const int* const shares = arrays.shares.data; // first tile of each share
     share_out(team, threads, (int)arrays.shares.shape[0] - 1, 1, [&](int s) {
         sum_share<Q>({arrays.targets, arrays.sources, arrays.effective, tiles + shares[s], tiles + shares[s + 1],
                       arrays.partial.data, (size_t)arrays.partial.shape[1]});

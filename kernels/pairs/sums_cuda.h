@@ -1,19 +1,19 @@
-// All-pairs sums of a work list of tiles on a GPU: field (Eq. 1) and force (Eqs. 4, 13 and 14). A block of warps holds
-// a tile of targets in registers, lane l of each warp the targets l, l + 32, ... The warps share out the tile's sources
-// and at the end add up their sums in order.
+// All-pairs sums of a work list of tiles on a GPU: field (Eq. 1) and force (Eqs. 4, 13 and 14). A block holds a tile of
+// targets in registers: lane l of each warp holds targets l, l + 32, ... The warps share the tile's sources, and their
+// sums are added up in order at the end.
 #pragma once
 #include "pairs/tiles_cuda.h"
 
 namespace warpmag {
 
-// One thread of the block that sums a tile. Shape of partial_out: [splits, target rows, width(Q)].
+// Sums a tile; called by each thread of a block. Shape of partial_out: [splits, target rows, width(Q)].
 template <Quantity Q, int TARGETS, int WARPS>
 CUDA_CALLABLE inline void sum_tile(int thread, const wp::array_t<int>& tiles, const wp::array_t<Real>& target_table,
                                    const wp::array_t<Real>& source_table, const wp::array_t<Real>& effective_table,
                                    const wp::array_t<Real>& partial_out) {
     constexpr bool FIELD = Q == Quantity::FIELD;
     constexpr int WIDTH = width(Q), UNROLLED = TARGETS < 4 ? 8 / TARGETS : 2;
-    // of each warp, for its sources, and at the end for its sums
+    // per warp: staged sources, at the end its sums
     __shared__ Quad staging[WARPS][TARGETS * WIDTH > 10 ? 8 * TARGETS * WIDTH : 80];
     const int lane = thread % 32, warp = thread / 32 % WARPS;
     const TileEntry& tile = ((const TileEntry*)tiles.data)[thread / (32 * WARPS)];
@@ -24,7 +24,7 @@ CUDA_CALLABLE inline void sum_tile(int thread, const wp::array_t<int>& tiles, co
     const Table target_rows(target_table), sources(source_table), effective_rows(effective_table);
     const bool same = sources.data == target_rows.data;
 
-    // targets beyond the last are the last again, and are not written
+    // lanes beyond the last target repeat it, and are not written
     const auto target_at = [&](int k) -> Target {
         const int column = column_begin + min(lane + 32 * k, count - 1);
         const Moment t = target_rows.moment(column);

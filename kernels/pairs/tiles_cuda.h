@@ -1,5 +1,5 @@
-// Common parts of all-pairs sums on a GPU: reading and staging moments, the inverse distance, the passage of a warp
-// over its sources, and sums over the warps of a block.
+// Common parts of all-pairs sums on a GPU: reading and staging moments, the inverse distance, the loop of a warp over
+// its sources, and sums over the warps of a block.
 #pragma once
 #include "pairs/pair_terms.h"
 
@@ -8,7 +8,7 @@ namespace warpmag {
 constexpr unsigned ALL_LANES = ~0u;
 constexpr int FAR = 1 << 30; // beyond all columns
 
-// 1/√c. The library's rsqrtf spends as many instructions on denormal numbers as the pair law has left.
+// 1/√c. The handling of denormals in the library's rsqrtf would take as many instructions as the rest of the pair law.
 CUDA_CALLABLE inline float inverse_root(float c) {
     float y;
     asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c));
@@ -31,7 +31,7 @@ struct Moment {
     Real label;
 };
 
-// Rows of a table, of which the native code reads columns.
+// Table with a column for each moment.
 struct Table {
     const Real* data;
     size_t stride;
@@ -44,13 +44,13 @@ struct Table {
         return {(*this)(row, column), (*this)(row + 1, column), (*this)(row + 2, column)};
     }
 
-    // A packed moment; with the others' place, radius and label, but no moment, unless it is wanted.
-    CUDA_CALLABLE Moment moment(int column, bool wanted = true) const {
-        return {vector(0, column), (*this)(3, column), wanted ? vector(4, column) : Vec3<Real>{}, (*this)(7, column)};
+    // Packed moment of a column; with a zero moment if not ``loaded``.
+    CUDA_CALLABLE Moment moment(int column, bool loaded = true) const {
+        return {vector(0, column), (*this)(3, column), loaded ? vector(4, column) : Vec3<Real>{}, (*this)(7, column)};
     }
 };
 
-// Numbers that are read at once.
+// Numbers that one instruction loads.
 struct alignas(16) Quad {
     Real x, y, z, w;
 };
@@ -59,31 +59,31 @@ struct alignas(2 * sizeof(Real)) Pair {
     Real x, y;
 };
 
-// A target of a lane, and for a force its effective moment.
+// Target of a lane; e is its effective moment, for a force.
 struct Target {
     Vec3<Real> x;
     Real radius, label;
     Vec3<Real> e;
 };
 
-// The targets of a lane, and their sums.
+// Targets of a lane, and their sums.
 template <Quantity Q, int TARGETS> struct LaneTargets {
     Target targets[TARGETS];
     Sums<Real> sums[TARGETS];
     Real clamp[TARGETS];
 
-    // Takes the squared contact distances with sources of one radius, for add.
+    // Sets the squared contact distances with sources of one radius, for add.
     CUDA_CALLABLE void clamp_for(Real radius) {
 #pragma unroll
         for (int k = 0; k < TARGETS; ++k) clamp[k] = (targets[k].radius + radius) * (targets[k].radius + radius);
     }
 
-    // Adds a source that is masked for none of the targets.
+    // Adds a source without masking.
     CUDA_CALLABLE void add(const Source<Real>& source) {
         add(source, [&](int k, Real d2) { return inverse_root(max(d2, clamp[k])); });
     }
 
-    // Adds a source of any radius, unless masked(k) for the k-th target.
+    // Adds a source of any radius; masked(k) leaves out the k-th target.
     template <class Masked> CUDA_CALLABLE void add_masked(const Source<Real>& source, Real radius, Masked masked) {
         add(source, [&](int k, Real d2) { return masked_inverse(d2, targets[k].radius + radius, masked(k)); });
     }
@@ -97,7 +97,8 @@ template <Quantity Q, int TARGETS> struct LaneTargets {
     }
 };
 
-// Lowest and highest label among the targets of some lanes; a source of another label is of no target's body.
+// Lowest and highest label of the targets of several lanes. A source whose label is outside belongs to no target's
+// body.
 struct LabelRange {
     Real lowest, highest;
 
@@ -119,15 +120,15 @@ struct LabelRange {
     CUDA_CALLABLE bool excludes(Real label) const { return label < lowest || label > highest; }
 };
 
-// Adds the sources `begin` to `end` to the sums of a warp's targets; lanes that are a multiple of LANES apart hold the
-// same. The sources are staged in shared memory, 32 at a time; 32 / LANES groups of lanes share them out, and a lane
-// takes UNROLLED of them in a step.
+// Adds the sources `begin` to `end` to the sums of a warp's targets. Lanes that are a multiple of LANES apart hold the
+// same targets. Sources are staged in shared memory, 32 at a time. 32 / LANES groups of lanes share a stage, and a lane
+// takes UNROLLED sources in a step.
 //
-// A source is masked for targets of its label, or for the field if it is the target itself; own_count targets are
-// sources, from column own_begin on. Where the sources of a step have the given radius, and none of them is masked, the
-// clamp is a constant of the target: 20 instructions a pair for the field and 31 for the force, next to the four or so
-// that a source takes once for all targets of a lane, and the sixty that a warp takes to stage 32. A LONG sum takes the
-// radius from each stage, decides for the whole stage, and is by parts, so that it keeps its digits.
+// A force masks sources of the target's label, a field masks the target itself: own_count targets are sources, from
+// column own_begin on. A step is plain if its sources all have the given radius and none is masked. Then the clamp is a
+// constant of the target, and a pair takes 20 instructions for the field and 31 for the force. In addition a source
+// takes about four for all targets of a lane, and the staging of 32 sources about sixty. A LONG sum takes the radius
+// from each stage, decides for the whole stage, and adds up parts, so that it keeps its digits.
 template <int LANES, int UNROLLED, bool LONG, Quantity Q, int HELD, class TargetAt, class Sources>
 CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt target_at, const Sources& sources, int begin,
                                       int end, Real radius, int own_begin, unsigned own_count, int lane, Quad* staged) {
@@ -136,7 +137,7 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt targe
     constexpr int GROUPS = 32 / LANES, STRIDE = GROUPS * UNROLLED, STAGES_PER_PART = 16;
     constexpr int RUN = LONG ? 32 : STRIDE;
     constexpr unsigned RUN_MASK = RUN < 32 ? (1u << RUN) - 1 : ~0u;
-    // packed rows may be read beyond the last moment, whose place a LONG sum repeats so that its radius does not differ
+    // rows may be read beyond the last moment; a LONG sum repeats the last one so that the radius stays the same
     const auto load = [&](int j) { return sources.moment(LONG ? min(j, end - 1) : j, j < end); };
     const auto source_at = [&](int i) -> Source<Real> {
         const Quad a = staged[i], b = staged[i + 32];
@@ -194,7 +195,7 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt targe
     for (int k = 0; k < HELD && LONG; ++k) held.sums[k] += long_sums[k];
 }
 
-// Adds up what the warps of a block left in shared memory, in their order; store(item, total) is called for each item.
+// Adds up the sums of a block's warps in shared memory, in order, and calls store(item, total) for each item.
 template <int WARPS, int QUADS, class Store>
 CUDA_CALLABLE inline void sum_warps(const Quad (&staging)[WARPS][QUADS], int thread, int items, Store store) {
     for (int item = thread; item < items; item += 32 * WARPS) {

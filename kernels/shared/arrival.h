@@ -1,11 +1,11 @@
-// Work that a GPU's blocks leave to the last of them.
+// Work of the last block of a GPU's launch.
 #pragma once
 
 namespace warpmag {
 
 #if defined(__CUDA_ARCH__)
-// Whether this block is the last of ``count`` that come here, which can read what they have all written. The number of
-// those that have come, zero before the first, is zero again after the last.
+// Returns whether this block is the last of ``count`` blocks to call this function. The last block may read what all
+// blocks wrote. ``arrived`` counts the calls: zero before the first and after the last.
 CUDA_CALLABLE inline bool is_last_of(int* arrived, int count) {
     __shared__ bool last;
     __syncthreads();

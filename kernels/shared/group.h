@@ -1,5 +1,5 @@
-// Groups of threads of a GPU that share a ball: ``GROUP`` of them (from Python, a power of two). On a CPU a thread has
-// a vector of balls for itself.
+// Groups of ``GROUP`` threads of a GPU that share a ball (from Python, a power of two). On a CPU a thread has a vector
+// of balls for itself.
 #pragma once
 #include "shared/vectors.h"
 
@@ -7,26 +7,26 @@ namespace warpmag {
 
 #if defined(__CUDA_ARCH__)
 constexpr int SHARES = GROUP;
-// Number of this thread in its group.
+// Index of this thread in its group.
 CUDA_CALLABLE inline int share() { return threadIdx.x % GROUP; }
-// The threads of its group among those of the warp.
+// Mask of the group's threads in the warp.
 CUDA_CALLABLE inline unsigned group_mask() { return (~0u >> (32 - GROUP)) << (threadIdx.x % 32 / GROUP * GROUP); }
 // Sum over the threads of a group; all threads of the warp take part.
 CUDA_CALLABLE inline Number group_total(Number part) {
     for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(~0u, part, other);
     return part;
 }
-// The same, of a group whose warp may have diverged.
+// Sum over the threads of a group whose warp may have diverged.
 CUDA_CALLABLE inline Number group_sum(Number part) {
     for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(group_mask(), part, other);
     return part;
 }
-// The largest count of a warp's balls.
+// Largest count among a warp's balls.
 CUDA_CALLABLE inline int most(const int* counts) {
     int largest = *counts;
     for (int other = GROUP; other < 32; other *= 2) {
-        const int its = __shfl_xor_sync(~0u, largest, other);
-        largest = its > largest ? its : largest;
+        const int count = __shfl_xor_sync(~0u, largest, other);
+        largest = count > largest ? count : largest;
     }
     return largest;
 }
@@ -35,7 +35,7 @@ constexpr int SHARES = 1;
 inline constexpr int share() { return 0; }
 inline Number group_total(Number part) { return part; }
 inline Number group_sum(Number part) { return part; }
-// The largest count of a vector's balls.
+// Largest count among a vector's balls.
 inline int most(const int* counts) {
     int largest = 0;
     for (int l = 0; l < WIDTH; ++l) largest = counts[l] > largest ? counts[l] : largest;

@@ -1,15 +1,15 @@
-// Numbers of several balls at a time: on a CPU vectors as wide as the machine's registers, on a GPU one number a
-// thread. A pass written with these runs on both.
+// Numbers of several balls at a time, so that one source serves both devices: on a CPU vectors of 64 bytes, on a GPU
+// one number per thread.
 //
-// ``Number``, ``Index`` and ``Mask`` hold a Real, an int and a truth value for each of ``WIDTH`` balls, ``Four`` four
-// numbers of each ball's cache line. On a GPU ``GROUP`` threads (from Python, a power of two) share a ball. Arrays of
-// passes have ``CHUNK`` balls along their last axis, so that what a vector of balls needs follows in memory.
+// ``Number``, ``Index`` and ``Mask`` hold a Real, an int and a truth value for each of ``WIDTH`` balls. ``Four`` holds
+// four numbers of each ball's cache line. On a GPU ``GROUP`` threads (from Python, a power of two) share a ball. Arrays
+// have ``CHUNK`` balls along their last axis, so that a vector of balls is contiguous in memory.
 #pragma once
 
 namespace warpmag {
 
-constexpr int CHUNK = 16,
-              LINE = 16; // balls side by side in an array, and numbers of a ball's cache line; as in passes.py
+constexpr int CHUNK = 16; // balls side by side in an array; as in native.py
+constexpr int LINE = 16;  // numbers in a ball's cache line; as in native.py
 
 #if defined(__CUDA_ARCH__)
 constexpr int WIDTH = 1;
@@ -20,7 +20,7 @@ struct alignas(4 * sizeof(Real)) Four {
     Number x, y, z, w;
 };
 
-// Sets what other threads may set at the same time.
+// Sets a flag that other threads may set at the same time.
 CUDA_CALLABLE inline void raise_flag(int& flag) { flag = 1; }
 CUDA_CALLABLE inline bool any(Mask mask) { return mask; }
 CUDA_CALLABLE inline Number root(Number x) { return sqrt(x); }
@@ -62,8 +62,9 @@ inline void raise_flag(int& flag) { __atomic_store_n(&flag, 1, __ATOMIC_RELAXED)
 inline bool any(Mask mask) { return __builtin_reduce_or(mask) != 0; }
 inline Number root(Number x) { return __builtin_elementwise_sqrt(x); }
 inline Number logarithm(Number x) {
-    if constexpr (sizeof(Real) == 8) return __builtin_elementwise_log(x); // one by one
-    // x = 2ⁿ m, m between √½ and √2, of which the series in s = (m − 1)/(m + 1) is good to float32
+    if constexpr (sizeof(Real) == 8) return __builtin_elementwise_log(x);
+    // x = 2ⁿ m with m between √½ and √2: log x = n log 2 + 2 artanh s, s = (m − 1)/(m + 1). The series of artanh is
+    // good to float32.
     Index bits;
     __builtin_memcpy(&bits, &x, sizeof(bits));
     const Index n = (bits - 0x3f3504f3) >> 23;
@@ -74,14 +75,14 @@ inline Number logarithm(Number x) {
     const Number series = 1 + z * (Real(1.0 / 3) + z * (Real(1.0 / 5) + z * (Real(1.0 / 7) + z * Real(1.0 / 9))));
     return __builtin_convertvector(n, Number) * Real(0.693147180559945) + 2 * s * series;
 }
-// Angle of the point (x, y) from the x-axis.
+// Angle between the x-axis and the point (x, y).
 inline Number angle(Number y, Number x) {
     Number turned;
-    if constexpr (sizeof(Real) == 8) { // one by one
+    if constexpr (sizeof(Real) == 8) {
         for (int l = 0; l < WIDTH; ++l) turned[l] = atan2(y[l], x[l]);
         return turned;
     }
-    // of the smaller part t of the larger, 2 atan(t / (1 + √(1 + t²))), of which the series is good to float32
+    // t = smaller/larger coordinate; atan t = 2 atan s with s = t / (1 + √(1 + t²)), whose series is good to float32
     const Number a = __builtin_elementwise_abs(x), b = __builtin_elementwise_abs(y);
     const Number large = __builtin_elementwise_max(a, b), small = __builtin_elementwise_min(a, b);
     const Number t = small / (large > 0 ? large : Number(Real(1))), s = t / (1 + root(1 + t * t)), z = s * s;
@@ -124,7 +125,7 @@ template <class Places> inline Number collect(const Real* row, Places j) {
     return n;
 #endif
 }
-// of scalars, as of vectors
+// The same functions for scalars.
 inline bool any(bool mask) { return mask; }
 inline bool mask_of(bool condition) { return condition; }
 inline bool mask_of(int condition) { return condition; }
@@ -136,13 +137,13 @@ template <class Lanes> inline auto lane_of(Lanes x, int l) { return x[l]; }
 template <class T, T... L> struct Sequence {};
 typedef __make_integer_seq<Sequence, int, WIDTH> AllLanes;
 
-// In each group of four lanes, those of two vectors by a pattern, the second's counted from four on.
+// Picks lanes A, B, C, D in each group of four lanes of two vectors; the second vector's lanes count from four.
 template <int A, int B, int C, int D, int... L> inline Number by_fours(Number a, Number b, Sequence<int, L...>) {
     constexpr int pattern[4] = {A, B, C, D};
     return __builtin_shufflevector(a, b, (L / 4 * 4 + pattern[L % 4] % 4 + WIDTH * (pattern[L % 4] > 3))...);
 }
 
-// Rows and columns of each group of four lanes exchanged.
+// Transposes each group of four lanes of four vectors.
 inline Four transposed(Number a, Number b, Number c, Number d) {
     const AllLanes all;
     const Number ab = by_fours<0, 4, 1, 5>(a, b, all), cd = by_fours<0, 4, 1, 5>(c, d, all);
@@ -155,7 +156,7 @@ template <class Half, int... L> inline auto joined(Half a, Half b, Sequence<int,
     return __builtin_shufflevector(a, b, L...);
 }
 
-// Four numbers of each ball, found at place(lane), as vectors.
+// Loads four numbers of each ball from place(lane), transposed into vectors.
 template <class Place> inline Four fours(Place place) {
     typedef __make_integer_seq<Sequence, int, 8> Eight;
     auto part = [=](int l) -> Quarter {
@@ -188,7 +189,7 @@ inline void put_four(Real* lines, int quarter, int i, Four f) {
 }
 #endif
 
-// Where the rows of an array stand for ball i, or for one of its slots, each CHUNK numbers from the last.
+// Address of the rows of ball i in an array, or of the rows of its slot s. Rows are CHUNK numbers apart.
 CUDA_CALLABLE inline Real* rows_at(Real* array, int rows, int i) {
     return array + (unsigned)i / CHUNK * (rows * CHUNK) + (unsigned)i % CHUNK;
 }

@@ -1,4 +1,4 @@
-// Threads of a CPU that share the work of one launch; team.py says how they live.
+// Threads of a CPU that share the work of a launch; team.py describes the team.
 #pragma once
 
 #if !defined(__CUDA_ARCH__)
@@ -22,7 +22,8 @@ namespace warpmag {
 typedef unsigned long long Word;
 
 constexpr int MOST_THREADS = 64; // as in team.py
-constexpr int PATIENCE = 4000; // looks for work before a member sleeps, about 1 ms; others may have its core meanwhile
+// Polls before a member sleeps, about 1 ms. It yields its core between polls.
+constexpr int PATIENCE = 4000;
 
 enum State : Word { GONE, WAITING, ASLEEP, CLAIMED, POSTED, WORKING }; // GONE and ASLEEP as in team.py
 
@@ -32,7 +33,7 @@ struct Member {
     void* job;
     Word number;
     Word padding[4];
-    Word lock[8], wake[8]; // room for a mutex and for a condition variable
+    Word lock[8], wake[8]; // storage of a mutex and of a condition variable
 };
 
 inline bool change(Member* member, Word from, Word to) {
@@ -54,7 +55,7 @@ inline void start_members(int, Word*) {}
 
 template <class Work> void run_together(Word*, int, Work& work) { work(0); }
 #else
-// What a member does for as long as the process lives.
+// Main function of a member's thread: runs posted jobs until the process ends.
 inline void* serve(void* argument) {
     Member* const member = (Member*)argument;
     for (int idle = 0;; ++idle) {
@@ -87,8 +88,8 @@ inline void start_members(int count, Word* team) {
     }
 }
 
-// Calls work(number) on up to ``threads`` threads, number 0 being the caller, and returns when all of those that began
-// have returned; one that cannot be had, or is late, leaves its part to the others.
+// Calls work(number) on up to ``threads`` threads; the caller is number 0. Returns when all calls that began have
+// returned. A thread that is busy or late does not take part: the others do its work.
 template <class Work> void run_together(Word* team, int threads, Work& work) {
     Member* claimed[MOST_THREADS];
     int count = 0;
@@ -108,13 +109,13 @@ template <class Work> void run_together(Word* team, int threads, Work& work) {
         pthread_cond_signal(member->wake);
     }
     work(0);
-    // to sleep until a thread has ended would take longer than to wait for its state to change
+    // polling a member's state is faster than sleeping until it ends
     for (int t = 0; t < count; ++t)
         while (!change(claimed[t], POSTED, WAITING) && state_of(claimed[t]) == WORKING) sched_yield();
 }
 #endif
 
-// Calls visit(i) for each of ``count`` items, by threads that take ``share`` of them at a time.
+// Calls visit(i) for each of ``count`` items. Threads take ``share`` items at a time.
 template <class Visit> void share_out(Word* team, int threads, int count, int share, Visit visit) {
     int next = 0;
     auto work = [&](int) {
@@ -127,9 +128,9 @@ template <class Visit> void share_out(Word* team, int threads, int count, int sh
     run_together(team, threads, work);
 }
 
-// Calls make_pass(pass, i) for passes ``first`` to ``last`` and the vectors of ``width`` items that begin at item i, of
-// items(pass), by threads that take chunks of items and go on to the next pass when one is done.
 constexpr int MOST_PASSES = 16;
+// Makes passes ``first`` to ``last`` − 1, one after the other. A pass has items(pass) items; make_pass(pass, i) handles
+// ``width`` of them from item i on. Threads take chunks of items and wait at the end of each pass.
 template <class Items, class MakePass>
 void run_passes(Word* team, int threads, int first, int last, Items items, int width, MakePass make_pass) {
     const int taken_at_once = 4 * width;
@@ -139,7 +140,8 @@ void run_passes(Word* team, int threads, int first, int last, Items items, int w
         const int end = begin + taken_at_once < count ? begin + taken_at_once : count;
         for (int i = begin; i < end; i += width) make_pass(pass, i);
     };
-    // the caller takes chunks from the first on, others from the last: each finds its own in its cache next time
+    // the caller takes chunks from the first on, the others from the last on, so that a thread finds its data in its
+    // cache
     int taken[MOST_PASSES] = {}, ahead[MOST_PASSES] = {}, behind[MOST_PASSES] = {}, done[MOST_PASSES] = {};
     auto work = [&](int member) {
         for (int pass = first; pass < last; ++pass) {
@@ -155,7 +157,7 @@ void run_passes(Word* team, int threads, int first, int last, Items items, int w
     run_together(team, threads, work);
 }
 
-// The same for passes over ``count`` items each.
+// The same, for passes that all have ``count`` items.
 template <class MakePass>
 void run_passes(Word* team, int threads, int first, int last, int count, int width, MakePass make_pass) {
     run_passes(team, threads, first, last, [=](int) { return count; }, width, make_pass);

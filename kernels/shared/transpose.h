@@ -1,10 +1,10 @@
-// Rows and columns of a square of numbers exchanged, in vectors of a CPU.
+// Transposition of a square of numbers in vectors of a CPU.
 #pragma once
 #include "shared/lanes.h"
 
 namespace warpmag {
 
-// By blocks of STEP and more; ``lanes`` counts those of a vector.
+// Exchanges blocks of STEP lanes and more. ``lanes`` is the sequence 0, 1, ... of a vector's lanes.
 template <int STEP, class Simd, int LANES, int... L>
 inline void transpose(Simd (&rows)[LANES], Sequence<int, L...> lanes) {
     if constexpr (STEP < LANES) {

@@ -1,29 +1,34 @@
-// Three-vectors and symmetric tensors of several balls at a time, and how arrays of vectors are read and written.
+// Three-vectors and symmetric tensors, of one ball or of several at a time, and access to arrays of vectors.
 #pragma once
 #include "shared/lanes.h"
 
 namespace warpmag {
 
-struct Vector {
-    Number x, y, z;
+// Vector of numbers N: scalars, or vectors of several balls' numbers.
+template <class N> struct Vec3 {
+    N x, y, z;
+
+    friend CUDA_CALLABLE Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+    friend CUDA_CALLABLE Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+    friend CUDA_CALLABLE Vec3 operator-(Vec3 a) { return {-a.x, -a.y, -a.z}; }
+    friend CUDA_CALLABLE Vec3 operator*(N k, Vec3 a) { return {k * a.x, k * a.y, k * a.z}; }
+    friend CUDA_CALLABLE Vec3& operator+=(Vec3& a, Vec3 b) { return a = a + b; }
+    friend CUDA_CALLABLE Vec3& operator-=(Vec3& a, Vec3 b) { return a = a - b; }
+    friend CUDA_CALLABLE N dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+    friend CUDA_CALLABLE Vec3 cross(Vec3 a, Vec3 b) {
+        return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+    }
 };
-struct Traceless { // symmetric tensor with zz = −xx − yy
+typedef Vec3<Number> Vector;
+
+// Symmetric tensors; zz of a traceless tensor is −xx − yy.
+struct Traceless {
     Number xx, yy, xy, yz, zx;
 };
 struct Symmetric {
     Number xx, yy, zz, xy, yz, zx;
 };
 
-CUDA_CALLABLE inline Number dot(Vector a, Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-CUDA_CALLABLE inline Vector operator+(Vector a, Vector b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-CUDA_CALLABLE inline Vector operator-(Vector a, Vector b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-CUDA_CALLABLE inline Vector operator-(Vector a) { return {-a.x, -a.y, -a.z}; }
-CUDA_CALLABLE inline Vector operator*(Number k, Vector a) { return {k * a.x, k * a.y, k * a.z}; }
-CUDA_CALLABLE inline Vector& operator+=(Vector& a, Vector b) { return a = a + b; }
-CUDA_CALLABLE inline Vector& operator-=(Vector& a, Vector b) { return a = a - b; }
-CUDA_CALLABLE inline Vector cross(Vector a, Vector b) {
-    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
 CUDA_CALLABLE inline Number length(Vector a) { return root(dot(a, a)); }
 CUDA_CALLABLE inline Vector operator*(Traceless t, Vector a) {
     return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
@@ -33,13 +38,14 @@ CUDA_CALLABLE inline Vector operator*(const Symmetric& t, Vector a) {
     return {t.xx * a.x + t.xy * a.y + t.zx * a.z, t.xy * a.x + t.yy * a.y + t.yz * a.z,
             t.zx * a.x + t.yz * a.y + t.zz * a.z};
 }
-CUDA_CALLABLE inline void add_where(Mask wanted, Vector& to, Vector a) {
-    to.x += wanted ? a.x : 0;
-    to.y += wanted ? a.y : 0;
-    to.z += wanted ? a.z : 0;
+// Adds a to ``total`` in active lanes.
+CUDA_CALLABLE inline void add_where(Mask active, Vector& total, Vector a) {
+    total.x += active ? a.x : 0;
+    total.y += active ? a.y : 0;
+    total.z += active ? a.z : 0;
 }
 
-// Vectors of balls whose components are rows of CHUNK.
+// Loads and stores vectors whose components are rows, CHUNK numbers apart.
 CUDA_CALLABLE inline Vector own_vector(const Real* rows) {
     return {numbers(rows), numbers(rows + CHUNK), numbers(rows + 2 * CHUNK)};
 }
@@ -49,11 +55,11 @@ CUDA_CALLABLE inline void put_vector(Real* rows, Vector v) {
     put(rows + 2 * CHUNK, v.z);
 }
 
-// Arrays of the public buffers have a vector (x, y, z) or a number for each moment. What a pass needs of the last
-// moments of a world, where a vector has more lanes than moments are left, is found lane by lane: ``held`` are there.
+// Loads and stores of public buffers, with a number or a vector (x, y, z) for each moment. At the end of a world fewer
+// moments are left than a vector has lanes: only the first ``held`` lanes are read and written, lane by lane.
 #if defined(__CUDA_ARCH__)
-CUDA_CALLABLE inline Number some(const Real* row, int held, Real other) { return held > 0 ? *row : other; }
-CUDA_CALLABLE inline void put_some(Real* row, int held, Number n) {
+CUDA_CALLABLE inline Number numbers_or(const Real* row, int held, Real other) { return held > 0 ? *row : other; }
+CUDA_CALLABLE inline void put_first(Real* row, int held, Number n) {
     if (held > 0) *row = n;
 }
 CUDA_CALLABLE inline Vector vectors(const Real* rows, int held) {
@@ -63,25 +69,25 @@ CUDA_CALLABLE inline void put_vectors(Real* rows, int held, Vector v) {
     if (held > 0) rows[0] = v.x, rows[1] = v.y, rows[2] = v.z;
 }
 #else
-inline Number some(const Real* row, int held, Real other) {
+inline Number numbers_or(const Real* row, int held, Real other) {
     Number n = other;
     if (held >= WIDTH) __builtin_memcpy(&n, row, sizeof(n));
     else
         for (int l = 0; l < held; ++l) n[l] = row[l];
     return n;
 }
-inline void put_some(Real* row, int held, Number n) {
+inline void put_first(Real* row, int held, Number n) {
     if (held >= WIDTH) __builtin_memcpy(row, &n, sizeof(n));
     else
         for (int l = 0; l < held; ++l) row[l] = n[l];
 }
 
-// Component C of vectors that follow each other in (a, b, c).
+// Component C of the vectors that are interleaved in (a, b, c).
 template <int C, int... L> inline Number component(Number a, Number b, Number c, Sequence<int, L...>) {
     const Number low = __builtin_shufflevector(a, b, (3 * L + C < 2 * WIDTH ? 3 * L + C : 0)...);
     return __builtin_shufflevector(low, c, (3 * L + C < 2 * WIDTH ? L : 3 * L + C - WIDTH)...);
 }
-// Part N of three of the numbers of vectors, one vector after the other.
+// Part N of three of the interleaved components of vectors.
 template <int N, int... L> inline Number interleaved(Vector v, Sequence<int, L...>) {
     constexpr int F = N * WIDTH;
     const Number low = __builtin_shufflevector(v.x, v.y,
