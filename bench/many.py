@@ -21,7 +21,7 @@ from bench.report import machine_of, read
 from bench.timing import measure
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments.fmm import FastSums
 from warpmag.moments.ranks import current_ranks
 

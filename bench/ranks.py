@@ -13,7 +13,7 @@ import warp as wp
 from bench.machine import line_writer
 from bench.many import Moments, lattice, repetitions
 from bench.timing import measure
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments.arrays import resolve_device
 from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, without_ranks
 

@@ -1,10 +1,20 @@
-"""Warp kernels of warpmag, in rooms by physical stage, each of which imports only rooms before it.
+"""Warp kernels of warpmag, in rooms by physical stage. Each room imports only the rooms before it.
 
-``shared``: what all use. ``material``: magnetization curves. ``pairs``: fields and forces of moments. ``induction``:
-their equilibrium. ``near_contact``: what dipoles lack between balls that nearly touch. ``rigid``: bodies and steps.
+| room | content |
+|---|---|
+| shared | native code, threads of a CPU, vectors, reductions |
+| material | magnetization curves |
+| pairs | fields and forces of moments, summed over all pairs |
+| fmm | the fast multipole method |
+| applied | fields of coils, field maps and permanent bodies |
+| cells | corrections between the cells of one body |
+| eddy | eddy currents |
+| induction | equilibrium of inducible moments |
+| near_contact | corrections between balls that nearly touch |
+| rigid, contacts | magnets on rigid bodies, contacts and joints |
 
-The folder ``kernels/`` of the checkout is the package ``warpmag.kernels``. Imported under another name its modules
-would be compiled, and their functions registered with Warp, a second time.
+The folder ``kernels/`` of the checkout is the package ``warpmag.kernels``. Under another name its modules would be
+compiled and registered with Warp a second time.
 """
 
 if __name__ != "warpmag.kernels":

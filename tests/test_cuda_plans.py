@@ -25,7 +25,7 @@ from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
 from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+from warpmag.kernels.pairs.pair_law import WIDTHS, Quantity
 from warpmag.moments import fmm, system
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.system import MomentSystem

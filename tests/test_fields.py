@@ -11,7 +11,7 @@ from bench.reference import oracle
 from warpmag.kernels.pairs import fused_cuda, mirror_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared import team
 
 # Sums of n terms in float32 carry about √n·2⁻²⁴ ≈ 2.7e-6·√(n/2000) in the worst case and 3e-7 in lanes; issue: 1e-6.

@@ -11,7 +11,7 @@ import warpmag
 from bench.systems import moment_system
 from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments import fmm, pair_sums
 from warpmag.moments.arrays import resolve_dtype, vec3_type
 

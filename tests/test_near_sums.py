@@ -8,7 +8,7 @@ import warp as wp
 
 from bench.reference import oracle
 from warpmag.kernels.fmm.near import launch_near_sums
-from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+from warpmag.kernels.pairs.pair_law import WIDTHS, Quantity
 
 PITCH = 128
 

@@ -12,7 +12,7 @@ from warpmag.declarations import magnets
 from warpmag.errors import InputError
 from warpmag.kernels.pairs import evaluate
 from warpmag.kernels.pairs.neighbors import CAPACITY
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared import team
 
 MS = 1.7e6

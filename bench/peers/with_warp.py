@@ -7,7 +7,7 @@ from bench.cases import RADIUS
 from bench.peers import Evaluation, evaluation_of
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments import fields
 
 TILE = wp.constant(64)

@@ -44,7 +44,7 @@ CUDA_CALLABLE inline Vector rate_of_body(const All& all, const Body& body, const
         return {of[0], of[pitch], of[2 * pitch]};
     };
     const Real* const own = all.motion.data + i;
-    const Vector v = {some(own, held, 0), some(own + pitch, held, 0), some(own + 2 * pitch, held, 0)};
+    const Vector v = {numbers_or(own, held, 0), numbers_or(own + pitch, held, 0), numbers_or(own + 2 * pitch, held, 0)};
     const Vector w = spread(three_of(3)), r = x - spread(center_of(all, body));
     const Vector u = v - spread(three_of(0)) - cross(w, r);
     return u.x * seen.x + u.y * seen.y + u.z * seen.z + cross(w, seen.h);

@@ -16,7 +16,7 @@ from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.fmm.sharing import share_boxes
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PITCH
-from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+from warpmag.kernels.pairs.pair_law import WIDTHS, Quantity
 
 _SAMPLED = 256
 """Moments at which the error of the field is measured."""

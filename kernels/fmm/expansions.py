@@ -12,7 +12,7 @@ import warp as wp
 
 from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.fmm.translate import Translation, pitch
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.team import team, threads_for
 

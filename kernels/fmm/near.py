@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.work_list import tile_size
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
 from warpmag.kernels.shared.team import team, threads_for

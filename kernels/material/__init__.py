@@ -1,4 +1,4 @@
-"""Magnetization curves M = f(H) (Kim and Han 2022, Eqs. 7, 10) and the materials of moments.
+"""Magnetization curves M = f(H) (Kim and Han 2022, Eqs. 7, 10).
 
 May import ``shared``.
 """

@@ -9,25 +9,26 @@ With the reduced field s = k‖H‖/Ms every curve reads ‖M‖ = Ms c(s), c(0)
 | clamped | min(s, 1) | Eq. 7 |
 | frohlich | s/(1 + s) | Fröhlich 1881, Kennelly 1891 |
 
-k = 3χ/(3+χ) is the initial slope of a ball of susceptibility χ. ``curves.h`` has the functions. Kernels that call them
-from here, for float32 or float64, take ``native_options("material/curves.h", dtype=dtype)``. Besides there is c = s,
-with no token: the response of a permanent magnet.
+k = 3χ/(3+χ) is the initial slope of a ball of susceptibility χ. ``curves.h`` has the functions. Kernels that call the
+Warp functions of this module, for float32 or float64, take ``native_options("material/curves.h", dtype=dtype)``. The
+curve c = s has no token; it is the response of a permanent magnet.
 
-**Measured curves.** A table says how M grows with the field H' inside the material. With y = k H'/Ms and c = M/Ms, a
-ball feels s = y + (k/3) c. c is cubic in y between two knots, t in [0, 1] from one to the next,
+**Measured curves.** A table gives M as a function of the field H' inside the material. With y = k H'/Ms and c = M/Ms,
+the reduced field at a ball is s = y + (k/3) c. Between two knots c is cubic in y,
 
-    c = c_i + t (c1 + t (c2 + t c3)),    y = y_i + t span,
+    c = c_i + t (c1 + t (c2 + t c3)),    y = y_i + t span,    t in [0, 1].
 
-and beyond the last it saturates as c = 1 − a/z does, z further by a constant than y, with the same slope at the knot
-(the law of approach to saturation, R. M. Bozorth, Ferromagnetism, 1951). k belongs to the largest susceptibility of the
-table, so that no slope c' exceeds 1: the iteration converges as for other curves. ``tables.h`` solves for t. Rows are
+Beyond the last knot c = 1 − a/z, where z is y plus a constant, with a continuous slope (law of approach to saturation,
+R. M. Bozorth, Ferromagnetism, 1951). k belongs to the largest susceptibility of the table. So no slope c' exceeds 1,
+and the iteration converges as for other curves. ``tables.h`` solves for t. The rows of a table are
 
 | column | 0 | 1 | 2 | 3 to 5 | 6 | 7 |
 |---|---|---|---|---|---|---|
 | of a piece | s_i | c_i | span | c1, c2, c3 | ∫c dy from 0 to y_i | k/3 |
 | of the last knot | s_n | c_n | 0 | z_n, a, 0 | ∫c dy from 0 to y_n | k/3 |
 
-padded, for a search in as many steps for all, with rows that no field reaches; the number of rows stands before them.
+Rows that no field reaches pad all tables to one length, so that every search takes the same number of steps. The first
+row of all holds that length.
 """
 
 from dataclasses import dataclass
@@ -37,12 +38,12 @@ import numpy as np
 import warp as wp
 
 MIXED, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR, FIRST_TABLE = range(-1, 6)
-"""Numbers of the curves; as in ``curves.h`` and ``tables.h``."""
+"""Ids of the curves; as in ``curves.h`` and ``tables.h``."""
 CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED, "frohlich": FROHLICH}
-"""Numbers of those with a token."""
+"""Ids of the curves with a token."""
 _COLUMNS = 8
 _BEYOND = 1e30
-"""Reduced field and magnetization that none reaches."""
+"""Reduced field and magnetization that are never reached."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,9 @@ class CurveParameters:
         inducible: 1 for inducible moments, 0 for permanent ones, shape [n].
         saturation: Saturation magnetization Ms [A/m], shape [n].
         slope: Slope k = 3χ/(3+χ) [dimensionless], the largest of the curve, shape [n].
-        curve: Curve id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` and up for those of ``tables``, shape [n].
-        common_curve: The id that all inducible moments have in common, or ``MIXED``.
-        tables: Measured curves, as :func:`curve_tables` makes them.
+        curve: Curve id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` + i for measured curve i of ``tables``, shape [n].
+        common_curve: Common curve id of all inducible moments, or ``MIXED``.
+        tables: Measured curves (:func:`curve_tables`).
     """
 
     inducible: wp.array
@@ -70,19 +71,19 @@ def curve_tables(measured, dtype, device) -> wp.array:
     """Return the rows of measured curves for the kernels, shape [rows, 8].
 
     Args:
-        measured: Curves as :class:`warpmag.declarations.curves.MagnetizationCurve` has them: knots ``fields`` and
+        measured: Curves, :class:`warpmag.declarations.curves.MagnetizationCurve`: knots ``fields`` and
             ``magnetizations`` [A/m], ``slopes`` dM/dH at them, ``saturation`` [A/m] and the largest ``susceptibility``.
         dtype: Warp scalar type.
         device: Warp device.
     """
-    longest = max((len(one.fields) for one in measured), default=1)
+    longest = max((len(curve.fields) for curve in measured), default=1)
     size = 1 << (longest - 1).bit_length()
     rows = np.zeros((1 + size * len(measured), _COLUMNS))
     rows[0] = size
     rows[1:, :2] = _BEYOND
-    for number, one in enumerate(measured):
+    for number, curve in enumerate(measured):
         first = 1 + size * number
-        rows[first : first + len(one.fields)] = _rows(one)
+        rows[first : first + len(curve.fields)] = _rows(curve)
     return wp.array(rows, dtype=dtype, device=device)
 
 
@@ -108,7 +109,7 @@ for _dtype in (wp.float32, wp.float64):
 
     @wp.func_native("return warpmag::curve_ratio(s, curve, tables.data);")
     def curve_ratio(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
-        """c(s)/s, which is c'(0) at s = 0: the factor between a reduced field vector and its reduced magnetization."""
+        """c(s)/s, the factor between a reduced field vector and its reduced magnetization; 1 at s = 0."""
         ...
 
     @wp.func_native("return warpmag::curve_slope(s, curve, tables.data);")
@@ -123,7 +124,7 @@ for _dtype in (wp.float32, wp.float64):
 
     @wp.func_native("return warpmag::inverse_curve_ratio(c, curve, tables.data);")
     def inverse_curve_ratio(c: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
-        """s/c of the reduced field s that makes reduced magnetization ``c``; a saturated one gets a large finite s."""
+        """s/c of the reduced field s at reduced magnetization ``c``; saturation gets a large finite s."""
         ...
 
 
@@ -137,4 +138,5 @@ def curve_derivative_times(h: Any, v: Any, k: Any, saturation: Any, curve: int, 
         return across * v
     unit = h / norm
     along = k * curve_slope(s, curve, tables)
+    # f' v = k (c/s) v + k (c' − c/s) (u·v) u
     return across * v + ((along - across) * wp.dot(unit, v)) * unit

@@ -1,20 +1,19 @@
-"""Field (Eq. 1), and force and torque (Eqs. 4, 13, 14), of packed moments: sums over pairs, and what follows them.
+"""Field (Eq. 1), and force and torque (Eqs. 4, 13, 14), of packed moments from sums over pairs.
 
 A quantity is summed over all pairs of a target and its sources: 4π times the field H [A/m], or 4π times (e·∇)H [A²] for
-an effective moment e of the target, or both. The native sums evaluate the dipole clamped at contact (see ``pair_law``).
-They are stored as partial sums, several of a target where threads or blocks share out the pairs. ``finish.h`` adds them
-up in a fixed order, so that results do not depend on scheduling, and corrects pairs that overlap. This is the one place
-where the form of the sums is chosen:
+an effective moment e of the target, or both. The native sums evaluate the dipole clamped at contact (``pair_law``). A
+target has several partial sums where threads or blocks share its pairs. ``finish.h`` adds them up in a fixed order, so
+that results do not depend on scheduling, and corrects overlapping pairs. Only this module chooses the form of the sums:
 
 | form | native code | for |
 |---|---|---|
-| ``LOOP`` | ``sums_cuda``, ``sums_cpu`` | anything; partial sums of tiles |
+| ``LOOP`` | ``sums_cuda``, ``sums_cpu`` | any moments; partial sums of tiles |
 | ``FUSED`` | ``fused_cuda`` | few moments: one kernel sums a tile and finishes it, without partial sums |
-| ``MIRRORED`` | ``mirror_cuda`` | many moments among themselves: each pair is evaluated once, for both of its ends |
+| ``MIRRORED`` | ``mirror_cuda`` | many moments among themselves: each pair is evaluated once, for both its moments |
 | ``REFERENCE`` | ``reference`` | a plain Warp loop, exact for overlapping balls, or with the paper's smoothing |
 
-A caller may bring sums of its own, such as those of room ``fmm``. Where several processes have the same moments, each
-sums a part of the work list, which is that of one of them; they merge the partial sums, and each finishes all of them.
+A caller may supply the sums, as room ``fmm`` does (``GIVEN``). Where several processes have the same moments, each
+process sums a part of the work list. The processes merge their partial sums, and each finishes all targets.
 """
 
 from functools import cache
@@ -24,11 +23,11 @@ import warp as wp
 
 from warpmag.kernels.pairs import fused_cuda, mirror_cuda, sums_cuda
 from warpmag.kernels.pairs.neighbors import CAPACITY
-from warpmag.kernels.pairs.pair_law import INVERSE_4PI
-from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS, WIDTHS, Quantity
+from warpmag.kernels.pairs.pair_law import INVERSE_4PI, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
 from warpmag.kernels.pairs.work_list import (
     PAIRS_PER_THREAD,
+    TILE_COLUMNS,
     arrays_type,
     block_tiles,
     cpu_tiles,
@@ -45,55 +44,54 @@ from warpmag.kernels.shared.team import team, threads_for
 
 LOOP, FUSED, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "mirrored", "reference", "given"
 
-# Measured on an H200: the most targets for which the fused form is best, and the fewest for which the mirrored is.
+# Measured on an H200: most targets for which the fused form is fastest, and fewest for which the mirrored form is.
 _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE: 2640, Quantity.WRENCH: 2640}
 _LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
 _LEAST_MUTUAL = 0.75
-"""Least part of the sources that are targets, for both ends of a pair to be worth what the mirrored form costs."""
+"""Least fraction of the sources that are targets, for which the mirrored form is faster."""
 _LEAST_SHARED = {"cpu": 800_000, "cuda": 1_000_000_000}
-"""Fewest pairs that are worth sharing out between processes, by kind of device."""
+"""Fewest pairs that several processes share, by kind of device."""
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
 
 
 class PairEvaluation:
-    """Field, or force and torque, of packed sources at packed targets, again and again in the same arrays.
+    """Field, or force and torque, of packed sources at packed targets, evaluated repeatedly in the same arrays.
 
-    The field is H, on top of a given one. A field at moments that are the sources, too, leaves out a moment's own. The
-    force is μ0 (e·∇)H, the torque μ0 e × H about the moment's position, of sources of other bodies.
+    The field is H plus a base field. If targets and sources are the same moments, a moment's own field is left out. The
+    force is μ0 (e·∇)H, the torque about the moment's position is μ0 e × H, of sources of other bodies.
 
     Args:
-        quantity: What is summed: ``FIELD``; ``WRENCH``; ``FORCE``, with a torque of zero; or ``MUTUAL_FORCE``, the same
+        quantity: Summed quantity: ``FIELD``; ``WRENCH``; ``FORCE``, with zero torque; or ``MUTUAL_FORCE``, a force
             where e is the moment itself.
-        segments: Integers [k, 4]: packed column of targets begin and end, and of their sources begin and end.
+        segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
         targets: Packed targets with their overlapping sources (``packing.PackedMoments``), t of them.
         sources: Packed sources.
-        base: Field to start from, or that turns moments, too [A/m], shape [t].
-        out: Out, field [A/m] or forces [N], shape [t]; that of the targets in ``segments``, in the form ``MIRRORED`` of
-            others, too.
+        base: Base field, which also contributes to torques [A/m], shape [t].
+        out: Out, field [A/m] or forces [N] at the targets of ``segments``, shape [t]. The form ``MIRRORED`` also writes
+            other sources' elements.
         effective: Effective moments e [A·m²], shape [3, t]; None means the moments.
-        turned: Whether the torque on a moment is wanted, shape [t].
+        turned: Nonzero where a torque is computed, shape [t].
         torques: Out, torques [N·m], shape [t].
-        extra_parts: Partial sums that the caller writes.
+        extra_parts: Number of partial sums that the caller writes.
         smoothing: Length ℓ [m] of the paper's smoothing, with the form ``REFERENCE``.
         form: Form of the sums; None means the fastest.
-        sums: Sums of the caller's: called with effective moments, packed columns of the target rows, and the partial
-            sums to write, it launches them.
-        ranks: Processes that share out the sums (``warpmag.moments.ranks.Ranks``); None means that there is but this
-            one.
+        sums: Function (effective moments, packed columns of the target rows, partial sums out) that launches the sums,
+            in place of the forms of this module.
+        ranks: Processes that share the sums (``warpmag.moments.ranks.Ranks``); None for a single process.
 
     Attributes:
         form: ``LOOP``, ``FUSED``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
         count: Number of target rows.
-        target: Packed column of each, shape [count].
-        pair_count: Pairs of a target and a source.
-        partial: Partial sums, shape [parts, rows, sums], the caller's ``extra_parts`` last.
+        target: Packed column of each target row, shape [count].
+        pair_count: Number of pairs of a target and a source.
+        partial: Partial sums, shape [parts, rows, sums]; the caller's ``extra_parts`` are last.
     """
 
     def __init__(
         self, quantity, segments, targets, sources, base, out, *, effective=None, turned=None, torques=None,
         extra_parts=0, smoothing=0.0, form=None, sums=None, ranks=None,
     ):  # fmt: skip
-        """Allocate what the form needs."""
+        """Choose the form and allocate its buffers."""
         segments = np.asarray(segments, np.int64).reshape(-1, 4)
         device, dtype = targets.device, targets.dtype
         self._given_sums = sums
@@ -103,8 +101,8 @@ class PairEvaluation:
         self._arrays = a = arrays_type(dtype)()
         a.target, a.begin, a.end = target_rows(segments, device)
         self.target, self.count, self.pair_count = a.target, a.target.shape[0], pair_count(segments)
-        worth = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
-        self._ranks = ranks if worth else None
+        shared = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
+        self._ranks = ranks if shared else None
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         parts, tiles = self._plan_sums(quantity, segments, targets, targets is sources, smoothing)
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
@@ -119,12 +117,12 @@ class PairEvaluation:
             a.turned, a.torques = turned, torques
         self._recorded = {}
 
-    def _plan_sums(self, quantity, segments, targets, among, smoothing):
-        """Set the launch of the sums of arrays; return the number of partial sums of a row, and tiles."""
+    def _plan_sums(self, quantity, segments, targets, same_set, smoothing):
+        """Set the function that launches the sums; return the number of partial sums per row, and the tiles."""
         device, finished, count = targets.device, self._finished, self.count
-        given = self._given_sums
-        if given is not None:
-            self._launch_sums = lambda a: given(a.effective, a.target, a.partial)
+        launch_given = self._given_sums
+        if launch_given is not None:
+            self._launch_sums = lambda a: launch_given(a.effective, a.target, a.partial)
             return 1, ()
         if self.form == REFERENCE:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
@@ -146,7 +144,7 @@ class PairEvaluation:
                 finished, shape, a.targets, a.sources, a.effective, a.tiles, a.partial
             )
             return parts, tiles
-        mutual = among and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
+        mutual = same_set and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
         tiles, shares, parts, threads = cpu_tiles(segments, mutual, targets.dtype)
         if self._ranks is not None:
             tiles, shares = tiles_of_rank(tiles, shares, self._ranks)
@@ -156,7 +154,7 @@ class PairEvaluation:
         return parts, tiles
 
     def launch(self, wait=None):
-        """Evaluate at all target rows; ``wait``, if given, is called before the partial sums are added up."""
+        """Launch the evaluation at all target rows; ``wait`` is called before the partial sums are added up."""
         if self.count == 0:
             return
         if self._ranks is not None:
@@ -168,11 +166,11 @@ class PairEvaluation:
             wait()
         if self.form != FUSED:
             finish = _finish_kernel(self.partial.dtype, self._finished, group_threads(self.partial.device))
-            # as many threads as summed: they are awake, and a row whose list is full goes through all its sources
+            # the threads that summed are awake, and a row whose overlap list is full visits all its sources
             self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD))
 
     def _launch_pass(self, kernel, threads):
-        """Launch a pass over the target rows, recorded, which spares packing the struct each time."""
+        """Launch a pass over the target rows. The launch is recorded, so that the struct is packed only once."""
         if kernel not in self._recorded:
             device = self.partial.device
             self._recorded[kernel] = wp.launch(
@@ -185,18 +183,18 @@ class PairEvaluation:
         self._recorded[kernel].launch()
 
 
-def _choose_form(quantity, segments, device, among, extra_parts) -> str:
-    """The fastest form; ``among`` says whether targets and sources are the same moments."""
+def _choose_form(quantity, segments, device, same_set, extra_parts) -> str:
+    """Return the fastest form; ``same_set`` is true if targets and sources are the same moments."""
     if not device.is_cuda:
         return LOOP
     count = int(np.sum(segments[:, 1] - segments[:, 0]))
-    if among and count >= _LEAST_MIRRORED.get(quantity, np.inf) and _are_mutual(segments, count):
+    if same_set and count >= _LEAST_MIRRORED.get(quantity, np.inf) and _are_mutual(segments, count):
         return MIRRORED
     return FUSED if count <= _MOST_FUSED[quantity] and not extra_parts else LOOP
 
 
 def _are_mutual(segments, count: int) -> bool:
-    """Whether ``count`` targets are most of the only range of sources, so that both ends of most pairs are wanted."""
+    """Return whether the segments have one range of sources, and ``count`` targets are most of it."""
     if (segments[:, 2:] != segments[0, 2:]).any():
         return False
     begin, end = segments[0, 2:]

@@ -1,9 +1,9 @@
-"""All-pairs sums of few moments on a GPU, ``fused_cuda.h``: the kernel that needs the sums computes them itself."""
+"""Shape of the fused all-pairs sums of few moments on a GPU, ``fused_cuda.h``."""
 
 import math
 from dataclasses import dataclass
 
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 
 
 @dataclass(frozen=True)
@@ -11,10 +11,10 @@ class FusedShape:
     """Shape of the blocks.
 
     Attributes:
-        held: Targets that a lane holds.
+        held: Targets per lane.
         lanes: Lanes of a warp that hold different targets.
-        warps: Warps of a block that share out the sources.
-        unrolled: Sources that the compiler interleaves.
+        warps: Warps of a block, which share the sources.
+        unrolled: Sources per unrolled step of the loop.
     """
 
     held: int
@@ -24,34 +24,33 @@ class FusedShape:
 
     @property
     def targets(self) -> int:
-        """Targets of a block."""
+        """Targets per block."""
         return self.held * self.lanes
 
     @property
     def summing(self) -> int:
-        """Threads of a block that sum."""
+        """Threads of a block that sum pairs."""
         return 32 * self.warps
 
     @property
     def correcting(self) -> int:
-        """Threads of a block that correct, after those that sum."""
+        """Threads of a block that correct overlapping pairs, after those that sum."""
         return 32 * max(min(4, math.ceil(self.targets / 8)), math.ceil(self.targets / 32))
 
     @property
     def threads(self) -> int:
-        """Threads of a block."""
+        """Threads per block."""
         return self.summing + self.correcting
 
     @property
     def shares(self) -> int:
-        """Threads that share out the corrections of a target, a power of two."""
+        """Threads that share the corrections of a target, a power of two."""
         return min(32, 1 << (self.correcting // self.targets).bit_length() - 1)
 
 
-# Measured on an H200: the most targets that a shape is best for, those of a block on each of 132 multiprocessors, and
-# the shape. Clusters of blocks, which share out the sources of a larger tile and add up through each other's shared
-# memory, gained nothing: clusters of two take 10.4 µs for a field at 2,560 targets, single blocks 10.0; those of four
-# or eight use only 124 or 120 multiprocessors.
+# Measured on an H200: most targets for which a shape is fastest, one block on each of 132 multiprocessors, and the
+# shape. Clusters of blocks that share the sources of a larger tile are no faster. For a field at 2,560 targets clusters
+# of two take 10.4 µs and single blocks 10.0 µs; clusters of four or eight use only 124 or 120 multiprocessors.
 _SHAPES = {
     Quantity.FIELD: (
         (528, FusedShape(2, 2, 8, 1)),
@@ -79,5 +78,5 @@ _SHAPES = {
 
 
 def choose_fused_shape(quantity: Quantity, count: int) -> FusedShape:
-    """Shape for a number of targets."""
+    """Return the fastest shape for a number of targets."""
     return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)

@@ -1,4 +1,4 @@
-"""What points need beside sums over pairs: the external field, flux density inside balls, gradients as matrices."""
+"""Fields at points besides sums over pairs: external field, flux density inside balls, gradients as matrices."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ def _flux_density_kernel(dtype):
 
     @wp.func
     def magnetization_at(x: vec3, j: int, packed: wp.array2d[dtype]):
-        """Magnetization [A/m] of source ``j`` at a point: none outside its ball."""
+        """Magnetization [A/m] of source ``j`` at a point; zero outside its ball."""
         m = vec3()
         if wp.length(x - vec3(packed[0, j], packed[1, j], packed[2, j])) < packed[3, j]:
             m = vec3(packed[4, j], packed[5, j], packed[6, j]) / ball_volume(packed[3, j])
@@ -41,22 +41,22 @@ def _flux_density_kernel(dtype):
         if count <= wp.static(CAPACITY):
             for k in range(count):
                 total += magnetization_at(points[i], overlaps[i, k], sources)
-        else:  # the list is too short, and all sources are asked
+        else:  # the list is full: visit all sources
             for j in range(source_count):
                 if source_worlds[j] == worlds[i]:
                     total += magnetization_at(points[i], j, sources)
-        b_out[i] = dtype(wp.static(MU0)) * total
+        b_out[i] = dtype(wp.static(MU0)) * total  # B = μ0 (H + M)
 
     return flux_density
 
 
 def launch_flux_density(points, targets: PackedMoments, sources: PackedMoments, h, b):
-    """Write B = μ0 (H + M) [T] at points, M being the sum of the magnetizations of the balls that hold a point.
+    """Write B = μ0 (H + M) [T] at points, where M is the sum of the magnetizations of the balls that contain a point.
 
     Args:
-        points: The points [m], Warp array of vectors, shape [p].
-        targets: The points, packed as balls of radius zero, with their overlaps found.
-        sources: The balls.
+        points: Points [m], Warp array of vectors, shape [p].
+        targets: Points packed as balls of radius zero, with their overlaps listed.
+        sources: Packed balls.
         h: Field at the points [A/m], shape [p].
         b: Out, flux density [T], shape [p].
     """
@@ -83,7 +83,7 @@ def _world_field_kernel(vec3):
 
 
 def launch_field_of_worlds(external_field, first, base):
-    """Write the external field [A/m] at points, shape [p], which is that at moment ``first`` of each one's world."""
+    """Write the external field [A/m] at points, shape [p]: that of the moment ``first`` of a point's world."""
     wp.launch(
         _world_field_kernel(base.dtype),
         dim=len(base),
@@ -111,7 +111,7 @@ def _gradient_kernel(vec3, mat33):
 
 
 def launch_store_gradients(along, gradients):
-    """Write gradients [A/m²], matrices of shape [p], from the three derivatives of H along the axes, vectors."""
+    """Write gradients [A/m²], matrices of shape [p], from the derivatives of H along x, y and z, vectors."""
     wp.launch(
         _gradient_kernel(along[0].dtype, gradients.dtype),
         dim=len(gradients),

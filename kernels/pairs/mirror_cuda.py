@@ -1,7 +1,7 @@
-"""Plan and launch of the sums of many moments among themselves on a GPU, each pair once, ``mirror_cuda.h``.
+"""Plan and launch of the sums of many moments among themselves on a GPU, with each pair once, ``mirror_cuda.h``.
 
-The finishing kernel adds up the partial sums in order, so that results do not depend on the order in which blocks run.
-Where they would take too much memory, several passes each add to the partial sums of the one before.
+The finishing kernel adds up the partial sums in order, so that results do not depend on the order of blocks. If the
+partial sums would take too much memory, several passes add to the same partial sums.
 """
 
 import math
@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.sums_cuda import launch_time
 from warpmag.kernels.shared.native import native_kernel
 
@@ -21,10 +21,10 @@ class MirrorShape:
     """Shape of the blocks.
 
     Attributes:
-        moments: Moments that a lane holds; a tile has at most 32 times as many.
-        warps: Warps of a block.
-        blocks: Blocks that a multiprocessor holds together, in float32.
-        unrolled: Steps of a stage that the compiler interleaves.
+        moments: Moments per lane; a tile has at most 32 times as many.
+        warps: Warps per block.
+        blocks: Resident blocks per multiprocessor, in float32.
+        unrolled: Unrolled steps of a stage.
     """
 
     moments: int
@@ -33,7 +33,7 @@ class MirrorShape:
     unrolled: int
 
 
-# Measured on an H200 at 5,000 to 131,072 moments: the most moments that a shape is best for, and the shape.
+# Measured on an H200 at 5,000 to 131,072 moments: most moments for which a shape is fastest, and the shape.
 _SHAPES = {
     Quantity.FIELD: (
         (7000, MirrorShape(2, 4, 6, 2)),
@@ -43,34 +43,27 @@ _SHAPES = {
     Quantity.MUTUAL_FORCE: ((7000, MirrorShape(2, 4, 6, 2)), (None, MirrorShape(4, 4, 4, 1))),
 }
 _MOST_DOUBLE_WARPS = 4
-"""Warps of a block whose staging in float64 fits into shared memory."""
+"""Most warps per block in float64, limited by shared memory."""
 _SLAB_BYTES = 2**28
-"""Memory that slabs may take."""
+"""Most memory of slabs. A slab holds the partial sums of one distance between tiles."""
 _MOST_SPLITS, _MOST_STAGES = 32, 32
-"""Blocks that share the walk of a tile, and stages that a warp sums in one piece: longer sums would lose digits."""
+"""Most blocks that share the walk of a tile, and most stages in a warp's sum: longer sums would lose digits."""
 _SPLITS_TOGETHER = 4
-"""Splits of several passes are a multiple of so many, for as many processes to share them out."""
+"""The number of splits of several passes is a multiple of it, so that as many processes can share them."""
 _FIXED_COST = 0.1
-"""Time that a block takes to start and to end, and that a split takes to be added up, in stages of a warp."""
+"""Start and end of a block, and sum over a split, each in the time of a warp's stage."""
 
 
 @wp.struct
 class MirrorTiles:
-    """Tiles of moments among themselves, on one device.
+    """Tiles of moments among themselves, on one device."""
 
-    Attributes:
-        origin: Packed column of the first moment.
-        edges: First moment of each tile, and the end, shape [tiles + 1].
-        blocks: Home tile, stages begin and end, and share of each block, shape [blocks, 4].
-        stages: Stages of a tile.
-        slabs: Distances between tiles that have partial sums of their own; those of the blocks' shares follow.
-    """
-
-    origin: int
-    edges: wp.array[int]
-    blocks: wp.array2d[int]
-    stages: int
-    slabs: int
+    # Model:
+    origin: int  # packed column of the first moment
+    edges: wp.array[int]  # first moment of each tile, and the end, shape [tiles + 1]
+    blocks: wp.array2d[int]  # home tile, stages begin and end, and share of each block, shape [blocks, 4]
+    stages: int  # stages per tile
+    slabs: int  # slabs; partial sums of the blocks' shares follow them
 
 
 @dataclass(frozen=True)
@@ -78,12 +71,12 @@ class Mirror:
     """Work list of moments among themselves, on one device.
 
     Attributes:
-        quantity: What is summed: ``FIELD`` or ``MUTUAL_FORCE``.
+        quantity: ``FIELD`` or ``MUTUAL_FORCE``.
         shape: Shape of the blocks.
-        tiles: What the blocks read.
-        passes: For each launch its first block and number of blocks, and the first distance between tiles.
-        slabs: Distances between tiles that have a slab of their own; those of the blocks' shares follow.
-        splits: Blocks of a pass that share out the walk of a home tile.
+        tiles: Tiles and blocks.
+        passes: First block, number of blocks, and first distance between tiles of each launch.
+        slabs: Number of slabs; partial sums of the blocks' shares follow them.
+        splits: Number of blocks of a pass that share the walk of a home tile.
     """
 
     quantity: Quantity
@@ -95,7 +88,7 @@ class Mirror:
 
 
 def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, ranks=None) -> Mirror:
-    """Plan the walk of ``count`` moments from packed column ``origin`` on, or what one of ``ranks`` has to do of it."""
+    """Plan the sums of ``count`` moments from packed column ``origin`` on, or the part of one process of ``ranks``."""
     shape = next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
     if dtype is wp.float64 and shape.warps > _MOST_DOUBLE_WARPS:
         shape = replace(shape, warps=shape.warps // 2, blocks=2 * shape.blocks)
@@ -104,17 +97,17 @@ def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, rank
     stages = math.ceil(math.ceil(count / tiles) / 32)
     farthest = tiles // 2
     slabs = min(farthest, max(1, _SLAB_BYTES // (12 * count)))
-    slabs = math.ceil(farthest / math.ceil(farthest / slabs))  # as many in each pass
+    slabs = math.ceil(farthest / math.ceil(farthest / slabs))  # equal in all passes
     splits = _choose_splits(shape, tiles, stages * min(slabs + 1, farthest + 1), device.sm_count)
     several = slabs < farthest
-    if several:  # a split has the same slabs in each pass, so that one process adds to a partial sum
+    if several:  # a split has the same slabs in each pass, so that only one process adds to a partial sum
         splits = min(-(-splits // _SPLITS_TOGETHER) * _SPLITS_TOGETHER, slabs)
     own = (0, tiles * splits) if ranks is None else ranks.share(tiles * splits)
     if ranks is not None and several:
         own = tuple(tiles * edge for edge in ranks.share(splits))
     blocks, passes = [], []
     for nearest in range(1, farthest + 1, slabs):
-        # the first pass has the pairs within a tile, too
+        # the first pass includes the pairs within a tile
         begin, end = stages * (nearest if nearest > 1 else 0), stages * min(nearest + slabs, farthest + 1)
         cuts = begin + (end - begin) * np.arange(splits + 1) // splits
         if several:
@@ -131,7 +124,7 @@ def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, rank
 
 
 def _choose_splits(shape: MirrorShape, tiles: int, walk: int, multiprocessors: int) -> int:
-    """Number of blocks that share the ``walk`` of a tile, in stages, for which a launch is fastest."""
+    """Return the fastest number of blocks that share the ``walk`` of a tile [stages]."""
 
     def cost(splits):
         work = shape.blocks * math.ceil(walk / splits / shape.warps)

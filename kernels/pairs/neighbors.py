@@ -1,15 +1,15 @@
-"""Lists of neighbours: found once per arrangement, for all passes over overlapping pairs.
+"""Neighbor lists, for corrections of overlapping pairs.
 
-The all-pairs loops clamp the dipole at contact. What an overlapping pair lacks is added from a short list of neighbours
-per moment, in ascending order. A list that is full is no error: its target goes through all its sources instead.
+The all-pairs loops clamp the dipole at contact. Corrections of overlapping pairs are added from a short list of
+neighbors per moment, in ascending order. If a list is full, its target visits all its sources instead.
 
-Lists hold everything nearer than (1 + ``SKIN``) times contact, and are made anew once a moment has moved by ``SKIN``
-times its radius: what was farther apart is until then farther than contact. Which neighbours do overlap is found for
-every arrangement.
+Neighbors are nearer than (1 + ``SKIN``) times the contact distance. The lists are rebuilt once a moment has moved by
+``SKIN`` times its radius; until then no other pair can touch. The neighbors that overlap are listed for every
+arrangement.
 
-The search sorts moments into cubic cells as wide as the largest distance of two neighbours, found by a hash table
-(``cells.h``). The devices have a search each: a GPU's linked lists need no prefix sum over the buckets, and a CPU's
-counting sort puts what a vector of candidates reads side by side.
+The search sorts moments into cubic cells as wide as the largest distance of neighbors, with a hash table (``cells.h``).
+Each device has its own search: linked lists on a GPU need no prefix sum over buckets, and a counting sort on a CPU
+makes the candidates of a target contiguous.
 """
 
 import math
@@ -22,76 +22,61 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 CAPACITY = 64
-"""Neighbours a list can hold before its target falls back to going through all its sources."""
+"""Length of a list."""
 SKIN = 0.6
-"""Part of its radius that a moment may move before the lists are made anew. Longer lists take longer to go through, but
-are made less often, and spare induction evaluations (see ``theta_flow``), which predict the moments of neighbours."""
+"""Fraction of its radius that a moment may move before the lists are rebuilt. A larger skin makes lists longer and
+rebuilds rarer. Longer lists also spare evaluations of the induction, which predicts the moments of neighbors
+(``theta_flow``)."""
 _BUCKETS_PER_MOMENT = 4
 _BLOCK = 128
 _PADDING = 16
-"""Entries that vectors may read beyond the last."""
+"""Entries beyond the last that vectors may read."""
 
 
 @cache
 def lists_type(dtype):
-    """Struct of moments, or other balls, and their neighbours; see :func:`allocate`."""
+    """Struct of moments, or other balls, and their neighbors; see :func:`allocate`."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
     class NeighborLists:
-        """Moments, their neighbours, and what the search keeps; see :func:`allocate`."""
-
+        # Model:
+        group: wp.array[int]  # only moments of one group are neighbors; none if negative
+        ratio: wp.float64  # distance of neighbors over their contact distance, at most
+        reach: wp.array[wp.float64]  # largest contact distance [m], shape [1]
+        # Data in:
         packed: wp.array2d[dtype]
-        group: wp.array[int]
-        ratio: wp.float64
-        reach: wp.array[wp.float64]
-        neighbor: wp.array2d[int]
-        count: wp.array[int]
-        overlap: wp.array2d[int]
-        overlap_count: wp.array[int]
-        found_at: wp.array[vec3]
-        moved: wp.array[int]
-        searching: wp.array[int]
-        searches: wp.array[int]
-        bucket: wp.array[int]
-        table: wp.array[wp.uint64]
-        cell: wp.array[wp.vec4i]
-        before: wp.array[int]
-        entries: wp.array2d[int]
-        places: wp.array2d[dtype]
+        moved: wp.array[int]  # 1 if a moment has moved too far since the last search, shape [1]; set by ``packing``
+        # Data out:
+        neighbor: wp.array2d[int]  # ascending indices of neighbors, shape [n, capacity]
+        count: wp.array[int]  # number of neighbors, which may exceed the capacity, shape [n]
+        overlap: wp.array2d[int]  # ascending indices of overlapping neighbors, shape [n, capacity]
+        overlap_count: wp.array[int]  # their number; ``count`` where a list is full, shape [n]
+        found_at: wp.array[vec3]  # positions at the last search [m], shape [n]
+        searching: wp.array[int]  # nonzero if the last search rebuilt the lists, shape [1]; on a GPU its number
+        # Buffers of a GPU:
+        searches: wp.array[int]  # number of the last search that filled the hash table, shape [1]
+        table: wp.array[wp.uint64]  # last search and last moment of each bucket, shape [2ᵏ]
+        cell: wp.array[wp.vec4i]  # cell (x, y, z, group) of each moment, shape [n]
+        before: wp.array[int]  # previous moment of the same bucket, or -1, shape [n]
+        # Buffers of a CPU, in the order of buckets:
+        bucket: wp.array[int]  # first entry of each bucket, shape [2ᵏ + 1]
+        entries: wp.array2d[int]  # index, cell's x and y, group; and the bucket of each moment, shape [5, n padded]
+        places: wp.array2d[dtype]  # positions and radii [m], shape [4, n padded]
 
     return NeighborLists
 
 
 def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capacity=CAPACITY):
-    """Allocate the lists of moments, empty.
+    """Allocate empty lists; return the struct :func:`lists_type`.
 
     Args:
         count: Number of moments n.
-        packed: The packed moments, shape [8, n].
-        group: Group of each, shape [n] or longer: only moments of one group are neighbours, none if it is negative.
-        reach: Distance of the farthest contact [m].
-        ratio: What is nearer than this times contact is a neighbour; with 1 the neighbours are what overlaps.
-        capacity: Neighbours a list can hold.
-
-    Returns:
-        A Warp struct of these, the reach as an array of shape [1], and
-            neighbor: Indices of the neighbours, ascending, shape [n, capacity].
-            count: How many there are, also beyond the capacity, shape [n].
-            overlap: Indices of what overlaps each, ascending, shape [n, capacity].
-            overlap_count: How many they are, shape [n]; where a list is full, its count.
-            found_at: Where each moment was when the lists were made [m], shape [n].
-            moved: Whether one has moved too far since, shape [1]; set by ``packing``.
-            searching: Whether the last search made lists, shape [1]; on a GPU its number.
-            searches: On a GPU the last search that filled the hash table, shape [1].
-            bucket: On a CPU where each bucket begins, shape [2ᵏ + 1].
-            table: On a GPU the number of the last search that used each bucket, and the moment that it last put there,
-                shape [2ᵏ].
-            cell: On a GPU the cell (x, y, z, group) of each moment, shape [n].
-            before: On a GPU the moment that was put into its bucket before each, −1 if none, shape [n].
-            entries: On a CPU, in the order of buckets, index, cell's x and y, and group, and the bucket of each moment,
-                shape [5, n padded].
-            places: On a CPU, in that order, positions and radii [m], shape [4, n padded].
+        packed: Packed moments, shape [8, n].
+        group: Group of each moment, shape [n] or longer: only moments of one group are neighbors, none if negative.
+        reach: Largest contact distance [m].
+        ratio: Largest distance of neighbors over their contact distance; 1 lists overlapping pairs only.
+        capacity: Length of a list.
     """
     device, dtype = packed.device, packed.dtype
     linked, padded = (0, count + _PADDING) if device.is_cpu else (count, 0)
@@ -117,7 +102,7 @@ def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capac
 
 
 def carried_lists(lists) -> dict:
-    """Return the arrays of lists that one search hands on to the next one, by name."""
+    """Return the arrays that a search reads from the one before, by name."""
     return {name: getattr(lists, name) for name in ("neighbor", "count", "found_at", "moved", "searching")}
 
 
@@ -129,7 +114,7 @@ def _kernel(call: str, header: str, dtype, capacity: int, group: int):
 
 
 def _launch(call: str, targets, sources, dim: int = 1):
-    """Launch threads that call a function of the device's header; on a CPU one, which shares the work out."""
+    """Launch ``dim`` threads that make a call of the device's header; on a CPU one thread shares the work out."""
     device = targets.packed.device
     header, threads, members = "pairs/neighbors_cuda.h", 0, None
     if device.is_cpu:
@@ -145,12 +130,11 @@ def _launch(call: str, targets, sources, dim: int = 1):
 
 
 def launch_find_neighbors(targets, sources):
-    """List the sources near each target, if targets have moved too far since the last time.
+    """List the sources near each target, if a target has moved too far since the last search.
 
     Args:
-        targets: Lists of the targets; their reach is that of both.
-        sources: Lists of the sources, whose hash table is used; the targets' own if both are the same moments, none of
-            which is its own neighbour.
+        targets: Lists of the targets, with the reach of targets and sources.
+        sources: Lists of the sources, with the hash table. If they are ``targets``, a moment is not its own neighbor.
     """
     if targets.packed.device.is_cpu:
         _launch("search_neighbors(targets, sources, threads, team.data)", targets, sources)
@@ -163,7 +147,7 @@ def launch_find_neighbors(targets, sources):
 
 
 def launch_list_overlaps(targets, sources):
-    """List those of each target's neighbours that overlap it; both are lists."""
+    """List the neighbors of each target that overlap it."""
     if targets.overlap is targets.neighbor:
         return
     if targets.packed.device.is_cpu:

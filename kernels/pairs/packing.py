@@ -1,6 +1,6 @@
-"""Moments packed for the sums over pairs, one row of scalars for each component.
+"""Packed moments for the sums over pairs: one row of scalars per component.
 
-One layout serves vector loads on a CPU and coalesced loads on a GPU:
+The layout suits vector loads on a CPU and coalesced loads on a GPU:
 
 | packed row | 0 1 2 | 3 | 4 5 6 | 7 |
 |---|---|---|---|---|
@@ -17,8 +17,8 @@ from warpmag.kernels.pairs import neighbors
 
 PACKED_ROWS = 8
 PITCH = 128
-"""Packed rows are a multiple of so many columns apart, with as many columns of no moment after the last, for vector
-loads."""
+"""Rows are a multiple of this number of columns apart, with at least this number of empty columns at the end, for
+vector loads."""
 
 
 @wp.func
@@ -29,7 +29,7 @@ def ball_volume(radius: Any):
 
 @wp.func
 def store_magnetization(i: int, magnetization: Any, moments: wp.array(dtype=Any), packed: wp.array2d(dtype=Any)):
-    """Set the moment of ball ``i`` to its volume times a magnetization [A/m], plain and packed."""
+    """Set the moment of ball ``i``, m = V M, from a magnetization [A/m], in both arrays."""
     m = ball_volume(packed[3, i]) * magnetization
     moments[i] = m
     for c in range(3):
@@ -67,31 +67,31 @@ def _pack_kernel(dtype):
 
 
 class PackedMoments:
-    """Moments packed on one device, and the pairs of them that overlap: what every sum over pairs starts from.
+    """Packed moments on one device, and lists of overlapping moments, for sums over pairs.
 
     Buffers are allocated once; both launches can be captured in a graph.
 
     Attributes:
         count: Number of moments n.
         packed: Packed moments, shape [8, n].
-        moments: The moments among them, a view, shape [3, n].
-        neighbors: Moments that overlap each, or nearly do, shape [n, capacity], valid after :meth:`find_overlaps`.
-        neighbor_counts: How many they are, shape [n]; zero until then.
-        searching: Whether the last :meth:`find_overlaps` made those lists anew, shape [1].
-        overlaps: Those of them that do overlap it, shape [n, capacity].
-        overlap_counts: How many they are, shape [n].
+        moments: Rows of the moments, a view of ``packed``, shape [3, n].
+        neighbors: Neighbors of each moment, shape [n, capacity], valid after :meth:`find_overlaps`.
+        neighbor_counts: Number of neighbors, shape [n]; zero before the first search.
+        searching: Nonzero if the last :meth:`find_overlaps` rebuilt the lists, shape [1].
+        overlaps: Neighbors that overlap each moment, shape [n, capacity].
+        overlap_counts: Number of overlapping neighbors, shape [n].
     """
 
     def __init__(self, radii, *, largest_radius: float, labels=None, groups=None, moving=True):
-        """Allocate for moments of given radii.
+        """Allocate the buffers.
 
         Args:
             radii: Ball radii [m], Warp array, shape [n].
-            largest_radius: The largest of them [m].
-            labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means each its own.
+            largest_radius: Largest radius [m].
+            labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None for different bodies.
             groups: World of each moment, shape [n]; None means one world.
-            moving: Whether they will move little by little, so that lists of neighbours longer than needed pay; else
-                they are listed afresh each time.
+            moving: True if the moments move by small steps, for which neighbor lists with a skin are faster. Otherwise
+                the lists are rebuilt each time.
         """
         device, dtype, n = radii.device, radii.dtype, radii.shape[0]
         self.count = n
@@ -118,19 +118,19 @@ class PackedMoments:
         self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
 
     def _pitched(self, rows: int) -> wp.array:
-        """Rows of zeros, with room after the last moment."""
+        """Rows of zeros, with padding after the last moment."""
         return wp.zeros((rows, (1 + -(-self.count // PITCH)) * PITCH), dtype=self.dtype, device=self.device)
 
     def vectors(self, rows: int = 3) -> wp.array:
-        """Return an array for more vectors of the moments, laid out as :attr:`moments`, shape [rows, n]."""
+        """Allocate rows with the layout of :attr:`moments`, zero, shape [rows, n]."""
         return self._pitched(rows)[:, : self.count] if self.count else self._pitched(rows)
 
     def carried(self) -> dict:
-        """Return the arrays that outlive an arrangement, by name."""
+        """Return the arrays that the next search reads, by name."""
         return neighbors.carried_lists(self._lists)
 
     def pack(self, positions, moments):
-        """Launch the packing of positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
+        """Pack positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
         if self.count:
             lists = self._lists
             wp.launch(
@@ -142,14 +142,14 @@ class PackedMoments:
             )
 
     def find_overlaps(self, sources: "PackedMoments | None" = None):
-        """Launch the search for the ``sources`` that overlap these moments; None means these moments themselves."""
+        """List the ``sources`` that overlap each of these moments; None means these moments themselves."""
         if sources is None:
             sources = self
         reach = sources.largest_radius + self.largest_radius
         if reach == 0.0 or self.count == 0 or sources.count == 0:
             return
         if sources is not self or not self._moving:
-            self._lists.moved.fill_(1)  # of others no motion is watched
+            self._lists.moved.fill_(1)  # motion is watched for these moments only
         if sources is not self:
             self._lists.reach.fill_(reach)
         neighbors.launch_find_neighbors(self._lists, sources._lists)
@@ -179,7 +179,7 @@ def _divide_kernel(dtype):
 
 
 def launch_divide_by_volume(moments, radii, magnetizations):
-    """Magnetizations M = m/V [A/m] of balls, shape [n]; zero where the radius is."""
+    """Write the magnetizations M = m/V [A/m] of balls, shape [n]; zero where the radius is zero."""
     wp.launch(
         _divide_kernel(radii.dtype),
         dim=radii.shape[0],

@@ -1,26 +1,27 @@
-"""Pair law of two magnetic moments, each spread over a ball.
+"""Pair law of two magnetic moments, each spread over a ball, and the quantities that are summed over pairs.
 
-A moment m at x_j makes at x_i, with r = x_i − x_j and d = ‖r‖, the field and the field gradient
+With r = x_i − x_j and d = ‖r‖, a moment m at x_j has at x_i the field and the field gradient
 
     H        = (g1 m + g2 r (r·m)) / 4π
     ∂H_k/∂x_l = (g2 [r_k m_l + m_k r_l + δ_kl r·m] + g3 (r·m) r_k r_l) / 4π
 
-with radial factors g1 = U'/d, g2 = g1'/d, g3 = g2'/d of a potential U(d). Functions return g1, g2 d and g3 d³, which go
-with the direction r/d and stay finite down to d = 0. Three sets of factors are used:
+with radial factors g1 = U'/d, g2 = g1'/d, g3 = g2'/d of a potential U(d). Functions return g1, g2 d and g3 d³, which
+multiply the direction r/d and stay finite down to d = 0. There are three sets of factors:
 
 * ``dipole_factors``: the point dipole, U = 1/d (Kim and Han 2022, Eqs. 1 and 14).
-* ``averaged_factors``: the field of one uniformly magnetized ball averaged over another that overlaps it. It joins the
-  dipole with its first derivative at contact and stays bounded down to coincident centres, and the averaged operator
-  is positive, so that induction has one solution for any arrangement of balls.
+* ``averaged_factors``: the field of a uniformly magnetized ball, averaged over another ball that overlaps it. At
+  contact the factors and their first derivatives equal those of the dipole. They are bounded down to coincident
+  centers. The averaged operator is positive, so that induction has one solution for any arrangement of balls.
 * ``smoothed_factors``: the paper's smoothing, ε² = ℓ⁵ added to d⁵ (section 5).
 
-The native sums evaluate the dipole with its distance clamped from below to the contact distance a + b; the few pairs
-that overlap get the difference, ``overlap_factors`` of ``pair_law.h``, when sums are finished. Both are continuous at
-contact, so a pair that two roundings of d put on different sides of it does no harm.
+The native sums evaluate the dipole at a distance clamped from below to the contact distance a + b. Overlapping pairs
+get the correction ``overlap_factors`` of ``pair_law.h`` when sums are finished. Both are continuous at contact, so a
+pair that rounding puts on different sides of contact is harmless.
 
-The functions are generic over float32 and float64; averaged factors are those of ``pair_law.h``.
+The functions are generic over float32 and float64.
 """
 
+from enum import IntEnum
 from functools import cache
 from typing import Any
 
@@ -29,11 +30,28 @@ import warp as wp
 INVERSE_4PI = 0.07957747154594767
 
 
+class Quantity(IntEnum):
+    """Summed quantity; the values are those of ``pair_terms.h``.
+
+    ``FIELD`` is H, ``FORCE`` is (e·∇)H for an effective moment e of the target, ``WRENCH`` is both. ``MUTUAL_FORCE`` is
+    (m·∇)H for the target's moment m.
+    """
+
+    FIELD = 0
+    FORCE = 1
+    WRENCH = 2
+    MUTUAL_FORCE = 3
+
+
+WIDTHS = {Quantity.FIELD: 3, Quantity.FORCE: 3, Quantity.WRENCH: 6, Quantity.MUTUAL_FORCE: 3}
+"""Numbers stored per target."""
+
+
 @wp.func
 def dipole_factors(d: Any):
-    """Factors of two point dipoles at distance ``d`` [m]; zero at zero distance."""
+    """Factors of two point dipoles at distance ``d`` [m]: −1/d³, 3/d⁴, −15/d⁴; zero at zero distance."""
     zero = d * type(d)(0.0)
-    # masked before the power: a self pair's r⁻⁴ overflows float32
+    # d is masked before the power: r⁻⁴ of a moment with itself would overflow float32
     inverse = wp.where(d > zero, type(d)(1.0) / wp.where(d > zero, d, type(d)(1.0)), zero)
     g1 = -inverse * inverse * inverse
     g2 = type(d)(-3.0) * g1 * inverse
@@ -49,9 +67,9 @@ def smoothed_factors(d: Any, epsilon2: Any):
 
 @cache
 def pair_factors(dtype):
-    """Warp function (d, a, b, epsilon2): factors of balls of radii a, b [m] at distance d [m].
+    """Warp function (d, a, b, epsilon2) that returns the factors of balls of radii a, b [m] at distance d [m].
 
-    They are averaged where the balls overlap; with an ε² [m⁵] they are smoothed instead.
+    The factors are averaged where the balls overlap. With ε² > 0 [m⁵] they are smoothed instead.
     """
     vec3 = wp.types.vector(3, dtype)
 

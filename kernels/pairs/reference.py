@@ -1,14 +1,13 @@
-"""Plain loop over pairs: readable, exact for overlapping balls, the reference for the native sums.
+"""Plain loop over pairs: the reference for the native sums, exact for overlapping balls.
 
-It also has the paper's smoothing (section 5).
+It also implements the paper's smoothing (section 5).
 """
 
 from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pairs.pair_law import field_of, force_of, pair_factors
-from warpmag.kernels.pairs.pair_terms import WIDTHS, Quantity
+from warpmag.kernels.pairs.pair_law import WIDTHS, Quantity, field_of, force_of, pair_factors
 from warpmag.kernels.pairs.work_list import arrays_type
 from warpmag.kernels.shared.native import native_options
 
@@ -55,11 +54,12 @@ def _kernel(dtype, quantity: Quantity):
 def launch_reference_sums(quantity: Quantity, arrays, smoothing: float):
     """Sum a quantity over all pairs of target rows and their sources.
 
-    A field leaves out the target itself, if targets and sources are the same; a force what has the target's label.
+    A field leaves out the target itself if targets and sources are the same. A force leaves out sources with the
+    target's label.
 
     Args:
         quantity: ``FIELD``, ``FORCE`` or ``WRENCH``.
-        arrays: Struct of ``work_list.arrays_type``, of one part of sums.
+        arrays: Struct of ``work_list.arrays_type`` with one partial sum.
         smoothing: Length ℓ [m] of the paper's smoothing; 0 for none.
     """
     dtype = arrays.partial.dtype

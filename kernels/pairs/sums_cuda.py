@@ -1,7 +1,7 @@
-"""Shapes and launch of the all-pairs sums of a work list of tiles on a GPU, ``sums_cuda.h``.
+"""Shape and launch of the all-pairs sums of a work list of tiles on a GPU, ``sums_cuda.h``.
 
-Sources of few targets are split over blocks, each of which writes partial sums of its own, so that results do not
-depend on the order in which blocks run.
+If there are few targets, several blocks share the sources of a tile. Each block writes separate partial sums, so that
+results do not depend on the order of blocks.
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared.native import native_kernel
 
 
@@ -18,9 +18,9 @@ class LoopShape:
     """Shape of the blocks.
 
     Attributes:
-        targets: Targets of a lane; a tile has 32 times as many.
-        warps: Warps of a block.
-        blocks: Blocks that a multiprocessor holds together, in float32.
+        targets: Targets per lane; a tile has 32 times as many.
+        warps: Warps per block.
+        blocks: Resident blocks per multiprocessor, in float32.
     """
 
     targets: int
@@ -28,7 +28,7 @@ class LoopShape:
     blocks: int
 
 
-# Measured on an H200 at 243 to 131,072 targets: the most targets that a shape is best for, and the shape.
+# Measured on an H200 at 243 to 131,072 targets: most targets for which a shape is fastest, and the shape.
 _SHAPES = {
     Quantity.FIELD: ((6144, LoopShape(4, 8, 2)), (65536, LoopShape(6, 4, 3)), (None, LoopShape(8, 4, 2))),
     Quantity.FORCE: ((None, LoopShape(4, 4, 3)),),
@@ -36,22 +36,22 @@ _SHAPES = {
 }
 _MOST_SPLITS = 32
 _FIXED_COST = 16
-"""Sources that a block sums in the time that it takes to start and to end."""
+"""Start and end of a block, in the time of a source."""
 
 
 def choose_loop_shape(quantity: Quantity, count: int) -> LoopShape:
-    """Shape for a number of targets."""
+    """Return the fastest shape for a number of targets."""
     return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
 
 
 def choose_splits(shape: LoopShape, tiles: int, longest: int, multiprocessors: int) -> int:
-    """Number of blocks that share the sources of a tile, for which a launch is fastest.
+    """Return the fastest number of blocks that share the sources of a tile.
 
     Args:
         shape: Shape of the blocks.
-        tiles: Tiles before splitting.
-        longest: Sources of the longest tile.
-        multiprocessors: Of the device.
+        tiles: Number of tiles before splitting.
+        longest: Number of sources of the longest tile.
+        multiprocessors: Multiprocessors of the device.
     """
 
     def cost(splits):
@@ -63,18 +63,18 @@ def choose_splits(shape: LoopShape, tiles: int, longest: int, multiprocessors: i
 
 
 def launch_time(blocks: int, together: int, work: float, multiprocessors: int) -> tuple[float, int]:
-    """Time that equal blocks take, and the waves in which they run.
+    """Estimate the time of equal blocks, and the number of waves in which they run.
 
     Args:
         blocks: Number of blocks.
-        together: Blocks that a multiprocessor holds together.
-        work: Time that so many blocks take on a multiprocessor.
-        multiprocessors: Of the device.
+        together: Resident blocks per multiprocessor.
+        work: Time of ``together`` blocks on a multiprocessor.
+        multiprocessors: Multiprocessors of the device.
     """
     waves, rest = divmod(blocks, multiprocessors * together)
     if rest == 0:
         return waves * work, waves
-    # a multiprocessor with few blocks runs each of them faster, but all of them together slower
+    # with fewer blocks on a multiprocessor each block is faster, but the throughput is lower
     share = -(-rest // multiprocessors) / together
     return waves * work + (0.4 + 0.6 * share) * work, waves + 1
 

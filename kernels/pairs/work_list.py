@@ -1,7 +1,7 @@
-"""Work lists of the sums over pairs: target rows, and tiles of some rows and some sources.
+"""Work lists of the sums over pairs: target rows, and tiles of target rows and sources.
 
-Segments say which range of packed targets has which range of packed sources; the targets of all of them, one after the
-other, are the target rows. A tile is a row of ``TILE_COLUMNS`` integers, see ``pair_terms``.
+A segment is a range of packed targets with a range of packed sources. The targets of all segments, one after the other,
+are the target rows. A tile is a range of target rows with a range of sources.
 """
 
 import math
@@ -11,27 +11,30 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.pair_terms import TILE_COLUMNS
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
+TILE_COLUMNS = 8
+"""Columns of a work list, ``TileEntry`` of ``pair_terms.h``: target rows begin and end, packed column of the first
+target, sources begin and end, partial sums of the targets, 1 for a mirrored tile, partial sums of its sources. A
+mirrored tile stands also for the tile with targets and sources exchanged. A GPU reads a row as two vectors."""
 PAIRS_PER_THREAD = 400_000
-"""Pairs that make another thread worth waking, which takes 50 to 100 µs: in these a thread sums half of them."""
+"""Pairs per thread, at least: waking a thread takes 50 to 100 µs, in which it would sum half of them."""
 _LEAST_SHARE = 50_000
-"""Pairs of a share, of several blocks if they are few."""
+"""Pairs per share, at least; small blocks are put together."""
 _TILE_BYTES = 2560
-"""Of a component of the sources, and of targets that are sources, too, that a CPU keeps in its first-level cache."""
+"""Bytes per component of a tile's sources that a CPU keeps in its first-level cache."""
 _LEAST_TARGETS = 32
-"""Targets that are worth loading a tile of sources for."""
+"""Targets per tile, at least, so that loading its sources is worthwhile."""
 _LANES = 16
-"""Width of the widest vectors: a stripe of a multiple of it wastes none."""
+"""Lanes of the widest vectors; stripes are a multiple of it, so that no lane is idle."""
 
 
 def target_rows(segments, device):
-    """Packed column, first source and end of the sources of each target row, Warp arrays.
+    """Packed column, first source and end of sources of each target row, as Warp arrays.
 
     Args:
-        segments: Integers [k, 4]: target column begin and end, source begin and end.
+        segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
         device: Warp device.
     """
     sizes, starts, segments = segments[:, 1] - segments[:, 0], row_starts(segments), segments.astype(np.int32)
@@ -41,27 +44,36 @@ def target_rows(segments, device):
 
 
 def row_starts(segments):
-    """First target row of each segment, and the end."""
+    """First target row of each segment, and the number of target rows."""
     return np.concatenate([[0], np.cumsum(segments[:, 1] - segments[:, 0])])
 
 
 def block_tiles(segments, width: int, splits: int = 1):
-    """Tiles of at most ``width`` targets, each for every one of ``splits`` parts of the sources."""
+    """Tiles of at most ``width`` targets, one for each of ``splits`` parts of the sources."""
     starts = row_starts(segments)
     counts = -(-np.diff(starts) // width)
-    of = np.repeat(np.arange(len(segments)), counts)
+    segment = np.repeat(np.arange(len(segments)), counts)
     within = width * (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts))
-    first, _, begin, end = segments[of].T[:, :, None]
+    first, _, begin, end = segments[segment].T[:, :, None]
     cuts = begin + (end - begin) * np.arange(splits + 1) // splits
-    tiles = np.zeros((len(of), splits, TILE_COLUMNS), np.int64)
-    columns = (starts[of] + within, np.minimum(starts[of] + within + width, starts[of + 1]), first[:, 0] + within)
-    for column, values in enumerate((*(one[:, None] for one in columns), cuts[:, :-1], cuts[:, 1:], np.arange(splits))):
+    tiles = np.zeros((len(segment), splits, TILE_COLUMNS), np.int64)
+    row_begin = starts[segment] + within
+    row_end = np.minimum(row_begin + width, starts[segment + 1])
+    columns = (
+        row_begin[:, None],
+        row_end[:, None],
+        first + within[:, None],
+        cuts[:, :-1],
+        cuts[:, 1:],
+        np.arange(splits),
+    )
+    for column, values in enumerate(columns):
         tiles[..., column] = values
     return tiles.reshape(-1, TILE_COLUMNS)
 
 
 def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
-    """Tiles of the looped sums on a GPU, each for one part of the sources; and the number of these."""
+    """Tiles of the looped sums on a GPU, each for one part of the sources, and the number of parts."""
     width = 32 * shape.targets
     longest = int(np.max(segments[:, 3] - segments[:, 2], initial=0))
     splits = choose_splits(shape, len(block_tiles(segments, width)), longest, multiprocessors)
@@ -69,21 +81,21 @@ def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
 
 
 def tile_size(dtype) -> int:
-    """Most sources that a CPU loads at a time, and most targets of a tile that stands for its mirror image, too."""
+    """Most sources that a CPU loads at a time, and most targets of a mirrored tile."""
     return _TILE_BYTES // wp.types.type_size_in_bytes(dtype)
 
 
 def cpu_tiles(segments, mutual: bool, dtype):
-    """Tiles of a CPU; where each share of them begins; the number of partial sums; and threads to take shares.
+    """Tiles of a CPU, first tile of each share, number of partial sums, and number of threads.
 
-    A segment of many pairs is cut into blocks, stripes of targets by stripes of sources. Blocks that have targets in
-    common write partial sums of their own there. How a segment is cut depends on nothing else, and so does the order in
-    which the sums of a target are added up. Threads take shares, which are runs of whole blocks, the largest first.
+    A segment of many pairs is cut into blocks: stripes of targets by stripes of sources. Blocks with common targets
+    write separate partial sums. The cuts depend on the arguments alone, and so does the order of each sum, whatever the
+    number of threads. Threads take shares, which are runs of whole blocks, the largest first.
 
     Args:
-        segments: Integers [k, 4]: target column begin and end, source begin and end.
-        mutual: Whether a pair may be summed for both its ends. Then targets among their own sources need the blocks
-            above the diagonal only, each standing for its mirror image.
+        segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
+        mutual: True if a pair may be summed for both its moments. Targets among their own sources then need only the
+            blocks on and above the diagonal, as mirrored tiles.
         dtype: Warp scalar type of the sums.
     """
     tiles, begin, parts = _cut(tuple(map(tuple, segments.tolist())), mutual, tile_size(dtype))
@@ -92,9 +104,9 @@ def cpu_tiles(segments, mutual: bool, dtype):
 
 
 def tiles_of_rank(tiles, begin, ranks):
-    """Tiles of one of several processes, and where each share of them begins: every so manieth share of all.
+    """Tiles of one of several processes, and first tile of each share: every ``ranks.size``-th share of the work list.
 
-    Shares are sorted by size, so that each process has as much to do.
+    Shares are sorted by size, so that the processes get about equal work.
     """
     own = range(ranks.rank, len(begin) - 1, ranks.size)
     pieces = [tiles[begin[share] : begin[share + 1]] for share in own]
@@ -103,28 +115,28 @@ def tiles_of_rank(tiles, begin, ranks):
 
 @lru_cache(maxsize=4)
 def _cut(segments, mutual: bool, most: int):
-    """Tiles, where each share begins, and the number of partial sums; kept for one-shot calls that repeat."""
+    """Tiles, first tile of each share, and number of partial sums; cached for repeated calls."""
     starts = row_starts(np.array(segments, np.int64).reshape(-1, 4)).tolist()
     blocks, written = [], []
     for segment, row in zip(segments, starts[:-1], strict=True):
-        found, parts = _cut_segment(segment, row, mutual, most)
-        blocks += found
+        segment_blocks, parts = _cut_segment(segment, row, mutual, most)
+        blocks += segment_blocks
         written.append(parts)
     parts = max([1, *written])
     blocks.sort(key=lambda block: block[0], reverse=True)
     blocks += [(0, [tile]) for tile in _idle_rows(starts, written, parts)]
-    begin, tiles, begun = [], [], 0
+    begin, tiles, share_work = [], [], 0
     for work, block in blocks:
-        if not begin or begun >= _LEAST_SHARE:
+        if not begin or share_work >= _LEAST_SHARE:
             begin.append(len(tiles))
-            begun = 0
-        begun += work
+            share_work = 0
+        share_work += work
         tiles += block
     return np.reshape(np.array(tiles, np.int32), (-1, TILE_COLUMNS)), [*begin, len(tiles)], parts
 
 
 def _cut_segment(segment, row, mutual, most):
-    """Work and tiles of the blocks of a segment whose first target has a given row, and the number of partial sums."""
+    """Work and tiles of each block of a segment whose first target has row ``row``, and number of partial sums."""
     t0, t1, s0, s1 = segment
     count, shift, parts, blocks = t1 - t0, row - t0, 0, []
     pairs = count * (s1 - s0)
@@ -132,17 +144,17 @@ def _cut_segment(segment, row, mutual, most):
     whole, grain = busy < 2, pairs / (2 * max(busy, 1))
     rest = [(s0, s1)]
     if mutual and s0 <= t0 and t1 <= s1:
-        # as wide as makes two blocks for each thread, one on the diagonal being half of another
-        wanted = 1 if whole or count**2 <= grain else 2 * math.ceil(count / math.sqrt(2.0 * grain))
-        stripes = _stripes(t0, t1, wanted)
+        # two blocks per thread, where a block on the diagonal counts half
+        stripe_count = 1 if whole or count**2 <= grain else 2 * math.ceil(count / math.sqrt(2.0 * grain))
+        stripes = _stripes(t0, t1, stripe_count)
         cut = [_stripes(*ends, -(-(ends[1] - ends[0]) // most)) for ends in stripes]
         blocks = [_square(shift, cut, a, b) for a in range(len(cut)) for b in range(a, len(cut))]
         parts, rest = len(stripes), [(s0, t0), (t1, s1)]
     for j0, j1 in rest:
-        wanted = 1 if whole else math.ceil(count * (j1 - j0) / grain)
-        rows = max(min(wanted, count // _LEAST_TARGETS), 1)
+        block_count = 1 if whole else math.ceil(count * (j1 - j0) / grain)
+        rows = max(min(block_count, count // _LEAST_TARGETS), 1)
         edges = [t0 + count * k // rows for k in range(rows + 1)]
-        sources = _stripes(j0, j1, -(-wanted // rows))
+        sources = _stripes(j0, j1, -(-block_count // rows))
         part = 0 if whole else parts
         blocks += [
             ((i1 - i0) * (end - begin), [(i0 + shift, i1 + shift, i0, begin, end, part + k, 0, 0)])
@@ -150,18 +162,18 @@ def _cut_segment(segment, row, mutual, most):
             for i0, i1 in pairwise(edges)
         ]
         parts += len(sources)
-    if whole and blocks:  # in one block, and in one partial sum
+    if whole and blocks:  # one block with one partial sum
         return [(sum(work for work, _ in blocks), [tile for _, block in blocks for tile in block])], 1
     return blocks, parts
 
 
 def _idle_rows(starts, written, parts):
-    """Tiles without sources, for the partial sums that no block of a row's segment writes."""
+    """Tiles without sources, which zero the partial sums that no block of a segment writes."""
     idle = [
         (begin, end, 0, 0, 0, part, 0, 0)
         for part in range(min(written, default=parts), parts)
-        for (begin, end), own in zip(pairwise(starts), written, strict=True)
-        if own <= part
+        for (begin, end), own_parts in zip(pairwise(starts), written, strict=True)
+        if own_parts <= part
     ]
     joined = idle[:1]
     for tile in idle[1:]:
@@ -174,9 +186,9 @@ def _idle_rows(starts, written, parts):
 
 
 def _square(shift, stripes, a, b):
-    """Work and tiles of targets in stripe a and sources in stripe b, on or above the diagonal.
+    """Work and mirrored tiles of targets in stripe a and sources in stripe b, on or above the diagonal.
 
-    Stripes are cut into ranges of a tile's width; ``shift`` leads from columns to rows.
+    Stripes are lists of ranges of at most a tile's width. A row is a column plus ``shift``.
     """
     targets, sources = stripes[a], stripes[b]
     tiles = [
@@ -187,38 +199,41 @@ def _square(shift, stripes, a, b):
 
 
 def pair_count(segments) -> int:
-    """Pairs of a target and a source."""
+    """Number of pairs of a target and a source."""
     return int(np.sum((segments[:, 1] - segments[:, 0]) * (segments[:, 3] - segments[:, 2])))
 
 
-def _stripes(begin, end, wanted):
-    """At most so many ranges that cut one into equal parts, of a multiple of ``_LANES``."""
-    width = max(-(-(end - begin) // (max(wanted, 1) * _LANES)), 1) * _LANES
+def _stripes(begin, end, count):
+    """Split a range into at most ``count`` ranges of equal width, a multiple of ``_LANES``."""
+    width = max(-(-(end - begin) // (max(count, 1) * _LANES)), 1) * _LANES
     return [(a, min(a + width, end)) for a in range(begin, end, width)]
 
 
 @cache
 def arrays_type(dtype):
-    """Struct of what sums over pairs are made from and of what becomes of them, see ``evaluate``."""
+    """Struct of the arrays that an evaluation reads and writes; see ``evaluate.PairEvaluation``."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
     class EvaluationArrays:
-        target: wp.array[int]
-        begin: wp.array[int]
+        # Model: target rows and work list
+        target: wp.array[int]  # packed column of a row
+        begin: wp.array[int]  # range of sources of a row
         end: wp.array[int]
         tiles: wp.array2d[int]
+        shares: wp.array[int]  # first tile of each share of a CPU, and the end
+        same_set: int  # 1 if targets and sources are the same moments
+        turned: wp.array[int]  # 1 where a torque is computed
+        # Data in:
         targets: wp.array2d[dtype]
         sources: wp.array2d[dtype]
-        same_set: int
         effective: wp.array2d[dtype]
-        partial: wp.array3d[dtype]
         overlap: wp.array2d[int]
         overlap_count: wp.array[int]
         base: wp.array[vec3]
-        turned: wp.array[int]
+        # Data out:
+        partial: wp.array3d[dtype]
         out: wp.array[vec3]
         torques: wp.array[vec3]
-        shares: wp.array[int]
 
     return EvaluationArrays

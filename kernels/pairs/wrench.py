@@ -5,12 +5,13 @@
 | kelvin | F = μ0 (m·∇)H | Kim and Han 2022, Eqs. 13 and 14 (both r⁴ of Eq. 14 are r⁵) |
 | zeeman | F = μ0 V [f'(H) ∇H (2M + H) + ∇H M] | Eq. 4 |
 
-Both are μ0 (e·∇)H for an effective moment e, m or m + f'(H)(2m + V H), and the torque on a moment is τ = μ0 e × H, see
-``evaluate``. The moments of one body make neither force nor torque on each other: with Kelvin's law what they would add
-up to is zero, and rounding must not make it otherwise. With Eq. 4 the paper, which handles no torque, sums pairs of one
-body, too (Algorithm 1). In equilibrium the two agree: e is λm with λ of 1 to 8 and m is parallel to the whole field, so
-that the body's own pairs turn it by −λm × H_own = λm × H, as far as λ is one number in the body; where it is not, they
-also push it, which no body can do to itself.
+Both are μ0 (e·∇)H for an effective moment e, which is m or m + f'(H)(2m + V H). The torque on a moment is τ = μ0 e × H.
+Pairs of moments of one body are left out: with Kelvin's law they add up to zero, which rounding would violate.
+
+With Eq. 4 the paper, which has no torque, also sums pairs of one body (Algorithm 1). In equilibrium e = λm, with λ from
+1 to 8, and m is parallel to the total field. If λ is uniform in a body, the torque of its own pairs is
+−λm × H_own = λm × H, which agrees with the sum without them. Otherwise they would also exert a net force of the body on
+itself.
 """
 
 from functools import cache
@@ -45,7 +46,8 @@ def _zeeman_kernel(dtype):
         i = wp.tid()
         m = vec3(packed[4, i], packed[5, i], packed[6, i])
         e = m
-        if inducible[i] == 1 and curve[i] != wp.static(LINEAR):  # permanent ones respond little
+        if inducible[i] == 1 and curve[i] != wp.static(LINEAR):  # the response of permanent moments is small
+            # e = m + f'(H) (2m + V H)
             v = dtype(2.0) * m + ball_volume(packed[3, i]) * h[i]
             e += curve_derivative_times(h[i], v, slope[i], saturation[i], curve[i], tables)
         for c in range(3):
@@ -59,8 +61,8 @@ def launch_zeeman_moments(moments, h, material: CurveParameters, effective):
 
     Args:
         moments: Packed moments (``packing.PackedMoments``).
-        h: Whole field at inducible moments [A/m], shape [n].
-        material: What the moments are made of.
+        h: Total field at inducible moments [A/m], shape [n].
+        material: Magnetization curves of the moments.
         effective: Out, effective moments [A·m²], shape [3, n].
     """
     wp.launch(

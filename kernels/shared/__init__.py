@@ -1,4 +1,4 @@
-"""What all rooms share: native code, threads of a CPU, vectors, sums over threads, prefix sums, keys over time.
+"""Shared code of all rooms: native kernels, threads of a CPU, vectors, sums over threads, prefix sums.
 
 Imports Warp and NumPy only.
 """

@@ -1,7 +1,7 @@
-"""Cores that this process may use: its affinity, and the quota of the cgroups that it is in.
+"""Number of cores that this process may use, from its affinity and the CPU quota of its cgroups.
 
-A container is often given a part of its machine by a quota alone: 2 cores' time on a machine of 64. Threads beyond it
-would be stopped for the rest of each period, all at once.
+A container is often limited by a quota alone, for example to 2 cores' time on a machine of 64 cores. With more threads
+than that, all of them are stopped for the rest of each period.
 """
 
 import math
@@ -12,10 +12,10 @@ from pathlib import Path
 
 
 def cores() -> int:
-    """Cores that this process may use, at least 1; a part of a core counts as one.
+    """Number of cores that this process may use, at least 1; a fraction of a core counts as one.
 
-    The affinity is that of the calling thread now. The quota is that of the first call: reading it takes longer than
-    many a launch.
+    The affinity of the calling thread is read at each call. The quota is read at the first call only, since reading it
+    takes longer than many launches.
     """
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(allowed, math.ceil(min(_own_quota(), allowed))))
@@ -27,10 +27,10 @@ def _own_quota() -> float:
 
 
 def cpu_quota(root: Path) -> float:
-    """Cores' worth of time that the cgroups of this process, and those around them, allow; infinite without a limit.
+    """CPU time per real time that the cgroups of this process and their parents allow; infinite without a limit.
 
     Args:
-        root: Folder of the file system, whose ``proc/self/cgroup`` and ``proc/self/mountinfo`` are read.
+        root: Root of the file system; ``proc/self/cgroup`` and ``proc/self/mountinfo`` in it are read.
     """
     try:
         groups = (root / "proc/self/cgroup").read_text().splitlines()
@@ -42,7 +42,7 @@ def cpu_quota(root: Path) -> float:
         if controllers and "cpu" not in controllers.split(","):
             continue
         for mounted, folder in _mounts(mounts, unified=not controllers):
-            # a container may see its own group, or none but its own, as the top
+            # a container may see its own group as the root of the hierarchy
             inside = group[len(mounted) :] if (group + "/").startswith(mounted.rstrip("/") + "/") else ""
             parts = [part for part in inside.split("/") if part not in ("", "..")]
             for count in range(len(parts) + 1):
@@ -51,7 +51,7 @@ def cpu_quota(root: Path) -> float:
 
 
 def _mounts(mounts, unified: bool):
-    """Group and folder at the top of each mounted hierarchy of cgroups, unified (version 2) or of the CPU's (1)."""
+    """Group and mount folder of each mounted cgroup hierarchy: unified (version 2) or of the CPU (1)."""
     for line in mounts:
         # 36 35 98:0 /group /folder rw,noatime master:1 - cgroup cgroup rw,cpu,cpuacct
         own, _, kind = line.partition(" - ")
@@ -63,7 +63,7 @@ def _mounts(mounts, unified: bool):
 
 
 def _limit(folder: Path) -> float:
-    """Quota over period of a cgroup, of version 2 or 1."""
+    """Quota divided by period of a cgroup of version 1 or 2; infinite without a limit."""
     try:
         if (folder / "cpu.max").exists():
             quota, period = (folder / "cpu.max").read_text().split()

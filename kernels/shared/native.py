@@ -51,7 +51,7 @@ def native_kernel(call: str, header: str, arguments: dict, *, dtype, launch: dic
 
 
 def native_options(*headers: str, dtype, **constants: int | float) -> dict:
-    """Module options of a kernel with ``module="unique"`` whose snippets call functions of ``headers``.
+    """Module options of a kernel with ``module="unique"`` whose ``wp.func_native`` snippets call functions of headers.
 
     Args:
         headers: Paths from ``kernels/``.
@@ -63,7 +63,7 @@ def native_options(*headers: str, dtype, **constants: int | float) -> dict:
         f"constexpr {'int' if isinstance(value, int) else 'Real'} {name} = {value!r};"
         for name, value in constants.items()
     ]
-    # products and sums of a header may be fused, as those of a GPU are; Warp's own code that follows stays as it was
+    # fused multiply-add in headers, as on a GPU, but not in Warp's code that follows
     lines = [
         "namespace warpmag {",
         f"using Real = {real};",
@@ -86,19 +86,19 @@ def native_options(*headers: str, dtype, **constants: int | float) -> dict:
         extra_cuda_preamble=preamble,
         extra_build_dependencies=sorted(_closure(headers)),
     )
-    # vectors as wide as there are, where clang stops at half of AVX-512; and no word on how wider ones would be handed
-    # to code that was compiled without them: there is none
+    # full AVX-512 vectors, of which clang uses half by default. The warning about passing vectors to code compiled
+    # without AVX-512 does not apply: there is no such code.
     flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512 -Wno-psabi"
     return {"extra_build_options": options, "cpu_compiler_flags": flags}
 
 
 def _closure(headers) -> set[Path]:
-    """Files of ``headers`` and of all that they include."""
-    found: set[Path] = set()
-    wanted = [_FOLDER / header for header in headers]
-    while wanted:
-        path = wanted.pop()
-        if path not in found:
-            found.add(path)
-            wanted += [_FOLDER / name for name in _INCLUDE.findall(path.read_text(encoding="utf-8"))]
-    return found
+    """Files of ``headers`` and of all headers that they include."""
+    files: set[Path] = set()
+    pending = [_FOLDER / header for header in headers]
+    while pending:
+        path = pending.pop()
+        if path not in files:
+            files.add(path)
+            pending += [_FOLDER / name for name in _INCLUDE.findall(path.read_text(encoding="utf-8"))]
+    return files

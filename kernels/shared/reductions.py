@@ -6,17 +6,17 @@ from typing import Any
 import warp as wp
 
 _GROUP_THREADS = 8
-"""Threads of a GPU that share out the neighbours of a moment; a part of a warp."""
+"""Threads of a GPU that share the neighbors of a moment; a power of two, at most a warp."""
 
 
 def group_threads(device) -> int:
-    """Threads that share out the neighbours of a moment; each takes every so many of them."""
+    """Number of threads that share the neighbors of a moment: ``_GROUP_THREADS`` on a GPU, 1 on a CPU."""
     return _GROUP_THREADS if device.is_cuda else 1
 
 
 @cache
 def group_sum(vector):
-    """Warp function that adds up a vector over groups of 2ᵏ threads of a warp, for each of them."""
+    """Warp function (value, width) that returns the sum of a vector over groups of ``width`` = 2ᵏ threads of a warp."""
 
     @wp.func_native(f"""
     auto total = value;
@@ -33,15 +33,15 @@ def group_sum(vector):
 
 
 @wp.func
-def block_sum(mine: Any):
-    """Sum of a value over the threads of a block, in a fixed order; the same for all of them."""
-    return wp.tile_extract(wp.tile_sum(wp.tile(mine, preserve_type=True)), 0)
+def block_sum(value: Any):
+    """Sum of a value over the threads of a block, in a fixed order; all threads get the same sum."""
+    return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
 
 
 @wp.func
-def block_max(mine: Any):
-    """Largest value of the threads of a block."""
-    return wp.tile_extract(wp.tile_max(wp.tile(mine)), 0)
+def block_max(value: Any):
+    """Largest value among the threads of a block."""
+    return wp.tile_extract(wp.tile_max(wp.tile(value)), 0)
 
 
 @wp.func_native("""
@@ -50,5 +50,5 @@ def block_max(mine: Any):
 #endif
 """)
 def fence():
-    """Let what a thread has written be seen by other blocks before what it writes next."""
+    """Make earlier writes of a thread visible to other blocks before its later writes."""
     ...

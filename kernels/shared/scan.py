@@ -1,4 +1,4 @@
-"""Prefix sums without allocation, as conditional nodes of CUDA graphs need (``engine/pile_xpbd/capture.py``)."""
+"""Prefix sums without allocation, for conditional nodes of CUDA graphs (``engine/pile_xpbd/capture.py``)."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ def _scan(
     # outputs:
     sums_out: wp.array[wp.int32],
 ):
-    """One block walks through the tiles; loads beyond the end give zeros, stores there do nothing."""
+    """Scan the tiles one after the other in one block; loads beyond the end return zero, stores there do nothing."""
     before = int(0)
     for tile in range((values_in.shape[0] + _TILE - 1) // _TILE):
         values = wp.tile_load(values_in, shape=_TILE, offset=tile * _TILE)
@@ -30,12 +30,12 @@ def _scan(
 
 
 def launch_scan(values, sums, inclusive: bool = True):
-    """Add up integers from the first on; the same as ``wp.utils.array_scan``.
+    """Write the prefix sums of integers, as ``wp.utils.array_scan`` does.
 
     Args:
         values: Integers, shape [n].
         sums: Out, sum of the values up to each one, shape [n]; may be ``values``.
-        inclusive: Whether the value itself is counted.
+        inclusive: True if a value is part of its own sum.
     """
     wp.launch_tiled(
         _scan, dim=1, inputs=[values, int(inclusive)], outputs=[sums], block_dim=_BLOCK, device=values.device

@@ -1,15 +1,15 @@
-"""Threads of a CPU that help with the work of a launch.
+"""Team of threads of a CPU that share the work of a launch.
 
-Warp launches serially on a CPU, and a launch may sit inside a graph, where Python's threads cannot help. So native code
-shares its work with threads of the process's own library. They are started once, since to start one takes longer than
-many a launch. One that has helped looks for more to do for a while, as launches follow each other, and then sleeps.
+Warp launches serially on a CPU, and a launch may be part of a graph, which Python's threads cannot run. So native code
+shares its work with POSIX threads. They are started once, since starting a thread takes longer than many launches. A
+thread polls for work for a while after a launch, as launches follow each other, and then sleeps.
 
-How many threads work on something is decided when its launch is prepared, by the cores that this process may use then;
-it never shows in results, since no sum is cut or ordered by it.
+The number of threads of a launch is chosen when the launch is prepared, from the cores that the process may use. It
+never changes results: no sum is split or ordered by thread.
 
-A member of the team is some memory that all launches share: its state, what it is to do, and what it sleeps with. A
-launch claims members that have nothing to do, and takes back what they have not begun when it is done itself. So it
-never waits for a thread that does not come, and several that run at once share the members.
+A member of the team is a record in memory that all launches share: its state, its job, and its mutex and condition
+variable. A launch claims idle members, and takes back jobs that have not begun once its own part is done. So it never
+waits for a thread that does not run, and concurrent launches share the members.
 """
 
 import atexit
@@ -24,12 +24,12 @@ from warpmag.kernels.shared.cores import cores
 from warpmag.kernels.shared.native import native_kernel
 
 MOST_THREADS = 64
-"""Threads that may work on one launch."""
+"""Most threads per launch; as in ``team.h``."""
 MOMENTS_PER_THREAD = 2500
-"""Moments that make another thread worth waking for a pass over them and their neighbours: 0.1 to 0.2 ms."""
+"""Moments per thread, at least, in a pass over moments and their neighbors: 0.1 to 0.2 ms of work."""
 _STATE, _WORDS = 0, 24
 _GONE, _ASLEEP = 0, 2
-"""Place of a member's state among its words, how many these are, and two of its values; as in ``team.h``."""
+"""Index of the state in a member's record, words per record, and two states; as in ``team.h``."""
 
 
 _start_members = native_kernel(
@@ -41,26 +41,26 @@ _start_members = native_kernel(
 
 
 def threads_for(count: int, each: int) -> int:
-    """Threads that share ``count`` pieces of work, ``each`` of which make another one worth waking."""
+    """Number of threads for ``count`` items of work, with at least ``each`` items per thread."""
     return max(1, min(int(count) // each, cores(), MOST_THREADS))
 
 
 def team() -> wp.array:
-    """The members' memory, one for the process; what ``run_together`` of ``team.h`` takes.
+    """Records of the team's members, the argument of ``run_together`` in ``team.h``; one array per process.
 
-    There are as many as other cores; should this process be given more, members join.
+    There is a member for each further core. If the process gets more cores, more members are started.
     """
     members, started = _members()
-    wanted = min(cores(), MOST_THREADS) - 1
-    if wanted > started[0]:
-        wp.launch(_start_members, dim=1, inputs=[wanted], outputs=[members], device="cpu")
-        started[0] = wanted
+    count = min(cores(), MOST_THREADS) - 1
+    if count > started[0]:
+        wp.launch(_start_members, dim=1, inputs=[count], outputs=[members], device="cpu")
+        started[0] = count
     return members
 
 
 @cache
 def _members() -> tuple[wp.array, list[int]]:
-    """Memory of the members, and how many have been started."""
+    """Records of the members, and the number of members that have been started."""
     members = wp.zeros((MOST_THREADS, _WORDS), dtype=wp.uint64, device="cpu")
     atexit.register(_wait_until_asleep, members.numpy())
     if hasattr(os, "register_at_fork"):
@@ -69,7 +69,7 @@ def _members() -> tuple[wp.array, list[int]]:
 
 
 def _wait_until_asleep(members: np.ndarray) -> None:
-    """Wait for members that look for work: the code that they run goes when the process ends."""
+    """Wait until no member polls for work: its code is unloaded when the process ends."""
     for _ in range(100):
         if np.isin(members[:, _STATE], (_GONE, _ASLEEP)).all():
             return
@@ -77,6 +77,6 @@ def _wait_until_asleep(members: np.ndarray) -> None:
 
 
 def _forget(members: np.ndarray) -> None:
-    """Do without the members, which a process that was forked has not."""
+    """Clear the records after a fork: the child process has no members."""
     members[:] = _GONE
     _members.cache_clear()

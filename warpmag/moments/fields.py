@@ -9,7 +9,7 @@ from warpmag.declarations.checks import check_not_negative, check_token
 from warpmag.declarations.magnets import check_rtol
 from warpmag.errors import InputError
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments.arrays import (
     LEAST_FORCE_MOMENT,
     REFERENCE_RADIUS_RANGE,

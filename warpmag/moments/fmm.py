@@ -12,7 +12,7 @@ from warpmag.kernels.fmm.evaluation import FmmSums
 from warpmag.kernels.fmm.expansions import ExpansionTables
 from warpmag.kernels.fmm.octree import Octree, join_moments
 from warpmag.kernels.fmm.translate import displacements
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments import harmonics
 from warpmag.moments.ranks import current_ranks
 

@@ -14,7 +14,7 @@ import warp as wp
 from warpmag.kernels.fmm.evaluation import FmmSums
 from warpmag.kernels.pairs.evaluate import REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 from warpmag.moments.arrays import vec3_type
 from warpmag.moments.fmm import FastSums

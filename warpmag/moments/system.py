@@ -23,7 +23,7 @@ from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
 from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
-from warpmag.kernels.pairs.pair_terms import Quantity
+from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.work_list import pair_count
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
 from warpmag.moments.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
