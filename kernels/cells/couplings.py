@@ -39,9 +39,7 @@ def couplings_type(dtype):
         # Model: tables of shapes
         slot_begin: wp.array[int]  # first slot of each chunk of all tables, and the end
         other: wp.array[int]  # cell of the body that an entry refers to, shape [slots · CHUNK]
-        tensor: wp.array[
-            dtype
-        ]  # T_ij [1/m³], rows xx, yy, zz, xy, xz, yz of CHUNK numbers per slot; zero after the end
+        tensor: wp.array[dtype]  # T_ij [1/m³]: xx, yy, zz, xy, xz, yz of CHUNK cells per slot; zero after a list's end
         place: wp.array2d[dtype]  # positions of cells for the low-order fields of their body, shape [3, rows]
         # Model: bodies
         chunk: wp.array[wp.vec4i]  # first moment, count, first row of the body, first row of its table, shape [chunks]
