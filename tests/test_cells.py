@@ -1,4 +1,4 @@
-"""Inducible bodies that are no balls: demagnetizing tensors of their cells, and the moments, forces and torques."""
+"""Inducible bodies other than balls: demagnetizing tensors of their cells, moments, forces and torques."""
 
 import math
 from dataclasses import replace
@@ -32,7 +32,7 @@ SIDES = np.array([1.0, 0.7, 0.4])
 
 
 def demagnetizing_factors(semi_axes):
-    """Those of an ellipsoid (Osborn 1945), by their integrals."""
+    """Demagnetizing factors of an ellipsoid (Osborn 1945), by numerical integration."""
     a = np.asarray(semi_axes, float)
     return np.array(
         [a.prod() / 2 * quad(lambda s, x=x: 1 / ((s + x * x) * np.sqrt((s + a * a).prod())), 0, np.inf)[0] for x in a]
@@ -40,27 +40,27 @@ def demagnetizing_factors(semi_axes):
 
 
 def test_tensors_of_cuboids_are_their_exact_fields_averaged():
-    nodes, weights = np.polynomial.legendre.leggauss(8)  # of the field at a side's distance: to 1e-9
+    nodes, weights = np.polynomial.legendre.leggauss(8)  # exact to 1e-9 for a field at a side's distance
     weight = np.einsum("i,j,k->ijk", weights, weights, weights).reshape(-1) / 8
     points = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3) * SIDES / 2
     for offset in ((2, 1, 0), (0, 3, -2), (-1, 2, 5), (-2, -3, -4)):
-        found = full(demagnetization.cuboid_tensors(np.array([offset]), SIDES))[0]
+        result = full(demagnetization.cuboid_tensors(np.array([offset]), SIDES))[0]
         for axis in np.eye(3):
             field = magpylib.magnet.Cuboid(dimension=SIDES, magnetization=axis).getH(points + offset * SIDES)
-            np.testing.assert_allclose(-found @ axis, weight @ field, atol=1e-8)
+            np.testing.assert_allclose(-result @ axis, weight @ field, atol=1e-8)
 
 
 def test_the_potential_of_a_tiny_facet_beside_a_large_one():
-    """In the middle of a square of edge a it is 4 a ln(1 + √2) / 4π."""
+    """The potential in the center of a square of edge a is 4 a ln(1 + √2) / 4π."""
     square = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     tiny = np.array([1.0, 0.3, 0.2])
-    found = uniform_response.potentials(tiny[None], np.stack([square, 1e-9 * square + tiny]))
-    # coordinates of order one place the corners of the tiny facet to 1e-7 of its edge
-    assert found[0, 1] == pytest.approx(1e-9 * math.log(1.0 + math.sqrt(2.0)) / math.pi, rel=1e-6)
+    result = uniform_response.potentials(tiny[None], np.stack([square, 1e-9 * square + tiny]))
+    # coordinates of order 1 round the corners of the tiny facet to 1e-7 of its edge
+    assert result[0, 1] == pytest.approx(1e-9 * math.log(1.0 + math.sqrt(2.0)) / math.pi, rel=1e-6)
 
 
 def test_tensors_of_cuboids_add_up_to_that_of_the_block_they_fill():
-    """Ten digits: what is left of float64 when terms of offsets up to 6 sides cancel."""
+    """Ten digits remain of float64 after cancellation at offsets of up to 6 sides."""
     counts = np.array([3, 2, 5])
     grid = np.stack(np.meshgrid(*(np.arange(k) for k in counts), indexing="ij"), axis=-1).reshape(-1, 3)
     pairs = demagnetization.cuboid_tensors((grid[:, None] - grid).reshape(-1, 3), SIDES)
@@ -105,24 +105,24 @@ def magnetized(solid, susceptibility, device, spacing=0.0, **settings):
 @pytest.mark.parametrize("name", ELLIPSOIDS)
 @pytest.mark.parametrize("susceptibility", [10.0, 179.0, math.inf])
 def test_ellipsoids_take_the_moment_of_the_closed_form(device, name, susceptibility):
-    """1 %: facets are good to 0.5 % in an even field, whatever the cells."""
+    """1 %: facets are good to 0.5 % in a uniform field, whatever the cells."""
     axes = np.array(ELLIPSOIDS[name])
-    found = magnetized(lattice.ellipsoid(0.01 * axes), susceptibility, device, rtol=1e-3)
-    np.testing.assert_allclose(found, 1.0 / (demagnetizing_factors(axes) + 1.0 / susceptibility)[[0, 2]], rtol=1e-2)
+    result = magnetized(lattice.ellipsoid(0.01 * axes), susceptibility, device, rtol=1e-3)
+    np.testing.assert_allclose(result, 1.0 / (demagnetizing_factors(axes) + 1.0 / susceptibility)[[0, 2]], rtol=1e-2)
 
 
 @pytest.mark.parametrize("sides", [(1.0, 1.0, 5.0), (1.0, 1.0, 10.0), (5.0, 5.0, 1.0), (10.0, 10.0, 1.0)])
 def test_rods_and_sheets_take_the_moment_of_a_surface_integral_equation(device, sides):
     """1 % at the default spacing; the reference is good to 0.3 %."""
-    found = magnetized(lattice.box(0.5 * np.array(sides)), math.inf, device)
-    np.testing.assert_allclose(found, surface_integrals.box_moments(sides, [math.inf])[0, [0, 2]], rtol=1e-2)
+    result = magnetized(lattice.box(0.5 * np.array(sides)), math.inf, device)
+    np.testing.assert_allclose(result, surface_integrals.box_moments(sides, [math.inf])[0, [0, 2]], rtol=1e-2)
 
 
 @pytest.mark.parametrize("length", surface_integrals.CYLINDER_LENGTHS)
 def test_cylinders_take_the_moment_of_a_surface_integral_equation(device, length):
     """1 %; the reference is good to 0.3 %."""
-    found = magnetized(lattice.cylinder(0.5, 0.5 * length), math.inf, device)
-    np.testing.assert_allclose(found[::-1], surface_integrals.cylinder_moments(length, [math.inf])[0], rtol=1e-2)
+    result = magnetized(lattice.cylinder(0.5, 0.5 * length), math.inf, device)
+    np.testing.assert_allclose(result[::-1], surface_integrals.cylinder_moments(length, [math.inf])[0], rtol=1e-2)
 
 
 def test_moments_of_any_susceptibility_are_those_of_a_surface_integral_equation(device):
@@ -134,23 +134,23 @@ def test_moments_of_any_susceptibility_are_those_of_a_surface_integral_equation(
         body = filled([solid])
         coupling = coupled(body, [solid])
         for susceptibility, expected in zip(values, references, strict=True):
-            found = polarizability(body, susceptibility, device, coupling=coupling)
-            np.testing.assert_allclose(found, expected, rtol=1e-2)
+            result = polarizability(body, susceptibility, device, coupling=coupling)
+            np.testing.assert_allclose(result, expected, rtol=1e-2)
 
 
 @pytest.mark.parametrize("spacing", [1.0, 2.0, 10.0])
 def test_bodies_of_a_cell_across_take_the_moment_of_their_surface(device, spacing):
     """1 %: 5, 3 and 1 cells of a rod, which alone take down to 11.3 of 17.5 along it."""
-    found = magnetized(lattice.box([0.5, 0.5, 2.5]), math.inf, device, spacing)
+    result = magnetized(lattice.box([0.5, 0.5, 2.5]), math.inf, device, spacing)
     expected = surface_integrals.box_moments((1.0, 1.0, 5.0), [math.inf])[0, [0, 2]]
-    np.testing.assert_allclose(found, expected, rtol=1e-2)
+    np.testing.assert_allclose(result, expected, rtol=1e-2)
 
 
 def test_crossed_bars_of_a_cell_across_take_the_moment_of_a_surface_integral_equation(device):
     """2 %: facets are whole or left out where the bars meet; cells alone take a quarter too little."""
     bars = posed(([1.0, 1.0, 5.0], [0.0] * 3), ([5.0, 1.0, 1.0], [0.0] * 3))
     body = filled(bars, 2.0)
-    found = polarizability(body, math.inf, device, coupling=coupled(body, bars))
+    result = polarizability(body, math.inf, device, coupling=coupled(body, bars))
     squares = [((1, -1, 1), (5, 1, 1)), ((1, -1, -1), (5, 1, -1)), ((5, -1, -1), (5, 1, 1))]
     squares += [((1, 1, -1), (5, 1, 1)), ((1, -1, -1), (5, -1, 1))]
     faces = [((-1, y, -1), (1, y, 1)) for y in (-1, 1)]
@@ -160,7 +160,7 @@ def test_crossed_bars_of_a_cell_across_take_the_moment_of_a_surface_integral_equ
             face = face[:, ::-1] if swap else face
             faces.append((face.min(axis=0), face.max(axis=0)))
     expected = surface_integrals.permeable_moments(np.array(faces, float), body.volumes.sum(), 8)
-    np.testing.assert_allclose(found, expected[[0, 2], [0, 2]], rtol=2e-2)
+    np.testing.assert_allclose(result, expected[[0, 2], [0, 2]], rtol=2e-2)
 
 
 def test_flat_cells_of_thin_plates_keep_the_operator_positive(monkeypatch):
@@ -203,7 +203,7 @@ def test_cubes_approach_the_published_value(device):
     ids=lambda solid: f"{solid.name}{solid.upper.max() / solid.upper.min():.0f}",
 )  # fmt: skip
 def test_operator_of_a_body_is_positive(solid):
-    """So that induction has one solution whatever the susceptibility; and no eigenvalue exceeds 1, its largest norm."""
+    """Eigenvalues are in [0, 1], so that induction has one solution for any susceptibility."""
     body = lattice.fill(solid, (solid.volume / 150.0) ** (1 / 3))
     matrix = demagnetizing_matrix(body, coupled(body, [solid]))
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
@@ -214,10 +214,10 @@ def test_operator_of_a_body_is_positive(solid):
 
 @pytest.mark.parametrize("apart", [0.0, 0.004, 0.009, 0.01])
 def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
-    """Two cubes of 10 mm and infinite permeability, also in one place, from whatever start."""
+    """Two cubes of 10 mm and infinite permeability, also coincident, from different starts."""
     body = lattice.fill(lattice.box([0.005] * 3), 0.0025)
     n, coupling = len(body.volumes), demagnetization.coupling(body, body.radii)
-    found = []
+    solutions = []
     for seed in range(3):
         system = moment_system(
             radii=np.tile(body.radii, 2), bodies=np.repeat([0, 1], n), saturation=1.7e6, external_field=(0.0, 0.0, 1e3),
@@ -228,13 +228,14 @@ def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
         system.start_from(wp.array(np.clip(start, -9e5, 9e5), dtype=wp.vec3d, device=device))
         system.solve()
         assert system.converged.numpy().tolist() == [1]
-        found.append(system.moments.numpy())
-    for other in found[1:]:
-        assert np.linalg.norm(other - found[0]) < 1e-6 * np.linalg.norm(found[0])  # rtol, and what slowness makes of it
+        solutions.append(system.moments.numpy())
+    for other in solutions[1:]:
+        # rtol, amplified by slow convergence
+        assert np.linalg.norm(other - solutions[0]) < 1e-6 * np.linalg.norm(solutions[0])
 
 
 def intersecting(body, coupling, places, turns, device):
-    """A system of equal bodies, and their operator H = −D M symmetrized by volumes, by one field for each moment."""
+    """A system of equal bodies, and their operator H = −D M, symmetrized by volumes, from the field of each moment."""
     n, count = len(body.volumes), len(places)
     system = moment_system(
         radii=np.tile(body.radii, count), bodies=np.repeat(np.arange(count), n), saturation=FAINT,
@@ -252,10 +253,10 @@ def intersecting(body, coupling, places, turns, device):
         system.evaluate()
         fields.append(system.h.numpy().flatten())
     root = np.repeat(np.sqrt(np.tile(body.volumes, count)), 3)
-    found = np.eye(size) / 3.0 - root * (np.array(fields[1:]) - fields[0]).T * root[:, None]
-    np.testing.assert_allclose(found, found.T, atol=1e-6)  # places in float64 are rounded to float32 where packed
+    operator = np.eye(size) / 3.0 - root * (np.array(fields[1:]) - fields[0]).T * root[:, None]
+    np.testing.assert_allclose(operator, operator.T, atol=1e-6)  # positions are rounded to float32
     system.start_from(wp.zeros(n * count, dtype=wp.vec3d, device=device))
-    return system, found
+    return system, operator
 
 
 @pytest.mark.parametrize(
@@ -271,7 +272,7 @@ def intersecting(body, coupling, places, turns, device):
     ids=["cube", "plate", "rod", "cylinder", "cone", "ellipsoid"],
 )
 def test_operator_of_bodies_that_intersect_is_positive(solid, spacing, device):
-    """In one place, a little apart, and anyhow; so that induction converges, whatever was put into what."""
+    """Coincident, close and random bodies: induction converges for any intersection."""
     body = lattice.fill(solid, spacing, lattice.LEAST_ACROSS)
     coupling = coupled(body, [solid])
     rng = np.random.default_rng(0)
@@ -279,7 +280,7 @@ def test_operator_of_bodies_that_intersect_is_positive(solid, spacing, device):
         places = spread * solid.upper.min() * rng.uniform(-1.0, 1.0, (count, 3))
         turns = Rotation.from_rotvec(turn * rng.normal(size=(count, 3)))
         system, operator = intersecting(body, coupling, places, list(turns), device)
-        assert np.linalg.eigvalsh(operator)[0] > -0.03 * coupling.hardening  # which is known to 3 %
+        assert np.linalg.eigvalsh(operator)[0] > -0.03 * coupling.hardening  # hardening is known to 3 %
         system.solve()
         assert system.converged.numpy().tolist() == [1]
         assert system.evaluations.numpy()[0] < 50
@@ -292,7 +293,7 @@ def test_hardening_is_what_balls_are_harder_by(solid):
     nothing = replace(coupling, tensor=np.zeros_like(coupling.tensor), common=np.zeros_like(coupling.common))
     harder = demagnetizing_matrix(body, nothing) - demagnetizing_matrix(body, coupling)
     truth = np.linalg.eigvalsh(0.5 * (harder + harder.T))[-1]
-    assert 0.97 * truth < coupling.hardening <= truth * (1.0 + 1e-9)  # from below, as 20 steps leave it
+    assert 0.97 * truth < coupling.hardening <= truth * (1.0 + 1e-9)  # 20 Lanczos steps converge from below
 
 
 def coenergy(system):
@@ -322,7 +323,7 @@ def test_torque_on_a_turned_body_is_the_gradient_of_its_energy(device):
 
 
 def test_a_soft_ellipsoid_turns_with_the_torque_of_the_closed_form(device):
-    """1 %, as its moments, of which the torque is μ0 V H0² (κ∥ − κ⊥) sin α cos α; down to a fifth without cells."""
+    """1 %, as for its moments: the torque is μ0 V H0² (κ∥ − κ⊥) sin α cos α; down to a fifth without cells."""
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
     body = builder.add_body()
@@ -339,7 +340,7 @@ def test_a_soft_ellipsoid_turns_with_the_torque_of_the_closed_form(device):
 
 
 def test_a_body_neither_pushes_nor_turns_itself(device):
-    """Whatever an iron plate does to a magnet, the magnet does to it."""
+    """Forces and torques of an iron plate and a magnet are opposite and equal."""
     body = lattice.fill(lattice.box([0.01, 0.01, 0.002]), 0.001)
     magnet = np.array([[0.004, 0.002, 0.006]]), np.array([[0.1, -0.3, 0.5]])
     system = make_system(body, turn=TURN, permanent=[magnet], susceptibility=1e3, dtype="float64", device=device)
@@ -376,7 +377,7 @@ def test_a_needle_of_a_model_turns_into_the_field(device):
     moment = volume * 1e3 * (2.28 * np.array([0, 0, 1]) + (40.9 - 2.28) * along[2] * along)
     np.testing.assert_allclose(wrench[3:], oracle.MU0 * np.cross(moment, field), rtol=0.05, atol=1e-9)
     np.testing.assert_allclose(wrench[:3], 0.0, atol=1e-6 * np.abs(wrench).max() / 0.05)
-    # the same bits again, and from a graph
+    # bitwise equal when repeated, and from a graph
     again = model.state()
     magnetics.system.start_cold()
     with wp.ScopedCapture(device=device) as capture:
@@ -392,7 +393,7 @@ def test_bodies_of_one_shape_share_a_table_and_balls_have_none(device):
     for k in range(3):
         add_needle(builder, wp.quat_identity(), (0.1 * k, 0.0, 0.0))
     magnetics = warpmag.Magnetics(builder.finalize(device=device))
-    couplings = {id(one.lattice.coupling) for one in magnetics.magnets}
+    couplings = {id(magnet.lattice.coupling) for magnet in magnetics.magnets}
     assert len(couplings) == 1
     assert len(magnetics.system.rotations) == 3
     balls = newton.ModelBuilder()

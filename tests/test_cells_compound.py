@@ -16,7 +16,7 @@ L_SHAPE = posed(([1.0, 1.0, 3.0], [0.0, 0.0, 3.0]), ([2.0, 1.0, 1.0], [3.0, 0.0,
 
 
 def test_halves_of_a_box_are_the_box(device):
-    """Cells are the same: what is left is the residual, and what rod and halves make of rounding."""
+    """Cells are equal: differences are the residual and rounding."""
     half, at = [1.0, 1.0, 5.0], [0.0, 0.0, 5.0]
     turned = lattice.box([5.0, 1.0, 1.0]).posed([0.0, 0.0, -5.0], [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)])
     whole = polarizability(filled([lattice.box([1.0, 1.0, 10.0])]), math.inf, device, rtol=1e-5)
@@ -42,26 +42,26 @@ def test_an_l_of_two_boxes_takes_the_moment_of_a_surface_integral_equation(devic
     for axis in (0, 2):
         system = make_system(body, susceptibility=math.inf, external_field=1e3 * np.eye(3)[axis], device=device)
         system.solve()
-        found = system.moments.numpy().sum(axis=0) / (1e3 * body.volumes.sum())
-        assert np.linalg.norm(found - expected[axis]) < 0.05 * np.linalg.norm(expected[axis])
+        moment = system.moments.numpy().sum(axis=0) / (1e3 * body.volumes.sum())
+        assert np.linalg.norm(moment - expected[axis]) < 0.05 * np.linalg.norm(expected[axis])
 
 
 def test_parts_apart_are_dipoles_to_each_other(device):
     """Two cubes 100 sides apart in two corners of a common grid of 10 million cells."""
     body = filled(posed(([0.01] * 3, [0.0] * 3), ([0.01] * 3, [1.0, -1.5, 2.0])))
-    one = filled([lattice.box([0.01] * 3)], 0.02 / 7)
+    cube = filled([lattice.box([0.01] * 3)], 0.02 / 7)
     coupling = demagnetization.coupling(body, body.radii)
-    assert len(coupling.other) == 2 * len(demagnetization.coupling(one, one.radii).other)
-    expected = polarizability(one, math.inf, device)
+    assert len(coupling.other) == 2 * len(demagnetization.coupling(cube, cube.radii).other)
+    expected = polarizability(cube, math.inf, device)
     np.testing.assert_allclose(polarizability(body, math.inf, device), expected, rtol=2e-3)  # rtol of the solves
 
 
 @pytest.mark.parametrize("spacing", [8.0, 20.0, 1e10, 1e38])
 def test_a_spacing_larger_than_the_body_is_as_large_as_the_body(spacing):
-    """The L is 6 m wide; a spacing of 1e38 m overflowed, and 1e10 m had one test point in all of it."""
-    body, wanted = (lattice.fill(L_SHAPE, one, together=True) for one in (spacing, 6.0))
-    np.testing.assert_array_equal(body.positions, wanted.positions)
-    np.testing.assert_array_equal(body.volumes, wanted.volumes)
+    """The L is 6 m wide. A spacing of 1e38 m once overflowed, and 1e10 m had a single test point."""
+    body, expected = (lattice.fill(L_SHAPE, value, together=True) for value in (spacing, 6.0))
+    np.testing.assert_array_equal(body.positions, expected.positions)
+    np.testing.assert_array_equal(body.volumes, expected.volumes)
     builder = newton.ModelBuilder()
     warpmag.register_custom_attributes(builder)
     magnet = builder.add_body()
@@ -85,20 +85,20 @@ def test_a_spacing_larger_than_the_body_is_as_large_as_the_body(spacing):
     ids=["L", "hammer", "crooked hammer", "foil", "screw", "inner"],
 )  # fmt: skip
 def test_operator_of_several_shapes_is_positive(solids):
-    """And the volume is what the shapes fill, common volume once and to the test points."""
+    """The volume is that of the union of the shapes, to the resolution of the test points."""
     body = filled(solids, (solids[0].volume / 100.0) ** (1 / 3))
     values = np.linalg.eigvalsh(demagnetizing_matrix(body, coupled(body, solids)))
     assert values[0] > 0.0
     assert values[-1] < 1.0
     owned = np.bincount(body.owners, body.volumes, len(solids))
-    assert owned[0] == pytest.approx(solids[0].volume, rel=1e-12)  # the first takes what it fills
-    assert (owned[1:] <= [one.volume * (1 + 1e-12) for one in solids[1:]]).all()
+    assert owned[0] == pytest.approx(solids[0].volume, rel=1e-12)  # the first shape has its whole volume
+    assert (owned[1:] <= [solid.volume * (1 + 1e-12) for solid in solids[1:]]).all()
     if solids[0].name != "cylinder" and len(solids) == 2:
         assert owned[1] == pytest.approx(solids[1].volume, rel=1e-12)
 
 
 def test_shapes_of_one_body_magnetize_as_one(device):
-    """A rod of two boxes takes the moment of the rod in a model, too, and says how much each shape has."""
+    """In a model a rod of two boxes has the moment of the rod, and reports the share of each shape."""
     moments = []
     for parts in (1, 2):
         builder = newton.ModelBuilder()

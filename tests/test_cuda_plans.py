@@ -1,4 +1,4 @@
-"""The host's side of every launch on a GPU, run without one: what is launched, on how many threads, with what."""
+"""Host code of every launch on a GPU, run without a GPU: kernels, numbers of threads, and arguments."""
 
 import ctypes
 import dataclasses
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.skipif("not config.getoption('--device') == 'cpu'")
 
 @dataclasses.dataclass
 class Launch:
-    """A kernel that was launched: its threads, those of a block, and its arguments as Warp packed them."""
+    """A launched kernel: number of threads, threads per block, and arguments as Warp packed them."""
 
     kernel: wp.Kernel
     threads: int
@@ -51,21 +51,21 @@ class Launch:
 
 @pytest.fixture
 def launches(monkeypatch):
-    """Launches on a device that looks like CUDA's, recorded where they would run."""
-    found = []
+    """Launches on a device that looks like a CUDA device, recorded in place of running."""
+    records = []
 
     def record(kernel, hooks, params, _):
         assert params[0].size % hooks.block_dim == 0 or kernel.grid_stride, kernel.key
         assert hooks.block_dim <= np.ravel(kernel.options.get("launch_bounds") or 1024)[0], kernel.key
         assert -(-params[0].size // hooks.block_dim) % hooks.cluster_dim == 0, kernel.key
-        found.append(Launch(kernel, params[0].size, hooks.block_dim, tuple(params[1:])))
+        records.append(Launch(kernel, params[0].size, hooks.block_dim, tuple(params[1:])))
 
     real = context.Module.load
 
     def load(module, device, block_dim=None):
         if not all(map(cuda_on_cpu.ours, module._get_live_kernels())):
             return real(module, device, block_dim)
-        module.get_module_hash(block_dim)  # which looks into kernels that share a module
+        module.get_module_hash(block_dim)  # resolves kernels that share a module
         hooks = SimpleNamespace(forward=1, backward=None, det_launch_meta=None, block_dim=block_dim)
         hooks.cluster_dim = module.options.get("cluster_dim") or 1
         return SimpleNamespace(get_kernel_hooks=lambda _: hooks)
@@ -82,8 +82,8 @@ def launches(monkeypatch):
         def __exit__(self, *_):
             pass
 
-    for one in (expansions._translation, expansions._device_tables):
-        one.cache_clear()
+    for function in (expansions._translation, expansions._device_tables):
+        function.cache_clear()
     with monkeypatch.context() as patch:
         cuda_on_cpu.look_like_cuda(patch.setattr, arch=90)
         patch.setattr(context, "invoke_cpu_blocks", record)
@@ -94,9 +94,9 @@ def launches(monkeypatch):
         patch.setattr(wp, "capture_while", lambda _, body, **arguments: body(**arguments))
         patch.setattr(wp, "ScopedCapture", Capture)
         patch.setattr(wp, "capture_launch", lambda _: None)
-        yield found
-    for one in (expansions._translation, expansions._device_tables):
-        one.cache_clear()
+        yield records
+    for function in (expansions._translation, expansions._device_tables):
+        function.cache_clear()
 
 
 def packed(count: int, dtype=wp.float32) -> PackedMoments:
@@ -116,7 +116,7 @@ def evaluation(quantity, count, segments=None, *, among=True, dtype=wp.float32, 
 
 
 def integers(array) -> np.ndarray:
-    """Integers of an array as it was packed."""
+    """Integers of a packed array argument."""
     shape = array.shape[: array.ndim]
     return np.ctypeslib.as_array((ctypes.c_int * int(np.prod(shape))).from_address(array.data)).reshape(shape)
 
@@ -137,9 +137,9 @@ class Half:
 
 
 def assert_each_pair_once(sums, segments, tiles, width):
-    """Each target row with each of its sources, in tiles of so many targets, and no partial sum written twice."""
+    """Check that tiles of at most ``width`` targets cover each pair once, and write each partial sum once."""
     count = sums.count
-    expected, found = np.zeros((2, count, 1 + max(s[3] for s in segments)), int)
+    expected, covered = np.zeros((2, count, 1 + max(s[3] for s in segments)), int)
     row = 0
     for t0, t1, s0, s1 in segments:
         expected[row : row + t1 - t0, s0:s1] += 1
@@ -148,9 +148,9 @@ def assert_each_pair_once(sums, segments, tiles, width):
     for begin, end, column, first, last, part, *_ in tiles:
         assert 0 < end - begin <= width
         assert column == sums.target.numpy()[begin]
-        found[begin:end, first:last] += 1
+        covered[begin:end, first:last] += 1
         written[part, begin:end] += 1
-    assert (found == expected).all()
+    assert (covered == expected).all()
     assert (written == 1).all()
 
 
@@ -159,7 +159,7 @@ QUANTITIES = Quantity.FIELD, Quantity.FORCE, Quantity.MUTUAL_FORCE, Quantity.WRE
 
 
 def finish_of(sums, launch, parts: int):
-    """Check the kernel that adds up so many partial sums: a group of threads for each target row."""
+    """Check the kernel that adds up ``parts`` partial sums, with a group of threads for each target row."""
     assert launch.name == "finish"
     assert launch.threads == 8 * sums.count
     assert sums.partial.shape == (parts, sums.count, WIDTHS[sums._finished])
@@ -171,11 +171,11 @@ def finish_of(sums, launch, parts: int):
 def test_few_moments_take_one_kernel(quantity, which, launches):
     sums = evaluation(quantity, 300, SEGMENTS[which])
     sums.launch()
-    (one,), tiles = launches, sums._arrays.tiles.numpy()
+    (launch,), tiles = launches, sums._arrays.tiles.numpy()
     assert sums.form == FUSED
     shape = fused_cuda.choose_fused_shape(sums._finished, sums.count)
     assert_each_pair_once(sums, SEGMENTS[which], tiles, shape.targets)
-    assert (one.threads, one.block) == (len(tiles) * shape.threads, shape.threads)
+    assert (launch.threads, launch.block) == (len(tiles) * shape.threads, shape.threads)
     assert shape.shares * shape.targets <= shape.correcting
 
 
@@ -185,10 +185,10 @@ def test_few_moments_take_one_kernel(quantity, which, launches):
 def test_tiles_of_the_loop(quantity, which, extra, launches):
     sums = evaluation(quantity, 300, SEGMENTS[which], among=False, form=LOOP, extra_parts=extra)
     sums.launch()
-    (one, finish), tiles = launches, sums._arrays.tiles.numpy()
+    (launch, finish), tiles = launches, sums._arrays.tiles.numpy()
     shape = sums_cuda.choose_loop_shape(sums._finished, sums.count)
     assert_each_pair_once(sums, SEGMENTS[which], tiles, 32 * shape.targets)
-    assert (one.threads, one.block) == (len(tiles) * 32 * shape.warps, 32 * shape.warps)
+    assert (launch.threads, launch.block) == (len(tiles) * 32 * shape.warps, 32 * shape.warps)
     finish_of(sums, finish, 1 + tiles[:, 5].max() + extra)
 
 
@@ -196,7 +196,7 @@ def test_tiles_of_the_loop(quantity, which, extra, launches):
 @pytest.mark.parametrize("quantity", [Quantity.FIELD, Quantity.MUTUAL_FORCE])
 @pytest.mark.parametrize("memory", [2**28, 2**19])
 def test_mirrored_walk(quantity, memory, dtype, launches, monkeypatch):
-    """Each distance between tiles once in each home tile, in passes whose slabs fit into the partial sums."""
+    """Each home tile covers each distance between tiles once, in passes whose slabs fit the partial sums."""
     count = 5500
     monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", memory)
     sums = evaluation(quantity, count, dtype=dtype)
@@ -210,10 +210,10 @@ def test_mirrored_walk(quantity, memory, dtype, launches, monkeypatch):
     assert edges[0] == 0 and edges[-1] == count and (np.diff(edges) <= 32 * stages).all()
     finish_of(sums, finish, walk.slabs + 1 + blocks[:, 3].max())
     done = np.zeros((tiles, stages * (tiles // 2 + 1)), int)
-    for one in passes:
-        first, nearest = one.arguments[2].value, one.arguments[3].value
-        assert one.threads == one.block * tiles * (1 + blocks[:, 3].max())
-        for tile, begin, end, _ in blocks[first : first + one.threads // one.block]:
+    for launch in passes:
+        first, nearest = launch.arguments[2].value, launch.arguments[3].value
+        assert launch.threads == launch.block * tiles * (1 + blocks[:, 3].max())
+        for tile, begin, end, _ in blocks[first : first + launch.threads // launch.block]:
             assert begin // stages == 0 or begin // stages >= nearest
             assert -(-end // stages) - nearest <= walk.slabs
             done[tile, begin:end] += 1
@@ -221,7 +221,7 @@ def test_mirrored_walk(quantity, memory, dtype, launches, monkeypatch):
 
 
 def test_given_and_plain_sums(launches):
-    """The caller's sums, and those of a plain loop, have one partial sum."""
+    """Sums of the caller and of the reference loop have one partial sum."""
     called = []
     for settings in ({"sums": lambda *arguments: called.append(arguments)}, {"form": REFERENCE, "smoothing": 0.1}):
         launches.clear()
@@ -235,7 +235,7 @@ def test_given_and_plain_sums(launches):
 
 @pytest.mark.parametrize(("form", "count"), [(LOOP, 300), (MIRRORED, 5500), (FUSED, 300)])
 def test_processes_share_out_the_sums(form, count, launches, monkeypatch):
-    """A process has its half of the work and merges the partial sums, but not those that it has none of."""
+    """A process sums half of the work and merges the shared partial sums, but not the caller's."""
     whole = evaluation(Quantity.FIELD, count, form=form)
     whole.launch()
     alone = launches[0].threads
@@ -255,12 +255,12 @@ LINES = AppliedSource(SourceKind.POLYLINE, (1e-4,), 0.05 * np.eye(3))
 
 
 def solid(first: int, **settings) -> SolidMagnet:
-    """A box that is one moment."""
+    """A box with one moment."""
     return SolidMagnet(first, 1, 8e-6, 0, 0.1, polyhedra.box(BOX), True, **settings)
 
 
 def cells(spacing: float) -> dict:
-    """What a system of one body of cells takes."""
+    """Arguments of a system with one body of cells."""
     body = lattice.fill([lattice.box(BOX).posed((0.0,) * 3, (0.0, 0.0, 0.0, 1.0))], spacing, 3, together=True)
     coupling = demagnetization.coupling(body, body.radii)
     return {"radii": body.radii, "bodies": np.zeros(len(body.radii), int), "couplings": [(0, coupling)]}
@@ -297,11 +297,11 @@ EXPECTED = {
     "fast": {"build_boxes", "near_sums_cuda", "translate_cuda", "add_parts", "expand", "return_sums"},
     "most": {"sum_mirrored", "finish", "sweep", "list_neighbors"},
 }
-"""Kernels without which a system has not taken the way of a GPU."""
+"""Kernels that a system must launch on a GPU."""
 
 
 def drive(which: str, dtype: str) -> MomentSystem:
-    """Launch induction, forces and fields at points, with eddy currents where there are balls alone."""
+    """Launch induction, forces and fields at points, and eddy currents of balls."""
     magnets = moment_system(saturation=1e6, dtype=dtype, device="cpu", **SYSTEMS[which])
     if which in ("balls", "coils", "solids"):
         magnets.set_conductivity(np.full(magnets.count, 1e7), 1e-3)
@@ -321,7 +321,7 @@ def test_systems(which, launches):
     assert EXPECTED[which] <= threads.keys()
     induced = sum(middle - first for first, middle, _ in ranges)
     if "sweep" in threads:
-        assert threads["sweep"] == {8 * induced}  # a group for each
+        assert threads["sweep"] == {8 * induced}  # a group per moment
     if "advance" in threads:
         assert threads["advance"] == {induced}
     chunks = sum(-(-(middle - first) // BLOCK_CHUNK) for first, middle, _ in ranges)
@@ -330,7 +330,7 @@ def test_systems(which, launches):
 
 @pytest.mark.parametrize("which", ["fast", "most"])
 def test_systems_of_two_processes(which, launches, monkeypatch):
-    """Each has half of the cells; or of the blocks of each pass, which is a run of whole splits."""
+    """Each process has half of the boxes, or half of the blocks of each pass, in whole splits."""
     ranks = Half()
     for module in (system, fmm):
         monkeypatch.setattr(module, "current_ranks", lambda: ranks)
@@ -363,12 +363,12 @@ def magnets() -> newton.ModelBuilder:
 
 
 def advance(builder, **settings):
-    """Launch a step, and what a graph of it would hold."""
+    """Launch a step without a graph."""
     Simulation(builder, device="cpu", **settings)._stepper._launch()
 
 
 def pile(worlds: int, contact_max: int, bodies: int = 3) -> tuple:
-    """A solver of balls in some worlds, a state, and room for contacts."""
+    """A solver of balls in several worlds, its model, and contacts."""
     builder = newton.ModelBuilder()
     for _ in range(worlds):
         part = newton.ModelBuilder()
@@ -385,11 +385,11 @@ def pile(worlds: int, contact_max: int, bodies: int = 3) -> tuple:
 
 @pytest.mark.parametrize(("worlds", "contact_max"), [(1, 1000), (1, 6000), (1, 60_000), (20, 1000)])
 def test_contact_solve(worlds, contact_max, launches):
-    """By a cluster, which leaves what it may not fit to launches; by launches alone; and by a block for each world."""
+    """Contacts solved by a cluster with launches for the rest, by launches alone, or by a block per world."""
     solver, model, contacts = pile(worlds, contact_max)
     solver.step(model.state(), model.state(), None, contacts, 1e-3)
     bodies, solve = model.body_count, solver._solve
-    found = [(launch.kernel, launch.threads) for launch in launches if launch.name == "solve_contacts"]
+    solves = [(launch.kernel, launch.threads) for launch in launches if launch.name == "solve_contacts"]
 
     def kernel(call, **form):
         return contact_solve.solve_kernel(call, True, solve.group, **form)
@@ -408,12 +408,12 @@ def test_contact_solve(worlds, contact_max, launches):
     elif contact_max <= 50_000:
         in_cluster, block = kernel(contact_solve.SOLVE, cluster=16)
         expected.insert(0, (in_cluster, 16 * block))
-    assert found == expected
+    assert solves == expected
 
 
 @pytest.mark.long
 def test_every_kernel_compiles(launches, tmp_path):
-    """By NVRTC, which needs no GPU, for the one that the shapes of blocks were measured on."""
+    """NVRTC compiles every kernel, without a GPU, for the architecture of the H200."""
     for which, dtype in itertools.product(SYSTEMS, ("float32", "float64")):
         drive(which, dtype)
     for quantity, dtype in itertools.product(QUANTITIES, (wp.float32, wp.float64)):

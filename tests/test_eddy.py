@@ -17,11 +17,11 @@ RADIUS, COUNT, PERMANENT = 0.005, 12, 3
 MASS = 7870.0 * 4.0 / 3.0 * math.pi * RADIUS**3
 INERTIA = 0.4 * MASS * RADIUS**2
 NO_STEP = 0.0
-"""Time step [s] of forces that no step follows."""
+"""Time step [s] of forces that are not followed by a motion."""
 
 
 class Clump:
-    """Balls that nearly touch, or overlap a little; the last ones are permanent, every second one conducts."""
+    """Balls that nearly touch or overlap a little; the last balls are permanent, every second ball conducts."""
 
     def __init__(self, dtype, device, step=NO_STEP, conductivity=1e7):
         rng = np.random.default_rng(3)
@@ -60,7 +60,7 @@ class Clump:
         return self._wrench(velocities, spins) - self.still
 
     def expected(self):
-        """The same by the oracle, as a function, with the power."""
+        """Forces, torques and dissipated power by the oracle."""
 
         def rates(velocities, spins):
             radii = np.full(COUNT, RADIUS)
@@ -75,7 +75,7 @@ def clump(device):
 
 
 def _motion(speed=1e-3):
-    """Velocities [m/s] and spins [rad/s], slow enough for what the eddy moments do to each other not to show."""
+    """Velocities [m/s] and spins [rad/s], so slow that interactions of eddy moments are negligible."""
     rng = np.random.default_rng(4)
     return speed * rng.normal(size=(COUNT, 3)), speed / RADIUS * rng.normal(size=(COUNT, 3))
 
@@ -83,63 +83,63 @@ def _motion(speed=1e-3):
 def test_forces_are_slopes_of_the_dissipation(clump):
     velocities, spins = _motion()
     power, *expected = clump.expected()(velocities, spins)
-    found = clump.braked(velocities, spins)
-    # differences over 1 µs err by 1e-6, and the eddy moments act on each other in the second order of speeds
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-5 * np.abs(other).max())
-    assert -(found[0] * velocities).sum() - (found[1] * spins).sum() == pytest.approx(power, rel=1e-5)
+    results = clump.braked(velocities, spins)
+    # differences over 1 µs have errors of 1e-6; interactions of eddy moments are of second order in the speeds
+    for value, other in zip(results, expected, strict=True):
+        np.testing.assert_allclose(value, other, rtol=0.0, atol=1e-5 * np.abs(other).max())
+    assert -(results[0] * velocities).sum() - (results[1] * spins).sum() == pytest.approx(power, rel=1e-5)
     assert power > 0.0
 
 
 def test_single_precision(device):
     clump, (velocities, spins) = Clump("float32", device), _motion(speed=1.0)
     _, *expected = clump.expected()(velocities, spins)
-    # at 1 m/s forces that change by a hundredth are known to 1e-4, and the second order is 2e-3
-    for one, other in zip(clump.braked(velocities, spins), expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=5e-3 * np.abs(other).max())
+    # at 1 m/s changes of 1 % of a force have errors of 1e-4, and the second order is 2e-3
+    for value, other in zip(clump.braked(velocities, spins), expected, strict=True):
+        np.testing.assert_allclose(value, other, rtol=0.0, atol=5e-3 * np.abs(other).max())
 
 
 def test_micrometres(device):
-    """Balls of 1 µm in single precision as in double; r⁻⁷ there is no float."""
-    found = []
+    """Balls of 1 µm in float32 as in float64, where r⁻⁷ overflows float32."""
+    results = []
     for dtype in ("float32", "float64"):
         system = moment_system(
             radii=[1e-6, 1e-6], saturation=1.7e6, permanent=[False, True], dtype=dtype, device=device
         )
         system.positions.assign([[0.5e-6, 0.0, 2.5e-6], [0.0, 0.0, 0.0]])
         system.moments.assign([[0.0, 0.0, 0.0], [0.0, 0.0, 4e-12]])
-        system.set_conductivity([1e16, 0.0], 1e-12)  # so good that currents show beside the pull
+        system.set_conductivity([1e16, 0.0], 1e-12)  # large enough for a measurable brake
         system.solve()
         system.eddy.motion.assign(np.outer([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0]))
         system.apply_forces()
-        found.append(system.forces.numpy().astype(float))
-    np.testing.assert_allclose(found[0], found[1], rtol=0.0, atol=1e-5 * np.abs(found[1]).max())
+        results.append(system.forces.numpy().astype(float))
+    np.testing.assert_allclose(results[0], results[1], rtol=0.0, atol=1e-5 * np.abs(results[1]).max())
     system.eddy.motion.zero_()
     system.apply_forces()
-    assert np.abs(found[1] - system.forces.numpy()).max() > 0.1 * np.abs(found[1]).max()
+    assert np.abs(results[1] - system.forces.numpy()).max() > 0.1 * np.abs(results[1]).max()
 
 
 def test_momentum_and_angular_momentum_are_kept(clump):
     forces, torques = clump.braked(*_motion())
     turned = np.cross(clump.positions, forces)
     assert np.abs(forces.sum(axis=0)).max() < 1e-9 * np.abs(forces).max()
-    # of the solve's 1e-10; forces change by 1e-5 of themselves
+    # the solve's tolerance is 1e-10; forces change by a fraction of 1e-5
     assert np.abs((turned + torques).sum(axis=0)).max() < 1e-6 * np.abs(turned).max()
 
 
 def test_common_motion_is_not_braked(clump):
-    """Neither a common velocity nor a rotation of all as one body."""
+    """A common velocity and a common rotation of all balls are not braked."""
     scale = np.abs(clump.braked(*_motion())).max(axis=(1, 2))
     same = np.broadcast_to([1e-3, 2e-3, -1e-3], (COUNT, 3))
     spin = np.broadcast_to([0.3, -0.2, 0.1], (COUNT, 3))
     for velocities, spins in ((same, 0.0 * spin), (np.cross(spin, clump.positions), spin)):
-        found = np.abs(clump.braked(velocities, spins)).max(axis=(1, 2))
-        assert (found < 1e-6 * scale).all()
+        results = np.abs(clump.braked(velocities, spins)).max(axis=(1, 2))
+        assert (results < 1e-6 * scale).all()
 
 
 @pytest.mark.parametrize("conductivity", [1e7, 1e10, 1e14])
 def test_no_step_is_too_long(device, conductivity):
-    """Whatever the conductivity, a step never makes kinetic energy, and a superconductor's motion dies quickly."""
+    """A step never increases the kinetic energy, and stops a ball of very high conductivity quickly."""
     dt = 1e-3
     clump, (velocities, spins) = Clump("float64", device, step=dt, conductivity=conductivity), _motion()
     energies = []
@@ -151,11 +151,11 @@ def test_no_step_is_too_long(device, conductivity):
 
 
 GRADIENT = np.array([1.0, 1.0, -2.0]) * 2e7
-"""Of the field of a quadrupole, H = (g x, g y, −2g z) [A/m²]."""
+"""Gradient g of a quadrupole, H = (g x, g y, −2g z) [A/m²]."""
 
 
 def _flying_ball(device, saturation, susceptibility, velocity):
-    """A ball in a quadrupole, as a simulation."""
+    """Simulation of a ball in a quadrupole."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     warpmag.register_attributes(builder)
     body = builder.add_body()
@@ -169,7 +169,7 @@ def _flying_ball(device, saturation, susceptibility, velocity):
 
 
 def _slowed_down(velocity, mass, steps, dt):
-    """Velocity of a copper ball from the middle of the quadrupole, by the same steps in float64.
+    """Velocity of a copper ball that starts in the center of the quadrupole, by the same steps in float64.
 
     The force is −c G b and the torque c B × b, with G = μ0 ∇H, B = G x and b = G v − ω × B.
     """
@@ -187,20 +187,20 @@ def _slowed_down(velocity, mass, steps, dt):
 
 
 def test_a_copper_ball_slows_down_in_a_quadrupole(device):
-    """It would by dv/dt = −c (μ0 g)² v / m along each axis, if it did not begin to turn."""
+    """A copper ball is braked by about dv/dt = −c (μ0 g)² v / m along each axis, apart from its rotation."""
     start, steps = np.array([0.03, -0.02, 0.04]), 100
     simulation = _flying_ball(device, 1e-3, 1e-9, start)
     for _ in range(steps):
         simulation.step()
-    found = simulation.state.body_qd.numpy()[0, :3]
+    results = simulation.state.body_qd.numpy()[0, :3]
     expected = _slowed_down(start, float(simulation.model.body_mass.numpy()[0]), 2 * steps, 5e-4)
     assert (np.abs(expected) < 0.5 * np.abs(start)).all()
-    # places of single precision, 5 mm away, leave a velocity 1e-6 m/s a substep
-    np.testing.assert_allclose(found, expected, atol=3e-5)
+    # float32 positions, 5 mm from the origin, change the velocity by 1e-6 m/s per substep
+    np.testing.assert_allclose(results, expected, atol=3e-5)
 
 
 def test_iron_is_braked_by_the_field_inside(device):
-    """In a weak field B inside is 3 μ0 H, and the force nine times that on copper."""
+    """In a weak field B inside iron is 3 μ0 H, and the force is nine times that on copper."""
     forces = []
     for saturation, susceptibility in ((1e-3, 1e-9), (1e12, math.inf)):
         simulation = _flying_ball(device, saturation, susceptibility, (0.0, 0.0, 0.5))
@@ -218,7 +218,7 @@ def test_iron_is_braked_by_the_field_inside(device):
 
 
 def _ball_at_a_magnet(motion):
-    """An iron ball near a permanent box with a coil on it; ``motion`` is velocity and spin of each at its place."""
+    """An iron ball near a permanent box with a coil on it; ``motion`` returns a body's velocity and spin."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     warpmag.register_attributes(builder)
     places = np.array([[0.0, 0.0, 0.0], [0.004, 0.002, 0.018]])
@@ -235,29 +235,29 @@ def _ball_at_a_magnet(motion):
 
 
 def _wrenches(device, motion):
-    """Force and torque on the magnet and on the ball, and what brakes them."""
-    found = []
-    for one in (lambda body, place: (np.zeros(3), np.zeros(3)), motion):
-        model = _ball_at_a_magnet(one).finalize(device=device)
+    """Force and torque on the magnet and on the ball, and the part due to eddy currents."""
+    results = []
+    for moving in (lambda body, place: (np.zeros(3), np.zeros(3)), motion):
+        model = _ball_at_a_magnet(moving).finalize(device=device)
         state, magnetics = model.state(), warpmag.Magnetics(model, rtol=1e-5)
         state.clear_forces()
         magnetics.apply(state)
-        found.append(state.body_f.numpy().astype(float))
-    return found[1], found[1] - found[0]
+        results.append(state.body_f.numpy().astype(float))
+    return results[1], results[1] - results[0]
 
 
 def test_a_magnet_and_its_coil_move(device):
-    """What moves and turns with the magnet is not braked; else momentum is kept, and power is lost."""
+    """A ball that moves with the magnet is not braked; otherwise momentum is conserved and power dissipated."""
     spin, speed = np.array([0.5, -1.0, 2.0]), np.array([0.02, 0.01, -0.03])
     whole, along = _wrenches(device, lambda body, place: (speed + np.cross(spin, place), spin))
     _, apart = _wrenches(device, lambda body, place: (body * speed, body * spin))
     _, turned = _wrenches(device, lambda body, place: (0.0 * speed, (1 - body) * 20.0 * spin))
-    noise = 1e-6 * np.abs(whole).max(axis=0)  # of the forces that these are differences of, in single precision
+    noise = 1e-6 * np.abs(whole).max(axis=0)  # rounding of the forces, of which these are differences
     assert (np.abs(along) < 5.0 * noise).all()
-    for found, power in ((apart, apart[1] @ [*speed, *spin]), (turned, turned[0, 3:] @ (20.0 * spin))):
-        assert np.abs(found).max() > 100.0 * noise.max()
+    for forces, power in ((apart, apart[1] @ [*speed, *spin]), (turned, turned[0, 3:] @ (20.0 * spin))):
+        assert np.abs(forces).max() > 100.0 * noise.max()
         assert power < 0.0
-        assert (np.abs(found[:, :3].sum(axis=0)) < 10.0 * noise[:3]).all()
+        assert (np.abs(forces[:, :3].sum(axis=0)) < 10.0 * noise[:3]).all()
 
 
 def test_only_balls_conduct(device):
@@ -277,7 +277,7 @@ def test_nothing_is_prepared_without_conductors(device):
 
 
 def test_worlds_do_not_see_each_other(clump, device):
-    """Twice the same balls, of which only the second world's conduct in part as those of the first."""
+    """Two worlds of equal balls, of which fewer conduct in the second world."""
     motion, alone = np.zeros((8, 2 * COUNT)), clump.braked(*_motion())
     system = moment_system(
         radii=np.full(2 * COUNT, RADIUS),
@@ -292,20 +292,20 @@ def test_worlds_do_not_see_each_other(clump, device):
     system.moments.assign(np.tile(clump.moments, (2, 1)))
     system.set_conductivity(np.concatenate([np.zeros(COUNT), clump.conductivity]), NO_STEP)
     system.solve()
-    found = []
+    results = []
     for speed in (1.0, 0.0):
         motion[:6] = speed * np.tile(np.concatenate([part.T for part in _motion()]), 2)
         system.eddy.motion.assign(motion)
         system.apply_forces()
-        found.append(np.stack([system.forces.numpy(), system.torques.numpy()]))
-    first, second = np.split(found[0] - found[1], 2, axis=1)
+        results.append(np.stack([system.forces.numpy(), system.torques.numpy()]))
+    first, second = np.split(results[0] - results[1], 2, axis=1)
     assert not first.any()
-    # two solves to 1e-10, and forces that change by 1e-5 of themselves
+    # two solves to 1e-10, and forces that change by a fraction of 1e-5
     assert np.abs(second - alone).max() < 1e-5 * np.abs(alone).max()
 
 
 def test_a_ball_that_hangs_stops_to_swing(device):
-    """Closed form of small swings of an iron ball about a dipole, without friction.
+    """Decay of small oscillations of an iron ball about a dipole, against the closed form without friction.
 
     The field turns by 3/2 of the swing's angle, and the ball after it at a rate of c B²/I, slower than it swings, so
     that |dB/dt|² is B² (3/2 dφ/dt)² Ω²/(Ω² + (cB²/I)²): the amplitude falls at a quarter of that power over
@@ -332,11 +332,11 @@ def test_a_ball_that_hangs_stops_to_swing(device):
     zeros = np.flatnonzero(np.diff(np.sign(angles)) != 0)
     swing = np.pi / (step * np.diff(zeros).mean())
     peaks = [np.abs(angles[a:b]).max() for a, b in itertools.pairwise(zeros)]
-    found = -np.polyfit(step * zeros[:-1], np.log(peaks), 1)[0]
+    results = -np.polyfit(step * zeros[:-1], np.log(peaks), 1)[0]
 
     distance, c = magnet + RADIUS, oracle.eddy_coefficient(RADIUS, 1e7)
     flux_density = 3.0 * oracle.MU0 * 2.0 / 3.0 * 3e5 * (magnet / distance) ** 3
     follows = c * flux_density**2 / INERTIA
     power = c * flux_density**2 * 1.5**2 * swing**2 / (swing**2 + follows**2)
-    # the step takes 2 % of the coefficient, the amplitude changes 1 %, a peak between steps and saturation less
-    assert found == pytest.approx(power / (2.0 * MASS * distance**2), rel=0.05)
+    # the step reduces the coefficient by 2 %; amplitude (1 %), peaks between steps and saturation have smaller effects
+    assert results == pytest.approx(power / (2.0 * MASS * distance**2), rel=0.05)

@@ -14,14 +14,14 @@ from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared import team
 
-# Sums of n terms in float32 carry about √n·2⁻²⁴ ≈ 2.7e-6·√(n/2000) in the worst case and 3e-7 in lanes; issue: 1e-6.
+# Sums of n terms in float32 have an error of √n·2⁻²⁴ ≈ 2.7e-6·√(n/2000) at worst and 3e-7 in lanes; the limit is 1e-6.
 TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
 DTYPES = ("float32", "float64")
 
 
 @pytest.fixture(scope="module")
 def touching():
-    """2,000 touching balls of three radii, and the oracle's answers."""
+    """2,000 touching balls of three radii, with the oracle's fields and wrenches."""
     x, radii, m = pile()
     h, gradient = oracle.h_field(x, m, radii=radii), oracle.field_gradient(x, m, radii=radii)
     return x, radii, m, h, oracle.kelvin_force(m, gradient), oracle.torque(m, h)
@@ -31,8 +31,8 @@ def touching():
 @pytest.mark.parametrize("method", ["direct", "reference"])
 def test_touching_balls(touching, dtype, method, device):
     x, radii, m, h, force, torque = touching
-    found = warpmag.h_field(x, m, radii=radii, method=method, dtype=dtype, device=device)
-    assert relative(found, h) < TOLERANCE[dtype]
+    results = warpmag.h_field(x, m, radii=radii, method=method, dtype=dtype, device=device)
+    assert relative(results, h) < TOLERANCE[dtype]
     forces, torques = warpmag.wrench(x, m, radii=radii, method=method, dtype=dtype, device=device)
     assert relative(forces, force) < TOLERANCE[dtype]
     assert relative(torques, torque) < TOLERANCE[dtype]
@@ -71,25 +71,25 @@ def balls_in_one_another(scale, dtype):
 
 @pytest.mark.parametrize("dtype, scale", [("float32", 1e-4), ("float32", 5e3), ("float64", 1e-8), ("float64", 1e3)])
 def test_balls_in_one_another(dtype, scale, device):
-    """Fields, forces and torques to a few roundings, of the result and of the distance, down to coincident centres."""
+    """Fields, forces and torques to a few roundings, of the result and of the distance, down to coincident centers."""
     cases = [*balls_in_one_another(scale, dtype)]
-    x, radii, m = (np.concatenate(one) for one in zip(*cases, strict=True))
+    x, radii, m = (np.concatenate(arrays) for arrays in zip(*cases, strict=True))
     worlds = np.arange(len(x)) // 2
     segments = [(i, i + 2, i, i + 2) for i in range(0, len(x), 2)]
     eps = float(np.finfo(dtype).eps)
     for form in forms(device):
         (h,) = sums(x, radii, m, segments, Quantity.FIELD, dtype, device, groups=worlds, form=form)
         forces, torques = sums(x, radii, m, segments, Quantity.WRENCH, dtype, device, groups=worlds, form=form)
-        found = [np.reshape(one, (-1, 2, 3)) for one in (h, forces, torques)]
-        for (at, size, moments), *results in zip(cases, *found, strict=True):
+        pairs = [np.reshape(array, (-1, 2, 3)) for array in (h, forces, torques)]
+        for (at, size, moments), *results in zip(cases, *pairs, strict=True):
             exact, moved = (pair_at(place, size, moments) for place in (at, (1.0 + 8.0 * eps) * at))
-            # the clamped dipole, from which the law of overlapping balls is taken
+            # the clamped dipole, to which corrections of overlapping balls are added
             field = np.linalg.norm(moments[::-1], axis=1) / (2.0 * np.pi * size.sum() ** 3)
             turn = oracle.MU0 * np.linalg.norm(moments, axis=1) * field
-            for one, value, other, unit in zip(
+            for result, value, other, unit in zip(
                 results, exact, moved, (field, 3.0 * turn / size.sum(), turn), strict=True
             ):
-                error, spread = np.linalg.norm(one - value, axis=1), np.linalg.norm(other - value, axis=1)
+                error, spread = np.linalg.norm(result - value, axis=1), np.linalg.norm(other - value, axis=1)
                 assert (error <= 20.0 * eps * (unit + np.linalg.norm(value, axis=1)) + 5.0 * spread).all()
 
 
@@ -105,25 +105,25 @@ def test_any_scale(dtype, scale, device):
     x, radii, m = pile(count=300)
     x, radii, m = (np.asarray(a, dtype).astype(float) for a in (scale * x, 0.9999 * scale * radii, scale**3 * m))
     h, force, torque = pair_at(x, radii, m)
-    # positions are rounded, and so is where balls touch
+    # positions are rounded, and with them the contact distances
     assert relative(warpmag.h_field(x, m, radii=radii, dtype=dtype, device=device), h) < TOLERANCE[dtype]
-    found = warpmag.wrench(x, m, radii=radii, dtype=dtype, device=device)
-    assert relative(found[0], force) < 2.0 * TOLERANCE[dtype]
-    assert relative(found[1], torque) < TOLERANCE[dtype]
+    results = warpmag.wrench(x, m, radii=radii, dtype=dtype, device=device)
+    assert relative(results[0], force) < 2.0 * TOLERANCE[dtype]
+    assert relative(results[1], torque) < TOLERANCE[dtype]
 
 
 @pytest.mark.parametrize("distance", [1e-9, 2e-8, 2e-7, 1e3, 5e6])
 @pytest.mark.parametrize("strength", [1e-17, 1e-6, 1e6, 1e18])
 def test_points_at_any_distance(distance, strength, device):
-    """In float32 the field and the force of point dipoles are right, or refused by name."""
+    """In float32 the field and the force of point dipoles are correct, or an error names the cause."""
     x, m = as_float32([[0.0, 0.0, 0.0], [0.6 * distance, 0.0, 0.8 * distance]], [[0.0, 0.0, 1.0], [1.0, 0.5, 0.0]])
     m = as_float32(strength * m)[0]
     exact, force, _ = pair_at(x, None, m)
     try:
         assert relative(warpmag.h_field(x, m, device=device), exact) < TOLERANCE["float32"]
-        found = warpmag.wrench(x, m, device=device)[0]
-        # what underflows is zero
-        assert np.abs(found - force).max() < TOLERANCE["float32"] * np.abs(force).max() + 1e-36
+        results = warpmag.wrench(x, m, device=device)[0]
+        # underflow gives zero
+        assert np.abs(results - force).max() < TOLERANCE["float32"] * np.abs(force).max() + 1e-36
     except warpmag.InputError as error:
         assert str(error).startswith(("positions, moments", "moments"))
         assert distance < 1e-7 or not 1e-36 < np.abs(force).max() < 1e30  # of which 4π/μ0 is a float32
@@ -131,7 +131,7 @@ def test_points_at_any_distance(distance, strength, device):
 
 @pytest.mark.parametrize("extent", [1e-3, 0.0])
 def test_neighbor_lists_that_overflow(extent, device):
-    """More overlapping neighbours than a list holds: everybody walks all sources, nothing is dropped."""
+    """More overlapping neighbors than a list holds: each target visits all sources, and none is dropped."""
     x, radii, m = overlapping(count=150, extent=extent)
     assert relative(warpmag.h_field(x, m, radii=radii, device=device), oracle.h_field(x, m, radii=radii)) < 1e-5
 
@@ -151,9 +151,9 @@ def test_any_count_of_sources_and_targets(count, dtype, device):
     rng = np.random.default_rng(count)
     x, m = as_float32(rng.uniform(-1, 1, (count, 3)), rng.normal(size=(count, 3)))
     targets = as_float32(rng.uniform(-1, 1, (count + 3, 3)))[0]
-    found = warpmag.h_field(x, m, targets, dtype=dtype, device=device)
+    results = warpmag.h_field(x, m, targets, dtype=dtype, device=device)
     # a random target may lie next to a source: its own differences lose up to a digit
-    assert relative(found, oracle.h_field(x, m, targets)) < 10.0 * TOLERANCE[dtype]
+    assert relative(results, oracle.h_field(x, m, targets)) < 10.0 * TOLERANCE[dtype]
     if count > 1:
         assert (
             relative(warpmag.h_field(x, m, dtype=dtype, device=device), oracle.h_field(x, m)) < 10.0 * TOLERANCE[dtype]
@@ -162,18 +162,18 @@ def test_any_count_of_sources_and_targets(count, dtype, device):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_as_many_targets_as_moments(dtype, device):
-    """Targets that are not the moments, but as many, and one of them where a moment is: nothing is excluded."""
+    """As many other targets as moments, one of them at a moment: no moment is excluded."""
     x, radii, m = pile(count=700)
     targets = as_float32(x + 0.003)[0]
     targets[5] = x[5]
-    found = warpmag.h_field(x, m, targets, radii=radii, dtype=dtype, device=device)
-    assert relative(found, oracle.h_field(x, m, targets, radii=radii)) < 10.0 * TOLERANCE[dtype]
+    results = warpmag.h_field(x, m, targets, radii=radii, dtype=dtype, device=device)
+    assert relative(results, oracle.h_field(x, m, targets, radii=radii)) < 10.0 * TOLERANCE[dtype]
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("threads", [1, 3])
 def test_segments(dtype, threads, device, monkeypatch):
-    """Two worlds of one radius each, more than a tile of moments, and some moments that see all of them."""
+    """Two worlds of one radius each, with more moments than a tile, and moments with sources in both worlds."""
     monkeypatch.setattr(team, "cores", lambda: threads)
     x, _, m = pile(count=1500)
     radii = as_float32(np.where(np.arange(1500) < 900, 0.0049, 0.0045))[0]
@@ -196,28 +196,28 @@ def test_moments_of_one_body_leave_each_other_alone(quantity, dtype, device):
     force = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii, bodies=bodies))
     torque = oracle.torque(m, oracle.h_field(x, m, radii=radii, bodies=bodies))
     for form in forms(device, *[MIRRORED] * (quantity == Quantity.MUTUAL_FORCE)):
-        found = sums(x, radii, m, [(0, 1100, 0, 1100)], quantity, dtype, device, bodies, form=form)
-        assert relative(found[0], force) < TOLERANCE[dtype]
+        results = sums(x, radii, m, [(0, 1100, 0, 1100)], quantity, dtype, device, bodies, form=form)
+        assert relative(results[0], force) < TOLERANCE[dtype]
         if quantity == Quantity.WRENCH:
-            assert relative(found[1], torque) < TOLERANCE[dtype]
+            assert relative(results[1], torque) < TOLERANCE[dtype]
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("count", [1, 2, 31, 33, 127, 243, 257])
 def test_any_count_of_touching_balls(count, dtype, device):
-    """All forms of the sums, whatever is left over of vectors, warps and tiles."""
+    """All forms of the sums, with incomplete vectors, warps and tiles."""
     x, radii, m = pile(count=count)
     every = [(0, count, 0, count)]
     h = oracle.h_field(x, m, radii=radii)
     force, torque = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii)), oracle.torque(m, h)
     for form in forms(device, MIRRORED):
-        found = [*sums(x, radii, m, every, Quantity.FIELD, dtype, device, form=form)]
-        if form == MIRRORED:  # which has forces alone
-            found += [sums(x, radii, m, every, Quantity.MUTUAL_FORCE, dtype, device, form=form)[0], torque]
+        results = [*sums(x, radii, m, every, Quantity.FIELD, dtype, device, form=form)]
+        if form == MIRRORED:  # has no torques
+            results += [sums(x, radii, m, every, Quantity.MUTUAL_FORCE, dtype, device, form=form)[0], torque]
         else:
-            found += sums(x, radii, m, every, Quantity.WRENCH, dtype, device, form=form)
-        for value, expected in zip(found, (h, force, torque), strict=True):
-            # not as a ratio: a lone ball feels nothing at all
+            results += sums(x, radii, m, every, Quantity.WRENCH, dtype, device, form=form)
+        for value, expected in zip(results, (h, force, torque), strict=True):
+            # no relative error: the wrench of a lone ball is zero
             assert np.linalg.norm(value - expected) <= TOLERANCE[dtype] * np.linalg.norm(expected)
 
 
@@ -232,38 +232,38 @@ def test_any_count_of_touching_balls(count, dtype, device):
     ],
 )
 def test_every_shape_of_blocks(module, quantity, shape, device, monkeypatch):
-    """Those for many moments too, with some moments that fill no tile; of one radius but for a few."""
+    """All forms for many moments, with an incomplete tile; nearly all moments have one radius."""
     monkeypatch.setitem(module._SHAPES, quantity, ((None, shape),))
     form = MIRRORED if module is mirror_cuda else FUSED
     x, radii, m = pile(count=1103)
     radii[40:] = 0.005
-    (found, *_) = sums(x, radii, m, [(0, 1103, 0, 1103)], quantity, "float32", device, form=form)
+    (results, *_) = sums(x, radii, m, [(0, 1103, 0, 1103)], quantity, "float32", device, form=form)
     if quantity == Quantity.FIELD:
         expected = oracle.h_field(x, m, radii=radii)
     else:
         expected = oracle.kelvin_force(m, oracle.field_gradient(x, m, radii=radii))
-    assert relative(found, expected) < TOLERANCE["float32"]
+    assert relative(results, expected) < TOLERANCE["float32"]
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("quantity", [Quantity.FIELD, Quantity.MUTUAL_FORCE])
 @pytest.mark.parametrize("slabs", [1, 3, 100])
 def test_mirrored_passes(slabs, quantity, dtype, device, monkeypatch):
-    """Tiles of moments in as many passes as little memory asks for; bodies of three."""
+    """Mirrored tiles in several passes, for little memory; bodies of three moments."""
     monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", slabs * 12 * 2001)
     x, _, m = pile(count=2001)
     radii, bodies = as_float32(np.where(np.arange(2001) < 1500, 0.0049, 0.004))[0], np.arange(2001) // 3
     form = MIRRORED if device != "cpu" else LOOP
-    (found, *_) = sums(x, radii, m, [(0, 2001, 0, 2001)], quantity, dtype, device, bodies, form=form)
+    (results, *_) = sums(x, radii, m, [(0, 2001, 0, 2001)], quantity, dtype, device, bodies, form=form)
     if quantity == Quantity.FIELD:
-        assert relative(found, oracle.h_field(x, m, radii=radii)) < TOLERANCE[dtype]
+        assert relative(results, oracle.h_field(x, m, radii=radii)) < TOLERANCE[dtype]
     else:
         gradient = oracle.field_gradient(x, m, radii=radii, bodies=bodies)
-        assert relative(found, oracle.kelvin_force(m, gradient)) < TOLERANCE[dtype]
+        assert relative(results, oracle.kelvin_force(m, gradient)) < TOLERANCE[dtype]
 
 
 def forms(device, *mirrored):
-    """Forms of the sums to try, with or without the mirrored one; a CPU has one only."""
+    """Forms of the sums on the device, with or without the mirrored form; a CPU has one form."""
     return (LOOP,) if device == "cpu" else (LOOP, FUSED, *mirrored)
 
 
@@ -286,7 +286,7 @@ def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, groups=
 
 
 def test_runs_are_bitwise_equal(device):
-    """More sums than one thread or block makes, twice."""
+    """More sums than one thread or block makes; they repeat bit by bit."""
     x, radii, m = pile(count=2000)
     first, second = (warpmag.h_field(x, m, radii=radii, device=device) for _ in range(2))
     assert np.array_equal(first, second)
@@ -295,11 +295,11 @@ def test_runs_are_bitwise_equal(device):
 
 
 def test_long_sums_keep_their_digits(device):
-    """As many moments as a sum in one piece would lose digits over; aligned, so that terms pile up."""
+    """Many aligned moments, whose terms have one sign: a single float32 sum would lose digits."""
     rng = np.random.default_rng(6)
     x, m = as_float32(rng.uniform(0.0, 1.0, (60000, 3)), rng.normal(size=(60000, 3)) * 0.1 + [0.0, 0.0, 1.0])
     at = as_float32(rng.uniform(0.0, 1.0, (20, 3)) + np.array([0.0, 0.0, 1.1]))[0]
-    # a sum in one piece: √n·2⁻²⁴ = 1.5e-5 at the worst; the issue's limit is 2e-6
+    # a single sum: √n·2⁻²⁴ = 1.5e-5 in the worst case; the limit is 2e-6
     assert relative(warpmag.h_field(x, m, at, device=device), oracle.h_field(x, m, at)) < 2e-6
 
 
@@ -327,16 +327,16 @@ def test_magpylib_dipoles_and_spheres(dtype, device):
         ]
     )
     inside = np.concatenate([at, x[:1] + 0.003, x[1:2]])
-    found = warpmag.h_field(x, m, inside, radii=radius, dtype=dtype, device=device)
-    assert relative(found, spheres.getH(inside)) < 1e-6
+    results = warpmag.h_field(x, m, inside, radii=radius, dtype=dtype, device=device)
+    assert relative(results, spheres.getH(inside)) < 1e-6
 
 
 def test_third_law_and_angular_momentum(touching, device):
     x, radii, m, *_ = touching
     forces, torques = warpmag.wrench(x, m, radii=radii, device=device)
     forces, torques = forces.astype(float), torques.astype(float)
-    centre = x.mean(0)
-    arms = np.cross(x - centre, forces)
+    center = x.mean(0)
+    arms = np.cross(x - center, forces)
     assert np.linalg.norm(forces.sum(0)) < 1e-6 * np.linalg.norm(forces, axis=1).sum()
     total = (arms + torques).sum(0)
     assert np.linalg.norm(total) < 1e-6 * (np.linalg.norm(arms, axis=1) + np.linalg.norm(torques, axis=1)).sum()
@@ -369,10 +369,10 @@ def test_external_field_turns_but_does_not_pull(device):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_smoothing(dtype, device):
-    """The paper's ε²: bounded at zero distance, the dipole far away."""
+    """The paper's smoothing: bounded at zero distance, a dipole far away."""
     x, _, m = overlapping(count=200, extent=0.05)
-    found = warpmag.h_field(x, m, smoothing=0.004, dtype=dtype, device=device)
-    assert relative(found, oracle.h_field(x, m, smoothing=0.004)) < 10.0 * TOLERANCE[dtype]
+    results = warpmag.h_field(x, m, smoothing=0.004, dtype=dtype, device=device)
+    assert relative(results, oracle.h_field(x, m, smoothing=0.004)) < 10.0 * TOLERANCE[dtype]
     forces, _ = warpmag.wrench(x, m, smoothing=0.004, dtype=dtype, device=device)
     assert (
         relative(forces, oracle.kelvin_force(m, oracle.field_gradient(x, m, smoothing=0.004))) < 10.0 * TOLERANCE[dtype]
@@ -390,7 +390,7 @@ def test_coincident_point_dipoles_are_left_out(device):
 
 
 def test_far_from_the_origin(device):
-    """Offset 1e4 m: only the inputs' own rounding shows."""
+    """Offset of 1e4 m: the error is the rounding of the inputs."""
     x, radii, m = pile(count=300)
     shifted = as_float32(x * 100.0 + 1e4)[0]
     reference = oracle.h_field(shifted, m, radii=radii)

@@ -1,4 +1,4 @@
-"""Sums over pairs in cells that are neighbours, against the float64 oracle."""
+"""Sums over pairs in neighboring leaves, against the float64 oracle."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ PITCH = 128
 
 
 def make_leaves(counts, radius, seed=21):
-    """Moments of a grid of leaves with edges of length 1, sorted by leaf; those without moments do not exist.
+    """Moments of a grid of leaves with edges of length 1, sorted by leaf; empty leaves do not exist.
 
     Args:
         counts: Number of moments in each leaf, shape [z, y, x].
@@ -22,14 +22,14 @@ def make_leaves(counts, radius, seed=21):
         seed: Of random numbers.
 
     Returns:
-        Positions and moments [n, 3], radii [n], places of leaves [c, 3] (x, y, z), neighbours [c, 27], first moments.
+        Positions and moments [n, 3], radii [n], places of leaves [c, 3] (x, y, z), neighbors [c, 27], first moments.
     """
     rng = np.random.default_rng(seed)
     filled = np.argwhere(counts > 0)
-    found = np.full(np.array(counts.shape) + 2, -1)
-    found[tuple((filled + 1).T)] = np.arange(len(filled))
+    numbers = np.full(np.array(counts.shape) + 2, -1)
+    numbers[tuple((filled + 1).T)] = np.arange(len(filled))
     offsets = np.array([(k // 9, k // 3 % 3, k % 3) for k in range(27)])
-    neighbors = np.stack([found[tuple((filled + offset).T)] for offset in offsets], axis=1)
+    neighbors = np.stack([numbers[tuple((filled + offset).T)] for offset in offsets], axis=1)
     sizes = counts[tuple(filled.T)]
     begin = np.concatenate([[0], np.cumsum(sizes)])
     n = begin[-1]
@@ -50,7 +50,7 @@ def launch(quantity, leaves, labels, dtype, device):
     def integers(values):
         return wp.array(np.ascontiguousarray(values), dtype=wp.int32, device=device)
 
-    capacity = len(begin) + 3  # leaves that do not exist
+    capacity = len(begin) + 3  # three unused leaves
     begins = np.pad(begin, (0, capacity - len(begin)), constant_values=n)
     sums = wp.full((n, WIDTHS[quantity]), np.nan, dtype=dtype, device=device)
     level_begin = integers([0, len(neighbors), len(neighbors)])
@@ -59,14 +59,14 @@ def launch(quantity, leaves, labels, dtype, device):
 
 
 def are_near(leaves) -> np.ndarray:
-    """Whether leaves of two moments are neighbours, shape [n, n]."""
+    """True where the leaves of two moments are neighbors, shape [n, n]."""
     _, _, _, places, _, begin = leaves
     own = np.repeat(places, np.diff(begin), axis=0)
     return np.all(np.abs(own[:, None] - own[None]) <= 1, axis=2)
 
 
 def wanted_sums(leaves, labels):
-    """4π (m·∇)H and 4π H at each moment from those near it: of other bodies, and last of all but itself."""
+    """4π (m·∇)H and 4π H at each moment from near moments of other bodies, and 4π H from all other near moments."""
     positions, moments, radii = leaves[:3]
     r = positions[:, None] - positions[None]
     d = np.maximum(np.linalg.norm(r, axis=2), radii[:, None] + radii[None])[..., None]
@@ -92,34 +92,34 @@ def uneven_counts():
 
 @pytest.mark.parametrize("quantity, dtype", [(Quantity.FIELD, wp.float32), (Quantity.FORCE, wp.float32),
                                              (Quantity.WRENCH, wp.float64)])  # fmt: skip
-def test_sums_are_of_pairs_in_neighbouring_cells(device, quantity, dtype):
+def test_sums_over_pairs_in_neighboring_leaves(device, quantity, dtype):
     leaves = make_leaves(uneven_counts(), 0.02)
     n = len(leaves[0])
     labels = np.arange(n) if quantity == Quantity.FIELD else np.arange(n) // 3 * 3  # bodies of three moments
-    found = launch(quantity, leaves, labels, dtype, device)
+    sums = launch(quantity, leaves, labels, dtype, device)
     force, field, of_all = wanted_sums(leaves, labels)
-    wanted = {Quantity.FIELD: of_all, Quantity.FORCE: force, Quantity.WRENCH: np.hstack([force, field])}[quantity]
+    expected = {Quantity.FIELD: of_all, Quantity.FORCE: force, Quantity.WRENCH: np.hstack([force, field])}[quantity]
     epsilon = np.finfo(wp.dtype_to_numpy(dtype)).eps
-    # sums of hundreds of terms, the largest of them between moments at contact, whose separations have lost digits:
-    # positions are up to 100 contact distances from the origin
-    np.testing.assert_allclose(found, wanted, rtol=1e3 * epsilon, atol=1e3 * epsilon * np.abs(wanted).max())
-    np.testing.assert_array_equal(found, launch(quantity, leaves, labels, dtype, device))
+    # sums of hundreds of terms; separations at contact lose digits, since positions are up to 100 contact distances
+    # from the origin
+    np.testing.assert_allclose(sums, expected, rtol=1e3 * epsilon, atol=1e3 * epsilon * np.abs(expected).max())
+    np.testing.assert_array_equal(sums, launch(quantity, leaves, labels, dtype, device))
 
 
 def test_points_in_two_cells_a_side_are_all_near(device):
-    """In a grid of two cells a side all cells are neighbours: the sums are those over all pairs."""
+    """In a grid of two leaves a side all leaves are neighbors: the sums are over all pairs."""
     leaves = make_leaves(np.full((2, 2, 2), 20), 0.0)
     positions, moments = leaves[:2]
-    found = launch(Quantity.FIELD, leaves, np.arange(len(positions)), wp.float32, device)
-    wanted = 4 * np.pi * oracle.h_field(positions, moments)
-    # of the nearest pairs, whose separations have lost digits
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=2e-5 * np.abs(wanted).max())
+    sums = launch(Quantity.FIELD, leaves, np.arange(len(positions)), wp.float32, device)
+    expected = 4 * np.pi * oracle.h_field(positions, moments)
+    # separations of the nearest pairs lose digits
+    np.testing.assert_allclose(sums, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
 def test_a_cell_of_many_moments_is_summed_in_parts(device):
     counts = np.array([[[650, 3, 700]]])
     leaves = make_leaves(counts, 0.01)
     labels = np.arange(len(leaves[0]))
-    found = launch(Quantity.FIELD, leaves, labels, wp.float32, device)
+    sums = launch(Quantity.FIELD, leaves, labels, wp.float32, device)
     field = wanted_sums(leaves, labels)[2]
-    np.testing.assert_allclose(found, field, rtol=0, atol=2e-5 * np.abs(field).max())
+    np.testing.assert_allclose(sums, field, rtol=0, atol=2e-5 * np.abs(field).max())

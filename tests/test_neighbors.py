@@ -1,4 +1,4 @@
-"""Lists of overlapping moments against all pairs tried one by one."""
+"""Neighbor lists against a loop over all pairs."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def make(radii, device, dtype=wp.float32, groups=None):
 
 
 def find(packed, positions):
-    """Put moments at positions and return their lists, and how long they are."""
+    """Place moments at positions; return their lists and the lengths of the lists."""
     x = wp.array(positions, dtype=vec3_type(packed.dtype), device=packed.device)
     packed.pack(x, wp.zeros_like(x))
     packed.find_overlaps()
@@ -32,7 +32,7 @@ def closeness(positions, radii, groups=None):
 
 
 def check(packed, near):
-    """Everything that overlaps is listed, nothing beyond the skin is, in the order of indices."""
+    """Lists contain all overlapping moments and none beyond the skin, in ascending order."""
     full = packed.neighbor_counts.numpy() > CAPACITY
     assert np.array_equal(packed.overlap_counts.numpy()[full], packed.neighbor_counts.numpy()[full])
     check_lists(packed.neighbors.numpy(), packed.neighbor_counts.numpy(), near, 1.0 + SKIN)
@@ -76,7 +76,7 @@ def test_lists_stay_complete_while_moments_move(device):
         assert all(np.isin(np.flatnonzero(overlapping[i]), lists[i, : counts[i]]).all() for i in range(200))
         check_lists(packed.overlaps.numpy(), packed.overlap_counts.numpy(), near, 1.0)
         positions = positions + 0.024 * rng.normal(size=(200, 3))
-    assert 10 < stale < 39  # lists are kept for a while, not for good
+    assert 10 < stale < 39  # lists are kept for several steps, but not for all
 
 
 def test_moments_at_no_place_have_no_neighbors(device):

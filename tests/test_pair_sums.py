@@ -1,4 +1,4 @@
-"""What one-shot calls keep for the next one of their shape never shows in results."""
+"""Buffers that calls on arrays keep for the next call of the same shape do not affect results."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from warpmag.moments import pair_sums
 
 
 def _call(device, seed, *, radii=True, targets=False, moved=0.0):
-    """Arguments of a field of 600 balls that overlap, the largest of which is always as large."""
+    """Arguments of a field of 600 overlapping balls; the largest radius is fixed."""
     x, _, m = overlapping(count=600, extent=0.07, seed=seed)
     x = x + moved * np.random.default_rng(0).normal(size=x.shape)
     radius = np.random.default_rng(seed).uniform(0.003, 0.01, len(x))
@@ -28,9 +28,9 @@ def _call(device, seed, *, radii=True, targets=False, moved=0.0):
 
 @pytest.mark.parametrize("targets", [False, True])
 def test_a_call_is_as_if_it_were_the_first(targets, device):
-    """Places, moments and radii of the calls before leave nothing, nor do what touched and how large balls were."""
+    """Positions, moments, radii and overlaps of earlier calls do not affect results."""
     calls = [_call(device, seed, radii=seed != 2, targets=targets) for seed in (1, 2, 3)]
-    calls.append(_call(device, 3, targets=targets, moved=5e-4))  # others overlap, of those that were near
+    calls.append(_call(device, 3, targets=targets, moved=5e-4))  # other neighbors overlap
     alone = []
     for arguments, options in calls:
         pair_sums._kept.clear()
@@ -43,19 +43,19 @@ def test_a_call_is_as_if_it_were_the_first(targets, device):
 
 
 def test_wrenches_of_calls_that_follow_each_other(device):
-    """Each with its own external field."""
+    """Calls with different external fields."""
     (x, m), options = _call(device, 1)
-    found = []
+    results = []
     for field in ((0.0, 0.0, 1e4), None):
         pair_sums._kept.clear()
-        found.append(warpmag.wrench(x, m, external_field=field, **options))
+        results.append(warpmag.wrench(x, m, external_field=field, **options))
     again = warpmag.wrench(x, m, external_field=(0.0, 0.0, 1e4), **options)
-    assert [a.tobytes() for a in again] == [a.tobytes() for a in found[0]]
-    assert not np.allclose(found[0][1], found[1][1], rtol=1e-3, atol=0.0)
+    assert [a.tobytes() for a in again] == [a.tobytes() for a in results[0]]
+    assert not np.allclose(results[0][1], results[1][1], rtol=1e-3, atol=0.0)
 
 
 def test_results_are_the_callers_own(device):
-    """NumPy or Warp: the next call leaves them alone, and what is written into them shows in none."""
+    """Results, NumPy or Warp, belong to the caller: later calls neither change nor read them."""
     (x, m), options = _call(device, 1)
     first = warpmag.h_field(x, m, **options)
     kept = first.copy()
@@ -68,7 +68,7 @@ def test_results_are_the_callers_own(device):
 
 
 def test_a_call_that_fails(device):
-    """Leaves nothing behind."""
+    """A call that raises an error does not affect later calls."""
     (x, m), options = _call(device, 1)
     expected = warpmag.h_field(x, m, **options)
     with pytest.raises(warpmag.InputError, match="not finite"):
@@ -79,7 +79,7 @@ def test_a_call_that_fails(device):
 
 
 def test_calls_of_several_threads(device):
-    """Never share what they sum in. On a GPU in a process of its own: Warp 1.19 can capture no graph afterwards."""
+    """Threads do not share buffers. On a GPU in a separate process: Warp 1.19 cannot capture graphs afterwards."""
     if device == "cpu":
         call_from_threads(device)
         return
@@ -106,7 +106,7 @@ def call_from_threads(device):
 
 
 def test_large_sums_are_not_kept(device, monkeypatch):
-    """Nor more than a few."""
+    """Few buffers are kept."""
     monkeypatch.setattr(pair_sums, "_MOST_MOMENTS_KEPT", 100)
     pair_sums._kept.clear()
     for count in (80, 81, 82, 83, 84, 85, 101, 150):

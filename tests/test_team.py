@@ -17,7 +17,7 @@ team.cores = lambda: 3
 rng = np.random.default_rng(1)
 x, m = rng.normal(size=(2, 6000, 3))
 before = warpmag.h_field(x, m, device="cpu")
-assert (team.team().numpy()[:2, 0] > 0).all()  # two threads help
+assert (team.team().numpy()[:2, 0] > 0).all()  # two members have been started
 child = os.fork()
 same = np.array_equal(warpmag.h_field(x, m, device="cpu"), before)
 if child == 0:
@@ -28,6 +28,6 @@ print(same, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_a_forked_process_has_threads_of_its_own():
-    """Fork copies the members' memory but none of the threads behind it."""
+    """A fork copies the members' records, but not their threads."""
     result = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, timeout=300)
     assert result.stdout.split() == ["True", "0"], result.stderr

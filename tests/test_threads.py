@@ -1,4 +1,4 @@
-"""Threads of a CPU: how many there are never shows in results, nor do forks and signals, and they keep to limits."""
+"""Threads of a CPU: results do not depend on their number, on forks or signals, and limits on cores are respected."""
 
 import subprocess
 import sys
@@ -23,18 +23,18 @@ MS = 1.7e6
 
 @pytest.fixture
 def assert_same_bits(monkeypatch):
-    """Checks that what a function returns does not depend on the number of threads, which share small work, too."""
+    """Return a function that checks that results do not depend on the number of threads, even for little work."""
     for module in (neighbors, theta_flow):
         monkeypatch.setattr(module, "MOMENTS_PER_THREAD", 100)
     monkeypatch.setattr(evaluate, "PAIRS_PER_THREAD", 10_000)
     monkeypatch.setattr(near_pairs, "_BALLS_PER_THREAD", 100)
 
     def check(work, counts=COUNTS):
-        found = []
+        results = []
         for count in counts:
             monkeypatch.setattr(team, "cores", lambda count=count: count)
-            found.append([np.ascontiguousarray(array).tobytes() for array in work()])
-        assert found[0] and all(arrays == found[0] for arrays in found)
+            results.append([np.ascontiguousarray(array).tobytes() for array in work()])
+        assert results[0] and all(arrays == results[0] for arrays in results)
 
     return check
 
@@ -42,7 +42,7 @@ def assert_same_bits(monkeypatch):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("count", [1000, 2197])
 def test_fields_and_wrenches(count, dtype, device, assert_same_bits):
-    """Of one radius and of several, at targets that are no sources, at few targets, and where lists overflow."""
+    """Fields of balls of one and of several radii, at other targets, at few targets, and where lists overflow."""
     x, several, m = pile(count=count)
     targets = as_float32(x[: count // 2] + 0.001)[0]
     many = np.tile(x, (40, 1)) + 0.1 * np.arange(40).repeat(count)[:, None]
@@ -65,7 +65,7 @@ def test_fields_and_wrenches(count, dtype, device, assert_same_bits):
 
 @pytest.mark.parametrize("contact_model", ["dipole", "multipole"])
 def test_solves_over_time(contact_model, device, assert_same_bits):
-    """Balls that touch, overlap and move, in two worlds, one with a magnet that is a lattice and turns."""
+    """Balls that touch, overlap and move, in two worlds; one world has a rotating magnet of several moments."""
     x = 0.00995 * np.stack(np.meshgrid(*[np.arange(11.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
     lattice = 0.004 * np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij"), -1).reshape(-1, 3) - [0.0, 0.0, 0.05]
     positions = np.concatenate([x, lattice, x[:900]])
@@ -82,25 +82,25 @@ def test_solves_over_time(contact_model, device, assert_same_bits):
             contact_model=contact_model, rtol=1e-4, device=device,
         )  # fmt: skip
         system.moments.assign(np.where(magnet[:, None], [0.0, 0.1, 0.2], 0.0))
-        found = []
+        results = []
         for step in range(3):
             system.positions.assign(positions + step * velocities)
             system.solve()
-            found += [a.numpy().copy() for a in (system.moments, system.error, system.evaluations)]
+            results += [a.numpy().copy() for a in (system.moments, system.error, system.evaluations)]
             for law in ("kelvin", "zeeman")[: 1 + (contact_model == "dipole")]:
                 system.apply_forces(law)
-                found += [a.numpy().copy() for a in (system.forces, system.torques)]
-        return found
+                results += [a.numpy().copy() for a in (system.forces, system.torques)]
+        return results
 
     assert_same_bits(work)
 
 
 def test_a_world_keeps_its_bits_in_company(device):
-    """On a CPU the sums of a world are cut by what it holds alone."""
+    """On a CPU the order of a world's sums depends on that world alone."""
     if device != "cpu":
         pytest.skip("a GPU shares out the sources of a target by how many targets there are in all")
     x, radii, _ = pile(count=1500)
-    found = []
+    results = []
     for companions in (0, 1300):
         n = len(x) + companions
         system = moment_system(
@@ -110,12 +110,12 @@ def test_a_world_keeps_its_bits_in_company(device):
         system.positions.assign(np.concatenate([x, x[:companions]]))
         system.solve()
         system.apply_forces()
-        found.append([a.numpy()[: len(x)].tobytes() for a in (system.moments, system.forces)])
-    assert found[0] == found[1]
+        results.append([a.numpy()[: len(x)].tobytes() for a in (system.moments, system.forces)])
+    assert results[0] == results[1]
 
 
 def test_a_simulation(device, assert_same_bits, tmp_path):
-    """Balls Up with balls enough for several threads."""
+    """Balls Up with enough balls for several threads."""
     stage = tmp_path / "pile.usda"
     balls_up.author(stage, columns=15, rows=15, layers=4, height=0.0611)
 
@@ -130,7 +130,7 @@ def test_a_simulation(device, assert_same_bits, tmp_path):
 
 
 def test_threads_forks_and_signals_at_once(device):
-    """In a process of its own, some rounds of what ``stress_threads`` has more of."""
+    """A few rounds of ``stress_threads``, in a separate process."""
     if device != "cpu":
         pytest.skip("about threads of a CPU")
     stress = Path(__file__).with_name("stress_threads.py")
