@@ -59,16 +59,9 @@ def block_tiles(segments, width: int, splits: int = 1):
     tiles = np.zeros((len(segment), splits, TILE_COLUMNS), np.int64)
     row_begin = starts[segment] + within
     row_end = np.minimum(row_begin + width, starts[segment + 1])
-    columns = (
-        row_begin[:, None],
-        row_end[:, None],
-        first + within[:, None],
-        cuts[:, :-1],
-        cuts[:, 1:],
-        np.arange(splits),
-    )
-    for column, values in enumerate(columns):
-        tiles[..., column] = values
+    for column, values in enumerate((row_begin, row_end, first[:, 0] + within)):
+        tiles[..., column] = values[:, None]
+    tiles[..., 3], tiles[..., 4], tiles[..., 5] = cuts[:, :-1], cuts[:, 1:], np.arange(splits)
     return tiles.reshape(-1, TILE_COLUMNS)
 
 
