@@ -135,14 +135,14 @@ def test_what_usd_passes_over_in_an_instance_is_refused(case, metres, tmp_path):
     path.write_text(path.read_text().replace("metersPerUnit = 1", f"metersPerUnit = {metres}"))
     with pytest.raises(InputError) as caught:
         Simulation(path, device="cpu")
-    assert str(caught.value).startswith(f"/World/Copy: USD passes over /World/Copy/{name}, for it is in an instance")
+    assert str(caught.value).startswith(f"/World/Copy: USD ignores the override /World/Copy/{name} in the instance")
 
 
 def test_so_is_what_an_instance_in_an_instance_says(tmp_path, device, capsys):
     inner = f'def Xform "Inner" {{\n{COPY.format(IN_INSTANCE["a value"][0])}}}\n'
     path = write(tmp_path, physics(), KINDS, inner.replace("def Xform", "over", 1), NESTED)
     (error,), _ = told(path, tmp_path, device, capsys)
-    assert error.startswith("/World/Outer/Copy: USD passes over /World/Inner/Copy/Ball, for it is in an instance")
+    assert error.startswith("/World/Outer/Copy: USD ignores the override /World/Inner/Copy/Ball in the instance")
 
 
 def test_in_what_is_only_seen_it_does_not_matter(tmp_path):
@@ -153,7 +153,7 @@ def test_in_what_is_only_seen_it_does_not_matter(tmp_path):
         try:
             assert check(path).contents.bodies == bodies
         except InputError as error:
-            assert not bodies and "USD passes over /World/Copy/Extra" in str(error)
+            assert not bodies and "USD ignores the override /World/Copy/Extra" in str(error)
 
 
 def test_an_instance_that_says_nothing_runs(tmp_path, device, capsys):
@@ -199,7 +199,7 @@ def test_slips_are_warnings_of_both(device, tmp_path, capsys):
     assert expected <= set(warnings)
     assert not any(foreign in one for one in warnings for foreign in ("wax:", "warpSceneAPI"))
     [mesh] = [one for one in warnings if one.startswith("/World/Open: mesh: not closed")]
-    assert "the convexHull that it collides as is magnetized in its place" in mesh
+    assert "its approximation for collisions, convexHull, is magnetized in its place" in mesh
 
 
 def test_what_goes_together_is_no_slip(device, tmp_path, capsys):

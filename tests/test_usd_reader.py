@@ -114,7 +114,7 @@ REFUSED = {
     ),
     "uneven ball": (
         ball('float3 xformOp:scale = (1, 2, 1)\nuniform token[] xformOpOrder = ["xformOp:scale"]'),
-        "/Ball: a sphere scaled unevenly",
+        "/Ball: a sphere with non-uniform scale",
     ),
     "sheared": (
         ball(

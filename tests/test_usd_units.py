@@ -328,7 +328,7 @@ def test_a_unit_that_is_not_set_is_told(tmp_path):
     path.write_text(path.read_text().replace("metersPerUnit = 0.01", ""))
     found = survey(open_stage(path)).findings
     assert [(one.severity, one.message) for one in found] == [
-        ("warning", "metersPerUnit is not set, which in USD means 0.01: lengths are taken for so many meters")
+        ("warning", "metersPerUnit is not set, which in USD means 0.01: lengths are read in that unit")
     ]
 
 

@@ -27,7 +27,7 @@ from .mutate import mutate
 from .truth import differences
 
 FORMS = ("usda",) * 13 + ("text",) * 3 + ("crate",) * 3 + ("package",)
-"""How mutants lie on disk, as often as here: sound text, damaged text, damaged crate files, damaged packages."""
+"""Formats of mutants, in these proportions: text, damaged text, crate files, packages."""
 CPU_SECONDS, WALL_SECONDS = 150, 600
 """Time that a stage may take [s], up to 80 of which are for compiling contacts of a new kind of shape; wall time allows
 for a loaded machine."""
@@ -39,7 +39,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 _FRESH = {name: value for name, value in os.environ.items() if name != "PXR_WORK_THREAD_LIMIT"}
 _CAUSES = ("overlapped at the start", "apart at the start", "too fast for the shortest substep")
 """What may end a run of a sound stage, and has to be named then."""
-_READING = re.compile("USD's reader dies of it|USD did not read it within")
+_READING = re.compile("USD's reader crashes on it|USD did not read it within")
 _EXPECTED = re.compile(r"^warpmag: |^$|^\S+: loading|frame/s|s/frame|frame \[")
 
 
@@ -73,12 +73,11 @@ def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Pat
     chance = random.Random(f"{seed}-{number}")
     form, source = chance.choice(FORMS), sources[number % len(sources)]
     path = folder / f"{number:05}.usda"
-    done, layer = mutate(source, path, chance.randrange(1 << 40), fewest=1 if form == "usda" else 0)
+    done, layer = mutate(source, path, chance.randrange(1 << 40), fewest=0 if form == "text" else 1)
     if form == "text":
         done += "; " + damage.spoil_text(path, chance)
     elif form != "usda":
         path = damage.to_crate(layer, path) if form == "crate" else damage.to_package(layer, path, chance)
-        done += "; " + damage.spoil_bytes(path, chance)
     return path, form, f"{source.stem}: {done}"
 
 

@@ -1,4 +1,4 @@
-"""Files damaged on their way: text cut, garbled and spliced, bytes of crate files and packages changed."""
+"""Damaged text files, and undamaged crate files and packages."""
 
 import random
 import re
@@ -34,34 +34,6 @@ def spoil_text(path: Path, chance: random.Random) -> str:
         path.write_bytes(what(data, chance))
         done.append(what.__name__)
     return " ".join(done)
-
-
-def spoil_bytes(path: Path, chance: random.Random) -> str:
-    """Damage bytes of a file in place, a crate file or a package say; return what was done."""
-    data = bytearray(path.read_bytes())
-    kind = chance.randrange(7)
-    size = len(data)
-    if kind < 3:  # a few bytes, more often than not in the tables at the end that say where everything is
-        first = chance.choice((0, 0, size * 2 // 3, max(0, size - 400)))
-        count = chance.choice((1, 1, 3, 10, 50))
-        for _ in range(count):
-            data[chance.randrange(first, size)] = chance.choice((0, 1, 0x7F, 0x80, 0xFF, chance.randrange(256)))
-        path.write_bytes(data)
-        return f"{count} bytes from {first} on"
-    if kind == 3:
-        del data[chance.randrange(size) :]
-        path.write_bytes(data)
-        return f"cut to {len(data)} of {size} bytes"
-    place, length = chance.randrange(size), chance.choice((1, 8, 64, 1000))
-    if kind == 4:
-        data[place : place + length] = bytes(len(data[place : place + length]))
-    elif kind == 5:
-        data[place:place] = chance.randbytes(length)
-    else:
-        source = chance.randrange(size)
-        data[place : place + length] = data[source : source + length]
-    path.write_bytes(data)
-    return f"{('zeros', 'noise', 'a splice')[kind - 4]} of {length} bytes at {place} of {size}"
 
 
 def to_crate(layer: Sdf.Layer, path: Path) -> Path:

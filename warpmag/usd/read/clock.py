@@ -1,4 +1,4 @@
-"""How time runs on a stage, and its units."""
+"""Times, rates and units of a stage."""
 
 import math
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ _MOST_FRAMES = 10_000_000
 
 @dataclass(frozen=True)
 class StageClock:
-    """How time runs on a stage.
+    """Time range and rates of a stage.
 
     Attributes:
-        start: Time code of the start.
-        end: Time code of the end; equal to ``start`` where the stage has no range.
-        time_codes_per_second: Time codes that make a second.
+        start: First time code.
+        end: Last time code; equal to ``start`` where the stage has no range.
+        time_codes_per_second: Time codes per second.
         frames_per_second: Rate of the output frames [Hz].
-        step: Time step of the physics [s], None where the stage does not say.
+        step: Time step of the physics [s], None where the stage has none.
     """
 
     start: float
@@ -35,17 +35,17 @@ class StageClock:
 
 
 def stage_name(stage: Usd.Stage) -> str:
-    """Return the name by which messages call a stage."""
+    """Return the name of a stage in messages."""
     return stage.GetRootLayer().realPath or "stage"
 
 
 def start_of(stage: Usd.Stage) -> float:
-    """Return the time code at which a stage starts; raises :class:`InputError` where it is none."""
+    """Return the first time code of a stage; raises :class:`InputError` unless it is finite."""
     return _time_code(stage, "startTimeCode", stage.GetStartTimeCode())
 
 
 def stage_clock(stage: Usd.Stage) -> StageClock:
-    """Read how time runs on a stage; raises :class:`InputError` where that makes no sense."""
+    """Return times and rates of a stage; raises :class:`InputError` where they are invalid."""
     name = stage_name(stage)
     codes = stage.GetTimeCodesPerSecond()
     frames = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else codes
@@ -61,9 +61,9 @@ def stage_clock(stage: Usd.Stage) -> StageClock:
 
 
 def check_rates(stage: Usd.Stage) -> None:
-    """Raise :class:`InputError` for a layer whose time codes have no rate: USD loops over its samples.
+    """Raise :class:`InputError` for a layer with an invalid rate, over whose samples USD would loop forever.
 
-    It divides the rates of layers where they differ, and takes two NaN for different.
+    USD divides the rates of layers that differ, and NaN differs from itself.
     """
     for layer in stage.GetUsedLayers():
         what = "timeCodesPerSecond" if layer.HasTimeCodesPerSecond() else "framesPerSecond"
@@ -71,12 +71,12 @@ def check_rates(stage: Usd.Stage) -> None:
 
 
 def scenes(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the physics scenes of a stage; Newton takes the first."""
+    """Return the physics scenes of a stage; Newton reads the first."""
     return [prim for prim in stage.Traverse() if prim.IsA(UsdPhysics.Scene)]
 
 
 def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
-    """Yield what is wrong with the units of a stage, and which length it has only by USD's default."""
+    """Yield errors in the units of a stage, and a warning where the unit of length is USD's default."""
     units, name = units_of(stage), stage_name(stage)
     for what, unit in (("metersPerUnit", units.meters), ("kilogramsPerUnit", units.kilograms)):
         if not 1e-50 < unit < 1e50:
@@ -84,7 +84,7 @@ def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
     if (up := UsdGeom.GetStageUpAxis(stage)) not in ("Y", "Z"):
         yield Finding(name, f"upAxis must be Y or Z, got {up!r}")
     if not stage.GetRootLayer().pseudoRoot.HasInfo("metersPerUnit"):
-        message = f"metersPerUnit is not set, which in USD means {units.meters:g}: lengths are taken for so many meters"
+        message = f"metersPerUnit is not set, which in USD means {units.meters:g}: lengths are read in that unit"
         yield Finding(name, message, "warning")
 
 

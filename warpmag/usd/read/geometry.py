@@ -1,4 +1,4 @@
-"""Meshes and sizes of colliders: what Newton would read beyond its arrays, loop over without end, or take wrong."""
+"""Checks meshes and sizes of colliders: Newton would read out of bounds, loop forever or import wrong shapes."""
 
 from collections.abc import Iterator
 
@@ -13,11 +13,11 @@ _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height")
 _LARGEST_MAGNET = 2e4
 """Limit of a magnet's sizes [m], so that its moment and its square stay in single precision."""
 _AS_DRAWN = ("none", "meshSimplification", "sdf", None)
-"""Approximations of a mesh that keep its surface; all others close it, and magnetize in its place if it is open."""
+"""Approximations that keep a mesh's surface. The others close it; for an open mesh they are magnetized in its place."""
 
 
 def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield what is wrong with the size of a collider in the world, and with its mesh."""
+    """Yield errors in the size of a collider in the world, and in its mesh."""
     if prim.IsA(UsdGeom.Mesh):
         yield from _mesh_findings(prim)
     else:
@@ -25,7 +25,7 @@ def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield why a collider that is sound as such cannot be magnetized."""
+    """Yield the reason why a valid collider cannot be magnetized."""
     if not prim.IsA(UsdGeom.Mesh):
         yield from _size_findings(prim, _LARGEST_MAGNET)
         return
@@ -33,16 +33,16 @@ def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
     try:
         lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
     except InputError as error:
-        collided = prim.GetAttribute("physics:approximation").Get()
-        if collided in _AS_DRAWN:
+        approximation = prim.GetAttribute("physics:approximation").Get()
+        if approximation in _AS_DRAWN:
             yield Finding(str(prim.GetPath()), str(error))
         else:
-            message = f"{error}: the {collided} that it collides as is magnetized in its place"
+            message = f"{error}: its approximation for collisions, {approximation}, is magnetized in its place"
             yield Finding(str(prim.GetPath()), message, "warning")
 
 
 def spacing_findings(magnet: Usd.Prim, colliders: list[Usd.Prim], spacing: float) -> Iterator[Finding]:
-    """Yield why the colliders of a magnet, which are sound, cannot be filled with moments at a spacing [m]."""
+    """Yield an error if a moment spacing [m] is too small for the valid colliders of a magnet."""
     boxes = []
     for prim in colliders if spacing > 0.0 else ():
         lower, upper = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
@@ -55,7 +55,7 @@ def spacing_findings(magnet: Usd.Prim, colliders: list[Usd.Prim], spacing: float
 
 
 def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield why a viewer could not read the faces of a mesh that is only seen; it may have none."""
+    """Yield errors in the faces of a visual mesh, which may have none."""
     try:
         points, counts, indices = _topology(prim)
         holes = value_of(prim, "holeIndices")
@@ -69,7 +69,7 @@ def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
 def _size_findings(prim, largest) -> Iterator[Finding]:
     try:
         sizes = [value_of(prim, name) for name in _SIZES] if prim.IsA(UsdGeom.Gprim) else []
-    except InputError:  # among the findings of the attributes already
+    except InputError:  # reported with the attributes
         return
     lengths = np.linalg.norm(_axes(prim), axis=1)
     for name, size in zip(_SIZES, sizes, strict=False):
@@ -86,7 +86,7 @@ def _mesh_findings(prim) -> Iterator[Finding]:
     try:
         points, counts, indices = _topology(prim)
         holes = value_of(prim, "holeIndices")
-    except InputError:  # among the findings of the attributes already
+    except InputError:  # reported with the attributes
         return
     if points is None or not len(points):
         yield Finding(path, "mesh has no points")
@@ -107,7 +107,7 @@ def _topology(prim) -> tuple:
 
 
 def _topology_fault(vertices: int, counts, indices, holes) -> str:
-    """Return what is wrong with the faces of a mesh, empty where nothing is."""
+    """Return the error in the faces of a mesh, empty where there is none."""
     if counts is None or indices is None or not len(counts):
         return "mesh has no faces: faceVertexCounts or faceVertexIndices is empty"
     counts, indices = np.asarray(counts, dtype=np.int64), np.asarray(indices, dtype=np.int64)
@@ -126,12 +126,12 @@ def _topology_fault(vertices: int, counts, indices, holes) -> str:
 
 
 def _triangles(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Return the triangles of polygons, as fans from their first corners."""
+    """Return the triangles of polygons, as fans around their first corners."""
     starts = np.repeat(np.cumsum(counts) - counts, counts - 2)
-    turns = np.arange(len(starts)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    return np.stack([indices[starts], indices[starts + turns + 1], indices[starts + turns + 2]], axis=1)
+    offsets = np.arange(len(starts)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    return np.stack([indices[starts], indices[starts + offsets + 1], indices[starts + offsets + 2]], axis=1)
 
 
 def _axes(prim) -> np.ndarray:
-    """Return the rows that a transform turns the axes of a prim into."""
+    """Return the world vectors of a prim's axes, one row each."""
     return np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim))[:3, :3]

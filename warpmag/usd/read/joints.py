@@ -1,7 +1,7 @@
-"""Reads which bodies joints connect, and where the ends of joints stand that no body moves.
+"""Checks and prepares joints for Newton's importer.
 
-Newton's importer drops joints that it cannot make, without a word, and takes the frame of a fixed prim at a joint for
-that of the world. Both are found here.
+The importer silently drops joints that it cannot create, and ignores the frame of a fixed prim at a joint. The
+checks report the former; :func:`prepare_joints` returns the frames for the latter.
 """
 
 import math
@@ -12,30 +12,31 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.declarations.checks import joint_ends_apart, joint_gap_message
 from warpmag.errors import InputError
+from warpmag.usd.read.prims import body_of
 from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.values import Finding, value_of
 
 _AXES = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 _MEETING = (UsdPhysics.FixedJoint, UsdPhysics.RevoluteJoint, UsdPhysics.SphericalJoint)
-"""Joints whose ends are at one place; those of a prismatic joint are on its axis."""
+"""Joints whose ends coincide; the ends of a prismatic joint lie on its axis."""
 _PLACES = ("physics:localPos0", "physics:localPos1")
 _ROOTS = ("PhysicsArticulationRootAPI", "NewtonArticulationRootAPI")
-"""What makes a prim the root of an articulation; the second brings the first along."""
+"""API schemas of the root of an articulation; the second includes the first."""
 _SELF_COLLISION = "newton:selfCollisionEnabled"
 
 
 @dataclass(frozen=True)
 class GroundedJoint:
-    """A joint between a body that moves and something that does not.
+    """A joint between a dynamic body and a fixed end.
 
     Attributes:
-        path: Prim of the joint.
-        position: Where the joint's frame stands on what is fixed [m], world frame.
-        rotation: How it is turned there, quaternion x y z w.
-        fixed: Prim that is fixed, a collider or a kinematic body for instance; empty for the world itself.
-        moving: Prim of the body that moves.
-        reversed: Whether the body that moves is ``body0``: coordinates of the joint then count the other way round.
-        collides: Whether the two may touch.
+        path: Path of the joint.
+        position: Position of the joint's frame at the fixed end [m], world frame.
+        rotation: Rotation of that frame, a quaternion (x, y, z, w).
+        fixed: Path of the fixed prim, such as a collider or a kinematic body; empty for the world itself.
+        moving: Path of the dynamic body.
+        reversed: Whether the dynamic body is ``body0``: the joint's coordinates then have the opposite sign.
+        collides: Whether the two may collide.
     """
 
     path: str
@@ -49,7 +50,7 @@ class GroundedJoint:
 
 @dataclass(frozen=True)
 class _End:
-    """One end of a joint: what it is attached to, and the rigid body that carries that, if one does."""
+    """One end of a joint: its prim, the rigid body that carries the prim, and whether that body is dynamic."""
 
     prim: Usd.Prim | None
     body: Usd.Prim | None
@@ -57,7 +58,7 @@ class _End:
 
 
 def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Finding]:
-    """Yield what is wrong with the joints of a stage, of which keys move the bodies ``keyed``."""
+    """Yield errors in the joints of a stage; keys move the bodies ``keyed``."""
     transforms = TransformCheck()
     for joint in enabled_joints(stage):
         path = str(joint.GetPath())
@@ -76,42 +77,42 @@ def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Fin
 
 
 def _hung_on(stage, joint) -> str:
-    """Return the body that is ``physics:body1`` of a joint whose other end moves, empty where there is none."""
-    one, other = _ends(stage, joint)
-    return str(other.body.GetPath()) if one.moves and other.body else ""
+    """Return the path of ``physics:body1`` of a joint whose ``body0`` is dynamic, else an empty path."""
+    first, second = _ends(stage, joint)
+    return str(second.body.GetPath()) if first.moves and second.body else ""
 
 
 def _strained_joints(stage: Usd.Stage) -> dict[str, float]:
-    """Return how far the ends of joints are apart at the start [m], in ways that the joint does not leave free."""
-    places, found = UsdGeom.XformCache(Usd.TimeCode.Default()), {}
+    """Return the distance [m] between the ends of joints at the start, along directions that the joint constrains."""
+    transforms, gaps = UsdGeom.XformCache(Usd.TimeCode.Default()), {}
     for joint in enabled_joints(stage):
         ends, slides = _ends(stage, joint), joint.GetPrim().IsA(UsdPhysics.PrismaticJoint)
         if not (slides or any(joint.GetPrim().IsA(kind) for kind in _MEETING)) or not all(end.prim for end in ends):
             continue
         try:
-            frames = [places.GetLocalToWorldTransform(end.prim) for end in ends]
-            one, other = (
+            frames = [transforms.GetLocalToWorldTransform(end.prim) for end in ends]
+            first, second = (
                 frame.Transform(Gf.Vec3d(value_of(joint.GetPrim(), name)))
                 for frame, name in zip(frames, _PLACES, strict=True)
             )
             axis = frames[0].TransformDir(_axis(joint.GetPrim())).GetNormalized() if slides else Gf.Vec3d(0.0)
-        except (InputError, Tf.ErrorException):  # among the findings of the attributes and ends
+        except (InputError, Tf.ErrorException):  # reported with the attributes and ends
             continue
-        gap = (one - other - axis * ((one - other) * axis)).GetLength()
-        if any(end.moves for end in ends) and joint_ends_apart(gap, one.GetLength()):
-            found[str(joint.GetPath())] = gap
-    return found
+        gap = (first - second - axis * ((first - second) * axis)).GetLength()
+        if any(end.moves for end in ends) and joint_ends_apart(gap, first.GetLength()):
+            gaps[str(joint.GetPath())] = gap
+    return gaps
 
 
 def _axis(joint: Usd.Prim) -> Gf.Vec3d:
-    """Return the direction in which a prismatic joint slides, in the frame of what ``body0`` names."""
+    """Return the sliding direction of a prismatic joint, in the frame of ``body0``."""
     axis = Gf.Vec3d(0.0)
     axis["XYZ".index(value_of(joint, "physics:axis"))] = 1.0
     return Gf.Rotation(Gf.Quatd(value_of(joint, "physics:localRot0"))).TransformDir(axis)
 
 
 def enabled_joints(stage: Usd.Stage) -> list[UsdPhysics.Joint]:
-    """Return the joints of a stage that are enabled, those in instances included."""
+    """Return the enabled joints of a stage, including those in instances."""
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     joints = [UsdPhysics.Joint(prim) for prim in prims if prim.IsA(UsdPhysics.Joint)]
     return [joint for joint in joints if joint.GetJointEnabledAttr().Get()]
@@ -123,18 +124,18 @@ def enabled_joint_paths(stage: Usd.Stage) -> list[str]:
 
 
 def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[GroundedJoint]:
-    """Rewrite joints that Newton reads otherwise than USD means them, in the stage's session layer.
+    """Rewrite joints that Newton would misread, in the stage's session layer.
 
-    Joints with a kinematic body as ``body1`` hang on the world then, those between two things that do not move are
-    disabled, and axes that a generic joint does not limit are free in so many words.
+    Joints with a kinematic ``body1`` are attached to the world, joints between two fixed ends are disabled, and the
+    unlimited axes of a generic joint get explicit infinite limits.
 
     Args:
         stage: The stage.
-        articulations: Whether joints are wanted in trees. Newton takes nothing but trees, from parent to child, with
-            all their bodies in them; where each joint counts for itself, the roots only stand in the way of the rest.
+        articulations: Keep articulations, for solvers in generalized coordinates. Newton takes only trees from parent
+            to child that contain all their bodies; without articulations it takes any graph of joints.
 
     Returns:
-        The joints between a body that moves and something that does not, but for kinematic bodies as ``body0``.
+        The joints between a dynamic body and a fixed end, except for kinematic bodies as ``body0``.
     """
     if not articulations:
         _drop_articulations(stage)
@@ -154,7 +155,7 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
                 limit = UsdPhysics.LimitAPI.Apply(joint.GetPrim(), axis)
                 limit.CreateLowAttr(-math.inf)
                 limit.CreateHighAttr(math.inf)
-            if swapped:  # Newton drops it; where a prim is no body it takes the world, and joints with one prim each
+            if swapped:  # Newton drops the joint; with a target that is no body it uses the world
                 joint.GetBody1Rel().SetTargets([path])
             if len(still) == 2:
                 joint.GetJointEnabledAttr().Set(False)
@@ -162,7 +163,7 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
 
 
 def _drop_articulations(stage: Usd.Stage) -> None:
-    """Take the roots of articulations off, but for those within which bodies do not collide."""
+    """Remove articulation roots, except for articulations without self-collision."""
     for path in [prim.GetPath() for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())]:
         prim = stage.GetPrimAtPath(path)
         if prim.HasAPI(UsdPhysics.ArticulationRootAPI) and prim.GetAttribute(_SELF_COLLISION).Get() is not False:
@@ -172,7 +173,7 @@ def _drop_articulations(stage: Usd.Stage) -> None:
 
 
 def _editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:
-    """Return the prim at ``path``, no longer in an instance: those cannot be edited."""
+    """Return the prim at ``path``, with the instances around it made editable."""
     while (prim := stage.GetPrimAtPath(path)).IsInstanceProxy():
         while prim.IsInstanceProxy():
             prim = prim.GetParent()
@@ -181,23 +182,23 @@ def _editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:
 
 
 def _free_axes(joint: Usd.Prim) -> list[str]:
-    """Return the axes that a generic joint leaves free by having no limit for them, which Newton would lock."""
+    """Return the axes without limits of a generic joint, which USD leaves free and Newton would lock."""
     if joint.GetTypeName() != "PhysicsJoint":
         return []
     return [axis for axis in _AXES if not joint.HasAPI(UsdPhysics.LimitAPI, axis)]
 
 
 def _problem(stage: Usd.Stage, joint: UsdPhysics.Joint) -> str:
-    """Return why a joint cannot be made; empty if it can."""
+    """Return the reason why a joint cannot be created, empty where it can."""
     for relationship in _relationships(joint):
         targets = relationship.GetTargets()
         if len(targets) > 1:
             return f"{relationship.GetName()} names {len(targets)} prims, a joint has one at each end"
         if targets and not stage.GetPrimAtPath(targets[0]):
             return f"{relationship.GetName()} names {targets[0]}, which is not there"
-    one, other = _ends(stage, joint)
-    if one.body and one.body == other.body:
-        return f"both of its ends are on the body {one.body.GetPath()}"
+    first, second = _ends(stage, joint)
+    if first.body and first.body == second.body:
+        return f"both of its ends are on the body {first.body.GetPath()}"
     return ""
 
 
@@ -210,30 +211,24 @@ def _ends(stage, joint) -> list[_End]:
     for relationship in _relationships(joint):
         targets = relationship.GetTargets()
         prim = stage.GetPrimAtPath(targets[0]) if targets else None
-        body = prim
-        while body and not _is_body(body):
-            body = body.GetParent()
+        body = body_of(prim) if prim else None
         kinematic = body and UsdPhysics.RigidBodyAPI(body).GetKinematicEnabledAttr().Get()
         ends.append(_End(prim or None, body or None, bool(body) and not kinematic))
     return ends
 
 
-def _is_body(prim) -> bool:
-    return prim.HasAPI(UsdPhysics.RigidBodyAPI) and bool(UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get())
-
-
 def _grounded(joint, ends, still: int) -> GroundedJoint:
-    """Return where the end number ``still`` of a joint stands in the world."""
-    place = (joint.GetLocalPos0Attr, joint.GetLocalPos1Attr)[still]().Get()
-    turn = Gf.Quatd((joint.GetLocalRot0Attr, joint.GetLocalRot1Attr)[still]().Get()).GetNormalized()
+    """Return a joint with the world frame of its fixed end, number ``still``."""
+    local_position = (joint.GetLocalPos0Attr, joint.GetLocalPos1Attr)[still]().Get()
+    local_rotation = Gf.Quatd((joint.GetLocalRot0Attr, joint.GetLocalRot1Attr)[still]().Get()).GetNormalized()
     fixed = ends[still].prim
     world = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(fixed) if fixed else Gf.Matrix4d(1.0)
-    position = world.Transform(Gf.Vec3d(place))
-    turn = Gf.Transform(world).GetRotation().GetQuat() * turn
+    position = world.Transform(Gf.Vec3d(local_position))
+    rotation = Gf.Transform(world).GetRotation().GetQuat() * local_rotation
     return GroundedJoint(
         str(joint.GetPath()),
         tuple(position),
-        (*turn.GetImaginary(), turn.GetReal()),
+        (*rotation.GetImaginary(), rotation.GetReal()),
         str(fixed.GetPath()) if fixed else "",
         str(ends[1 - still].body.GetPath()),
         still == 1,

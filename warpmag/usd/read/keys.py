@@ -1,7 +1,7 @@
-"""Reads what a stage gives time samples for and a run follows: transforms of kinematic bodies, fields, magnetizations.
+"""Reads the time samples (keys) that a run follows: transforms of kinematic bodies, fields, magnetizations, currents.
 
-Samples are read from the stage without what its session holds, which would hide them. What moves by keys and is
-no rigid body, as artists leave it, becomes a kinematic one there, coils and field maps too.
+Keys are read from the stage without frozen values, which would hide them. Animated colliders, coils and field maps
+without a rigid body, as artists leave them, become kinematic bodies in the session layer.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,29 +13,29 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 from warpmag.declarations.keys import Keys, Motion, Operation
 from warpmag.errors import InputError
 from warpmag.usd.read.prims import is_body, is_collider
-from warpmag.usd.read.session import without_held
+from warpmag.usd.read.session import without_frozen
 from warpmag.usd.read.transforms import is_animated
 from warpmag.usd.values import LARGEST_COORDINATE, Finding
 
-_UNEVEN = 1e-5
-"""By this part of its size a scale may change, and its axes be off right angles: poses are often single precision."""
+_SCALE_TOLERANCE = 1e-5
+"""Relative tolerance for constant scale and right angles of axes: poses are often in single precision."""
 
 
 class KeyReader:
     """Reads the keys of one stage."""
 
     def __init__(self, stage: Usd.Stage):
-        """Read those of ``stage``, held at any moment or not."""
+        """Read from ``stage``, which may be frozen."""
         self._stage = stage
         self._moving: dict[Sdf.Path, bool] = {}
 
     @cached_property
     def plain(self) -> Usd.Stage:
-        """The stage without the values that are held."""
-        return without_held(self._stage)
+        """The stage without frozen values."""
+        return without_frozen(self._stage)
 
     def moves(self, prim: Usd.Prim, within: Usd.Prim | None = None) -> bool:
-        """Whether keys move a prim, or what is above it, in the world or within another prim above it."""
+        """Return whether keys move a prim or a parent, in the world or relative to the parent ``within``."""
         while prim and not prim.IsPseudoRoot() and prim != within:
             path = prim.GetPath()
             if path not in self._moving:
@@ -48,32 +48,32 @@ class KeyReader:
         return False
 
     def motion(self, prim: Usd.Prim) -> Motion:
-        """Return how keys move a prim, at time codes of the stage.
+        """Return the keyed transform operations of a prim and its parents, at time codes of the stage.
 
         Raises:
-            InputError: A sample is missing, not finite, or nothing that USD can compose.
+            InputError: A sample is missing, not finite, or cannot be composed by USD.
         """
         operations: list[Operation] = []
         prim = self.plain.GetPrimAtPath(prim.GetPath())
         while prim and not prim.IsPseudoRoot():
             if prim.IsA(UsdGeom.Xformable):
                 xform = UsdGeom.Xformable(prim)
-                operations = [*_without_idle([_operation(one) for one in xform.GetOrderedXformOps()]), *operations]
+                operations = [*_without_identities([_operation(op) for op in xform.GetOrderedXformOps()]), *operations]
                 if xform.GetResetXformStack():
                     break
             prim = prim.GetParent()
         return Motion(tuple(operations))
 
     def keys(self, prim: Usd.Prim, name: str, read: Callable[[str, object], tuple]) -> Keys | None:
-        """Return the time samples of an attribute, None where it has not several.
+        """Return the time samples of an attribute, None where it has fewer than two.
 
         Args:
             prim: The prim.
             name: The attribute.
-            read: Checks a value, the first argument being its name for the message, and returns its numbers.
+            read: Function of the name in messages and a value; checks the value and returns its numbers.
 
         Raises:
-            InputError: A sample is none that ``read`` takes.
+            InputError: A sample is invalid.
         """
         attribute = self.plain.GetPrimAtPath(prim.GetPath()).GetAttribute(name)
         times = attribute.GetTimeSamples() if attribute else ()
@@ -83,29 +83,29 @@ class KeyReader:
         return _keys(times, [read(f"{where} at time code {time:g}", _sample(attribute, time)) for time in times], where)
 
     def findings(self, prim: Usd.Prim, motion: Motion) -> Iterator[Finding]:
-        """Yield why a rigid body cannot follow a motion, at its keys and half-way between them."""
+        """Yield the first error of a motion that a rigid body cannot follow, at its keys and half-way between them."""
         path = str(prim.GetPath())
-        times = np.unique(np.concatenate([one.keys.times for one in motion.operations if len(one.keys.times) > 1]))
+        times = np.unique(np.concatenate([op.keys.times for op in motion.operations if len(op.keys.times) > 1]))
         times = np.unique(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
-        prim, places, sizes = self.plain.GetPrimAtPath(prim.GetPath()), UsdGeom.XformCache(), None
+        prim, transforms, scales = self.plain.GetPrimAtPath(prim.GetPath()), UsdGeom.XformCache(), None
         for time in times.tolist():
-            places.SetTime(time)
-            world = np.array(places.GetLocalToWorldTransform(prim))
+            transforms.SetTime(time)
+            world = np.array(transforms.GetLocalToWorldTransform(prim))
             if message := _fault(world):
                 yield Finding(path, f"keyed transform {message} at time code {time:g}")
                 return
-            own = np.linalg.norm(world[:3, :3], axis=1)
-            sizes = own if sizes is None else sizes
-            if np.abs(own - sizes).max() > _UNEVEN * sizes.max():
+            scale = np.linalg.norm(world[:3, :3], axis=1)
+            scales = scale if scales is None else scales
+            if np.abs(scale - scales).max() > _SCALE_TOLERANCE * scales.max():
                 yield Finding(path, "its scale is keyed, and a rigid body keeps its size")
                 return
 
     def _varies(self, path: Sdf.Path) -> bool:
-        """Whether a transform of a prim itself is not the same at all its samples."""
-        for one in UsdGeom.Xformable(self.plain.GetPrimAtPath(path)).GetOrderedXformOps():
-            if one.GetAttr().HasSpline():
+        """Return whether the prim's own transform differs between its samples."""
+        for op in UsdGeom.Xformable(self.plain.GetPrimAtPath(path)).GetOrderedXformOps():
+            if op.GetAttr().HasSpline():
                 return True
-            values = [_sample(one.GetAttr(), time) for time in one.GetTimeSamples()]
+            values = [_sample(op.GetAttr(), time) for time in op.GetTimeSamples()]
             if any(value != values[0] for value in values):
                 return True
         return False
@@ -114,22 +114,22 @@ class KeyReader:
 def make_kinematic(
     stage: Usd.Stage, animated: Iterable[Sdf.Path], is_source: Callable[[Usd.Prim], bool] = lambda _: False
 ) -> None:
-    """Make what collides or makes a field, moves by keys and is no rigid body a kinematic one, in the session layer.
+    """Make animated colliders and field sources without a rigid body kinematic bodies, in the session layer.
 
     Args:
         stage: The stage.
         animated: Prims whose own transforms have time samples.
-        is_source: Whether a prim is a coil or a field map.
+        is_source: Function that returns whether a prim is a coil or a field map.
     """
     roots = [path for path in Sdf.Path.RemoveDescendentPaths(list(animated)) if stage.GetPrimAtPath(path)]
-    reader, found = KeyReader(stage), []
+    reader, paths = KeyReader(stage), []
     for root in roots:
         for prim in Usd.PrimRange(stage.GetPrimAtPath(root), Usd.TraverseInstanceProxies()):
             chosen = is_collider(prim) or (prim.IsA(UsdGeom.Xformable) and is_source(prim))
-            if chosen and not _belongs(prim, found) and reader.moves(prim):
-                found.append(prim.GetPath())
+            if chosen and not _belongs(prim, paths) and reader.moves(prim):
+                paths.append(prim.GetPath())
     with Usd.EditContext(stage, stage.GetSessionLayer()):
-        for path in found:
+        for path in paths:
             prim = instance = stage.GetPrimAtPath(path)
             while not instance.IsPseudoRoot() and not instance.IsInstance():
                 instance = instance.GetParent()
@@ -139,7 +139,7 @@ def make_kinematic(
             body = UsdPhysics.RigidBodyAPI.Apply(prim)
             body.CreateRigidBodyEnabledAttr(True)
             body.CreateKinematicEnabledAttr(True)
-            # which nothing depends on, but planes and open meshes have none, and Newton leaves bodies without out
+            # Newton drops bodies without mass, such as planes and open meshes; a kinematic body's value is arbitrary
             mass = UsdPhysics.MassAPI.Apply(prim)
             mass.CreateMassAttr(1.0)
             mass.CreateDiagonalInertiaAttr(Gf.Vec3f(1.0))
@@ -147,17 +147,17 @@ def make_kinematic(
             mass.CreateCenterOfMassAttr(Gf.Vec3f(0.0))
 
 
-def _belongs(prim: Usd.Prim, found: list[Sdf.Path]) -> bool:
-    """Whether a prim is a rigid body, to be one, or part of one."""
+def _belongs(prim: Usd.Prim, bodies: list[Sdf.Path]) -> bool:
+    """Return whether a prim is at or below a rigid body or one of the future ``bodies``."""
     while prim and not prim.IsPseudoRoot():
-        if is_body(prim) or prim.GetPath() in found:
+        if is_body(prim) or prim.GetPath() in bodies:
             return True
         prim = prim.GetParent()
     return False
 
 
 def _sample(attribute: Usd.Attribute, time: float):
-    """Return the value of an attribute at a time; raises :class:`InputError` if it has none that USD can read."""
+    """Return the value of an attribute at a time code; raises :class:`InputError` if USD cannot read it."""
     try:
         value = attribute.Get(time)
     except Tf.ErrorException:
@@ -179,18 +179,18 @@ def _keys(times, values, where: str, interpolation: str = "linear") -> Keys:
 
 
 def _operation(xform: UsdGeom.XformOp) -> Operation:
-    """Return one of USD's operations with its keys, a single one if it never changes."""
+    """Return a transform operation with its keys; a constant one has a single key."""
     attribute = xform.GetAttr()
     where = f"{attribute.GetPrim().GetPath()}: {attribute.GetName()}"
     if attribute.HasSpline():
-        raise InputError(f"{where} is a spline, of which a run reads no keys: bake it into time samples")
+        raise InputError(f"{where} is a spline, which a run does not read: bake it into time samples")
     token = UsdGeom.XformOp.GetOpTypeToken(xform.GetOpType())
     times = xform.GetTimeSamples()
     if times:
         values = [_sample(attribute, time) for time in times]
     else:
         times, values = [0.0], [attribute.Get()]
-    if values[0] is None:  # for USD it is no transform at all
+    if values[0] is None:  # the identity for USD
         return Operation("matrix", Keys.constant(np.eye(4)))
     if token == "orient":
         quaternions = [(*value.GetImaginary(), value.GetReal()) for value in values]
@@ -203,24 +203,24 @@ def _operation(xform: UsdGeom.XformOp) -> Operation:
     rows = _keys(times, [np.ravel(np.array(value, dtype=float)) for value in values], where)
     if token[-1] in "XYZ" and token[:-1] in ("translate", "scale", "rotate"):
         kind = token[:-1]
-        whole = np.full((len(times), 3), 1.0 if kind == "scale" else 0.0)
-        whole[:, "XYZ".index(token[-1])] = rows.values[:, 0]
-        kind, rows = ("rotateXYZ" if kind == "rotate" else kind), Keys(rows.times, whole)
+        vectors = np.full((len(times), 3), 1.0 if kind == "scale" else 0.0)
+        vectors[:, "XYZ".index(token[-1])] = rows.values[:, 0]
+        kind, rows = ("rotateXYZ" if kind == "rotate" else kind), Keys(rows.times, vectors)
     return Operation(kind, rows, xform.IsInverseOp())
 
 
-def _without_idle(operations: list[Operation]) -> list[Operation]:
-    """Return operations without those that change nothing."""
+def _without_identities(operations: list[Operation]) -> list[Operation]:
+    """Return operations other than constant identities."""
 
-    def idle(one: Operation) -> bool:
-        neutral = {"translate": np.zeros(3), "scale": np.ones(3), "matrix": np.eye(4).ravel()}.get(one.kind)
-        return neutral is not None and bool((one.keys.values == neutral).all())
+    def is_identity(operation: Operation) -> bool:
+        neutral = {"translate": np.zeros(3), "scale": np.ones(3), "matrix": np.eye(4).ravel()}.get(operation.kind)
+        return neutral is not None and bool((operation.keys.values == neutral).all())
 
-    return [one for one in operations if not idle(one)]
+    return [operation for operation in operations if not is_identity(operation)]
 
 
 def _fault(world: np.ndarray) -> str:
-    """Return why no rigid body can have a transform, empty where one can."""
+    """Return the reason why a rigid body cannot have a transform, empty where it can."""
     matrix = world[:3, :3]
     if not np.isfinite(world).all() or not np.abs(world).max() <= LARGEST_COORDINATE:
         return f"reaches beyond {LARGEST_COORDINATE:g}"
@@ -228,7 +228,7 @@ def _fault(world: np.ndarray) -> str:
     size = np.trace(gram) / 3.0
     if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
         return f"has a scale of less than {1.0 / LARGEST_COORDINATE:g}"
-    if np.abs(gram - np.diag(np.diag(gram))).max() > _UNEVEN * size:
+    if np.abs(gram - np.diag(np.diag(gram))).max() > _SCALE_TOLERANCE * size:
         return "is sheared"
     if np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
         return "is a projection"

@@ -1,8 +1,8 @@
 """Layers that reading adds to the session of a stage: instances as prims, and SI units.
 
 From weak to strong a stage then has its own layers, ``instances`` in its own units, ``units`` in SI units, and the
-session layer itself, which holds the values of one moment. Who reads the stage needs not know of any of them; who
-writes over the scene takes :func:`as_written` for what a layer over it finds there.
+session layer itself with the values of one time code. Code that reads the stage can ignore the layers. Code that writes
+a layer over the scene uses :func:`as_written`, the stage as seen below that layer.
 """
 
 from collections.abc import Iterable, Iterator
@@ -18,29 +18,29 @@ INSTANCES, UNITS = "warpmag_instances", "warpmag_units"
 
 
 def add_layer(stage: Usd.Stage, layer: Sdf.Layer) -> None:
-    """Put a layer between the session layer of a stage and all others that are below it so far."""
+    """Insert a layer directly below the session layer of a stage."""
     session = stage.GetSessionLayer()
-    for one in (session, layer):  # USD would rescale its time samples otherwise
-        one.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
+    for target in (session, layer):  # USD would rescale its time samples otherwise
+        target.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
     session.subLayerPaths.insert(0, layer.identifier)
 
 
 def new_layer(name: str) -> Sdf.Layer:
-    """Return an empty layer that :func:`added_layer` finds by its name."""
+    """Return an empty layer that :func:`added_layer` can find by its name."""
     return Sdf.Layer.CreateAnonymous(f"{name}.usda")
 
 
 def added_layer(stage: Usd.Stage, name: str) -> Sdf.Layer | None:
-    """Return the layer of a name that was added to a stage, None where there is none."""
-    found = (Sdf.Layer.Find(path) for path in stage.GetSessionLayer().subLayerPaths)
-    return next((one for one in found if one and one.GetDisplayName() == f"{name}.usda"), None)
+    """Return the added layer with a name, None where there is none."""
+    layers = (Sdf.Layer.Find(path) for path in stage.GetSessionLayer().subLayerPaths)
+    return next((layer for layer in layers if layer and layer.GetDisplayName() == f"{name}.usda"), None)
 
 
 def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> None:
-    """Make what instances below a prim hold editable, those in instances included, by opinions in ``layer``.
+    """Make all instances below a prim editable, nested ones included, by opinions in ``layer``.
 
     Raises:
-        InputError: One would change by that.
+        InputError: A physical instance would change by that.
     """
     while True:
         prims = Usd.PrimRange(stage.GetPrimAtPath(within), Usd.PrimAllPrimsPredicate)
@@ -51,10 +51,10 @@ def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> N
 
 
 def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> None:
-    """Make what instances hold editable, by opinions in ``layer``.
+    """Make instances editable, by opinions ``instanceable = false`` in ``layer``.
 
     Raises:
-        InputError: What they hold that is physical may change by that.
+        InputError: A physical instance may change by that.
     """
     with Sdf.ChangeBlock():
         for path in instances:
@@ -69,71 +69,70 @@ def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> No
 
 
 def instances_around(prims: Iterable[Usd.Prim]) -> list[Usd.Prim]:
-    """Return the instances that prims are, or are in, each once."""
-    found = {}
+    """Return the instances at or above prims, each once."""
+    instances = {}
     for prim in prims:
-        while (prim.IsInstance() or prim.IsInstanceProxy()) and prim.GetPath() not in found:
-            found[prim.GetPath()] = prim
+        while (prim.IsInstance() or prim.IsInstanceProxy()) and prim.GetPath() not in instances:
+            instances[prim.GetPath()] = prim
             prim = prim.GetParent()
-    return [prim for prim in found.values() if prim.IsInstance()]
+    return [prim for prim in instances.values() if prim.IsInstance()]
 
 
 def instance_findings(instances: Iterable[Usd.Prim]) -> Iterator[Finding]:
-    """Yield which instances say something about what they hold: USD passes over that until they are editable."""
+    """Yield an error for each instance with overrides of prims in it: USD ignores these until it is editable."""
     for prim in instances:
-        if spec := _passed_over(prim):
-            message = (
-                f"USD passes over {spec.path}, for it is in an instance, and a run, which edits what is in it, cannot"
-            )
-            yield Finding(str(prim.GetPath()), f"{message}: remove that, or set instanceable = false")
+        if spec := _ignored_override(prim):
+            message = f"USD ignores the override {spec.path} in the instance, and a run, which edits it, would not"
+            yield Finding(str(prim.GetPath()), f"{message}: remove the override, or set instanceable = false")
 
 
-def _passed_over(prim: Usd.Prim) -> Sdf.PrimSpec | None:
-    """Return what an instance says of a prim below it, itself or as a part of what it was referred to in."""
+def _ignored_override(prim: Usd.Prim) -> Sdf.PrimSpec | None:
+    """Return an override of a prim inside an instance, None where there is none."""
     stage = prim.GetStage()
-    own = stage.GetLayerStack(includeSessionLayers=False)
-    added = [layer for layer in stage.GetLayerStack() if layer not in own]
+    scene = stage.GetLayerStack(includeSessionLayers=False)
+    added = [layer for layer in stage.GetLayerStack() if layer not in scene]
     waiting = [(prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPrimIndex().rootNode]
     root = waiting[0]
     while waiting:
         node = waiting.pop()
         waiting += node.children
-        if node != root and not node.IsDueToAncestor():  # all instances share what it brings
+        if node != root and not node.IsDueToAncestor():  # shared by all instances
             continue
         for layer in node.layerStack.layers:
             spec = layer.GetPrimAtPath(node.path) if layer not in added else None
-            if found := next((one for child in spec.nameChildren if (one := _opinion(child))), None) if spec else None:
-                return found
+            override = next(filter(None, map(_opinion, spec.nameChildren)), None) if spec else None
+            if override:
+                return override
     return None
 
 
 def _opinion(spec: Sdf.PrimSpec) -> Sdf.PrimSpec | None:
-    """Return the first prim of a tree of which something is said."""
-    says = spec.specifier != Sdf.SpecifierOver or spec.properties or set(spec.ListInfoKeys()) > {"specifier"}
-    return spec if says else next((one for child in spec.nameChildren if (one := _opinion(child))), None)
+    """Return the first prim of a tree with an opinion."""
+    has_opinion = spec.specifier != Sdf.SpecifierOver or spec.properties or set(spec.ListInfoKeys()) > {"specifier"}
+    return spec if has_opinion else next(filter(None, map(_opinion, spec.nameChildren)), None)
 
 
 def unsaved_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
-    """Return the layers with files, of those a stage is made of, that this process has edited and not saved."""
+    """Return the layers of a stage with files and with edits that this process has not saved."""
     return [layer for layer in stage.GetUsedLayers() if layer.realPath and layer.dirty]
 
 
-def without_held(stage: Usd.Stage) -> Usd.Stage:
-    """Return the stage without the values that are held at one moment."""
+def without_frozen(stage: Usd.Stage) -> Usd.Stage:
+    """Return the stage without frozen values, with its time samples."""
     return _opened(stage, list(stage.GetSessionLayer().subLayerPaths))
 
 
 def as_written(stage: Usd.Stage) -> Usd.Stage:
-    """Return the stage in the units of its file, no values held, with its instances as prims."""
+    """Return the stage in the units of its file, without frozen values, with its instances as prims."""
     layer = added_layer(stage, INSTANCES)
     added = [layer.identifier] if layer else []
     session = stage.GetSessionLayer()
-    as_it_is = list(session.subLayerPaths) == added and not session.rootPrims
-    return stage if as_it_is else _opened(stage, added)
+    unchanged = list(session.subLayerPaths) == added and not session.rootPrims
+    return stage if unchanged else _opened(stage, added)
 
 
 def file_of(stage: Usd.Stage) -> Usd.Stage:
-    """Return the stage as its file has it where layers were added, else the stage."""
+    """Return the stage of the file alone, without added layers."""
     return Usd.Stage.Open(stage.GetRootLayer(), None) if stage.GetSessionLayer().subLayerPaths else stage
 
 

@@ -1,4 +1,4 @@
-"""Transforms: those that USD cannot compose, and those that no rigid body can have."""
+"""Checks transforms: errors in their composition, and shear, mirroring or scale that a rigid body cannot have."""
 
 from collections.abc import Iterator
 
@@ -14,15 +14,15 @@ _INVERSE = "!invert!"
 
 
 def is_animated(prim: Usd.Prim) -> bool:
-    """Whether a layer gives time samples or a spline for the prim's own transform, held or not."""
+    """Return whether any layer has time samples or a spline for the prim's own transform, frozen or not."""
     if not prim.IsA(UsdGeom.Xformable):
         return False
     try:
         order = value_of(prim, "xformOpOrder") or ()
-    except InputError:  # among the findings of the prims that it moves
+    except InputError:  # reported for the prims that it moves
         return False
-    operations = (prim.GetAttribute(name.removeprefix(_INVERSE)) for name in order if "xformOp:" in name)
-    specs = [spec for one in operations if one for spec in one.GetPropertyStack()]
+    attributes = (prim.GetAttribute(name.removeprefix(_INVERSE)) for name in order if "xformOp:" in name)
+    specs = [spec for attribute in attributes if attribute for spec in attribute.GetPropertyStack()]
     return any(spec.HasInfo("timeSamples") or spec.HasInfo("spline") for spec in specs)
 
 
@@ -44,15 +44,15 @@ def rotation_of(matrix) -> np.ndarray:
 
 
 class TransformCheck:
-    """Finds transforms that no rigid body can have, those that cannot be composed once, at the prim that causes it."""
+    """Checks transforms of bodies and colliders; reports an error in composition once, at the prim that causes it."""
 
     def __init__(self):
-        """Know nothing yet."""
+        """Create a check without results."""
         self._cache = UsdGeom.XformCache(Usd.TimeCode.Default())
         self._sound = {}
 
     def findings(self, prim: Usd.Prim) -> Iterator[Finding]:
-        """Yield what is wrong with the transform of a body or collider, its ancestors' included."""
+        """Yield errors in the transform of a body or collider, including its parents' transforms."""
         yield from self._lineage_findings(prim)
         if not self.is_sound(prim):
             return
@@ -74,10 +74,10 @@ class TransformCheck:
         elif is_body(prim) and np.linalg.det(matrix) < 0.0:
             yield Finding(path, "transform is mirrored, which Newton imports wrong: mirror the mesh instead")
         elif prim.IsA(UsdGeom.Sphere) and np.abs(np.diag(gram) - size).max() > 1e-5 * size:
-            yield Finding(path, "a sphere scaled unevenly would be imported as a ball: make it a mesh")
+            yield Finding(path, "a sphere with non-uniform scale would be imported as a ball: make it a mesh")
 
     def is_sound(self, prim: Usd.Prim) -> bool:
-        """Whether the findings of a prim have been asked for, and USD can compose its transform."""
+        """Return whether :meth:`findings` was called for a prim, and USD can compose its transform."""
         return self._sound.get(prim.GetPath(), False)
 
     def _lineage_findings(self, prim) -> Iterator[Finding]:
@@ -86,13 +86,13 @@ class TransformCheck:
             lineage.append(prim)
             prim = prim.GetParent()
         for prim in reversed(lineage):
-            found = list(_own_findings(prim))
-            self._sound[prim.GetPath()] = not found and self._sound.get(prim.GetParent().GetPath(), True)
-            yield from found
+            findings = list(_own_findings(prim))
+            self._sound[prim.GetPath()] = not findings and self._sound.get(prim.GetParent().GetPath(), True)
+            yield from findings
 
 
 def _own_findings(prim) -> Iterator[Finding]:
-    """Yield what is wrong with the operations of one prim."""
+    """Yield errors in the transform operations of one prim."""
     if not prim.IsA(UsdGeom.Xformable):
         return
     path = str(prim.GetPath())
@@ -122,7 +122,7 @@ def _own_findings(prim) -> Iterator[Finding]:
 
 
 def _operation_fault(prim, name) -> str:
-    """Return what is wrong with one operation of a transform, empty where nothing is."""
+    """Return the error in one transform operation, empty where there is none."""
     attribute = prim.GetAttribute(name) if name.startswith("xformOp:") else None
     if not attribute:
         return f"xformOpOrder names {name!r:.80}, which the prim does not have"

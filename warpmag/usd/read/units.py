@@ -1,10 +1,10 @@
-"""Stages in other units than meters and kilograms, read in SI units: a layer of converted values over the scene.
+"""Converts stages in other units than meters and kilograms to SI units, in a layer over the unchanged scene.
 
-Newton's importer converts nothing, and takes no stage in other units. So every value with a length or a mass in it is
-written in SI units into a layer of the session, over the scene that stays as it is: values and time samples, and the
-defaults of shapes where nothing is authored (a sphere without a radius has one unit). Angles are degrees and times
-seconds everywhere. Of warpmag's own attributes lengths follow the stage, as those of shapes do. Magnetizations, fields,
-currents and moments are SI always: USD has no unit for a current, and data sheets have A/m.
+Newton's importer converts no units. Every value with a length or a mass in its unit is therefore written in SI units to
+a layer of the session: defaults, time samples, and fallback values of shapes (a sphere without a radius has one unit).
+Angles are always in degrees and times in seconds. Lengths of warpmag's attributes are in the unit of the stage, like
+those of shapes. Magnetizations, fields, currents and moments are always SI, because USD has no unit of current and data
+sheets use A/m.
 """
 
 import math
@@ -22,14 +22,14 @@ from warpmag.usd.read.session import UNITS, add_layer, new_layer, release_instan
 _LENGTH, _NONE = (1, 0), (0, 0)
 _FORCE, _TORQUE = (1, 1), (2, 1)
 _STIFFNESS = (0, 1)
-"""Powers of length and mass in a unit; a stiffness is a force for a length, a damping one for a velocity."""
+"""Exponents of length and mass in a unit. Damping has the exponents of stiffness."""
 
 _SIZES = (
     *("radius", "radiusTop", "radiusBottom", "size", "height", "width", "length"),
     *("clippingRange", "focusDistance", "focalLength"),
     *("horizontalAperture", "verticalAperture", "horizontalApertureOffset", "verticalApertureOffset"),
 )
-"""Lengths whose defaults are in units of the stage, too."""
+"""Lengths whose fallback values are in the unit of the stage."""
 _POWERS = {
     **dict.fromkeys(_SIZES, _LENGTH),
     **dict.fromkeys(("points", "extent", "extentsHint", "widths", "primvars:widths"), _LENGTH),
@@ -61,7 +61,7 @@ _OF_JOINTS = {
     "newton:friction": (_FORCE, _TORQUE),
     **dict.fromkeys(("newton:damping", "newton:limitStiffness", "newton:limitDamping"), (_STIFFNESS, _TORQUE)),
 }
-"""What has one unit for joints that slide and another for those that turn."""
+"""Attributes with different units for sliding and for turning joints."""
 _OF_DRIVES = {
     **dict.fromkeys(("targetPosition", "targetVelocity"), (_LENGTH, _NONE)),
     **dict.fromkeys(("stiffness", "damping"), (_STIFFNESS, _TORQUE)),
@@ -71,9 +71,9 @@ _SLIDING = (UsdPhysics.PrismaticJoint, UsdPhysics.DistanceJoint)
 _TURNING = (UsdPhysics.RevoluteJoint, UsdPhysics.SphericalJoint)
 _PER_AXIS = re.compile(r"(drive|limit):(\w+):physics:(\w+)$")
 _UNIT = re.compile(r"Units:.*\b(distance|mass|force|torque|effort)\b")
-"""What the documentation of an attribute says whose unit has to be converted."""
+"""Pattern in the documentation of attributes whose unit must be converted."""
 _PRECISE = {Sdf.ValueTypeNames.Half: Sdf.ValueTypeNames.Double, Sdf.ValueTypeNames.Half3: Sdf.ValueTypeNames.Double3}
-"""Types that would lose digits, and what takes their place."""
+"""Types too imprecise for converted values, and their replacements."""
 _ARRAYS = (Vt.Vec3fArray, Vt.Vec3dArray, Vt.FloatArray, Vt.DoubleArray)
 _VECTORS = (Gf.Vec2f, Gf.Vec2d, Gf.Vec3f, Gf.Vec3d)
 
@@ -92,17 +92,17 @@ class Units:
 
     @property
     def are_si(self) -> bool:
-        """Whether nothing has to be converted."""
+        """Whether the units are SI units."""
         return math.isclose(self.meters, 1.0) and math.isclose(self.kilograms, 1.0)
 
     @property
     def are_sound(self) -> bool:
-        """Whether anything can be converted."""
+        """Whether the units are valid."""
         return all(1e-50 < unit < 1e50 for unit in (self.meters, self.kilograms))
 
 
 def units_of(stage: Usd.Stage) -> Units:
-    """Return the units of the file of a stage, whatever it is read in."""
+    """Return the units of a stage's file, before any conversion."""
     root = stage.GetRootLayer().pseudoRoot
     defaults = (
         ("metersPerUnit", UsdGeom.LinearUnits.centimeters),
@@ -112,9 +112,9 @@ def units_of(stage: Usd.Stage) -> Units:
 
 
 def convert_units(stage: Usd.Stage) -> None:
-    """Let a stage be read in SI units, by a layer of its session; one that is, or whose units are wrong, stays.
+    """Convert a stage to SI units, in a layer of its session. Stages with SI units or invalid units stay unchanged.
 
-    Instances become editable: each has converted values of its own.
+    Instances become editable, as each needs its own converted values.
 
     Raises:
         InputError: An attribute cannot be converted.
@@ -125,9 +125,9 @@ def convert_units(stage: Usd.Stage) -> None:
     layer = new_layer(UNITS)
     add_layer(stage, layer)
     release_instances(stage, layer, stage.GetPseudoRoot().GetPath())
-    # all is read before anything is written: what is referenced would be converted twice
+    # read everything before writing: referenced values would be converted twice
     everywhere = Usd.PrimRange(stage.GetPseudoRoot(), Usd.PrimAllPrimsPredicate)
-    converted = [one for prim in everywhere for one in _converted(prim, units)]
+    converted = [pair for prim in everywhere for pair in _converted(prim, units)]
     with Sdf.ChangeBlock():
         for attribute, scale in converted:
             _write(layer, attribute, scale)
@@ -138,7 +138,7 @@ def convert_units(stage: Usd.Stage) -> None:
 
 @dataclass(frozen=True)
 class _Attribute:
-    """An attribute with all its values, as they were before anything was converted."""
+    """An attribute with its values before the conversion."""
 
     path: Sdf.Path
     kind: Sdf.ValueTypeName
@@ -148,7 +148,7 @@ class _Attribute:
 
 
 def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[_Attribute, float]]:
-    """Yield the attributes of a prim that have to be converted, and the factors."""
+    """Yield the attributes of a prim to convert, with their factors."""
     for name in prim.GetPropertyNames():
         attribute = prim.GetAttribute(name)
         if not attribute or not (attribute.HasAuthoredValue() or name in _SIZES):
@@ -160,13 +160,13 @@ def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[_Attribute, float
 
 
 def _powers(prim: Usd.Prim, name: str) -> tuple[int, int]:
-    """Return the powers of length and mass in the unit of an attribute."""
+    """Return the exponents of length and mass in the unit of an attribute."""
     if name.startswith(("xformOp:translate", "xformOp:transform")):
         return _LENGTH
     if name in _POWERS:
         return _POWERS[name]
-    if found := _PER_AXIS.match(name):
-        return _powers_per_axis(prim, *found.groups())
+    if per_axis := _PER_AXIS.match(name):
+        return _powers_per_axis(prim, *per_axis.groups())
     if name in _OF_JOINTS:
         slides, turns = (any(prim.IsA(kind) for kind in kinds) for kinds in (_SLIDING, _TURNING))
         if slides or turns:
@@ -178,18 +178,18 @@ def _powers(prim: Usd.Prim, name: str) -> tuple[int, int]:
     return _NONE
 
 
-def _powers_per_axis(prim, what: str, axis: str, name: str) -> tuple[int, int]:
+def _powers_per_axis(prim, kind: str, axis: str, name: str) -> tuple[int, int]:
     slides = axis in ("linear", "distance") or axis.startswith("trans")
-    if what == "limit":
+    if kind == "limit":
         return _LENGTH if slides and name in ("low", "high") else _NONE
     length, mass = _OF_DRIVES.get(name, (_NONE, _NONE))[0 if slides else 1]
     if name in ("stiffness", "damping") and prim.GetAttribute(f"drive:{axis}:physics:type").Get() == "acceleration":
-        return _NONE  # it accelerates by so much, whatever the mass
+        return _NONE  # an acceleration, independent of mass
     return length, mass
 
 
 def _values(attribute: Usd.Attribute) -> _Attribute:
-    """Return what an attribute has; where USD cannot read a value, nothing of it: the reader tells later."""
+    """Return the values of an attribute; none where USD cannot read one, which the survey reports later."""
     path = attribute.GetPath()
     if attribute.HasSpline():
         where = f"{path.GetPrimPath()}: {attribute.GetName()}"
@@ -203,7 +203,7 @@ def _values(attribute: Usd.Attribute) -> _Attribute:
 
 
 def _write(layer: Sdf.Layer, attribute: _Attribute, scale: float) -> None:
-    """Write the converted values of an attribute, those that have the type of a length."""
+    """Write the converted values of an attribute whose type can be scaled."""
     default = _scaled(attribute.default, scale)
     samples = [(time, _scaled(value, scale)) for time, value in attribute.samples]
     if (default is None and not samples) or not attribute.kind:
@@ -218,7 +218,7 @@ def _write(layer: Sdf.Layer, attribute: _Attribute, scale: float) -> None:
 
 
 def _scaled(value, scale: float):
-    """Return a value times a factor, of a matrix its translation; None where it is no length."""
+    """Return a value times a factor, for a matrix with scaled translation; None for types without unit."""
     if isinstance(value, float):
         return value * scale
     if isinstance(value, Gf.Matrix4d):
@@ -229,6 +229,6 @@ def _scaled(value, scale: float):
         return value * scale
     if isinstance(value, _ARRAYS):
         numbers = np.asarray(value)
-        with np.errstate(over="ignore", invalid="ignore"):  # the reader refuses what is not finite
+        with np.errstate(over="ignore", invalid="ignore"):  # the survey reports values that are not finite
             return type(value).FromNumpy(np.ascontiguousarray(scale * numbers, dtype=numbers.dtype))
     return None

@@ -1,11 +1,11 @@
-"""Crate files (``.usdc``) of many attributes alike, written by hand: USD itself takes 20 µs for each.
+"""Encodes crate files (``.usdc``) with many attributes of the same kind; USD itself takes 20 µs for each attribute.
 
-A crate file has values first and then its structure, tables that refer to each other by number: tokens, fields (a name
-and a reference to a value), sets of fields, paths, and specs (a path and its set). A reference is eight bytes: the type
-of a value, and either the value itself or where it lies. Tables are compressed: integers as differences, and all of it
-by LZ4, here in the form that leaves everything as it is.
+A crate file holds values, then its structure: tables that refer to each other by number. They are tokens, fields (a
+name and a reference to a value), sets of fields, paths, and specs (a path and its set of fields). A reference has eight
+bytes: the type of a value, and either the value itself or its place in the file. Integers in tables are stored as
+differences. Tables are LZ4 blocks, here of literals only, which need no compression.
 
-The format: https://github.com/PixarAnimationStudios/OpenUSD, ``pxr/usd/usd/crateFile.cpp`` and ``integerCoding.cpp``.
+Format: https://github.com/PixarAnimationStudios/OpenUSD, ``pxr/usd/usd/crateFile.cpp`` and ``integerCoding.cpp``.
 """
 
 import struct
@@ -16,15 +16,15 @@ import numpy as np
 
 BOOL, DOUBLE, STRING, TOKEN, QUATF, VEC3D, VEC3F, DICTIONARY = 1, 9, 10, 11, 17, 23, 24, 31
 TOKEN_VECTOR, SPECIFIER, VARIABILITY, TIME_SAMPLES, DOUBLE_VECTOR = 41, 42, 44, 46, 48
-"""Types of values, by their numbers in references."""
+"""Numbers of value types in references."""
 MAGIC = b"PXR-USDC"
-"""What a crate file begins with."""
+"""First bytes of a crate file."""
 HEAD = 24
-"""Size of what begins the time samples of an attribute, see ``samples.py`` [bytes]."""
+"""Size of the head of an attribute's time samples, see ``samples.py`` [bytes]."""
 CONTENTS = 16
-"""Where a crate file says where its table of contents lies [bytes]."""
+"""Place of the field that holds the place of the table of contents [bytes]."""
 SECTION, SECTION_NAME = 32, 16
-"""Size of an entry of that table, and of the name before the place [bytes]."""
+"""Size of an entry of the table of contents, and of the name at its beginning [bytes]."""
 _BOOTSTRAP = 88
 _VERSION = bytes((0, 8, 0))
 _ARRAY, _INLINED = 1 << 63, 1 << 62
@@ -32,25 +32,25 @@ _OVER, _UNIFORM = 1, 1
 _ATTRIBUTE, _PRIM, _PSEUDO_ROOT = 1, 6, 7
 _NO_FIELD = 0xFFFFFFFF
 _PER_SAMPLED = 4
-"""Entries of the set of fields of an attribute with samples: type name, default, samples and the end."""
+"""Entries in the set of fields of an attribute with samples: type name, default, samples and the end mark."""
 
 
 def reference(kind: int, payload: int, flags: int = 0) -> int:
-    """Return the reference to a value, which lies at ``payload`` [bytes] or is that, as the flags say."""
+    """Return a reference: ``payload`` is the place of the value [bytes], or with ``_INLINED`` the value itself."""
     return flags | kind << 48 | payload
 
 
 @dataclass(frozen=True)
 class LayerFile:
-    """A layer as a file.
+    """An encoded layer.
 
     Attributes:
-        values: Its first bytes, which do not say yet where the table of contents lies.
-        structure: Its last bytes, as they have to be right behind.
-        contents: Where in these the table of contents lies [bytes].
-        heads: Where the heads of time samples lie [bytes], one after the other; zeros so far.
-        end_code: Where ``endTimeCode`` lies [bytes].
-        types: References without a place to values of each attribute with samples, shape [attributes].
+        values: First part of the file; the place of the table of contents is not set yet.
+        structure: Last part of the file, valid directly behind ``values``.
+        contents: Place of the table of contents in ``structure`` [bytes].
+        heads: Place of the first head of time samples [bytes]; the heads are contiguous and still zero.
+        end_code: Place of ``endTimeCode`` [bytes].
+        types: References of each sampled attribute without the place of a value, shape [attributes].
     """
 
     values: bytes
@@ -62,21 +62,21 @@ class LayerFile:
 
 
 class OverLayer:
-    """A layer that has opinions on attributes and defines no prim.
+    """A layer of ``over`` prims with attributes, some of which get time samples later.
 
-    Attributes that are to get time samples have the numbers in which they are added. Their defaults are the values of
-    the first frame, which has to stand right behind the values of the layer.
+    Sampled attributes are numbered in the order in which they are added. Their defaults are the values of the first
+    frame, which must follow directly behind the values of the layer.
     """
 
     def __init__(self, sizes: np.ndarray):
-        """Begin an empty layer.
+        """Create an empty layer.
 
         Args:
-            sizes: Size of a value of each attribute that will get samples [bytes], shape [attributes].
+            sizes: Size of a value of each sampled attribute [bytes], shape [attributes].
         """
         self._sizes = sizes
         self._types, self._type_fields = list[int](), list[int]()
-        self._tokens, self._strings = {";-)": 0}, dict[int, int]()  # a property is told by a token below 0
+        self._tokens, self._strings = {";-)": 0}, dict[int, int]()  # properties are negative tokens, so token 0 is none
         self._values, self._end_code = bytearray(_BOOTSTRAP), -1
         self._fields, self._sets = dict[tuple[int, int], int](), dict[tuple[int, ...], int]()
         self._next_set = _PER_SAMPLED * len(sizes)
@@ -86,14 +86,14 @@ class OverLayer:
         self._editable, self._vectors = set[str](), dict[tuple[int, ...], int]()
 
     def set_metadata(self, name: str, value: float | str | dict) -> None:
-        """Set what a layer says of itself."""
-        found = self._reference_to(value)
+        """Set metadata of the layer."""
+        field_value = self._reference_to(value)
         if name == "endTimeCode":
             self._end_code = len(self._values) - 8
-        self._metadata.append(self._field(name, found))
+        self._metadata.append(self._field(name, field_value))
 
     def add_sampled(self, paths: Sequence[str], name: str, type_name: str, kind: int) -> None:
-        """Let prims have an attribute that gets time samples, of a name like ``quatf[]`` arrays of values of a kind."""
+        """Add an attribute with time samples to prims; for an array such as ``quatf[]``, ``kind`` is its element."""
         type_field = self._field("typeName", self._token_reference(type_name))
         token = self._token(name)
         for number, path in enumerate(paths, len(self._types)):
@@ -102,13 +102,13 @@ class OverLayer:
         self._type_fields += [type_field] * len(paths)
 
     def add_vector(self, path: str, name: str, value: np.ndarray) -> None:
-        """Let a prim have an attribute of type ``double3`` that does not change, shape [3]."""
+        """Add a constant attribute of type ``double3`` to a prim; ``value`` has shape [3]."""
         place = self._place(np.asarray(value, dtype="<f8").tobytes())
         fields = (("typeName", self._token_reference("double3")), ("default", reference(VEC3D, place)))
         self._properties_of(path).append((self._token(name), self._set(fields)))
 
     def add_tokens(self, paths: Iterable[str], name: str, tokens: Sequence[str]) -> None:
-        """Let prims have a uniform attribute of type ``token[]``."""
+        """Add a uniform attribute of type ``token[]`` to prims."""
         fields = (
             ("typeName", self._token_reference("token[]")),
             ("variability", reference(VARIABILITY, _UNIFORM, _INLINED)),
@@ -119,12 +119,12 @@ class OverLayer:
             self._properties_of(path).append(own)
 
     def make_editable(self, path: str) -> None:
-        """Let a prim be no instance any more."""
+        """Set ``instanceable = false`` on a prim."""
         self._properties_of(path)
         self._editable.add(path)
 
     def encode(self) -> LayerFile:
-        """Return the file."""
+        """Return the layer as a file."""
         paths, specs = self._encode_prims()
         heads = self._place(b"")
         start = heads + HEAD * len(self._sizes)
@@ -158,14 +158,14 @@ class OverLayer:
         return self._strings.setdefault(self._token(text), len(self._strings))
 
     def _place(self, data: bytes) -> int:
-        """Append a value; return where it lies, a multiple of 8."""
+        """Append a value; return its place, a multiple of 8."""
         self._values += bytes(-len(self._values) % 8)
         place = len(self._values)
         self._values += data
         return place
 
     def _reference_to(self, value: float | str | dict) -> int:
-        """Return a reference to metadata; texts are tokens, but strings in dictionaries."""
+        """Return a reference to metadata; texts become tokens, in dictionaries strings."""
         if isinstance(value, str):
             return self._token_reference(value)
         if isinstance(value, dict):
@@ -174,18 +174,20 @@ class OverLayer:
 
     def _dictionary(self, value: dict[str, str | dict]) -> int:
         data = struct.pack("<Q", len(value))
-        for key, one in value.items():
-            inner = self._dictionary(one) if isinstance(one, dict) else reference(STRING, self._string(one), _INLINED)
-            data += struct.pack("<IqQ", self._string(key), 8, inner)  # the reference lies 8 bytes behind that number
+        for key, item in value.items():
+            inner = (
+                self._dictionary(item) if isinstance(item, dict) else reference(STRING, self._string(item), _INLINED)
+            )
+            data += struct.pack("<IqQ", self._string(key), 8, inner)  # the reference follows 8 bytes behind this offset
         return reference(DICTIONARY, self._place(data))
 
     def _field(self, name: str, value: int) -> int:
-        """Return the number of a field, which stands behind those of the attributes with samples."""
+        """Return the number of a field; fields of sampled attributes come first."""
         return self._fields.setdefault((self._token(name), value), 2 * len(self._sizes) + len(self._fields))
 
     def _set(self, fields: Iterable[tuple[str, int]]) -> int:
-        """Return where a set of fields begins, given by names and references."""
-        return self._set_of([self._field(*one) for one in fields])
+        """Return the index at which a set of fields begins, given as names and references."""
+        return self._set_of([self._field(*field) for field in fields])
 
     def _set_of(self, fields: Sequence[int]) -> int:
         key = tuple(fields)
@@ -195,18 +197,18 @@ class OverLayer:
         return self._sets[key]
 
     def _properties_of(self, path: str) -> list[tuple[int, int]]:
-        """Return tokens and sets of fields of the properties of a prim, which is made with those above it."""
+        """Return tokens and sets of fields of a prim's properties; the prim and its parents are created."""
         if path not in self._properties:
-            above = path.rpartition("/")[0] or "/"
-            self._properties_of(above)
+            parent = path.rpartition("/")[0] or "/"
+            self._properties_of(parent)
             self._properties[path], self._children[path] = [], []
-            self._children[above].append(path)
+            self._children[parent].append(path)
         return self._properties[path]
 
     # ---------------------------------------------------------------------------------------------------------------
 
     def _encode_prims(self) -> tuple[bytes, bytes]:
-        """Return the tables of paths and of specs, which have the same order: prims, each before what it holds."""
+        """Return the tables of paths and specs in the same order: each prim, its properties, its children."""
         order, waiting = list[str](), ["/"]
         while waiting:
             order.append(path := waiting.pop())
@@ -221,12 +223,12 @@ class OverLayer:
             own, children = self._properties[path], self._children[path]
             held = [token for token, _ in own]
             tokens += [names[path], *(-token for token in held)]
-            # to the next sibling; -1 where there is none but something below, 0 with nothing below, -2 without both
+            # offset to the next sibling; -1 for the last with a subtree, 0 without a subtree, -2 for the last without
             jumps.append((-1 if path in last else sizes[path]) if own or children else (-2 if path in last else 0))
             jumps += [0] * len(own)
             if own and not children:
                 jumps[-1] = -2
-            sets += [self._prim_set(path, held, [names[child] for child in children]), *(one for _, one in own)]
+            sets += [self._prim_set(path, held, [names[child] for child in children]), *(fields for _, fields in own)]
             kinds += [_PRIM, *[_ATTRIBUTE] * len(own)]
         tokens[0], kinds[0] = 0, _PSEUDO_ROOT
         numbers, count = _integers(range(len(sets))), struct.pack("<Q", len(sets))
@@ -234,7 +236,7 @@ class OverLayer:
         return b"".join(paths), b"".join([count, numbers, _integers(sets), _integers(kinds)])
 
     def _prim_set(self, path: str, properties: list[int], children: list[int]) -> int:
-        """Return the set of fields of a prim, by tokens of what it holds."""
+        """Return the set of fields of a prim with the tokens of its properties and children."""
         fields = [*self._metadata] if path == "/" else [self._over]
         if path in self._editable:
             fields.append(self._field("instanceable", reference(BOOL, 0, _INLINED)))
@@ -249,7 +251,7 @@ class OverLayer:
         return self._vectors[tokens]
 
     def _encode_fields(self, heads: int, first_frame: int) -> bytes:
-        """Return the table of fields: default and samples of each attribute, and the others."""
+        """Return the table of fields: default and samples of each sampled attribute, then the others."""
         attributes = len(self._sizes)
         names, values = np.empty(2 * attributes, dtype=np.int32), np.empty(2 * attributes, dtype=np.uint64)
         names[::2], names[1::2] = self._token("default"), self._token("timeSamples")
@@ -262,32 +264,32 @@ class OverLayer:
         return struct.pack("<Q", 2 * attributes + len(others)) + names + struct.pack("<Q", len(values)) + values
 
     def _encode_sets(self) -> bytes:
-        """Return the table of sets of fields: those of the attributes with samples, and the others."""
+        """Return the table of sets of fields: those of sampled attributes, then the others."""
         attributes = len(self._sizes)
         sampled = np.full((attributes, _PER_SAMPLED), _NO_FIELD, dtype=np.uint32)
         sampled[:, 0], sampled[:, 1] = self._type_fields, 2 * np.arange(attributes)
         sampled[:, 2] = sampled[:, 1] + 1
-        others = [number for one in self._sets for number in (*one, _NO_FIELD)]
+        others = [number for fields in self._sets for number in (*fields, _NO_FIELD)]
         table = np.append(sampled, np.array(others, dtype=np.uint32))
         return struct.pack("<Q", len(table)) + _integers(table.view(np.int32))
 
     def _encode_tokens(self) -> bytes:
-        text = "".join(f"{one}\0" for one in self._tokens).encode()
+        text = "".join(f"{token}\0" for token in self._tokens).encode()
         data = _compressed(text)
         return struct.pack("<QQQ", len(self._tokens), len(text), len(data)) + data
 
 
 def _counted(numbers: Iterable[int]) -> bytes:
-    """Return how many numbers there are, and the numbers."""
+    """Return numbers with their count in front."""
     table = np.fromiter(numbers, dtype="<u4")
     return struct.pack("<Q", len(table)) + table.tobytes()
 
 
 def _integers(values: Sequence[int] | np.ndarray) -> bytes:
-    """Return the size of a table of integers and the table: differences, of which the most frequent takes two bits."""
+    """Return a table of integers with its size in front: differences, of which the most frequent takes two bits."""
     differences = np.diff(np.asarray(values, dtype=np.int32), prepend=np.int32(0))
-    found, counts = np.unique(differences, return_counts=True)
-    common = found[np.argmax(counts)]
+    values, counts = np.unique(differences, return_counts=True)
+    common = values[np.argmax(counts)]
     widths = np.where(np.abs(differences) < 1 << 7, 1, np.where(np.abs(differences) < 1 << 15, 2, 4))
     widths[differences == common] = 0
     codes = np.zeros(-(-len(widths) // 4) * 4, dtype=np.uint8)
@@ -299,7 +301,7 @@ def _integers(values: Sequence[int] | np.ndarray) -> bytes:
 
 
 def _compressed(data: bytes) -> bytes:
-    """Return data as one piece of one block of LZ4, all of it literal."""
+    """Return data as one LZ4 block of literals."""
     more, rest = divmod(len(data) - 15, 255)
     length = bytes((len(data) << 4,)) if more < 0 else b"\xf0" + b"\xff" * more + bytes((rest,))
     return b"\0" + length + data

@@ -1,9 +1,8 @@
-"""The files of a run on disk: how they come into place, the lock on them, and the checkpoint beside them.
+"""Files of a run on disk: temporary files, their placement, the lock and the checkpoint.
 
-For ``out.usda`` they are ``out.usda`` and ``out.cache.usdc``; ``out.instances.usdc`` where the scene has instancers of
-bodies; ``out.scene.usdc`` or the folder ``out.scene`` where the scene is copied; while the run is not complete
-``out.resume.npz``; and while it runs ``.out.lock`` and a folder ``.out.tmp*``. What is written there first is moved
-into place when it is whole.
+The files for ``out.usda`` are ``out.usda`` and ``out.cache.usdc``; ``out.instances.usdc`` for scenes with instancers of
+bodies; ``out.scene.usdc`` or the folder ``out.scene`` for a copied scene; ``out.resume.npz`` until the run is complete;
+and ``.out.lock`` and a folder ``.out.tmp*`` during the run. Files are written to that folder and moved when complete.
 """
 
 import contextlib
@@ -27,11 +26,11 @@ from warpmag.usd.values import quiet
 
 _SUFFIXES = (".usd", ".usda", ".usdc")
 _SCENES = (".usdc", ".usdz")
-_ABOUT = "about"
+_HEADER = "about"
 _FORMAT = 2
-"""What a checkpoint is like. Another number for each change of what is in one, here or in what the engine carries."""
+"""Version of the checkpoint format. Increase it with each change of its content, here or in the engine's state."""
 _UNLOCKABLE = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
-"""What file systems say that know no locks."""
+"""Errors of file systems without locks."""
 
 
 class Output:
@@ -41,19 +40,19 @@ class Output:
         root: The thin root layer.
         cache: The layer with the motion.
         instances: The layer with the prims of instances.
-        checkpoint: What :meth:`save_checkpoint` writes.
+        checkpoint: The file of :meth:`save_checkpoint`.
     """
 
     def __init__(self, path: str | os.PathLike, scene: set[Path], *, copy_scene: bool = False):
-        """Check that the files can be written; nothing is touched yet.
+        """Check that the files can be written; nothing is written yet.
 
         Args:
             path: File of the root layer.
-            scene: Files of the scene, resolved, which must not be overwritten.
+            scene: Resolved paths of the scene's files, which must not be overwritten.
             copy_scene: Whether the scene will be copied.
 
         Raises:
-            InputError: They cannot; the message says why.
+            InputError: They cannot; the message gives the reason.
         """
         self.root = usable_path(path)
         if self.root.suffix not in _SUFFIXES:
@@ -91,7 +90,7 @@ class Output:
     @staticmethod
     @contextlib.contextmanager
     def errors(path: Path) -> Iterator[None]:
-        """Make one line of what goes wrong with a file."""
+        """Raise :class:`InputError` of one line for errors with a file in the block."""
         try:
             with quiet():
                 yield
@@ -103,10 +102,10 @@ class Output:
     # ---------------------------------------------------------------------------------------------------------------
 
     def lock(self) -> None:
-        """Keep other runs off these files until :meth:`close`; the lock of a process that died is none.
+        """Lock the files for this run until :meth:`close`. The lock of a process that died is void.
 
         Raises:
-            InputError: Another run has them.
+            InputError: Another run has locked them.
         """
         if self._lock >= 0:
             return
@@ -115,12 +114,12 @@ class Output:
             path.parent.mkdir(parents=True, exist_ok=True)
             while self._lock < 0:
                 self._lock = self._try_lock(path)
-            for left in path.parent.glob(glob.escape(f".{self.root.stem}.tmp") + "?" * 8):
-                shutil.rmtree(left, ignore_errors=True)  # of a run that was killed
+            for leftover in path.parent.glob(glob.escape(f".{self.root.stem}.tmp") + "?" * 8):
+                shutil.rmtree(leftover, ignore_errors=True)  # of a run that was killed
             self._folder = Path(tempfile.mkdtemp(prefix=f".{self.root.stem}.tmp", dir=path.parent))
 
     def _try_lock(self, path: Path) -> int:
-        """Lock a file; return its descriptor, -1 where its last owner has removed it meanwhile."""
+        """Lock a file; return its descriptor, -1 where its previous owner has removed the file meanwhile."""
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -136,24 +135,24 @@ class Output:
         return -1
 
     def temporary(self, target: Path) -> Path:
-        """Return where to write what :meth:`place` then moves to ``target``; :meth:`lock` first."""
+        """Return the temporary path that :meth:`place` moves to ``target``; call :meth:`lock` first."""
         assert self._folder is not None, "lock() comes first"
         return self._folder / target.name
 
     def write(self, layer: Sdf.Layer, target: Path) -> None:
-        """Write a layer, to be moved to ``target``."""
-        arguments = {"format": "usda"} if target.suffix == ".usd" else {}  # a thin root is for people to read
+        """Write a layer to the temporary path of ``target``."""
+        arguments = {"format": "usda"} if target.suffix == ".usd" else {}  # people read the short root layer
         if not layer.Export(str(self.temporary(target)), args=arguments):
             raise InputError(f"{target}: cannot be written")
 
     def place(self, target: Path) -> None:
-        """Move what was written to its place, a folder too."""
+        """Move a temporary file or folder to ``target``."""
         if target.is_dir() and not target.is_symlink():
             os.rename(target, self.temporary(target).with_suffix(".old"))
         os.replace(self.temporary(target), target)
 
     def close(self) -> None:
-        """Remove what only served the run, and unlock."""
+        """Remove temporary files, and unlock."""
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
@@ -164,15 +163,15 @@ class Output:
 
     # ---------------------------------------------------------------------------------------------------------------
 
-    def save_checkpoint(self, about: dict[str, str], arrays: dict[str, np.ndarray]) -> None:
-        """Write a checkpoint, or leave the earlier one."""
-        noted = {"format": _FORMAT, "run": about, "names": sorted(arrays)}
+    def save_checkpoint(self, run: dict[str, str], arrays: dict[str, np.ndarray]) -> None:
+        """Write a checkpoint of a run with identity ``run``; if that fails, the earlier one stays."""
+        header = {"format": _FORMAT, "run": run, "names": sorted(arrays)}
         with open(self.temporary(self.checkpoint), "wb") as file:
-            np.savez(file, **{_ABOUT: np.array(json.dumps(noted)), **arrays})
+            np.savez(file, **{_HEADER: np.array(json.dumps(header)), **arrays})
         self.place(self.checkpoint)
 
     def load_checkpoint(self) -> tuple[dict[str, str], dict[str, np.ndarray]] | None:
-        """Return the checkpoint, None where there is none.
+        """Return the identity of the run and the arrays of its checkpoint, None where there is none.
 
         Raises:
             InputError: It cannot be read, or another version of warpmag wrote it.
@@ -180,14 +179,14 @@ class Output:
         try:
             with open(self.checkpoint, "rb") as file, np.load(file, allow_pickle=False) as saved:
                 arrays = dict(saved)
-            noted = json.loads(str(arrays.pop(_ABOUT)))
+            header = json.loads(str(arrays.pop(_HEADER)))
         except FileNotFoundError:
             return None
         except (OSError, EOFError, ValueError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile) as error:
-            said = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{self.checkpoint}: cannot be read ({said})") from None
-        if not isinstance(noted, dict) or noted.get("format") != _FORMAT:
+            message = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(f"{self.checkpoint}: cannot be read ({message})") from None
+        if not isinstance(header, dict) or header.get("format") != _FORMAT:
             raise InputError(f"{self.checkpoint}: cannot be resumed, another version of warpmag has written it")
-        if noted["names"] != sorted(arrays):
+        if header["names"] != sorted(arrays):
             raise InputError(f"{self.checkpoint}: cannot be read (some of it is missing)")
-        return noted["run"], arrays
+        return header["run"], arrays

@@ -1,21 +1,21 @@
-"""Time samples that are added to a crate file (``.usdc``) while any USD reader can open it.
+"""Appends time samples to a crate file (``.usdc``) that any USD reader can open meanwhile.
 
-USD itself writes a layer in one go, from memory. Here the samples are put into the file by hand, in its own format: a
-sample is eight bytes that say where its value lies, an attribute has a row of those, and all rows share one list of
-times::
+USD itself writes a layer at once, from memory. Here frames are appended to the file in its own format: a sample is a
+reference of eight bytes to its value, an attribute has a row of references, and all rows share one list of times::
 
     values of the layer | heads | frames: the values of all attributes | times | rows | structure of the layer
 
-The place for all frames to come is left free, which costs nothing where the file system knows holes. A frame is written
-first and then counted, in eight bytes, so that at no moment a reader meets a frame that is not whole. Where frames are
-more than planned, the file is continued behind its end in the same way, with rows and structure anew.
+Space for all planned frames is reserved, as a hole in the file where the file system supports that. A frame is written
+first, and then the count of frames is increased by one write of eight bytes, so readers see complete frames only. For
+more frames than planned, new space, times, rows and structure are appended to the file.
 
-An attribute whose value never changes has no samples: its head names an empty list of times until the value is another
-one.
+An attribute whose value never changes has no samples: its head refers to an empty list of times until the value
+changes.
 
-The format: https://github.com/PixarAnimationStudios/OpenUSD, ``pxr/usd/usd/crateFile.cpp``. Time samples are a jump to
-the reference of the times, that reference and a jump to the number of samples, here the head, then that number and a
-reference for each sample, here the row; jumps count from where they stand, and the type is part of a reference.
+Format: https://github.com/PixarAnimationStudios/OpenUSD, ``pxr/usd/usd/crateFile.cpp``. Time samples consist of an
+offset to the reference of the times, that reference, and an offset to the number of samples (here the head), followed
+by that number and a reference for each sample (here the row). Offsets count from their own places, and a reference
+includes the type.
 """
 
 import contextlib
@@ -39,29 +39,29 @@ from warpmag.usd.write.crate import (
 )
 
 _AHEAD = 512
-"""Frames whose references are written to a row at once, a page of the file, some rows with each frame before."""
+"""Frames whose references are written to a row at once, one page of the file; each earlier frame writes some rows."""
 _FIRST_AHEAD = 64
-"""The same where all rows are written at once, so that it takes no longer than it has to."""
+"""The same where all rows are written at once; smaller, to keep the first frame short."""
 _BLOCK = 1 << 17
-"""References that are held in memory at once."""
+"""References in memory at once."""
 _FIRST_CAPACITY = 64
 
 
 @dataclass
 class _Places:
-    """Where things lie in the file [bytes]; what it takes to go on with it.
+    """Places in the file [bytes]: the state from which a file can be continued.
 
     Attributes:
-        heads: Where the heads begin.
-        end_code: ``endTimeCode`` of the layer.
-        types: References without a place to values of each attribute, shape [attributes].
-        first_frames: The first frame of each stretch of frames.
-        stretches: Where each stretch begins.
-        capacity: Frames that all stretches hold.
-        times: Number of frames, then the time code of each; before it an empty list, after it the rows.
+        heads: Place of the heads.
+        end_code: Place of the layer's ``endTimeCode``.
+        types: References of each attribute without the place of a value, shape [attributes].
+        first_frames: First frame of each contiguous block of frames.
+        stretches: Place of each block.
+        capacity: Frames that fit in all blocks.
+        times: Place of the number of frames, followed by their time codes; an empty list precedes, the rows follow.
         size: Least size of the file, up to the end of the structure.
-        filled: Frames whose references are written.
-        count: Frames.
+        filled: Number of frames whose references are written.
+        count: Number of frames.
         sampled: Whether an attribute has samples, shape [attributes].
     """
 
@@ -79,35 +79,35 @@ class _Places:
 
 
 class SampleFile:
-    """A crate file to which frames are added.
+    """A crate file to which frames are appended.
 
     Attributes:
-        count: Frames so far.
+        count: Number of frames.
     """
 
     def __init__(self, file: BinaryIO, sizes: np.ndarray, places: _Places):
-        """Go on with a file; use :meth:`begin` or :meth:`resume`.
+        """Wrap an open file; use :meth:`begin` or :meth:`resume`.
 
         Args:
             file: The file, open for reading and writing, unbuffered.
             sizes: Size of a value of each attribute [bytes], in the order of a frame, shape [attributes].
-            places: Where things lie.
+            places: Places in the file.
         """
         self._file, self._places = file, places
         self._offsets = (np.cumsum(sizes) - sizes).astype(np.uint64)
         self._frame_size = int(np.sum(sizes))
-        self._ahead = 0  # rows that have references of the frames behind those that all rows have
-        self._told = -1  # number of samples that all rows say they have; -1 where a run before may have closed the file
+        self._ahead = 0  # rows that have references of frames beyond ``filled``
+        self._row_count = -1  # number of samples in the rows; -1 where an earlier run may have closed the file
 
     @classmethod
     def begin(cls, path: str | os.PathLike, layer: LayerFile, sizes: np.ndarray, frames: int | None) -> "SampleFile":
-        """Write a layer, and make room for samples.
+        """Create a file with a layer and space for samples.
 
         Args:
-            path: The file, which is new.
+            path: The file, which must not exist.
             layer: The layer.
             sizes: Size of a value of each attribute [bytes], shape [attributes].
-            frames: Frames that are expected; more may come.
+            frames: Expected number of frames; there may be more.
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "x+b", buffering=0))
@@ -123,17 +123,17 @@ class SampleFile:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, sizes: np.ndarray, places: dict[str, np.ndarray]) -> "SampleFile":
-        """Go on with a file where it was at :meth:`places`; frames since then are dropped.
+        """Continue a file from an earlier :meth:`places`; later frames are dropped.
 
         Raises:
-            InputError: It is not that file, or not all of it.
+            InputError: The file is another one or incomplete.
             OSError: It cannot be opened or written.
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
             known = {name: value if value.ndim else int(value) for name, value in places.items()}
             self = cls(file, sizes, _Places(**known))
-            if not self._is_there():
+            if not self._is_intact():
                 raise InputError(f"{path}: cannot be resumed, it is not as the run left it")
             self._set_count(float(self.codes()[-1]))
             self._write_heads(0, len(sizes))
@@ -147,20 +147,20 @@ class SampleFile:
 
     @property
     def count(self) -> int:
-        """Frames so far."""
+        """Number of frames."""
         return self._places.count
 
     def places(self) -> dict[str, np.ndarray]:
-        """Return what :meth:`resume` needs to come back to the present state."""
+        """Return the state from which :meth:`resume` continues."""
         return {name: np.asarray(value) for name, value in asdict(self._places).items()}
 
     def append(self, code: float, values: bytes, changed: np.ndarray) -> None:
-        """Add a frame.
+        """Append a frame.
 
         Args:
-            code: Its time code, later than the last one.
-            values: The values of all attributes, one after the other.
-            changed: Attributes without samples so far whose value is another one than in the first frame, shape [n].
+            code: Its time code, greater than the last one.
+            values: Values of all attributes, contiguous.
+            changed: Attributes without samples whose value now differs from the first frame, shape [n].
 
         Raises:
             OSError: The file cannot be written; the frame is not in it.
@@ -191,11 +191,11 @@ class SampleFile:
         return np.frombuffer(os.pread(self._file.fileno(), 8 * self.count, self._places.times + 8))
 
     def close(self) -> None:
-        """Close the file, complete: readers of other makes compare the number of samples with that of the times."""
+        """Close the file with the counts of samples in all rows, as readers other than USD's expect."""
         try:
             counts = np.where(self.sampled, self.count, 0).tolist()
             for row, count in zip(self._rows(), counts, strict=True):
-                if count != self._told:
+                if count != self._row_count:
                     self._write(row, struct.pack("<Q", count))
         finally:
             self._file.close()
@@ -203,8 +203,8 @@ class SampleFile:
     # ---------------------------------------------------------------------------------------------------------------
 
     def _extend(self, start: int, capacity: int, structure: "_Structure") -> None:
-        """Make room for ``capacity`` frames in all, with new times, rows and structure, from ``start`` on."""
-        old, told = self._places, self._told
+        """Append space for ``capacity`` frames in total, with new times, rows and structure, from ``start`` on."""
+        old, row_count = self._places, self._row_count
         codes = self.codes() if old.count else np.zeros(0)
         empty = start + (capacity - old.capacity) * self._frame_size
         self._places = replace(
@@ -215,7 +215,7 @@ class SampleFile:
             times=empty + 8,
             filled=min(old.count + _FIRST_AHEAD, capacity),
         )
-        self._told, self._ahead = capacity, 0
+        self._row_count, self._ahead = capacity, 0
         try:
             self._write(empty, struct.pack("<QQ", 0, old.count) + codes.tobytes())
             self._fill_rows(0, self._places.filled, 0, len(self._offsets))
@@ -225,31 +225,31 @@ class SampleFile:
             self._write_heads(0, len(self._offsets))
             self._write(CONTENTS, struct.pack("<q", structure.contents))
         except OSError:
-            self._places, self._told = old, told  # what the file has still stands there
+            self._places, self._row_count = old, row_count  # the file still refers to them
             raise
 
-    def _is_there(self) -> bool:
-        """Whether the file has its end, and has counted the frames."""
+    def _is_intact(self) -> bool:
+        """Return whether the file has its full size and counts the frames."""
         places, descriptor = self._places, self._file.fileno()
         if os.fstat(descriptor).st_size < places.size:
             return False
-        (counted,) = struct.unpack("<Q", os.pread(descriptor, 8, places.times))
-        return os.pread(descriptor, len(MAGIC), 0) == MAGIC and places.count <= counted <= places.capacity
+        (frames,) = struct.unpack("<Q", os.pread(descriptor, 8, places.times))
+        return os.pread(descriptor, len(MAGIC), 0) == MAGIC and places.count <= frames <= places.capacity
 
     def _rows(self) -> range:
-        """Return where the rows begin."""
+        """Return the places of the rows."""
         size, first = 8 * (1 + self._places.capacity), self._places.times + 8 * (1 + self._places.capacity)
         return range(first, first + size * len(self._offsets), size)
 
     def _frame_places(self, first: int, last: int) -> np.ndarray:
-        """Return where frames begin."""
+        """Return the places of frames."""
         frames = np.arange(first, last)
-        stretch = np.searchsorted(self._places.first_frames, frames, side="right") - 1
-        inside = frames - self._places.first_frames[stretch]
-        return (self._places.stretches[stretch] + inside * self._frame_size).astype(np.uint64)
+        block = np.searchsorted(self._places.first_frames, frames, side="right") - 1
+        inside = frames - self._places.first_frames[block]
+        return (self._places.stretches[block] + inside * self._frame_size).astype(np.uint64)
 
     def _fill_ahead(self) -> None:
-        """Write references of the frames that come after those that have some: to so many rows that all get them."""
+        """Write references of frames beyond ``filled``, to as many rows as needed to finish all rows in time."""
         places, rows = self._places, len(self._offsets)
         left = places.filled - places.count
         if places.filled == places.capacity or left > _AHEAD:
@@ -262,13 +262,13 @@ class SampleFile:
             places.filled, self._ahead = last, 0
 
     def _fill_rows(self, first: int, last: int, begin: int, end: int) -> None:
-        """Write the references of frames that may not be there yet; before the first one the number of samples.
+        """Write references of frames, which may not exist yet, to rows; in front of frame 0 the number of samples.
 
         Args:
-            first: The first frame.
-            last: Behind the last one.
-            begin: The first row.
-            end: Behind the last one.
+            first: First frame.
+            last: One past the last frame.
+            begin: First row.
+            end: One past the last row.
         """
         frames = self._frame_places(first, last)
         block = max(1, _BLOCK // max(1, last - first))
@@ -279,14 +279,14 @@ class SampleFile:
                 words = np.insert(words, 0, self._places.capacity, axis=1)
             rows, size = self._rows()[part], words[0].nbytes
             data, inside = words.tobytes(), 8 * (1 + first) if first else 0
-            if size == rows.step:  # they touch
+            if size == rows.step:  # contiguous
                 self._write(rows.start, data)
                 continue
             for number, row in enumerate(rows):
                 self._write(row + inside, data[number * size : (number + 1) * size])
 
     def _write_heads(self, first: int, last: int) -> None:
-        """Let the time samples of attributes have the present times, where these change, and rows."""
+        """Write the heads of attributes: the times, or the empty list without samples, and the rows."""
         places = self._places
         heads = np.full((last - first, HEAD // 8), 8, dtype=np.int64)
         times = np.where(places.sampled[first:last], places.times, places.times - 8)  # the empty list
@@ -301,28 +301,28 @@ class SampleFile:
 
     def _write(self, place: int, data: bytes) -> None:
         view = memoryview(data)
-        while view:  # a disk that is nearly full takes a part
+        while view:  # a nearly full disk takes only part of it
             written = os.pwrite(self._file.fileno(), view, place)
             place, view = place + written, view[written:]
 
 
 class _Structure:
-    """The structure of a layer, its last part: sections, and the table of contents that says where they lie.
+    """The structure of a layer: sections, and the table of contents with their places.
 
     Attributes:
-        start: Where it begins.
-        contents: Where the table of contents lies.
+        start: Place of the structure.
+        contents: Place of the table of contents.
     """
 
     def __init__(self, data: bytes, start: int, contents: int):
-        """Take the bytes from ``start`` on."""
+        """Wrap the bytes of the structure, which begin at ``start``."""
         self.start, self.contents, self._data = start, contents, bytearray(data)
         entries = range(contents - start + 8 + SECTION_NAME, len(data), SECTION)
         self._sections = [(entry, struct.unpack_from("<q", data, entry)[0] - start) for entry in entries]
 
     @classmethod
     def read(cls, file: BinaryIO) -> "_Structure":
-        """Read that of a file."""
+        """Read the structure of a file."""
         (contents,) = struct.unpack("<q", os.pread(file.fileno(), 8, CONTENTS))
         (count,) = struct.unpack("<Q", os.pread(file.fileno(), 8, contents))
         end = contents + 8 + SECTION * count
@@ -331,7 +331,7 @@ class _Structure:
         return cls(os.pread(file.fileno(), end - start, start), start, contents)
 
     def moved_to(self, place: int) -> bytes:
-        """Return it as it has to be at another place, which is its place then."""
+        """Move the structure to another place; return its bytes there."""
         for entry, section in self._sections:
             struct.pack_into("<q", self._data, entry, place + section)
         self.start, self.contents = place, self.contents - self.start + place

@@ -1,4 +1,4 @@
-"""Copies a scene beside the output of a run, with everything that it is made of."""
+"""Copies a scene with all its files beside the output of a run."""
 
 import os
 import shutil
@@ -12,17 +12,17 @@ from warpmag.usd.write.output import Output
 
 
 def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
-    """Write a copy of the scene of a stage, to be placed beside a run's output.
+    """Write a temporary copy of a stage's scene, for a place beside the run's output.
 
-    A scene of one layer becomes ``out.scene.usdc`` and a package ``out.scene.usdz``. What has sublayers, references,
-    payloads or assets, textures say, becomes a folder ``out.scene`` with all of them, as they lie to each other. Edits
-    that are not saved are in the copy.
+    A scene of one layer becomes ``out.scene.usdc``, a package ``out.scene.usdz``. A scene with sublayers, references,
+    payloads or assets such as textures becomes a folder ``out.scene`` with all files in their relative places. The copy
+    includes unsaved edits.
 
     Returns:
-        The file or folder, and in it the root layer of the scene.
+        The file or folder, and the root layer of the scene in it.
 
     Raises:
-        InputError: There are such edits in a package.
+        InputError: A package has unsaved edits.
     """
     scene, edited = stage.GetRootLayer(), unsaved_layers(stage)
     for layer in edited:
@@ -51,12 +51,12 @@ def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
 
 
 def file_with(path: str) -> str:
-    """Return the file that a layer or an asset is in, perhaps a package."""
+    """Return the file that contains a layer or an asset, which may be a package."""
     return Ar.SplitPackageRelativePathOuter(path)[0]
 
 
 def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path], *, edited: bool) -> None:
-    """Let the copy of ``layer`` name the other copies and have its edits; names relative to its folder stay right."""
+    """Write the copy of ``layer`` with its unsaved edits, and with paths to the other copies."""
     changed = edited
     resolver = Ar.GetResolver()
 
@@ -65,11 +65,11 @@ def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path], *, edited: bool)
         outer, inner = Ar.SplitPackageRelativePathOuter(path)
         if not outer or outer.startswith(("./", "../")):
             return path
-        found = resolver.Resolve(Sdf.ComputeAssetPathRelativeToLayer(layer, outer)).GetPathString()
-        if found not in places:
+        resolved = resolver.Resolve(Sdf.ComputeAssetPathRelativeToLayer(layer, outer)).GetPathString()
+        if resolved not in places:
             return path
         changed = True
-        short = os.path.relpath(places[found], places[layer.realPath].parent)
+        short = os.path.relpath(places[resolved], places[layer.realPath].parent)
         short = short if short.startswith("../") else f"./{short}"
         return Ar.JoinPackageRelativePath(short, inner) if inner else short
 
