@@ -159,6 +159,16 @@ def test_a_long_complaint_is_cut(tmp_path):
         open_stage(path)
 
 
+def test_a_read_that_takes_all_memory_is_ended(tmp_path, monkeypatch):
+    """USD reports a lack of memory as an error of its own kind; the parent must not try again."""
+    program = "raise RuntimeError('Encountered: std::bad_alloc, while reading')"
+    (tmp_path / "pxr").mkdir()
+    (tmp_path / "pxr" / "__init__.py").write_text(program)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(InputError, match=r"stage.usdc: USD needs more than half of the memory to read it"):
+        open_stage(crate(tmp_path / "stage.usdc"))
+
+
 def test_a_line_of_a_very_long_text_takes_no_memory():
     text = "x" * 20_000_000
     tracemalloc.start()

@@ -83,7 +83,6 @@ if __name__ == "__main__":  # pragma: no cover - runs in the child
         resource.setrlimit(kind, (limits[kind] if soft < 0 else min(soft, limits[kind]), hard))
     try:
         print(_read(sys.argv[2], int(sys.argv[3])))
-    except MemoryError:
-        print("USD needs more than half of the memory to read it")
-    except Exception:
-        pass
+    except Exception as error:  # of other kinds: the parent's own reading raises it again
+        if isinstance(error, MemoryError) or "bad_alloc" in str(error):
+            print("USD needs more than half of the memory to read it")
