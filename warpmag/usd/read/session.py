@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from pxr import Sdf, Usd
 
 from warpmag.errors import InputError
-from warpmag.usd.read.prims import is_physical
+from warpmag.usd.read.prims import descendants, is_physical
 from warpmag.usd.values import Finding
 
 INSTANCES, UNITS = "warpmag_instances", "warpmag_units"
@@ -59,11 +59,10 @@ def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> No
     with Sdf.ChangeBlock():
         for path in instances:
             Sdf.CreatePrimInLayer(layer, path).instanceable = False
-    everywhere = Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)
     for finding in instance_findings(
         prim
         for prim in map(stage.GetPrimAtPath, instances)
-        if any(is_physical(one) or one.GetTypeName().startswith("Physics") for one in Usd.PrimRange(prim, everywhere))
+        if any(is_physical(inner) or inner.GetTypeName().startswith("Physics") for inner in descendants(prim))
     ):
         raise InputError(str(finding))
 

@@ -92,12 +92,12 @@ class Units:
 
     @property
     def are_si(self) -> bool:
-        """Whether the units are SI units."""
+        """True for SI units."""
         return math.isclose(self.meters, 1.0) and math.isclose(self.kilograms, 1.0)
 
     @property
     def are_sound(self) -> bool:
-        """Whether the units are valid."""
+        """True for units that can be converted."""
         return all(1e-50 < unit < 1e50 for unit in (self.meters, self.kilograms))
 
 

@@ -142,7 +142,7 @@ class SampleFile:
 
     @property
     def sampled(self) -> np.ndarray:
-        """Whether each attribute has samples, shape [attributes]."""
+        """True for each attribute with samples, shape [attributes]."""
         return self._places.sampled
 
     @property

@@ -240,7 +240,7 @@ class CacheWriter:
 
     @property
     def save_due(self) -> bool:
-        """Whether :meth:`save` should be called after the next frame, about once a second."""
+        """True about once a second, when :meth:`save` should be called after the next frame."""
         return clock_time.monotonic() >= self._save_time
 
     def save(self, state: dict[str, np.ndarray] | None) -> None:
