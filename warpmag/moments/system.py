@@ -89,7 +89,7 @@ class MomentSystem:
         movable: True for a moment whose force is needed, shape [n]; None means all.
         body_extent: Largest distance [m] between two moments of a movable body. The method ``fmm`` needs it if such a
             body has several moments, because it sums their pairs one by one. None means unknown.
-        material: MomentMaterial of the inducible moments.
+        material: Material of the inducible moments.
         external_field: Applied field [A/m], shape [3] or [n, 3].
         settings: Settings of the solve and of the forces.
         couplings: For each body that consists of cells its first moment, and the correction of the pair sums between
