@@ -1,4 +1,4 @@
-"""Sphinx reads this: ``uv run --extra docs sphinx-build -n -W docs build/docs``; pages are MyST Markdown."""
+"""Settings of Sphinx: ``uv run --extra docs sphinx-build -n -W docs build/docs``. Pages are MyST Markdown."""
 
 import os
 import re
@@ -30,48 +30,49 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # docstrings say shapes and units, which types do not
+autodoc_typehints = "none"  # docstrings state shapes and units, which types do not
 maximum_signature_line_length = 90
 autodoc_preserve_defaults = True
 napoleon_use_ivar = True
 napoleon_custom_sections = ["Warns"]
-# Warp's, Newton's, NumPy's and USD's own pages are not asked for, and what is not public has none
+# no links to other projects' pages, nor to names that are not public
 nitpick_ignore_regex = [("py:mod", ".*"), ("py:.*", r"(?!warpmag\.[A-Za-z_]+$).*")]
 
 
 def _schemas() -> str:
-    """Tables of the attributes of all schemas, from their text."""
+    """Return tables of the attributes of all schemas."""
     layer = Sdf.Layer.FindOrOpen(str(ROOT / "warpmag" / "usd" / "schema" / "generatedSchema.usda"))
     return "\n".join(_schema(prim) for prim in layer.rootPrims)
 
 
 def _schema(prim) -> str:
-    lines = [f"## {prim.name}", "", _plain(prim.documentation), ""]
+    lines = [f"## {prim.name}", "", _one_line(prim.documentation), ""]
     lines += ["| attribute | type | default | meaning |", "|---|---|---|---|"]
-    for one in prim.properties:
-        kind = f"{'uniform ' * (one.variability == Sdf.VariabilityUniform)}{one.typeName}"
-        tokens = f" One of {', '.join(f'`{token}`' for token in one.allowedTokens)}." if one.allowedTokens else ""
-        default = "" if one.default in (None, "") else f"`{one.default}`"
-        lines.append(f"| `{one.name}` | {kind} | {default} | {_plain(one.documentation)}{tokens} |")
+    for attribute in prim.properties:
+        kind = f"{'uniform ' * (attribute.variability == Sdf.VariabilityUniform)}{attribute.typeName}"
+        allowed = ", ".join(f"`{token}`" for token in attribute.allowedTokens or ())
+        tokens = f" One of {allowed}." if allowed else ""
+        default = "" if attribute.default in (None, "") else f"`{attribute.default}`"
+        lines.append(f"| `{attribute.name}` | {kind} | {default} | {_one_line(attribute.documentation)}{tokens} |")
     return "\n".join([*lines, ""])
 
 
-def _plain(text: str) -> str:
-    """Documentation of a schema in one line."""
+def _one_line(text: str) -> str:
+    """Return the documentation of a schema in one line of Markdown."""
     return " ".join(text.split()).replace("Range: ", "<br>Range: ").replace(" Units: ", "<br>Units: ")
 
 
 def _commands() -> str:
-    """Help of the command and of each of its commands."""
+    """Return the help of the command and of each subcommand."""
     os.environ["COLUMNS"] = "84"
     parser = cli._parser()
-    (commands,) = (one.choices for one in parser._subparsers._group_actions)
-    texts = {"warpmag": parser, **{f"warpmag {name}": one for name, one in commands.items()}}
-    return "\n".join(f"## {name}\n\n```text\n{one.format_help()}```\n" for name, one in texts.items())
+    (commands,) = (action.choices for action in parser._subparsers._group_actions)
+    parsers = {"warpmag": parser, **{f"warpmag {name}": command for name, command in commands.items()}}
+    return "\n".join(f"## {name}\n\n```text\n{command.format_help()}```\n" for name, command in parsers.items())
 
 
 def _file(name: str) -> str:
-    """A file beside this folder; its links go to pages, or to nothing where there is none."""
+    """Return the text of a file outside this folder. Links to pages are adapted, other links to files removed."""
     text = (ROOT / name).read_text(encoding="utf-8").replace("```mermaid", "```text")
     text = re.sub(r"\[([^]]+)\]\(docs/([\w/]+\.md)\)", r"[\1](\2)", text)
     return re.sub(
@@ -86,9 +87,9 @@ FILES = {
     "SECURITY.md": "security.md",
     "warpmag/examples/README.md": "examples.md",
 }
-"""Files beside this folder that are pages, too."""
+"""Files outside this folder that become pages, and the names of the pages."""
 GENERATED = {"schemas": _schemas, "command": _commands, **{name: partial(_file, name) for name in FILES}}
-"""What stands in a page, as a comment, for text that is made where the page is."""
+"""Generated texts by name: ``<!-- name -->`` in a page is replaced by the text."""
 
 
 def _fill_in(app, page, source):
@@ -96,5 +97,5 @@ def _fill_in(app, page, source):
 
 
 def setup(app):
-    """Sphinx calls this."""
+    """Register the replacement of comments. Sphinx calls this function."""
     app.connect("source-read", _fill_in)
