@@ -18,12 +18,10 @@ from warpmag.declarations import materials
 from warpmag.declarations.attributes import Attribute, Schema, attributes_of
 from warpmag.declarations.checks import check_vector
 from warpmag.declarations.curves import MagnetizationCurve
-from warpmag.declarations.keys import Keys
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.declarations.schemas import MAGNET_SCHEMA, SCENE_SCHEMA
 from warpmag.errors import InputError
-from warpmag.usd.read.keys import KeyReader
-from warpmag.usd.values import flag, instance_finding, number, point_array, text, vector, vector_array, whole_numbers
+from warpmag.usd.values import flag, number, point_array, text, vector, vector_array, whole_numbers
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
 
@@ -180,7 +178,7 @@ def moment_of(prim: Usd.Prim) -> tuple[float, float, float] | None:
     """Return the authored moment of a magnet [A·m²], world frame, None where there is none."""
     attribute = prim.GetAttribute(MOMENT)
     value = attribute.Get() if attribute and attribute.HasAuthoredValue() else None
-    return None if value is None else _finite_vector(f"{prim.GetPath()}: {MOMENT}", value)
+    return None if value is None else finite_vector(f"{prim.GetPath()}: {MOMENT}", value)
 
 
 def _material_fields(prim: Usd.Prim, material: str, magnet: Magnet) -> dict:
@@ -233,27 +231,8 @@ def settings_of(prim: Usd.Prim) -> MagneticSettings:
     return settings
 
 
-def field_keys(prim: Usd.Prim, keys: KeyReader) -> Keys | None:
-    """Return the time samples of a scene's external field [A/m], None where it is constant."""
-    return keys.keys(prim, SCENE_SCHEMA.usd_name("external_field"), _finite_vector)
-
-
-def magnetization_keys(prim: Usd.Prim, magnet: Magnet, keys: KeyReader) -> Keys | None:
-    """Return the time samples of a permanent magnet's magnetization [A/m], None where it is constant."""
-    if magnet.kind != "permanent":
-        return None
-    if finding := instance_finding(prim.GetAttribute(_MAGNETIZATION)):
-        raise InputError(str(finding))
-    material = prim.GetAttribute(MATERIAL).Get()
-
-    def read(where: str, value) -> tuple:
-        magnetization = _finite_vector(where, value)
-        return materials.permanent(where, material, magnetization) if material else magnetization
-
-    return keys.keys(prim, _MAGNETIZATION, read)
-
-
-def _finite_vector(name: str, value) -> tuple[float, float, float]:
+def finite_vector(name: str, value) -> tuple[float, float, float]:
+    """Return the three components of a vector of a stage; raise :class:`InputError` by its name where not finite."""
     components = vector(name, value)
     check_vector(name, components)
     return components

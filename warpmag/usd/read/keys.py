@@ -10,12 +10,16 @@ from functools import cached_property
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
+from warpmag.declarations import materials
 from warpmag.declarations.keys import Keys, Motion, Operation
+from warpmag.declarations.magnets import Magnet
+from warpmag.declarations.schemas import MAGNET_SCHEMA, SCENE_SCHEMA
 from warpmag.errors import InputError
 from warpmag.usd.read.prims import is_body, is_collider
 from warpmag.usd.read.session import without_frozen
 from warpmag.usd.read.transforms import is_animated
-from warpmag.usd.values import LARGEST_COORDINATE, Finding
+from warpmag.usd.schemas import MATERIAL, finite_vector
+from warpmag.usd.values import LARGEST_COORDINATE, Finding, instance_finding
 
 _SCALE_TOLERANCE = 1e-5
 """Relative tolerance for constant scale and right angles of axes: poses are often in single precision."""
@@ -233,3 +237,24 @@ def _fault(world: np.ndarray) -> str:
     if np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
         return "is a projection"
     return "is mirrored" if np.linalg.det(matrix) < 0.0 else ""
+
+
+def field_keys(prim: Usd.Prim, keys: KeyReader) -> Keys | None:
+    """Return the time samples of a scene's external field [A/m], None where it is constant."""
+    return keys.keys(prim, SCENE_SCHEMA.usd_name("external_field"), finite_vector)
+
+
+def magnetization_keys(prim: Usd.Prim, magnet: Magnet, keys: KeyReader) -> Keys | None:
+    """Return the time samples of a permanent magnet's magnetization [A/m], None where it is constant."""
+    if magnet.kind != "permanent":
+        return None
+    name = MAGNET_SCHEMA.usd_name("magnetization")
+    if finding := instance_finding(prim.GetAttribute(name)):
+        raise InputError(str(finding))
+    material = prim.GetAttribute(MATERIAL).Get()
+
+    def read(where: str, value) -> tuple:
+        magnetization = finite_vector(where, value)
+        return materials.permanent(where, material, magnetization) if material else magnetization
+
+    return keys.keys(prim, name, read)

@@ -17,7 +17,7 @@ from warpmag.usd.read.clock import scenes, stage_name, unit_findings
 from warpmag.usd.read.coils import PlacedSource, is_source, sources_of
 from warpmag.usd.read.geometry import magnet_findings, mesh_findings, shape_findings, spacing_findings
 from warpmag.usd.read.input_errors import failure
-from warpmag.usd.read.keys import KeyReader
+from warpmag.usd.read.keys import KeyReader, field_keys, magnetization_keys
 from warpmag.usd.read.materials import material_findings
 from warpmag.usd.read.opening import copied_metadata
 from warpmag.usd.read.prims import body_of, is_body, is_collider, is_solid, prims_of_magnet
@@ -27,10 +27,8 @@ from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.schemas import (
     MAGNET_API,
     SCENE_API,
-    field_keys,
     has_api,
     magnet_of,
-    magnetization_keys,
     moment_of,
     settings_of,
 )
