@@ -256,7 +256,7 @@ def test_a_magnet_of_a_size_that_cannot_be_is_refused_by_name(radius):
     builder = new_builder()
     shape = builder.add_shape_sphere(-1, radius=radius, label="odd")
     warpmag.add_permanent(builder, shape=shape, magnetization=(0.0, 0.0, M))
-    with pytest.raises(warpmag.InputError, match="^odd: its moments have radii of .* m, not of 5e-08 to 20000$"):
+    with pytest.raises(warpmag.InputError, match="^odd: its moments have radii of .* m, must be 5e-08 to 20000$"):
         warpmag.Magnetics(builder.finalize(device="cpu"))
 
 

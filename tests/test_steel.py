@@ -406,5 +406,5 @@ def test_a_changed_number_does_not_bend_a_measured_curve(device):
     saturation = model.warpmag.saturation.numpy()
     saturation[1] *= 0.5
     model.warpmag.saturation.assign(saturation)
-    with pytest.raises(InputError, match="saturation was changed, and a measured curve says what it is"):
+    with pytest.raises(InputError, match="saturation was changed, but a measured curve determines it"):
         magnetics.notify_model_changed()

@@ -1,8 +1,8 @@
 """Magnets and sources as custom attributes of shapes, namespace ``warpmag``, on Newton builders and models.
 
-Shapes carry magnets, not bodies: so a static shape can be a magnet, and magnets survive ``add_builder``, ``add_world``,
-``replicate`` and ``collapse_fixed_joints``. The attributes of magnets follow from the table of attributes
-(``warpmag.declarations.magnets``).
+The attributes belong to shapes, not to bodies. A static shape can therefore be a magnet, and magnets survive
+``add_builder``, ``add_world``, ``replicate`` and ``collapse_fixed_joints``. The fields of
+:class:`warpmag.declarations.magnets.Magnet` define the attributes of magnets.
 """
 
 from collections.abc import Callable
@@ -19,14 +19,14 @@ from warpmag.declarations.magnets import CURVES, KINDS, Magnet
 from warpmag.errors import InputError
 
 NO_MAGNET = 0
-"""Value of ``warpmag:kind`` on a shape that is no magnet; a magnet has 1 + the index of its kind in ``KINDS``."""
+"""Value of ``warpmag:kind`` on a shape that is not a magnet; a magnet has 1 + the index of its kind in ``KINDS``."""
 
 MAGNET_ATTRIBUTES = attributes_of(Magnet)
-"""Rows of the table; a model has one array of shapes for each, named like the field of ``Magnet``."""
+"""Attributes of magnets. A model has one array over its shapes for each, named after the field of ``Magnet``."""
 _TYPES = {"token": wp.int32, "float": wp.float32, "vector3f": wp.vec3}
-"""Type in a model by type in USD; a token is stored as a number."""
+"""Warp type of a model's attribute by its USD type; a token is stored as an index."""
 _SOURCE_ATTRIBUTES = {
-    "source": (str, ""),  # text of a ``declarations.coils.SourceRecord``; empty on a shape that is no source
+    "source": (str, ""),  # text of a ``declarations.coils.SourceRecord``; empty on a shape that is not a source
     "strength": (wp.float32, 0.0),
     "current_keys": (str, ""),  # text of the ``Keys`` of a coil's current; empty where it is constant
 }
@@ -37,7 +37,7 @@ def declare_attributes(builder: newton.ModelBuilder, usd_value: Callable[[Any, d
 
     Args:
         builder: The builder.
-        usd_value: Function by which Newton's ``add_usd`` gets the value of a magnet's attribute for a shape.
+        usd_value: Function that Newton's ``add_usd`` calls for the value of a magnet's attribute on a shape.
     """
     check_builder(builder)
     from_usd = {} if usd_value is None else {"usd_attribute_name": "*", "usd_value_transformer": usd_value}
@@ -49,7 +49,7 @@ def declare_attributes(builder: newton.ModelBuilder, usd_value: Callable[[Any, d
 
 
 def _declare(builder: newton.ModelBuilder, name: str, dtype: Any, default: Any, **from_usd: Any) -> None:
-    """Declare one attribute of shapes."""
+    """Declare one shape attribute."""
     builder.add_custom_attribute(
         newton.ModelBuilder.CustomAttribute(
             name=name,
@@ -81,42 +81,42 @@ def check_body(builder: newton.ModelBuilder, body: int) -> None:
     check_index("body", body, builder.body_count, "bodies")
 
 
-def check_index(name: str, index: int, count: int, things: str) -> None:
-    """Raise :class:`InputError` unless ``index`` is one of ``count`` things of the builder."""
+def check_index(name: str, index: int, count: int, noun: str) -> None:
+    """Raise :class:`InputError` unless ``index`` is in ``range(count)``; ``noun`` names the builder's objects."""
     check_whole(name, index)
     if not 0 <= index < count:
-        raise InputError(f"{name}: {short_repr(index)} is out of range, the builder has {count} {things}")
+        raise InputError(f"{name}: {short_repr(index)} is out of range, the builder has {count} {noun}")
 
 
 def mark_shapes(builder: newton.ModelBuilder, shapes: range | list[int], magnet: Magnet) -> None:
-    """Store a checked ``magnet`` on shapes, its magnetization in the frame of each shape."""
+    """Store a valid ``magnet`` on shapes, with its magnetization in the frame of each shape."""
     for name, value in stored_values(magnet).items():
-        values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values  # Newton declares a list, too
+        values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values  # Newton's annotation also allows a list
         values.update(dict.fromkeys(shapes, value))
 
 
 def stored_values(magnet: Magnet) -> dict[str, Any]:
-    """Return the values of a shape's attributes; ``magnet`` is in the frame of the shape."""
+    """Return a shape's attribute values by name, with the magnetization of ``magnet`` in the frame of the shape."""
     return {row.field: _stored(row, getattr(magnet, row.field)) for row in MAGNET_ATTRIBUTES}
 
 
 def _stored(row: Attribute, value: Any) -> Any:
-    """Return the value of a field as a model stores it."""
+    """Return the value that a model stores for an attribute."""
     if row.field == "kind":
         return 1 + KINDS.index(value)
     if row.field == "curve":
-        return _curve_number(value)
+        return _curve_index(value)
     if row.usd_type == "vector3f":
         return wp.vec3(*(float(component) for component in value))
     return float(value)
 
 
 _measured_curves: list[MagnetizationCurve] = []
-"""Measured curves of all shapes; a model stores the position in this list, after those of ``CURVES``."""
+"""Measured curves of all shapes; a model stores the index in this list plus the length of ``CURVES``."""
 
 
-def _curve_number(curve: str | MagnetizationCurve) -> int:
-    """Return the number by which a model stores a curve."""
+def _curve_index(curve: str | MagnetizationCurve) -> int:
+    """Return the index that a model stores for a curve."""
     if not isinstance(curve, MagnetizationCurve):
         return CURVES.index(curve)
     if curve not in _measured_curves:
@@ -124,13 +124,13 @@ def _curve_number(curve: str | MagnetizationCurve) -> int:
     return len(CURVES) + _measured_curves.index(curve)
 
 
-def _curve_of(number: int) -> str | MagnetizationCurve:
-    """Return the curve that a model stores by a number."""
-    return CURVES[number] if number < len(CURVES) else _measured_curves[number - len(CURVES)]
+def _curve_at(index: int) -> str | MagnetizationCurve:
+    """Return the curve of a stored index."""
+    return CURVES[index] if index < len(CURVES) else _measured_curves[index - len(CURVES)]
 
 
 def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
-    """Return the magnets of a finished model by shape, magnetizations in the frame of the shape.
+    """Return the magnets of a finalized model by shape, with magnetizations in the frames of the shapes.
 
     Raises:
         InputError: The model has no magnets.
@@ -148,7 +148,7 @@ def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
 
 
 def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the different rows of numbers, shape [k, m], and the index among them of each row, shape [n]."""
+    """Return the distinct rows of an array, shape [k, m], and the index of each row among them, shape [n]."""
     order = np.lexsort(rows.T)
     differs = np.ones(len(rows), bool)
     differs[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
@@ -158,13 +158,13 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _magnet_of(values: list[np.ndarray]) -> Magnet:
-    """Return the magnet of the stored values of one shape, in the order of the table."""
+    """Return the magnet of the stored values of one shape, in the order of ``MAGNET_ATTRIBUTES``."""
     fields = {}
     for row, value in zip(MAGNET_ATTRIBUTES, values, strict=True):
         if row.field == "kind":
             fields["kind"] = KINDS[int(value[0]) - 1]
         elif row.field == "curve":
-            fields["curve"] = _curve_of(int(value[0]))
+            fields["curve"] = _curve_at(int(value[0]))
         else:
             fields[row.field] = tuple(value.tolist()) if row.usd_type == "vector3f" else float(value[0])
     return Magnet(**fields)

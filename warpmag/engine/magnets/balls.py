@@ -1,4 +1,4 @@
-"""Adding many balls at once: Newton's own calls make one ball, and Newton copies it."""
+"""Adds many balls at once: Newton's own calls make one ball, and Newton replicates it."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from warpmag.moments.arrays import host_array, host_radii, host_scalars, shape_m
 from warpmag.terminal import collection_paused
 
 _SUFFIXES = {"body": "", "joint": "_free_joint", "articulation": "_articulation", "shape": "_shape"}
-"""Ends of the labels of what belongs to a body: Newton's ``add_body`` appends the first three, warpmag the last."""
+"""Label suffixes of the objects of a body. Newton's ``add_body`` appends the first three, warpmag the last."""
 _NOT_COPIED = ("body_q", "body_qd", "body_world", "body_label", "shape_body", "shape_world", "shape_label")
 """Lists of a builder whose entries differ between copies of a ball."""
 
@@ -55,15 +55,15 @@ def add_balls(
     color: tuple[float, float, float] | None = None,
     label: str | None = None,
 ) -> Balls:
-    """Add many free balls, each of which is one magnet.
+    """Add many free balls, each one a magnet.
 
     The model equals that of ``add_body``, ``add_shape_sphere`` and :func:`add_inducible` or :func:`add_permanent` for
-    each ball. A ball takes some microseconds. Other properties of shapes are those of ``builder.default_shape_cfg``.
+    each ball, and takes a few microseconds per ball. ``builder.default_shape_cfg`` sets all other shape properties.
 
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
         positions: Centers [m], shape [n, 3].
-        radius: Radius of all, or of each, shape [n] [m].
+        radius: Radius [m], one number or shape [n].
         orientations: Rotations, unit quaternions x y z w, shape [n, 4]; by default the identity.
         density: Density [kg/m³].
         friction: Coefficient of friction [dimensionless].
@@ -71,11 +71,11 @@ def add_balls(
             ``magnetization``.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
-        curve: Magnetization curve, as :func:`add_inducible` takes it.
-        magnetization: Magnetization M [A/m] in the frame of each ball: makes them permanent magnets. With ``material``
-            only its direction counts.
-        recoil_permeability: As :func:`add_permanent` takes it.
-        color: Color of all, RGB from 0 to 1; by default one of Newton's palette.
+        curve: Magnetization curve, see :func:`add_inducible`.
+        magnetization: Magnetization M [A/m] in the frame of each ball. If given, the balls are permanent magnets. With
+            ``material`` only its direction counts.
+        recoil_permeability: Recoil permeability, see :func:`add_permanent`.
+        color: Color of all balls, RGB from 0 to 1; by default a color of Newton's palette.
         label: Prefix of labels, before ``_`` and the number of the ball; by default Newton's labels.
 
     Returns:
@@ -106,7 +106,12 @@ def add_balls(
 
 
 def copy_ball(
-    builder: newton.ModelBuilder, body: int, poses: np.ndarray, velocities: np.ndarray, first: str, others: list[str]
+    builder: newton.ModelBuilder,
+    body: int,
+    poses: np.ndarray,
+    velocities: np.ndarray,
+    prefix: str,
+    new_prefixes: list[str],
 ) -> Balls:
     """Add copies of a ball of the builder, magnet included, at other poses.
 
@@ -115,19 +120,19 @@ def copy_ball(
         body: A free body with one shape, a ball.
         poses: Positions [m] and quaternions x y z w, shape [n, 7].
         velocities: Linear [m/s] and angular velocities [rad/s], world frame, shape [n, 6].
-        first: Prefix of the labels of the body and its shape.
-        others: Prefix of the labels of each copy.
+        prefix: Prefix of the labels of the body and its shape.
+        new_prefixes: Prefix of the labels of each copy, in its place.
 
     Returns:
         The bodies and the shapes of the copies.
     """
     (shape,) = builder.body_shapes[body]
-    rows, count = {"body": body, "shape": shape}, len(poses)
+    originals, count = {"body": body, "shape": shape}, len(poses)
     template = _template(builder, builder.shape_scale[shape][0], builder.default_shape_cfg, None)
     for name, values in vars(template).items():
         kind = name.partition("_")[0]
-        if kind in rows and name not in _NOT_COPIED and isinstance(values, list) and len(values) == 1:
-            values[0] = getattr(builder, name)[rows[kind]]
+        if kind in originals and name not in _NOT_COPIED and isinstance(values, list) and len(values) == 1:
+            values[0] = getattr(builder, name)[originals[kind]]
     new = {
         "body": range(builder.body_count, builder.body_count + count),
         "shape": range(builder.shape_count, builder.shape_count + count),
@@ -138,39 +143,39 @@ def copy_ball(
     builder.body_qd[-count:] = map(wp.spatial_vector.from_buffer_copy, velocities)
     builder.joint_qd[-velocities.size :] = velocities.ravel().tolist()
     _name(builder, count, None)
-    for kind, row in rows.items():
+    for kind, original in originals.items():
         labels = getattr(builder, f"{kind}_label")
-        end = labels[row].removeprefix(first)
-        labels[-count:] = [f"{prefix}{end}" for prefix in others]
-    builder.articulation_label[-count:] = builder.body_label[-count:]  # as Newton's import of stages names them
+        suffix = labels[original].removeprefix(prefix)
+        labels[-count:] = [f"{new_prefix}{suffix}" for new_prefix in new_prefixes]
+    builder.articulation_label[-count:] = builder.body_label[-count:]  # the labels of Newton's USD import
     for attribute in builder.custom_attributes.values():
         kind = getattr(attribute.frequency, "name", "").lower()
         values: Any = attribute.values
-        if kind in rows and rows[kind] in values:
-            values.update(dict.fromkeys(new[kind], values[rows[kind]]))
+        if kind in originals and originals[kind] in values:
+            values.update(dict.fromkeys(new[kind], values[originals[kind]]))
     return Balls(new["body"], new["shape"])
 
 
 def _poses(positions, orientations) -> np.ndarray:
     """Return checked positions and unit quaternions, shape [n, 7]."""
-    places = host_array("positions", positions)
-    if places.ndim != 2 or places.shape[1] != 3:
-        raise InputError(shape_message("positions", "[n, 3]", places))
-    poses = np.zeros((len(places), 7), np.float32)
-    if (np.abs(places) > np.finfo(np.float32).max).any():
+    centers = host_array("positions", positions)
+    if centers.ndim != 2 or centers.shape[1] != 3:
+        raise InputError(shape_message("positions", "[n, 3]", centers))
+    poses = np.zeros((len(centers), 7), np.float32)
+    if (np.abs(centers) > np.finfo(np.float32).max).any():
         raise InputError("positions: must be finite in single precision")
-    poses[:, :3], poses[:, 6] = places, 1.0
+    poses[:, :3], poses[:, 6] = centers, 1.0
     if orientations is not None:
-        turns = host_array("orientations", orientations)
-        if turns.shape != (len(places), 4):
-            raise InputError(shape_message("orientations", f"[{len(places)}, 4]", turns))
-        lengths = np.linalg.norm(turns, axis=1)
+        quaternions = host_array("orientations", orientations)
+        if quaternions.shape != (len(centers), 4):
+            raise InputError(shape_message("orientations", f"[{len(centers)}, 4]", quaternions))
+        lengths = np.linalg.norm(quaternions, axis=1)
         if (np.abs(lengths - 1.0) > 1e-3).any():  # components are often rounded to few digits
             worst = int(np.argmax(np.abs(lengths - 1.0)))
             raise InputError(
                 f"orientations: must be unit quaternions, that of ball {worst} has length {lengths[worst]:g}"
             )
-        poses[:, 3:] = turns / lengths[:, None]
+        poses[:, 3:] = quaternions / lengths[:, None]
     return poses
 
 
@@ -183,7 +188,7 @@ def _radii(radius, count: int) -> np.ndarray:
 
 
 def _config(builder: newton.ModelBuilder, density, friction) -> newton.ModelBuilder.ShapeConfig:
-    """Return the builder's properties of shapes with another density and friction, where given."""
+    """Return the builder's shape configuration with the given density and friction."""
     config = builder.default_shape_cfg.copy()
     if density is not None:
         check_positive("density", density)
@@ -195,15 +200,15 @@ def _config(builder: newton.ModelBuilder, density, friction) -> newton.ModelBuil
 
 
 def _magnet(material, response: dict, magnetization, recoil_permeability: float) -> Magnet:
-    """Return the magnet of the arguments of :func:`add_balls`; ``response`` are those of inducible magnets."""
+    """Return the magnet that :func:`add_balls` describes; ``response`` has the arguments of inducible magnets."""
     fields = {name: value for name, value in response.items() if value is not None}
     if magnetization is None:
         if recoil_permeability != 1.0:
-            raise InputError("recoil_permeability: is of permanent magnets only, which have a magnetization")
+            raise InputError("recoil_permeability: for permanent magnets only, which need a magnetization")
         curve = fields.pop("curve", None)
         return Magnet("inducible", **materials.inducible_from(material, curve, fields))
     if fields:
-        raise InputError(f"{next(iter(fields))}: is of inducible magnets only, and magnetization makes permanent ones")
+        raise InputError(f"{next(iter(fields))}: for inducible magnets only, but magnetization makes permanent magnets")
     check_vector("magnetization", magnetization)
     if material is not None:
         magnetization = materials.permanent("material", material, magnetization)
@@ -228,9 +233,9 @@ def _template(builder: newton.ModelBuilder, radius: float, config, color) -> new
 
 
 def _add_copies(builder: newton.ModelBuilder, template: newton.ModelBuilder, count: int) -> None:
-    """Add ``count`` copies of a builder with one ball: a row of copies, and many copies of that row.
+    """Add ``count`` copies of a builder with one ball: replicate a row of √count balls, then single balls.
 
-    Newton loops over copies in Python, but adds the contents of one copy as a whole: n copies take about 2√n passes.
+    Newton loops over copies in Python. Replicating rows takes about 2√count iterations in place of ``count``.
     """
     row_length = math.isqrt(count)
     row = _empty_like(template)
@@ -247,17 +252,17 @@ def _place(builder: newton.ModelBuilder, poses: np.ndarray) -> None:
 
 
 def _resize(builder: newton.ModelBuilder, radii: np.ndarray, config: Any) -> None:
-    """Set scale, mass and inertia of the last balls where radii differ, computed by Newton once for each radius."""
-    sizes, size_of = np.unique(radii, return_inverse=True)
-    if len(sizes) == 1:
+    """Set scale, mass and inertia of the last balls if radii differ; Newton computes them once for each radius."""
+    unique_radii, index_of = np.unique(radii, return_inverse=True)
+    if len(unique_radii) == 1:
         return
     density, solid, margin = config.density, config.is_solid, config.margin
-    kind, size_of = newton.GeoType.SPHERE, size_of.tolist()
-    scales = [(float(size), 0.0, 0.0) for size in sizes]
+    kind, index_of = newton.GeoType.SPHERE, index_of.tolist()
+    scales = [(float(ball_radius), 0.0, 0.0) for ball_radius in unique_radii]
     properties = [newton.geometry.compute_inertia_shape(kind, scale, None, density, solid, margin) for scale in scales]
     masses, inertias = [mass for mass, _, _ in properties], [inertia for _, _, inertia in properties]
-    about_axis = [float(np.array(inertia).flat[0]) for inertia in inertias]  # the same about every axis
-    inverses = [wp.mat33(*(np.eye(3) * (1.0 / value if value else 0.0)).ravel().tolist()) for value in about_axis]
+    diagonal = [float(np.array(inertia).flat[0]) for inertia in inertias]  # equal about every axis
+    inverses = [wp.mat33(*(np.eye(3) * (1.0 / value if value else 0.0)).ravel().tolist()) for value in diagonal]
     for name, values in (
         ("body_mass", masses),
         ("body_inv_mass", [1.0 / mass if mass else 0.0 for mass in masses]),
@@ -266,16 +271,16 @@ def _resize(builder: newton.ModelBuilder, radii: np.ndarray, config: Any) -> Non
         ("shape_scale", scales),
         ("shape_collision_radius", [scale[0] for scale in scales]),
     ):
-        getattr(builder, name)[-len(size_of) :] = [values[size] for size in size_of]
+        getattr(builder, name)[-len(index_of) :] = [values[index] for index in index_of]
 
 
 def _name(builder: newton.ModelBuilder, count: int, label: str | None) -> None:
-    """Label the last balls, their joints and shapes as if each ball had been added alone."""
+    """Label the last balls, their joints and shapes as separate calls of ``add_body`` would."""
     for kind, suffix in _SUFFIXES.items():
         labels = getattr(builder, f"{kind}_label")
         before = len(labels) - count
         if label is None:
-            first = before + int(labels[-1].removeprefix(f"{kind}_"))  # Newton counts some from 0, some from 1
+            first = before + int(labels[-1].removeprefix(f"{kind}_"))  # Newton numbers some kinds from 0, some from 1
             labels[before:] = [f"{kind}_{number}" for number in range(first, first + count)]
         else:
             labels[before:] = [f"{label}_{number}{suffix}" for number in range(count)]

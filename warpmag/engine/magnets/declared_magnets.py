@@ -1,4 +1,4 @@
-"""Adding magnets to Newton builders: inducible and permanent materials of bodies and shapes."""
+"""Adds magnets to Newton builders: inducible and permanent materials of bodies and shapes."""
 
 from dataclasses import replace
 from typing import Any
@@ -44,18 +44,18 @@ def add_inducible(
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
         body: The body. All its colliding shapes, which must exist already, become one magnet.
-        shape: One shape in place of all shapes of the body; the way to make a static shape a magnet.
-        material: Name of an inducible material of :mod:`warpmag.declarations.materials`. It replaces the next two
-            arguments, and the curve where the material has a measured one.
+        shape: One shape in place of all shapes of the body, for example a static shape.
+        material: Name of an inducible material of :mod:`warpmag.declarations.materials`. It replaces ``saturation`` and
+            ``susceptibility``, and ``curve`` if the material has a measured curve.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
-        curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured curve. The latter is a
-            :class:`warpmag.MagnetizationCurve` or the name of a material that has one. It replaces saturation and
-            susceptibility.
+        curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured curve: a
+            :class:`warpmag.MagnetizationCurve` or the name of a material with a measured curve. A measured curve
+            replaces saturation and susceptibility.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
         conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet. Eddy currents brake
-            a conductor that moves through the field. 0 means none, with ``material``, too, since eddy currents cost a
-            sum over pairs (:class:`warpmag.declarations.materials.Material` lists conductivities).
+            a conductor that moves through the field. 0 means no eddy currents. ``material`` does not set it, since eddy
+            currents cost a sum over pairs; :class:`warpmag.declarations.materials.Material` lists values.
 
     Raises:
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
@@ -85,15 +85,15 @@ def add_permanent(
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
         body: The body. All its colliding shapes, which must exist already, become one magnet.
-        shape: One shape in place of all shapes of the body; the way to make a static shape a magnet.
+        shape: One shape in place of all shapes of the body, for example a static shape.
         material: Name of a permanent material of :mod:`warpmag.declarations.materials`, which gives the strength.
-        magnetization: Magnetization M [A/m] in the frame of the body, of the shape if that is static. With
-            ``material`` only its direction counts.
+        magnetization: Magnetization M [A/m] in the frame of the body, or of a static shape. With ``material`` only
+            its direction counts.
         recoil_permeability: μ of M = M_r + (μ − 1) H [dimensionless], with the internal field H and ``magnetization``
             M_r: about 1.05 for NdFeB, 1.1 for ferrite. At 1, the default, no field changes M. Above 1 the induction
-            solves for the magnet, too.
+            solve includes the magnet.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
-        conductivity: Electrical conductivity [S/m], as :func:`add_inducible` takes it.
+        conductivity: Electrical conductivity [S/m], see :func:`add_inducible`.
 
     Raises:
         InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
@@ -110,31 +110,31 @@ def add_permanent(
         conductivity=conductivity,
     )
     for index in magnet_shapes(builder, body, shape):
-        turn = wp.quat_identity()
+        rotation = wp.quat_identity()
         if builder.shape_body[index] >= 0:
-            frame: Any = builder.shape_transform[index]  # Newton declares a tuple where it holds a transform
-            turn = frame.q
-        turned = in_shape_frame(magnet, turn)
-        turned.check(builder.shape_label[index])
-        mark_shapes(builder, [index], turned)
+            frame: Any = builder.shape_transform[index]  # Newton annotates a tuple, but it is a transform
+            rotation = frame.q
+        rotated = in_shape_frame(magnet, rotation)
+        rotated.check(builder.shape_label[index])
+        mark_shapes(builder, [index], rotated)
 
 
-def in_shape_frame(magnet: Magnet, turn: wp.quat) -> Magnet:
+def in_shape_frame(magnet: Magnet, rotation: wp.quat) -> Magnet:
     """Return ``magnet`` with its magnetization in the frame of a shape.
 
     Args:
         magnet: The magnet, in the frame of its body or prim.
-        turn: Rotation of the shape's frame in that frame.
+        rotation: Rotation from the shape's frame to that frame.
     """
     if not np.any(magnet.magnetization):
         return magnet
-    return replace(magnet, magnetization=tuple(wp.quat_rotate_inv(turn, wp.vec3(*magnet.magnetization))))
+    return replace(magnet, magnetization=tuple(wp.quat_rotate_inv(rotation, wp.vec3(*magnet.magnetization))))
 
 
-def axis_turn(axis: str | None) -> Any:
-    """Return the rotation of a shape's frame in that of its prim.
+def axis_rotation(axis: str | None) -> Any:
+    """Return the rotation from a shape's frame to the frame of its prim.
 
-    Newton puts the axis of a capsule, cylinder or cone along z.
+    Newton's capsules, cylinders and cones have their axis along z.
 
     Args:
         axis: Token of the prim's axis, None for other shapes.
@@ -143,7 +143,7 @@ def axis_turn(axis: str | None) -> Any:
 
 
 def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
-    """Return the shapes that a magnet on ``body``, or on ``shape`` alone, covers.
+    """Return the shapes of a magnet on ``body``, or on ``shape`` alone.
 
     Raises:
         InputError: Body or shape do not exist, or there is no colliding shape with a volume.

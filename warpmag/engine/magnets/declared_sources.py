@@ -1,7 +1,7 @@
-"""Adding coils and field maps to Newton builders.
+"""Adds coils and field maps to Newton builders.
 
-A source of a field is a site: a shape that neither collides nor weighs anything, with a body, a frame and a world. It
-survives ``add_builder``, ``add_world``, ``replicate`` and ``collapse_fixed_joints``.
+A field source is a site: a massless shape without collision, with a body, a frame and a world. It survives
+``add_builder``, ``add_world``, ``replicate`` and ``collapse_fixed_joints``.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ from warpmag.errors import InputError
 from warpmag.moments.arrays import host_array
 
 _UNIT_TOLERANCE = 1e-3
-"""Largest deviation of the length of a quaternion from 1: digits are often rounded."""
+"""Largest deviation of a quaternion's norm from 1; components are often rounded to few digits."""
 
 
 def add_coil(
@@ -38,9 +38,9 @@ def add_coil(
 ) -> int:
     """Add a coil to a body or to the world; the reaction of the magnets acts on the body.
 
-    Loops and solenoids are about the z axis of their frame. A positive current makes a field along z inside them.
-    Closer to the axis of a wire than its radius the field falls to zero. Elsewhere the field is exact: of loops by
-    elliptic integrals, of sheets of current after Derby and Olbert 2010, of thin straight pieces in closed form.
+    The axis of loops and solenoids is the z axis of their frame. A positive current makes a field along z inside them.
+    Inside a wire the field falls to zero toward the wire's axis. Elsewhere the field is exact: elliptic integrals for
+    loops, Derby and Olbert 2010 for current sheets, a closed form for thin straight segments.
 
     Args:
         builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
@@ -49,12 +49,12 @@ def add_coil(
         radius: Radius of a loop or a solenoid [m].
         length: Length of a solenoid [m]; its middle is the origin.
         points: Corners of a polyline [m], shape [k, 3], in the direction of a positive current.
-        closed: Whether a wire joins the last corner to the first; an open polyline is a part of a circuit.
-        wire_radius: Radius of the wire [m], of a solenoid that of the edges of its sheet. 0 means a hundredth of the
-            coil's radius, or of the diagonal of the box around a polyline.
+        closed: True if a wire joins the last corner to the first. An open polyline is a part of a circuit.
+        wire_radius: Radius of the wire [m]; for a solenoid, radius of the rounded edges of its current sheet. 0 means
+            1 % of the coil's radius, or of the diagonal of a polyline's bounding box.
         ampere_turns: Current times turns [A], all turns of a solenoid; :meth:`warpmag.Magnetics.set_current` changes
             it.
-        xform: Frame of the coil in that of the body, or of the world.
+        xform: Pose of the coil in the frame of the body, or in the world.
         label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.
 
     Returns:
@@ -85,8 +85,8 @@ def add_field_map(
     """Add a field on a regular grid, fixed in the world or on a body; the reaction of the magnets acts on the body.
 
     Cubic convolution interpolates between the nodes, to third order in the spacing. Forces follow from the gradient of
-    the interpolant and are continuous. Outside the grid the field is zero, with a jump at the boundary: a map should
-    reach to where its field is small.
+    the interpolant and are continuous. Outside the grid the field is zero, with a jump at the boundary: extend a map
+    to where its field is small.
 
     Args:
         builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
@@ -94,8 +94,8 @@ def add_field_map(
         spacing: Distance between nodes [m], one number or one along each axis.
         values: Field H at the nodes [A/m], shape [nx, ny, nz, 3], at least two along each axis, NumPy.
         body: The body; -1 for a map fixed in the world.
-        factor: Factor of the field; :meth:`warpmag.Magnetics.set_current` changes it.
-        xform: Frame of the map in that of the body, or of the world.
+        factor: Factor on the field; :meth:`warpmag.Magnetics.set_current` changes it.
+        xform: Pose of the map in the frame of the body, or in the world.
         label: Label of the map.
 
     Returns:
@@ -124,7 +124,7 @@ def add_placed_source(
         placed: The source, a ``usd.read.coils.PlacedSource``; the path of its prim becomes the label.
         body: The body, -1 for none.
         frame: Frame of the source in the world.
-        current_keys: Keys of its current as text, for :class:`KeyedCurrents`; empty where another object sets the
+        current_keys: Keys of its current as text, for :class:`KeyedCurrents`; empty if another object sets the
             current.
 
     Returns:
@@ -160,7 +160,7 @@ def _add_source(
 
 
 def _checked_frame(name: str, xform) -> wp.transform:
-    """Return the transform of seven numbers, or of a position and a rotation; the quaternion is normalized."""
+    """Return a transform from seven numbers, or from a position and a quaternion, which is normalized."""
     try:
         parts = list(xform)
     except TypeError:

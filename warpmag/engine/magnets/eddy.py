@@ -1,4 +1,4 @@
-"""Eddy currents on a Newton model: which balls conduct, and the motion of balls and sources."""
+"""Eddy currents in the conducting balls of a Newton model, from the velocities of balls and sources."""
 
 import newton
 import numpy as np
@@ -12,14 +12,14 @@ from warpmag.moments.system import MomentSystem
 
 
 class BodyEddies:
-    """Eddy currents of the conducting balls of a model. Without such balls nothing is allocated or launched.
+    """Eddy currents of the conducting balls of a model. A model without conducting balls needs no memory and no launch.
 
     Args:
         model: The model.
         magnets: Its magnets, in the order of their moments.
-        moments: The bodies of the moments.
-        sources: Its sources of fields.
-        system: The moments; their conductivities are set.
+        moments: The body of each moment.
+        sources: Its field sources.
+        system: The moment system; the constructor sets its conductivities.
         step: Longest time between evaluations of forces [s].
 
     Raises:
@@ -45,8 +45,8 @@ class BodyEddies:
         for magnet, count in zip(magnets, counts, strict=True):
             if magnet.magnet.conductivity == 0.0:
                 continue
-            ball = count == 1 and kinds[magnet.shapes[0]] == newton.GeoType.SPHERE
-            if not ball or (magnet.body >= 0 and bodies.count(magnet.body) > 1):
+            is_ball = count == 1 and kinds[magnet.shapes[0]] == newton.GeoType.SPHERE
+            if not is_ball or (magnet.body >= 0 and bodies.count(magnet.body) > 1):
                 label = model.shape_label[magnet.shapes[0]]
                 raise InputError(
                     f"{label}: conductivity: only balls of one moment that are their body's only magnet may conduct"

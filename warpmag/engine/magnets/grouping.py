@@ -1,4 +1,4 @@
-"""The magnets of a Newton model: groups of shapes that are one magnet each, with their worlds and sampled moments."""
+"""Groups the magnetic shapes of a Newton model into magnets, with their worlds and sampled moments."""
 
 from dataclasses import dataclass, replace
 
@@ -17,10 +17,10 @@ class BodyMagnet:
     """One magnet: shapes of one body with the same material and magnetization.
 
     Attributes:
-        magnet: The material, magnetization in the frame of the body.
+        magnet: Material and magnetization, in the frame of the body.
         body: The body, -1 for a magnet fixed in the world.
-        shapes: The shapes, together one volume.
-        world: Index of the world among those that hold magnets.
+        shapes: The shapes; their union is the volume of the magnet.
+        world: Index of the world among the worlds with magnets.
         lattice: The sampled moments in the frame of the body, grouped by shape.
     """
 
@@ -38,34 +38,38 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
         model: The model.
 
     Returns:
-        The magnets, by world, then inducible before permanent ones, then by body; and the Newton worlds that hold
-        them, [-1] for a model without worlds.
+        The magnets, sorted by world, then solved before fixed magnetizations, then by body. And the Newton worlds with
+        magnets, [-1] for a model without worlds.
     """
     magnet_of_shape = marked_shapes(model)
     shapes, stored = np.array(list(magnet_of_shape)), list(magnet_of_shape.values())
-    _, first, stored_of = np.unique(list(map(id, stored)), return_index=True, return_inverse=True)
-    body_of = model.shape_body.numpy()[shapes]
-    # many shapes share few materials and rotations: each pair is turned into the body's frame once
-    pairs, pair_of = unique_rows(np.column_stack([stored_of, model.shape_transform.numpy()[shapes, 3:]]))
+    _, first, stored_index = np.unique(list(map(id, stored)), return_index=True, return_inverse=True)
+    shape_bodies = model.shape_body.numpy()[shapes]
+    # many shapes share few pairs of material and rotation: each pair is rotated to the body's frame once
+    pairs, pair_index = unique_rows(np.column_stack([stored_index, model.shape_transform.numpy()[shapes, 3:]]))
     magnets = [_in_body_frame(stored[first[int(pair[0])]], pair[1:].tolist()) for pair in pairs]
-    groups = _group(body_of, pair_of, magnets)
-    lead = np.array([rows[0] for rows in groups])
-    worlds, held = _number_worlds(model, shapes[lead])
-    # magnets of one shape share a lattice with others of the same shape and material
+    groups = _group(shape_bodies, pair_index, magnets)
+    first_rows = np.array([rows[0] for rows in groups])
+    worlds, magnet_worlds = _number_worlds(model, shapes[first_rows])
+    # single-shape magnets of equal geometry and material share a lattice; other magnets have a kind of their own
     sampler, single = ShapeSampler(model), np.array([len(rows) == 1 for rows in groups])
-    own_kind = -1 - np.arange(len(groups))
-    kinds = np.where(single, sampler.kinds[shapes[lead]], own_kind)
-    _, first, lattice_of = np.unique(np.stack([pair_of[lead], kinds]), axis=1, return_index=True, return_inverse=True)
-    lattices = [_sampled(sampler, shapes[groups[group]].tolist(), magnets[pair_of[lead[group]]]) for group in first]
-    fixed = np.array([magnet.fixed for magnet in magnets])[pair_of[lead]]
-    order = np.lexsort((shapes[lead], body_of[lead], fixed, worlds))
-    columns = (pair_of[lead], body_of[lead], worlds, lattice_of.ravel())
+    unique_kind = -1 - np.arange(len(groups))
+    kinds = np.where(single, sampler.kinds[shapes[first_rows]], unique_kind)
+    _, first, lattice_index = np.unique(
+        np.stack([pair_index[first_rows], kinds]), axis=1, return_index=True, return_inverse=True
+    )
+    lattices = [
+        _sampled(sampler, shapes[groups[group]].tolist(), magnets[pair_index[first_rows[group]]]) for group in first
+    ]
+    fixed = np.array([magnet.fixed for magnet in magnets])[pair_index[first_rows]]
+    order = np.lexsort((shapes[first_rows], shape_bodies[first_rows], fixed, worlds))
+    columns = (pair_index[first_rows], shape_bodies[first_rows], worlds, lattice_index.ravel())
     table = zip(order.tolist(), *(column[order].tolist() for column in columns), strict=True)
     shape_of = shapes.tolist()
     return [
         BodyMagnet(magnets[pair], body, tuple(shape_of[row] for row in groups[group]), world, lattices[lattice])
         for group, pair, body, world, lattice in table
-    ], held
+    ], magnet_worlds
 
 
 def _group(bodies: np.ndarray, magnet_of: np.ndarray, magnets: list[Magnet]) -> list[list[int]]:
@@ -96,13 +100,13 @@ def _sampled(sampler: ShapeSampler, shapes: list[int], magnet: Magnet) -> BodyLa
 
 
 def _in_body_frame(magnet: Magnet, rotation: list[float]) -> Magnet:
-    """Return a magnet in the frame of its body; ``rotation`` is that of the shape, a quaternion x y z w."""
+    """Return a magnet in the frame of its body; ``rotation`` is the quaternion x y z w of its shape."""
     magnetization = wp.quat_rotate(wp.quat(*rotation), wp.vec3(*magnet.magnetization))
     return replace(magnet, magnetization=tuple(magnetization))
 
 
 def _same_magnet(a: Magnet, b: Magnet) -> bool:
-    """Return whether two magnets of one body have the same material, and the same magnetization up to rounding."""
+    """Return true if two magnets of one body have equal materials, and equal magnetizations up to rounding."""
     if a is b:
         return True
     if replace(a, magnetization=b.magnetization) != b:
@@ -112,15 +116,17 @@ def _same_magnet(a: Magnet, b: Magnet) -> bool:
 
 
 def _number_worlds(model: newton.Model, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of each shape's world among the worlds that hold magnets, and these worlds.
+    """Return the index of each shape's world among the worlds with magnets, and these worlds.
 
-    A model without worlds has the worlds [-1]. A magnet outside all worlds belongs to the world that holds magnets; an
-    error is raised if there are several.
+    A model without worlds has the worlds [-1]. A magnet outside all worlds belongs to the only world with magnets;
+    several worlds raise an error.
     """
     worlds = model.shape_world.numpy()[shapes]
-    held = np.unique(worlds[worlds >= 0])
-    if len(held) > 1 and (worlds < 0).any():
+    magnet_worlds = np.unique(worlds[worlds >= 0])
+    if len(magnet_worlds) > 1 and (worlds < 0).any():
         label = model.shape_label[shapes[int(np.argmax(worlds < 0))]]
-        raise InputError(f"{label}: a magnet outside all worlds, while {len(held)} worlds hold magnets of their own")
-    numbers = np.where(worlds >= 0, np.searchsorted(held, worlds), 0)
-    return numbers, held if len(held) else np.array([-1])
+        raise InputError(
+            f"{label}: a magnet outside all worlds, while {len(magnet_worlds)} worlds hold magnets of their own"
+        )
+    numbers = np.where(worlds >= 0, np.searchsorted(magnet_worlds, worlds), 0)
+    return numbers, magnet_worlds if len(magnet_worlds) else np.array([-1])

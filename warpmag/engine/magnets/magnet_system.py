@@ -1,4 +1,4 @@
-"""The :class:`MomentSystem` of the magnets of a Newton model."""
+"""Builds the :class:`MomentSystem` of the magnets of a Newton model."""
 
 import newton
 import numpy as np
@@ -22,19 +22,19 @@ def make_system(
     method,
     max_evaluations,
 ) -> tuple[MomentSystem, list[int], list[int]]:
-    """Return the system of all moments of the magnets of a model.
+    """Build the system of the moments of all magnets of a model.
 
     Args:
         model: The model.
         magnets: The magnets, in the order of the system.
         settings: Force law, dynamics, contact model, tolerance, external field.
-        curve: Magnetization curve of all inducible magnets; None stands for their own.
+        curve: Magnetization curve of all inducible magnets; None for each magnet's own curve.
         sources: Coils and field maps, as :class:`MomentSystem` takes them.
         method: Summation method of :class:`SolverSettings`.
         max_evaluations: Largest number of field evaluations of a solve.
 
     Returns:
-        The system, the bodies of its couplings, and the bodies of its solids.
+        The system, the body of each of its couplings, and the body of each of its solids.
     """
     counts = [len(magnet.lattice.volumes) for magnet in magnets]
 
@@ -42,11 +42,11 @@ def make_system(
         return np.repeat(np.asarray(values, dtype=dtype), counts)
 
     first = (np.cumsum(counts) - counts).tolist()
-    celled = [(k, magnet) for k, magnet in zip(first, magnets, strict=True) if magnet.lattice.coupling is not None]
+    coupled = [(k, magnet) for k, magnet in zip(first, magnets, strict=True) if magnet.lattice.coupling is not None]
     materials = [magnet.magnet for magnet in magnets]
     flags = model.body_flags  # None in a model without bodies
     kinematic = [] if flags is None else ((flags.numpy() & KINEMATIC) != 0).tolist()
-    # a static magnet counts as a body of its own, behind the bodies of the model
+    # each static magnet counts as a body, numbered after the bodies of the model
     static = np.cumsum([magnet.body < 0 for magnet in magnets]) + model.body_count
     bodies = [magnet.body if magnet.body >= 0 else own for magnet, own in zip(magnets, static.tolist(), strict=True)]
     movable = [magnet.body >= 0 and not kinematic[magnet.body] for magnet in magnets]
@@ -77,29 +77,30 @@ def make_system(
         settings=SolverSettings(
             settings.force, settings.dynamics, settings.contact_model, method, settings.rtol, max_evaluations
         ),
-        couplings=[(k, magnet.lattice.coupling) for k, magnet in celled],
+        couplings=[(k, magnet.lattice.coupling) for k, magnet in coupled],
         solids=[solid for _, solid in solids],
         body_extent=_largest_extent(magnets, moment_bodies, moments_move),
         sources=sources,
         device=model.device,
     )
-    return system, [magnet.body for _, magnet in celled], [body for body, _ in solids]
+    return system, [magnet.body for _, magnet in coupled], [body for body, _ in solids]
 
 
 def _solid_magnet(first: int, magnet: BodyMagnet, movable: bool, part) -> SolidMagnet:
     """Return the record of a part with a closed form. ``first`` is the first moment of its magnet in the system."""
+    # the response of recoil, 3χ/(3 + χ) = 3 (μ − 1)/(μ + 2)
     lattice, response = magnet.lattice, 3.0 - 9.0 / (2.0 + magnet.magnet.recoil_permeability)
     volume, first = float(lattice.volumes[part.first]), first + part.first
     return SolidMagnet(first, part.count, volume, magnet.world, part.reach, part.shape, movable, response)
 
 
 def _largest_extent(magnets: list[BodyMagnet], bodies: np.ndarray, movable: np.ndarray) -> float:
-    """Return an upper bound of the distances of moments in one movable body [m]; 0 if each has one moment."""
+    """Return an upper bound of the distance between moments of a movable body [m]; 0 if each has one moment."""
     if not movable.any():
         return 0.0
     order = np.flatnonzero(movable)[np.argsort(bodies[movable], kind="stable")]
     positions = np.concatenate([magnet.lattice.positions for magnet in magnets])[order]
     bodies = bodies[order]
-    begin = np.flatnonzero(np.diff(bodies, prepend=bodies[0] - 1))
-    low, high = np.minimum.reduceat(positions, begin), np.maximum.reduceat(positions, begin)
+    starts = np.flatnonzero(np.diff(bodies, prepend=bodies[0] - 1))
+    low, high = np.minimum.reduceat(positions, starts), np.maximum.reduceat(positions, starts)
     return float(np.linalg.norm(high - low, axis=1).max())

@@ -58,8 +58,8 @@ class Magnetics:
         magnets: The magnets, in the order of their moments.
         system: The moments on the device.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
-        shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. A volume that shapes of a body share
-            counts for the first of them.
+        shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where
+            shapes of one body overlap, the common volume belongs to the first of them.
     """
 
     @collection_paused()
@@ -88,10 +88,10 @@ class Magnetics:
             contact_model: ``dipole``, or ``multipole``, which adds higher multipoles of balls that nearly touch.
             method: Summation of fields and forces: ``direct`` over all pairs, ``fmm`` by the fast multipole method
                 with an error within ``rtol``, or ``auto`` for the faster one.
-            rtol: Relative magnetization error at which induction ends.
+            rtol: Relative magnetization error at which the induction solve ends.
             external_field: Uniform applied field H0 [A/m], world frame.
-            max_evaluations: Field evaluations after which induction ends without convergence.
-            curve: Magnetization curve of all magnets, as in :func:`warpmag.add_inducible`; by default their own.
+            max_evaluations: Field evaluations after which an unconverged induction solve ends.
+            curve: Magnetization curve of all magnets, see :func:`warpmag.add_inducible`; by default each magnet's own.
             step: Longest time between calls of :meth:`apply` [s]. Drag by eddy currents is limited so that it stops no
                 body within this time.
 
@@ -101,8 +101,8 @@ class Magnetics:
         """
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         if (all_ranks := current_ranks()) is not None:
-            more = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "step": step}
-            all_ranks.check_equal(vars(settings) | more | magnetic_arrays(model), "Magnetics: ")
+            others = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "step": step}
+            all_ranks.check_equal(vars(settings) | others | magnetic_arrays(model), "Magnetics: ")
         settings.check("Magnetics")
         check_positive("Magnetics: step", step)
         if curve is not None:
@@ -111,12 +111,12 @@ class Magnetics:
         self._model, self._values = model, ModelValues(model, measured=isinstance(curve, MagnetizationCurve))
         self._sources = ModelSources(model, self._worlds)
         self._induced = False
-        self.system, celled, solid = make_system(
+        self.system, coupled_bodies, solid_bodies = make_system(
             model, self.magnets, settings, sources=self._sources.applied, curve=curve,
             method=method, max_evaluations=max_evaluations,
         )  # fmt: skip
-        self._celled, self._solid_bodies = (
-            wp.array(bodies, dtype=wp.int32, device=model.device) for bodies in (celled, solid)
+        self._coupled_bodies, self._solid_bodies = (
+            wp.array(bodies, dtype=wp.int32, device=model.device) for bodies in (coupled_bodies, solid_bodies)
         )
         self._sources.bind(self.system)
         self._map_bodies()
@@ -129,7 +129,7 @@ class Magnetics:
 
     @property
     def rtol(self) -> float:
-        """Relative magnetization error at which induction ends."""
+        """Relative magnetization error at which the induction solve ends."""
         return self.system.rtol
 
     @property
@@ -158,19 +158,19 @@ class Magnetics:
         return self.system.eddy is not None
 
     def field_error(self) -> float:
-        """Return the relative error of the last field by the fast multipole method; 0 without that method.
+        """Return the relative error of the last field that the fast multipole method summed; 0 for direct sums.
 
         The reference is the sum over all pairs at 256 random magnets. Waits for the device.
         """
         return self.system.field_error()
 
     def _map_bodies(self) -> None:
-        """Copy to the device which moments belong to each body and to each shape."""
+        """Copy the moments of each body and each shape to the device."""
         device = self._model.device
         lattices, magnets = [magnet.lattice for magnet in self.magnets], [magnet.magnet for magnet in self.magnets]
         counts = [len(lattice.volumes) for lattice in lattices]
         run_body = np.array([magnet.body for magnet in self.magnets])
-        body, permanent = np.repeat(run_body, counts), np.repeat([magnet.fixed for magnet in magnets], counts)
+        body, fixed = np.repeat(run_body, counts), np.repeat([magnet.fixed for magnet in magnets], counts)
         self._volumes = np.concatenate([lattice.volumes for lattice in lattices])
         self.shapes = np.concatenate([magnet.shapes for magnet in self.magnets])
         shape_counts = np.concatenate([lattice.counts for lattice in lattices])
@@ -184,7 +184,7 @@ class Magnetics:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
         self._body_moments = moments = BodyMoments()
-        moments.body, moments.permanent = put(body, wp.int32), put(permanent, wp.bool)
+        moments.body, moments.permanent = put(body, wp.int32), put(fixed, wp.bool)
         moments.local_positions = put(np.concatenate([lattice.positions for lattice in lattices]), wp.vec3)
         moments.volumes, moments.shape = put(self._volumes, float), put(np.repeat(self.shapes, shape_counts), wp.int32)
         moments.shape_frames = self._model.shape_transform
@@ -197,15 +197,15 @@ class Magnetics:
         moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
         moments.kinematic_flag = KINEMATIC
 
-        self._parts = np.concatenate([[0], np.cumsum(shape_counts)])
+        self._first_moments = np.concatenate([[0], np.cumsum(shape_counts)])
         volume = np.concatenate([[0.0], np.cumsum(self._volumes)])
-        self.shape_volumes = np.diff(volume[self._parts])
-        self._part_start = put(self._parts, wp.int32)
-        self._totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=device)
+        self.shape_volumes = np.diff(volume[self._first_moments])
+        self._first_moments_on_device = put(self._first_moments, wp.int32)
+        self._shape_totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=device)
         self._newton_world = put(np.maximum(self._worlds, 0)[self.system.worlds], wp.int32)
-        fixed = [magnet.magnet.kind == "permanent" for magnet in self.magnets for _ in magnet.shapes]
+        permanent = [magnet.magnet.kind == "permanent" for magnet in self.magnets for _ in magnet.shapes]
         shape_body = self._model.shape_body.numpy()
-        shapes = self.shapes[np.array(fixed)]
+        shapes = self.shapes[np.array(permanent)]
         shapes = shapes[np.argsort(shape_body[shapes], kind="stable")]
         self._permanent_shapes, self._permanent_list = shapes, put(shapes, wp.int32)
         self._permanent_bodies = shape_body[shapes]
@@ -224,7 +224,7 @@ class Magnetics:
         self.add_forces(state)
 
     def induce(self, state: newton.State) -> None:
-        """Bring the inducible magnets to equilibrium at the poses of ``state``, from their last magnetizations."""
+        """Solve the induction at the poses of ``state``, starting from the last magnetizations."""
         values, system = self._values, self.system
         self._induced = True
         gather_moments(
@@ -233,7 +233,7 @@ class Magnetics:
         )
         values.check(wait=False)
         if self.system.rotations is not None:
-            gather_rotations(state.body_q, self._celled, self.system.rotations)
+            gather_rotations(state.body_q, self._coupled_bodies, self.system.rotations)
         self._sources.gather(state.body_q)
         if len(self._solid_bodies):
             gather_frames(state.body_q, self._solid_bodies, self.system.sources.solid_frames)
@@ -258,7 +258,7 @@ class Magnetics:
             flags: Kinds of changes, as for Newton's solvers. Nothing happens without ``SHAPE_PROPERTIES``.
 
         Raises:
-            InputError: A value is out of range, or the contact model has tables for the old one. Or another attribute
+            InputError: A value is out of range, the contact model has tables for the old value, or another attribute
                 was changed, such as the kind, the curve or the moment spacing of a magnet.
         """
         if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
@@ -270,7 +270,7 @@ class Magnetics:
         moments = np.flatnonzero(affected)
         self.system.set_material(moments, *self._values.material(moment_shapes[moments]))
         self.magnets = [self._with_material(magnet) for magnet in self.magnets]
-        self._values.take()
+        self._values.accept_changes()
 
     def _with_material(self, body_magnet: BodyMagnet) -> BodyMagnet:
         """Return the magnet with the present material of its first shape."""
@@ -279,7 +279,7 @@ class Magnetics:
         return replace(body_magnet, magnet=magnet)
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays that the next step depends on, by name: values set by the user, and the last solution."""
+        """Return the arrays that the next step depends on, by name: values set by the user and the last solution."""
         attributes, system = getattr(self._model, NAMESPACE), self.system
         values = {"magnetization": attributes.magnetization, "strength": attributes.strength}
         values["field"] = system.external_field
@@ -344,7 +344,7 @@ class Magnetics:
         set_magnetization(self._vectors("magnetization", magnetization, (1,)), shapes, self._model, self._body_moments)
 
     def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
-        """Return ``value`` as vectors on the model's device; their number must be one of ``counts``."""
+        """Return ``value`` as an array of vectors on the model's device; its length must be one of ``counts``."""
         if isinstance(value, wp.array):  # values are not read: this may run in a graph capture
             if value.dtype is not wp.vec3 or value.ndim != 1 or value.device != self._model.device:
                 raise InputError(f"{name}: must be a Warp array of vec3 on {self._model.device}")
@@ -367,7 +367,7 @@ class Magnetics:
 
         Args:
             points: The points [m], shape [p, 3], or a Warp array of vectors on the model's device.
-            worlds: World of each point, a number or shape [p]; None stands for the only world with magnets.
+            worlds: World of each point, a number or shape [p]; by default the only world with magnets.
             gradients: Measure gradients as well.
 
         Raises:
@@ -377,11 +377,13 @@ class Magnetics:
         largest = max(float(magnet.lattice.radii.max()) for magnet in self.magnets)
         context = CallContext(self.system.device, self.system.dtype, warp_out=False)
         points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
-        probe = FieldProbe(self.system, len(points), worlds=self._numbers_of(worlds, len(points)), gradients=gradients)
+        probe = FieldProbe(
+            self.system, len(points), worlds=self._world_indices(worlds, len(points)), gradients=gradients
+        )
         wp.copy(probe.points, points)
         return probe
 
-    def _numbers_of(self, worlds, count: int) -> np.ndarray:
+    def _world_indices(self, worlds, count: int) -> np.ndarray:
         """Return the index of each point's world among the worlds with magnets, shape [count]."""
         if worlds is None:
             if len(self._worlds) > 1:
@@ -398,20 +400,21 @@ class Magnetics:
         return np.broadcast_to(np.searchsorted(self._worlds, worlds), count)
 
     def h_field(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
-        """Return the field H [A/m] at points, shape [p, 3]; arguments and errors as :meth:`probe`."""
-        return self._measured(points, worlds).h.numpy()
+        """Return the field H [A/m] at points, shape [p, 3]; see :meth:`probe` for arguments and errors."""
+        return self._measured_probe(points, worlds).h.numpy()
 
     def b_field(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
-        """Return the flux density B [T] at points, also inside bodies, shape [p, 3]; arguments as :meth:`probe`."""
-        return self._measured(points, worlds).b.numpy()
+        """Return the flux density B [T] at points, also inside bodies, shape [p, 3]; see :meth:`probe`."""
+        return self._measured_probe(points, worlds).b.numpy()
 
     def field_gradient(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
-        """Return the gradient ∂H_i/∂x_k [A/m²] at points, shape [p, 3, 3]; arguments as :meth:`probe`."""
-        gradient = self._measured(points, worlds, gradients=True).gradient
+        """Return the gradient ∂H_i/∂x_k [A/m²] at points, shape [p, 3, 3]; see :meth:`probe`."""
+        gradient = self._measured_probe(points, worlds, gradients=True).gradient
         assert gradient is not None
         return gradient.numpy()
 
-    def _measured(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
+    def _measured_probe(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
+        """Return a probe of the points with the present field."""
         if not self._induced:
             raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
         probe = self.probe(points, worlds=worlds, gradients=gradients)
@@ -420,9 +423,9 @@ class Magnetics:
         return probe
 
     def energy(self) -> np.ndarray:
-        """Return the present energy of the magnets of each world [J], shape [worlds]; 0 without magnets.
+        """Return the present energy of the magnets of each world [J], shape [worlds]; 0 for a world without magnets.
 
-        Its negative gradient by positions is the Kelvin force, see :meth:`MomentSystem.energy`.
+        Its negative gradient with respect to positions is the Kelvin force, see :meth:`MomentSystem.energy`.
         """
         self.check_model()
         energies = np.zeros(max(self._model.world_count, 1))
@@ -430,7 +433,7 @@ class Magnetics:
         return energies
 
     def shape_moments(self) -> np.ndarray:
-        """Return the total moment of each magnetic shape [A·m²], world frame, in the order of :attr:`shapes`, [n, 3].
+        """Return the total moment of each magnetic shape [A·m²], world frame, shape [n, 3]; order as in :attr:`shapes`.
 
         Where shapes of one body overlap, the common volume belongs to the first of them. Waits for the device.
         """
@@ -439,11 +442,11 @@ class Magnetics:
 
     def sum_moments(self) -> wp.array:
         """Return :meth:`shape_moments` as a Warp array, which the next call overwrites; capturable in a graph."""
-        sum_moments(self._part_start, self.system.moments, self._totals)
-        return self._totals
+        sum_moments(self._first_moments_on_device, self.system.moments, self._shape_totals)
+        return self._shape_totals
 
     def moments_at(self, state: newton.State) -> np.ndarray:
-        """Return the total moments in equilibrium at a state, without an effect on later steps.
+        """Return the total equilibrium moments at a state; later steps are not affected.
 
         Args:
             state: State with poses ``body_q``.
@@ -468,7 +471,7 @@ class Magnetics:
         start = np.zeros((len(self._volumes), 3))
         inducible = ~self._body_moments.permanent.numpy()
         for part, shape in enumerate(self.shapes.tolist()):
-            rows = slice(self._parts[part], self._parts[part + 1])
+            rows = slice(self._first_moments[part], self._first_moments[part + 1])
             if shape in magnetizations and inducible[rows].all():
                 start[rows] = magnetizations[shape]
         self.system.start_from(wp.array(start, dtype=wp.vec3, device=self._model.device))

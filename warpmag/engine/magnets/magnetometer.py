@@ -26,10 +26,10 @@ class SensorMagnetometer:
         magnetometer.update(state)
         flux_density = magnetometer.flux_density.numpy()
 
-    The readings include the external field and all magnets of the world, those of the sensor's own body too.
+    The readings include the external field and all magnets of the world, also magnets of the sensor's own body.
 
     Attributes:
-        flux_density: Readings B [T] in the frames of the sites, on the device, vectors of shape [s].
+        flux_density: Readings B [T] in the frames of the sites, vectors on the device, shape [s].
         sites: Shape indices of the sites, [s].
     """
 
@@ -48,8 +48,8 @@ class SensorMagnetometer:
         Args:
             model: The model.
             magnetics: Its magnets.
-            sites: Pattern of labels as in a shell, or a list of patterns, or a regular expression for whole labels, or
-                a list of shape indices.
+            sites: Shell pattern of labels, list of patterns, regular expression for whole labels, or list of shape
+                indices.
             noise: Standard deviation of Gaussian noise on each component [T].
             saturation: Largest magnitude of a component of a reading [T].
             seed: Seed of the noise.

@@ -1,8 +1,8 @@
-"""Changes of ``model.warpmag`` after ``Magnetics`` was built.
+"""Detects changes of ``model.warpmag`` after ``Magnetics`` was built.
 
-Magnetizations are read again in every substep. All else in ``model.warpmag`` went into buffers, tables and lattices
-once. The kernel that gathers moments detects a change on the device. The host raises the error, which on a GPU it can
-do later, without a wait.
+Magnetizations are read in every substep. All other attributes are copied once, into buffers, tables and lattices. The
+kernel that gathers moments detects changes on the device. The host raises the error, with a GPU some calls later, so
+that it does not wait.
 """
 
 from typing import Any
@@ -29,20 +29,23 @@ _MODEL_ARRAYS = (
 
 
 def magnetic_arrays(model: newton.Model) -> dict[str, Any]:
-    """Return the arrays that determine the magnets of ``model`` and the forces on them, by names for messages."""
-    own = {name: values for name, values in vars(getattr(model, NAMESPACE)).items() if isinstance(values, wp.array)}
+    """Return the arrays that determine the magnets of ``model`` and their forces, by name for messages."""
+    attributes = {
+        name: values for name, values in vars(getattr(model, NAMESPACE)).items() if isinstance(values, wp.array)
+    }
     meshes = [getattr(mesh, "vertices", None) for mesh in model.shape_source]
     arrays = {name: getattr(model, name) for name in _MODEL_ARRAYS} | {"shape_source": meshes}
-    arrays |= {f"{NAMESPACE}.{name}": values for name, values in own.items()}
+    arrays |= {f"{NAMESPACE}.{name}": values for name, values in attributes.items()}
     return {f"model.{name}": values for name, values in arrays.items()}
 
 
 class ModelValues:
-    """The attributes of a model's magnets, now and when ``Magnetics`` last read them.
+    """The attributes of a model's magnets, and copies as ``Magnetics`` last read them.
 
     Attributes:
-        now, then: Both, for the kernels; ``now`` are arrays of the model.
-        changed: One plus a shape that has changed, or 0, on the device, shape [1].
+        now: Arrays of the model, for the kernels.
+        then: Copies of these arrays when ``Magnetics`` last read them.
+        changed: 1 + the index of a changed shape, or 0, on the device, shape [1].
     """
 
     def __init__(self, model: newton.Model, *, measured: bool):
@@ -50,7 +53,7 @@ class ModelValues:
 
         Args:
             model: The model.
-            measured: Whether all magnets have one measured curve in place of their own curves.
+            measured: True if one measured curve replaces the curves of all magnets.
         """
         self._model, self._measured = model, measured
         self.now, self.then = ShapeMagnets(), ShapeMagnets()
@@ -67,7 +70,7 @@ class ModelValues:
         """Raise :class:`InputError` if the model has changed.
 
         Args:
-            wait: Whether to wait for the device. Otherwise a later call may raise the error.
+            wait: Wait for the device. Otherwise a later call may raise the error.
         """
         device = self.changed.device
         if self._changed_on_host is not self.changed:
@@ -84,44 +87,42 @@ class ModelValues:
             )
 
     def _differing(self, name: str) -> np.ndarray:
-        """Return the magnets among the shapes whose attribute has changed."""
+        """Return the magnetic shapes with a changed value of one attribute."""
         now, then = getattr(self.now, name).numpy(), getattr(self.then, name).numpy()
-        magnet = (self.now.kind.numpy() != NO_MAGNET) | (name == "kind")
-        return np.flatnonzero((now != then) & magnet)
+        is_magnet = (self.now.kind.numpy() != NO_MAGNET) | (name == "kind")
+        return np.flatnonzero((now != then) & is_magnet)
 
     def changed_materials(self) -> np.ndarray:
-        """Return the shapes whose material has changed.
+        """Return the shapes with a changed material.
 
         Raises:
-            InputError: A material is out of range, or an attribute has changed that must not.
+            InputError: A material is out of range, or an attribute changed that must stay constant.
         """
         labels = self._model.shape_label
         for name, row in _COMPARED.items():
             for shape in self._differing(name).tolist():
-                owner = f"{labels[shape]}: {NAMESPACE}.{name}"
+                subject = f"{labels[shape]}: {NAMESPACE}.{name}"
                 if name not in _MATERIAL:
-                    raise InputError(
-                        f"{owner} was changed, and this Magnetics keeps what it was made with: make another"
-                    )
+                    raise InputError(f"{subject} was changed, and its Magnetics cannot follow: make another")
                 if self._measured or self.now.curve.numpy()[shape] >= len(CURVES):
-                    raise InputError(f"{owner} was changed, and a measured curve says what it is")
+                    raise InputError(f"{subject} was changed, but a measured curve determines it")
                 assert row.check is not None, "only tokens have no check"
-                row.check(owner, float(getattr(self.now, name).numpy()[shape]))
+                row.check(subject, float(getattr(self.now, name).numpy()[shape]))
         return np.unique(np.concatenate([self._differing(name) for name in _MATERIAL]))
 
     def material(self, shapes) -> tuple[np.ndarray, np.ndarray]:
-        """Return saturations [A/m] and susceptibilities of shapes, as the model has them now."""
+        """Return the present saturations [A/m] and susceptibilities of shapes."""
         saturation, susceptibility = (
             getattr(self.now, name).numpy()[shapes].astype(float) for name in ("saturation", "susceptibility")
         )
         return saturation, susceptibility
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays of attributes that can change, by name, for a checkpoint."""
+        """Return the arrays of changeable attributes by name, for a checkpoint."""
         return {f"{when}.{name}": getattr(getattr(self, when), name) for when in ("now", "then") for name in _MATERIAL}
 
-    def take(self) -> None:
-        """Copy the values that the model has now."""
+    def accept_changes(self) -> None:
+        """Copy the present values of the model, and clear :attr:`changed`."""
         for name in _COMPARED:
             wp.copy(getattr(self.then, name), getattr(self.now, name))
         self.changed.zero_()

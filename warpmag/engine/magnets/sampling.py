@@ -17,7 +17,7 @@ from warpmag.shapes.solids import boxes_meet
 from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0
-"""Reach of the closed form of a magnet that is a lattice of cells farther away, in cells."""
+"""Distance up to which the closed form of a magnet replaces its lattice of cells, in cell sizes."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class BodyLattice:
         volumes: Volumes [m³], shape [n].
         radii: Radii of the balls over which the fields of moments are averaged [m], shape [n].
         counts: Number of moments of each shape.
-        coupling: Interaction of inducible cells, less that of balls; None for permanent magnets and separate balls.
+        coupling: Interaction of inducible cells minus that of balls; None for permanent magnets and separate balls.
         solids: Closed forms of the near field of a permanent magnet; empty for inducible magnets and balls.
     """
 
@@ -58,7 +58,7 @@ class BodyLattice:
 
 
 class ShapeSampler:
-    """Samples the shapes of one model. Equal shapes, for example of replicated worlds, are sampled once."""
+    """Samples the shapes of one model. Equal shapes, for example in replicated worlds, are sampled once."""
 
     def __init__(self, model: newton.Model):
         """Read the geometry of ``model``."""
@@ -74,12 +74,12 @@ class ShapeSampler:
         """Return the moments of one magnet.
 
         Separate balls are one moment each if ``spacing`` is 0. All other shapes are filled with moments as one solid:
-        a volume that shapes share is counted once, for the first of them.
+        the common volume of overlapping shapes belongs to the first of them.
 
         Args:
             shapes: Shapes of one body, or one static shape.
             spacing: Distance between moments [m]; 0 for automatic.
-            permanent: The moments are fixed. Their fields are averaged over no more than their cells.
+            permanent: The moments are fixed. Their fields are averaged over balls inside their cells.
             closed: Use closed forms of the near field, where the shapes have them.
         """
         key = (spacing, permanent, closed, *self.kinds[shapes].tolist())
@@ -100,16 +100,16 @@ class ShapeSampler:
                 np.ones(len(shapes), dtype=int),
             )
         solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
-        bounds = self._polyhedra(shapes, solids) if closed else []
-        if bounds and permanent and spacing == 0.0:
-            return self._close_up(shapes, solids, bounds)
+        surfaces = self._polyhedra(shapes, solids) if closed else []
+        if surfaces and permanent and spacing == 0.0:
+            return self._sample_closed_forms(shapes, solids, surfaces)
         across = 1 if permanent else lattice.LEAST_ACROSS
         filled = lattice.fill(solids, spacing, across, together=not permanent)
         counts = np.bincount(filled.owners, minlength=len(solids))
         ends, grids = np.cumsum(counts), filled.pieces if permanent else filled.pieces * len(solids)
         parts = tuple(
             ClosedForm(int(end - count), int(count), shape, _REACH * float(grid.sides.max()))
-            for end, count, shape, grid in zip(ends, counts, bounds, grids, strict=bool(bounds))
+            for end, count, shape, grid in zip(ends, counts, surfaces, grids, strict=bool(surfaces))
         )
         if permanent:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
@@ -129,21 +129,23 @@ class ShapeSampler:
             surfaces.append(surface.posed(solid.position, solid.rotation))
         return surfaces
 
-    def _close_up(self, shapes: list[int], solids: list[lattice.Solid], closed: list[Polyhedron]) -> BodyLattice:
-        """Return the moments of permanent boxes and cylinders, which have closed forms of their near fields."""
-        places, volumes, radii, parts, first = [], [], [], [], 0
-        for shape, solid, bound in zip(shapes, solids, closed, strict=True):
+    def _sample_closed_forms(
+        self, shapes: list[int], solids: list[lattice.Solid], surfaces: list[Polyhedron]
+    ) -> BodyLattice:
+        """Return the moments of permanent boxes and cylinders, with closed forms of their near fields."""
+        positions, volumes, radii, parts, first = [], [], [], [], 0
+        for shape, solid, surface in zip(shapes, solids, surfaces, strict=True):
             scale = self._scales[shape]
             box = self._types[shape] == newton.GeoType.BOX
             moments = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
-            places.append(solid.to_body(moments.places))
+            positions.append(solid.to_body(moments.places))
             volumes.append(moments.volumes)
             radii.append(np.minimum(0.5 * np.cbrt(moments.volumes), moments.depths))
-            parts.append(ClosedForm(first, len(moments.volumes), bound, moments.reach))
+            parts.append(ClosedForm(first, len(moments.volumes), surface, moments.reach))
             first += len(moments.volumes)
         counts = np.array([part.count for part in parts])
         return BodyLattice(
-            np.concatenate(places), np.concatenate(volumes), np.concatenate(radii), counts, solids=tuple(parts)
+            np.concatenate(positions), np.concatenate(volumes), np.concatenate(radii), counts, solids=tuple(parts)
         )
 
     def _are_balls_apart(self, shapes: list[int]) -> bool:
@@ -174,7 +176,7 @@ class ShapeSampler:
 
 
 def _number_sources(sources: list) -> list[int]:
-    """Return a number for each source: 0 for None, and the same for meshes of equal points and triangles."""
+    """Return a number for each geometry source: 0 for None, equal for meshes of equal points and triangles."""
     number_of_contents: dict[Any, int] = {}
     number_of_object: dict[int, int] = {id(None): 0}
     for source in sources:
@@ -187,10 +189,10 @@ def _number_sources(sources: list) -> list[int]:
 
 
 def _within_range(sampled: BodyLattice) -> BodyLattice:
-    """Return ``sampled``; raise :class:`InputError` if single precision does not hold its radii."""
+    """Return ``sampled``; raise :class:`InputError` if its radii are out of range for single precision."""
     (least, most), radii = RADIUS_RANGE[wp.float32], sampled.radii
     if not ((radii >= least) & (radii <= most)).all():
         raise InputError(
-            f"its moments have radii of {radii.min():.3g} to {radii.max():.3g} m, not of {least:g} to {most:g}"
+            f"its moments have radii of {radii.min():.3g} to {radii.max():.3g} m, must be {least:g} to {most:g}"
         )
     return sampled

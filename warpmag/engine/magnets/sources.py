@@ -21,18 +21,18 @@ _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 
 class ModelSources:
-    """The sources of fields of a model.
+    """The field sources of a model.
 
     Args:
         model: The model.
-        held: Worlds that hold magnets, [-1] for a model without worlds.
+        magnet_worlds: Worlds with magnets, [-1] for a model without worlds.
 
     Attributes:
         shapes: Shapes that represent sources, in the order of ``applied``.
         applied: The sources as a :class:`MomentSystem` takes them.
     """
 
-    def __init__(self, model: newton.Model, held: np.ndarray):
+    def __init__(self, model: newton.Model, magnet_worlds: np.ndarray):
         """Read the sources from the attributes of the model.
 
         Raises:
@@ -44,7 +44,7 @@ class ModelSources:
         bodies, worlds, flags = model.shape_body.numpy(), model.shape_world.numpy(), model.body_flags
         records: dict[str, SourceRecord] = {}
         for shape in [shape for shape, text in enumerate(texts) if text]:
-            world = _world_of(model.shape_label[shape], int(worlds[shape]), bodies[shape] >= 0, held)
+            world = _world_of(model.shape_label[shape], int(worlds[shape]), bodies[shape] >= 0, magnet_worlds)
             if world is None:
                 continue
             record = records.setdefault(texts[shape], SourceRecord.from_text(texts[shape]))
@@ -87,19 +87,19 @@ class ModelSources:
             frames, wrenches = self._system.sources.frames, self._system.source_interaction.wrenches
             add_reactions(self._shapes, self._model, state, frames, wrenches)
 
-    def set_strength(self, name: str, which: int | str, value) -> None:
+    def set_strength(self, name: str, selector: int | str, value) -> None:
         """Set the strengths of some sources.
 
         Args:
             name: Name of the argument, for messages.
-            which: A shape, or a pattern of labels.
+            selector: A shape index, or a shell pattern of labels.
             value: One strength for all matching sources, or one for each, in the order of their shapes.
         """
-        if not isinstance(which, str):
-            check_whole(name, which)
-        if which not in self._matches:
-            self._matches[which] = self._matching(name, which)
-        shapes = self._matches[which]
+        if not isinstance(selector, str):
+            check_whole(name, selector)
+        if selector not in self._matches:
+            self._matches[selector] = self._matching(name, selector)
+        shapes = self._matches[selector]
         if isinstance(value, wp.array):
             if value.dtype is not wp.float32 or value.ndim != 1 or value.device != self._model.device:
                 raise InputError(f"{name}: must be a Warp array of float32 on {self._model.device}")
@@ -112,32 +112,34 @@ class ModelSources:
                 raise InputError(f"{name}: shape must be [] or [{len(shapes)}], got {list(numbers.shape)}")
             values = wp.array(numbers, dtype=wp.float32, device=self._model.device)
         if len(values) not in (1, len(shapes)):
-            raise InputError(f"{name}: must be 1 or {len(shapes)} numbers, for so many sources, got {len(values)}")
+            raise InputError(f"{name}: must be 1 or {len(shapes)} numbers, one for each source, got {len(values)}")
         set_strengths(values, shapes, self._shapes.strengths)
 
-    def _matching(self, name: str, which: int | str) -> wp.array:
+    def _matching(self, name: str, selector: int | str) -> wp.array:
         """Return the shapes of the matching sources, on the device."""
         labels = self._model.shape_label
-        if isinstance(which, str):
-            matches = re.compile(fnmatch.translate(which)).match
+        if isinstance(selector, str):
+            matches = re.compile(fnmatch.translate(selector)).match
             shapes = [shape for shape in self.shapes if matches(labels[shape])]
         else:
-            shapes = [shape for shape in self.shapes if shape == which]
+            shapes = [shape for shape in self.shapes if shape == selector]
         if not shapes:
-            raise InputError(f"{name}: {short_repr(which)} is no source of the model")
+            raise InputError(f"{name}: {short_repr(selector)} is no source of the model")
         return wp.array(shapes, dtype=wp.int32, device=self._model.device)
 
 
-def _world_of(label: str, world: int, on_body: bool, held: np.ndarray) -> int | None:
-    """Return the index of a source's world among those that hold magnets.
+def _world_of(label: str, world: int, on_body: bool, magnet_worlds: np.ndarray) -> int | None:
+    """Return the index of a source's world among the worlds with magnets.
 
-    -1 means all of these worlds, None that the source acts on no magnet. A source outside all worlds acts in all of
-    them; on a body it can do so only if one world holds magnets.
+    -1 stands for all of these worlds, None for a source without magnets in its world. A source outside all worlds acts
+    in all of them. If the source is on a body, only one world may have magnets.
     """
-    if world >= 0 and held[0] >= 0:
-        return int(np.searchsorted(held, world)) if world in held else None
+    if world >= 0 and magnet_worlds[0] >= 0:
+        return int(np.searchsorted(magnet_worlds, world)) if world in magnet_worlds else None
     if world >= 0:
         raise InputError(f"{label}: a source of fields in a world, while the magnets are outside all worlds")
-    if len(held) > 1 and on_body:
-        raise InputError(f"{label}: a source on a body outside all worlds, while {len(held)} worlds hold magnets")
-    return 0 if len(held) == 1 else -1
+    if len(magnet_worlds) > 1 and on_body:
+        raise InputError(
+            f"{label}: a source on a body outside all worlds, while {len(magnet_worlds)} worlds hold magnets"
+        )
+    return 0 if len(magnet_worlds) == 1 else -1

@@ -1,6 +1,6 @@
-"""Magnets, coils and field maps of a stage that a program imports with Newton's own ``builder.add_usd``.
+"""Imports magnets, coils and field maps of a stage with Newton's own ``builder.add_usd``.
 
-Newton calls back with prims. ``warpmag.usd`` turns each into a record; nothing here looks into a prim.
+Newton calls the functions here with prims, and ``warpmag.usd`` reads them.
 """
 
 from collections.abc import Iterable
@@ -11,18 +11,18 @@ import numpy as np
 import warp as wp
 
 from warpmag.engine.magnets.attributes import NAMESPACE, declare_attributes, stored_values
-from warpmag.engine.magnets.declared_magnets import axis_turn, in_shape_frame
+from warpmag.engine.magnets.declared_magnets import axis_rotation, in_shape_frame
 from warpmag.engine.magnets.declared_sources import add_placed_source
 from warpmag.errors import InputError
 
 
 def register_custom_attributes(builder: newton.ModelBuilder) -> None:
-    """Declare the attributes that magnets are stored in; call it before :func:`add_inducible` and friends.
+    """Declare the attributes of magnets and sources; call it before the functions that add them.
 
     Newton's solvers have class methods of this name; ``register_attributes`` is the same function.
 
     Newton's ``builder.add_usd(stage)`` then imports the magnets, coils and field maps of a stage, too. Magnets are
-    colliders, or their rigid bodies, with ``WarpmagMagnetAPI``; attributes that are not authored have their defaults.
+    colliders, or their rigid bodies, with ``WarpmagMagnetAPI``; unauthored attributes have their default values.
 
     Args:
         builder: The builder; declaring twice does nothing.
@@ -45,27 +45,27 @@ register_attributes = register_custom_attributes
 
 
 def _attribute_value(_, context: dict[str, Any]) -> Any:
-    """Return the value of one attribute for the shape of a prim, None where that is no magnet."""
+    """Return the value of one attribute for the shape of a prim, None if the shape is not a magnet."""
     from warpmag.usd import collider_magnet  # noqa: PLC0415 - a builder can do without USD
 
     collider = collider_magnet(context["prim"])
     if collider is None:
         return None
-    turn = axis_turn(collider.axis)
+    rotation = axis_rotation(collider.axis)
     if collider.frames:
-        magnet_turn, shape_turn = (_transform(matrix).q for matrix in collider.frames)
-        turn = wp.quat_inverse(magnet_turn) * shape_turn * turn
-    return stored_values(in_shape_frame(collider.magnet, turn))[context["attr"].name]
+        magnet_rotation, shape_rotation = (_transform(matrix).q for matrix in collider.frames)
+        rotation = wp.quat_inverse(magnet_rotation) * shape_rotation * rotation
+    return stored_values(in_shape_frame(collider.magnet, rotation))[context["attr"].name]
 
 
 def _transform(matrix: np.ndarray) -> wp.transform:
-    """Return the transform of a matrix for row vectors, as Newton reads it from a prim."""
+    """Return the transform of a matrix for row vectors, with the scale removed as in Newton's import."""
     position, rotation, _ = wp.transform_decompose(wp.mat44(matrix.astype(np.float32).T))
     return wp.transform(position, rotation)
 
 
 def _is_source(prim: Any, _) -> bool:
-    """Return whether a prim is a coil or a field map."""
+    """Return true if a prim is a coil or a field map."""
     from warpmag.usd import is_source  # noqa: PLC0415 - a builder can do without USD
 
     return is_source(prim)
@@ -75,7 +75,7 @@ def _add_sources(prim: Any, context: dict[str, Any]) -> Iterable[dict[str, Any]]
     """Add the coil and the field map of a prim to the builder.
 
     Returns:
-        No rows of attributes: the sources are sites.
+        No attribute rows, since the sources are sites.
 
     Raises:
         InputError: A source is invalid, or on a body that Newton has not imported.
@@ -86,9 +86,9 @@ def _add_sources(prim: Any, context: dict[str, Any]) -> Iterable[dict[str, Any]]
     bodies = imported["path_body_map"]
     for source in placed_sources(prim):
         if source.body is not None and source.body not in bodies:
-            raise InputError(f"{source.prim}: on {source.body}, of which Newton imports no body")
+            raise InputError(f"{source.prim}: is on {source.body}, which Newton does not import as a body")
         anchor = source.body or next(iter(bodies), None)
-        if anchor is None:  # nothing that moves: only the axes may have been turned
+        if anchor is None:  # a stage without bodies: only the up axis may differ
             stage = wp.transform((0.0, 0.0, 0.0), newton.math.quat_between_axes(imported["up_axis"], builder.up_axis))
         else:
             pose = wp.transform(*builder.body_q[bodies[anchor]])

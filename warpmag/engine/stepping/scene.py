@@ -13,7 +13,7 @@ from warpmag.declarations.keys import Keys, SceneKeys
 from warpmag.declarations.magnets import Magnet, StageMagnets
 from warpmag.engine.magnets.attributes import declare_attributes, mark_shapes
 from warpmag.engine.magnets.balls import copy_ball
-from warpmag.engine.magnets.declared_magnets import axis_turn, in_shape_frame, magnet_shapes
+from warpmag.engine.magnets.declared_magnets import axis_rotation, in_shape_frame, magnet_shapes
 from warpmag.engine.magnets.declared_sources import add_placed_source
 from warpmag.engine.stepping.drawn import StageBuilder
 from warpmag.errors import InputError
@@ -220,8 +220,8 @@ def _mark_magnets(
             raise InputError(f"{prim}: Newton imports neither body nor shape of this magnet")
         covered[prim] = builder.as_drawn(covered[prim])
         for shape in covered[prim]:
-            turn = _shape_turn(builder, stage, prim, shape, bodies)
-            mark_shapes(builder, [shape], in_shape_frame(magnet, turn))
+            rotation = _shape_rotation(builder, stage, prim, shape, bodies)
+            mark_shapes(builder, [shape], in_shape_frame(magnet, rotation))
     return covered
 
 
@@ -234,8 +234,8 @@ def _scene_keys(
         return keys.in_seconds(clock.start, clock.time_codes_per_second)
 
     def in_shape(keys: Keys, prim: str, shape: int) -> Keys:
-        turn = np.array(wp.quat_to_matrix(_shape_turn(builder, stage, prim, shape, bodies))).reshape(3, 3)
-        return replace(keys, values=keys.values @ turn)
+        rotation = np.array(wp.quat_to_matrix(_shape_rotation(builder, stage, prim, shape, bodies))).reshape(3, 3)
+        return replace(keys, values=keys.values @ rotation)
 
     motions = {bodies[prim]: in_seconds(motion) for prim, motion in contents.motions.items()}
     magnetizations = {
@@ -247,9 +247,9 @@ def _scene_keys(
     return SceneKeys(motions, magnetizations, currents, contents.field_keys and in_seconds(contents.field_keys))
 
 
-def _shape_turn(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
+def _shape_rotation(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
     """Return the rotation of a shape's frame from the frame of its magnet prim."""
-    return builder.shape_transform[shape].q if prim in bodies else axis_turn(shape_axis(stage, prim))
+    return builder.shape_transform[shape].q if prim in bodies else axis_rotation(shape_axis(stage, prim))
 
 
 def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> dict[int, Keys]:
