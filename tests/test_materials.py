@@ -70,11 +70,11 @@ def test_bodies_of_named_materials():
 @pytest.mark.parametrize(
     "magnet,message",
     [
-        ({"material": "adamantium"}, "'adamantium' is no inducible material known here, which are iron,"),
+        ({"material": "adamantium"}, "'adamantium' is no inducible material; known are iron,"),
         ({"material": "N42"}, "'N42' is no inducible material"),
         ({"material": "iron", "magnetization": (0.0, 0.0, 1.0)}, "'iron' is no permanent material"),
         ({"material": "N42", "magnetization": (0.0, 0.0, 0.0)}, "must have a direction"),
-        ({"material": "iron", "saturation": 1e6}, "'iron' says what saturation"),
+        ({"material": "iron", "saturation": 1e6}, "'iron' sets saturation"),
     ],
 )
 def test_bad_materials_are_refused(magnet, message):

@@ -320,13 +320,13 @@ def test_units_and_quantities_of_a_file(tmp_path):
 @pytest.mark.parametrize(
     "text,message",
     [
-        ("0,0\n1000,1.2\n", "its first line must say what the two columns are"),
-        ("H [A/m], B [furlong]\n0,0\n", "B in furlong is not known, only in T, mT, G, kG"),
+        ("0,0\n1000,1.2\n", "the first line must name the two columns"),
+        ("H [A/m], B [furlong]\n0,0\n", "unknown unit furlong of B; known are T, mT, G, kG"),
         ("B [T], H [A/m]\n0,0\n", "the first column must be H"),
         ("H [A/m], B [T]\n0,0\n1000,x\n", "not a number"),
         ("H [A/m], B [T]\n0,0\n1000,1.2,3\n", "not a number|two numbers"),
         ("H [A/m], B [T]\n", "two numbers"),
-        ("", "its first line"),
+        ("", "the first line"),
     ],
 )
 def test_bad_files_are_refused_by_name(tmp_path, text, message):
@@ -387,10 +387,10 @@ def test_two_curves_in_one_model(how, device):
 @pytest.mark.parametrize(
     "magnet,message",
     [
-        ({"material": "M-19", "saturation": 1e6}, "material: 'M-19' says what saturation"),
-        ({"material": "M-19", "curve": "tanh"}, "material: 'M-19' says what curve"),
-        ({"material": "iron", "curve": "M-19"}, "material: 'iron' says what curve"),
-        ({"curve": "M-19", "susceptibility": 9.0}, "curve: it says what susceptibility"),
+        ({"material": "M-19", "saturation": 1e6}, "material: 'M-19' sets saturation"),
+        ({"material": "M-19", "curve": "tanh"}, "material: 'M-19' sets curve"),
+        ({"material": "iron", "curve": "M-19"}, "material: 'iron' sets curve"),
+        ({"curve": "M-19", "susceptibility": 9.0}, "curve: a measured curve sets susceptibility"),
         ({"curve": "M-18"}, "curve: 'M-18' is not one of"),
     ],
 )

@@ -19,22 +19,22 @@ if not (_FOLDER / "kernels").exists():  # in a checkout kernels and scenes_usd a
     __path__.append(str(_FOLDER.parent))
 
 
-def _homes() -> dict[str, str]:
+def _public_modules() -> dict[str, str]:
     """Return the module of each public name, from the stub beside this file."""
     stub = ast.parse((_FOLDER / "__init__.pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     return {alias.name: node.module or "" for node in imports for alias in node.names}
 
 
-_HOMES = _homes()
-__all__ = sorted(_HOMES)
+_MODULES = _public_modules()
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name):
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with collection_paused():  # Newton and Warp make very many objects
-        return getattr(import_module(_HOMES[name]), name)
+    with collection_paused():  # importing Newton and Warp creates very many objects
+        return getattr(import_module(_MODULES[name]), name)
 
 
 def __dir__():

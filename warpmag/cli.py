@@ -17,11 +17,11 @@ from warpmag.progress import Progress
 from warpmag.terminal import Stopped, collection_paused, open_standard_files, quiet_warp, signals_raised, silence, tell
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
-"""Exit codes. 0 is success; ``STOPPED`` plus its number stands for a signal that ended the command."""
+"""Exit codes. 0 is success. A command ended by a signal exits with ``STOPPED`` plus the signal's number."""
 
 _VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
-_STAYING = ("viser", "rerun")
-"""Viewers that a browser shows only while the command runs."""
+_BROWSER_VIEWERS = ("viser", "rerun")
+"""Viewers in a browser, which show the scene only while the command runs."""
 _OUTPUT_FOLDER = Path("warpmag_out")
 
 
@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         tell(error)
         return BAD_INPUT
-    code, line = _do(arguments, all_ranks)
+    code, line = _execute(arguments, all_ranks)
     if line and all_ranks is not None:
         all_ranks.fail(line, code, tell)
     elif line:
@@ -62,14 +62,14 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def _do(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]:
-    """Run the command; return its exit code and an error line, empty on success."""
+def _execute(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]:
+    """Run the command and return its exit code and an error line, which is empty on success."""
     try:
         with signals_raised():
             options = _parser().parse_args(arguments)
             if not is_first_rank(all_ranks):
                 if options.command is not _run:
-                    return 0, ""  # only a run is shared among ranks
+                    return 0, ""  # ranks share the command 'run' only
                 silence(1)
             with contextlib.nullcontext() if options.command is _run else without_ranks():
                 code = options.command(options)
@@ -126,7 +126,7 @@ def _add_run(commands) -> None:
     run.add_argument(
         "--preset",
         choices=PRESETS,
-        help="force law, dynamics and all curves of this library, of Kim and Han 2022, or of Kim et al. 2018",
+        help="force law, dynamics, and curve of all magnets: from this library, Kim and Han 2022, or Kim et al. 2018",
     )
     run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
     run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
@@ -138,7 +138,7 @@ def _add_run(commands) -> None:
         action=_Method,
         default=METHODS[0],
         metavar=f"{{{','.join(METHODS)}}}",
-        help="summation over all pairs, by the fast multipole method, or by the faster one (default: %(default)s)",
+        help="sums by the faster method, over all pairs, or by the fast multipole method (default: %(default)s)",
     )
     run.add_argument("--sums", dest="method", action=_Method, default=METHODS[0], help=argparse.SUPPRESS)
     run.add_argument(
@@ -163,11 +163,11 @@ def _add_render(commands) -> None:
     render = commands.add_parser("render", help="draw frames of a stage or of a finished run")
     render.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
     render.add_argument("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
-    several = render.add_mutually_exclusive_group()
-    several.add_argument(
+    frames = render.add_mutually_exclusive_group()
+    frames.add_argument(
         "--frame", type=int, metavar="N", help="number of the frame to draw, 0 for the start (default: the last)"
     )
-    several.add_argument("--frames", metavar="A:B", help="first and last frame to draw (default for a film: all)")
+    frames.add_argument("--frames", metavar="A:B", help="first and last frame to draw (default for a film: all)")
     render.add_argument("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
     render.add_argument(
         "--quality",
@@ -226,10 +226,10 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
     if name in (*scenes, *MADE) and not os.path.isfile(path):
         if balls is None and name in scenes:
             return scenes[name], True
-        made = on_first_rank(lambda: make(name, folder, balls), current_ranks())
+        generated = on_first_rank(lambda: make(name, folder, balls), current_ranks())
         if is_first_rank(current_ranks()):
-            tell(f"scene: {made}")
-        return made, False
+            tell(f"scene: {generated}")
+        return generated, False
     if not os.path.exists(path) and not path.suffix:
         raise InputError(f"{name}: no such file and no bundled scene (bundled: {', '.join((*scenes, *MADE))})")
     if balls is not None:
@@ -256,9 +256,9 @@ def _check(options) -> int:
     sources = [source for placed in contents.sources.values() for source in placed]
     currents = sum(source.currents is not None for source in sources)
     if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
-        more = f", {currents} currents" if currents else ""
-        more += ", the external field" if contents.field_keys else ""
-        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{more}")
+        others = f", {currents} currents" if currents else ""
+        others += ", the external field" if contents.field_keys else ""
+        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{others}")
     if sources:
         kinds = [type(source.source).__name__ for source in sources]
         print(f"sources     {kinds.count('Coil')} coils, {kinds.count('FieldMap')} field maps")
@@ -288,7 +288,7 @@ def _load(path: Path, **options):
 
 
 def _start_warp(path: Path) -> None:
-    """Initialize Warp, and print a line on a terminal. Call it before the engine is imported."""
+    """Initialize Warp; on a terminal, print that the stage is loading. Call this before the engine is imported."""
     quiet_warp()
     if sys.stderr.isatty():
         print(f"{path.stem}: loading (the first run compiles kernels for a minute or two)", file=sys.stderr)
@@ -303,7 +303,7 @@ def _render(options) -> int:
         if options.frames or options.moments:
             raise InputError("quality: 'final' draws one frame without moments; 'warpmag export --arrows' draws them")
         print(
-            f"written {render_final(path, options.output, frame=options.frame, size=_two('size', options.size, 'x'))}"
+            f"written {render_final(path, options.output, frame=options.frame, size=_pair('size', options.size, 'x'))}"
         )
         return 0
     from warpmag.show.ray_tracing import render  # noqa: PLC0415
@@ -312,8 +312,8 @@ def _render(options) -> int:
         path,
         options.output,
         frame=options.frame,
-        frames=_two("frames", options.frames, ":") if options.frames is not None else None,
-        size=_two("size", options.size, "x"),
+        frames=_pair("frames", options.frames, ":") if options.frames is not None else None,
+        size=_pair("size", options.size, "x"),
         moments=options.moments,
         device=options.device,
     )
@@ -321,11 +321,11 @@ def _render(options) -> int:
     return 0
 
 
-def _two(name: str, text: str, between: str) -> tuple[int, int]:
+def _pair(name: str, text: str, separator: str) -> tuple[int, int]:
     """Return the two whole numbers of an argument, such as 960x540."""
-    parts = text.lower().split(between)
+    parts = text.lower().split(separator)
     if len(parts) != 2 or not all(part.isdecimal() and len(part) < 10 for part in parts):
-        raise InputError(f"{name}: must be two whole numbers such as 10{between}20, got {text!r:.40}")
+        raise InputError(f"{name}: must be two whole numbers such as 10{separator}20, got {text!r:.40}")
     return int(parts[0]), int(parts[1])
 
 
@@ -347,7 +347,7 @@ def _run(options) -> int:
     if options.rtol is not None:
         check_rtol("rtol", options.rtol)
     if options.viewer != "none" and current_ranks() is not None:
-        raise InputError("viewer: not with several ranks")
+        raise InputError("viewer: a run with several ranks cannot have one")
     folder = Path(options.output).parent if options.output else _OUTPUT_FOLDER
     path, is_bundled = _find_scene(options.scene, options.balls, folder)
     display, resume = None, options.resume
@@ -383,8 +383,8 @@ def _simulation_of(path: Path, options):
 def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, resume: bool) -> None:
     """Run to the end, or until the viewer restarts or closes, and print the summary."""
     output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
-    known = simulation.warnings()
-    _warn(known)
+    warnings = simulation.warnings()
+    _warn(warnings)
     progress = Progress(simulation.frames_of(options.frames))
 
     def show(frame: int) -> bool:
@@ -410,10 +410,10 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
         with without_ranks():
             export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
         print(f"to render      {rendered}")
-    _warn([line for line in simulation.warnings() if line not in known])
+    _warn([line for line in simulation.warnings() if line not in warnings])
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
-    if display is not None and options.viewer in _STAYING and display.viewer.is_running():
+    if display is not None and options.viewer in _BROWSER_VIEWERS and display.viewer.is_running():
         tell(f"the {options.viewer} viewer shows the last frame until Ctrl-C")
         display.stay()
 
@@ -432,7 +432,7 @@ def _open_display(name: str, simulation):
 
     try:
         viewer = getattr(newton.viewer, _VIEWERS[name])()
-    except Exception as error:  # each viewer fails in its own way
+    except Exception as error:  # viewers raise errors of many types
         raise no_viewer(name, error) from None
     display = Display(viewer, simulation.model, simulation.magnetics)
     display.allow_restart()

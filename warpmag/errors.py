@@ -6,13 +6,13 @@ _BEGIN, _END = 400, 200
 
 def one_line(text: str) -> str:
     """Return ``text`` as one line of printable characters, without its middle if it is very long."""
-    if len(text) > _BEGIN + _END:  # cut first: a gigabyte as single characters does not fit into memory
+    if len(text) > _BEGIN + _END:  # cut first: a list of a gigabyte's characters would exhaust memory
         text = f"{text[:_BEGIN]} ... {text[-_END:]}"
     return "".join(character if character.isprintable() else " " for character in text)
 
 
 def extra(name: str) -> str:
-    """Return the name of an extra with the commands that install it, for an error message."""
+    """Return the name of an extra of the package and the commands that install it, for an error message."""
     return f"the extra '{name}' (in a checkout pip install '.[{name}]', or uv run --extra {name} ...)"
 
 

@@ -6,10 +6,10 @@ from warpmag.terminal import silence
 
 
 class Progress:
-    """A progress bar on stderr. It appears with the first frame, so that errors in the input stand alone."""
+    """A progress bar on stderr. It appears with the first frame, after errors of the input."""
 
     def __init__(self, frames: int):
-        """Make a bar for a number of frames."""
+        """Prepare a bar for ``frames`` frames."""
         self.frames, self.done = frames, None
         self._bar = None
 

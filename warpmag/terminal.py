@@ -1,4 +1,4 @@
-"""The process: its standard files, the signals that end it, and Python's garbage collection."""
+"""Standard files, signals and garbage collection of the process."""
 
 import contextlib
 import gc
@@ -14,7 +14,7 @@ class Stopped(KeyboardInterrupt):
     """A signal that ends the command."""
 
     def __init__(self, number: int):
-        """Name the signal ``number``."""
+        """Store the signal's number, and name the signal in the message."""
         self.number = number
         super().__init__("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
 
@@ -37,28 +37,28 @@ def signals_raised() -> Iterator[None]:
     def stop(number, _):
         raise Stopped(number)
 
-    ends = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
-    before = {}
+    ending = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    replaced = {}
     if threading.current_thread() is threading.main_thread():
-        before = {number: handler for number, handler in ends.items() if signal.getsignal(number) == handler}
-    for number in before:
+        replaced = {number: handler for number, handler in ending.items() if signal.getsignal(number) == handler}
+    for number in replaced:
         signal.signal(number, stop)
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in replaced.items():
             signal.signal(number, handler)
 
 
 def silence(descriptor: int) -> None:
-    """Redirect a standard file to the null device, for what Python writes when it exits as well."""
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, descriptor)
-    os.close(nothing)
+    """Redirect a standard file to the null device, including output that Python flushes at exit."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, descriptor)
+    os.close(null)
 
 
 def tell(message) -> None:
-    """Print a line on stderr; a closed stderr is no error."""
+    """Print a line on stderr. A closed stderr raises no error."""
     try:
         print(f"warpmag: {message}", file=sys.stderr, flush=True)
     except OSError:
@@ -70,7 +70,7 @@ def quiet_warp() -> None:
     import warp  # noqa: PLC0415
 
     warp.config.log_level = warp.LOG_ERROR
-    warp.config.enable_backward = False  # no gradients are used, and they double the time to compile
+    warp.config.enable_backward = False  # gradients are not used, and double the compile time
     with _without_lines("Could not find or load the NVIDIA CUDA driver", "no CUDA-capable device is detected"):
         warp.init()
 
@@ -95,7 +95,7 @@ def _without_lines(*texts: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def collection_paused() -> Iterator[None]:
-    """Pause Python's garbage collection, where very many objects are made and none is garbage. Also a decorator.
+    """Pause Python's garbage collection while very many objects are created and none is released. Also a decorator.
 
     Collection takes a fifth of the time to read and build a stage of 100,000 balls, and a seventh of the time to import
     Newton. If the caller has disabled collection, it stays disabled.

@@ -1,7 +1,7 @@
-"""The table of attributes: a field of a record and all that follows from it, in one row.
+"""Table of attributes: one row describes a field of a record for Newton, USD, checks and documentation.
 
-A record, such as ``Magnet``, is a dataclass. The annotation of each field carries an :class:`Attribute`, the row of the
-table. From the rows follow the attributes of Newton models, the USD schemas, their reading and writing, the checks of
+A record, such as ``Magnet``, is a dataclass. The annotation of each field holds an :class:`Attribute`, its row of the
+table. The rows generate the attributes of Newton models, the USD schemas, their reading and writing, the checks of
 values, and the tables of the documentation. ``warpmag.declarations.schemas`` lists all rows.
 """
 
@@ -26,15 +26,16 @@ class Attribute:
         title: Name in user interfaces.
         doc: Meaning, in one or two sentences.
         unit: Unit as USD's own schemas write it, empty for tokens and flags; ``distance`` means the stage's unit.
-        range: Range of values for readers, empty where every finite value is valid.
+        range: Range of values in the documentation, empty where every finite value is valid.
         tokens: Valid tokens.
-        check: Raises an error for a value out of range, by the name of the value and the value; None for tokens.
-        uniform: Whether USD allows no time samples.
+        check: Function of a name and a value. It raises an error with the name if the value is out of range. None for
+            tokens.
+        uniform: True if USD allows no time samples.
         kind: Kind of magnets that the attribute describes, empty for all.
-        optional: Whether a stage that warpmag writes leaves out the default.
-        model_change: When a change of a Newton model's array takes effect: in every substep, after
-            ``Magnetics.notify_model_changed``, or never, so that it is an error.
-        field: Field of the record, or what stands for it where USD alone has the attribute.
+        optional: True if warpmag omits the default from the stages that it writes.
+        model_change: Effect of a change of a Newton model's array: ``substep``, from the next substep on; ``notified``,
+            after ``Magnetics.notify_model_changed``; ``never``, an error.
+        field: Field of the record. Attributes of USD alone have a name in the same style.
         default: Default, None where the attribute has none.
     """
 
@@ -99,10 +100,10 @@ class Schema:
     """An applied API schema of USD.
 
     Attributes:
-        name: Its name.
+        name: Name in USD.
         record: The record that a prim with the schema declares.
         doc: Meaning, in a few sentences.
-        usd_only: Rows that no field of the record stands for.
+        usd_only: Rows of attributes without a field of the record.
     """
 
     name: str
@@ -112,7 +113,7 @@ class Schema:
 
     @property
     def attributes(self) -> tuple[Attribute, ...]:
-        """All rows: those of the record, then those of USD alone."""
+        """All rows: first the record's, then ``usd_only``."""
         return (*attributes_of(self.record), *self.usd_only)
 
     def usd_name(self, field: str) -> str:

@@ -1,6 +1,6 @@
 """Checks of single values, each with a message of one line that names the value.
 
-Stages, command lines and scripts pass through the same checks, so that a wrong value gives the same message.
+Stages, command lines and scripts use the same checks, so that an invalid value gives the same message.
 """
 
 import math
@@ -11,9 +11,9 @@ from typing import Any
 from warpmag.errors import InputError
 
 _JOINT_GAP, _JOINT_ROUNDING = 1e-4, 1e-5
-"""Gap at which the ends of a joint count as apart [m], plus a fraction of their coordinates.
+"""Largest gap [m] between the ends of a joint that count as coincident, plus a fraction of their coordinates.
 
-Poses are often in single precision, which the fraction allows for.
+The fraction allows for poses in single precision.
 """
 
 _REPR = reprlib.Repr()
@@ -26,7 +26,7 @@ def short_repr(value: Any) -> str:
 
 
 def real_number(name: str, value: Any) -> float:
-    """Return one real number as a float; raise :class:`InputError` for anything else, a bool too."""
+    """Return one real number as a float; raise :class:`InputError` for anything else, including a bool."""
     plain = value
     if getattr(value, "shape", None) == () and hasattr(value, "item") and not getattr(value, "mask", False):
         plain = value.item()
@@ -45,7 +45,7 @@ def check_token(name: str, value: Any, allowed: tuple[str, ...]) -> None:
 
 
 def check_positive(name: str, value: Any, *, infinite: bool = False) -> None:
-    """Raise :class:`InputError` unless ``value`` is positive and finite, or infinite where that is allowed."""
+    """Raise :class:`InputError` unless ``value`` is positive and finite, or ``infinite`` is True and it is infinite."""
     number = real_number(name, value)
     if not number > 0.0 or (math.isinf(number) and not infinite):
         raise InputError(f"{name}: must be positive{'' if infinite else ' and finite'}, got {number:g}")
@@ -62,7 +62,7 @@ def check_vector(name: str, values: Any) -> None:
     """Raise :class:`InputError` unless ``values`` are three finite numbers."""
     try:
         three = len(values) == 3
-    except TypeError:  # NumPy arrays of no dimension define a length that raises
+    except TypeError:  # len() of a zero-dimensional NumPy array raises
         three = False
     if not three:
         raise InputError(f"{name}: must be three numbers, got {short_repr(values)}")
@@ -83,14 +83,14 @@ def check_whole(name: str, value: Any) -> None:
 
 
 def check_count(name: str, value: Any) -> None:
-    """Raise :class:`InputError` unless ``value`` is a whole number from 1 to the largest of 32 bits."""
+    """Raise :class:`InputError` unless ``value`` is a whole number from 1 to 2³¹ − 1."""
     check_whole(name, value)
     if not 1 <= value < 2**31:
         raise InputError(f"{name}: must be at least 1 and below 2³¹, got {short_repr(value)}")
 
 
 def joint_ends_apart(gap, distance):
-    """Return whether the ends of joints count as apart.
+    """Return True if the ends of joints count as apart.
 
     Args:
         gap: Distance between the ends [m], a number or an array.
@@ -100,5 +100,5 @@ def joint_ends_apart(gap, distance):
 
 
 def joint_gap_message(gap: float) -> str:
-    """Return the part of a warning that says how far the ends of a joint are apart [m], and what follows."""
-    return f"{gap:.3g} m apart at the start, and a run begins by pulling"
+    """Return the end of a warning about a gap [m] between the ends of a joint."""
+    return f"{gap:.3g} m apart at the start, and the run begins by pulling them together"

@@ -1,8 +1,8 @@
-"""Records of coils and field maps: their rows of the table of attributes, and what the kernels take of them.
+"""Records of coils and field maps: their rows of the table of attributes, and their data for the kernels.
 
-A source of a field does not respond to other fields. The kernels take a kind, some numbers and a table of vectors, in
-the frame of the source (``kernels.applied``). Newton's builders carry a source as one line of text on a shape, which
-survives all copying of shapes.
+A source of a field does not respond to other fields. The kernels read a kind, some numbers and a table of vectors, in
+the frame of the source (``kernels.applied``). Newton's builders store a source as one line of text on a shape, because
+copies of a shape keep its text.
 """
 
 import base64
@@ -23,7 +23,7 @@ LARGEST_STRENGTH = 1e15
 DEFAULT_WIRE_RADIUS = 0.01
 """Default radius of a wire, in radii of the coil, or in diagonals of the box around a polyline."""
 SIZE_RANGE = (1e-7, 1e6)
-"""Least and largest radius, length and spacing [m]."""
+"""Smallest and largest radius, length and spacing [m]."""
 LARGEST_POINT = 1e7
 """Largest coordinate [m] of a point of a coil or of a map."""
 STRONGEST_FIELD = 1e30
@@ -34,7 +34,7 @@ Vector = tuple[float, float, float]
 
 
 def check_strength(name: str, value: Any) -> None:
-    """Raise :class:`InputError` unless ``value`` is a valid number of ampere-turns, or a valid factor."""
+    """Raise :class:`InputError` unless the magnitude of ``value`` is at most :data:`LARGEST_STRENGTH`."""
     number = real_number(name, value)
     if not abs(number) <= LARGEST_STRENGTH:
         raise InputError(f"{name}: must be finite and at most {LARGEST_STRENGTH:g} in size, got {number:g}")
@@ -58,7 +58,7 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
     """Return vectors as an array of shape [k, 3].
 
     Raises:
-        InputError: The values are no vectors, or a component is not finite or larger than ``most``.
+        InputError: The values are no vectors, or a component is not finite or exceeds ``most``.
     """
     try:
         array = np.asarray(values)
@@ -75,7 +75,7 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SourceRecord:
-    """One source in its own frame, as the kernels take it.
+    """Data of one source for the kernels, in the frame of the source.
 
     Attributes:
         kind: Name of a ``kernels.applied.sources.SourceKind``, in lower case.
@@ -127,7 +127,7 @@ class Coil:
     )] = ()  # fmt: skip
     closed: Annotated[bool, Attribute(
         "coil:closed", "bool", "Closed",
-        "Whether a wire joins the last corner of a polyline to the first. An open polyline is a part of a circuit.",
+        "True if a wire joins the last corner of a polyline to the first. An open polyline is a part of a circuit.",
         check=check_flag, uniform=True,
     )] = True  # fmt: skip
     wire_radius: Annotated[float, Attribute(
@@ -171,7 +171,7 @@ class Coil:
             raise InputError(f"{name}: points: must be {SIZE_RANGE[0]:g} m apart or more, number {short} is not")
 
     def _path(self) -> np.ndarray:
-        """Return the corners of a polyline in order, the first again at the end of a closed one, shape [k, 3]."""
+        """Return the corners of a polyline, shape [k, 3]. A closed polyline ends with its first corner."""
         points = np.array(self.points, float).reshape(-1, 3)
         return np.concatenate([points, points[:1]]) if self.closed else points
 
@@ -191,8 +191,8 @@ class Coil:
             wire = self.wire_radius or DEFAULT_WIRE_RADIUS * self._diagonal()
             return SourceRecord(self.shape, (float(wire),), self._path())
         wire = self.wire_radius or min(DEFAULT_WIRE_RADIUS * self.radius, self._largest_wire_radius())
-        halves = (0.5 * float(self.length),) if self.shape == "solenoid" else ()
-        return SourceRecord(self.shape, (float(self.radius), *halves, float(wire)), np.zeros((0, 3)))
+        half_length = (0.5 * float(self.length),) if self.shape == "solenoid" else ()
+        return SourceRecord(self.shape, (float(self.radius), *half_length, float(wire)), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ class FieldMap:
         unit="ampere / meter", check=partial(checked_vectors, most=STRONGEST_FIELD), uniform=True,
     )]  # fmt: skip
     factor: Annotated[float, Attribute(
-        "fieldMap:factor", "float", "Factor", "Factor of the field.",
+        "fieldMap:factor", "float", "Factor", "Factor on the values of the field.",
         unit="dimensionless", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
         uniform=True,
     )] = 1.0  # fmt: skip
@@ -234,10 +234,10 @@ class FieldMap:
         checked_vectors(f"{name}: values", np.reshape(self.values, (-1, 3)), STRONGEST_FIELD)
 
     def border_ratio(self) -> float:
-        """Return the largest field on the boundary of the map over the largest of all; 0 for a map of zeros."""
-        size = np.linalg.norm(np.asarray(self.values, float), axis=3)
-        inner = size[1:-1, 1:-1, 1:-1].max(initial=0.0)
-        outer = max(size.take(end, axis).max() for axis in range(3) for end in (0, -1))
+        """Return the largest field on the boundary of the map over the largest in the map; 0 for a map of zeros."""
+        magnitude = np.linalg.norm(np.asarray(self.values, float), axis=3)
+        inner = magnitude[1:-1, 1:-1, 1:-1].max(initial=0.0)
+        outer = max(magnitude.take(end, axis).max() for axis in range(3) for end in (0, -1))
         return float(outer / max(outer, inner)) if outer > 0.0 else 0.0
 
     def record(self) -> SourceRecord:
@@ -253,7 +253,7 @@ class FieldMap:
 def _extrapolated(nodes: np.ndarray, axis: int) -> np.ndarray:
     """Return nodes with one more at either end of an axis (Keys 1981).
 
-    The new node lies on the parabola through the last three nodes, or on the line through the only two.
+    A new node lies on the parabola through the nearest three nodes, or on the line through the only two.
     """
 
     def beyond(ends):

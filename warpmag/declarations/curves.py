@@ -72,7 +72,7 @@ class MagnetizationCurve:
             name: Name of the curve in messages.
 
         Raises:
-            InputError: The points are no magnetization curve; the message has the reason and the point.
+            InputError: The points are no magnetization curve; the message names the reason and the point.
         """
         h, b = _numbers(name, "fields", fields), _numbers(name, "flux densities", flux_densities)
         _check_count(name, h, b)
@@ -152,15 +152,16 @@ class MagnetizationCurve:
         t = np.minimum((x - h[k]) / span, 1.0)
         begin, end = span * d[k], span * d[k + 1]
         inside = m[k] + t * (begin + t * (3.0 * rise - 2.0 * begin - end + t * (begin + end - 2.0 * rise)))
-        left = self.saturation - m[-1]
-        beyond = left**2 / (left + d[-1] * np.maximum(x - h[-1], 0.0)) if left > 0.0 else 0.0
-        return np.where(x <= h[-1], inside, self.saturation - beyond)
+        rest = self.saturation - m[-1]  # of the magnetization, at the last point
+        rest_beyond = rest**2 / (rest + d[-1] * np.maximum(x - h[-1], 0.0)) if rest > 0.0 else 0.0
+        return np.where(x <= h[-1], inside, self.saturation - rest_beyond)
 
 
 def _slopes(h, m):
-    """Return the slopes dM/dH at the points: by PCHIP, at the last point by the law of the approach to saturation.
+    """Return the slopes dM/dH at the points, by PCHIP.
 
-    At the origin the slope is that of the curve with its mirror image.
+    At the last point the slope is that of the law of approach to saturation. At the origin it is that of the curve
+    joined to its mirror image.
     """
     span, secant = np.diff(h), np.diff(m) / np.diff(h)
     slope = np.empty(len(h))
@@ -200,9 +201,9 @@ def _check_count(name: str, h, other) -> None:
 def _check_points(name: str, h, m) -> None:
     if h[0] == 0.0 and m[0] != 0.0:
         raise InputError(f"{name}: at H = 0 there is M = {m[0]:.4g} A/m; a curve without hysteresis begins at 0")
-    where = np.flatnonzero(np.diff(h) <= 0.0)
-    if len(where):
-        k = where[0]
+    falls = np.flatnonzero(np.diff(h) <= 0.0)
+    if len(falls):
+        k = falls[0]
         raise InputError(f"{name}: H must rise from 0, but {h[k + 1]:g} A/m follows {h[k]:g} A/m")
     strongest = float(MU0 * m.max())
     if strongest > _LARGEST_POLARIZATION:
@@ -211,9 +212,9 @@ def _check_points(name: str, h, m) -> None:
             f"{name}: at H = {h[k]:g} A/m the polarization B − μ0 H is {strongest:.3g} T, which no material reaches: "
             "H is in A/m, B in T"
         )
-    where = np.flatnonzero(np.diff(m) < -_LEVEL_TOLERANCE * strongest / MU0)
-    if len(where):
-        k = where[0]
+    falls = np.flatnonzero(np.diff(m) < -_LEVEL_TOLERANCE * strongest / MU0)
+    if len(falls):
+        k = falls[0]
         raise InputError(
             f"{name}: M = B/μ0 − H must not fall, but from H = {h[k]:g} to {h[k + 1]:g} A/m it does, from {m[k]:.5g} "
             f"to {m[k + 1]:.5g} A/m: B rises by less than μ0 ΔH"
@@ -224,10 +225,10 @@ def _check_points(name: str, h, m) -> None:
 
 def _check_saturation(name: str, h, m, slope: float, saturation) -> None:
     try:
-        sound = math.isfinite(saturation) and not isinstance(saturation, bool)
+        is_number = math.isfinite(saturation) and not isinstance(saturation, bool)
     except TypeError:
-        sound = False
-    if not sound:
+        is_number = False
+    if not is_number:
         raise InputError(f"{name}: saturation must be a finite number [A/m]")
     if saturation < m[-1] * (1.0 - 1e-9):
         raise InputError(f"{name}: saturation {saturation:g} A/m is less than the last point's M, {m[-1]:g} A/m")
@@ -241,7 +242,7 @@ def _check_saturation(name: str, h, m, slope: float, saturation) -> None:
 
 
 def _read_csv(path, name: str):
-    """Return quantity and factor to SI of each of the two columns of a file, and the rows."""
+    """Return (quantity, factor to SI) of each of the two columns of a file, and the rows."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             lines = [row for row in csv.reader(line for line in file if line.strip() and line.lstrip()[0] != "#")]
@@ -249,7 +250,7 @@ def _read_csv(path, name: str):
         raise InputError(f"{name}: cannot be read ({error})") from None
     matches = [_COLUMN.fullmatch(cell) for cell in lines[0]] if lines else []
     if len(matches) != 2 or None in matches:
-        raise InputError(f"{name}: its first line must say what the two columns are, as 'H [A/m], B [T]'")
+        raise InputError(f"{name}: the first line must name the two columns, such as 'H [A/m], B [T]'")
     columns = [_unit(name, *match.groups()) for match in matches if match]
     if columns[0][0] != "h" or columns[1][0] == "h":
         raise InputError(f"{name}: the first column must be H, the second B, J or M")
@@ -266,5 +267,5 @@ def _unit(name: str, quantity: str, unit: str) -> tuple[str, float]:
     """Return a quantity in lower case and the factor of its unit to SI."""
     units = _UNITS[quantity.lower()]
     if unit not in units:
-        raise InputError(f"{name}: {quantity} in {unit} is not known, only in {', '.join(units)}")
+        raise InputError(f"{name}: unknown unit {unit} of {quantity}; known are {', '.join(units)}")
     return quantity.lower(), units[unit]

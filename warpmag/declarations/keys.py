@@ -1,4 +1,4 @@
-"""Values keyed over time, and motions of keyed transforms: read from a stage, interpolated on a device.
+"""Values keyed over time, and motions of keyed transforms. A stage holds them; a device interpolates them.
 
 No Warp, Newton or USD is imported here.
 """
@@ -55,8 +55,8 @@ class Operation:
     Attributes:
         kind: ``translate``, ``scale``, ``orient``, ``matrix``, or ``rotate`` with the order of its axes: ``rotateXYZ``
             rotates about x first. A matrix has 16 numbers by rows, for row vectors, as in USD.
-        keys: Numbers of the transform; of rotations three angles [degrees].
-        inverse: Whether the inverse of the transform applies.
+        keys: Numbers of the transform; three angles [degrees] for ``rotate``.
+        inverse: True if the inverse of the transform applies.
     """
 
     kind: str
@@ -75,8 +75,8 @@ class Motion:
     operations: tuple[Operation, ...]
 
     def in_seconds(self, start: float, rate: float) -> "Motion":
-        """Return the motion with its keys in seconds, see :meth:`Keys.in_seconds`."""
-        return Motion(tuple(replace(step, keys=step.keys.in_seconds(start, rate)) for step in self.operations))
+        """Return the motion with times in seconds, see :meth:`Keys.in_seconds`."""
+        return Motion(tuple(replace(item, keys=item.keys.in_seconds(start, rate)) for item in self.operations))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Records of magnets and of the settings of a scene: the rows of the table of attributes that belong to them.
+"""Records of magnets and of the settings of a scene, with their rows of the table of attributes.
 
 No Warp, Newton or USD is imported here. Stages, the command line and scripts check values through these records.
 """
@@ -16,24 +16,24 @@ from warpmag.errors import InputError
 
 KINDS = ("inducible", "permanent")
 LINEAR_CURVE = "linear"
-"""Curve of permanent magnets with recoil. It is no token of a stage: every inducible magnet saturates."""
+"""Curve of permanent magnets with recoil. Stages have no such token, because every inducible magnet saturates."""
 CURVES = ("tanh", "langevin", "clamped", "frohlich")
 """Formulas of magnetization curves (``kernels.material.curves``); a model stores the position in this list."""
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")
 METHODS = ("auto", "direct", "fmm")
-"""Summation methods: the faster one, over all pairs, by the fast multipole method."""
+"""Summation methods: the faster of the other two, sums over all pairs, and the fast multipole method."""
 DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 
 ACCURACY = {"float32": 2e-6, "float64": 1e-13}
-"""Relative L2 error that tests allow to sums over all pairs, by precision; a smaller tolerance cannot be met."""
+"""Largest relative L2 error of sums over all pairs in tests, by precision. It is also the smallest valid tolerance."""
 
 MATERIAL_RANGE = {"float32": (1e-12, 1e15), "float64": (1e-100, 1e100)}
-"""Least and largest saturation [A/m] and finite susceptibility, by the precision of a solve."""
+"""Smallest and largest saturation [A/m] and finite susceptibility, by the precision of a solve."""
 _MATERIAL_TEXT = f"[{MATERIAL_RANGE['float32'][0]:g}, {MATERIAL_RANGE['float32'][1]:g}]"
 
 _RECOIL_RANGE = (1.001, 10.0)
-"""Least recoil permeability above 1 that single precision resolves, and a limit above all magnets: AlNiCo reaches 5."""
+"""Smallest recoil permeability above 1 that float32 resolves, and a limit above all magnets: AlNiCo reaches 5."""
 
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
@@ -42,7 +42,7 @@ SATURATION_OF_IRON = 1.7e6
 def check_curve(name: str, value: Any, others: tuple[str, ...] = ()) -> None:
     """Raise :class:`InputError` unless ``value`` is one of :data:`CURVES` or a measured curve.
 
-    The message lists ``others``, too.
+    The message also lists ``others``, further valid names.
     """
     if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
         check_token(name, value, (*CURVES, *others))
@@ -64,7 +64,7 @@ def check_recoil(name: str, value: Any) -> None:
 
 
 def check_force(name: str, value: Any, contact_model: str = "dipole") -> None:
-    """Raise :class:`InputError` unless ``value`` is a force law that goes with ``contact_model``."""
+    """Raise :class:`InputError` unless ``value`` is a force law compatible with ``contact_model``."""
     check_token(name, value, FORCES)
     if contact_model == "multipole" and value != "kelvin":
         raise InputError(f"{name}: the contact model 'multipole' goes with 'kelvin' only, got {value!r}")
@@ -81,13 +81,13 @@ def check_rtol(name: str, value: Any, dtype: str = "float32") -> None:
 class Magnet:
     """The magnetic material of one rigid body or collider; each field is a row of the table of attributes.
 
-    A measured ``curve`` sets ``saturation`` and ``susceptibility`` to its own values, the latter to the largest.
-    ``magnetization`` is in the frame of whatever carries the magnet.
+    A measured ``curve`` sets ``saturation`` to its limit and ``susceptibility`` to its largest slope.
+    ``magnetization`` is in the frame of the body or collider.
     """
 
     kind: Annotated[str, Attribute(
         "kind", "token", "Kind",
-        "Whether the applied field magnetizes the magnet (inducible), or it is magnetized for good (permanent).",
+        "Kind of the magnet: magnetized by the applied field (inducible), or permanently (permanent).",
         tokens=KINDS, uniform=True,
     )] = "inducible"  # fmt: skip
     saturation: Annotated[float, Attribute(
@@ -154,7 +154,7 @@ class Magnet:
 
         Args:
             name: Prim path or label of the body, for the message.
-            unused: Whether to check attributes of the other kind of magnets, too.
+            unused: True to check the attributes of the other kind of magnets, too.
         """
         for row in attributes_of(Magnet):
             if unused or row.kind in ("", self.kind):
@@ -193,7 +193,7 @@ class MagneticSettings:
     )] = 1e-3  # fmt: skip
 
     def check(self, name: str) -> None:
-        """Raise :class:`InputError` naming ``name`` if a value is out of range, or values do not go together."""
+        """Raise :class:`InputError` naming ``name`` if a value is out of range, or values are incompatible."""
         check_fields(self, name, "external_field", "contact_model")
         check_force(f"{name}: force", self.force, self.contact_model)
         check_fields(self, name, "dynamics", "rtol")
@@ -208,7 +208,7 @@ class StageMagnets:
     """Magnets and settings of a stage, by prim path.
 
     Attributes:
-        magnets: Magnet of each prim that carries one; the prim is a rigid body or a collider.
+        magnets: Magnet of each magnetic prim, a rigid body or a collider.
         settings: Magnetic settings of the scene.
         initial_moments: Total moment [A·m²], world frame, of prims with ``warpmag:moment``, for a warm start.
     """

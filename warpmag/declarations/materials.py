@@ -1,9 +1,9 @@
 """Magnetic materials by name.
 
-Values are typical at room temperature; the data sheet of a part is better. The susceptibility is the initial one, for
-small fields. Above 100 it hardly matters for a ball: the demagnetizing field limits the response of a ball to 3. Some
-materials have a measured curve in place of saturation and susceptibility (``measured.py``), which gets the knee right.
-Densities are from Bozorth's table and makers' data sheets, rounded.
+Values are typical at room temperature; the data sheet of a part is more accurate. The susceptibility is the initial
+one, for small fields. Above 100 it hardly matters for a ball, because the demagnetizing field limits M/H0 to 3. Some
+materials have a measured curve in place of saturation and susceptibility (``measured.py``), with an accurate knee.
+Densities are rounded values from Bozorth's table and makers' data sheets.
 """
 
 import math
@@ -26,7 +26,7 @@ class Material:
     """A magnetic material.
 
     Attributes:
-        name: Its name.
+        name: Name of the material.
         kind: ``inducible`` or ``permanent``.
         polarization: Saturation polarization μ0·Ms of an inducible, remanence Br of a permanent material [T].
         permeability: Initial relative permeability of an inducible material [dimensionless], the largest permeability
@@ -35,7 +35,8 @@ class Material:
         source: Source of the numbers.
         curve: Measured magnetization curve of an inducible material, or None.
         conductivity: Electrical conductivity [S/m], 0 where the source has none. Magnets do not take it from the
-            material: pass it to ``add_inducible(..., conductivity=...)``, for balls. It costs a sum over pairs.
+            material, because eddy currents cost a sum over pairs: pass it to ``add_inducible(..., conductivity=...)``,
+            for balls.
     """
 
     name: str
@@ -107,7 +108,7 @@ def material(name: str) -> Material:
     """Return a material by its name.
 
     Raises:
-        InputError: There is no such material; the message names all.
+        InputError: There is no such material; the message lists all names.
     """
     return _look_up("material", name)
 
@@ -134,7 +135,7 @@ def inducible_from(material: str | None, curve, numbers: dict) -> dict:
     Args:
         material: Name of a material, or None.
         curve: A curve as :func:`measured` takes it, or None.
-        numbers: Saturation [A/m] and susceptibility, without those that are not given.
+        numbers: Values of ``saturation`` [A/m] and ``susceptibility``, as far as given.
 
     Raises:
         InputError: Two of the arguments set the same field.
@@ -144,28 +145,28 @@ def inducible_from(material: str | None, curve, numbers: dict) -> dict:
     from_material = {} if material is None else inducible("material", material)
     is_measured = has_table or "curve" in from_material
     set_fields = ("saturation", "susceptibility", "curve") if is_measured else tuple(from_material)
-    twice = [name for name in values if name in set_fields and (material is not None or name != "curve")]
-    if twice and (material is not None or has_table):
-        owner = f"material: {short_repr(material)}" if material is not None else "curve: it"
-        raise InputError(f"{owner} says what {' and '.join(twice)} are, give one or the other")
+    conflicts = [name for name in values if name in set_fields and (material is not None or name != "curve")]
+    if conflicts and (material is not None or has_table):
+        owner = f"material: {short_repr(material)}" if material is not None else "curve: a measured curve"
+        raise InputError(f"{owner} sets {' and '.join(conflicts)}, give one or the other")
     return {**values, **from_material}
 
 
 def measured(owner: str, curve):
-    """Return a magnetization curve: a token or a measured curve as it is, a measured curve for a material's name.
+    """Return the measured curve of a material for its name; return a token or a measured curve unchanged.
 
     Raises:
         InputError: The value is none of these.
     """
-    known = [entry.name for entry in MATERIALS.values() if entry.curve is not None]
-    if isinstance(curve, str) and curve in known:
+    names = [entry.name for entry in MATERIALS.values() if entry.curve is not None]
+    if isinstance(curve, str) and curve in names:
         return MATERIALS[curve].curve
-    check_curve(owner, curve, tuple(known))
+    check_curve(owner, curve, tuple(names))
     return curve
 
 
 def name_of_curve(curve: MagnetizationCurve) -> str | None:
-    """Return the name of the material with a measured curve, None where no material has it."""
+    """Return the name of the material with this measured curve, or None."""
     return next((entry.name for entry in MATERIALS.values() if entry.curve == curve), None)
 
 
@@ -183,15 +184,15 @@ def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> t
     entry = _look_up(owner, name, "permanent")
     length = math.hypot(*direction)
     if not (length > 0.0 and math.isfinite(length)):
-        raise InputError(f"{owner}: magnetization: must have a direction for {name} to be magnetized in")
+        raise InputError(f"{owner}: magnetization: must have a direction, in which {name} is magnetized")
     x, y, z = (entry.magnetization * component / length for component in direction)
     return x, y, z
 
 
 def _look_up(owner: str, name: str, kind: str | None = None) -> Material:
-    """Return a material by its name; raise :class:`InputError` where none of the kind has it."""
-    known = [entry.name for entry in MATERIALS.values() if kind in (None, entry.kind)]
-    if not isinstance(name, str) or name not in known:
-        sought = f"{kind} material" if kind else "material"
-        raise InputError(f"{owner}: {short_repr(name)} is no {sought} known here, which are {', '.join(known)}")
+    """Return a material by its name; raise :class:`InputError` for an unknown name, or for another kind."""
+    names = [entry.name for entry in MATERIALS.values() if kind in (None, entry.kind)]
+    if not isinstance(name, str) or name not in names:
+        expected = f"{kind} material" if kind else "material"
+        raise InputError(f"{owner}: {short_repr(name)} is no {expected}; known are {', '.join(names)}")
     return MATERIALS[name]

@@ -1,8 +1,8 @@
 """Published B-H curves of named materials, H [A/m] and B [T].
 
 The points are from the material library of FEMM 4.2 (D. Meeker, Finite Element Method Magnetics; file ``matlib.dat``,
-``bin/matlib.dat`` of the repository cenit/FEMM at 544172c). Long tables are thinned: the curve through the points that
-remain is within 0.5 % in B of those left out.
+``bin/matlib.dat`` of the repository cenit/FEMM at 544172c). Long tables are thinned. The curve through the remaining
+points deviates from the omitted ones by less than 0.5 % in B.
 """
 
 MEASURED_CURVES = {

@@ -1,4 +1,4 @@
-"""The USD schemas of warpmag, which together list the whole table of attributes."""
+"""USD schemas of warpmag. Together they list the whole table of attributes."""
 
 from warpmag.declarations.attributes import Attribute, Schema
 from warpmag.declarations.coils import Coil, FieldMap
@@ -14,7 +14,8 @@ MAGNET_SCHEMA = Schema(
             "material", "token", "Material",
             "Name of a material, such as iron, mild-steel, N42 or hard-ferrite. For an inducible magnet it replaces "
             "saturation magnetization and susceptibility, or the curve. For a permanent magnet it gives the strength, "
-            "and warpmag:magnetization the direction. Its density counts where the stage has neither mass nor density.",
+            "and warpmag:magnetization the direction. The body takes the density of the material if the stage has "
+            "neither mass nor density.",
             uniform=True, field="material", default="",
         ),
         Attribute(

@@ -25,13 +25,13 @@ _CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class Filled:
-    """Part of each cell that a shape fills, without its overlap with earlier shapes.
+    """Part of each cell that a shape fills, excluding overlap with earlier shapes.
 
     Attributes:
         index: Index in the grid of each cell that the shape reaches into, shape [m, 3].
         shares: Filled share of each subcell, shape [m, a, b, c].
-        weights: Number of test points of each cell inside the shape, shape [m].
-        sums: Sum of these points' positions [m], frame of the grid, shape [m, 3].
+        weights: Number of test points of each cell in the filled part, shape [m].
+        sums: Sum of the positions of these points [m], frame of the grid, shape [m, 3].
         whole: Number of test points in the shape, including overlap with earlier shapes.
     """
 
@@ -44,11 +44,11 @@ class Filled:
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Equal cells over shapes, in the frame of the largest; a whole number fits across the thinnest shape on each axis.
+    """Equal cells over shapes, in the frame of the largest. On each axis, cells fit exactly across the thinnest shape.
 
     Attributes:
         solids: Shapes posed in the frame of the grid. The first ``earlier`` ones only remove overlap.
-        earlier: Number of shapes outside the grid.
+        earlier: Number of shapes that have no cells in the grid.
         lower: Lower corner [m], shape [3].
         sides: Sides of a cell [m], shape [3].
         counts: Cells along each axis, shape [3].
@@ -102,7 +102,7 @@ class CellGrid:
         return index[(np.abs(center - 0.5 * (part.lower + part.upper)) < reach).all(axis=1)]
 
     def _filled_by_thin_shape(self, part: Solid, others: list[Solid], pitch: np.ndarray) -> Filled:
-        """Return :meth:`filled` of a shape that the grid's test points may miss, from test points of its own."""
+        """Return :meth:`filled` of a thin shape from its own test points, because the grid's points may miss it."""
         extent = part.upper - part.lower
         counts = np.maximum(np.ceil(extent / pitch).astype(int), _MOST_SPLITS)
         points = part.to_body(part.lower + (grid(counts) + 0.5) * (extent / counts))
@@ -127,18 +127,18 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
 
     Args:
         parts: Shapes, posed in the frame of the body.
-        earlier: Other shapes of the body, whose overlap is removed.
+        earlier: Other shapes of the body; overlap with them is removed.
         spacing: Approximate side of a cell [m].
         across: Smallest number of cells across a shape. In a shared grid ``_FLATTEST`` limits it.
     """
-    home = max(parts, key=lambda part: part.volume)
-    solids = [_in_frame_of(home, part) for part in (*earlier, *parts)]
-    own = solids[len(earlier) :]
-    half = np.array([np.abs(part.rotation) @ (0.5 * (part.upper - part.lower)) for part in own])
-    middle = np.array([part.to_body(0.5 * (part.lower + part.upper)) for part in own])
+    largest = max(parts, key=lambda part: part.volume)
+    solids = [_in_frame_of(largest, part) for part in (*earlier, *parts)]
+    posed = solids[len(earlier) :]
+    half = np.array([np.abs(part.rotation) @ (0.5 * (part.upper - part.lower)) for part in posed])
+    middle = np.array([part.to_body(0.5 * (part.lower + part.upper)) for part in posed])
     lower, upper = (middle - half).min(axis=0), (middle + half).max(axis=0)
     spacing = min(spacing, (upper - lower).max())  # larger cells would have fewer test points in the shapes
-    large = np.array([part.volume >= _SMALL * home.volume for part in parts])
+    large = np.array([part.volume >= _SMALL * largest.volume for part in parts])
     thinnest = np.where(large[:, None], half, np.inf).argmin(axis=0), np.arange(3)
     thin, face = 2.0 * half[thinnest], (middle - half)[thinnest]
     flattest = np.inf if len(parts) == 1 else _FLATTEST if across > 1 else 1.0
@@ -150,15 +150,15 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     splits = np.where(splits > 4, -(-splits // 8) * 8, 4)  # demagnetizing tensors use 8 or 4 subcells
     splits = splits if len(parts) == 1 else np.minimum(splits, _MOST_SPLITS)
     lower = face - before * sides
-    return CellGrid(solids, len(earlier), lower, sides, counts, splits, home.position, home.rotation)
+    return CellGrid(solids, len(earlier), lower, sides, counts, splits, largest.position, largest.rotation)
 
 
-def _in_frame_of(home: Solid, part: Solid) -> Solid:
+def _in_frame_of(frame: Solid, part: Solid) -> Solid:
     """Return a shape posed in the frame of another shape of its body."""
-    if part is home:
+    if part is frame:
         return replace(part, position=np.zeros(3), rotation=np.eye(3))
-    rotation = home.rotation.T @ part.rotation
-    return replace(part, position=(part.position - home.position) @ home.rotation, rotation=rotation)
+    rotation = frame.rotation.T @ part.rotation
+    return replace(part, position=(part.position - frame.position) @ frame.rotation, rotation=rotation)
 
 
 def _inside(part: Solid, others: list[Solid], points: np.ndarray) -> tuple[int, np.ndarray]:

@@ -21,7 +21,7 @@ def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise InputError(f"mesh: faces name a vertex outside 0 to {len(points) - 1}")
     size = float(np.ptp(points, axis=0).max())
-    keys = np.rint((points - points.min(axis=0)) / max(1e-6 * size, np.finfo(float).tiny))  # float32 files
+    keys = np.rint((points - points.min(axis=0)) / max(1e-6 * size, np.finfo(float).tiny))  # joins float32 vertices
     _, first, joined = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     triangles = joined.reshape(-1)[triangles]
     a, b, c = triangles.T
@@ -44,11 +44,12 @@ def check_closed(triangles: np.ndarray) -> None:
 
 
 def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of points that returns the winding number of a closed mesh about each of them.
+    """Return a function of points that returns the winding number of a closed mesh about each point.
 
-    It counts the triangles that a ray along +z crosses. A ray through an edge or a vertex counts exactly once: the side
-    of an edge is computed from its end points in the order of their indices, and is thus the same for both triangles.
-    Triangles are sorted into square columns of the xy plane, so that a point tests only those of its own column.
+    The function counts the triangles that a ray along +z crosses. A ray through an edge or a vertex counts exactly
+    once: the side of an edge is computed from its end points in the order of their indices, and is thus the same for
+    both triangles.
+    Triangles are sorted into rectangular columns along z, so that a point tests only the triangles of its own column.
     """
     corners = points[triangles]
     flat = corners[:, :, :2]

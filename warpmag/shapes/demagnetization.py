@@ -36,7 +36,8 @@ _FAR_REACH = 4.0
 """Distance up to which quadrupoles of cells are corrected, in :data:`EXACT_REACH`."""
 
 _LARGEST_SPREAD = 0.15
-"""Bound on the norm of a moment's traceless second moments, in squares of a cell's longest side; two cells have 0.2."""
+"""Bound on the norm of a moment's traceless second moments, in squares of a cell's longest side. Two joined cubic cells
+have 0.2."""
 
 COMPONENTS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 """Rows and columns of the six components of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
@@ -56,7 +57,7 @@ class Coupling:
         start: First entry of each moment, and the end, shape [n + 1].
         other: Moment j of each entry, ascending, shape [entries].
         tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
-        common: Matrix C [1/m³] of the fields that all moments have in common (``uniform_response.py``), which adds
+        common: Matrix C [1/m³] between the common fields E of all moments (``uniform_response.py``), which adds
             H_i += E_i C Σ_j E_jᵀ m_j, shape [8, 8].
         positions: Positions of the moments [m], shape [n, 3].
         radii: Radii of the moments' balls [m], shape [n].
@@ -86,9 +87,10 @@ class Coupling:
 
     @cached_property
     def hardening(self) -> float:
-        """Largest eigenvalue of √V_i T_ij √V_j with the common fields [dimensionless], by Lanczos with all vectors.
+        """Largest eigenvalue of √V_i T_ij √V_j with the common fields [dimensionless], by Lanczos iteration.
 
-        It is the demagnetizing factor that makes every magnetization of the cells as stiff as that of balls.
+        It is the largest reduction of a demagnetizing factor by the correction. Cells that overlap other bodies get it
+        as an additional demagnetizing factor (``kernels.cells.couplings``). All Lanczos vectors are orthogonalized.
         """
         root = np.sqrt(4.0 / 3.0 * np.pi * self.radii**3)[:, None]
         near, common = full_tensors(self.tensor), common_fields(self.scaled_positions)
@@ -113,9 +115,9 @@ class Coupling:
 
     @cached_property
     def dense(self) -> np.ndarray:
-        """Tensors between all moments [1/m³], corrected ones and those of the pair sums, shape [2, n, n, 6].
+        """Tensors between all moments [1/m³]: the corrected ones, then those of the pair sums, shape [2, n, n, 6].
 
-        Only for couplings whose common fields are uniform: with linear fields the tensors are not symmetric.
+        Valid for uniform common fields only: with linear fields the tensors are not symmetric.
         """
         n = len(self.radii)
         i, j = np.divmod(np.arange(n * n), n)
@@ -189,12 +191,12 @@ def _off_diagonal(x, y, z):
 
 
 def _arsinh(a, b):
-    """Return arsinh(a/b), or 0 where b = 0, because its factor vanishes there."""
+    """Return arsinh(a/b), or 0 where b = 0, because the factor before it is 0 there."""
     return np.where(b > 0.0, np.arcsinh(a / np.where(b > 0.0, b, 1.0)), 0.0)
 
 
 def _arctan(a, b):
-    """Return arctan(a/b), or 0 where b = 0, because its factor vanishes there."""
+    """Return arctan(a/b), or 0 where b = 0, because the factor before it is 0 there."""
     return np.where(b != 0.0, np.arctan(a / np.where(b != 0.0, b, 1.0)), 0.0)
 
 
@@ -260,7 +262,7 @@ def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndar
 
 
 def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
-    """Return the traceless second moments of each moment's volume about its centroid, over volume, shape [n, 3, 3]."""
+    """Return the traceless second moments of each moment's volume about its centroid, per volume, shape [n, 3, 3]."""
     split = np.array(part.filled.shape[1:])
     points, weights = (grid(split) + 0.5) / split * part.sides, part.filled.reshape(len(part.filled), -1) / split.prod()
     corner, zeroth = part.index * part.sides, weights.sum(axis=1)[:, None]
@@ -281,11 +283,11 @@ def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
 
 
 def _far_corrections(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray, reach: float) -> np.ndarray:
-    """Return the field of quadrupoles beyond the reach, as tensors on each moment itself, shape [n, 6].
+    """Return the quadrupole fields of cells beyond ``reach`` [m], as a tensor on each moment itself, shape [n, 6].
 
     Distant cells are dipoles in the pair sums. The correction assumes that they are magnetized like the moment itself.
     It falls off with the fifth power of the distance and ends at ``_FAR_REACH`` times the reach. Negative eigenvalues
-    are dropped, because with them the operator of thin plates with flat cells would not stay positive.
+    are set to 0. With them, the operator of thin plates with flat cells would not stay positive.
     """
     total = np.zeros((6, len(points)))
     if np.abs(spreads).max() < 1e-9 * reach * reach:  # cubes have none
@@ -310,8 +312,8 @@ def _far_corrections(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarra
             total[k] += np.bincount(i, volumes[j] * tensor[:, k], len(points))
             total[k] += np.bincount(j, volumes[i] * tensor[:, k], len(points))
     values, vectors = np.linalg.eigh(full_tensors(total.T))
-    stiffer = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
-    return stiffer[:, *COMPONENTS]
+    positive = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return positive[:, *COMPONENTS]
 
 
 def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -327,7 +329,7 @@ def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarra
 
 
 def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return ∫∫ of the demagnetizing kernel over pairs of pieces, over the volume of a cell, shape [pairs, 6]."""
+    """Return ∫∫ of the demagnetizing kernel over pairs of pieces, divided by a cell's volume, shape [pairs, 6]."""
     apart = part.index[p] - part.index[q]
     full = part.filled.min(axis=(1, 2, 3)) == 1.0
     whole, touching = full[p] & full[q], (np.abs(apart) <= 1).all(axis=1)
@@ -362,7 +364,7 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarr
     offsets, inverse = np.unique(apart, axis=0, return_inverse=True)
     order = np.argsort(inverse.reshape(-1), kind="stable")
     ends = np.append(0, np.cumsum(np.bincount(inverse.reshape(-1))))
-    for k, offset in enumerate(offsets):
+    for k, offset in enumerate(offsets):  # in cells
         steps = offset * split + between
         tensors = np.where(valid[:, None], table[tuple(np.minimum(np.abs(steps), reach - 1).T)], 0.0)
         signs = np.where(steps < 0, -1.0, 1.0)
@@ -377,13 +379,13 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarr
 
 
 def _binary(filled: np.ndarray) -> np.ndarray:
-    """Return shares with subcells either empty or equally filled, with the same mean."""
+    """Return filled shares of the same mean in which each subcell is either empty or equally filled."""
     inside = (filled >= np.minimum(0.5, filled.max(axis=(1, 2, 3), keepdims=True))).astype(float)
     return inside * (filled.mean(axis=(1, 2, 3)) / inside.mean(axis=(1, 2, 3)))[:, None, None, None]
 
 
 def _coarsened(filled: np.ndarray, most: int) -> np.ndarray:
-    """Return the filled shares of at most ``most`` subcells along each axis; ``most`` must divide a larger number."""
+    """Return the filled shares of at most ``most`` subcells along each axis; ``most`` must divide larger counts."""
     for axis, size in enumerate(filled.shape[1:], start=1):
         if size > most:
             shape = (*filled.shape[:axis], most, size // most, *filled.shape[axis + 1 :])

@@ -1,12 +1,12 @@
 """Lattices of moments that fill a solid body.
 
 A body that is not a ball is replaced by moments of volume Vᵢ at xᵢ. ΣVᵢ is the volume of the body, and ΣVᵢxᵢ/ΣVᵢ its
-centroid. The bounding box of each shape is divided into nearly cubic cells that fit it exactly. The moment of a cell is
+centroid. Nearly cubic cells divide the bounding box of each shape exactly. The moment of a cell is
 at the centroid of the part that the shape fills. Cells filled by less than half join their nearest neighbor, so that a
 curved surface has neither steps nor slivers. The filled part is found from a fine grid of test points. Where shapes of
 a body overlap, each test point counts once.
 
-The accuracy determines :data:`AUTOMATIC_COUNT`. The table has errors of a uniformly magnetized cube of side L as n³
+The accuracy determines :data:`AUTOMATIC_COUNT`. The table lists errors of a uniformly magnetized cube of side L as n³
 point dipoles: the relative L2 error of the field over all points at distance d from the surface, and the error of the
 force on an iron ball of radius L/8 in contact (5 mm at a cube of 40 mm). It is the same for linear and saturated balls.
 
@@ -62,7 +62,7 @@ _FINE_POINTS = 32
 _CHUNK = 1 << 18
 """Pairs of cells evaluated at a time (some tens of MB)."""
 
-_NOTHING = np.empty((0, 3)), np.empty(0), (np.empty(0, int), np.empty(0, int), np.empty(0))
+_NO_MOMENTS = np.empty((0, 3)), np.empty(0), (np.empty(0, int), np.empty(0, int), np.empty(0))
 """Moments of a shape that lies inside others: positions, weights and joined cells."""
 
 
@@ -189,7 +189,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     points, triangles = welded(vertices, faces)
     check_closed(triangles)
     corners = points[triangles]
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))  # apex of tetrahedra: digits of a far mesh are kept
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))  # apex of tetrahedra: keeps the digits of a far mesh
     local = corners - middle
     parts = np.einsum("nk,nk->n", local[:, 0], np.cross(local[:, 1], local[:, 2])) / 6.0
     volume, lower, upper = float(parts.sum()), points.min(axis=0), points.max(axis=0)
@@ -228,8 +228,8 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
         spacing: Distance between moments [m]; 0 chooses it for about, and at most, :data:`AUTOMATIC_COUNT` moments. A
             shape smaller than the spacing gets one moment.
         across: Smallest number of cells across a shape at automatic spacing, with flatter cells where necessary.
-        together: True if all shapes share one grid, in the frame of the largest, as tensors between them require. A
-            cell that several shapes reach into is then a moment of each.
+        together: True if all shapes share one grid, in the frame of the largest, which tensors between them require. A
+            cell in several shapes then gives a moment of each shape.
 
     Returns:
         The lattice. Its volume is exact if shapes do not overlap, else it has the error of the test grid, about 1 %.
@@ -261,8 +261,8 @@ def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -
     filled = [_fill_part(cells, k) for cells in grids for k in range(cells.earlier, len(cells.solids))]
     counts = [len(volumes) for _, volumes, _ in filled]
     firsts = np.cumsum(counts) - counts
-    parts_pieces = [replace(p, moment=p.moment + first) for (_, _, p), first in zip(filled, firsts, strict=True)]
-    pieces = [_concatenated(parts_pieces)] if together else [p for p in parts_pieces if len(p.index)]
+    all_pieces = [replace(p, moment=p.moment + first) for (_, _, p), first in zip(filled, firsts, strict=True)]
+    pieces = [_concatenated(all_pieces)] if together else [p for p in all_pieces if len(p.index)]
     return Lattice(
         np.concatenate([positions for positions, _, _ in filled]),
         np.concatenate([volumes for _, volumes, _ in filled]),
@@ -292,11 +292,11 @@ def _concatenated(pieces: list[Pieces]) -> Pieces:
 
 
 def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]:
-    """Return positions, body frame, and volumes of the moments of shape ``k`` outside of earlier shapes, and pieces."""
+    """Return positions [m], body frame, volumes [m³] and pieces of shape ``k``'s moments outside earlier shapes."""
     part, filled = cells.solids[k], cells.filled(k)
     if filled.whole == 0.0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
-    positions, weights, (piece, moment, share) = _joined(filled) if len(filled.index) else _NOTHING
+    positions, weights, (piece, moment, share) = _joined(filled) if len(filled.index) else _NO_MOMENTS
     if filled.weights.sum() == filled.whole:  # no overlap: the exact centroid is known
         positions = positions + part.to_body(part.centroid[None]) - weights @ positions / weights.sum()
     pieces = Pieces(cells.sides, filled.index, filled.shares, piece, moment, share, cells.position, cells.rotation)
@@ -304,9 +304,9 @@ def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]
 
 
 def _joined(filled: Filled) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-    """Return centroids and weights of moments, after cells filled by less than half joined their nearest neighbors.
+    """Return centroids and weights of the moments, and (cell, moment, share of the cell that belongs to the moment).
 
-    The third result has cell, moment, and the share of the cell that belongs to the moment.
+    Cells filled by less than half join their nearest neighbors.
     """
     hits, sums = filled.weights, filled.sums
     centroids = sums / hits[:, None]

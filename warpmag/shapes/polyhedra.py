@@ -20,10 +20,10 @@ CYLINDER_SIDES = 32
 """Number of sides of the prism that replaces a cylinder."""
 
 _LEAST_POINTS, _EDGE_POINTS, _FACE_POINTS, _FINE_FACE_POINTS = 4, 16, 8, 32
-"""Numbers of Gauss points: smallest on an edge, on the longest edge, across a face of that length, and across it for
-energies. Forces between touching boxes are then right to 2e-3 at any offset. Only torques and energies use points on
-faces. The potential has a kink on a face near an edge of the other body. For two boxes half a millimeter apart, 8
-points give the force to 1e-5, but the slope of the energy only to 3 %; energies therefore use more."""
+"""Numbers of Gauss points: at least on an edge; on the longest edge; across a face as long as that edge; and across it
+for energies. Forces between touching boxes then have an error of 2e-3 at any offset. Only torques and energies use
+points on faces. The potential has a kink on a face near an edge of the other body. For two boxes half a millimeter
+apart, 8 points give the force to 1e-5, but the slope of the energy only to 3 %; energies therefore use more."""
 
 _REACH, _REMAINDER, _MOST_MOMENTS = 1.5, 1e-5, 256
 """For the moments that replace a body at a distance: smallest distance, in halves of the body's smallest side; relative
@@ -55,7 +55,7 @@ class Polyhedron:
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """Two corners and two faces of each edge, shape [e, 4]; the first face passes it from the first corner on."""
+        """Two corners and two faces of each edge, shape [e, 4]; the first face lists it from first to second."""
         sides = {}
         for k, face in enumerate(self.faces):
             sides |= dict.fromkeys(zip(face, face[1:] + face[:1], strict=True), k)
@@ -85,14 +85,14 @@ class Polyhedron:
         across = _FINE_FACE_POINTS if fine else _FACE_POINTS
         longest, points = self.edge_rows()[:, 6].max(), []
         for face, normal in zip(self.faces, self.normals, strict=True):
-            places, weights = _points_of(self.corners[list(face)], longest, across)
+            places, weights = _gauss_points_on_face(self.corners[list(face)], longest, across)
             points.append(np.concatenate([places, np.broadcast_to(normal, places.shape), weights[:, None]], axis=1))
         return np.concatenate(points)
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Moments at Gauss points that replace a body at a distance, where gradients of their field are right to 1e-3.
+    """Moments at Gauss points that replace a body at a distance; there, gradients of their field have an error of 1e-3.
 
     Lattice cells that are not cubes, or that a surface cuts, have an error of 1e-2 at any distance.
 
@@ -143,15 +143,18 @@ def cylinder_moments(radius: float, half_height: float) -> Moments:
     (line, (rings, around)), distance = _planned(min(radius, half_height), plan)
     (squared, area), (z, height) = _gauss(rings), _along(half_height, *line)
     angle = 2.0 * np.pi / around * np.arange(around)
-    r, turn, z = np.meshgrid(radius * np.sqrt(squared), angle, z, indexing="ij")
-    places = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=-1).reshape(-1, 3)
+    r, phi, z = np.meshgrid(radius * np.sqrt(squared), angle, z, indexing="ij")
+    places = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).reshape(-1, 3)
     shares = (area[:, None, None] / around * np.ones((around, 1)) * height).ravel()
     depth = np.minimum(radius - r, half_height - np.abs(z)).ravel()
     return Moments(places, 2.0 * np.pi * radius**2 * half_height * shares, depth, distance)
 
 
 def _planned(half: float, plan):
-    """Return the plan (panels and points per axis) of at most :data:`_MOST_MOMENTS` moments, and its distance [m]."""
+    """Return ``plan(distance)``, (panels, points) per axis, and the smallest distance [m] for a plan of few moments.
+
+    Few means at most :data:`_MOST_MOMENTS`. The search starts at ``_REACH * half``.
+    """
     distance = _REACH * half
     while np.prod(plan(distance)) > _MOST_MOMENTS:
         distance *= 1.1
@@ -182,7 +185,7 @@ def _prism(polygon: np.ndarray, half_height: float) -> Polyhedron:
     return Polyhedron(corners, (tuple(range(n))[::-1], tuple(range(n, 2 * n)), *sides))
 
 
-def _points_of(corners: np.ndarray, longest: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_points_on_face(corners: np.ndarray, longest: float, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss points on a rectangle or a regular polygon, and their weights [m²]."""
     if len(corners) == 4:
         across = corners[1] - corners[0], corners[3] - corners[0]

@@ -20,8 +20,8 @@ class Solid:
         upper: Upper corner of the bounding box [m], frame of the shape, shape [3].
         volume: Volume [m³].
         centroid: Centroid [m], frame of the shape, shape [3].
-        inside: Function of points [m], frame of the shape, shape [n, 3], that returns True for those inside.
-        facets: Function of a number that returns about as many facets of the surface [m], frame of the shape, shape
+        inside: Function of points [m], frame of the shape, shape [n, 3], that returns True for points inside.
+        facets: Function of a count that returns about ``count`` facets of the surface [m], frame of the shape, shape
             [m, 4, 3] (``facets.py``).
         position: Origin of the shape in the body's frame [m], shape [3].
         rotation: Rotation from the frame of the shape to the body's, shape [3, 3].
@@ -54,17 +54,17 @@ class Solid:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return True for the points [m], body frame, shape [n, 3], that lie inside, shape [n]."""
-        own = (points - self.position) @ self.rotation
-        near = np.flatnonzero(((own >= self.lower) & (own <= self.upper)).all(axis=1))
+        local = (points - self.position) @ self.rotation
+        in_box = np.flatnonzero(((local >= self.lower) & (local <= self.upper)).all(axis=1))
         result = np.zeros(len(points), bool)
-        result[near] = self.inside(own[near])
+        result[in_box] = self.inside(local[in_box])
         return result
 
 
 def boxes_meet(a: Solid, b: Solid) -> bool:
     """Return True if the bounding boxes of two posed shapes, aligned with the body's axes, overlap beyond rounding."""
-    reach = sum(np.abs(s.rotation) @ (0.5 * (s.upper - s.lower)) for s in (a, b))
-    middle_a, middle_b = (s.to_body(0.5 * (s.lower + s.upper)) for s in (a, b))
+    reach = sum(np.abs(solid.rotation) @ (0.5 * (solid.upper - solid.lower)) for solid in (a, b))
+    middle_a, middle_b = (solid.to_body(0.5 * (solid.lower + solid.upper)) for solid in (a, b))
     return bool((np.abs(middle_a - middle_b) < reach * (1.0 - 1e-6)).all())
 
 

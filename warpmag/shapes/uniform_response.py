@@ -1,15 +1,16 @@
-"""Response of a body to uniform and linear fields, from a surface integral, and the correction of its cells for it.
+"""Response of a body to uniform and linear fields, from a surface integral, and the correction of its cells.
 
-Cells of uniform magnetization (``demagnetization.py``) take too small a moment: with one or two cells across a sheet or
-a letter by up to a third. The response of an ideally permeable body follows from its surface alone, which is at one
-potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a uniform field H0, ψ = H0·x, and the moment is ∫ σ x dA. The charge σ is taken
-as constant on facets (``facets.py``), whose potentials are closed forms (Wilton et al., IEEE Trans. Antennas Propag. 32
-(1984) 276). The response of the cells is computed by conjugate gradients.
+Cells of uniform magnetization (``demagnetization.py``) take too small a moment. The moment is up to a third too small
+with one or two cells across a sheet or across the strokes of a letter. The response of an ideally permeable body
+follows from its surface alone, which is at one potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a uniform field H0, ψ = H0·x,
+and the moment is ∫ σ x dA. The charge σ is taken as constant on facets (``facets.py``). The potential of a facet is a
+closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the cells is computed by
+conjugate gradients.
 
 Let P be the polarizability of the cells, Q that of the surface, and N the operator of the cells. The correction
 replaces N by N − E C Eᵀ, where C = P⁻¹ − Q⁻¹ and the columns of E are uniform fields. It adds a field of C times the
 moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is positive,
-the operator stays positive, which it would not if the cells' own tensors were changed instead.
+the operator stays positive. A change of the cells' own tensors would not ensure that.
 
 The same holds for more fields. The columns of E are gradients of harmonic polynomials ψ_k, and P and Q are matrices,
 Q_kl = ∫ σ_k ψ_l dA. Three uniform fields and five linear ones are used. A nearby magnet excites mostly these: without
@@ -32,8 +33,8 @@ FIELD_COUNT = 8
 
 _LINEAR_FIELD_CELLS = 65, 2500
 """Smallest and largest number of cells of bodies that get the linear fields, too. Bodies of fewer cells may respond as
-wholes, for which the tensors with linear fields are not symmetric. Bodies of more cells need little correction, which
-takes time in proportion to their number."""
+wholes (``kernels.induction.body_response``), which needs symmetric tensors; with linear fields they are not symmetric.
+Bodies of more cells need little correction, and its time is proportional to their number."""
 
 FACETS = 600
 """Approximate number of facets of a body. Extrapolation from it and a quarter of it gives a cube's moment to 0.3 %."""
@@ -45,20 +46,20 @@ MOST_FACETS = 1500
 """Largest number of facets. Bodies of more facets, such as meshes of many triangles, are not corrected."""
 
 MOST_MOMENTS = 6200
-"""Largest number of moments of a corrected body: arrays of their pairs take 0.6 GB."""
+"""Largest number of moments of a corrected body: arrays over its pairs take 0.6 GB."""
 
 _POLARIZABILITY_RATIOS = 0.9, 4.0
-"""Smallest and largest plausible ratio of the surface's polarizability to that of the cells. Other ratios come from
-surfaces that nearly meet, which facets do not resolve."""
+"""Smallest and largest plausible ratio of the surface's polarizability to that of the cells. Ratios outside come from
+nearly touching surfaces, which facets do not resolve."""
 
 _NEAR_DISTANCE = 6.0
-"""Distance up to which a facet's potential is integrated, in distances from its center to its corners."""
+"""Distance up to which a facet's potential is integrated, in distances from its center to its farthest corner."""
 
 _ON_EDGE = 1e-15
 """Relative rounding error of r1 + r2 − l on an edge of length l. It bounds a logarithm whose factor is 0 there."""
 
 _RESIDUAL = 1e-3
-"""Relative residual of the cells' magnetization. The error of the moment is its square over the smallest eigenvalue."""
+"""Relative residual of the cells' magnetization. The moment's error is its square over the smallest eigenvalue."""
 
 _MOST_STEPS = 1000
 """Largest number of steps of conjugate gradients; rods of 1:10 take about 60."""
@@ -68,10 +69,10 @@ _CHUNK = 1 << 18
 
 
 def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
-    """Return the coupling with common fields that give the body the response of its surface.
+    """Return the coupling with a matrix of the common fields that gives the body the response of its surface.
 
-    The coupling is returned as it is if the body consists of separate parts, if its surface or its cells are too many,
-    or if shapes coincide, because their facets then coincide, too.
+    The coupling is returned unchanged if the body consists of separate parts, if it has too many facets or cells, or if
+    shapes coincide, because their facets then coincide, too.
     """
     if len(lattice.volumes) > MOST_MOMENTS or not _is_connected(coupling):
         return coupling
@@ -79,10 +80,10 @@ def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence
     coarse, fine = (facets.of_body(solids, count) for count in (most // 4, most))
     if not len(coarse) or len(fine) > MOST_FACETS:
         return coupling
-    of_surface = extrapolated_polarizability(coupling, coarse, fine)
-    of_cells = cell_polarizability(coupling, lattice)
-    for count in range(len(of_cells), 0, -FIELD_COUNT + 3):
-        cells, surface = of_cells[:count, :count], of_surface[:count, :count]
+    surface_matrix = extrapolated_polarizability(coupling, coarse, fine)
+    cell_matrix = cell_polarizability(coupling, lattice)
+    for count in range(len(cell_matrix), 0, -FIELD_COUNT + 3):  # with linear fields if any, else uniform ones only
+        cells, surface = cell_matrix[:count, :count], surface_matrix[:count, :count]
         ratios = np.linalg.eigvals(np.linalg.solve(surface, cells)).real
         if ratios.min() > 1.0 / _POLARIZABILITY_RATIOS[1] and ratios.max() < 1.0 / _POLARIZABILITY_RATIOS[0]:
             common = np.zeros((FIELD_COUNT, FIELD_COUNT))
@@ -98,7 +99,7 @@ def common_potentials(points: np.ndarray) -> np.ndarray:
 
 
 def extrapolated_polarizability(coupling: Coupling, coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
-    """Return :func:`surface_polarizability`, extrapolated from two surfaces: its error is inverse to their facets."""
+    """Return :func:`surface_polarizability`, extrapolated; its error is inversely proportional to the facet count."""
     result = surface_polarizability(coupling, fine)
     if len(fine) < 2 * len(coarse):
         return result
@@ -108,19 +109,19 @@ def extrapolated_polarizability(coupling: Coupling, coarse: np.ndarray, fine: np
 def surface_polarizability(coupling: Coupling, surface: np.ndarray) -> np.ndarray:
     """Return the polarizability matrix Q_kl [m³] of an ideally permeable body for its common fields, shape [k, k].
 
-    The entries of the uniform fields are the moments in them.
+    The entries of the uniform fields are the moments in uniform fields.
 
     Args:
         coupling: Coupling of the body's cells; their number decides which fields are used.
         surface: Facets of the body [m], shape [m, 4, 3].
     """
-    middles, (_, areas) = facets.middles(surface), facets.measures(surface)
+    centroids, (_, areas) = facets.centroids(surface), facets.normals_and_areas(surface)
     count = _field_count(coupling)
-    potential = coupling.extent * common_potentials((middles - coupling.center) / coupling.extent)[:, :count]
+    potential = coupling.extent * common_potentials((centroids - coupling.center) / coupling.extent)[:, :count]
     matrix = np.zeros((len(potential) + 1, len(potential) + 1))
     step = max(1, _CHUNK // len(potential))
     for start in range(0, len(potential), step):
-        matrix[start : min(start + step, len(potential)), :-1] = potentials(middles[start : start + step], surface)
+        matrix[start : min(start + step, len(potential)), :-1] = potentials(centroids[start : start + step], surface)
     matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # unknown potential of the body, whose charge is zero
     charges = np.linalg.solve(matrix, np.append(potential, np.zeros((1, count)), axis=0))[:-1]
     result = (charges * areas[:, None]).T @ potential
@@ -135,13 +136,13 @@ def _field_count(coupling: Coupling) -> int:
 def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
     """Return (1/4π) ∫ dA/‖x − y‖ of each facet at each point [m], shape [points, facets].
 
-    Far from a facet, its area at its center stands for it, with an error below 0.3 %.
+    A distant facet counts as its area at its center, with an error below 0.3 %.
     """
-    origin = surface.mean(axis=(0, 1))  # distances from planes near the origin keep their digits
+    origin = surface.mean(axis=(0, 1))  # near the facets, so that distances from their planes keep their digits
     points, surface = points - origin, surface - origin
-    middles, (_, areas) = facets.middles(surface), facets.measures(surface)
-    squares = _squared_distances(points, middles)
-    size2 = ((surface - middles[:, None]) ** 2).sum(axis=2).max(axis=1)
+    centroids, (_, areas) = facets.centroids(surface), facets.normals_and_areas(surface)
+    squares = _squared_distances(points, centroids)
+    size2 = ((surface - centroids[:, None]) ** 2).sum(axis=2).max(axis=1)
     near = squares < _NEAR_DISTANCE**2 * size2
     squares[near] = 1.0
     result = areas / np.sqrt(squares)
@@ -158,11 +159,11 @@ def _squared_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Return ∫ dA/‖x − y‖ for the pairs of a point and a facet that ``near`` marks.
 
-    It is a sum over edges minus the height over the plane times the solid angle. An edge contributes its distance from
-    the point's projection times a logarithm of the distances of its ends. The solid angle is that of two triangles (van
-    Oosterom and Strackee 1983), whose scalar triple products are heights times areas.
+    The integral is a sum over edges, minus the point's height over the plane times the solid angle. The term of an edge
+    is its distance from the point's projection times a logarithm of the distances of its ends. The solid angle is the
+    sum over two triangles (van Oosterom and Strackee 1983), with scalar triple products of height times area.
     """
-    normals, _ = facets.measures(surface)
+    normals, _ = facets.normals_and_areas(surface)
     squares = [_squared_distances(points, surface[:, k])[near] for k in range(4)]
     distances = [np.sqrt(square) for square in squares]
     height = np.abs(points @ normals.T - np.einsum("mk,mk->m", normals, surface[:, 0]))[near]
@@ -192,7 +193,7 @@ def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) 
 def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     """Return the polarizability matrix P_kl [m³] of a body's cells for its common fields, shape [k, k].
 
-    Cells without a coupling act on each other as dipoles.
+    Pairs of cells without an entry in the coupling act on each other as dipoles.
     """
     apply, root = _cell_operator(coupling, lattice), np.sqrt(lattice.volumes)[:, None, None]
     fields = root * common_fields(coupling.scaled_positions)[:, :, : _field_count(coupling)]
@@ -215,7 +216,7 @@ def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
 def _cell_operator(coupling: Coupling, lattice: Lattice):
     """Return the operator N of the cells, symmetrized by their volumes: a function of arrays [n, 3, fields].
 
-    r = x − y separates each term of r(r·m) into sums over y, which are products of matrices.
+    With r = x − y, each term of r(r·m) becomes a sum over y, computed as a product of matrices.
     """
     unit, n = float(lattice.radii.max()), len(lattice.volumes)
     x, radii = (lattice.positions - lattice.positions.mean(axis=0)) / unit, lattice.radii / unit
@@ -245,7 +246,7 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
 
 
 def _is_connected(coupling: Coupling) -> bool:
-    """Return True if the couplings connect all cells, directly or over other cells."""
+    """Return True if the couplings connect all cells, directly or through other cells."""
     group, before = np.arange(len(coupling.start) - 1), None
     while before is None or (group != before).any():
         before, group = group, np.minimum.reduceat(group[coupling.other], coupling.start[:-1])
