@@ -6,10 +6,12 @@ import sys
 import tomllib
 from collections import defaultdict
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
+import warpmag
 from warpmag.declarations import magnets
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -352,3 +354,12 @@ def test_tokens_have_their_numbers_in_kernels(device):
 
     assert tuple(CURVE_IDS) == magnets.CURVES
     assert {"theta", *LAW_IDS} == set(magnets.DYNAMICS)
+
+
+def test_moved_modules_import_by_their_earlier_names():
+    for earlier, present in warpmag._MOVED.items():
+        sys.modules.pop(earlier, None)
+        with pytest.warns(DeprecationWarning, match=f"{earlier} is now {present}"):
+            module = import_module(earlier)
+        names = [name for name in vars(import_module(present)) if not name.startswith("_")]
+        assert names and all(getattr(module, name) is getattr(import_module(present), name) for name in names)

@@ -7,7 +7,10 @@ Importing this package imports neither Warp nor Newton nor USD. A public name lo
 """
 
 import ast
+import sys
+import warnings
 from importlib import import_module
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 from warpmag.terminal import collection_paused
@@ -39,3 +42,36 @@ def __getattr__(name):
 
 def __dir__():
     return [*__all__, "__version__"]
+
+
+_MOVED = {
+    **{f"warpmag.{name}": f"warpmag.declarations.{name}" for name in ("magnets", "coils", "materials", "curves")},
+    "warpmag.probe": "warpmag.moments.probe",
+    "warpmag.export": "warpmag.show.export",
+    "warpmag.final": "warpmag.show.blender",
+    "warpmag.engine.render": "warpmag.show.ray_tracing",
+    "warpmag.engine.statistics": "warpmag.engine.stepping.statistics",
+}
+"""Earlier and present names of documented modules."""
+
+
+class _MovedModules:
+    """Imports a module by its earlier name, with a DeprecationWarning that gives the present one."""
+
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return ModuleSpec(name, cls) if name in _MOVED else None
+
+    @staticmethod
+    def create_module(spec):
+        return None
+
+    @staticmethod
+    def exec_module(module):
+        present = _MOVED[module.__name__]
+        warnings.warn(f"{module.__name__} is now {present}", DeprecationWarning, stacklevel=2)
+        contents = vars(import_module(present)).items()
+        vars(module).update({name: value for name, value in contents if not name.startswith("__")})
+
+
+sys.meta_path.append(_MovedModules)  # after the finders of files, so it sees only what they do not find
