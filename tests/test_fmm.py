@@ -162,7 +162,7 @@ def test_calls_cache_no_arrays_but_tables(device):
     """Only the tables of harmonics are cached. Cached boxes could be shared with a call in another thread."""
 
     def arrays():
-        pair_sums._kept.clear()
+        pair_sums._cache.clear()
         gc.collect()
         return {id(item): item for item in gc.get_objects() if isinstance(item, wp.array)}
 

@@ -33,13 +33,13 @@ def test_a_call_is_as_if_it_were_the_first(targets, device):
     calls.append(_call(device, 3, targets=targets, moved=5e-4))  # other neighbors overlap
     alone = []
     for arguments, options in calls:
-        pair_sums._kept.clear()
+        pair_sums._cache.clear()
         alone.append(warpmag.h_field(*arguments, **options))
-    pair_sums._kept.clear()
+    pair_sums._cache.clear()
     for k in (0, 2, 3, 1, 0, 1, 3, 2):
         arguments, options = calls[k]
         assert warpmag.h_field(*arguments, **options).tobytes() == alone[k].tobytes()
-    assert len(pair_sums._kept) == (2 if device == "cpu" else 0)
+    assert len(pair_sums._cache) == (2 if device == "cpu" else 0)
 
 
 def test_wrenches_of_calls_that_follow_each_other(device):
@@ -47,7 +47,7 @@ def test_wrenches_of_calls_that_follow_each_other(device):
     (x, m), options = _call(device, 1)
     results = []
     for field in ((0.0, 0.0, 1e4), None):
-        pair_sums._kept.clear()
+        pair_sums._cache.clear()
         results.append(warpmag.wrench(x, m, external_field=field, **options))
     again = warpmag.wrench(x, m, external_field=(0.0, 0.0, 1e4), **options)
     assert [a.tobytes() for a in again] == [a.tobytes() for a in results[0]]
@@ -107,8 +107,8 @@ def call_from_threads(device):
 
 def test_large_sums_are_not_kept(device, monkeypatch):
     """Few buffers are kept."""
-    monkeypatch.setattr(pair_sums, "_MOST_MOMENTS_KEPT", 100)
-    pair_sums._kept.clear()
+    monkeypatch.setattr(pair_sums, "_MOST_CACHED_MOMENTS", 100)
+    pair_sums._cache.clear()
     for count in (80, 81, 82, 83, 84, 85, 101, 150):
         warpmag.h_field(np.random.default_rng(1).normal(size=(count, 3)), np.ones((count, 3)), device=device)
-    assert [shape.count for shape in pair_sums._kept] == ([82, 83, 84, 85] if device == "cpu" else [])
+    assert [shape.count for shape in pair_sums._cache] == ([82, 83, 84, 85] if device == "cpu" else [])

@@ -1,6 +1,6 @@
-"""Array arguments: every check of their shapes, values and ranges, and conversion between NumPy and Warp.
+"""Array arguments: checks of shapes, values and ranges, and conversion between NumPy and Warp.
 
-Calls on arrays take NumPy or Warp arrays and return what they were given. Snapshots of Warp arrays are at the end.
+Calls on arrays take NumPy or Warp arrays and return arrays of the same kind. Snapshots of Warp arrays are at the end.
 """
 
 import math
@@ -29,7 +29,7 @@ REFERENCE_RADIUS_RANGE = {wp.float32: (1e-6, 2e4), wp.float64: (1e-30, 1e30)}
 REFERENCE_FARTHEST = {wp.float32: 5e4, wp.float64: 1e30}
 """Largest coordinate [m] for the method ``reference``."""
 LEAST_FORCE_MOMENT = {wp.float32: 1e-18, wp.float64: 1e-150}
-"""Smallest accepted maximum of moment components [A·m²] for forces, by Warp scalar type: smaller products underflow."""
+"""Lower limit [A·m²] of the largest moment component for forces, by Warp scalar type: smaller products underflow."""
 GRID_REACH = 1e9
 """Largest coordinate that the grid of the neighbor search can index, in contact distances of the largest balls."""
 
@@ -53,7 +53,7 @@ def check_bodies(text: str, count: int, dtype) -> None:
 
 
 def hint(dtype) -> str:
-    """Return the end of a message about numbers out of range of the Warp scalar type ``dtype``."""
+    """Return the end of a message about a number out of range of the Warp scalar type ``dtype``."""
     return "in float32; use float64" if dtype is wp.float32 else "in float64"
 
 
@@ -185,7 +185,7 @@ def norm_squared(array) -> float:
 def largest(array) -> float:
     """Return the largest absolute component of a Warp array of vectors.
 
-    On a GPU the root of the sum of squares stands for it, if that sum is in the range of float32: one reduction.
+    On a GPU one reduction returns the root of the sum of squares instead, if the sum is between 1e-30 and 1e30.
     """
     if array.shape[0] and array.device.is_cuda and 1e-30 < (squared := norm_squared(array)) < 1e30:
         return math.sqrt(squared)
@@ -193,7 +193,7 @@ def largest(array) -> float:
 
 
 def first_not_finite(array, count: int) -> int | None:
-    """Return the first row, of ``count``, that is not finite, or None; on a GPU a reduction decides if there is any."""
+    """Return the first of ``count`` rows that is not finite, or None. On a GPU a reduction tests all rows first."""
     if isinstance(array, wp.array):
         if not count or (array.device.is_cuda and math.isfinite(norm_squared(array[:count]))):
             return None
@@ -233,7 +233,7 @@ class CallContext:
             value: Its value; with ``count`` also one vector, shape [3], for all.
             count: Number of vectors; None accepts any.
             farthest: Largest coordinate [m], for positions; None accepts any.
-            least: Smallest accepted maximum of the components by Warp scalar type; zeros are always accepted.
+            least: Lower limit of the largest component, by Warp scalar type; all zeros are always accepted.
             shared: True if the result may share the caller's memory, because the call only reads it.
 
         Raises:
@@ -285,7 +285,7 @@ class CallContext:
         raise InputError(f"{text}, at most {farthest:g} m {hint(self.dtype)}")
 
     def _from_warp(self, name, array, warp_type, count):
-        """Return a contiguous Warp array of a type, from an array that may be strided, indexed or of another scalar."""
+        """Return a contiguous Warp array of a type, from one that may be strided, indexed or of another scalar type."""
         if array.ndim != 1 or (count is not None and array.shape[0] != count):
             expected = f"[{'n' if count is None else count}] of {warp_type.__name__}"
             raise InputError(shape_message(name, expected, array) + f" of {array.dtype.__name__}")

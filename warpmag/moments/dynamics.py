@@ -1,14 +1,14 @@
-"""Magnetization dynamics, which bring inducible moments from a field evaluation towards equilibrium.
+"""Magnetization dynamics: iterations that bring inducible moments to equilibrium, one field evaluation each.
 
-:func:`make_dynamics` alone chooses a dynamics. All have the same methods, which only launch kernels:
+:func:`make_dynamics` chooses a dynamics by name. All have the same methods, which only launch kernels:
 
 * ``start_from`` sets the magnetizations from which the next solve starts,
 * ``start`` starts a solve in the applied field,
 * ``refine`` improves the moments by the field of their neighbors, before the whole field is summed,
 * ``iterate`` checks convergence in the summed field and takes one step.
 
-``carried`` returns the arrays that a solve leaves for the next one. All work on the state of a solve
-(``kernels.induction.solve_state``), which is bound to its moments.
+``carried`` returns the arrays that one solve passes to the next. All dynamics work on the state of a solve
+(``kernels.induction.solve_state``), which holds the moments.
 """
 
 from functools import cached_property
@@ -21,17 +21,17 @@ from warpmag.kernels.induction import submagnetization, theta_flow
 from warpmag.kernels.induction.body_response import BodyResponses
 
 STEP = 0.3
-"""Default step κ = βΔtMs [dimensionless] of the explicit dynamics: the largest measured one that converges in weak and
+"""Default step κ = βΔtMs [dimensionless] of the explicit dynamics: the largest tested step that converges in weak and
 in strong fields (``bench.paper``, Fig. 8)."""
 DAMPING = 0.2
-"""Default damping α [dimensionless] of LLG: the paper's 0.2 to 0.25."""
+"""Default damping α [dimensionless] of LLG; Kim and Han 2022 use 0.2 to 0.25."""
 
 
 class ThetaFlow:
     """Exact flow of the θ dynamics (Kim and Han 2022, Eqs. 8, 9), accelerated, with an automatic step."""
 
     def __init__(self, state, responses: BodyResponses | None = None):
-        """Act on the moments of ``state``; ``responses`` are the bodies that respond as wholes."""
+        """Prepare the dynamics of the moments of ``state``; ``responses`` are the bodies that respond as wholes."""
         self._state, self._responses = state, responses
 
     def carried(self) -> dict:
@@ -52,7 +52,7 @@ class ThetaFlow:
             launch.launch()
 
     def refine(self):
-        """Sweep over the neighbors of each moment."""
+        """Improve each moment by the field of its neighbors."""
         for launch in self._launches.sweeps:
             launch.launch()
 
@@ -71,7 +71,7 @@ class SubmagnetizationPairs:
     """
 
     def __init__(self, state, law: str, step: float, damping: float):
-        """Act on the moments of ``state`` by the law ``theta-euler``, ``llg`` or ``llg-damping`` (no precession)."""
+        """Prepare the law ``theta-euler``, ``llg`` or ``llg-damping`` (no precession) for the moments of ``state``."""
         self._state = state
         self._pairs = submagnetization.make_pairs(state, law, step, 1.0 / damping if law == "llg" else 0.0)
         self.first, self.second = self._pairs.first, self._pairs.second
@@ -107,13 +107,13 @@ def make_dynamics(name: str, state, *, responses=None, step: float | None = None
 
     Args:
         name: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``.
-        state: State of the solve, bound to its moments.
+        state: State of the solve, after ``solve_state.bind``.
         responses: Bodies that respond as wholes (``BodyResponses``), or None; only ``theta`` uses them.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means :data:`STEP`.
         damping: Damping α [dimensionless] of ``llg``; None means :data:`DAMPING`.
 
     Raises:
-        InputError: A setting is out of range, or the dynamics does not have it.
+        InputError: A setting is out of range, or the dynamics has no such setting.
     """
     if step is not None and name == "theta":
         raise InputError("step: the dynamics 'theta' has an automatic step")

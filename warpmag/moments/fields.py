@@ -29,7 +29,7 @@ from warpmag.moments.ranks import compare_arguments
 
 _METHODS = ("auto", "direct", "reference", "fmm")
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
-"""Smallest accepted maximum of moment components [A·m²] for fields, by Warp scalar type: smaller fields underflow."""
+"""Lower limit [A·m²] of the largest moment component for fields, by Warp scalar type: smaller fields underflow."""
 
 
 @compare_arguments
@@ -49,8 +49,8 @@ def h_field(
     """Return the field H of magnetic moments (Kim and Han 2022, Eq. 1).
 
     Moments with a radius are uniformly magnetized balls. If a ball overlaps the target's ball, the field is averaged
-    over the target. A moment's own field is left out, and so is a point dipole at the target itself: at a distance of
-    zero, or of less than about 1e-19 m in float32.
+    over the target. The field excludes a moment's own, and that of a point dipole at the target itself: at a distance
+    of zero, or of less than about 1e-19 m in float32.
 
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
@@ -179,13 +179,13 @@ def _fmm_rtol(method, rtol, shape: SumsShape) -> float | None:
     """Return the relative error for the fast multipole method, or None for sums over all pairs."""
     targets = shape.count if shape.target_count is None else shape.target_count
     count, pairs = shape.count + (shape.target_count or 0), targets * shape.count
-    better = (
+    is_faster = (
         rtol is not None
-        and not shape.reference  # only the plain loop has the smoothed law
+        and not shape.reference  # only the plain loop computes the smoothed law
         and is_fast(pairs, count, shape.quantity, rtol, wp.get_device(shape.device), launched=True)
     )
-    chosen = method == "fmm" or (method == "auto" and better)
-    return (rtol or DEFAULT_RTOL) if chosen and shape.count and shape.target_count != 0 else None
+    uses_fmm = method == "fmm" or (method == "auto" and is_faster)
+    return (rtol or DEFAULT_RTOL) if uses_fmm and shape.count and shape.target_count != 0 else None
 
 
 def _largest_radius(name, radii, dtype, reference) -> float:
@@ -212,7 +212,10 @@ def _is_reference(context: CallContext, method, smoothing, radii, rtol, dtype) -
 
 
 def _check_finite(name, context: CallContext, results, positions, moments, targets, more=""):
-    """Raise ``InputError`` if a result [n] at the targets is not finite, naming the nearest moment and the largest."""
+    """Raise ``InputError`` if a result at a target is not finite.
+
+    The message lists the arguments and ``more``, the distance of the nearest moment, and the largest moment.
+    """
     row = first_not_finite(results, results.shape[0])
     if row is None:
         return

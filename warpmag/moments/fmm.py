@@ -20,18 +20,18 @@ _DEGREES = (
     (1e-2, 5, 57), (3e-3, 6, 57), (1e-3, 8, 57), (3e-4, 9, 57), (1e-4, 10, 70), (3e-5, 12, 90), (1e-5, 14, 100),
 )  # fmt: skip
 """Relative error, degree of the expansions, and moments of a leaf box. The largest measured errors of fields and forces
-are a third to four fifths of the relative error. Measured were random and aligned moments in boxes and balls, in
+are a third to four fifths of the relative error. The test cases are random and aligned moments in boxes and balls, in
 equilibrium and near saturation, in a shell, a chain and two distant clumps."""
 DEFAULT_RTOL = 1e-3
 """Relative error of the method ``fmm`` if the caller gives none."""
 LEAST_RTOL = _DEGREES[-1][0]
 """Smallest relative error that the expansions reach."""
 _FIELD_SHARE = 0.3
-"""Relative error of a field, over the relative error of the magnetization that it serves."""
+"""Relative error of a field, over the relative error of the magnetization computed from it."""
 _SLACK = 1.001
-"""Factor on the extent of a body, because rounding of its pose may move its moments apart."""
+"""Factor on the extent of a body, because rounding of poses may move moments apart."""
 _LARGE_SHARE = 0.1
-"""Share of all pairs from which on the method ``fmm`` sums pairs by multipoles, even if direct sums are faster."""
+"""Smallest share of all pairs that the method ``fmm`` always sums by multipoles, even if direct sums are faster."""
 _COSTS = {
     ("cpu", Quantity.FIELD): (2.8e7, 55.0),
     ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
@@ -40,10 +40,10 @@ _COSTS = {
     ("cuda, launched", Quantity.FIELD): (2.32e9, 137.0),
     ("cuda, launched", Quantity.WRENCH): (6.8e8, 90.0),
 }
-"""Time of the method in pairs that direct sums take in the same time: a constant, and a number for each harmonic of
-each moment. On a GPU ``launched`` means kernels launched from Python instead of by a graph.
+"""Time of the method, as the number of pairs that direct sums compute in that time: a constant, plus a number per
+harmonic and moment. On a GPU ``launched`` means kernels launched from Python instead of by a graph.
 
-Numbers of moments from which on the method is faster, at a relative error of 1e-3 and of 1e-5:
+Smallest numbers of moments for which the method is faster, at a relative error of 1e-3 and of 1e-5:
 
 ==========================  ================  ================
 device                      fields            forces
@@ -82,7 +82,7 @@ def check_fast(rtol: float):
 
 
 def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device, launched: bool = False) -> bool:
-    """Return True if the method reaches a relative error, and faster than direct sums.
+    """Return True if the method reaches ``rtol`` and is faster than direct sums.
 
     Args:
         pairs: Number of pairs of a target and a moment.
@@ -90,13 +90,13 @@ def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device, l
         quantity: ``FIELD`` or ``WRENCH``.
         rtol: Relative error.
         device: Warp device.
-        launched: True if kernels are launched from Python, False if a graph launches them; matters on a GPU.
+        launched: True if Python launches the kernels, False if a graph does; matters on a GPU.
     """
     if rtol < LEAST_RTOL:
         return False
     on_gpu = "cuda, launched" if launched else "cuda"
-    alone, each = _COSTS[on_gpu if device.is_cuda else "cpu", quantity]
-    return pairs >= alone + (choose_degree(rtol)[0] + 1) ** 2 * each * count
+    constant, per_harmonic = _COSTS[on_gpu if device.is_cuda else "cpu", quantity]
+    return pairs >= constant + (choose_degree(rtol)[0] + 1) ** 2 * per_harmonic * count
 
 
 def choose_degree(rtol: float) -> tuple[int, int]:
@@ -139,15 +139,15 @@ class FastSums:
 
 
 class SystemSums(FastSums):
-    """Sums over pairs of a system's moments, by multipoles only for sets of pairs for which that pays.
+    """Sums over pairs of a system's moments, by multipoles where that is faster.
 
     Args:
         moments: Packed moments, at least one.
         rtol: Relative error.
         worlds: Number of worlds.
         extent: Distance [m] up to which all pairs are summed one by one.
-        crowding: Moments of a leaf box over the number that is best.
-        always_from: Number of pairs from which on multipoles are used even if they are slower.
+        crowding: Moments of a leaf box over the optimal number.
+        always_from: Smallest number of pairs that multipoles sum even if they are slower.
     """
 
     def __init__(self, moments, rtol: float, worlds: int, extent: float, crowding: float, always_from: float):
@@ -156,7 +156,7 @@ class SystemSums(FastSums):
         self._costs = moments.count, rtol, moments.device
         self._crowding, self._always_from = crowding, always_from
 
-    def serves(self, quantity: Quantity, pairs: float) -> bool:
+    def uses_multipoles(self, quantity: Quantity, pairs: float) -> bool:
         """Return True if multipoles sum this number of pairs of a target and an acting moment.
 
         Few pairs are summed one by one. That is faster, and avoids an error that is relatively large if no moment is
@@ -168,7 +168,7 @@ class SystemSums(FastSums):
 
     def sums_of(self, quantity: Quantity, pairs: float, acting: np.ndarray | None = None) -> FmmSums | None:
         """Return :meth:`sums`, or None if this number of pairs is summed one by one."""
-        return self.sums(quantity, acting) if self.serves(quantity, pairs) else None
+        return self.sums(quantity, acting) if self.uses_multipoles(quantity, pairs) else None
 
 
 class NoFastSums:
@@ -180,7 +180,7 @@ class NoFastSums:
     def sums_of(self, quantity: Quantity, pairs: float, acting=None) -> None:
         """Return None."""
 
-    def serves(self, quantity: Quantity, pairs: float) -> bool:
+    def uses_multipoles(self, quantity: Quantity, pairs: float) -> bool:
         """Return False."""
         return False
 
@@ -189,7 +189,7 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
     """Return the sums of an induction solve and of its forces.
 
     Moments of a body exert no force on each other, but expansions cannot distinguish bodies. The moments of a movable
-    body must therefore be in neighboring boxes, whose pairs are summed one by one.
+    body must therefore be in neighboring boxes, because pairs of neighboring boxes are summed one by one.
 
     Args:
         method: One of ``magnets.METHODS``.
@@ -202,12 +202,12 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
         InputError: ``fmm`` is given, but ``rtol`` is too small, or the extent of a body is unknown.
     """
     check_token("method", method, METHODS)
-    several, rtol = layout.movable & ~layout.single, _FIELD_SHARE * rtol
-    known = extent is not None or not several.any()
+    share_body, rtol = layout.movable & ~layout.single, _FIELD_SHARE * rtol
+    extent_known = extent is not None or not share_body.any()
     if method == "fmm":
         check_fast(rtol)
-        if not known:
-            body = layout.bodies[several.argmax()]
+        if not extent_known:
+            body = layout.bodies[share_body.argmax()]
             raise InputError(f"method: 'fmm' needs body_extent, because the movable body {body} has several moments")
     worlds, extent = layout.ranges(), extent or 0.0
     counts = np.diff([0, *(end for _, _, end in worlds)])
@@ -215,20 +215,20 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
     crowding = _crowding(layout.radii, max(2.0 * moments.largest_radius, extent), rtol)
     forces = counts[layout.worlds] @ layout.movable
     fields = counts[layout.worlds] @ ~layout.permanent
-    better = any(
+    is_faster = any(
         is_fast(number / crowding, moments.count, quantity, rtol, moments.device)
         for number, quantity in ((fields, Quantity.FIELD), (forces, Quantity.WRENCH))
     )
-    if not moments.count or method == "direct" or (method == "auto" and not (known and better)):
+    if not moments.count or method == "direct" or (method == "auto" and not (extent_known and is_faster)):
         return NoFastSums()
     always_from = _LARGE_SHARE * pairs if method == "fmm" else math.inf
     return SystemSums(moments, rtol, len(worlds), extent, crowding, always_from)
 
 
 def _crowding(radii: np.ndarray, reach: float, rtol: float) -> float:
-    """Return the number of touching moments in the smallest possible leaf box, over the best number; at least 1.
+    """Return the number of touching moments in the smallest possible leaf box, over the optimal number; at least 1.
 
-    A leaf box is at least as long as ``reach`` [m], so that moments of neighboring boxes include all near pairs.
+    A leaf box is at least as long as ``reach`` [m], so that all near pairs are in neighboring boxes.
     """
     radius = float(np.median(radii)) if len(radii) else 0.0
     occupancy = (0.5 * reach / radius) ** 3 if radius > 0.0 else 0.0

@@ -5,8 +5,8 @@ near 1 up to high degrees. They satisfy
 
     1/|y − x| = Σ R_i(x) I_i(y) for |x| < |y|,    i = n² + n + m, m > 0 for cos mφ, m < 0 for sin |m|φ.
 
-There are K = (degree + 1)² of them. Each is even or odd under x → −x, y → −y and z → −z (``parity``). Translations by
-offsets that differ in signs therefore differ in signs only.
+There are K = (degree + 1)² harmonics. Each is even or odd under x → −x, y → −y and z → −z (``parity``). If two offsets
+differ in signs only, so do the entries of their translations.
 
 Positions are relative to the center of an octree box, in units of its edge h. A multipole q and a local expansion L
 represent the potential ψ, H = −∇ψ, of dipoles with moments m,
@@ -138,7 +138,7 @@ def multipole_to_local(degree: int, offsets) -> np.ndarray:
 
     Args:
         degree: Highest degree of both.
-        offsets: From the center of the multipole to that of the local expansion, in edges, shape [3] or [n, 3].
+        offsets: Vectors from the multipole's center to the local expansion's, in edges, shape [3] or [n, 3].
 
     Returns:
         Shape [K, K] or [n, K, K]; rows belong to the local expansion.
@@ -161,7 +161,7 @@ def _shift_terms(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     n, m, sine = degrees(degree), np.abs(orders(degree)), orders(degree) < 0
     k, j, target_sine = n[:, None], m[:, None], sine[:, None]
     crossed = target_sine != sine  # the harmonic at the offset has a sine
-    reached, sum_order, difference = k + n, m + j, np.abs(m - j)
+    sum_degree, sum_order, difference = k + n, m + j, np.abs(m - j)
     sign = np.where(k % 2, -1.0, 1.0) * _irregular_scales(degree) / _scales(degree)[:, None]
     added = sign * np.where(target_sine & sine, -1, 1)
     subtracted = sign * np.where(target_sine & ~sine, -1, 1) * np.where(j % 2, -1, 1)
@@ -169,8 +169,8 @@ def _shift_terms(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     subtracted = subtracted * np.where(m < j, np.where(difference % 2, -1, 1) * np.where(crossed, -1, 1), 1)
     subtracted = np.where((j == 0) | (crossed & (difference == 0)), 0, subtracted)
     side = np.where(crossed, -1, 1)
-    of_added = reached * reached + reached + side * sum_order
-    of_subtracted = reached * reached + reached + side * difference
+    of_added = sum_degree * sum_degree + sum_degree + side * sum_order
+    of_subtracted = sum_degree * sum_degree + sum_degree + side * difference
     scales = _irregular_scales(2 * degree)
     return added / scales[of_added], subtracted / scales[of_subtracted], of_added, of_subtracted
 
@@ -202,7 +202,7 @@ def _mirrored(degree: int) -> np.ndarray:
 
 
 def _scales(degree: int) -> np.ndarray:
-    """Return each real harmonic's norm over that of the complex harmonic r^n P_n^m/(n + m)! exp(imφ), shape [K]."""
+    """Return the norm of each real harmonic over that of r^n P_n^m/(n + m)! exp(imφ), shape [K]."""
     pairs = zip(degrees(degree).tolist(), np.abs(orders(degree)).tolist(), strict=True)
     return np.array([np.sqrt(float((2 if m else 1) * factorial(n - m) * factorial(n + m))) for n, m in pairs])
 
@@ -213,7 +213,7 @@ def _irregular_scales(degree: int) -> np.ndarray:
 
 
 def _real(matrix: np.ndarray, degree: int) -> np.ndarray:
-    """Return the matrix between real harmonics for one between complex ones, in which order −m is (−1)^m conj."""
+    """Convert a matrix between complex harmonics to real ones. Complex order −m is (−1)^m times the conjugate of m."""
     m, mirrored, scale = orders(degree), _mirrored(degree), _scales(degree)
     sign = np.where(m % 2, -1, 1)
     # cos is half the sum of the orders m and −m, sin their difference over 2i
@@ -224,7 +224,7 @@ def _real(matrix: np.ndarray, degree: int) -> np.ndarray:
 
 
 def _complex(values: np.ndarray, degree: int) -> np.ndarray:
-    """Return the complex harmonics for real ones of the same norm, shape [K]."""
+    """Convert values of real harmonics to complex ones of the same norm, shape [K]."""
     m, mirrored = orders(degree), _mirrored(degree)
     sign = np.where(m % 2, -1, 1)
     return np.where(m < 0, sign * (values[mirrored] - 1j * values), values + np.where(m == 0, 0, 1j) * values[mirrored])

@@ -32,9 +32,9 @@ from warpmag.moments.ranks import compare_arguments
 from warpmag.moments.system import MomentSystem, SolverSettings
 
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
-"""Smallest and largest field in units of the saturation by Warp scalar type: its square and root keep their digits."""
-_USUAL = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
-"""Range of plausible values by Warp scalar type; an error about a result names the arguments outside."""
+"""Smallest and largest field, in units of the saturation, by Warp scalar type: its square and root stay accurate."""
+_PLAUSIBLE = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
+"""Range of plausible values by Warp scalar type. If a result is not finite, the error names the arguments outside."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,15 @@ class InductionResult:
 
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
-        h_field: Field H at the balls [A/m], from everything but the ball itself, shape [n, 3].
+        h_field: Field H at the balls [A/m], without a ball's own, shape [n, 3].
         error: Estimated relative error of the magnetizations, ‖M − M*‖/‖M*‖ over all balls, where M* is the exact
             solution. ``theta`` multiplies the last residual by its estimated amplification (see
             ``warpmag.kernels.induction.theta_flow``). For other dynamics it is the residual ‖M − f(H)‖/‖f(H)‖, the
             computable form of Eq. 12.
         evaluations: Number of field evaluations.
         converged: True if ``error`` is at most ``rtol``.
-        field_error: Relative error ‖H − H_exact‖/‖H_exact‖ of the fast multipole method's field, from sums over all
-            pairs at 256 random balls; 0 without the method.
+        field_error: Relative error ‖H − H_exact‖/‖H_exact‖ of the fast multipole method's field at 256 random balls,
+            where H_exact is from sums over all pairs; 0 without the method.
     """
 
     magnetizations: Any
@@ -218,7 +218,7 @@ class _Balls:
     def make_system(
         self, context: CallContext, material: MomentMaterial, settings: SolverSettings, initial
     ) -> MomentSystem:
-        """Return a system of the balls, followed by the permanent dipoles, ready to solve from ``initial`` or None."""
+        """Return a system of the balls, followed by the permanent dipoles, that starts from ``initial`` if given."""
         n, k = self.count, self.permanent_positions.shape[0]
 
         def padded(values):  # the values of permanent moments are ignored
@@ -248,7 +248,7 @@ class _Balls:
 
 
 def _read_balls(context: CallContext, positions, radii, external_field, permanent) -> _Balls:
-    """Return the arrays of :func:`solve_induction`, raising ``InputError`` for those that it cannot take."""
+    """Return the arrays of :func:`solve_induction`; raises ``InputError`` for invalid arguments."""
     radii = host_radii("radii", radii, context.dtype)
     farthest = largest_coordinate(context.dtype, 2.0 * float(radii.max(initial=0.0)))
     x = context.vectors("positions", positions, farthest=farthest)
@@ -268,10 +268,10 @@ def _read_balls(context: CallContext, positions, radii, external_field, permanen
 def _read_material(count: int, saturation, susceptibility, curve) -> MomentMaterial:
     """Return the material of ``count`` balls: arrays, and one curve or a list of ``count``.
 
-    :meth:`MomentMaterial.parameters` checks the values, and replaces those of measured curves.
+    :meth:`MomentMaterial.parameters` checks the values, and replaces the values of balls with measured curves.
     """
-    each = isinstance(curve, (tuple, list)) and len(curve) == count and count > 0
-    curves = [measured("curve", item) for item in curve] if each else [measured("curve", curve)]
+    is_list = isinstance(curve, (tuple, list)) and len(curve) == count and count > 0
+    curves = [measured("curve", item) for item in curve] if is_list else [measured("curve", curve)]
     if all(isinstance(item, MagnetizationCurve) for item in curves):
         if saturation is not None or not np.array_equal(susceptibility, math.inf):
             name = "saturation" if saturation is not None else "susceptibility"
@@ -281,7 +281,7 @@ def _read_material(count: int, saturation, susceptibility, curve) -> MomentMater
     return MomentMaterial(
         host_scalars("saturation", 1.0 if saturation is None else saturation, count),
         host_scalars("susceptibility", susceptibility, count, infinite=True),
-        curves if each else curves[0],
+        curves if is_list else curves[0],
     )
 
 
@@ -343,7 +343,7 @@ def _check_finite(dtype, count: int, arguments: dict, **results):
     failures = [f"the {name} of ball {row}" for name, row in rows.items() if row is not None]
     if not failures:
         return
-    least, most = _USUAL[dtype]
+    least, most = _PLAUSIBLE[dtype]
     sizes = {name: np.abs(real_array(name, value)) for name, value in arguments.items() if value is not None}
     unusual = [name for name, size in sizes.items() if ((size > 0.0) & ~((size > least) & (size < most))).any()]
     raise InputError(f"{', '.join(unusual or sizes)}: {failures[0]} is not finite {hint(dtype)}")

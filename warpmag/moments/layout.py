@@ -17,7 +17,7 @@ from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host
 
 @dataclass(frozen=True)
 class MomentLayout:
-    """Place of each moment in the system: NumPy arrays of shape [n].
+    """Geometry, world and body of each moment: NumPy arrays of shape [n].
 
     Attributes:
         radii: Radius of the moment's ball [m].
@@ -51,7 +51,7 @@ class MomentLayout:
         )
 
     def runs(self, selected: np.ndarray) -> list[tuple[int, int, int, int]]:
-        """Return (first, end, first of the world, end of the world) of each run of selected moments in one world."""
+        """Return (first, end, first of its world, end of its world) of each run of selected moments within a world."""
         edges = self._edges()
         continues = np.ones(len(selected) + 1, bool)  # False where a world begins
         continues[edges] = False
@@ -120,7 +120,7 @@ class MomentMaterial:
     curve: Any = "tanh"
 
     def parameters(self, permanent: np.ndarray, dtype, device) -> tuple[CurveParameters, np.ndarray]:
-        """Return the material for kernels, and each moment's susceptibility, which is 1 for permanent ones, shape [n].
+        """Return the material for kernels, and the susceptibility of each moment, 1 for a permanent one, shape [n].
 
         Args:
             permanent: True for a permanent moment, shape [n].
@@ -173,9 +173,9 @@ def _slope(susceptibility):
 
 def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
     """Return the kernels' number of each moment's curve, shape [n], and the list of measured curves."""
-    each = isinstance(curve, (tuple, list)) and len(curve) == n
+    is_list = isinstance(curve, (tuple, list)) and len(curve) == n
     measured: dict[MagnetizationCurve, int] = {}
-    known: dict[int, int] = {}  # by identity, because the moments of a body share a curve
+    numbers: dict[int, int] = {}  # by identity, because the moments of a body share a curve object
 
     def number(curve) -> int:
         if isinstance(curve, MagnetizationCurve):
@@ -185,8 +185,8 @@ def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
         check_token("curve", curve, tuple(CURVE_IDS))
         return CURVE_IDS[curve]
 
-    for item in curve if each else (curve,):
-        if id(item) not in known:
-            known[id(item)] = number(item)
-    ids = [known[id(item)] for item in curve] if each else known[id(curve)]
+    for item in curve if is_list else (curve,):
+        if id(item) not in numbers:
+            numbers[id(item)] = number(item)
+    ids = [numbers[id(item)] for item in curve] if is_list else numbers[id(curve)]
     return np.array(np.broadcast_to(ids, n), np.int32), list(measured)

@@ -1,6 +1,6 @@
-"""Sums over pairs for calls on arrays, with buffers and recorded launches kept for the next call of the same shape.
+"""Sums over pairs for calls on arrays. Buffers and recorded launches are cached for the next call of the same shape.
 
-They are kept on a CPU only. Making them takes a millisecond, in which a core sums the field of two thousand moments.
+The cache serves CPUs only. Making the buffers takes a millisecond, in which a core sums the field of 2000 moments.
 """
 
 import os
@@ -20,14 +20,14 @@ from warpmag.moments.arrays import vec3_type
 from warpmag.moments.fmm import FastSums
 from warpmag.moments.ranks import current_ranks
 
-_MOST_KEPT, _MOST_MOMENTS_KEPT = 4, 40_000
-"""Number of sums that are kept, and the largest number of moments and targets of one; each takes half a kilobyte."""
-_kept: "OrderedDict[SumsShape, PairSums]" = OrderedDict()
+_MOST_CACHED, _MOST_CACHED_MOMENTS = 4, 40_000
+"""Largest number of cached sums, and of moments and targets of each; a moment takes half a kilobyte."""
+_cache: "OrderedDict[SumsShape, PairSums]" = OrderedDict()
 
 
 @dataclass(frozen=True)
 class SumsShape:
-    """Shape and options of sums, by which they are kept.
+    """Shape and options of sums, the key of the cache.
 
     Attributes:
         quantity: Summed quantity, ``FIELD`` or ``WRENCH``.
@@ -58,7 +58,8 @@ class PairSums:
     Attributes:
         moments: Packed moments.
         targets: Packed targets; the same object as ``moments`` if these are the targets.
-        base: Field [A/m] that is added to the sums, or that also exerts torques, shape [targets]; 0 at first.
+        base: Field [A/m] at the targets, shape [targets]; 0 at first. ``FIELD`` adds it to the sums. In ``WRENCH`` it
+            exerts torques.
         out: Field [A/m] or forces [N], shape [targets].
         torques: Torques [N·m], shape [targets]; None for ``FIELD``.
     """
@@ -90,7 +91,7 @@ class PairSums:
         others = None if self.targets is self.moments else self.targets
         if not self._shape.reference:  # the plain loop finds overlapping pairs itself
             self.targets.find_overlaps(None if others is None else self.moments)
-        if fmm_rtol is not None:  # the boxes depend on the positions, so that nothing is kept
+        if fmm_rtol is not None:  # not cached, because the boxes depend on the positions
             fast = FastSums(self.moments, fmm_rtol, others)
             fast.build()
             self._evaluation(fast.sums(self._shape.quantity)).launch()
@@ -110,15 +111,15 @@ class PairSums:
 
 @contextmanager
 def pair_sums(shape: SumsShape) -> Iterator[PairSums]:
-    """Yield sums of a shape for one call, which must copy the results before the next call overwrites them."""
-    sums = _kept.pop(shape, None)  # removed, so that threads never share sums
+    """Yield sums of a shape for one call. The caller must copy the results before the next call overwrites them."""
+    sums = _cache.pop(shape, None)  # removed, so that threads never share sums
     if sums is None or sums.threads != _threads():
         sums = PairSums(shape)
     yield sums
-    if shape.device == "cpu" and shape.count + (shape.target_count or 0) <= _MOST_MOMENTS_KEPT:
-        _kept[shape] = sums
-        while len(_kept) > _MOST_KEPT:
-            _kept.popitem(last=False)
+    if shape.device == "cpu" and shape.count + (shape.target_count or 0) <= _MOST_CACHED_MOMENTS:
+        _cache[shape] = sums
+        while len(_cache) > _MOST_CACHED:
+            _cache.popitem(last=False)
 
 
 def _threads() -> int:
@@ -127,4 +128,4 @@ def _threads() -> int:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_kept.clear)  # a child lacks the threads of the recorded launches
+    os.register_at_fork(after_in_child=_cache.clear)  # a child lacks the threads of the recorded launches

@@ -17,7 +17,7 @@ from warpmag.moments.arrays import shape_message, vec3_type
 from warpmag.moments.system import MomentSystem
 
 _NO_BODY = -2
-"""Body label of points: neither a moment nor the padding of packed rows has it."""
+"""Body label of points, different from the labels of moments and of the padding of packed rows."""
 
 
 class FieldProbe:
@@ -29,11 +29,11 @@ class FieldProbe:
         system: The moments.
         count: Number of points p.
         worlds: World of each point, shape [p]; None means the first for all. Points of one world should be adjacent,
-            because each run of them is summed separately.
+            because each run of adjacent points is summed separately.
         gradients: True to compute gradients, which takes three more sums over pairs.
 
     Raises:
-        InputError: ``worlds`` has a wrong shape, or the system lacks a world.
+        InputError: ``worlds`` has a wrong shape, or holds a world that the system lacks.
 
     Attributes:
         points: The points [m], shape [p]; written by the caller before :meth:`measure`.

@@ -1,12 +1,12 @@
 """Ranks: processes started by ``mpirun`` that share the sums over pairs of one simulation.
 
 Each rank holds all moments, and on a host with GPUs uses one of them. It computes its share of the list of pairs and
-then receives the sums of the other ranks. Everything small is computed by every rank. The list of pairs is that of a
-single process, so that results are bitwise the same. A single process imports nothing for this.
+then receives the sums of the other ranks. Every rank does all other work itself. The list of pairs is that of a single
+process, so that results are bitwise the same. A single process imports neither MPI nor NCCL.
 
 Sums are merged as integers: each rank stores its own sums and zeros elsewhere, and adding zeros to the bits of a number
-keeps them in any order. ``mpi4py`` merges arrays of CPUs and across hosts. NVIDIA's NCCL merges arrays of GPUs; its
-library is called directly, so that a CUDA graph captures it between kernels.
+keeps them in any order. ``mpi4py`` merges arrays of CPUs and across hosts. NVIDIA's NCCL merges arrays of GPUs. Python
+calls the NCCL library directly, so that a CUDA graph captures it between kernels.
 
 An error of one rank is exchanged before any rank waits for sums: for the arguments of calls, for work that the first
 rank does for all, and at the end of a sweep. All ranks then raise the same message.
@@ -33,9 +33,9 @@ from warpmag.declarations.checks import check_count
 from warpmag.errors import InputError, SimulationError, extra, one_line
 
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")
-"""Environment variables in which launchers give the number of processes."""
-_GRACE = 5.0
-"""Time [s] within which all ranks fail that fail for the same reason."""
+"""Environment variables of launchers with the number of processes."""
+_ABORT_DELAY = 5.0
+"""Time [s] for which a failed rank waits for the other ranks to fail, too, before it aborts them."""
 _ID_BYTES, _INT32, _SUM = 128, 2, 0
 """NCCL's size of a unique identifier [bytes], type ``ncclInt32`` and operation ``ncclSum`` (``nccl.h``)."""
 
@@ -55,20 +55,20 @@ def launched_ranks() -> "Ranks | None":
     if all(os.environ.get(name, "1") == "1" for name in _COUNTS):
         return None
     try:
-        from mpi4py import MPI  # noqa: PLC0415 - initializes MPI, which only processes of a launcher may
+        from mpi4py import MPI  # noqa: PLC0415 - initializes MPI, allowed in processes of a launcher only
     except ImportError as error:
         raise InputError(f"mpirun: ranks need {extra('ranks')}: {error}") from None
     return Ranks(MPI) if MPI.COMM_WORLD.size > 1 else None
 
 
 def current_ranks() -> "Ranks | None":
-    """Return the ranks that share the sums of objects made now, or None if this process computes them all."""
+    """Return the ranks that share the sums of newly made objects, or None if this process computes all sums."""
     return None if _disabled else launched_ranks()
 
 
 @contextmanager
 def without_ranks() -> Iterator[None]:
-    """Let this process compute everything itself, also later for objects made in this context."""
+    """Make this process compute all sums of objects made in this context, also later, without the other ranks."""
     global _disabled  # for all threads, because a thread that shared sums would wait for the other ranks
     _disabled += 1
     try:
@@ -159,13 +159,13 @@ def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -
             for worlds in groups[all_ranks.rank :: all_ranks.size]:
                 if all_ranks.has_failed():
                     break
-                own.append(pickle.dumps(simulate(worlds)))  # here, so that all ranks raise an error of pickling
+                own.append(pickle.dumps(simulate(worlds)))  # here, so that an error of pickling reaches all ranks
         results = all_ranks.exchange(own)
     return [pickle.loads(results[group % all_ranks.size][group // all_ranks.size]) for group in range(len(groups))]
 
 
 def _checksum(value: Any, before: int = 0) -> int:
-    """Return a checksum of an argument that is equal in all processes for equal values; objects count by their type."""
+    """Return a checksum of an argument, equal in all processes for equal values. Other objects count by type."""
     if hasattr(value, "numpy"):
         value = value.numpy()
     if isinstance(value, (list, tuple)):
@@ -204,17 +204,17 @@ class Ranks:
         host = self._all.Split_type(mpi.COMM_TYPE_SHARED)
         self.local_rank = host.rank
         self._failures, self._gpus = self._all.Dup(), None
-        self._show, sys.excepthook = sys.excepthook, self._end
+        self._show, sys.excepthook = sys.excepthook, self._fail_uncaught
 
     def share(self, count: int) -> tuple[int, int]:
         """Return begin and end of this rank's share of ``count`` pieces of work."""
         return count * self.rank // self.size, count * (self.rank + 1) // self.size
 
     def merge(self, array) -> None:
-        """Add a contiguous Warp array over all ranks, of which one at most has bits that are not 0 in each word.
+        """Add a contiguous Warp array over all ranks. Each 32-bit word may be nonzero on one rank only.
 
         Raises:
-            InputError: A graph is being captured on a CPU, which cannot contain this.
+            InputError: A graph is being captured on a CPU, and such a graph cannot contain the exchange.
         """
         if array.device.is_cuda:
             self._gpus = self._gpus or _Nccl(self, array.device)
@@ -267,15 +267,15 @@ class Ranks:
                     raise InputError(f"{prefix}{name}: {reason}")
 
     def fail(self, line: str, code: int, show) -> None:
-        """Report a failure once and end: rank 0 reports if all ranks fail, else this rank, which ends the others.
+        """Report a failure once. If all ranks fail, rank 0 reports it. Otherwise this rank does, and aborts the others.
 
         Args:
             line: Message.
             code: Exit code.
             show: Function that prints a line.
         """
-        everyone, until = self._failures.Ibarrier(), time.monotonic() + _GRACE
-        while not everyone.Test():
+        barrier, until = self._failures.Ibarrier(), time.monotonic() + _ABORT_DELAY
+        while not barrier.Test():
             if time.monotonic() > until:
                 show(f"rank {self.rank}: {line}")
                 sys.stdout.flush()
@@ -284,15 +284,15 @@ class Ranks:
         if self.rank == 0:
             show(line)
 
-    def _end(self, kind, error, trace) -> None:
-        """Show an uncaught exception, and end the other ranks, which would wait for this one."""
+    def _fail_uncaught(self, kind, error, trace) -> None:
+        """Show an uncaught exception, and abort the other ranks, which would wait for this rank."""
         self.fail(str(error), 1, lambda _: self._show(kind, error, trace))
 
 
 class _Nccl:
     """NVIDIA's library NCCL, which merges arrays on the GPUs of several ranks."""
 
-    def __init__(self, others: Ranks, device):
+    def __init__(self, ranks: Ranks, device):
         """Make a communicator of all ranks, each with its Warp device."""
         import warp as wp  # noqa: PLC0415 - the command reads the ranks before it silences Warp
 
@@ -303,15 +303,13 @@ class _Nccl:
         self._current = wp.ScopedDevice
         library.ncclGetErrorString.restype = ctypes.c_char_p
         identifier = (ctypes.c_char * _ID_BYTES)()
-        if others.rank == 0:
+        if ranks.rank == 0:
             self._check(library.ncclGetUniqueId(ctypes.byref(identifier)))
-        identifier = _Identifier.from_buffer_copy(others.exchange(bytes(identifier))[0])
+        identifier = _Identifier.from_buffer_copy(ranks.exchange(bytes(identifier))[0])
         self._communicator = ctypes.c_void_p()
         with wp.ScopedDevice(device):
-            self._check(
-                library.ncclCommInitRank(ctypes.byref(self._communicator), others.size, identifier, others.rank)
-            )
-            self.merge(wp.zeros(1, dtype=wp.int32, device=device))  # connects the ranks, which a graph cannot
+            self._check(library.ncclCommInitRank(ctypes.byref(self._communicator), ranks.size, identifier, ranks.rank))
+            self.merge(wp.zeros(1, dtype=wp.int32, device=device))  # connects the ranks, impossible in a graph
             wp.synchronize_device(device)
 
     def merge(self, array) -> None:

@@ -65,7 +65,7 @@ class SolverSettings:
     single_torque: bool = False
 
     def check(self, dtype: str) -> None:
-        """Raise ``InputError`` for a setting that is out of range, ``dtype`` being ``float32`` or ``float64``."""
+        """Raise ``InputError`` for a setting out of range of ``dtype``, ``float32`` or ``float64``."""
         check_token("contact_model", self.contact_model, CONTACT_MODELS)
         check_token("dynamics", self.dynamics, DYNAMICS)
         check_force("force", self.force, self.contact_model)
@@ -92,8 +92,8 @@ class MomentSystem:
         material: Material of the inducible moments.
         external_field: Applied field [A/m], shape [3] or [n, 3].
         settings: Settings of the solve and of the forces.
-        couplings: For each body that consists of cells its first moment, and the correction of the pair sums between
-            its cells (``shapes.demagnetization.Coupling``).
+        couplings: First moment of each body that consists of cells, and the correction of the pair sums between the
+            cells (``shapes.demagnetization.Coupling``).
         sources: Coils and field maps; their bodies are numbered like those of the moments.
         solids: Permanent bodies with a closed-form near field, ordered by world.
         dtype: ``float32`` or ``float64``.
@@ -123,7 +123,7 @@ class MomentSystem:
         is_fast: True if the fast multipole method sums the pairs.
         worlds: World of each moment, NumPy, shape [n].
         world_ranges: (First moment, first permanent moment, end) of each world.
-        h: Field at the inducible moments [A/m], from everything but themselves, with the bias, shape [n]. The dynamics
+        h: Field at the inducible moments [A/m], without a moment's own, with the bias, shape [n]. The dynamics
             ``theta`` ends with M = f(H) in this field.
         forces: Forces [N] on movable moments, shape [n], written by :meth:`apply_forces`.
         torques: Torques about each moment's position [N·m], shape [n], written by :meth:`apply_forces`; 0 for an
@@ -203,7 +203,7 @@ class MomentSystem:
         self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
 
     def _make_bias(self, layout: MomentLayout) -> MomentLayout:
-        """Allocate the bias of permanent moments with recoil permeability; return the layout without them as balls."""
+        """Allocate the bias of moments with recoil permeability, which are not aligned in the returned layout."""
         recoils = (self.material.curve.numpy() == LINEAR) & ~layout.permanent
         self.bias, self._biased = None, wp.array(np.flatnonzero(recoils), dtype=wp.int32, device=self.device)
         if recoils.any():
@@ -213,7 +213,7 @@ class MomentSystem:
         return replace(layout, aligned=layout.aligned & ~recoils)
 
     def _make_sources(self, layout: MomentLayout, sources, solids):
-        """Prepare the field of sources: added to the external field, it magnetizes moments and acts on them."""
+        """Prepare the field of sources. Added to the external field, it magnetizes moments and acts on them."""
         self.sources = self.source_interaction = None
         self._magnetizing_field = self._acting_field = self.external_field
         if sources or solids:
@@ -242,7 +242,7 @@ class MomentSystem:
         self._inducible_field = PairEvaluation(Quantity.FIELD, of_inducible, packed, packed, state.h0, self.h, **more)
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
-        """Prepare the corrections between cells; ``whole`` is True if small bodies respond as wholes."""
+        """Prepare the corrections between cells. If ``whole``, small bodies respond as wholes."""
         worlds = [(first, middle) for first, middle, _ in layout.ranges()]
         self._cells = self.rotations = None
         if couplings:
@@ -260,17 +260,17 @@ class MomentSystem:
         return BodyResponses(self._induction, bodies, self._cells) if bodies else None
 
     def _make_wrench(self, layout: MomentLayout, turned):
-        """Prepare the forces on movable moments, and the torques of the ``turned`` ones, for each force law."""
+        """Prepare forces on movable moments for each force law, and torques of the moments that ``turned`` marks."""
         self._turned = wp.array(turned.astype(np.int32), dtype=wp.int32, device=self.device)
         segments = [np.reshape(layout.runs(layout.movable & rows), (-1, 4)) for rows in (~turned, turned)]
-        whole = np.concatenate(segments)
-        pairs = pair_count(whole)  # one sum by multipoles, so that actions equal reactions
+        all_segments = np.concatenate(segments)
+        pairs = pair_count(all_segments)
 
         def evaluations(force, effective):
-            # those with a torque come last, because the mirrored form of the others writes forces on all moments
+            # moments with a torque come last, because the mirrored form of the others writes forces on all moments
             parts = [(force, segments[0]), (Quantity.WRENCH, segments[1])]
-            if self._fast.serves(Quantity.WRENCH, pairs):
-                parts = [(Quantity.WRENCH if len(segments[1]) else force, whole)]
+            if self._fast.uses_multipoles(Quantity.WRENCH, pairs):  # in one sum, so that actions equal reactions
+                parts = [(Quantity.WRENCH if len(segments[1]) else force, all_segments)]
             return [
                 PairEvaluation(
                     quantity, rows, self._packed, self._packed, self._acting_field, self.forces, effective=effective,
@@ -350,7 +350,7 @@ class MomentSystem:
             self.source_interaction.follow(self.eddy.motion)
 
     def carried(self) -> dict[str, wp.array]:
-        """Return by name the arrays that a solve leaves for the next one; restoring them repeats the next solve."""
+        """Return by name the arrays that one solve passes to the next. Restoring them repeats the next solve."""
         parts = {"induction": solve_state.carried_arrays(self._induction), "pairs": self._packed.carried()}
         parts["dynamics"] = self.dynamics.carried()
         if self._near is not None:
@@ -363,13 +363,13 @@ class MomentSystem:
         """Launch the induction solve: bring the inducible ``moments`` to equilibrium at ``positions``."""
         self.begin()
         if self._inducible_field.count:
-            # No world can converge before its first evaluation. One iteration outside of the loop saves a GPU time.
+            # No world can converge before its first evaluation. One iteration outside of the loop saves time on a GPU.
             iterate = self.iterate if self._ranks is None else self._iterate_with_ranks
             iterate()
             wp.capture_while(self._induction.condition, iterate)
 
     def begin(self):
-        """Launch the start of a solve, which :meth:`iterate` continues; :meth:`solve` does both."""
+        """Launch the start of a solve. :meth:`iterate` continues it; :meth:`solve` does both."""
         packed = self._packed
         packed.pack(self.positions, self.moments)
         if self.source_interaction is not None:
@@ -434,7 +434,7 @@ class MomentSystem:
             near_pairs.wait(self._near)
 
     def field_error(self) -> float:
-        """Return the relative error of the fast multipole method's field at some moments, or 0 without the method.
+        """Return the relative error of the fast multipole method's field at sampled moments, or 0 without the method.
 
         Corrections by cells and near contacts are left out of both fields. Waits for the device.
         """
@@ -454,18 +454,18 @@ class MomentSystem:
     def energy(self) -> np.ndarray:
         """Return the energy of each world's moments after :meth:`solve` [J], float64, shape [worlds].
 
-        It is the energy of all fields and of the magnetization curves. Its negative gradient by the positions is the
+        It is the energy of all fields and of the magnetization curves. The negative gradient by the positions is the
         Kelvin force. Permanent moments of one body add a constant. Waits for the device.
 
         Raises:
             InputError: The contact model is not ``dipole``.
         """
         if self.settings.contact_model != "dipole":
-            raise InputError("contact_model: the energy is known for dipole only, not for multipole")
+            raise InputError("contact_model: the energy can be computed for dipole only, not for multipole")
         energies = self._moment_energies()
         if self.source_interaction is not None:
             energies += self.source_interaction.energies()
-        if self.bias is not None:  # zero energy is at M = M_r in no field
+        if self.bias is not None:  # the energy is 0 at M = M_r without field
             bias = np.linalg.norm(self.bias.numpy().astype(float), axis=1)
             volumes = 4.0 / 3.0 * np.pi * self.radii.numpy().astype(float) ** 3
             energies += 0.5 * MU0 * volumes * self.material.slope.numpy() * bias**2

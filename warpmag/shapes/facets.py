@@ -10,7 +10,7 @@ import numpy as np
 
 from warpmag.shapes.solids import Solid
 
-_MIN_PER_SIDE = 3
+_LEAST_PER_SIDE = 3
 """Smallest number of facets along a side of a box."""
 
 _TEST_OFFSET = 1e-4
@@ -19,7 +19,7 @@ _TEST_OFFSET = 1e-4
 
 def box(half_extents: np.ndarray, count: int) -> np.ndarray:
     """Return about ``count`` facets of a box."""
-    n = max(_MIN_PER_SIDE, round(np.sqrt(count / 6.0)))
+    n = max(_LEAST_PER_SIDE, round(np.sqrt(count / 6.0)))
     lines = -np.cos(np.pi * np.linspace(0.0, 1.0, n + 1))
     sides = []
     for axis, sign in ((k, s) for k in range(3) for s in (1.0, -1.0)):
