@@ -134,7 +134,7 @@ def test_a_stage_written_with_the_numbers_reads_the_same():
         (
             "iron",
             {"saturationMagnetization": (Sdf.ValueTypeNames.Float, 1e6)},
-            "/Ball: warpmag:material: iron says what",
+            "/Ball: warpmag:material: iron sets",
         ),
     ],
 )

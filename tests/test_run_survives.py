@@ -268,9 +268,9 @@ def test_what_is_written_of_a_scene_edited_in_memory_has_the_edits(kind, scene, 
     rub(layer, 0.25)
     simulation = Simulation(path, device=device)
     (warning,) = [line for line in simulation.warnings() if "not saved" in line]
-    assert warning.startswith(f"{layer.realPath}: has edits in this process that are not saved")
+    assert warning.startswith(f"{layer.realPath}: has unsaved edits in this process")
     if kind == "package":
-        with pytest.raises(InputError, match=r"edited.usdz: has edits that are not saved, and is in a package"):
+        with pytest.raises(InputError, match=r"edited.usdz: has unsaved edits and is in a package"):
             simulation.run(1, output=output)
         return
     simulation.run(1, output=output)

@@ -36,20 +36,20 @@ def test_curves_on_a_stage():
 @pytest.mark.parametrize(
     "material,attributes,message",
     [
-        ("M-19", {"susceptibility": (FLOAT, 9.0)}, "M-19 says what warpmag:susceptibility is"),
-        ("M-19", {"curve": (Sdf.ValueTypeNames.Token, "tanh")}, "M-19 says what warpmag:curve is"),
+        ("M-19", {"susceptibility": (FLOAT, 9.0)}, "M-19 sets warpmag:susceptibility"),
+        ("M-19", {"curve": (Sdf.ValueTypeNames.Token, "tanh")}, "M-19 sets warpmag:curve"),
         (
             "M-19",
             {"curve": (Sdf.ValueTypeNames.Token, "1010-steel")},
-            "M-19 says what the magnet is made of",
+            "M-19 sets the magnetization curve",
         ),
-        ("iron", {"curve": (Sdf.ValueTypeNames.Token, "1010-steel")}, "iron says what the magnet is made of"),
+        ("iron", {"curve": (Sdf.ValueTypeNames.Token, "1010-steel")}, "iron sets the magnetization curve"),
         ("", {"curve:h": (DOUBLE, [0.0, 1e3])}, "warpmag:curve:h and warpmag:curve:b: 2 fields, but 0 values"),
         ("", {"curve:b": (DOUBLE, [0.0, 1.3])}, "warpmag:curve:h and warpmag:curve:b: 0 fields, but 2 values"),
         (
             "",
             {"curve:h": (DOUBLE, GOOD[0]), "curve:b": (DOUBLE, GOOD[1]), "saturationMagnetization": (FLOAT, 1e6)},
-            "warpmag:saturationMagnetization: a measured curve says it",
+            "warpmag:saturationMagnetization: a measured curve sets it",
         ),
         (
             "",

@@ -73,10 +73,10 @@ def test_what_cannot_run_is_told_by_both(case, device, tmp_path, capsys):
 
 
 WARNED = {
-    "a joint of nothing": ([A, joint("Revolute", None, None, RIGHT, LEFT)], "/World/Joint: joins things that do not"),
+    "a joint of nothing": ([A, joint("Revolute", None, None, RIGHT, LEFT)], "/World/Joint: joins two fixed ends"),
     "a joint of kinematic bodies": (
         [A, ball("K", (1, 0, 0), kinematic=True, magnet=False), joint("Fixed", "K", None, RIGHT, LEFT)],
-        "/World/Joint: joins things that do not move",
+        "/World/Joint: joins two fixed ends",
     ),
     "an overlap": ([A, ball("B", (1.9 * R, 0, 1))], "1 pair of bodies overlaps at the start"),
 }
@@ -94,12 +94,12 @@ SLIPS = {
     "/World/Spelt": (
         'uniform token warpmag:kind = "permanent"\nvector3f warpmag:magnetisation = (0, 0, 1e6)',
         "warpmag:magnetisation has no effect: no schema has it, the nearest is warpmag:magnetization",
-        "a permanent magnet without magnetization: warpmag:magnetization says it, or warpmag:material its strength",
+        "a permanent magnet without magnetization: author warpmag:magnetization",
     ),
     "/World/Soft": (
         "vector3f warpmag:magnetization = (0, 0, 1e6)\nfloat warpmag:recoilPermeability = 1.05",
-        "warpmag:magnetization has no effect on an inducible magnet: warpmag:kind says what it is",
-        "warpmag:recoilPermeability has no effect on an inducible magnet: warpmag:kind says what it is",
+        "warpmag:magnetization has no effect on an inducible magnet, as warpmag:kind declares it",
+        "warpmag:recoilPermeability has no effect on an inducible magnet, as warpmag:kind declares it",
     ),
     "/World/Space": (
         'uniform token wrapmag:kind = "permanent"\nvector3f warpMag:magnetization = (0, 0, 1e6)\nfloat wax:kind = 1',

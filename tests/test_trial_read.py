@@ -201,7 +201,7 @@ def test_every_failure_to_read_is_one_line_about_the_file(kind, module, name, tm
 def test_missing_variant_sets_are_damage(tmp_path):
     """One byte of a stage with variants is zero, so that their set has no name; USD's validators crash on it."""
     path = Path(shutil.copy(Path(__file__).parent / "fuzz" / "lost_variants.usdc", tmp_path / "stage.usdc"))
-    with pytest.raises(InputError, match=r"stage.usdc: damaged: /World/Earth names variants that are not there"):
+    with pytest.raises(InputError, match=r"stage.usdc: damaged: /World/Earth names variants that do not exist"):
         open_stage(path)
 
 

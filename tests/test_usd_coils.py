@@ -115,7 +115,7 @@ def test_a_run_has_the_coils_of_its_stage_in_their_places(tmp_path, device):
         expected = [0.0, 7.0 - current / (2.0 * 0.04), 0.0]
         np.testing.assert_allclose(magnetics.h_field(middle)[0], expected, atol=1e-4 * 700.0)  # the ball adds a little
     simulation.step()
-    assert any("100 % of its largest where the map ends" in line for line in simulation.warnings())
+    assert any("100 % of its maximum on the boundary of the map" in line for line in simulation.warnings())
 
 
 def test_a_current_follows_its_time_samples(tmp_path, device):
@@ -167,7 +167,7 @@ UNEVEN = "float3 xformOp:scale = (1, 2, 1)", 'uniform token[] xformOpOrder = ["x
     (coil("float warpmag:coil:radius.timeSamples = { 0: 1, 1: 2, }"), "has time samples, but cannot change"),
     (coil("float warpmag:coil:radius = 1", "float warpmag:coil:ampereTurns.timeSamples = { 0: 1, 1: nan, }"),
      "warpmag:coil:ampereTurns at time code 1: must be finite"),
-    (coil("float warpmag:coil:radius = 1", *UNEVEN), "must not be scaled unevenly"),
+    (coil("float warpmag:coil:radius = 1", *UNEVEN), "must not be mirrored or have a non-uniform scale"),
     (coil("float warpmag:coil:radius = 1", kind="Scope"), "has no transform"),
     (field_map(), "/Thing: warpmag:fieldMap:spacing is missing"),
     (field_map(*MAPPED), "warpmag:fieldMap:values is missing"),

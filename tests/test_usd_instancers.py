@@ -217,31 +217,37 @@ REFUSED = {
     "an index beyond the prototypes": (["Ball"], [0, 1], [(0, 0, 0), (0, 0, 1)], "", "protoIndices names prototype 1"),
     "a negative index": (["Ball"], [-1], [(0, 0, 0)], "", "protoIndices names prototype -1"),
     "too few positions": (["Ball"], [0, 0], [(0, 0, 0)], "", "positions has 1 values for 2 instances"),
-    "no positions": (["Ball"], [0], [], "", "positions is missing, of 1 instances"),
+    "no positions": (["Ball"], [0], [], "", "positions is missing for 1 instances"),
     "too many scales": (["Ball"], [0], [(0, 0, 0)], "float3[] scales = [(1, 1, 1), (1, 1, 1)]", "scales has 2 values"),
     "a quaternion of zeros": (
         ["Ball"],
         [0],
         [(0, 0, 0)],
         "quath[] orientations = [(0, 0, 0, 0)]",
-        "orientations of instance 0 has length 0 in place of 1",
+        "orientations of instance 0 has length 0, not 1",
     ),
     "an infinite quaternion": (
         ["Ball"],
         [0],
         [(0, 0, 0)],
         "quath[] orientations = [(inf, 0, 0, 0)]",
-        "orientations of instance 0 has length inf in place of 1",
+        "orientations of instance 0 has length inf, not 1",
     ),
     "a long quaternion": (
         ["Ball"],
         [0, 0],
         [(0, 0, 0), (1, 0, 0)],
         "quath[] orientations = [(1, 0, 0, 0), (1, 0, 1, 0)]",
-        "orientations of instance 1 has length 1.41421 in place of 1",
+        "orientations of instance 1 has length 1.41421, not 1",
     ),
     **{
-        f"{name} of {kind}": (["Ball"], [0], [(0, 0, 0)], f"{kind} {name} = {value}", f"{name} is no array of {wanted}")
+        f"{name} of {kind}": (
+            ["Ball"],
+            [0],
+            [(0, 0, 0)],
+            f"{kind} {name} = {value}",
+            f"{name} is not an array of {wanted}",
+        )
         for name, kind, value, wanted in (
             ("orientations", "Odd[]", "[(1, 0, 0, 0)]", "quaternions"),  # a type that USD does not know
             ("orientationsf", "float[]", "[1]", "quaternions"),

@@ -8,7 +8,7 @@ from warpmag.errors import InputError
 
 _ARGUMENTS = ":SDF_FORMAT_ARGS:"
 _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-"""Control characters, ends of lines, and the surrogates that Python decodes from bytes that are no UTF-8."""
+"""Control characters, line separators, and the surrogates by which Python represents invalid UTF-8."""
 
 
 def usable_path(path: str | os.PathLike) -> Path:
@@ -21,22 +21,22 @@ def usable_path(path: str | os.PathLike) -> Path:
     if not text:
         raise InputError("the path of a file must not be empty")
     if _UNPRINTABLE.search(text):
-        raise InputError(f"{text!a}: a path with a control character or one that is no UTF-8")
+        raise InputError(f"{text!a}: the path contains a control character or is not UTF-8")
     if _ARGUMENTS in text:
-        raise InputError(f"{text}: USD takes what follows {_ARGUMENTS} for arguments")
+        raise InputError(f"{text}: USD reads the text after {_ARGUMENTS} as arguments")
     try:
         expanded = Path(text).expanduser()
     except RuntimeError:
         raise InputError(f"{text}: no such home folder") from None
     if "\\" in os.path.abspath(expanded):
-        raise InputError(f"{text}: USD takes a backslash for a slash")
+        raise InputError(f"{text}: USD reads a backslash as a slash")
     return expanded
 
 
 def full_path(path: Path) -> Path:
     """Return the absolute path of a file.
 
-    A link to the file stays. Links of folders are resolved if the path contains ``..``: USD reads ``link/..`` as the
+    A link to the file is kept. Links to folders are resolved if the path contains ``..``: USD reads ``link/..`` as the
     folder that holds the link, the file system as the folder above the link's target.
     """
     return (path.parent.resolve() if ".." in path.parts else Path(os.path.abspath(path.parent))) / path.name

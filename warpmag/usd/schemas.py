@@ -45,7 +45,7 @@ _READERS: dict[str, Callable[[str, Any], Any]] = {
     "vector3f[]": vector_array,
     "point3f[]": point_array,
 }
-"""Functions from what a USD attribute holds to the value of a field, by the type that the schema has."""
+"""Functions that convert the value of a USD attribute to the value of a field, by USD type."""
 _TO_USD: dict[str, Callable[[Any], Any]] = {
     "vector3f": lambda value: Gf.Vec3f(*value),
     "point3f": lambda value: Gf.Vec3f(*value),
@@ -53,14 +53,14 @@ _TO_USD: dict[str, Callable[[Any], Any]] = {
     "vector3f[]": lambda value: Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, np.float32).reshape(-1, 3)),
     "point3f[]": lambda value: Vt.Vec3fArray([Gf.Vec3f(*point) for point in value]),
 }
-"""Functions from the value of a field to what a USD attribute takes; other types take the value as it is."""
+"""Functions that convert the value of a field to the value of a USD attribute; other USD types need none."""
 
 
 def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
     """Make ``prim`` a magnet and author its attributes: Newton reads authored values only, no fallbacks.
 
-    Attributes without a meaning for this magnet are left out: a recoil permeability of 1, a conductivity of 0, and
-    those that a measured curve sets.
+    Attributes without effect on this magnet are left out: a recoil permeability of 1, a conductivity of 0, and
+    attributes that a measured curve sets.
     """
     magnet.check(str(prim.GetPath()))
     measured = isinstance(magnet.curve, MagnetizationCurve)
@@ -81,7 +81,7 @@ def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
 
 
 def author_schema(prim: Usd.Prim, schema: Schema, values: Mapping[str, Any]) -> None:
-    """Apply a schema to ``prim`` and author its attributes, those of ``values`` by field."""
+    """Apply a schema to ``prim`` and author its attributes that have a field in ``values``."""
     prim.AddAppliedSchema(schema.name)
     for row in schema.attributes:
         if row.field in values:
@@ -91,9 +91,9 @@ def author_schema(prim: Usd.Prim, schema: Schema, values: Mapping[str, Any]) -> 
 def author(prim: Usd.Prim, attribute: Attribute, value: Any) -> None:
     """Author one attribute of the table on ``prim``."""
     variability = Sdf.VariabilityUniform if attribute.uniform else Sdf.VariabilityVarying
-    kind = Sdf.ValueTypeNames.Find(attribute.usd_type)
-    made = prim.CreateAttribute(attribute.usd_name, kind, custom=False, variability=variability)
-    made.Set(_TO_USD[attribute.usd_type](value) if attribute.usd_type in _TO_USD else value)
+    usd_type = Sdf.ValueTypeNames.Find(attribute.usd_type)
+    created = prim.CreateAttribute(attribute.usd_name, usd_type, custom=False, variability=variability)
+    created.Set(_TO_USD[attribute.usd_type](value) if attribute.usd_type in _TO_USD else value)
 
 
 def read_fields(prim: Usd.Prim, attributes: Iterable[Attribute]) -> dict[str, Any]:
@@ -182,27 +182,27 @@ def moment_of(prim: Usd.Prim) -> tuple[float, float, float] | None:
 
 
 def _material_fields(prim: Usd.Prim, material: str, magnet: Magnet) -> dict:
-    """Return the fields of a magnet that a named material sets; the prim must not author these, too."""
+    """Return the fields of a magnet that a named material sets; the prim must not author them itself."""
     owner = f"{prim.GetPath()}: {MATERIAL}"
     if magnet.kind == "permanent":
         return {"magnetization": materials.permanent(owner, material, magnet.magnetization)}
     values = materials.inducible(owner, material)
     if isinstance(magnet.curve, MagnetizationCurve):
-        raise InputError(f"{owner}: {material} says what the magnet is made of, and a measured curve does, author one")
+        raise InputError(f"{owner}: {material} sets the magnetization curve, and so does a measured curve: author one")
     for field in _SET_BY_CURVE if "curve" in values else values:
         name = MAGNET_SCHEMA.usd_name(field)
         if prim.GetAttribute(name).HasAuthoredValue():
-            raise InputError(f"{owner}: {material} says what {name} is, author one or the other")
+            raise InputError(f"{owner}: {material} sets {name}: author one or the other")
     return values
 
 
 def _with_curve(prim: Usd.Prim, magnet: Magnet) -> Magnet:
-    """Return a magnet with the measured curve of the prim, by name or by points; it sets saturation and χ, too."""
+    """Return a magnet with the measured curve of the prim, by name or points; the curve also sets saturation and χ."""
     points = [prim.GetAttribute(name).Get() for name in CURVE_POINTS]
     if any(points):
         curve_name = prim.GetAttribute(_CURVE)
         if curve_name and curve_name.HasAuthoredValue():
-            raise InputError(f"{prim.GetPath()}: {_CURVE}: there are points of a curve, too, author one or the other")
+            raise InputError(f"{prim.GetPath()}: {_CURVE}: conflicts with the points of a curve, author one")
         owner = f"{prim.GetPath()}: {' and '.join(CURVE_POINTS)}"
         curve = MagnetizationCurve.from_bh(*(numbers or () for numbers in points), name=owner)
     else:
@@ -210,7 +210,7 @@ def _with_curve(prim: Usd.Prim, magnet: Magnet) -> Magnet:
     if isinstance(curve, MagnetizationCurve):
         for name in map(MAGNET_SCHEMA.usd_name, ("saturation", "susceptibility")):
             if prim.GetAttribute(name).HasAuthoredValue():
-                raise InputError(f"{prim.GetPath()}: {name}: a measured curve says it, author one")
+                raise InputError(f"{prim.GetPath()}: {name}: a measured curve sets it, author one")
     return dataclasses.replace(magnet, curve=curve)
 
 
@@ -225,19 +225,19 @@ def _author_curve(prim: Usd.Prim, curve: MagnetizationCurve) -> None:
 
 
 def settings_of(prim: Usd.Prim) -> MagneticSettings:
-    """Return the magnetic settings of a PhysicsScene ``prim``; raise :class:`InputError` naming it where invalid."""
+    """Return the magnetic settings of a PhysicsScene ``prim``; raises :class:`InputError` if they are invalid."""
     settings = MagneticSettings(**read_fields(prim, attributes_of(MagneticSettings)))
     settings.check(str(prim.GetPath()))
     return settings
 
 
 def finite_vector(name: str, value) -> tuple[float, float, float]:
-    """Return the three components of a vector of a stage; raise :class:`InputError` by its name where not finite."""
+    """Return the components of a vector called ``name`` in messages; raises :class:`InputError` unless finite."""
     components = vector(name, value)
     check_vector(name, components)
     return components
 
 
 def has_api(prim: Usd.Prim, name: str) -> bool:
-    """Return whether the API schema ``name`` is applied to ``prim``, registered in time for USD to know it or not."""
+    """Return whether the API schema ``name`` is applied to ``prim``, even if registered after the first stage."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()

@@ -1,4 +1,4 @@
-"""Values of USD attributes, checked: of the type of the schema, finite and in range; otherwise an error of one line."""
+"""Checks values of USD attributes: type of the schema, finite, in range. Each error is one line."""
 
 import contextlib
 import math
@@ -50,7 +50,7 @@ _TOKENS = {
     **dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")),
     "orientation": ("rightHanded", "leftHanded"),
 }
-_TURNS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
+_QUATERNIONS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
 _INERTIA_TOLERANCE = 1e-2
 """Largest excess of a moment of inertia over the sum of the other two, as a fraction of the sum of all three.
 
@@ -66,12 +66,12 @@ _SHAPES = {
     "Mesh": ("points", "faceVertexCounts", "faceVertexIndices", "orientation", "subdivisionScheme", "holeIndices"),
 }
 _VECTORS = (Gf.Vec3f, Gf.Vec3d, Gf.Vec3h, Gf.Vec3i)
-_OF_SCHEMAS = (
+_NEED_SCHEMA = (
     *("physics:mass", "physics:density", "physics:centerOfMass", "physics:diagonalInertia", "physics:principalAxes"),
     *("physics:staticFriction", "physics:dynamicFriction", "physics:restitution"),
     *("physics:velocity", "physics:angularVelocity", "physics:kinematicEnabled"),
 )
-"""Attributes without effect where none of their schemas is applied, which are the first four of ``_SCHEMAS``."""
+"""Attributes that have no effect unless their schema, one of the first four of ``_SCHEMAS``, is applied."""
 _SCHEMAS = (
     *("PhysicsMassAPI", "PhysicsMaterialAPI", "PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"),
     *("NewtonSceneAPI", "NewtonMaterialAPI", "NewtonMeshCollisionAPI", "NewtonCollisionAPI"),
@@ -97,7 +97,7 @@ class Finding:
 
     Attributes:
         where: Path of the prim, or the name of the stage.
-        message: The fault.
+        message: Description of the error.
         severity: ``error`` (a run does not start) or ``warning``.
     """
 
@@ -129,8 +129,8 @@ def value_of(prim: Usd.Prim, name: str):
     """Return the default value of an attribute, None where it has none.
 
     Raises:
-        InputError: The value is not of the schema's type, not finite or out of range. Infinities are valid where they
-            are the schema's defaults, such as those of limits.
+        InputError: The value is not of the schema's type, not finite or out of range. Infinities are valid only
+            where they are the schema's defaults, such as those of limits.
     """
     attribute = prim.GetAttribute(name)
     if not attribute:
@@ -154,11 +154,11 @@ def value_of(prim: Usd.Prim, name: str):
 
 
 def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
-    """Yield errors and warnings about the attributes of a prim that Newton's importer reads, without transforms.
+    """Yield errors and warnings about the attributes that Newton's importer reads from a prim, except transforms.
 
     Args:
         prim: Any prim.
-        shape: Whether to check the attributes of its shape, too.
+        shape: Whether to check also the attributes of its shape.
     """
     names = [name for name in prim.GetAuthoredPropertyNames() if name.startswith(_READ)]
     for name in (*names, *(_SHAPES.get(prim.GetTypeName(), ()) if shape else ())):
@@ -171,13 +171,13 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
             yield finding_of(str(prim.GetPath()), error)
         if finding := instance_finding(attribute):
             yield finding
-        if name in _OF_SCHEMAS and name not in prim.GetPrimDefinition().GetPropertyNames():
+        if name in _NEED_SCHEMA and name not in prim.GetPrimDefinition().GetPropertyNames():
             schemas = " or ".join(schema for schema in _SCHEMAS[:4] if name in _defaults(schema))
             yield Finding(str(prim.GetPath()), f"{name} has no effect: the prim has no {schemas}", "warning")
 
 
 def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
-    """Yield findings about a scene's ``newton`` properties that no schema has: Newton takes them for declarations."""
+    """Yield findings about ``newton`` properties of a scene in no schema: Newton reads them as declarations."""
     path = str(scene.GetPath())
     known = {*scene.GetPrimDefinition().GetPropertyNames(), *_newton_attributes(), *_OPTIONS}
     for attribute in scene.GetAuthoredPropertiesInNamespace("newton"):
@@ -185,7 +185,7 @@ def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
         if name in known:
             continue
         if not isinstance(attribute, Usd.Attribute):
-            yield Finding(path, f"{name} is a relationship, but in no schema: Newton takes it for an attribute")
+            yield Finding(path, f"{name} is a relationship, but in no schema: Newton reads it as an attribute")
             continue
         declaration = {key: attribute.GetCustomDataByKey(key) for key in _DECLARED}
         for key, value in declaration.items():
@@ -197,7 +197,7 @@ def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
 
 
 def instance_finding(attribute: Usd.Attribute) -> Finding | None:
-    """Return the error about time samples inside an instance, where no value can be held; None where there are none."""
+    """Return an error if an attribute inside an instance has time samples, which cannot be frozen there, or None."""
     prim = attribute.GetPrim()
     if not (prim.IsInstanceProxy() and attribute.GetNumTimeSamples()):
         return None
@@ -208,7 +208,7 @@ def instance_finding(attribute: Usd.Attribute) -> Finding | None:
         prim = prim.GetParent()
     return Finding(
         str(attribute.GetPrim().GetPath()),
-        f"{attribute.GetName()} has time samples inside an instance, where no moment of them can be held: "
+        f"{attribute.GetName()} has time samples inside an instance, where they cannot be frozen: "
         f"set instanceable = false on {prim.GetPath()}",
     )
 
@@ -227,7 +227,7 @@ def number(name: str, value) -> float:
 
 
 def vector(name: str, value) -> tuple[float, float, float]:
-    """Return a vector of three numbers as :func:`number` gives them."""
+    """Return the components of a vector, each rounded by :func:`number`."""
     if not isinstance(value, _VECTORS):
         raise InputError(f"{name}: {_shown(value)} is not a vector")
     x, y, z = (number(name, component) for component in value)
@@ -275,13 +275,13 @@ def check_type(prim: Usd.Prim, name: str, value, example) -> None:
 
 
 def declared(attribute: Usd.Attribute):
-    """Return a value of the declared type of an attribute, None where that type is unknown."""
+    """Return the default value of an attribute's declared type, None where the type is unknown."""
     return attribute.GetTypeName().defaultValue if attribute.GetTypeName() else None
 
 
 @cache
 def _known() -> dict[str, object]:
-    """Return the defaults of attributes that Newton reads by name, with the schema applied or not."""
+    """Return the defaults of attributes that Newton reads by name, whether or not their schema is applied."""
     return {name: value for schema in _SCHEMAS for name, value in _defaults(schema).items()}
 
 
@@ -333,12 +333,12 @@ def _check_numbers(prim, name, value, fallback) -> None:
 
 def _broken_condition(name, value) -> str:
     """Return the condition that the numbers of a value break together, empty where they break none."""
-    if name in _TURNS:
+    if name in _QUATERNIONS:
         norm = float(np.linalg.norm(_numbers(value)))
         if abs(norm - 1.0) > 1e-2 and not (norm == 0.0 and name == "physics:principalAxes"):
             return "must be a quaternion of length 1"
     if name == "physics:diagonalInertia" and 2.0 * max(value) > (1.0 + _INERTIA_TOLERANCE) * sum(value):
-        return "must be the inertia of a body: none of three more than the sum of the others"
+        return "must be the inertia of a body: no component above the sum of the other two"
     return ""
 
 

@@ -1,6 +1,6 @@
 """Instancers of very many identical balls, which stay one prim: each ball is a row of the arrays and has no prims.
 
-100,000 prims take a gigabyte and a minute to open. An instancer of as many balls opens at once, and each frame of a
+100,000 prims take a gigabyte and a minute to open. An instancer of as many balls opens immediately, and each frame of a
 run is a few arrays.
 """
 
@@ -24,7 +24,7 @@ class BallInstancer:
         groups: Its identical balls.
         frames: Transforms of the balls of each group.
         bodies: Path of each ball, in the order of the arrays.
-        magnets: Path of the magnet of each ball, None for a ball without, shape [n].
+        magnets: Path of the magnet of each ball, None for a ball without a magnet, shape [n].
         permanent: Whether the magnet is permanent, shape [n].
     """
 

@@ -23,7 +23,7 @@ _SEVERITIES = {"Error": "error", "Warn": "warning"}
 
 @dataclass(frozen=True)
 class StageReport:
-    """Contents of a stage and everything that is wrong with it.
+    """Contents of a stage, with its errors and warnings.
 
     Attributes:
         path: File of the stage.
@@ -96,7 +96,7 @@ def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
 
 
 def _add_balls(contents: StageContents, instancer: BallInstancer) -> None:
-    """Add the balls of an instancer to ``contents``, behind the ball with prims that they are identical to."""
+    """Add the balls of an instancer to ``contents``, each after the identical ball that has prims."""
     for paths in (contents.bodies, contents.colliders):
         for prim, copies in instancer.copies_of(paths).items():
             position = paths.index(prim) + 1

@@ -49,8 +49,8 @@ def stage_clock(stage: Usd.Stage) -> StageClock:
     name = stage_name(stage)
     codes = stage.GetTimeCodesPerSecond()
     frames = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else codes
-    for what, rate in (("timeCodesPerSecond", codes), ("framesPerSecond", frames)):
-        _check_rate(name, what, rate)
+    for key, rate in (("timeCodesPerSecond", codes), ("framesPerSecond", frames)):
+        _check_rate(name, key, rate)
     start, end = start_of(stage), _time_code(stage, "endTimeCode", stage.GetEndTimeCode())
     if end < start and stage.HasAuthoredMetadata("endTimeCode"):
         raise InputError(f"{name}: endTimeCode {end:g} is before startTimeCode {start:g}")
@@ -61,13 +61,13 @@ def stage_clock(stage: Usd.Stage) -> StageClock:
 
 
 def check_rates(stage: Usd.Stage) -> None:
-    """Raise :class:`InputError` for a layer with an invalid rate, over whose samples USD would loop forever.
+    """Raise :class:`InputError` for a layer with an invalid rate: USD would loop forever over its samples.
 
     USD divides the rates of layers that differ, and NaN differs from itself.
     """
     for layer in stage.GetUsedLayers():
-        what = "timeCodesPerSecond" if layer.HasTimeCodesPerSecond() else "framesPerSecond"
-        _check_rate(layer.realPath or layer.identifier, what, layer.timeCodesPerSecond)
+        key = "timeCodesPerSecond" if layer.HasTimeCodesPerSecond() else "framesPerSecond"
+        _check_rate(layer.realPath or layer.identifier, key, layer.timeCodesPerSecond)
 
 
 def scenes(stage: Usd.Stage) -> list[Usd.Prim]:
@@ -78,9 +78,9 @@ def scenes(stage: Usd.Stage) -> list[Usd.Prim]:
 def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
     """Yield errors in the units of a stage, and a warning where the unit of length is USD's default."""
     units, name = units_of(stage), stage_name(stage)
-    for what, unit in (("metersPerUnit", units.meters), ("kilogramsPerUnit", units.kilograms)):
+    for key, unit in (("metersPerUnit", units.meters), ("kilogramsPerUnit", units.kilograms)):
         if not 1e-50 < unit < 1e50:
-            yield Finding(name, f"{what} must be positive and finite, got {unit:g}")
+            yield Finding(name, f"{key} must be positive and finite, got {unit:g}")
     if (up := UsdGeom.GetStageUpAxis(stage)) not in ("Y", "Z"):
         yield Finding(name, f"upAxis must be Y or Z, got {up!r}")
     if not stage.GetRootLayer().pseudoRoot.HasInfo("metersPerUnit"):
@@ -88,11 +88,11 @@ def unit_findings(stage: Usd.Stage) -> Iterator[Finding]:
         yield Finding(name, message, "warning")
 
 
-def _check_rate(name, what, rate) -> None:
+def _check_rate(name, key, rate) -> None:
     if not (rate > 0.0 and math.isfinite(rate)):
-        raise InputError(f"{name}: {what} must be positive and finite, got {rate}")
+        raise InputError(f"{name}: {key} must be positive and finite, got {rate}")
     if not _RATES[0] <= rate <= _RATES[1]:
-        raise InputError(f"{name}: {what} must be from {_RATES[0]:g} to {_RATES[1]:g}, got {rate}")
+        raise InputError(f"{name}: {key} must be from {_RATES[0]:g} to {_RATES[1]:g}, got {rate}")
 
 
 def _step(stage) -> float | None:
@@ -104,7 +104,7 @@ def _step(stage) -> float | None:
     return None if rate is None else 1.0 / rate
 
 
-def _time_code(stage, what, code) -> float:
+def _time_code(stage, key, code) -> float:
     if not abs(code) <= _LATEST:
-        raise InputError(f"{stage_name(stage)}: {what} must be finite and at most {_LATEST:g} in size, got {code}")
+        raise InputError(f"{stage_name(stage)}: {key} must be finite and at most {_LATEST:g} in size, got {code}")
     return code

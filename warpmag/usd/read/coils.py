@@ -1,4 +1,4 @@
-"""The applied API schemas ``WarpmagCoilAPI`` and ``WarpmagFieldMapAPI``: authoring, and reading with their places.
+"""The applied API schemas ``WarpmagCoilAPI`` and ``WarpmagFieldMapAPI``: authoring and reading.
 
 A source of a field moves with the nearest rigid body at or above its prim.
 """
@@ -90,7 +90,8 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
         if has_api(prim, FIELD_MAP_SCHEMA.name):
             field_map = field_map_of(prim)
             if (ratio := field_map.border_ratio()) > _BORDER_WARNING:
-                message = f"the field is up to {100.0 * ratio:.0f} % of its largest where the map ends, and zero beyond"
+                share = f"{100.0 * ratio:.0f} % of its maximum"
+                message = f"the field is up to {share} on the boundary of the map, and zero beyond"
                 yield Finding(path, message, "warning")
             yield PlacedSource(path, _scaled(field_map, scale), body, position, rotation)
     except InputError as error:
@@ -147,7 +148,7 @@ def field_map_of(prim: Usd.Prim) -> FieldMap:
 
 
 def _read(prim: Usd.Prim, schema: Schema) -> dict:
-    """Return the values of the attributes of a schema by field; none but ampere-turns may change over time."""
+    """Return the values of the attributes of a schema by field; only ampere-turns may change over time."""
     values = read_fields(prim, schema.attributes)
     for row in schema.attributes:
         if not (attribute := prim.GetAttribute(row.usd_name)):
@@ -167,7 +168,7 @@ def _current(name: str, value) -> tuple[float]:
 
 
 def _changes(attribute: Usd.Attribute) -> bool:
-    """Return whether a layer has several time samples for an attribute, also where a value is held over them."""
+    """Return whether a layer has several time samples for an attribute, even below a frozen value."""
     return any(spec.layer.GetNumTimeSamplesForPath(spec.path) > 1 for spec in attribute.GetPropertyStack())
 
 
@@ -188,7 +189,7 @@ def _frame(prim):
     axes = np.array(matrix)[:3, :3]
     scales = np.linalg.norm(axes, axis=1)
     if np.ptp(scales) > _SCALE_TOLERANCE * scales.max() or np.linalg.det(axes) < 0.0:
-        raise InputError(f"{prim.GetPath()}: a coil or a field map must not be scaled unevenly or mirrored")
+        raise InputError(f"{prim.GetPath()}: a coil or a field map must not be mirrored or have a non-uniform scale")
     quaternion = Gf.Matrix3d((axes / scales[:, None]).tolist()).ExtractRotation().GetQuat()
     rotation = (*quaternion.GetImaginary(), quaternion.GetReal())
     return tuple(np.array(matrix)[3, :3].tolist()), rotation, float(scales.mean())

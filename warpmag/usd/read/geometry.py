@@ -11,9 +11,9 @@ from warpmag.usd.values import LARGEST_COORDINATE, LARGEST_SIZE, SMALLEST_SIZE, 
 
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height")
 _LARGEST_MAGNET = 2e4
-"""Limit of a magnet's sizes [m], so that its moment and its square stay in single precision."""
+"""Limit of a magnet's sizes [m], so that its moment and the moment's square stay in single precision."""
 _AS_DRAWN = ("none", "meshSimplification", "sdf", None)
-"""Approximations that keep a mesh's surface. The others close it; for an open mesh they are magnetized in its place."""
+"""Collision approximations that keep a mesh's surface. The others are closed, and replace an open mesh as magnet."""
 
 
 def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:

@@ -16,7 +16,7 @@ from warpmag.usd.read.transforms import is_animated, rotation_of
 from warpmag.usd.schemas import MAGNET_API
 
 COMPACT_COUNT = 5_000
-"""Least number of instances that a run writes as an instancer: as prims each would take 10 kB of memory."""
+"""Least number of instances that a run writes as an instancer: as prims, each would take 10 kB of memory."""
 MOMENTS_PRIMVAR = "primvars:warpmag:moment"
 """Moments of instances [A·m²], world frame."""
 INSTANCE_ARRAYS = {
@@ -44,7 +44,8 @@ class IdenticalBalls:
         rows: Rows of the instances in the arrays, ``first`` in front, shape [1 + n].
         arrays: :data:`INSTANCE_ARRAYS` of these instances, shape [1 + n, ...]; quaternions (x, y, z, w). Empty where
             the instancer has none.
-        stays_instancer: Whether a run writes the instancer as one: it is large, and all its instances are such balls.
+        stays_instancer: Whether a run writes the instancer as an instancer: it is large, and all its instances are
+            identical balls.
         create_prims: Creates the prims of the other instances.
     """
 
@@ -90,8 +91,8 @@ class BallFrames:
         Args:
             stage: The stage, in meters.
             balls: Its instances.
-            rotation: Rotation of the first body in the world, whose bits the other bodies are to share; by default the
-                stage's.
+            rotation: Rotation of the first body in the world, such as Newton's, so that all bodies have its rounding;
+                by default the rotation in the stage.
         """
         transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
         self.instancer = np.array(transforms.GetLocalToWorldTransform(stage.GetPrimAtPath(balls.instancer)))
@@ -120,8 +121,8 @@ class BallFrames:
 
         Args:
             arrays: Arrays of the instances.
-            first: Velocities of the first body, shape [6], which the others share in their own frames where the arrays
-                have none; by default zero.
+            first: Velocities of the first body, shape [6], by default zero. Where the arrays have none, the other
+                bodies have the same velocities in their own frames.
         """
         linear, angular = arrays["velocities"], np.radians(arrays["angularVelocities"])
         rotations = self._rotations(arrays)
@@ -171,7 +172,7 @@ class BallFrames:
 
 
 def has_interchangeable_instances(stage: Usd.Stage, instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
-    """Return whether no prim may refer to single instances of an instancer, and its scale is uniform."""
+    """Return whether no prim can refer to a single instance, and the scale of the instancer is uniform."""
     path = instancer.GetPath()
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         if (
@@ -191,7 +192,7 @@ def has_interchangeable_instances(stage: Usd.Stage, instancer: UsdGeom.PointInst
 
 
 def can_stay_instancer(instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
-    """Return whether a run may write an instancer as one.
+    """Return whether a run may write an instancer as an instancer.
 
     Nothing else may move or scale it, and the scales and prototypes of its instances are constant.
     """

@@ -12,13 +12,13 @@ from warpmag.errors import InputError
 from warpmag.usd.values import quiet
 
 USD_FAILURES = (RuntimeError, UnicodeDecodeError, MemoryError, OverflowError, SystemError)
-"""Exceptions that USD raises over a stage; ``Tf.ErrorException`` and ``RecursionError`` are RuntimeErrors."""
+"""Exceptions that USD raises when it reads a stage; ``Tf.ErrorException`` and ``RecursionError`` are RuntimeErrors."""
 NOT_USD = "not a USD file"
 _NOT_TEXT = "text that is not UTF-8"
 _LONGEST = 1_000
-"""Characters that are kept of USD's message, which over a damaged file may be a gigabyte."""
+"""Largest number of characters read of USD's message, which for a damaged file may have a gigabyte."""
 _LZ4_CODE = re.compile(r" LZ4 error code: -?\d+")
-"""Part of USD's message over a damaged file that differs each time."""
+"""Part of USD's message about a damaged file that differs each time."""
 _LOSSES = re.compile(r"[Ss]kipp|Invalid|Ignoring(?! body-level density)|unspecified|zero mass|not imported|result\.")
 """Words of a warning about content that Newton leaves out; other warnings are ignored."""
 _SESSION_LAYER = re.compile(r",@anon:[^@]*@")

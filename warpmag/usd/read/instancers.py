@@ -1,9 +1,9 @@
 """Expands PointInstancers of physical prims, which Newton does not import: each instance becomes prims of its own.
 
 The prims are in a layer of the session, below the instancer, which becomes an Xform: ``/Balls/instance12/Ball`` with a
-reference to the prototype. A run writes that layer below its cache, in which each instance then moves by itself.
-Instances with an inactive id are left out, invisible ones are not. Instancers without colliders, bodies and magnets
-stay unchanged. Instancers of very many identical balls stay instancers (``ball_instancers.py``).
+reference to the prototype. A run writes that layer below its cache, which moves the instances. Instances with an
+inactive id are left out. Invisible instances are kept. Instancers without colliders, bodies and magnets stay
+unchanged. Instancers of very many identical balls stay instancers (``ball_instancers.py``).
 """
 
 from dataclasses import dataclass, replace
@@ -56,7 +56,7 @@ def expand_instancers(stage: Usd.Stage, time_code: float, *, defer: bool = False
         The deferred instances, whose prims :func:`complete_instances` creates.
 
     Raises:
-        InputError: An instancer breaks USD's rules or stands for too many prims.
+        InputError: An instancer breaks USD's rules or expands to too many prims.
     """
     expansion = _Expansion(stage, time_code, defer)
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
@@ -146,7 +146,9 @@ class _Expansion:
         """Write the prims of an instancer's instances, except for deferred ones."""
         path, layer = instancer.GetPath(), self._layer_of_prims()
         instances = _Instances(instancer, len(targets), self._time)
-        if any(len(instances.arrays[name]) for name in _VELOCITIES):  # which bodies inside instances get, too
+        if any(
+            len(instances.arrays[name]) for name in _VELOCITIES
+        ):  # they are written to the bodies, also inside instances
             for target in targets:
                 release_instances(self._stage, layer, target)
         prototypes = [_prototype(self._stage.GetPrimAtPath(target)) for target in targets]
@@ -161,7 +163,7 @@ class _Expansion:
             1 + prototypes[instances.prototypes[row]].prims for row in instances.rows if row not in without_prims
         )
         if self._prims > MOST_PRIMS:
-            raise InputError(f"{path}: instances of bodies that stand for more than {MOST_PRIMS} prims")
+            raise InputError(f"{path}: instances of bodies expand to more than {MOST_PRIMS} prims")
         later = [balls.rows[1:].tolist() for balls in groups]
         self.deferred += [
             replace(balls, create_prims=partial(write, rows)) for balls, rows in zip(groups, later, strict=True)
@@ -226,7 +228,7 @@ class _Instances:
         self.arrays["orientations"] = self._orientations(time)
         self._scales = self._array("scales", time, 3)
         if not len(self.arrays["positions"]) and self._count:
-            raise InputError(f"{self._path}: positions is missing, of {self._count} instances")
+            raise InputError(f"{self._path}: positions is missing for {self._count} instances")
         ids = self._array("ids", time, None)
         metadata = self._prim.GetMetadata("inactiveIds")
         inactive = set(metadata.GetAppliedItems() if metadata else ())
@@ -263,7 +265,7 @@ class _Instances:
         array = np.zeros(0) if value is None else np.asarray(value)
         kinds = "if" if width else "i"
         if array.size and (array.dtype.kind not in kinds or array.ndim != (2 if width else 1)):
-            raise InputError(f"{self._path}: {name} is no array of {'vectors' if width else 'whole numbers'}")
+            raise InputError(f"{self._path}: {name} is not an array of {'vectors' if width else 'whole numbers'}")
         if name != "protoIndices" and len(array) not in (0, self._count):
             raise InputError(f"{self._path}: {name} has {len(array)} values for {self._count} instances")
         return array if width else array.astype(np.int64)
@@ -273,7 +275,7 @@ class _Instances:
         values = {name: self._prim.GetAttribute(name).Get(time) or () for name in ("orientations", "orientationsf")}
         for name, value in values.items():
             if not isinstance(value, _QUATERNION_ARRAYS):
-                raise InputError(f"{self._path}: {name} is no array of quaternions")
+                raise InputError(f"{self._path}: {name} is not an array of quaternions")
         name = "orientationsf" if len(values["orientationsf"]) else "orientations"
         quaternions = np.array(values[name], dtype=float) if len(values[name]) else np.zeros((0, 4))
         if quaternions.shape not in ((0, 4), (self._count, 4)):
@@ -282,7 +284,7 @@ class _Instances:
         wrong = ~(np.abs(lengths - 1.0) <= _LENGTH_ERROR)
         if wrong.any():
             row = int(wrong.argmax())
-            raise InputError(f"{self._path}: {name} of instance {row} has length {lengths[row]:g} in place of 1")
+            raise InputError(f"{self._path}: {name} of instance {row} has length {lengths[row]:g}, not 1")
         return quaternions / lengths[:, None]
 
 

@@ -36,7 +36,7 @@ class GroundedJoint:
         fixed: Path of the fixed prim, such as a collider or a kinematic body; empty for the world itself.
         moving: Path of the dynamic body.
         reversed: Whether the dynamic body is ``body0``: the joint's coordinates then have the opposite sign.
-        collides: Whether the two may collide.
+        collides: Whether the body and the fixed prim may collide.
     """
 
     path: str
@@ -58,7 +58,7 @@ class _End:
 
 
 def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Finding]:
-    """Yield errors in the joints of a stage; keys move the bodies ``keyed``."""
+    """Yield errors in the joints of a stage; ``keyed`` are paths of bodies that keys move."""
     transforms = TransformCheck()
     for joint in enabled_joints(stage):
         path = str(joint.GetPath())
@@ -67,16 +67,16 @@ def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Fin
                 yield from transforms.findings(end.prim)
         if problem := _problem(stage, joint):
             yield Finding(path, problem)
-        elif keyed and (carrier := _hung_on(stage, joint)) in keyed:
-            message = "by physics:body1, which Newton would hold still: name it as physics:body0"
-            yield Finding(path, f"hangs on {carrier}, which keys move, {message}")
+        elif keyed and (carrier := _second_body(stage, joint)) in keyed:
+            message = "and Newton would hold it still: name it as physics:body0"
+            yield Finding(path, f"its physics:body1 {carrier} is moved by keys, {message}")
         elif not any(end.moves for end in _ends(stage, joint)):
-            yield Finding(path, "joins things that do not move, and is left out", "warning")
+            yield Finding(path, "joins two fixed ends, and is left out", "warning")
     for path, gap in _strained_joints(stage).items():
         yield Finding(path, f"its ends are {joint_gap_message(gap)}", "warning")
 
 
-def _hung_on(stage, joint) -> str:
+def _second_body(stage, joint) -> str:
     """Return the path of ``physics:body1`` of a joint whose ``body0`` is dynamic, else an empty path."""
     first, second = _ends(stage, joint)
     return str(second.body.GetPath()) if first.moves and second.body else ""
@@ -131,8 +131,8 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
 
     Args:
         stage: The stage.
-        articulations: Keep articulations, for solvers in generalized coordinates. Newton takes only trees from parent
-            to child that contain all their bodies; without articulations it takes any graph of joints.
+        articulations: Keep articulations, for solvers in generalized coordinates. Newton accepts only trees from
+            parent to child that contain all their bodies; without articulations it accepts any graph of joints.
 
     Returns:
         The joints between a dynamic body and a fixed end, except for kinematic bodies as ``body0``.

@@ -115,7 +115,7 @@ def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
 
 
 def _reload(stage: Usd.Stage) -> None:
-    """Read layers again whose files have changed since this process read them, except for layers with unsaved edits."""
+    """Reload layers with files that have changed since they were read, except for layers with unsaved edits."""
     for layer in stage.GetUsedLayers():
         if layer.realPath and not layer.dirty:
             layer.Reload()
@@ -125,7 +125,7 @@ def _reload(stage: Usd.Stage) -> None:
 def freeze(stage: Usd.Stage, time_code: float) -> None:
     """Make the values of ``time_code`` the defaults of the stage, in its session layer.
 
-    Newton reads default values only: it would take a pose with nothing but time samples for the identity. Values inside
+    Newton reads default values only: it would read a pose that has only time samples as the identity. Values inside
     instances cannot be frozen; :func:`warpmag.usd.survey` reports those that matter. USD ignores time samples of the
     order of transform operations, so that order stays. Network addresses are blocked. Animated colliders without a
     rigid body become kinematic bodies.

@@ -97,7 +97,7 @@ def _motion(bodies: list[Usd.Prim], codes: np.ndarray, seconds: np.ndarray) -> t
     positions, rotations = np.empty((*shape, 3)), np.empty((*shape, 4), dtype=np.float32)
     linear, angular = (np.zeros((*shape, 3), dtype=np.float32) for _ in range(2))
     for n, prim in enumerate(bodies):
-        positions[:, n], rotations[:, n] = poses.of(prim)
+        positions[:, n], rotations[:, n] = poses.read(prim)
         if prim.GetAttribute(TRANSLATE):  # a run wrote the velocities; elsewhere they are initial values
             for values, name in zip((linear, angular), _VELOCITIES, strict=True):
                 values[:, n] = _values(prim.GetAttribute(name), codes, Vt.Vec3fArray)
@@ -156,8 +156,8 @@ class _Poses:
         self._first = UsdGeom.XformCache(codes[0])
         self._caches = []
 
-    def of(self, prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions, shape [f, 3], and quaternions, shape [f, 4]: those written by a run unchanged."""
+    def read(self, prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions, shape [f, 3], and quaternions, shape [f, 4]; poses that a run wrote are unchanged."""
         order = list(UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() or ())
         resets = order[:1] == ["!resetXformStack!"]
         if order[resets:] not in ([TRANSLATE, ORIENT], [TRANSLATE, ORIENT, SCALE]) or not (

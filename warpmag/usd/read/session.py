@@ -78,10 +78,10 @@ def instances_around(prims: Iterable[Usd.Prim]) -> list[Usd.Prim]:
 
 
 def instance_findings(instances: Iterable[Usd.Prim]) -> Iterator[Finding]:
-    """Yield an error for each instance with overrides of prims in it: USD ignores these until it is editable."""
+    """Yield an error for each instance with overrides of prims in it: USD ignores them while it is not editable."""
     for prim in instances:
         if spec := _ignored_override(prim):
-            message = f"USD ignores the override {spec.path} in the instance, and a run, which edits it, would not"
+            message = f"USD ignores the override {spec.path} in the instance, but a run would apply it"
             yield Finding(str(prim.GetPath()), f"{message}: remove the override, or set instanceable = false")
 
 

@@ -1,6 +1,6 @@
-"""Surveys a stage: its magnets, bodies and settings, and everything that is wrong with it.
+"""Surveys a stage: its magnets, bodies and settings, with errors and warnings.
 
-The survey reports whatever Newton's importer would silently read wrong, before Newton sees the stage: values
+Before Newton imports the stage, the survey reports content that the importer would silently misread: values
 (``values.py``), transforms (``transforms.py``), sizes and meshes (``geometry.py``), units and time (``clock.py``), and
 here prims declared as magnets that cannot be magnets.
 """
@@ -22,8 +22,8 @@ from warpmag.usd.read.materials import material_findings
 from warpmag.usd.read.opening import copied_metadata
 from warpmag.usd.read.prims import body_of, is_body, is_collider, is_solid, prims_of_magnet
 from warpmag.usd.read.session import instance_findings, instances_around, unsaved_layers
-from warpmag.usd.read.slips import kind_findings, stray_findings
 from warpmag.usd.read.transforms import TransformCheck
+from warpmag.usd.read.unused_attributes import kind_findings, stray_findings
 from warpmag.usd.schemas import (
     MAGNET_API,
     SCENE_API,
@@ -84,7 +84,7 @@ def survey(stage: Usd.Stage) -> StageContents:
     """Return the contents of a stage, with all errors and warnings."""
     contents = StageContents()
     contents.findings += [*_metadata_findings(stage), *unit_findings(stage)]
-    unsaved = "has edits in this process that are not saved: a run has them, and writes a copy of the scene with them"
+    unsaved = "has unsaved edits in this process: a run uses them, and writes a copy of the scene with them"
     contents.findings += [Finding(layer.realPath, unsaved, "warning") for layer in unsaved_layers(stage)]
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     transforms, keys = TransformCheck(), KeyReader(stage)

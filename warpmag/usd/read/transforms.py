@@ -29,7 +29,7 @@ def is_animated(prim: Usd.Prim) -> bool:
 def rigid_part(matrix) -> np.ndarray:
     """Return position and rotation of a transform without its scale, shape [4, 4]: the frame of a rigid body.
 
-    USD's physics and Newton take the same rotation.
+    USD's physics and Newton extract the same rotation.
     """
     transform = Gf.Transform(Gf.Matrix4d(matrix.tolist()))
     rigid = Gf.Matrix4d().SetRotate(transform.GetRotation())
@@ -68,11 +68,11 @@ class TransformCheck:
         if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
             yield Finding(path, f"transform has a scale of less than {1.0 / LARGEST_COORDINATE:g}")
         elif np.abs(gram - np.diag(np.diag(gram))).max() > 1e-5 * size:
-            yield Finding(path, "transform is sheared, which Newton imports wrong")
+            yield Finding(path, "transform is sheared, which Newton imports wrongly")
         elif np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
             yield Finding(path, "transform is a projection, which no rigid body has")
         elif is_body(prim) and np.linalg.det(matrix) < 0.0:
-            yield Finding(path, "transform is mirrored, which Newton imports wrong: mirror the mesh instead")
+            yield Finding(path, "transform is mirrored, which Newton imports wrongly: mirror the mesh instead")
         elif prim.IsA(UsdGeom.Sphere) and np.abs(np.diag(gram) - size).max() > 1e-5 * size:
             yield Finding(path, "a sphere with non-uniform scale would be imported as a ball: make it a mesh")
 

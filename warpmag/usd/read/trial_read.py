@@ -1,7 +1,8 @@
 """Opens a stage in a child process first, because USD's reader can crash or hang on damaged or hostile files.
 
 The child costs a quarter of a second, so a single text file without references is read directly. This file is also the
-program of the child, which imports nothing of warpmag. Errors that USD raises are left to this process's own reading.
+program of the child, which imports nothing of warpmag. Errors that USD raises are raised again when this process
+reads the stage.
 """
 
 import contextlib
@@ -16,9 +17,9 @@ from itertools import accumulate, islice
 MOST_PRIMS, DEEPEST_NESTING = 500_000, 5_000
 """Most prims of a stage, and levels of brackets in a text: USD reads 10,000 levels, and crashes at 100,000."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 5e6
-"""CPU time of the child [s], and bytes of the stage and the files it names for which it gets a second more."""
+"""Least limit of the child's CPU time [s], and bytes of the stage and its files that add a second to it."""
 _ARCS = re.compile(rb"@|references|payload|inherits|specializes|prototypes")
-"""Words of a text by which other files, or prims repeatedly, become part of it."""
+"""Words of a text layer that compose other files, or repeat prims."""
 _NO_BRACKETS = bytes(set(range(256)) - set(b"{[(}])"))
 _NO_TABLE, _NO_TEXT = "its table of contents names bytes beyond its end", "text that is not UTF-8"
 _WARNINGS = {b"posix_madvise": f"damaged: {_NO_TABLE}", b"UnicodeDecodeError": f"damaged: {_NO_TEXT}"}
@@ -26,7 +27,7 @@ _WARNINGS = {b"posix_madvise": f"damaged: {_NO_TABLE}", b"UnicodeDecodeError": f
 
 
 def trial_read(path: str | os.PathLike) -> str:
-    """Return why a file must not be read in this process; empty where it can be."""
+    """Return the reason not to read a file in this process, empty if it can be read."""
     with open(path, "rb") as file:
         text = file.read() if file.peek(5).startswith(b"#usda") else b""
     nesting = accumulate(1 if bracket in b"{[(" else -1 for bracket in text.translate(None, _NO_BRACKETS))
@@ -52,16 +53,16 @@ def trial_read(path: str | os.PathLike) -> str:
 
 
 def _read(path: str, most_prims: int) -> str:  # pragma: no cover - runs in the child
-    """Read a stage up to the last value of its layers; return why it is refused."""
+    """Read a stage up to the last value of its layers; return the reason to reject it, or an empty text."""
     from pxr import Sdf, Usd  # noqa: PLC0415 - only the child needs it
 
     stage = Usd.Stage.Open(path)
-    have_rates = all(1e-6 < layer.timeCodesPerSecond < 1e9 for layer in stage.GetUsedLayers())
+    rates_are_valid = all(1e-6 < layer.timeCodesPerSecond < 1e9 for layer in stage.GetUsedLayers())
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
     for count, prim in enumerate(islice(prims, most_prims + 1), 1):
         if count > most_prims:
             return f"holds more than {most_prims} prims"
-        for attribute in prim.GetAuthoredAttributes() if have_rates else ():
+        for attribute in prim.GetAuthoredAttributes() if rates_are_valid else ():
             attribute.Get()
             attribute.GetTimeSamples()  # never ends where offsets of layers overflow
     for layer in (layer for layer in stage.GetUsedLayers() if layer.GetFileFormat().formatId != "usda"):
@@ -70,7 +71,7 @@ def _read(path: str, most_prims: int) -> str:  # pragma: no cover - runs in the 
         layer.Traverse("/", paths.append)
         for spec in filter(None, (layer.GetPrimAtPath(path) for path in paths if path.IsPrimPath())):
             if None in spec.variantSets.values():  # crashes USD's validators
-                return f"damaged: {spec.path} names variants that are not there"
+                return f"damaged: {spec.path} names variants that do not exist"
     return ""
 
 
@@ -83,6 +84,6 @@ if __name__ == "__main__":  # pragma: no cover - runs in the child
         resource.setrlimit(kind, (limits[kind] if soft < 0 else min(soft, limits[kind]), hard))
     try:
         print(_read(sys.argv[2], int(sys.argv[3])))
-    except Exception as error:  # of other kinds: the parent's own reading raises it again
+    except Exception as error:  # the parent raises errors of other kinds again when it reads the stage
         if isinstance(error, MemoryError) or "bad_alloc" in str(error):
             print("USD needs more than half of the memory to read it")

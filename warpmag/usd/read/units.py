@@ -1,10 +1,10 @@
 """Converts stages in other units than meters and kilograms to SI units, in a layer over the unchanged scene.
 
 Newton's importer converts no units. Every value with a length or a mass in its unit is therefore written in SI units to
-a layer of the session: defaults, time samples, and fallback values of shapes (a sphere without a radius has one unit).
-Angles are always in degrees and times in seconds. Lengths of warpmag's attributes are in the unit of the stage, like
-those of shapes. Magnetizations, fields, currents and moments are always SI, because USD has no unit of current and data
-sheets use A/m.
+a layer of the session: defaults, time samples, and fallback values of shapes: a sphere without an authored radius
+has a radius of one unit. Angles are always in degrees and times in seconds. Lengths of warpmag's attributes are in the
+unit of the stage, like those of shapes. Magnetizations, fields, currents and moments are always SI, because USD has no
+unit of current and data sheets use A/m.
 """
 
 import math
@@ -189,7 +189,7 @@ def _powers_per_axis(prim, kind: str, axis: str, name: str) -> tuple[int, int]:
 
 
 def _values(attribute: Usd.Attribute) -> _Attribute:
-    """Return the values of an attribute; none where USD cannot read one, which the survey reports later."""
+    """Return the values of an attribute, or none where USD cannot read them; the survey reports this later."""
     path = attribute.GetPath()
     if attribute.HasSpline():
         where = f"{path.GetPrimPath()}: {attribute.GetName()}"
@@ -203,7 +203,7 @@ def _values(attribute: Usd.Attribute) -> _Attribute:
 
 
 def _write(layer: Sdf.Layer, attribute: _Attribute, scale: float) -> None:
-    """Write the converted values of an attribute whose type can be scaled."""
+    """Write the converted values of an attribute; types that cannot be scaled are skipped."""
     default = _scaled(attribute.default, scale)
     samples = [(time, _scaled(value, scale)) for time, value in attribute.samples]
     if (default is None and not samples) or not attribute.kind:
@@ -218,7 +218,7 @@ def _write(layer: Sdf.Layer, attribute: _Attribute, scale: float) -> None:
 
 
 def _scaled(value, scale: float):
-    """Return a value times a factor, for a matrix with scaled translation; None for types without unit."""
+    """Return a value times a factor; in a matrix only the translation is scaled. None for types without unit."""
     if isinstance(value, float):
         return value * scale
     if isinstance(value, Gf.Matrix4d):

@@ -31,7 +31,7 @@ _ARRAY, _INLINED = 1 << 63, 1 << 62
 _OVER, _UNIFORM = 1, 1
 _ATTRIBUTE, _PRIM, _PSEUDO_ROOT = 1, 6, 7
 _NO_FIELD = 0xFFFFFFFF
-_PER_SAMPLED = 4
+_FIELDS_PER_SAMPLED = 4
 """Entries in the set of fields of an attribute with samples: type name, default, samples and the end mark."""
 
 
@@ -76,10 +76,10 @@ class OverLayer:
         """
         self._sizes = sizes
         self._types, self._type_fields = list[int](), list[int]()
-        self._tokens, self._strings = {";-)": 0}, dict[int, int]()  # properties are negative tokens, so token 0 is none
+        self._tokens, self._strings = {";-)": 0}, dict[int, int]()  # properties are negative tokens, so none may be 0
         self._values, self._end_code = bytearray(_BOOTSTRAP), -1
         self._fields, self._sets = dict[tuple[int, int], int](), dict[tuple[int, ...], int]()
-        self._next_set = _PER_SAMPLED * len(sizes)
+        self._next_set = _FIELDS_PER_SAMPLED * len(sizes)
         self._metadata, self._over = list[int](), self._field("specifier", reference(SPECIFIER, _OVER, _INLINED))
         self._properties: dict[str, list[tuple[int, int]]] = {"/": []}
         self._children: dict[str, list[str]] = {"/": []}
@@ -97,7 +97,7 @@ class OverLayer:
         type_field = self._field("typeName", self._token_reference(type_name))
         token = self._token(name)
         for number, path in enumerate(paths, len(self._types)):
-            self._properties_of(path).append((token, _PER_SAMPLED * number))
+            self._properties_of(path).append((token, _FIELDS_PER_SAMPLED * number))
         self._types += [reference(kind, 0, _ARRAY if type_name.endswith("[]") else 0)] * len(paths)
         self._type_fields += [type_field] * len(paths)
 
@@ -221,14 +221,17 @@ class OverLayer:
         tokens, jumps, sets, kinds = list[int](), list[int](), list[int](), list[int]()
         for path in order:
             own, children = self._properties[path], self._children[path]
-            held = [token for token, _ in own]
-            tokens += [names[path], *(-token for token in held)]
+            property_tokens = [token for token, _ in own]
+            tokens += [names[path], *(-token for token in property_tokens)]
             # offset to the next sibling; -1 for the last with a subtree, 0 without a subtree, -2 for the last without
             jumps.append((-1 if path in last else sizes[path]) if own or children else (-2 if path in last else 0))
             jumps += [0] * len(own)
             if own and not children:
                 jumps[-1] = -2
-            sets += [self._prim_set(path, held, [names[child] for child in children]), *(fields for _, fields in own)]
+            sets += [
+                self._prim_set(path, property_tokens, [names[child] for child in children]),
+                *(fields for _, fields in own),
+            ]
             kinds += [_PRIM, *[_ATTRIBUTE] * len(own)]
         tokens[0], kinds[0] = 0, _PSEUDO_ROOT
         numbers, count = _integers(range(len(sets))), struct.pack("<Q", len(sets))
@@ -240,9 +243,9 @@ class OverLayer:
         fields = [*self._metadata] if path == "/" else [self._over]
         if path in self._editable:
             fields.append(self._field("instanceable", reference(BOOL, 0, _INLINED)))
-        for name, held in (("properties", properties), ("primChildren", children)):
-            if held:
-                fields.append(self._field(name, self._token_vector(tuple(held))))
+        for name, tokens in (("properties", properties), ("primChildren", children)):
+            if tokens:
+                fields.append(self._field(name, self._token_vector(tuple(tokens))))
         return self._set_of(fields)
 
     def _token_vector(self, tokens: tuple[int, ...]) -> int:
@@ -266,7 +269,7 @@ class OverLayer:
     def _encode_sets(self) -> bytes:
         """Return the table of sets of fields: those of sampled attributes, then the others."""
         attributes = len(self._sizes)
-        sampled = np.full((attributes, _PER_SAMPLED), _NO_FIELD, dtype=np.uint32)
+        sampled = np.full((attributes, _FIELDS_PER_SAMPLED), _NO_FIELD, dtype=np.uint32)
         sampled[:, 0], sampled[:, 1] = self._type_fields, 2 * np.arange(attributes)
         sampled[:, 2] = sampled[:, 1] + 1
         others = [number for fields in self._sets for number in (*fields, _NO_FIELD)]
@@ -286,7 +289,7 @@ def _counted(numbers: Iterable[int]) -> bytes:
 
 
 def _integers(values: Sequence[int] | np.ndarray) -> bytes:
-    """Return a table of integers with its size in front: differences, of which the most frequent takes two bits."""
+    """Return differences of integers with their size in front; the most frequent difference takes two bits."""
     differences = np.diff(np.asarray(values, dtype=np.int32), prepend=np.int32(0))
     values, counts = np.unique(differences, return_counts=True)
     common = values[np.argmax(counts)]

@@ -38,8 +38,8 @@ class InstancerFrames:
             body_q: Position [m] and quaternion (x, y, z, w) of each ball in the world, shape [n, 7].
             body_qd: Linear [m/s] and angular velocity [rad/s], shape [n, 6].
             moments: Moments [A·m²], world frame, shape [n, 3].
-            last_rotations: Orientations of the previous frame, None in the first. Of the two quaternions of a rotation,
-                the one closer to the previous frame is written, so that interpolation takes the short way.
+            last_rotations: Orientations of the previous frame, None in the first. Each quaternion gets the sign closer
+                to the previous frame, so that interpolation takes the short way.
         """
         values = {name: np.empty((self._count, width), np.float32) for name, width in INSTANCE_ARRAYS.items()}
         values[MOMENTS_PRIMVAR] = moments

@@ -37,7 +37,7 @@ class Output:
     """The files of a run.
 
     Attributes:
-        root: The thin root layer.
+        root: The short root layer.
         cache: The layer with the motion.
         instances: The layer with the prims of instances.
         checkpoint: The file of :meth:`save_checkpoint`.
@@ -52,7 +52,7 @@ class Output:
             copy_scene: Whether the scene will be copied.
 
         Raises:
-            InputError: They cannot; the message gives the reason.
+            InputError: A file cannot be written.
         """
         self.root = usable_path(path)
         if self.root.suffix not in _SUFFIXES:
@@ -90,7 +90,7 @@ class Output:
     @staticmethod
     @contextlib.contextmanager
     def errors(path: Path) -> Iterator[None]:
-        """Raise :class:`InputError` of one line for errors with a file in the block."""
+        """Raise a one-line :class:`InputError` for file errors in the block."""
         try:
             with quiet():
                 yield
@@ -102,7 +102,7 @@ class Output:
     # ---------------------------------------------------------------------------------------------------------------
 
     def lock(self) -> None:
-        """Lock the files for this run until :meth:`close`. The lock of a process that died is void.
+        """Lock the files for this run until :meth:`close`. A lock ends with its process.
 
         Raises:
             InputError: Another run has locked them.
@@ -174,7 +174,7 @@ class Output:
         """Return the identity of the run and the arrays of its checkpoint, None where there is none.
 
         Raises:
-            InputError: It cannot be read, or another version of warpmag wrote it.
+            InputError: The checkpoint cannot be read, or another version of warpmag wrote it.
         """
         try:
             with open(self.checkpoint, "rb") as file, np.load(file, allow_pickle=False) as saved:

@@ -89,8 +89,8 @@ class Placements:
         Args:
             body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
             body_qd: Linear velocity of the center of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
-            last_rotations: Orientations of the previous frame, None in the first. Of the two quaternions of a rotation,
-                the one closer to the previous frame is returned, so that interpolation takes the short way.
+            last_rotations: Orientations of the previous frame, None in the first. Each quaternion gets the sign closer
+                to the previous frame, so that interpolation takes the short way.
         """
         # column-major arrays halve the time
         positions, rotations = (values.astype(np.float64, order="F") for values in (body_q[:, :3], body_q[:, 3:]))

@@ -39,7 +39,7 @@ from warpmag.usd.write.crate import (
 )
 
 _AHEAD = 512
-"""Frames whose references are written to a row at once, one page of the file; each earlier frame writes some rows."""
+"""References written to a row in advance: one page of the file. Each frame writes those of some rows."""
 _FIRST_AHEAD = 64
 """The same where all rows are written at once; smaller, to keep the first frame short."""
 _BLOCK = 1 << 17
@@ -111,9 +111,9 @@ class SampleFile:
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "x+b", buffering=0))
-            none = np.zeros(0, dtype=np.int64)
+            empty = np.zeros(0, dtype=np.int64)
             sampled = np.zeros(len(sizes), dtype=bool)
-            self = cls(file, sizes, _Places(layer.heads, layer.end_code, layer.types, none, none, sampled))
+            self = cls(file, sizes, _Places(layer.heads, layer.end_code, layer.types, empty, empty, sampled))
             self._write(0, layer.values)
             start = len(layer.values)
             structure = _Structure(layer.structure, start, start + layer.contents)
@@ -126,15 +126,15 @@ class SampleFile:
         """Continue a file from an earlier :meth:`places`; later frames are dropped.
 
         Raises:
-            InputError: The file is another one or incomplete.
+            InputError: The file is a different one, or incomplete.
             OSError: It cannot be opened or written.
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
-            known = {name: value if value.ndim else int(value) for name, value in places.items()}
-            self = cls(file, sizes, _Places(**known))
+            fields = {name: value if value.ndim else int(value) for name, value in places.items()}
+            self = cls(file, sizes, _Places(**fields))
             if not self._is_intact():
-                raise InputError(f"{path}: cannot be resumed, it is not as the run left it")
+                raise InputError(f"{path}: cannot be resumed, it has changed since the run wrote it")
             self._set_count(float(self.codes()[-1]))
             self._write_heads(0, len(sizes))
             stack.pop_all()
@@ -229,7 +229,7 @@ class SampleFile:
             raise
 
     def _is_intact(self) -> bool:
-        """Return whether the file has its full size and counts the frames."""
+        """Return whether the file has its full size and contains the frames of the checkpoint."""
         places, descriptor = self._places, self._file.fileno()
         if os.fstat(descriptor).st_size < places.size:
             return False
@@ -301,7 +301,7 @@ class SampleFile:
 
     def _write(self, place: int, data: bytes) -> None:
         view = memoryview(data)
-        while view:  # a nearly full disk takes only part of it
+        while view:  # a nearly full disk accepts only a part
             written = os.pwrite(self._file.fileno(), view, place)
             place, view = place + written, view[written:]
 

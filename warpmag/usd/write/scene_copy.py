@@ -12,7 +12,7 @@ from warpmag.usd.write.output import Output
 
 
 def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
-    """Write a temporary copy of a stage's scene, for a place beside the run's output.
+    """Write a temporary copy of a stage's scene, to be moved beside the run's output.
 
     A scene of one layer becomes ``out.scene.usdc``, a package ``out.scene.usdz``. A scene with sublayers, references,
     payloads or assets such as textures becomes a folder ``out.scene`` with all files in their relative places. The copy
@@ -27,7 +27,7 @@ def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
     scene, edited = stage.GetRootLayer(), unsaved_layers(stage)
     for layer in edited:
         if Ar.IsPackageRelativePath(layer.realPath) or layer.GetFileFormat().IsPackage():
-            raise InputError(f"{layer.realPath}: has edits that are not saved, and is in a package, which holds none")
+            raise InputError(f"{layer.realPath}: has unsaved edits and is in a package, which cannot contain them")
     if scene.GetFileFormat().IsPackage():
         copied = output.beside(".scene.usdz")
         shutil.copyfile(scene.realPath, output.temporary(copied))
@@ -60,7 +60,7 @@ def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path], *, edited: bool)
     changed = edited
     resolver = Ar.GetResolver()
 
-    def moved(path: str) -> str:
+    def copied_path(path: str) -> str:
         nonlocal changed
         outer, inner = Ar.SplitPackageRelativePathOuter(path)
         if not outer or outer.startswith(("./", "../")):
@@ -76,6 +76,6 @@ def _point_to_copies(layer: Sdf.Layer, places: dict[str, Path], *, edited: bool)
     copied = Sdf.Layer.CreateAnonymous() if edited else Sdf.Layer.OpenAsAnonymous(layer.realPath)
     if edited:
         copied.TransferContent(layer)
-    UsdUtils.ModifyAssetPaths(copied, moved)
+    UsdUtils.ModifyAssetPaths(copied, copied_path)
     if changed:
         copied.Export(str(places[layer.realPath]))

@@ -1,4 +1,4 @@
-"""Warnings about attributes without effect: misspelled names, missing schemas, values that do not go with the kind."""
+"""Warnings about attributes without effect: misspelled names, missing schemas, values of the other kind of magnet."""
 
 import difflib
 import functools
@@ -9,13 +9,13 @@ from pxr import Usd
 from warpmag.declarations.attributes import NAMESPACE, attributes_of
 from warpmag.declarations.magnets import Magnet
 from warpmag.declarations.schemas import SCHEMAS
-from warpmag.usd.schemas import MATERIAL, has_api
+from warpmag.usd.schemas import has_api
 from warpmag.usd.values import Finding
 
 _SCHEMA_NAMES = [schema.name for schema in SCHEMAS]
 _SCHEMA_OF = {row.usd_name: schema.name for schema in SCHEMAS for row in schema.attributes}
 _SIMILAR = 0.85
-"""Similarity from which names count as misspellings of each other: a wrong letter of seven, or two swapped ones."""
+"""Least similarity of a misspelled name and the right one: one wrong letter in seven, or two swapped letters."""
 
 
 def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
@@ -37,7 +37,7 @@ def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Finding]:
-    """Yield warnings about values of a magnet that do not go with its kind.
+    """Yield warnings about a permanent magnet without magnetization, and about values without effect on its kind.
 
     Args:
         prim: The prim.
@@ -46,13 +46,13 @@ def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Fi
     """
     path = str(prim.GetPath())
     if magnet.kind == "permanent" and not (keyed or any(magnet.magnetization)):
-        message = f"a permanent magnet without magnetization: warpmag:magnetization says it, or {MATERIAL} its strength"
+        message = "a permanent magnet without magnetization: author warpmag:magnetization"
         yield Finding(path, message, "warning")
     if magnet.kind == "inducible":
         for row in attributes_of(Magnet):
             used = getattr(magnet, row.field) != row.default or (keyed and row.field == "magnetization")
             if row.kind == "permanent" and used:
-                message = f"{row.usd_name} has no effect on an inducible magnet: warpmag:kind says what it is"
+                message = f"{row.usd_name} has no effect on an inducible magnet, as warpmag:kind declares it"
                 yield Finding(path, message, "warning")
 
 
