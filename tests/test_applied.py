@@ -1,4 +1,4 @@
-"""Sources that apply fields: coils and field maps; their field, what they do to magnets, and what these do to them."""
+"""Coils and field maps: their fields, their forces on magnets, and the reactions on them."""
 
 import math
 
@@ -17,7 +17,7 @@ from warpmag.declarations.coils import Coil, FieldMap  # noqa: E402
 A = 0.02  # m, radius of coils
 R = 0.005  # m
 VOLUME = 4.0 / 3.0 * math.pi * R**3
-SINGLE = 3e-6  # sums of some float32 terms, relative to the largest
+SINGLE = 3e-6  # rounding of float32 sums, relative to the largest term
 HALF = 0.03  # m, half the length of solenoids
 CORNERS = 2.5 * A * np.array([[-1.0, -0.5, 0.0], [1.0, -0.4, 0.1], [0.8, 0.6, 0.5], [-0.2, 0.3, -0.3]])
 
@@ -32,7 +32,7 @@ POLYLINE = source_of(Coil("polyline", points=tuple(map(tuple, CORNERS)), wire_ra
 
 
 def field_of(source, points, device, strength=100.0, frame=(0, 0, 0, 0, 0, 0, 1)):
-    """Field and gradient of one source, float64, by a probe beside a moment of zero."""
+    """Return field and gradient of one source in float64, measured by a probe."""
     system = moment_system(radii=[1e-9], permanent=[True], sources=[source], dtype="float64", device=device)
     system.sources.strengths.assign([[strength, 0.0, 0.0]])
     system.sources.frames.assign([frame])
@@ -44,7 +44,7 @@ def field_of(source, points, device, strength=100.0, frame=(0, 0, 0, 0, 0, 0, 1)
 
 
 def points_around(count=60, seed=0, scale=1.5 * A):
-    """Points about a coil, some of them on its axis and close to it."""
+    """Return points around a coil, some of them on its axis or close to it."""
     some = np.random.default_rng(seed).normal(size=(count, 3)) * scale
     some[:5, :2] = 0.0
     some[5:10, :2] *= 1e-9
@@ -52,7 +52,7 @@ def points_around(count=60, seed=0, scale=1.5 * A):
 
 
 def assert_gradients(source, device, points, **where):
-    """Gradients are the derivatives of fields, by differences of fourth order."""
+    """Assert that gradients equal fourth-order differences of fields."""
     step, tolerance = 1e-5 * A, 1e-8  # (1/160)⁴ of a derivative where the wire is nearest, and 1e-15/1e-5 of rounding
     _, gradient = field_of(source, points, device, **where)
     for axis, unit in enumerate(np.eye(3)):
@@ -88,7 +88,7 @@ def test_field_of_a_solenoid_on_its_axis(device):
 
 
 def test_field_of_a_solenoid_beside_its_axis(device):
-    """A sheet of current is a magnetized cylinder, whose magnetization is left out."""
+    """The H of a sheet of current is the B/μ0 of a magnetized cylinder."""
     magpylib = pytest.importorskip("magpylib")
     points = np.concatenate(
         [points_around(), A * np.array([[0.999999, 0.0, 0.5], [1.000001, 0.0, 0.5], [99.0, 0, 9.0]])]
@@ -111,7 +111,7 @@ def test_field_is_that_of_the_law_of_biot_and_savart(kind, device):
     else:
         source, expected = POLYLINE, coil_oracle.polyline_field(CORNERS[[0, 1, 2, 3, 0]], points, count=200)
     h, _ = field_of(source, points, device)
-    # where the reference has converged
+    # only points where the reference has converged
     far = np.abs(np.hypot(points[:, 0], points[:, 1]) - A) > 0.2 * A
     assert far.sum() > 20
     np.testing.assert_allclose(h[far], 100.0 * expected[far], atol=1e-9 * 100.0 / A)
@@ -135,13 +135,13 @@ def test_gradients_outside_and_inside_of_wires(device):
     (POLYLINE, CORNERS[2], (0.6, 0.8, 0.0)),
 ])  # fmt: skip
 def test_field_is_continuous_where_a_wire_begins_and_zero_on_its_axis(source, place, across, device):
-    """From 1 % of the radius of the wire inside to as much outside it changes by no more than some per cent."""
+    """The field changes by a few percent at most across the surface of a wire."""
     depths = 0.01 * A * np.array([0.99, 0.9999999, 1.0000001, 1.01, 1e-9])
     h, gradient = field_of(source, place + depths[:, None] * np.array(across), device)
     size = np.linalg.norm(h, axis=1)
     assert size[:4].min() > 0.3 * size.max()
     np.testing.assert_allclose(h[1], h[2], rtol=1e-5, atol=1e-5 * size[1])
-    assert size[4] < 0.01 * size[1]  # of other pieces
+    assert size[4] < 0.01 * size[1]  # the rest is the field of other pieces
     assert np.isfinite(gradient).all()
     centre, slope = field_of(source, np.array([place]), device)
     assert np.linalg.norm(centre) < 0.01 * size[1]
@@ -160,7 +160,7 @@ CORNER, SIDE = np.array([-0.02, -0.02, 0.03]), 0.04  # m, of a map beside it
 
 
 def map_of_a_dipole(cells):
-    """A map of a dipole's field, of so many cells along each side."""
+    """Return a map of a dipole's field with ``cells`` cells along each side."""
     axes = [start + SIDE / cells * np.arange(cells + 1) for start in CORNER]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     values = oracle.h_field(*DIPOLE, places.reshape(-1, 3)).reshape(places.shape)
@@ -168,12 +168,14 @@ def map_of_a_dipole(cells):
 
 
 def test_a_map_converges_to_the_field_that_it_is_of(device):
-    """The field as the third power of the spacing, its gradient as the second, up to the border."""
+    """Errors fall as the third power of the spacing, those of gradients as the second, up to the border."""
     points = CORNER + SIDE * np.random.default_rng(2).uniform(size=(1000, 3))
     exact, errors = (oracle.h_field(*DIPOLE, points), oracle.field_gradient(*DIPOLE, points)), []
     for cells in (20, 40, 80):
-        found = field_of(map_of_a_dipole(cells), points, device, strength=1.0)
-        errors.append([np.linalg.norm(one - of) / np.linalg.norm(of) for one, of in zip(found, exact, strict=True)])
+        result = field_of(map_of_a_dipole(cells), points, device, strength=1.0)
+        errors.append(
+            [np.linalg.norm(field - of) / np.linalg.norm(of) for field, of in zip(result, exact, strict=True)]
+        )
     errors = np.array(errors)
     assert errors[-1, 0] < 5e-6
     assert (errors[1:, 0] < errors[:-1, 0] / 7.0).all()  # 8 in the limit
@@ -181,7 +183,7 @@ def test_a_map_converges_to_the_field_that_it_is_of(device):
 
 
 def test_a_map_is_exact_for_parabolas_and_its_gradient_is_its_own(device):
-    """Also where no field could be so: the gradient is that of the interpolant, with a curl and a divergence."""
+    """The gradient is that of the interpolant, even for values with curl and divergence."""
     rng = np.random.default_rng(4)
     linear, square = rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
     origin, spacing, counts = np.array([0.1, -0.2, 0.0]), np.array([0.01, 0.02, 0.03]), (4, 3, 5)
@@ -205,7 +207,7 @@ PUSHED = LOOP._replace(world=0, body=50, pushed=True)
 
 
 def make_loaded_system(device, source=PUSHED):
-    """Twelve balls beside a coil, four of them permanent, two of one body; the system and places."""
+    """Return a system of twelve balls beside a coil, four permanent, two in one body, and their positions."""
     rng = np.random.default_rng(5)
     places = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 0, 1)]) * 2.3 * R
     places += rng.normal(size=places.shape) * 0.05 * R
@@ -222,7 +224,7 @@ def make_loaded_system(device, source=PUSHED):
 
 @pytest.mark.parametrize("kind", ["loop", "map"])
 def test_gradient_of_the_energy_is_the_force(kind, device):
-    """Of the interpolant of a map, too, which is rough: a field with a curl."""
+    """The force is also the gradient of the co-energy in a map, whose interpolant has a curl."""
     source = PUSHED
     if kind == "map":
         values = np.random.default_rng(7).normal(size=(4, 4, 4, 3))
@@ -240,7 +242,7 @@ def test_gradient_of_the_energy_is_the_force(kind, device):
     energy(places)
     system.apply_forces()
     forces, reaction = system.forces.numpy(), system.source_interaction.wrenches.numpy()[0, :3]
-    step = 1e-6  # m: the third derivative's part is (step/R)² of the force
+    step = 1e-6  # m; the truncation error is (step/R)² of the force
     for ball, axis in ((0, 0), (3, 1), (7, 2), (8, 0), (11, 2)):
         moved = np.zeros((12, 3))
         moved[: 2 if ball == 0 else 0, axis] = moved[ball, axis] = step
@@ -257,7 +259,7 @@ def test_force_law(force, device):
     system, places = make_loaded_system(device)
     system.solve()
     system.apply_forces(force)
-    found = system.forces.numpy()
+    result = system.forces.numpy()
     m, h = system.moments.numpy(), system.h.numpy()
     coil, own = field_of(LOOP, places, device, strength=800.0)
     labels = np.array([0, 0, *range(2, 12)])
@@ -266,7 +268,7 @@ def test_force_law(force, device):
     if force == "zeeman":
         magnetization, slope = oracle.magnetization(h, 2e5, 50.0)
         expected[:8] = oracle.zeeman_force(np.full(12, VOLUME), h, gradient, magnetization, slope)[:8]
-    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(result, expected, atol=1e-9 * np.abs(expected).max())
     turning = oracle.h_field(places, m, radii=R, bodies=labels) + coil + (1e3, 2e3, -5e2)
     torques = oracle.torque(m, turning)
     np.testing.assert_allclose(system.torques.numpy()[8:], torques[8:], atol=1e-12 * np.abs(torques).max())
@@ -274,7 +276,7 @@ def test_force_law(force, device):
 
 @pytest.mark.parametrize("force", ["kelvin", "zeeman"])
 def test_reaction_is_opposite_and_equal(force, device):
-    """Without the coil's part, the same moments feel other forces and torques; the coil feels the difference."""
+    """The reaction on the coil is the difference of forces and torques with and without its field."""
     system, places = make_loaded_system(device)
     frame = (0.01, -0.02, 0.03, 0.0, 0.0, 0.6, 0.8)
     system.sources.frames.assign([frame])
@@ -284,15 +286,15 @@ def test_reaction_is_opposite_and_equal(force, device):
     effective = system.moments.numpy() if force == "kelvin" else system._effective.numpy().T
     forces = oracle.kelvin_force(effective, gradient)
     torques = oracle.torque(effective, coil) + np.cross(places - frame[:3], forces)
-    for found, expected in (
+    for result, expected in (
         (system.source_interaction.wrenches.numpy()[0, :3], forces),
         (system.source_interaction.wrenches.numpy()[0, 3:6], torques),
     ):
-        np.testing.assert_allclose(found, -expected.sum(axis=0), atol=1e-13 * np.abs(expected).sum())
+        np.testing.assert_allclose(result, -expected.sum(axis=0), atol=1e-13 * np.abs(expected).sum())
 
 
 def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
-    """A coil with a core: the core is a moment of its body."""
+    """A coil exerts no force on the core in its own body."""
     for body in (0, 1):
         coil = LOOP._replace(world=0, body=body, pushed=True)
         system = moment_system(
@@ -311,7 +313,7 @@ def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
 
 
 def test_each_world_has_its_sources(device):
-    """One for all, one of the second world alone; the first is fixed, the second pushed."""
+    """The first source is fixed and acts on all worlds; the second is pushed and acts on the second world."""
     everywhere, second = LOOP, LOOP._replace(world=1, body=9, pushed=True)
     system = moment_system(
         radii=[R, R, R], worlds=[0, 1, 1], saturation=1e9, sources=[everywhere, second], dtype="float64", rtol=1e-10,
@@ -324,10 +326,10 @@ def test_each_world_has_its_sources(device):
     system.apply_forces()
     coil, gradient = field_of(LOOP, places, device, strength=1.0)
     m, strengths = system.moments.numpy(), np.array([100.0, 60.0, 60.0])
-    np.testing.assert_allclose(m[0], 3.0 * VOLUME * 100.0 * coil[0], rtol=1e-6)  # of an Ms of 1e9 A/m
+    np.testing.assert_allclose(m[0], 3.0 * VOLUME * 100.0 * coil[0], rtol=1e-6)  # far below saturation at 1e9 A/m
     np.testing.assert_allclose(system.sources.frames.numpy()[0], [0, 0, 0, 0, 0, 0, 1])
-    found = system.forces.numpy()
-    np.testing.assert_allclose(found[0], oracle.kelvin_force(m, strengths[:, None, None] * gradient)[0], atol=1e-15)
+    result = system.forces.numpy()
+    np.testing.assert_allclose(result[0], oracle.kelvin_force(m, strengths[:, None, None] * gradient)[0], atol=1e-15)
     push = -oracle.kelvin_force(m[1:], -40.0 * gradient[1:]).sum(axis=0)
     np.testing.assert_allclose(system.source_interaction.wrenches.numpy()[:, :3], [[0, 0, 0], push], atol=1e-18)
     probe = FieldProbe(system, 2, worlds=[1, 0])

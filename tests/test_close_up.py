@@ -1,4 +1,4 @@
-"""Permanent boxes and cylinders close up: their fields, and their forces on each other and on balls.
+"""Permanent boxes and cylinders at short range: fields, and forces on each other and on balls.
 
 References: magpylib's closed forms, differentiated and meshed, for fields and for forces in any pose; Akoun and Yonnet
 and Vokoun et al. (``bench/reference/magnet_pairs.py``) for parallel ones in contact.
@@ -26,7 +26,7 @@ BALL = ("ball", (0.005,))
 ALONG, ASKEW = (0.0, 0.0, M), (0.3 * M, -0.2 * M, 0.9 * M)
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 TILTED = tuple(Rotation.from_euler("xyz", [20.0, 35.0, 10.0], degrees=True).as_quat())
-SINGLE = 3e-6  # float32: sums of some hundred terms, relative to the largest
+SINGLE = 3e-6  # rounding of float32 sums of some hundred terms, relative to the largest
 
 
 def add(builder, kind, size, place=(0.0, 0.0, 0.0), turn=UPRIGHT, magnetization=ALONG):
@@ -39,7 +39,7 @@ def add(builder, kind, size, place=(0.0, 0.0, 0.0), turn=UPRIGHT, magnetization=
     else:
         heavy = newton.ModelBuilder.ShapeConfig(
             density=1e6
-        )  # Newton changes the inertia of light bodies, with a warning
+        )  # Newton corrects the inertia of light bodies with a warning
         builder.add_shape_sphere(body, radius=size[0], cfg=heavy)
     if magnetization is None:
         warpmag.add_inducible(builder, body)
@@ -49,7 +49,7 @@ def add(builder, kind, size, place=(0.0, 0.0, 0.0), turn=UPRIGHT, magnetization=
 
 
 def model_of(device, *parts):
-    """Magnetics and state of bodies (kind, size, place, turn, magnetization)."""
+    """Return magnetics and state of bodies (kind, size, position, rotation, magnetization)."""
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
     for part in parts:
@@ -59,7 +59,7 @@ def model_of(device, *parts):
 
 
 def magnets(device, *parts):
-    """Magnetics and wrenches of such bodies, shape [bodies, 6]."""
+    """Return magnetics and wrenches of such bodies, shape [bodies, 6]."""
     magnetics, state = model_of(device, *parts)
     magnetics.apply(state)
     return magnetics, state.body_f.numpy().astype(float)
@@ -79,13 +79,13 @@ def reference(kind, size, place=(0.0, 0.0, 0.0), turn=UPRIGHT, magnetization=ALO
 
 
 def gradient_of(magnet, x, step=1e-6):
-    """Gradient of its field by central differences, ∂H_i/∂x_k, shape [3, 3]."""
+    """Return the gradient of the field by central differences, ∂H_i/∂x_k, shape [3, 3]."""
     columns = [(magnet.getH(x + step * axis) - magnet.getH(x - step * axis)) / (2.0 * step) for axis in np.eye(3)]
     return np.stack(columns, axis=1)
 
 
 def near_system(half, device, dtype="float64", places=((0.0, 0.0, 0.0),), balls=(), magnetization=ASKEW):
-    """A system of equal boxes, and of permanent balls of 1 mm."""
+    """Return a system of equal boxes, and of permanent balls of 1 mm."""
     body, shape = polyhedra.box_moments(half), polyhedra.box(half)
     n = len(body.volumes)
     solids = [SolidMagnet(k * n, n, body.volumes[0], 0, body.reach, shape, True) for k in range(len(places))]
@@ -113,14 +113,14 @@ def near_system(half, device, dtype="float64", places=((0.0, 0.0, 0.0),), balls=
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-10), ("float32", 2e-5)])
 def test_field_of_a_box(dtype, tolerance, device):
-    """Inside, outside, near faces and edges, and on the lines that edges lie on."""
+    """Points lie inside, outside, near faces and edges, and on the lines through edges."""
     half = np.array([0.01, 0.007, 0.004])
     system, _ = near_system(half, device, dtype)
     rng = np.random.default_rng(0)
     x = rng.uniform(-1.3, 1.3, (300, 3)) * half
-    x[:60, :2] = half[:2] * (1.0 + 1e-3 * rng.normal(size=(60, 2)))  # near an edge and beyond it
+    x[:60, :2] = half[:2] * (1.0 + 1e-3 * rng.normal(size=(60, 2)))  # near the line through an edge
     x[60:80] = half
-    x[60:80, 2] *= np.linspace(1.01, 1.7, 20)  # on its line, as far as the closed form reaches
+    x[60:80, 2] *= np.linspace(1.01, 1.7, 20)  # on the line, up to the reach of the closed form
     probe = FieldProbe(system, len(x), gradients=True)
     probe.points.assign(x)
     probe.measure()
@@ -131,13 +131,13 @@ def test_field_of_a_box(dtype, tolerance, device):
     np.testing.assert_allclose(probe.b.numpy(), b, atol=tolerance * oracle.MU0 * M)
     for k in range(0, len(x), 7):
         expected = gradient_of(magnet, x[k], 1e-8)
-        # (step/distance)² of the differences, or places in float32 over it: 1e-6 m from an edge
+        # truncation (step/distance)² of the differences, or rounding of float32 positions: 1e-6 m from an edge
         allowed = (1e-4 if dtype == "float64" else 1e-3) * max(np.abs(expected).max(), M)
         np.testing.assert_allclose(probe.gradient.numpy()[k], expected, atol=allowed)
 
 
 def test_field_of_a_cylinder(device):
-    """The prism in its place: within 1 % of M a tenth of the radius from the rim, 1e-3 elsewhere."""
+    """A prism stands for the cylinder: within 1 % of M a tenth of the radius from the rim, 1e-3 elsewhere."""
     magnetics, _ = magnets(device, ("cylinder", (0.01, 0.008), (0.1, 0.0, 0.0), TILTED, ASKEW))
     magnet = reference("cylinder", (0.01, 0.008), (0.1, 0.0, 0.0), TILTED, ASKEW)
     rng = np.random.default_rng(1)
@@ -157,30 +157,30 @@ PLACES += [(SIDE, 0.0, 0.0), (SIDE, 0.0, SIDE / 36.0), (SIDE, 0.002, 0.003), (0.
 
 @pytest.mark.parametrize("place", PLACES)
 def test_cubes_in_contact(place, device):
-    """Gauss points leave 2e-3 at most, where an edge of one cube crosses the other's face."""
-    found = force_on_second(device, (*CUBE,), (*CUBE, place))
+    """Quadrature errors are 2e-3 at most, where an edge of one cube crosses the other's face."""
+    result = force_on_second(device, (*CUBE,), (*CUBE, place))
     half = np.array(CUBE[1])
     expected = magnet_pairs.box_force(half, half, place, M, M)
-    np.testing.assert_allclose(found, expected, atol=2e-3 * np.linalg.norm(expected))
+    np.testing.assert_allclose(result, expected, atol=2e-3 * np.linalg.norm(expected))
 
 
 @pytest.mark.filterwarnings("ignore:Inertia validation corrected")  # Newton's bodies are larger
 @pytest.mark.parametrize("side", [1.0, 3e-6])
 def test_cubes_of_any_size(side, device):
-    """Forces go as the square of sizes, to the roundings of places; r⁻⁷ of a micrometre is no float."""
-    found = [
+    """Forces scale as the square of sizes, up to rounding of positions; r⁻⁷ would overflow at a micrometer."""
+    result = [
         force_on_second(device, ("box", (a / 2,) * 3), ("box", (a / 2,) * 3, (0.1 * a, 0.2 * a, 1.1 * a))) / a**2
         for a in (SIDE, side)
     ]
-    np.testing.assert_allclose(found[1], found[0], atol=1e-5 * np.linalg.norm(found[0]))
+    np.testing.assert_allclose(result[1], result[0], atol=1e-5 * np.linalg.norm(result[0]))
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-4, 5e-4, 2e-3])
 def test_discs_in_line(gap, device):
-    """The prism's rim is 0.2 % of the radius off the cylinder's, in and out."""
-    found = force_on_second(device, (*DISC,), (*DISC, (0.0, 0.0, SIDE / 2 + gap)))
+    """The prism's rim deviates by 0.2 % of the radius from the cylinder's."""
+    result = force_on_second(device, (*DISC,), (*DISC, (0.0, 0.0, SIDE / 2 + gap)))
     expected = magnet_pairs.cylinder_force(DISC[1][0], SIDE / 2, SIDE / 2, gap, M, M)
-    np.testing.assert_allclose(found, [0.0, 0.0, expected], atol=3e-3 * abs(expected))
+    np.testing.assert_allclose(result, [0.0, 0.0, expected], atol=3e-3 * abs(expected))
 
 
 POSES = {
@@ -202,10 +202,10 @@ POSES = {
 
 @pytest.mark.parametrize("name", POSES)
 def test_force_and_torque_in_any_pose(name, device):
-    """Against magpylib's, of magnets cut into 2,000 cells (1e-3); what both feel is opposite and equal."""
-    one, other = POSES[name]
-    _, wrenches = magnets(device, one, other)
-    force, torque = magpylib.getFT(reference(*one), reference(*other), meshing=2000, eps=1e-7)
+    """Forces agree with magpylib's for 2,000 cells (1e-3); action equals reaction."""
+    body, other = POSES[name]
+    _, wrenches = magnets(device, body, other)
+    force, torque = magpylib.getFT(reference(*body), reference(*other), meshing=2000, eps=1e-7)
     size = np.linalg.norm(force)
     np.testing.assert_allclose(wrenches[1, :3], force, atol=2e-3 * size)
     np.testing.assert_allclose(wrenches[1, 3:], torque, atol=2e-3 * size * 0.005)
@@ -216,7 +216,7 @@ def test_force_and_torque_in_any_pose(name, device):
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.025), (0.02 + 0.0036, 0.0, 0.0236), (0.0229, 0.0229, 0.0229)])
 def test_iron_ball_at_a_large_cube(place, device):
-    """Its force is that of its moment in the exact field's gradient, and pushes the cube back."""
+    """The force on a ball follows from the exact field's gradient; the reaction acts on the cube."""
     magnetics, wrenches = magnets(device, (*LARGE,), (*BALL, place, UPRIGHT, None))
     magnet, moment = reference(*LARGE), magnetics.shape_moments()[list(magnetics.shapes).index(1)]
     applied = magnet.getH(place)
@@ -231,8 +231,8 @@ def test_iron_ball_at_a_large_cube(place, device):
 
 @pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
 def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
-    """The whole force, at face, edge and corner: degrees above 4 are 3 % of it at an edge."""
-    half, radius, weak = LARGE[1][0], BALL[1][0], 0.1 * M  # far from saturation: tanh leaves 3e-3
+    """Total force at face, edge and corner: degrees above 4 contribute 3 % at an edge."""
+    half, radius, weak = LARGE[1][0], BALL[1][0], 0.1 * M  # far from saturation: the tanh curve deviates by 3e-3
     outward = np.array(touched)
     place = half * outward + 1.00001 * radius * outward / np.linalg.norm(outward)
     builder = newton.ModelBuilder()
@@ -245,9 +245,9 @@ def test_iron_ball_with_its_multipoles_at_a_large_cube(touched, device):
     whole = ball_in_field.force_in_field(
         lambda x: ball_in_field.box_field(x, np.full(3, half), weak), place, radius, order=20
     )
-    found = state.body_f.numpy()
-    np.testing.assert_allclose(found[1, :3], whole, atol=0.03 * np.linalg.norm(whole))
-    np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=1e-4 * np.linalg.norm(whole))
+    result = state.body_f.numpy()
+    np.testing.assert_allclose(result[1, :3], whole, atol=0.03 * np.linalg.norm(whole))
+    np.testing.assert_allclose(result[0, :3], -result[1, :3], atol=1e-4 * np.linalg.norm(whole))
 
 
 SWITCHES = {
@@ -264,22 +264,22 @@ SWITCHES = {
 
 @pytest.mark.parametrize("name", SWITCHES)
 def test_lattice_takes_over_without_a_jump(name, device):
-    """Where the closed form ends, it changes the force by less than 1e-3."""
-    one, (kind, size), way, start = SWITCHES[name]
+    """The force jumps by less than 1e-3 at the reach of the closed form."""
+    body, (kind, size), way, start = SWITCHES[name]
     way = np.array(way) / np.abs(way).max()
 
     def forces(distance):
-        magnetics, state = model_of(device, one, (kind, size, tuple(distance * way), UPRIGHT, ASKEW))
-        found = []
+        magnetics, state = model_of(device, body, (kind, size, tuple(distance * way), UPRIGHT, ASKEW))
+        result = []
         for _ in range(2):
             state.clear_forces()
             magnetics.apply(state)
-            found.append(state.body_f.numpy()[1, :3].astype(float))
-            sizes = magnetics.system.sources.arrays["size"]
+            result.append(state.body_f.numpy()[1, :3].astype(float))
+            sizes = magnetics.system.sources.solid_arrays.size
             reachless = sizes.numpy()
-            reachless[:, 1] = np.nan  # nothing is nearer than that
+            reachless[:, 1] = np.nan  # no target is nearer than NaN
             sizes.assign(reachless)
-        return found
+        return result
 
     inside, outside = start, 10.0 * SIDE
     for _ in range(9):
@@ -293,25 +293,25 @@ def test_lattice_takes_over_without_a_jump(name, device):
 
 @pytest.mark.parametrize("across", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)])
 def test_boxes_that_sink_into_each_other(across, device):
-    """As contact solvers let them: the force goes on as it grew before, by 1 % for 10 µm."""
-    found = [
+    """Bodies may penetrate as contact solvers allow: the force still grows smoothly, by 1 % per 10 µm."""
+    result = [
         force_on_second(device, (*CUBE,), (*CUBE, tuple((SIDE + gap) * np.array(across)))) @ across
         for gap in (2e-5, 1e-5, 0.0, -1e-5, -2e-5)
     ]
-    assert np.isfinite(found).all()
-    steps = np.diff(found) / found[2]
+    assert np.isfinite(result).all()
+    steps = np.diff(result) / result[2]
     assert (steps > 0.0).all()
     np.testing.assert_allclose(steps, steps[1], rtol=0.3)
 
 
 def test_gradient_of_the_energy_is_the_force(device):
-    """Of two boxes half a millimetre apart and a ball, all near each other, in float64."""
+    """Forces are minus the gradient of the energy: two boxes half a millimeter apart and a ball, in float64."""
     places, balls = np.array([[0.0, 0.0, 0.0], [0.004, 0.002, 0.0105]]), np.array([[0.0075, 0.0005, -0.001]])
     system, put = near_system((0.005, 0.005, 0.005), device, places=places, balls=balls)
     system.apply_forces()
-    found = system.forces.numpy()
-    n = (len(found) - 1) // 2
-    forces = np.array([found[:n].sum(axis=0), found[n : 2 * n].sum(axis=0), found[-1]])
+    result = system.forces.numpy()
+    n = (len(result) - 1) // 2
+    forces = np.array([result[:n].sum(axis=0), result[n : 2 * n].sum(axis=0), result[-1]])
     step = 1e-6
     for axis in range(3):
         for k, (box, ball) in enumerate(((0, None), (1, None), (None, 0))):
@@ -325,7 +325,7 @@ def test_gradient_of_the_energy_is_the_force(device):
                 put(there, around)
                 energies.append(system.energy()[0])
             slope = (energies[0] - energies[1]) / (2.0 * step)
-            # Gauss points on the faces, whose energy this is, leave 3e-5; step/gap of the differences
+            # quadrature on the faces leaves 3e-5; truncation of the differences is (step/gap)²
             assert abs(slope + forces[k, axis]) < 3e-4 * np.abs(forces).max()
 
 
@@ -334,7 +334,7 @@ def test_what_has_no_closed_form_launches_nothing(device):
 
 
 def test_magnets_of_one_body_and_of_other_worlds_do_not_feel_each_other(device):
-    """Two boxes of one body, magnetized apart, and a disc over them; alone, and in two worlds."""
+    """Two boxes of one body with different magnetizations, and a disc above them: alone, and in two worlds."""
 
     def fill(builder, parts=2):
         body = builder.add_body()
@@ -345,7 +345,7 @@ def test_magnets_of_one_body_and_of_other_worlds_do_not_feel_each_other(device):
         if parts == 2:
             add(builder, *DISC, (0.001, 0.0, 0.019), UPRIGHT, ASKEW)
 
-    found = []
+    result = []
     for worlds, parts in ((1, 1), (1, 2), (2, 2)):
         world, builder = newton.ModelBuilder(), newton.ModelBuilder()
         warpmag.register_attributes(world)
@@ -355,14 +355,14 @@ def test_magnets_of_one_body_and_of_other_worlds_do_not_feel_each_other(device):
         model = builder.finalize(device=device)
         magnetics, state = warpmag.Magnetics(model), model.state()
         magnetics.apply(state)
-        found.append(state.body_f.numpy())
-    np.testing.assert_array_equal(found[0], 0.0)
-    assert np.abs(found[1]).max() > 1.0
-    np.testing.assert_allclose(found[2], np.tile(found[1], (2, 1)), rtol=1e-5, atol=1e-5)
+        result.append(state.body_f.numpy())
+    np.testing.assert_array_equal(result[0], 0.0)
+    assert np.abs(result[1]).max() > 1.0
+    np.testing.assert_allclose(result[2], np.tile(result[1], (2, 1)), rtol=1e-5, atol=1e-5)
 
 
 def test_a_magnet_of_several_boxes(device):
-    """Two legs of one magnet, apart and touching, under a cube; where they share volume they are a lattice."""
+    """Two legs of one magnet, apart and touching, under a cube; legs that share volume are a lattice."""
     for place, solids in ((0.006, 2), (0.005, 2), (0.003, 0)):
         builder = newton.ModelBuilder()
         warpmag.register_attributes(builder)
@@ -380,9 +380,9 @@ def test_a_magnet_of_several_boxes(device):
         if solids:
             apart = [reference("box", (0.005, 0.005, 0.01), (x, 0.0, 0.0), UPRIGHT, ASKEW) for x in (-place, place)]
             force = magpylib.getFT(apart, reference(*cube), meshing=2000, eps=1e-7)[0].sum(axis=0)
-            found = state.body_f.numpy()
-            np.testing.assert_allclose(found[1, :3], force, atol=2e-3 * np.linalg.norm(force))
-            np.testing.assert_allclose(found[0, :3], -found[1, :3], atol=SINGLE * np.linalg.norm(force))
+            result = state.body_f.numpy()
+            np.testing.assert_allclose(result[1, :3], force, atol=2e-3 * np.linalg.norm(force))
+            np.testing.assert_allclose(result[0, :3], -result[1, :3], atol=SINGLE * np.linalg.norm(force))
 
 
 def test_a_magnet_that_is_switched_is_switched_close_up(device):

@@ -1,4 +1,4 @@
-"""Coils and field maps on Newton models: what bodies feel, currents of worlds and graphs, and what is refused."""
+"""Coils and field maps on Newton models: forces on bodies, currents by world and in graphs, and errors."""
 
 import math
 
@@ -37,7 +37,7 @@ def test_a_coil_on_a_body_feels_what_it_does(device):
     assert np.abs(f[coil_body]).max() > 0.1 * np.abs(f[balls]).max()
     np.testing.assert_allclose(f[:, :3].sum(axis=0), 0.0, atol=SINGLE * np.abs(f[:, :3]).max())
     moments = f[:, 3:] + np.cross(centers, f[:, :3])
-    np.testing.assert_allclose(moments.sum(axis=0), 0.0, atol=1e-5 * np.abs(moments).max())  # of rtol
+    np.testing.assert_allclose(moments.sum(axis=0), 0.0, atol=1e-5 * np.abs(moments).max())  # from rtol
     world = wp.transform(*model.body_q.numpy()[coil_body].tolist()) * frame
     points = np.random.default_rng(1).normal(size=(20, 3)) * 0.05
     magnetics.set_magnetization((0.0, 0.0, 0.0), body=balls[1])
@@ -80,7 +80,7 @@ def test_64_worlds_with_64_currents(device):
 
 
 def test_force_of_a_gradient_coil_on_a_ball(device):
-    """A Maxwell pair: opposite loops √3 radii apart, whose gradient is even to fourth order, in a uniform field."""
+    """A Maxwell pair: opposite loops √3 radii apart, with a gradient uniform to fourth order, in a uniform field."""
     gap = math.sqrt(3.0) * A
     gradient = 300.0 * 3.0 * A**2 * 0.5 * gap / (A**2 + 0.25 * gap**2) ** 2.5
     builder = new_builder()
@@ -93,14 +93,14 @@ def test_force_of_a_gradient_coil_on_a_ball(device):
     magnetics.apply(state)
     moment = 3.0 * VOLUME * (2000.0 + gradient * 1e-4)
     expected = [0.0, 0.0, oracle.MU0 * moment * gradient]
-    # (1e-4/A)⁴ of the gradient's unevenness, rtol of the moment, and its curve's (3 H/Ms)²/3
+    # non-uniform gradient (1e-4/A)⁴, rtol of the moment, and nonlinearity of the curve (3 H/Ms)²/3
     np.testing.assert_allclose(state.body_f.numpy()[iron, :3], expected, atol=3e-5 * expected[2])
     np.testing.assert_allclose(magnetics.field_gradient([[0.0, 0.0, 0.0]])[0], gradient * np.diag([-0.5, -0.5, 1.0]),
                                atol=SINGLE * gradient)  # fmt: skip
 
 
 def test_momentum_of_a_coil_and_a_ball_is_kept_in_a_run(device):
-    """Each pulls the other; the ball has fallen well into the coil at the end."""
+    """Coil and ball attract each other; the ball has fallen well into the coil at the end."""
     builder = new_builder(gravity=(0.0, 0.0, 0.0))
     coil = builder.add_body(mass=0.02, inertia=wp.mat33(*(2e-6 * np.eye(3)).ravel().tolist()), label="coil")
     warpmag.add_coil(builder, coil, shape="solenoid", radius=A, length=2.0 * HALF, ampere_turns=4000.0)
@@ -140,13 +140,13 @@ def test_a_coil_is_switched_in_a_graph(device):
         current.assign([value])
         wp.capture_launch(capture.graph)
         moment_and_force = magnetics.shape_moments()[0, 2], state.body_f.numpy()[0, 2]
-        # the force is m dH/dz, of m = 3 V H: H'/H = -3 z/(A² + z²)
+        # force m dH/dz with m = 3 V H and H'/H = -3 z/(A² + z²)
         force = oracle.MU0 * 3.0 * VOLUME * (per_ampere * value) ** 2 * -1.5 / (1.25 * A)
         np.testing.assert_allclose(moment_and_force, (3.0 * VOLUME * per_ampere * value, force), rtol=1e-4)
 
 
 def test_fixed_bodies_and_fixed_maps(device):
-    """A kinematic coil is not pushed; one map serves all worlds; a magnetometer sees both."""
+    """A kinematic coil gets no reaction; one map acts on all worlds; a magnetometer measures both fields."""
     world = new_builder()
     add_ball(world, (0.0, 0.0, 0.5 * A))
     holder = world.add_body(is_kinematic=True)
@@ -247,7 +247,7 @@ WILD = {
 @pytest.mark.parametrize("name", WILD)
 @given(st.data())
 def test_any_source(name, data):
-    """Valid arguments make a record of finite numbers."""
+    """Valid arguments give a record of finite numbers."""
     builder, right = new_builder(), {"radius": A} if name == "add_coil" else {
         "origin": (0.0, 0.0, 0.0), "spacing": 1.0, "values": np.ones((2, 2, 2, 3))
     }  # fmt: skip
@@ -292,6 +292,6 @@ def test_sources_that_no_world_or_every_world_would_have(device):
         warpmag.Magnetics(outside.finalize(device=device))
     other = new_builder()
     other.add_world(world)
-    other.add_world(lone)  # holds no magnet that would feel it
+    other.add_world(lone)  # contains no magnet
     magnetics = warpmag.Magnetics(other.finalize(device=device))
     assert magnetics.system.sources is None

@@ -291,10 +291,10 @@ EXPECTED = {
     "turned": {"sum_tile", "finish", "begin_flow"},
     "yielding": {"sum_tile", "finish", "begin_flow", "add_bias"},
     "cells": {"sum_and_finish", "add_couplings", "sweep"},
-    "whole": {"sum_and_finish", "add_couplings", "respond"},
-    "coils": {"sum_tile", "apply_sources", "push", "add_to_probe", "brake"},
-    "solids": {"sum_and_finish", "apply_sources", "push", "add_to_probe", "brake"},
-    "fast": {"build_boxes", "near_sums_cuda", "translate_cuda", "add_parts", "expand", "return_sums"},
+    "whole": {"sum_and_finish", "add_couplings", "respond_all"},
+    "coils": {"sum_tile", "apply_sources", "add_forces", "add_to_probe", "brake"},
+    "solids": {"sum_and_finish", "apply_sources", "add_forces", "add_to_probe", "brake"},
+    "fast": {"build_octree", "sum_leaf", "translate_block", "add_parts", "expansion_step", "return_sums"},
     "most": {"sum_mirrored", "finish", "sweep", "list_neighbors"},
 }
 """Kernels that a system must launch on a GPU."""
@@ -330,10 +330,10 @@ def test_systems(which, launches):
 
 @pytest.mark.parametrize("which", ["fast", "most"])
 def test_systems_of_two_processes(which, launches, monkeypatch):
-    """Each process has half of the boxes, or half of the blocks of each pass, in whole splits."""
+    """Each has half of the boxes; or of the blocks of each pass, which is a run of whole splits."""
     ranks = Half()
     for module in (system, fmm):
-        monkeypatch.setattr(module, "current_ranks", lambda: ranks)
+        monkeypatch.setattr(module, "ranks", lambda: ranks)
     monkeypatch.setattr(sharing, "_LEAST_BOXES", {"cuda": 1})
     monkeypatch.setattr(evaluate, "_LEAST_SHARED", {"cuda": 1})
     monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", 2**20)
@@ -348,7 +348,7 @@ def test_simulation(launches):
     advance(magnets())
     threads = {launch.name: launch.threads for launch in launches}
     assert threads["advance"] == threads["_move"] == 2
-    assert {"_watch", "_judge", "solve_contacts", "list_neighbors", "sum_and_finish", "push"} <= threads.keys()
+    assert {"_watch", "_judge", "solve_contacts", "list_neighbors", "sum_and_finish", "add_forces"} <= threads.keys()
 
 
 def magnets() -> newton.ModelBuilder:

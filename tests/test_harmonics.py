@@ -9,8 +9,8 @@ from warpmag.moments import harmonics
 EPSILON = np.finfo(np.float64).eps
 
 
-def _relative(found, wanted):
-    return np.linalg.norm(found - wanted) / np.linalg.norm(wanted)
+def _relative(result, expected):
+    return np.linalg.norm(result - expected) / np.linalg.norm(expected)
 
 
 def _in_cell(rng, n):
@@ -26,7 +26,7 @@ def test_products_sum_to_the_inverse_distance():
     rng = np.random.default_rng(1)
     near, far = _at_distance(rng, 20, 0.1), _at_distance(rng, 20, 1.0)
     sums = (harmonics.regular(16, near) * harmonics.irregular(16, far)).sum(axis=1)
-    # the series is cut at 0.1¹⁷
+    # the series is truncated at 0.1¹⁷
     np.testing.assert_allclose(sums, 1 / np.linalg.norm(far - near, axis=1), rtol=32 * EPSILON)
 
 
@@ -35,16 +35,16 @@ def test_harmonics_of_a_degree_are_normalized():
     values = harmonics.regular(15, _at_distance(rng, 20, 1.0))
     for degree in range(16):
         squares = (values[:, harmonics.degrees(15) == degree] ** 2).sum(axis=1)
-        np.testing.assert_allclose(squares, 1, rtol=1e3 * EPSILON)  # of recursions through 15 degrees
+        np.testing.assert_allclose(squares, 1, rtol=1e3 * EPSILON)  # recurrences through 15 degrees
 
 
 def test_low_degrees_are_the_polynomials_they_should_be():
     x, y, z = np.random.default_rng(3).normal(size=(3, 10))
     values = harmonics.regular(2, np.stack([x, y, z], axis=1))
     root3 = np.sqrt(3)
-    wanted = [np.ones(10), y, z, x, root3 * x * y, root3 * y * z, z * z - (x * x + y * y) / 2, root3 * x * z]
-    wanted.append(root3 / 2 * (x * x - y * y))
-    np.testing.assert_allclose(values, np.stack(wanted, axis=1), rtol=0, atol=32 * EPSILON)
+    expected = [np.ones(10), y, z, x, root3 * x * y, root3 * y * z, z * z - (x * x + y * y) / 2, root3 * x * z]
+    expected.append(root3 / 2 * (x * x - y * y))
+    np.testing.assert_allclose(values, np.stack(expected, axis=1), rtol=0, atol=32 * EPSILON)
 
 
 def test_parity():
@@ -66,12 +66,14 @@ def test_gradients_by_differences():
 
 @pytest.mark.parametrize("offset", [(2, 0, 0), (-3, 1, 2), (0, -2, 3), (-1, -2, 0)])
 def test_multipole_to_local_has_irregular_harmonics_around_the_target(offset):
-    """Rows of the matrix, of harmonics of any degree, are expansions that converge fast near the centre."""
+    """Rows of the matrix are expansions of harmonics of any degree, which converge fast near the center."""
     points = 0.05 * _in_cell(np.random.default_rng(6), 10)
     expanded = harmonics.regular(15, points) @ harmonics.multipole_to_local(15, offset)
-    wanted = harmonics.irregular(15, points + np.asarray(offset, float))
-    # cut at (0.05 √¾ / 2)¹⁶ of large coefficients
-    np.testing.assert_allclose(expanded / np.abs(wanted).max(axis=0), wanted / np.abs(wanted).max(axis=0), atol=1e-11)
+    expected = harmonics.irregular(15, points + np.asarray(offset, float))
+    # truncated at (0.05 √¾ / 2)¹⁶ with large coefficients
+    np.testing.assert_allclose(
+        expanded / np.abs(expected).max(axis=0), expected / np.abs(expected).max(axis=0), atol=1e-11
+    )
 
 
 def test_offsets_with_other_signs_have_other_signs():
@@ -81,7 +83,7 @@ def test_offsets_with_other_signs_have_other_signs():
 
 
 def test_far_field_is_symmetric():
-    """What a source does to a target, the target does to the source: forces are mutual, and the operator symmetric."""
+    """Forces between source and target are mutual, so the operator is symmetric."""
     there, back = (harmonics.multipole_to_local(9, offset) for offset in ((2, -1, 3), (-2, 1, -3)))
     np.testing.assert_allclose(there, back.T, rtol=0, atol=4 * EPSILON)
 

@@ -90,7 +90,7 @@ def test_theta_needs_at_most_two_iterations_in_every_cell(sweeps):
     assert (counts["theta"].most[:, grid.multipliers == 1.0] == 1).all()
 
 
-def test_rivals_fail_as_the_field_grows(sweeps):
+def test_baseline_dynamics_fail_as_the_field_grows(sweeps):
     """Fig. 9 (b), (c): LLG fails in nearly all the plane, damping only beyond κ‖H‖ = 2 Ms."""
     counts, grid = sweeps
     strong = grid.strengths >= 8.0

@@ -1,32 +1,34 @@
-"""Fields that sources without a response apply to moments: coils, field maps, permanent bodies seen from near.
+"""Fields that coils, field maps and nearby permanent bodies apply to moments, and the reactions on these sources.
 
-May import ``shared``, ``material`` and ``pairs``. A source makes a field by a closed form, or from a table, in its own
-frame, whatever is around it. Coils and maps have it everywhere, in proportion to a strength of their own. A lattice of
-moments stands for a permanent body at a distance of a few cells; what is nearer than its reach gets the difference
-between the closed form of the body's field and that of its lattice, and two bodies near each other the difference
-between force and torque of their surfaces' charges and those of their moments.
+May import ``shared``, ``material`` and ``pairs``. The field of such a source does not depend on its surroundings: it
+follows from a closed form, or from a table, in the frame of the source.
 
-All of it is evaluated once a solve at all moments and added to the external field. What the moments feel pushes the
-source back: the reaction is summed from the same fields, so that forces are opposite and equal. Scenes without sources
-launch nothing of this.
+Fields of coils and maps act everywhere, in proportion to a strength. At a distance of a few lattice cells a lattice of
+moments represents a permanent body. Within its reach targets get a correction: the closed form of the body's field less
+the field of its lattice. Two bodies near each other get the force and torque between their surface charges, less those
+between their moments.
 
-| module | what it does |
+Fields are evaluated once a solve at all moments, and added to the external field. The reaction on a source is summed
+from the same fields, so that forces are opposite and equal. Without sources none of these kernels is launched.
+
+| module | content |
 |---|---|
-| sources | what sources are, and where they and the targets stand on a device |
-| fields | the launches: fields at targets and about balls, forces, reactions |
-| solids | tables of the polyhedra that bound permanent bodies |
-| expansion | points and tables by which a field is expanded about a ball |
-| `passes.h` | the passes over targets and sources |
-| `seen.h` | field and gradient as several targets see them, and what pushes moments there |
+| sources | records of sources, and the arrays of sources and targets on a device |
+| fields | launches: fields at targets and about balls, forces, reactions |
+| solids | tables of permanent bodies and of the polyhedra that bound them |
+| expansion | points and tables for the expansion of a field about a ball |
+| `passes.h` | passes over targets and sources |
+| `target_field.h` | field and gradient at a vector of targets, and the force on moments there |
+| `rates.h` | rate of change of a field at moving targets |
 | `balls.h` | expansion of fields about balls |
-| `sources.h` | the table of kinds and frames |
-| `field_at.h` | a field with its gradient, in double precision; what a wire is made of |
-| `loop.h`, `solenoid.h` | a circular loop, a sheet of current around a cylinder |
-| `polyline.h` | a chain of straight pieces of wire |
-| `field_map.h` | a field on a regular grid |
-| `solids.h`, `between.h` | permanent bodies, their lattices, and the force between two |
+| `sources.h` | kinds of coils and maps, and their frames |
+| `point_field.h` | field and gradient at one point, in double precision; the inside of a wire |
+| `loop.h`, `solenoid.h` | circular loop; cylindrical sheet of current |
+| `polyline.h` | chain of straight pieces of wire |
+| `field_map.h` | field on a regular grid |
+| `solids.h`, `body_pairs.h` | permanent bodies, their lattices; forces between two bodies |
 | `polyhedron.h` | field, gradient and potentials of a uniformly magnetized polyhedron |
 
-A kind is a header with one function of a source and a place in its frame, a line in ``sources.h``, and its name in
+A new kind of coil or map takes a header with its field, its include and case in ``sources.h``, and its name in
 ``sources.SourceKind``.
 """

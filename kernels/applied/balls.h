@@ -1,142 +1,141 @@
-// Fields of sources about the centres of balls, by degrees, of which uneven.py makes multipoles; expansion.py has the
-// points and the tables.
+// Expansion of the sources' fields about the centers of balls. near_contact computes the multipoles that they induce;
+// expansion.py has the equations, points and tables.
 #pragma once
-#include "applied/seen.h"
 #include "applied/sources.h"
+#include "applied/target_field.h"
 
 namespace warpmag {
 
 constexpr int POINTS = 12, TENSOR_ROWS = 21, EXPANSION_ROWS = 4 * TENSOR_ROWS; // as in expansion.py
-constexpr int HELD = CHUNK <= WIDTH * SHARES ? 1 : CHUNK / (WIDTH * SHARES);
+constexpr int VECTORS_PER_THREAD = CHUNK <= WIDTH * SHARES ? 1 : CHUNK / (WIDTH * SHARES);
 
-// A ball, and what is seen at its CHUNK places, POINTS of which count, of which a thread has those of vector v from
-// ``first`` on.
+// A ball, and the sources' field at its CHUNK points, of which the first POINTS count. A thread has VECTORS_PER_THREAD
+// vectors of points.
 struct Ball {
-    Three center;
-    Real size, label;
+    Real3 center;
+    Real radius, label;
     int moment;
-    bool lit; // whether any source takes part
-    Seen at[HELD];
+    bool in_field; // whether any source acts on it
+    TargetField fields[VECTORS_PER_THREAD];
 
+    // First point of vector v.
     CUDA_CALLABLE static int first(int v) { return WIDTH * (share() + SHARES * v); }
-    template <class All> CUDA_CALLABLE Vector points(const All& all, int v) const {
-        const Real* const p = all.points.data + first(v);
-        const Number r = Number(Real(0)) + size;
-        return spread(center) + r * own_vector(p);
+    template <class Arrays> CUDA_CALLABLE Vector points(const Arrays& arrays, int v) const {
+        const Real* const p = arrays.balls.points.data + first(v);
+        const Number r = Number(Real(0)) + radius;
+        return broadcast(center) + r * own_vector(p);
     }
 };
-template <class All> CUDA_CALLABLE inline Ball ball_at(const All& all, int i) {
-    Ball ball = {{packed_at(all, 0, i), packed_at(all, 1, i), packed_at(all, 2, i)},
-                 packed_at(all, 3, i),
-                 packed_at(all, 7, i),
-                 i,
-                 false,
-                 {}};
-    for (int v = 0; v < HELD; ++v) ball.at[v] = nothing_seen();
+template <class Arrays> CUDA_CALLABLE inline Ball ball_at(const Arrays& arrays, int i) {
+    Ball ball = {packed_real3(arrays, 0, i), packed_at(arrays, 3, i), packed_at(arrays, 7, i), i, false, {}};
+    for (int v = 0; v < VECTORS_PER_THREAD; ++v) ball.fields[v] = zero_target_field();
     return ball;
 }
 
-// How far a source takes part, and the derivative of that by the ball's place: it fades as the ball leaves the box
-// around the source.
-struct Part {
-    Real value;
-    Three slope, beyond;
+// Weight of a source's field at a ball, and its gradient by the ball's position. The weight fades from 1 to 0 with the
+// ball's distance from the box around the source. ``offset`` is the vector from the box to the ball.
+struct Fade {
+    Real weight;
+    Real3 slope, offset;
 };
-CUDA_CALLABLE inline Part part_of(const Ball& ball, const Pose& pose, Three middle, Three half) {
-    auto past = [](Real at, Real half) { return at > half ? at - half : at < -half ? at + half : Real(0); };
-    const Three r = ball.center - pose.origin;
-    const Three at = pose.to_body(r) - middle;
-    const Three d = {past(at.x, half.x), past(at.y, half.y), past(at.z, half.z)};
-    const Three beyond = d.x * pose.x + d.y * pose.y + d.z * pose.z;
-    const Real away = wp::sqrt(dot(d, d)) / ball.size, width = MAGNET_REACH_HIGH - MAGNET_REACH_LOW;
-    const Real left = (MAGNET_REACH_HIGH - away) / width, t = left < 1 ? left : Real(1);
-    if (!(t > 0)) return {0, {0, 0, 0}, beyond};
-    const Real slope = t < 1 ? -6 * t * (1 - t) / (width * ball.size * ball.size * away) : Real(0);
-    return {t * t * (3 - 2 * t), slope * beyond, beyond};
+CUDA_CALLABLE inline Fade fade_of(const Ball& ball, const Pose& pose, Real3 center, Real3 half) {
+    auto excess = [](Real at, Real half) { return at > half ? at - half : at < -half ? at + half : Real(0); };
+    const Real3 r = ball.center - pose.origin;
+    const Real3 at = pose.to_body(r) - center;
+    const Real3 d = {excess(at.x, half.x), excess(at.y, half.y), excess(at.z, half.z)};
+    const Real3 offset = d.x * pose.x + d.y * pose.y + d.z * pose.z;
+    const Real distance = wp::sqrt(dot(d, d)) / ball.radius, width = MAGNET_REACH_HIGH - MAGNET_REACH_LOW;
+    const Real ramp = (MAGNET_REACH_HIGH - distance) / width, t = ramp < 1 ? ramp : Real(1);
+    if (!(t > 0)) return {0, {0, 0, 0}, offset};
+    const Real slope = t < 1 ? -6 * t * (1 - t) / (width * ball.radius * ball.radius * distance) : Real(0);
+    return {t * t * (3 - 2 * t), slope * offset, offset};
 }
-// Adds a field that takes part so far.
-CUDA_CALLABLE inline void add_part(Seen& to, const Part& part, const Seen& s) {
+// Adds w H, and its derivatives w ∂H + ∂w H.
+CUDA_CALLABLE inline void add_faded(TargetField& to, const Fade& fade, const TargetField& s) {
     auto product = [&](Real slope, Vector v) {
-        return (Number(Real(0)) + part.value) * v + (Number(Real(0)) + slope) * s.h;
+        return (Number(Real(0)) + fade.weight) * v + (Number(Real(0)) + slope) * s.h;
     };
-    to.h += (Number(Real(0)) + part.value) * s.h;
-    to.x = to.x + product(part.slope.x, s.x), to.y = to.y + product(part.slope.y, s.y);
-    to.z += product(part.slope.z, s.z);
+    to.h += (Number(Real(0)) + fade.weight) * s.h;
+    to.x = to.x + product(fade.slope.x, s.x), to.y = to.y + product(fade.slope.y, s.y);
+    to.z += product(fade.slope.z, s.z);
 }
 
-// Adds what source s applies to the ball, unless both are of one body.
-template <class All> CUDA_CALLABLE inline void add_source(const All& all, int s, Ball& ball) {
-    if (all.label.data[s] == ball.label) return;
-    const Real* const extent = all.extent.data + 6 * (size_t)s;
-    const Pose pose = pose_from((const Real*)all.frame.data + 7 * (size_t)s);
-    const Part part = part_of(ball, pose, three(extent), three(extent + 3));
-    if (part.value == 0) return;
-    ball.lit = true;
-    for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {
-        const Vector x = ball.points(all, v);
-        Seen seen = nothing_seen();
+// Adds the field of coil or map s, unless it belongs to the ball's body.
+template <class Arrays> CUDA_CALLABLE inline void add_coil(const Arrays& arrays, int s, Ball& ball) {
+    if (arrays.coils.label.data[s] == ball.label) return;
+    const Real* const extent = arrays.coils.extent.data + 6 * (size_t)s;
+    const Pose pose = pose_from((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
+    const Fade fade = fade_of(ball, pose, real3(extent), real3(extent + 3));
+    if (fade.weight == 0) return;
+    ball.in_field = true;
+    for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
+        const Vector x = ball.points(arrays, v);
+        TargetField field = zero_target_field();
         for (int l = 0; l < WIDTH && Ball::first(v) + l < POINTS; ++l) {
-            const FieldAt f = field_at(all, s, {lane_of(x.x, l), lane_of(x.y, l), lane_of(x.z, l)});
-            set_lane(seen.h, l, f.h), set_lane(seen.x, l, f.dx), set_lane(seen.y, l, f.dy), set_lane(seen.z, l, f.dz);
+            const PointField f = field_at(arrays, s, {lane_of(x.x, l), lane_of(x.y, l), lane_of(x.z, l)});
+            set_lane(field.h, l, f.h), set_lane(field.x, l, f.dx);
+            set_lane(field.y, l, f.dy), set_lane(field.z, l, f.dz);
         }
-        add_part(ball.at[v], part, seen);
+        add_faded(ball.fields[v], fade, field);
     }
 }
-// Adds what a permanent body does: by its closed form, from its reach on by its lattice, which keeps more digits there.
-template <class All> CUDA_CALLABLE inline void add_body(const All& all, const Body& body, Ball& ball) {
-    if (body.yields) return; // its moments are neighbours of the ball
-    const Part part = part_of(ball, body.pose, body.middle, body.half);
-    if (part.value == 0 || body.label == ball.label) return;
-    ball.lit = true;
-    const bool near = dot(part.beyond, part.beyond) < body.reach * body.reach;
-    const Number zero = Number(Real(0)), least2 = zero + Real(0.0625) * ball.size * ball.size;
-    for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {
-        const Vector x = ball.points(all, v);
-        const Near field = near ? body.pose.to_world(field_of(body.solid, body.m, body.pose.place(x), least2, 0, 1))
-                                : (INVERSE_4PI * lattice_field(all, body, x, zero, x.x != x.x, 0, 1));
-        add_part(ball.at[v], part, seen_of(field));
+// Adds the field of a permanent body: its closed form within its reach, else its lattice, which keeps more digits
+// there.
+template <class Arrays> CUDA_CALLABLE inline void add_body(const Arrays& arrays, const Body& body, Ball& ball) {
+    if (body.responds) return; // its moments are neighbors of the ball already
+    const Fade fade = fade_of(ball, body.pose, body.box_center, body.box_half);
+    if (fade.weight == 0 || body.label == ball.label) return;
+    ball.in_field = true;
+    const bool near = dot(fade.offset, fade.offset) < body.reach * body.reach;
+    const Number zero = Number(Real(0)), least2 = zero + Real(0.0625) * ball.radius * ball.radius;
+    for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
+        const Vector x = ball.points(arrays, v);
+        const CurlFreeField field =
+            near ? body.pose.to_world(field_of(body.solid, body.m, body.pose.point_to_body(x), least2, 0, 1))
+                 : (INVERSE_4PI * lattice_field(arrays, body, x, zero, x.x != x.x, 0, 1));
+        add_faded(ball.fields[v], fade, target_field(field));
     }
 }
 
-// Writes the tensors of degrees 2 to 4 and what their derivatives pull by.
-template <class All> CUDA_CALLABLE inline void expand(const All& all, int n) {
-    const auto& own = all.ball.data[n]; // moment, world, and the permanent bodies of that
-    Ball ball = ball_at(all, own[0]);
+// Writes the tensors b of degrees 2 to 4, and the tensors whose contraction with the ball's response is its force.
+template <class Arrays> CUDA_CALLABLE inline void expand(const Arrays& arrays, int n) {
+    const auto& row = arrays.balls.ball.data[n]; // moment, world, and the range of permanent bodies in that world
+    Ball ball = ball_at(arrays, row[0]);
     if constexpr (COILS)
-        for (int k = all.list_begin.data[own[1]]; k < all.list_begin.data[own[1] + 1]; ++k)
-            add_source(all, all.list.data[k], ball);
+        for (int k = arrays.coils.list_begin.data[row[1]]; k < arrays.coils.list_begin.data[row[1] + 1]; ++k)
+            add_coil(arrays, arrays.coils.list.data[k], ball);
     if constexpr (SOLIDS)
-        for (int b = own[2]; b < own[3]; ++b) add_body(all, body_at(all, b), ball);
-    Real* const out = rows_at(all.expansion.data, EXPANSION_ROWS, own[0]);
-    for (int row = 0; row < TENSOR_ROWS; ++row) {
+        for (int b = row[2]; b < row[3]; ++b) add_body(arrays, body_at(arrays, b), ball);
+    Real* const out = rows_at(arrays.balls.expansion.data, EXPANSION_ROWS, row[0]);
+    for (int component = 0; component < TENSOR_ROWS; ++component) {
         Number tensor = Number(Real(0));
         Vector slope = {tensor, tensor, tensor};
-        for (int v = 0; ball.lit && v < HELD && Ball::first(v) < CHUNK; ++v) {
-            const Real* const table = all.tables.data + 6 * CHUNK * row + Ball::first(v);
-            tensor += dot(own_vector(table), ball.at[v].h);
-            slope += pulled(ball.at[v], own_vector(table + 3 * CHUNK));
+        for (int v = 0; ball.in_field && v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
+            const Real* const table = arrays.balls.tables.data + 6 * CHUNK * component + Ball::first(v);
+            tensor += dot(own_vector(table), ball.fields[v].h);
+            slope += gradient_dot(ball.fields[v], own_vector(table + 3 * CHUNK));
         }
-        const Three pull = ball.lit ? added_up(slope) : Three{0, 0, 0};
-        const Real rows[4] = {ball.lit ? added_up(tensor) : Real(0), pull.x, pull.y, pull.z};
+        const Real3 force = ball.in_field ? total_of(slope) : Real3{0, 0, 0};
+        const Real rows[4] = {ball.in_field ? total_of(tensor) : Real(0), force.x, force.y, force.z};
         for (int c = 0; c < 4 && share() == 0; ++c)
-            out[(c == 0 ? row : TENSOR_ROWS + 3 * row + c - 1) * CHUNK] = rows[c];
+            out[(c == 0 ? component : TENSOR_ROWS + 3 * component + c - 1) * CHUNK] = rows[c];
     }
 }
 
-// Force over μ0 of one source on the multipoles of a ball.
-template <class All> CUDA_CALLABLE inline Three pull_of(const All& all, const Ball& ball) {
-    if (!ball.lit) return {0, 0, 0};
-    const Real* const response = rows_at(all.response.data, RESPONSE_ROWS, ball.moment);
-    Vector total = nothing_seen().h;
-    for (int v = 0; v < HELD && Ball::first(v) < CHUNK; ++v) {
-        Vector e = nothing_seen().h;
+// Force/μ0 of one source on the multipoles of a ball.
+template <class Arrays> CUDA_CALLABLE inline Real3 multipole_force(const Arrays& arrays, const Ball& ball) {
+    if (!ball.in_field) return {0, 0, 0};
+    const Real* const response = rows_at(arrays.balls.response.data, RESPONSE_ROWS, ball.moment);
+    Vector total = zero_target_field().h;
+    for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
+        Vector e = zero_target_field().h;
         for (int row = 0; row < TENSOR_ROWS; ++row) {
-            const Real* const table = all.tables.data + 6 * CHUNK * row + 3 * CHUNK + Ball::first(v);
+            const Real* const table = arrays.balls.tables.data + 6 * CHUNK * row + 3 * CHUNK + Ball::first(v);
             e += (Number(Real(0)) + response[row * CHUNK]) * own_vector(table);
         }
-        total += pulled(ball.at[v], e);
+        total += gradient_dot(ball.fields[v], e);
     }
-    const Real volume = INVERSE_4PI * ball.size * ball.size * ball.size;
-    return volume * added_up(total);
+    const Real volume = INVERSE_4PI * ball.radius * ball.radius * ball.radius;
+    return volume * total_of(total);
 }
 }

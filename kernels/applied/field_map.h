@@ -1,13 +1,13 @@
-// A field given at the nodes of a regular grid. Between them each component is interpolated by cubic convolution along
-// the three axes (Keys 1981, "Cubic convolution interpolation for digital image processing", IEEE Trans. Acoust. 29,
-// 1153): through the values at the nodes, with a continuous first derivative, which is the gradient that acts, to third
-// order in the spacing. Beyond the grid the field is zero.
+// Field given at the nodes of a regular grid. Each component is interpolated by cubic convolution along the three axes
+// (Keys 1981, "Cubic convolution interpolation for digital image processing", IEEE Trans. Acoust. 29, 1153). The
+// interpolant passes through the nodes, is third-order accurate, and has a continuous gradient. The field is zero
+// outside the grid.
 #pragma once
-#include "applied/field_at.h"
+#include "applied/point_field.h"
 
 namespace warpmag {
 
-// Weights of the four nodes about a place, t of a cell after the second of them, and their derivatives by t.
+// Weights of the four nodes around a point, and their derivatives by t, the offset from the second node in spacings.
 struct CubicWeights {
     double value[4], slope[4];
 
@@ -18,30 +18,30 @@ struct CubicWeights {
                 0.5 * t * (3 * t - 2)} {}
 };
 
-// A map, of parameters first node, spacings [m] and numbers of nodes along x, y and z; the table has the field [A/m] at
-// them with one more node at either end of each axis, along z first; strength: a factor.
-CUDA_CALLABLE inline FieldAt map_field(const AppliedSource& source, Point x) {
+// Field map. Parameters: first node and spacings [m], and numbers of nodes, along x, y and z. Table: field [A/m] at the
+// nodes, z fastest, with one more node at either end of each axis. Strength: a factor.
+CUDA_CALLABLE inline PointField map_field(const AppliedSource& source, Point x) {
     const double* const p = source.parameters;
-    const double places[3] = {(x.x - p[0]) / p[3], (x.y - p[1]) / p[4], (x.z - p[2]) / p[5]};
+    const double position[3] = {(x.x - p[0]) / p[3], (x.y - p[1]) / p[4], (x.z - p[2]) / p[5]};
     int cell[3];
     for (int axis = 0; axis < 3; ++axis) {
         const double last = p[6 + axis] - 1;
-        if (!(places[axis] >= 0 && places[axis] <= last)) return {};
-        cell[axis] = (int)(places[axis] < last ? places[axis] : last - 1);
+        if (!(position[axis] >= 0 && position[axis] <= last)) return {};
+        cell[axis] = (int)(position[axis] < last ? position[axis] : last - 1);
     }
-    const CubicWeights u(places[0] - cell[0]), v(places[1] - cell[1]), w(places[2] - cell[2]);
+    const CubicWeights u(position[0] - cell[0]), v(position[1] - cell[1]), w(position[2] - cell[2]);
     const size_t row = (size_t)p[8] + 2, sheet = row * ((size_t)p[7] + 2);
-    FieldAt found = {};
+    PointField field = {};
     for (int i = 0; i < 4; ++i)
         for (int j = 0; j < 4; ++j) {
             const Point* const nodes = source.table + (cell[0] + i) * sheet + (cell[1] + j) * row + cell[2];
             Point line = {0, 0, 0}, slope = line;
             for (int k = 0; k < 4; ++k) line += w.value[k] * nodes[k], slope += w.slope[k] * nodes[k];
-            found.h += u.value[i] * v.value[j] * line;
-            found.dx += u.slope[i] * v.value[j] / p[3] * line;
-            found.dy += u.value[i] * v.slope[j] / p[4] * line;
-            found.dz += u.value[i] * v.value[j] / p[5] * slope;
+            field.h += u.value[i] * v.value[j] * line;
+            field.dx += u.slope[i] * v.value[j] / p[3] * line;
+            field.dy += u.value[i] * v.slope[j] / p[4] * line;
+            field.dz += u.value[i] * v.value[j] / p[5] * slope;
         }
-    return source.strength.x * found;
+    return source.strength.x * field;
 }
 }

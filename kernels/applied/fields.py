@@ -1,14 +1,14 @@
-"""Field of sources at targets, about balls, and the forces and reactions that follow.
+"""Fields of sources at targets and about balls, forces on moments, and reactions on sources.
 
-A source applies to a moment m at x the field H(x) [A/m], and with Kelvin's law (Kim and Han 2022, Eqs. 13 and 14) the
+The field H(x) [A/m] of a source exerts on a moment m at x, with Kelvin's law (Kim and Han 2022, Eqs. 13 and 14), the
 force and torque
 
     F = μ0 ∇(m·H),   F_k = μ0 m_i ∂H_i/∂x_k,      τ = μ0 m × H,
 
-with Eq. 4 those on the effective moment (``pairs.wrench``). ∇(m·H) is (m·∇)H where H has no curl, and everywhere the
-gradient of the co-energy. The source feels −ΣF and, about its origin o, −Σ(τ + (x − o) × F), of all moments that are
-not of its own body: momentum and angular momentum are kept by construction. On the multipoles of balls (``expansion``)
-the force acts at their centres.
+With Eq. 4 m is the effective moment (``pairs.wrench``). ∇(m·H) is the gradient of the co-energy; it equals (m·∇)H where
+H has no curl. The reaction on the source is −ΣF and, about its origin o, −Σ(τ + (x − o) × F), over all moments of other
+bodies: momentum and angular momentum are conserved by construction. Forces on the multipoles of balls (``expansion``)
+act at the balls' centers.
 """
 
 import itertools
@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.applied import expansion
-from warpmag.kernels.applied.sources import Sources, source_arrays_type
+from warpmag.kernels.applied.sources import FieldSources, SourceKind, source_arrays_type
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
@@ -26,93 +26,93 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
 AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP = range(5)
-"""The passes; as in ``passes.h``."""
+"""Passes; as in ``passes.h``."""
 _TARGETS_PER_THREAD, _BALLS_PER_THREAD = 500, 50
-"""Fields of a source at a target, and about a ball, that make another thread of a CPU worth waking."""
-_LEAST_ROW, _MOST_ROWS, _BALLS_IN_ROW = 256, 64, 8
-"""Targets in a row of a reaction, at least, and rows of a source, at most; balls in a row, at least."""
-_BODY_THREADS = 32
+"""Pairs of a source and a target, and of a source and a ball, per thread of a CPU, at least."""
+_TARGETS_PER_ROW, _BALLS_PER_ROW, _MOST_ROWS = 256, 8, 64
+"""Fewest targets and fewest balls in a row of a reaction, and most rows of a source."""
+_GROUP = 32
 """Threads of a GPU that share a source, or a row of its reaction."""
 
 
 @cache
-def _kernel(dtype, one: int, group: int, coils: bool, solids: bool, rates: bool, balls: tuple):
-    """Kernel of pass ``one``, or of all if that is −1."""
+def _kernel(dtype, only_pass: int, group: int, coils: bool, solids: bool, rates: bool, balls: tuple):
+    """Return the kernel of one pass, or of all passes if ``only_pass`` is −1."""
     call = "apply_sources(thread, first, last, threads, team.data, arrays)"
     arguments = {**PASS_ARGUMENTS, "arrays": source_arrays_type(dtype)}
     constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
-    constants |= {"PASS": one, "GROUP": group, "RATES": int(rates)}
+    constants |= {"PASS": only_pass, "GROUP": group, "RATES": int(rates)}
+    constants |= {kind.name: kind.value for kind in SourceKind}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
     return native_kernel(call, "applied/passes.h", arguments, dtype=dtype, **constants)
 
 
 class AppliedField:
-    """Field of sources at targets, again and again in the same arrays.
+    """Field of sources at targets, in arrays that all launches share.
 
     Args:
         sources: The sources.
         targets: The targets, packed (``packing.PackedMoments``); read at each launch, as is ``base``.
-        worlds: World of each, shape [t].
-        base: What fields are added to [A/m], Warp array, shape [t].
-        points: Whether they are points and not the moments.
+        worlds: World of each target, shape [t].
+        base: Field that is added to [A/m], Warp array, shape [t].
+        points: Whether targets are points of a probe; else they are all moments.
 
     Attributes:
-        field: What magnetizes the targets: their base and the field of all sources [A/m], shape [t].
-        acting: What turns them: their base and the field of the sources of other bodies [A/m], shape [t].
-        along: Derivatives along x, y and z of the field of the sources of other bodies [A/m²], shape [t] each.
+        field: Magnetizing field: base and the field of all sources [A/m], shape [t].
+        acting: Field that exerts torques: base and the field of other bodies' sources [A/m], shape [t].
+        along: Derivatives of the field of other bodies' sources along x, y and z [A/m²], shape [t] each.
     """
 
     balls: tuple = (0, 0.0, 0.0, 0)
-    """Whether fields are expanded about balls, and how; constants of ``balls.h``."""
+    """Constants of ``balls.h``: whether fields are expanded about balls, range of fading, rows of the response."""
     rates: wp.array | None = None
-    """How fast fields change at the moments [A/(m·s)], shape [t]; None where that is not wanted."""
+    """Rate of the field of other bodies' sources [A/(m·s)], shape [t]; None unless :meth:`follow` was called."""
 
-    def __init__(self, sources: Sources, targets, worlds, base, *, points: bool):
+    def __init__(self, sources: FieldSources, targets, worlds, base, *, points: bool):
         """Allocate the results."""
         self.sources, self.count, self._points = sources, targets.count, points
         self.arrays = arrays = source_arrays_type(sources.dtype)()
-        for name, values in sources.arrays.items():
-            setattr(arrays, name, values)
-        arrays.target, arrays.base = targets.packed, base
+        arrays.coils, arrays.solids, arrays.packed = sources.coil_arrays, sources.solid_arrays, sources.packed.packed
+        arrays.targets.packed, arrays.targets.base = targets.packed, base
         self._lay_out_targets(np.asarray(worlds))
         vec3 = wp.types.vector(3, sources.dtype)
         names = ("field", "acting", "along_x", "along_y", "along_z", *(["inside"] if points else []))
         results = [wp.zeros(self.count, dtype=vec3, device=sources.device) for _ in names]
         for name, values in zip(names, results, strict=True):
-            setattr(arrays, name, values)
-        self.field, self.acting, self.along = arrays.field, arrays.acting, results[2:5]
+            setattr(arrays.targets, name, values)
+        self.field, self.acting, self.along = *results[:2], results[2:5]
         self._commands: dict[tuple, wp.Launch] = {}
 
-    def _put(self, name: str, values, kind):
-        setattr(self.arrays, name, wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self.device))
+    def _integers(self, values, kind=wp.int32) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self.device)
 
     def _lay_out_targets(self, worlds):
-        """List the chunks of targets, each of one world, and which targets closed forms count for."""
-        sources, wanted = self.sources, np.ones(self.count)
-        for one in () if self._points else sources.solids:
-            wanted[one.first : one.first + one.count] = 0
-        self._put("wanted", wanted, wp.int32)
+        """List the chunks of targets, each in one world, and mark the targets that closed forms correct."""
+        sources, targets, corrected = self.sources, self.arrays.targets, np.ones(self.count)
+        for solid in () if self._points else sources.solids:
+            corrected[solid.first : solid.first + solid.count] = 0
+        targets.corrected = self._integers(corrected)
         edges, starts = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1)), []
         for begin, end in itertools.pairwise(edges):
             starts += [(k, min(CHUNK, end - k)) for k in range(begin, end, CHUNK)]
         starts = np.array(starts, int).reshape(-1, 2)
         world = worlds[starts[:, 0]].astype(int)
-        self._put("chunk", np.concatenate([starts, sources.bodies_of(world)], axis=1), wp.vec4i)
-        self._put("lists", np.stack([sources.lists[world], sources.lists[world + 1]], axis=1), wp.vec2i)
+        targets.chunk = self._integers(np.concatenate([starts, sources.bodies_of(world)], axis=1), wp.vec4i)
+        targets.lists = self._integers(np.stack([sources.lists[world], sources.lists[world + 1]], axis=1), wp.vec2i)
 
     @property
     def device(self):
-        """The sources' device."""
+        """Device of the sources."""
         return self.sources.device
 
-    def make(self, first: int, last: int, items: int, group: int, share: int):
-        """Launch passes ``first`` to ``last``, by a group of GPU threads to an item, or a CPU's to ``share`` items."""
+    def run_passes(self, first: int, last: int, items: int, group: int, share: int):
+        """Launch passes: on a GPU with ``group`` threads per item, on a CPU with ``share`` items per thread."""
         cuda, key = self.device.is_cuda, (first, last)
         if items and key not in self._commands:
-            some = self.sources
-            which = (first, group) if cuda else (-1, 1)
+            sources, form = self.sources, (first, group) if cuda else (-1, 1)
+            has_coils, has_solids = bool(sources.applied), bool(sources.solids)
             self._commands[key] = wp.launch(
-                _kernel(some.dtype, *which, bool(some.applied), bool(some.solids), bool(self.rates), self.balls),
+                _kernel(sources.dtype, *form, has_coils, has_solids, bool(self.rates), self.balls),
                 dim=group * items if cuda else 1,
                 inputs=[first, last + 1, threads_for(items, share), None if cuda else team(), self.arrays],
                 device=self.device,
@@ -122,15 +122,15 @@ class AppliedField:
             self._commands[key].launch()
 
     def launch(self):
-        """Evaluate the field at the targets, where sources and targets are now."""
+        """Launch the evaluation of the field at the targets, from the present positions of sources and targets."""
         group = group_threads(self.device) if self.sources.solids else 1
         share = _TARGETS_PER_THREAD // max(1, int(np.diff(self.sources.lists).max(initial=0)))
-        which = AT_POINTS if self._points else AT_TARGETS
-        self.make(which, which, CHUNK * self.arrays.chunk.shape[0], group, max(share, 1))
+        evaluation = AT_POINTS if self._points else AT_TARGETS
+        self.run_passes(evaluation, evaluation, CHUNK * self.arrays.targets.chunk.shape[0], group, max(share, 1))
 
     def add_to_probe(self, b, gradients):
-        """Add to flux density [T] and gradients [A/m²] at points what the fields alone lack; ``gradients`` or None."""
-        inputs = [self.arrays.inside, *self.along]
+        """Add μ0 M to the flux density [T] at points inside bodies, and the sources' gradients [A/m²] unless None."""
+        inputs = [self.arrays.targets.inside, *self.along]
         kernel = _probe_kernel(self.sources.dtype)
         wp.launch(kernel, self.count, inputs=inputs, outputs=[b, gradients], device=self.device)
 
@@ -159,14 +159,14 @@ def _probe_kernel(dtype):
 
 
 @cache
-def _push_kernel(dtype):
+def _force_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def push(
+    def add_forces(
         # inputs:
         movable: wp.array[int],
-        carried: wp.array[int],
+        source: wp.array[int],
         effective: wp.array2d[dtype],
         along_x: wp.array[vec3],
         along_y: wp.array[vec3],
@@ -182,139 +182,138 @@ def _push_kernel(dtype):
         e = vec3(effective[0, i], effective[1, i], effective[2, i])
         f = vec3(wp.dot(along_x[i], e), wp.dot(along_y[i], e), wp.dot(along_z[i], e))
         forces[i] += dtype(wp.static(MU0)) * f
-        s = carried[i]
+        s = source[i]
         if s >= 0:
             forces[i] += vec3(wrench[s, 0], wrench[s, 1], wrench[s, 2])
             torques[i] += vec3(wrench[s, 3], wrench[s, 4], wrench[s, 5])
 
-    return push
+    return add_forces
 
 
 class AppliedForces(AppliedField):
-    """What sources do to moments, and these to them.
+    """Forces and torques of sources on moments, and the reactions on sources.
 
     Args:
         sources: The sources.
         worlds: World of each moment, shape [n].
-        base: What fields at moments are added to [A/m], Warp array, shape [n].
-        movable: Whether the force on a moment is wanted, shape [n].
-        balls: Whether a moment is a ball whose multipoles feel the field, shape [n]; None without such.
-        constants: Of these what ``balls.h`` takes: first and last distance from a source [radii] over which they fade,
-            and the rows of ``response``.
+        base: Field at moments that is added to [A/m], Warp array, shape [n].
+        movable: Whether the force on a moment is computed, shape [n].
+        balls: Whether a moment is a ball whose multipoles respond to the field, shape [n]; None without such balls.
+        constants: First and last distance from a source [radii] over which the multipoles fade, and the number of rows
+            of ``response``.
 
     Attributes:
-        expansion: What ``balls.h`` makes of the field about the balls, shape [chunks, rows, CHUNK]; None without balls.
-        wrenches: Force [N] on each source that is pushed, torque [N·m] about its origin, of a permanent body about its
-            first moment, both without those on the moments of a body; half the energy of bodies, shape [sources, 7].
+        expansion: Field expanded about the balls (``balls.h``), shape [chunks, rows, CHUNK]; None without balls.
+        wrenches: Force [N] and torque [N·m] on each source that is pushed, shape [sources, 7]. Torques are about the
+            source's origin, or about the first moment of a permanent body. Wrenches on the moments of a body are not
+            included. The last column is half the energy [J] of a permanent body with others, less that of their
+            moments.
     """
 
-    def __init__(self, sources: Sources, worlds, base, movable, *, balls=None, constants=()):
+    def __init__(self, sources: FieldSources, worlds, base, movable, *, balls=None, constants=()):
         """Allocate the results."""
         super().__init__(sources, sources.packed, worlds, base, points=False)
-        self.expansion, chosen = None, np.zeros(0, int)
+        self.expansion, ball_indices = None, np.zeros(0, int)
         if balls is not None and np.any(balls):
-            self.balls, chosen = (1, *constants), np.flatnonzero(balls)
-            self._lay_out_balls(chosen, np.asarray(worlds))
-        carried = np.full(self.count, -1)
-        carried[[one.first for one in sources.solids]] = len(sources.applied) + np.arange(len(sources.solids))
-        movable = np.asarray(movable, bool)
-        self._moves = bool(movable.any())
-        device = sources.device
-        self._fine: dict[str, wp.array] | None = None
-        self._movable, self._carried = (
-            wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
-            for values in (movable, carried)
-        )
-        self._lay_out_rows(np.asarray(worlds), np.asarray(worlds)[chosen])
+            self.balls, ball_indices = (1, *constants), np.flatnonzero(balls)
+            self._lay_out_balls(ball_indices, np.asarray(worlds))
+        source_of_moment = np.full(self.count, -1)
+        bodies = len(sources.applied) + np.arange(len(sources.solids))
+        source_of_moment[[solid.first for solid in sources.solids]] = bodies
+        self._moves = bool(np.any(movable))
+        self._fine_tables: dict[str, wp.array] | None = None
+        self._movable, self._source = self._integers(np.asarray(movable, bool)), self._integers(source_of_moment)
+        self._lay_out_rows(np.asarray(worlds), np.asarray(worlds)[ball_indices])
 
-    def _lay_out_balls(self, chosen, worlds):
-        sources, arrays = self.sources, self.arrays
-        own = worlds[chosen].astype(int)
-        self._put("ball", np.column_stack([chosen, own, sources.bodies_of(own)]), wp.vec4i)
-        for name, values in (("points", expansion.points()), ("tables", expansion.tables())):
-            setattr(arrays, name, wp.array(values.ravel(), dtype=sources.dtype, device=self.device))
+    def _lay_out_balls(self, ball_indices, worlds):
+        sources, balls = self.sources, self.arrays.balls
+        world = worlds[ball_indices].astype(int)
+        balls.ball = self._integers(np.column_stack([ball_indices, world, sources.bodies_of(world)]), wp.vec4i)
+        balls.points, balls.tables = (
+            wp.array(values.ravel(), dtype=sources.dtype, device=self.device)
+            for values in (expansion.points(), expansion.tables())
+        )
         shape = -(-self.count // CHUNK), expansion.EXPANSION_ROWS, CHUNK
-        self.expansion = arrays.expansion = wp.zeros(shape, dtype=sources.dtype, device=self.device)
+        self.expansion = balls.expansion = wp.zeros(shape, dtype=sources.dtype, device=self.device)
 
     def _lay_out_rows(self, worlds, ball_worlds):
-        """List the parts of the reaction on each source that is pushed."""
+        """List the rows of the reaction on each source that is pushed: ranges of targets and of balls."""
         sources, rows, begin = self.sources, [], [0]
-        pushed = [one.pushed for one in sources.applied] + [one.movable for one in sources.solids]
-        for s, one in enumerate((*sources.applied, *sources.solids)):
-            for least, of, kind in ((_LEAST_ROW, worlds, 0), (_BALLS_IN_ROW, ball_worlds, 1)):
-                first, end = np.searchsorted(of, [one.world, one.world + 1])
+        pushed = [source.pushed for source in sources.applied] + [solid.movable for solid in sources.solids]
+        for s, source in enumerate((*sources.applied, *sources.solids)):
+            for least, item_worlds, is_ball in ((_TARGETS_PER_ROW, worlds, 0), (_BALLS_PER_ROW, ball_worlds, 1)):
+                first, end = np.searchsorted(item_worlds, [source.world, source.world + 1])
                 step = max(least, -(-(end - first) // _MOST_ROWS))
-                rows += [(s, k, min(k + step, end), kind) for k in range(first, end, step) if pushed[s]]
+                rows += [(s, k, min(k + step, end), is_ball) for k in range(first, end, step) if pushed[s]]
             begin.append(len(rows))
         arrays, dtype, device = self.arrays, sources.dtype, self.device
-        self._put("row", np.array(rows, int).reshape(-1, 4), wp.vec4i)
-        self._put("row_begin", begin, wp.int32)
+        arrays.row = self._integers(np.array(rows, int).reshape(-1, 4), wp.vec4i)
+        arrays.row_begin = self._integers(begin)
         arrays.partial = wp.zeros((len(rows), 6), dtype=dtype, device=device)
         self.wrenches = arrays.wrench = wp.zeros((len(pushed), 7), dtype=dtype, device=device)
-        together = len(sources.solids) > len(np.unique(sources.solid_worlds))
-        self._reacts, self._adds = bool(rows), bool(rows) or together
+        world_has_several_solids = len(sources.solids) > len(np.unique(sources.solid_worlds))
+        self._reacts, self._adds = bool(rows), bool(rows) or world_has_several_solids
 
     def follow(self, motion):
-        """Evaluate rates, too, from now on: of moments and sources that move as ``motion`` and ``source_motion`` say.
+        """Evaluate rates of fields from now on, with the caller's ``motion`` and ``source_motion``.
 
         Args:
-            motion: How the moments move (``pairs.eddy.MOTION_ROWS``), written by the caller, shape [8, n].
+            motion: Motion of the moments (``eddy.eddy.MOTION_ROWS``), written by the caller, shape [8, n].
         """
         arrays, sources = self.arrays, self.sources
-        self.rates = arrays.rate = wp.zeros_like(arrays.field)
+        self.rates = arrays.targets.rate = wp.zeros_like(self.field)
         self.source_motion = wp.zeros((len(sources.applied), 6), dtype=sources.dtype, device=self.device)
-        arrays.motion, arrays.source_motion = motion, self.source_motion
+        arrays.motion, arrays.coils.motion = motion, self.source_motion
         self._commands.clear()
 
     def expand(self):
-        """Expand the field of the sources about the balls."""
+        """Launch the expansion of the sources' field about the balls."""
         if self.expansion is not None:
-            self.make(AT_BALLS, AT_BALLS, self.arrays.ball.shape[0], CHUNK, _BALLS_PER_THREAD)
+            self.run_passes(AT_BALLS, AT_BALLS, self.arrays.balls.ball.shape[0], CHUNK, _BALLS_PER_THREAD)
 
     def _add_up(self, first: int):
         rows, sources = self.arrays.row.shape[0], self.wrenches.shape[0]
         if self.device.is_cpu:
-            self.make(first, ADD_UP, max(sources, rows), 1, 1)
+            self.run_passes(first, ADD_UP, max(sources, rows), 1, 1)
             return
         if first == REACT:
-            self.make(REACT, REACT, rows, _BODY_THREADS, 1)
-        self.make(ADD_UP, ADD_UP, sources, _BODY_THREADS, 1)
+            self.run_passes(REACT, REACT, rows, _GROUP, 1)
+        self.run_passes(ADD_UP, ADD_UP, sources, _GROUP, 1)
 
     def add(self, effective, forces, torques, response=None):
-        """Add the forces on the moments and on bodies near each other, and sum the reactions.
+        """Add the forces on moments and between bodies near each other, and sum the reactions.
 
         Args:
-            effective: Effective moments (``pairs.wrench``) [A·m²], shape [3, n], followed by as many numbers as there
-                are lanes.
+            effective: Effective moments (``pairs.wrench``) [A·m²], shape [3, n], padded by the widest vector.
             forces, torques: Forces [N] and torques [N·m] that are added to, shape [n].
-            response: Response of the balls (``near_contact.uneven``), shape [chunks, rows, CHUNK]; None without balls.
+            response: Multipoles of the balls (``near_contact``), shape [chunks, rows, CHUNK]; None without balls.
         """
         if self.arrays.effective is None or self.arrays.effective.ptr != effective.ptr:
-            self.arrays.effective, self.arrays.response = effective, response
-            self._commands = {key: one for key, one in self._commands.items() if key[1] < REACT}
+            self.arrays.effective, self.arrays.balls.response = effective, response
+            self._commands = {key: command for key, command in self._commands.items() if key[1] < REACT}
         if self._adds:
             self._add_up(REACT if self._reacts else ADD_UP)
         if not self._moves:
             return
-        inputs = [self._movable, self._carried, effective, *self.along, self.wrenches]
-        kernel = _push_kernel(self.sources.dtype)
+        inputs = [self._movable, self._source, effective, *self.along, self.wrenches]
+        kernel = _force_kernel(self.sources.dtype)
         wp.launch(kernel, self.count, inputs=inputs, outputs=[forces, torques], device=self.device)
 
     def energies(self) -> np.ndarray:
-        """Return what permanent bodies near each other add to the energy of their moments [J], shape [n].
+        """Return the energy of permanent bodies near each other less that of their moments [J], shape [n].
 
-        That of moments in fields is with ``acting``. Waits for the device.
+        The energy of moments in fields follows from ``acting``. Waits for the device.
         """
-        found, solids, arrays = np.zeros(self.count), self.sources.solids, self.arrays
+        energies, solids, arrays = np.zeros(self.count), self.sources.solids, self.arrays
         if len(solids) < 2:
-            return found
-        self._fine = self._fine or self.sources.tables(fine=True)
-        usual = {name: self.sources.arrays[name] for name in self._fine}
-        for tables in (self._fine, usual):
+            return energies
+        self._fine_tables = self._fine_tables or self.sources.tables(fine=True)
+        coarse = {name: getattr(self.sources.solid_arrays, name) for name in self._fine_tables}
+        for tables in (self._fine_tables, coarse):
             for name, values in tables.items():
-                setattr(arrays, name, values)
+                setattr(arrays.solids, name, values)
             self._commands.pop((ADD_UP, ADD_UP), None)
-            if tables is self._fine:
+            if tables is self._fine_tables:
                 self._add_up(ADD_UP)
-        found[[one.first for one in solids]] = self.wrenches.numpy()[len(self.sources.applied) :, 6]
-        return found
+        energies[[solid.first for solid in solids]] = self.wrenches.numpy()[len(self.sources.applied) :, 6]
+        return energies

@@ -1,6 +1,6 @@
-// Circular current loops, by complete elliptic integrals in Bulirsch's form cel(k, p, a, b).
+// Field of a circular current loop, by complete elliptic integrals in Bulirsch's form cel(k, p, a, b).
 //
-// With α² = z² + (a − ρ)², β² = z² + (a + ρ)², q = α/β, E and K of modulus √(1 − q²) and C = I/π,
+// With r² = ρ² + z², α² = z² + (a − ρ)², β² = z² + (a + ρ)², q = α/β, E and K of modulus √(1 − q²) and C = I/π,
 //
 //     H_ρ  = C z [(a² + r²) E − α² K]/(2 α² β ρ),         H_z = C [(a² − r²) E + α² K]/(2 α² β),
 //     ∂H_ρ/∂z = C [P E − α² Q K]/(2 α⁴ β³ ρ),   P = (ρ² − a²)²(ρ² + a²) + 2 z² (a⁴ − 6 a² ρ² + ρ⁴) + z⁴ (a² + ρ²),
@@ -8,18 +8,19 @@
 //     ∂H_z/∂z = C z [P E − α² Q K]/(2 α⁴ β³),    P = 6 a² (ρ² − z²) − 7 a⁴ + r⁴,   Q = r² − a²
 //
 // (Simpson, Lane, Immer and Youngquist 2001, "Simple analytic expressions for the magnetic field of a circular current
-// loop", NASA). Near the axis and far away these are small differences. They are taken out by hand: the
-// first step of cel is made in closed form, of c + s and 2 (s + c q) for cel(q, 1, c, s); and P − αβ Q, which is left
-// of the second, is (P² − α²β² Q²)/(P + αβ Q), if that does not cancel.
+// loop", NASA). Near the axis and far away these expressions are small differences of large numbers. Two steps avoid
+// the cancellation. The first step of cel is done in closed form: it gives c + s and 2 (s + c q) for cel(q, 1, c, s).
+// The remaining difference P − αβ Q is written as (P² − α²β² Q²)/(P + αβ Q) where P + αβ Q does not cancel.
 #pragma once
-#include "applied/field_at.h"
+#include "applied/point_field.h"
 
 namespace warpmag {
 
-// What Bulirsch's iteration for cel ends at, from the sums c and s after its first step (Bulirsch 1965).
-CUDA_CALLABLE inline double end_cel(double q, double p, double c, double s) {
+// cel by Bulirsch's iteration (Bulirsch 1965), from the sums c and s after its first step.
+CUDA_CALLABLE inline double cel_after_step(double q, double p, double c, double s) {
     double k = q, product = q, mean = 1 + q, before = 1;
-    for (int step = 0; step < 30 && fabs(before - k) > 1e-9 * before; ++step) { // quadratic: that is the last but one
+    for (int step = 0; step < 30 && fabs(before - k) > 1e-9 * before;
+         ++step) { // quadratic convergence: one more step is exact
         k = 2 * sqrt(product);
         product = k * mean;
         const double f = c, g = product / p;
@@ -32,70 +33,74 @@ CUDA_CALLABLE inline double end_cel(double q, double p, double c, double s) {
     return 1.5707963267948966 * (s + c * mean) / (mean * (mean + p));
 }
 
-// A place as loops of radius a about the z axis have it: distance from the axis, height, α², β² and q.
-struct NearLoop {
+// A point near a loop of radius a about the z axis: ρ, z, α², β² and q.
+struct LoopPoint {
     double a, rho, z, alpha2, beta2, beta, q;
 
-    CUDA_CALLABLE NearLoop(double a, double rho, double z)
+    CUDA_CALLABLE LoopPoint(double a, double rho, double z)
         : a(a), rho(rho), z(z), alpha2(z * z + (a - rho) * (a - rho)), beta2(z * z + (a + rho) * (a + rho)),
           beta(sqrt(beta2)), q(sqrt(alpha2) / beta) {}
 
-    // H_ρ/ρ and H_z of π ampere-turns.
+    // H_ρ/ρ of π ampere-turns.
     CUDA_CALLABLE double radial() const {
-        return 4 * a * a * z / (alpha2 * beta * beta2) * end_cel(q, 1 + q, 1, 2 * q / (1 + q));
+        return 4 * a * a * z / (alpha2 * beta * beta2) * cel_after_step(q, 1 + q, 1, 2 * q / (1 + q));
     }
+    // H_z of π ampere-turns.
     CUDA_CALLABLE double axial() const {
-        const double less = 4 * a * rho * rho / beta2, p = 1 + q;
-        return a / (alpha2 * beta) * end_cel(q, p, a * (1 + q * q) - less, 2 * q * (a * p - less / p));
+        const double term = 4 * a * rho * rho / beta2, p = 1 + q;
+        return a / (alpha2 * beta) * cel_after_step(q, p, a * (1 + q * q) - term, 2 * q * (a * p - term / p));
     }
 };
 
-// Field of a loop of radius a about the z axis, in the plane z = 0, of π ampere-turns.
-CUDA_CALLABLE inline FieldAt thin_loop(double a, Point x) {
+// Field of a thin loop of radius a about the z axis in the plane z = 0, of π ampere-turns.
+CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
     const double z = x.z, z2 = z * z, a2 = a * a, rho2 = x.x * x.x + x.y * x.y, rho = sqrt(rho2), r2 = rho2 + z2;
-    const NearLoop at(a, rho, z);
+    const LoopPoint at(a, rho, z);
     const double e = at.radial(), q = at.q, p = 1 + q, ab = sqrt(at.alpha2) * at.beta;
     const double outer = 0.5 / (at.alpha2 * at.alpha2 * at.beta2 * at.beta);
     const double a4 = a2 * a2, rho4 = rho2 * rho2, z4 = z2 * z2, d2 = (rho2 - a2) * (rho2 - a2), s2 = rho2 + a2;
 
-    // of both sums of ∂H_ρ/∂z a factor ρ² is left out
+    // ∂H_ρ/∂z: both sums are divided by ρ²
     const double p1 = d2 * s2 + 2 * z2 * (a4 - 6 * a2 * rho2 + rho4) + z4 * s2, q1 = d2 + z2 * s2;
     const double c1 = 8 * a2 * (d2 - 2 * z2 * s2 - 3 * z4) / at.beta2;
     const double n1 = 4 * a2
                       * (d2 * d2 - 4 * z2 * (a2 * a4 - a4 * rho2 - a2 * rho4 + rho2 * rho4)
                          - z4 * (11 * a4 - 38 * a2 * rho2 + 11 * rho4) - 6 * z4 * z2 * s2);
     const double s1 = p1 > 0 ? n1 / (p1 + ab * q1) : (p1 - ab * q1) / rho2;
-    const double f = outer * end_cel(q, p, c1, 2 * q * p * s1);
+    const double f = outer * cel_after_step(q, p, c1, 2 * q * p * s1);
 
+    // ∂H_z/∂z
     const double p2 = 6 * a2 * (rho2 - z2) - 7 * a4 + r2 * r2, q2 = r2 - a2;
     const double c2 = -4 * a2 * (3 * a4 + 2 * a2 * rho2 + 6 * a2 * z2 - 5 * rho4 - 2 * rho2 * z2 + 3 * z4) / at.beta2;
     const double n2 = -4 * a2
                       * (-12 * a2 * a4 + a4 * (20 * rho2 - 21 * z2) - a2 * (4 * rho4 - 26 * rho2 * z2 + 6 * z4)
                          - 4 * rho2 * rho4 - 5 * rho4 * z2 + 2 * rho2 * z4 + 3 * z4 * z2);
     const double s2z = p2 > 0 && q2 > 0 ? n2 / (p2 + ab * q2) : p2 - ab * q2;
-    const double zz = outer * z * end_cel(q, p, c2, 2 * q * p * s2z);
-    return round_field(x, e, at.axial(), -e - zz, f, zz);
+    const double zz = outer * z * cel_after_step(q, p, c2, 2 * q * p * s2z);
+    return axisymmetric_field(x, e, at.axial(), -e - zz, f, zz);
 }
 
-// Whether a place is less than w away from the circle of radius a about the z axis at some height, and where.
+// Returns whether x is less than w away from the circle of radius a about the z axis at ``height``. If so, writes the
+// point in the wire and the surface point.
 CUDA_CALLABLE inline bool within_ring(double a, double w, double height, Point x, InWire& wire, Point& surface) {
-    const double rho = sqrt(x.x * x.x + x.y * x.y), out = rho - a, up = x.z - height, d = sqrt(out * out + up * up);
+    const double rho = sqrt(x.x * x.x + x.y * x.y), outward = rho - a, upward = x.z - height,
+                 d = sqrt(outward * outward + upward * upward);
     if (!(d < w)) return false;
     const Point radial = {x.x / rho, x.y / rho, 0};
-    const double on = d > 0 ? out / d : 1.0;
-    const Point n = {on * radial.x, on * radial.y, d > 0 ? up / d : 0.0};
-    wire = {n, {-radial.y, radial.x, 0}, d, w, (a + w * on) / rho};
+    const double cosine = d > 0 ? outward / d : 1.0;
+    const Point n = {cosine * radial.x, cosine * radial.y, d > 0 ? upward / d : 0.0};
+    wire = {n, {-radial.y, radial.x, 0}, d, w, (a + w * cosine) / rho};
     surface = a * radial + w * n + Point{0, 0, height};
     return true;
 }
 
-// A loop, of parameters radius a and radius w of its wire [m], at most half of it; strength: ampere-turns [A].
-CUDA_CALLABLE inline FieldAt loop_field(const AppliedSource& source, Point x) {
+// Loop. Parameters: radius a and wire radius w ≤ a/2 [m]. Strength: ampere-turns [A].
+CUDA_CALLABLE inline PointField loop_field(const AppliedSource& source, Point x) {
     const double a = source.parameters[0];
     InWire wire;
     Point surface;
     const bool inside = within_ring(a, source.parameters[1], 0, x, wire, surface);
-    const FieldAt found = inside ? wire.inner(thin_loop(a, surface)) : thin_loop(a, x);
-    return source.strength.x * INVERSE_PI * found;
+    const PointField field = inside ? wire.inner_field(thin_loop(a, surface)) : thin_loop(a, x);
+    return source.strength.x * INVERSE_PI * field;
 }
 }

@@ -1,92 +1,100 @@
-// The passes over targets and sources: fields at targets, fields about balls, and what the targets push sources with.
+// Passes over targets and sources: fields at targets, fields about balls, and the reactions on sources.
 //
-// Of a permanent body everything is a difference: the closed form less what the sums over pairs make of the lattice. On
-// a CPU a pass works on a vector of targets or of points, on a GPU a group of threads shares a target, a ball, a row of
-// targets or a body. Takes GROUP, MU0, INVERSE_4PI and the switches COILS, SOLIDS, BALLS and RATES from Python, for
-// what there is, and PASS, the only one of a GPU's kernel; ``All`` is the struct of sources.py, which has the names.
+// Fields and forces of a permanent body are corrections: its closed form less its lattice, which the sums over pairs
+// have already. On a CPU a pass works on a vector of targets or points. On a GPU a group of threads shares a target, a
+// ball, a row of targets, or a body.
+//
+// Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, BALLS and RATES. PASS is the only pass
+// of a GPU's kernel, −1 on a CPU. ``Arrays`` is the struct of sources.py.
 #pragma once
 #include "applied/balls.h"
-#include "applied/between.h"
+#include "applied/body_pairs.h"
 #include "applied/rates.h"
 #include "shared/team.h"
 
 namespace warpmag {
 
 enum SourcePass { AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP }; // as in fields.py
-constexpr int WRENCH = 7;                                           // as in sources.py
+constexpr int WRENCH_ROW = 7;                                       // force, torque, energy
 
-// Targets from column i on: places, radii, moments and labels, and what is wanted of each (see sources.py).
+// Targets from column i on: positions, radii, labels, and whether closed forms correct their fields.
 struct Targets {
     Vector x;
     Number radius, label;
-    Index wanted;
+    Index corrected;
 };
-template <class All> CUDA_CALLABLE inline Targets targets_at(const All& all, int i, int held) {
+template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& arrays, int i, int held) {
     const Number zero = Number(Real(0));
     const Vector none = {zero, zero, zero};
     Targets at = {none, zero, zero, {}};
     if (held <= 0) return at;
-    const Real* const rows = all.target.data + i;
-    const size_t pitch = all.target.strides[0] / sizeof(Real);
+    const Real* const rows = arrays.targets.packed.data + i;
+    const size_t pitch = arrays.targets.packed.strides[0] / sizeof(Real);
     auto row = [=](int n) -> Number { return numbers(rows + n * pitch); };
     at = {{row(0), row(1), row(2)}, row(3), row(7), {}};
 #if defined(__CUDA_ARCH__)
-    at.wanted = all.wanted.data[i];
+    at.corrected = arrays.targets.corrected.data[i];
 #else
-    for (int l = 0; l < held && l < WIDTH; ++l) at.wanted[l] = all.wanted.data[i + l];
+    for (int l = 0; l < held && l < WIDTH; ++l) at.corrected[l] = arrays.targets.corrected.data[i + l];
 #endif
     return at;
 }
 
-// What each ``step``-th source of a list applies to targets, and in ``acting`` what those of other bodies do.
-template <class All>
-CUDA_CALLABLE inline Vector add_applied(const All& all, const int* list, int begin, int step, int count,
-                                        const Targets& at, int held, Seen& acting) {
+// Returns the field of every ``step``-th coil or map of a list at targets, and writes into ``acting`` the field and
+// gradient of those on other bodies.
+template <class Arrays>
+CUDA_CALLABLE inline Vector add_coil_fields(const Arrays& arrays, const int* list, int begin, int step, int count,
+                                            const Targets& at, int held, TargetField& acting) {
     Vector h = acting.h;
     for (int l = 0; l < WIDTH && l < held; ++l) {
-        Point whole = {0, 0, 0};
-        FieldAt others = {};
+        Point sum = {0, 0, 0};
+        PointField others = {};
         for (int k = begin; k < count; k += step) {
-            const FieldAt f = field_at(all, list[k], {lane_of(at.x.x, l), lane_of(at.x.y, l), lane_of(at.x.z, l)});
-            whole += f.h;
-            if (all.label.data[list[k]] != lane_of(at.label, l)) others = others + f;
+            const PointField f =
+                field_at(arrays, list[k], {lane_of(at.x.x, l), lane_of(at.x.y, l), lane_of(at.x.z, l)});
+            sum += f.h;
+            if (arrays.coils.label.data[list[k]] != lane_of(at.label, l)) others = others + f;
         }
-        set_lane(h, l, whole), set_lane(acting.h, l, others.h);
+        set_lane(h, l, sum), set_lane(acting.h, l, others.h);
         set_lane(acting.x, l, others.dx), set_lane(acting.y, l, others.dy), set_lane(acting.z, l, others.dz);
     }
     return h;
 }
 
-// Targets that a body's closed form counts for.
-template <class All> CUDA_CALLABLE inline Mask near_to(const Body& body, const Targets& at) {
-    return mask_of(at.wanted != 0) & (away2(body, body.pose.place(at.x)) < body.reach * body.reach);
+// Mask of targets whose field a body's closed form corrects.
+template <class Arrays> CUDA_CALLABLE inline Mask within_reach(const Body& body, const Targets& at) {
+    return mask_of(at.corrected != 0) & (box_distance2(body, body.pose.point_to_body(at.x)) < body.reach * body.reach);
 }
 
-template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(const All& all, int row) {
-    const auto& chunk = all.chunk.data[row / CHUNK]; // first target, their number, and the bodies of their world
+// Writes the fields at a vector of targets; POINTS: they are points of a probe, not moments.
+template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(const Arrays& arrays, int row) {
+    // first target, number of targets, and range of permanent bodies in their world
+    const auto& chunk = arrays.targets.chunk.data[row / CHUNK];
     const int offset = row % CHUNK, held = chunk[1] - offset, i = chunk[0] + offset;
     if (held <= 0) return;
-    const Targets at = targets_at(all, i, held);
-    Seen acting = nothing_seen();
+    const Targets at = targets_at(arrays, i, held);
+    TargetField acting = zero_target_field();
     Vector h = acting.h, inside = h, rate = h;
     if constexpr (COILS) {
-        const auto& list = all.lists.data[row / CHUNK];
-        const int* const first = all.list.data + list[0];
-        h = add_applied(all, first, share(), SHARES, list[1] - list[0], at, held, acting);
+        const auto& list = arrays.targets.lists.data[row / CHUNK];
+        const int* const first = arrays.coils.list.data + list[0];
+        h = add_coil_fields(arrays, first, share(), SHARES, list[1] - list[0], at, held, acting);
         if constexpr (RATES)
-            rate = rate_of_coils(all, first, share(), SHARES, list[1] - list[0], i, held, at.x, at.label);
+            rate = rate_of_coils(arrays, first, share(), SHARES, list[1] - list[0], i, held, at.x, at.label);
     }
     if constexpr (SOLIDS)
         for (int b = chunk[2]; b < chunk[3]; ++b) {
-            const Body body = body_at(all, b);
-            const Mask near = near_to<All>(body, at);
+            const Body body = body_at(arrays, b);
+            const Mask near = within_reach<Arrays>(body, at);
             if (!any(near)) continue;
-            const Seen seen = seen_of(lacking(all, body, at.x, at.radius, near, share(), SHARES));
-            add_where(near, h, seen.h);
-            add_where(near & (at.label != body.label), acting, seen);
+            const TargetField field =
+                target_field(field_correction(arrays, body, at.x, at.radius, near, share(), SHARES));
+            add_where(near, h, field.h);
+            add_where(near & (at.label != body.label), acting, field);
             if constexpr (RATES)
-                add_where(near & (at.label != body.label), rate, rate_of_body(all, body, seen, i, held, at.x));
-            if constexpr (POINTS) add_where(near, inside, lacking_inside(all, body, at.x, share(), SHARES));
+                add_where(near & (at.label != body.label), rate, rate_of_body(arrays, body, field, i, held, at.x));
+            if constexpr (POINTS)
+                add_where(near, inside, magnetization_correction(arrays, body, at.x, share(), SHARES));
         }
     h = group_sums(h);
     acting = {group_sums(acting.h), group_sums(acting.x), group_sums(acting.y), group_sums(acting.z)};
@@ -94,129 +102,136 @@ template <bool POINTS, class All> CUDA_CALLABLE inline void field_at_targets(con
     if constexpr (RATES) rate = group_sums(rate);
     if (share() != 0) return;
     const size_t column = 3 * (size_t)i;
-    const Vector base = vectors((Real*)all.base.data + column, held);
-    put_vectors((Real*)all.field.data + column, held, base + h);
-    put_vectors((Real*)all.acting.data + column, held, base + acting.h);
-    put_vectors((Real*)all.along_x.data + column, held, acting.x);
-    put_vectors((Real*)all.along_y.data + column, held, acting.y);
-    put_vectors((Real*)all.along_z.data + column, held, acting.z);
-    if constexpr (POINTS) put_vectors((Real*)all.inside.data + column, held, inside);
-    if constexpr (RATES) put_vectors((Real*)all.rate.data + column, held, rate);
+    const Vector base = vectors((Real*)arrays.targets.base.data + column, held);
+    put_vectors((Real*)arrays.targets.field.data + column, held, base + h);
+    put_vectors((Real*)arrays.targets.acting.data + column, held, base + acting.h);
+    put_vectors((Real*)arrays.targets.along_x.data + column, held, acting.x);
+    put_vectors((Real*)arrays.targets.along_y.data + column, held, acting.y);
+    put_vectors((Real*)arrays.targets.along_z.data + column, held, acting.z);
+    if constexpr (POINTS) put_vectors((Real*)arrays.targets.inside.data + column, held, inside);
+    if constexpr (RATES) put_vectors((Real*)arrays.targets.rate.data + column, held, rate);
 }
 
-// What the targets of a row push their source with: the opposite of what it pushes them with.
-template <class All> CUDA_CALLABLE inline Push push_of(const All& all, int s, const Body& body, int first, int last) {
-    Push push = no_push();
-    const bool solid = SOLIDS && s >= all.kind.shape[0];
-    const Three center = solid ? center_of(all, body) : three((const Real*)all.frame.data + 7 * (size_t)s);
-    const size_t pitch = all.effective.strides[0] / sizeof(Real);
+// Wrench of source s on the targets of a row, whose opposite is the reaction on the source.
+template <class Arrays>
+CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const Body& body, int first, int last) {
+    Wrench wrench = zero_wrench();
+    const bool solid = SOLIDS && s >= arrays.coils.kind.shape[0];
+    const Real3 center =
+        solid ? reference_point(arrays, body) : real3((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
+    const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
     for (int i = first + WIDTH * share(); i < last; i += WIDTH * SHARES) {
-        const Targets at = targets_at(all, i, last - i);
-        const Real* const m = all.effective.data + i;
-        Mask pushed = first_lanes(last - i);
-        Seen seen = nothing_seen();
+        const Targets at = targets_at(arrays, i, last - i);
+        const Real* const m = arrays.effective.data + i;
+        Mask mask = first_lanes(last - i);
+        TargetField field = zero_target_field();
         if constexpr (SOLIDS)
             if (solid) {
-                pushed &= near_to<All>(body, at) & (at.label != body.label);
-                if (!any(pushed)) continue;
-                seen = seen_of(lacking(all, body, at.x, at.radius, pushed, 0, 1));
+                mask &= within_reach<Arrays>(body, at) & (at.label != body.label);
+                if (!any(mask)) continue;
+                field = target_field(field_correction(arrays, body, at.x, at.radius, mask, 0, 1));
             }
         if constexpr (COILS)
-            if (!solid) add_applied(all, &s, 0, 1, 1, at, last - i, seen);
-        push_moments(push, pushed, seen, {numbers(m), numbers(m + pitch), numbers(m + 2 * pitch)}, at.x, center);
+            if (!solid) add_coil_fields(arrays, &s, 0, 1, 1, at, last - i, field);
+        add_wrench(wrench, mask, field, {numbers(m), numbers(m + pitch), numbers(m + 2 * pitch)}, at.x, center);
     }
-    return push;
+    return wrench;
 }
-template <class All> CUDA_CALLABLE inline void react(const All& all, int row) {
-    const auto& part = all.row.data[row]; // source, first target and the end, and whether these are balls
-    const int s = part[0], coils = all.kind.shape[0];
-    const Body body = SOLIDS && s >= coils ? body_at(all, s - coils) : Body{};
-    Three force = {0, 0, 0}, torque = force;
-    if (!part[3]) {
-        const Push push = push_of(all, s, body, part[1], part[2]);
-        force = added_up(push.force), torque = added_up(push.torque);
+// Writes the reaction of a row of targets, or balls, on its source.
+template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, int row) {
+    const auto& range = arrays.row.data[row]; // source, range of targets, whether these are balls
+    const int s = range[0], coils = arrays.coils.kind.shape[0];
+    const Body body = SOLIDS && s >= coils ? body_at(arrays, s - coils) : Body{};
+    Real3 force = {0, 0, 0}, torque = force;
+    if (!range[3]) {
+        const Wrench wrench = wrench_on_targets(arrays, s, body, range[1], range[2]);
+        force = total_of(wrench.force), torque = total_of(wrench.torque);
     } else if constexpr (BALLS) {
-        const Three center = s < coils ? three((const Real*)all.frame.data + 7 * (size_t)s) : center_of(all, body);
-        for (int n = part[1]; n < part[2]; ++n) {
-            Ball ball = ball_at(all, all.ball.data[n][0]);
+        const Real3 center =
+            s < coils ? real3((const Real*)arrays.coils.frame.data + 7 * (size_t)s) : reference_point(arrays, body);
+        for (int n = range[1]; n < range[2]; ++n) {
+            Ball ball = ball_at(arrays, arrays.balls.ball.data[n][0]);
             if constexpr (COILS)
-                if (s < coils) add_source(all, s, ball);
+                if (s < coils) add_coil(arrays, s, ball);
             if constexpr (SOLIDS)
-                if (s >= coils) add_body(all, body, ball);
-            const Three f = pull_of(all, ball);
+                if (s >= coils) add_body(arrays, body, ball);
+            const Real3 f = multipole_force(arrays, ball);
             force += f;
             torque += cross(ball.center - center, f);
         }
     }
     if (share() != 0) return;
-    Real* const out = all.partial.data + 6 * (size_t)row;
+    Real* const out = arrays.partial.data + 6 * (size_t)row;
     for (int k = 0; k < 6; ++k) out[k] = 0;
-    add_numbers(out, force, torque, -MU0);
+    add_force_torque(out, force, torque, -MU0);
 }
 
-// Adds up what pushes a source: its rows, and of permanent bodies other ones. Of two bodies the charges of the smaller
-// are summed, whichever of them asks, so that both get the same numbers.
-template <class All> CUDA_CALLABLE inline void add_bodies(const All& all, int b, Real (&total)[WRENCH]) {
-    const Body body = body_at(all, b);
-    const auto& world = all.world.data[b]; // the bodies of its world
+// Adds the wrenches of other permanent bodies on body b. Of two bodies the surface charges of the smaller one are
+// summed for both, so that action and reaction have the same bits.
+template <class Arrays>
+CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&total)[WRENCH_ROW]) {
+    const Body body = body_at(arrays, b);
+    const auto& world = arrays.solids.world.data[b]; // the bodies of its world
     for (int c = world[0]; c < world[1]; ++c) {
         if (c == b) continue;
-        const Body other = body_at(all, c);
+        const Body other = body_at(arrays, c);
         if (other.label == body.label) continue;
-        const bool own = body.radius < other.radius || (body.radius == other.radius && b < c);
-        const Body &q = own ? body : other, &s = own ? other : body;
-        const Three &p = q.pose.origin, &x = q.pose.x, &y = q.pose.y, &z = q.pose.z, &d = q.middle;
-        const Vector middle = spread(p + d.x * x + (d.y * y + d.z * z));
+        const bool is_smaller = body.radius < other.radius || (body.radius == other.radius && b < c);
+        const Body &q = is_smaller ? body : other, &s = is_smaller ? other : body;
+        const Real3 &p = q.pose.origin, &x = q.pose.x, &y = q.pose.y, &z = q.pose.z, &d = q.box_center;
+        const Vector center = broadcast(p + d.x * x + (d.y * y + d.z * z));
         const Real reach = q.radius + (q.reach > s.reach ? q.reach : s.reach);
-        if (!any(away2(s, s.pose.place(middle)) < Number(Real(0)) + reach * reach)) continue;
-        Three force, torque;
+        if (!any(box_distance2(s, s.pose.point_to_body(center)) < Number(Real(0)) + reach * reach)) continue;
+        Real3 force, torque;
         Real energy;
-        between(all, q, s, force, torque, energy);
-        if (own) add_numbers(total, force, torque, MU0);
+        body_wrench(arrays, q, s, force, torque, energy);
+        if (is_smaller) add_force_torque(total, force, torque, MU0);
         else {
-            const Three turn = cross(center_of(all, q) - center_of(all, s), force);
-            add_numbers(total, force, torque + turn, -MU0);
+            const Real3 arm_torque = cross(reference_point(arrays, q) - reference_point(arrays, s), force);
+            add_force_torque(total, force, torque + arm_torque, -MU0);
         }
         total[6] += Real(0.5) * MU0 * energy;
     }
 }
-template <class All> CUDA_CALLABLE inline void add_up(const All& all, int s) {
-    Real total[WRENCH] = {};
-    for (int row = all.row_begin.data[s] + share(); row < all.row_begin.data[s + 1]; row += SHARES)
-        for (int k = 0; k < 6; ++k) total[k] += all.partial.data[6 * (size_t)row + k];
+// Adds up the wrench on source s: its rows, and other permanent bodies.
+template <class Arrays> CUDA_CALLABLE inline void add_up(const Arrays& arrays, int s) {
+    Real total[WRENCH_ROW] = {};
+    for (int row = arrays.row_begin.data[s] + share(); row < arrays.row_begin.data[s + 1]; row += SHARES)
+        for (int k = 0; k < 6; ++k) total[k] += arrays.partial.data[6 * (size_t)row + k];
 #if defined(__CUDA_ARCH__)
     for (int k = 0; k < 6; ++k) total[k] = group_sum(total[k]);
 #endif
     if constexpr (SOLIDS)
-        if (s >= all.kind.shape[0]) add_bodies(all, s - all.kind.shape[0], total);
+        if (s >= arrays.coils.kind.shape[0]) add_body_pairs(arrays, s - arrays.coils.kind.shape[0], total);
     if (share() != 0) return;
-    for (int k = 0; k < WRENCH; ++k) all.wrench.data[WRENCH * (size_t)s + k] = total[k];
+    for (int k = 0; k < WRENCH_ROW; ++k) arrays.wrench.data[WRENCH_ROW * (size_t)s + k] = total[k];
 }
 
-template <class Word, class All>
-CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int threads, Word* team, const All& all) {
-    auto make_pass = [&](int pass, int i) {
+template <class Word, class Arrays>
+CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int threads, Word* team,
+                                        const Arrays& arrays) {
+    auto run_item = [&](int pass, int i) {
         if constexpr (PASS < 0 || PASS == AT_TARGETS)
-            if (pass == AT_TARGETS) field_at_targets<false>(all, i);
+            if (pass == AT_TARGETS) field_at_targets<false>(arrays, i);
         if constexpr (PASS < 0 || PASS == AT_POINTS)
-            if (pass == AT_POINTS) field_at_targets<true>(all, i);
+            if (pass == AT_POINTS) field_at_targets<true>(arrays, i);
         if constexpr (BALLS && (PASS < 0 || PASS == AT_BALLS))
-            if (pass == AT_BALLS) expand(all, i);
+            if (pass == AT_BALLS) expand(arrays, i);
         if constexpr (PASS < 0 || PASS == REACT)
-            if (pass == REACT) react(all, i);
+            if (pass == REACT) react(arrays, i);
         if constexpr (PASS < 0 || PASS == ADD_UP)
-            if (pass == ADD_UP) add_up(all, i);
+            if (pass == ADD_UP) add_up(arrays, i);
     };
 #if defined(__CUDA_ARCH__)
-    make_pass(PASS, thread / GROUP);
+    run_item(PASS, thread / GROUP);
 #else
-    auto items = [&](int pass) {
-        return pass < AT_BALLS    ? CHUNK * all.chunk.shape[0]
-               : pass == AT_BALLS ? all.ball.shape[0]
-               : pass == REACT    ? all.row.shape[0]
-                                  : all.wrench.shape[0];
+    auto item_count = [&](int pass) {
+        return pass < AT_BALLS    ? CHUNK * arrays.targets.chunk.shape[0]
+               : pass == AT_BALLS ? arrays.balls.ball.shape[0]
+               : pass == REACT    ? arrays.row.shape[0]
+                                  : arrays.wrench.shape[0];
     };
-    run_passes(team, threads, first, last, items, first < AT_BALLS ? WIDTH : 1, make_pass);
+    run_passes(team, threads, first, last, item_count, first < AT_BALLS ? WIDTH : 1, run_item);
 #endif
 }
 }

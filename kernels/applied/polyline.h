@@ -1,17 +1,17 @@
-// Straight pieces of wire. With r and s from the ends of a piece to the place, L from end to end,
+// Field of straight pieces of wire. With r and s from the ends of a piece to the point, and L from end to end,
 //
 //     H = I/4π (L × r) f,   f = (|r| + |s|)/(|r||s| (|r||s| + r·s))
 //
 // (Hanson and Hirshman 2002, "Compact expressions for the Biot-Savart fields of a filamentary segment", Phys. Plasmas
-// 9, 4410), with the gradient of f term by term. Beside the piece |r||s| + r·s is a small difference, which is |L ×
-// r|²/(|r||s| − r·s) there.
+// 9, 4410). The gradient of f is derived term by term. Beside the piece |r||s| + r·s cancels, and is written as
+// |L × r|²/(|r||s| − r·s).
 #pragma once
-#include "applied/field_at.h"
+#include "applied/point_field.h"
 
 namespace warpmag {
 
 // Field of a thin piece from a to b, of 4π amperes.
-CUDA_CALLABLE inline FieldAt thin_piece(Point a, Point b, Point x) {
+CUDA_CALLABLE inline PointField thin_piece(Point a, Point b, Point x) {
     const Point l = b - a, r = x - a, s = x - b, turn = cross(l, r);
     const double along = dot(r, s), nr = norm(r), ns = norm(s), product = nr * ns;
     const double opening = along < 0 ? dot(turn, turn) / (product - along) : product + along;
@@ -24,25 +24,24 @@ CUDA_CALLABLE inline FieldAt thin_piece(Point a, Point b, Point x) {
             df.z * turn + f * cross(l, {0, 0, 1})};
 }
 
-// The field of a piece of wire of radius w.
-CUDA_CALLABLE inline FieldAt piece_field(Point a, Point b, double w, Point x) {
+// Field of a piece of wire of radius w, of 4π amperes.
+CUDA_CALLABLE inline PointField piece_field(Point a, Point b, double w, Point x) {
     const Point l = b - a;
-    const double length2 = dot(l, l), at = dot(x - a, l) / length2, part = at < 0 ? 0.0 : at > 1 ? 1.0 : at;
-    const Point axis = a + part * l, away = x - axis;
+    const double length2 = dot(l, l), at = dot(x - a, l) / length2, nearest = at < 0 ? 0.0 : at > 1 ? 1.0 : at;
+    const Point axis = a + nearest * l, away = x - axis;
     const double d = norm(away);
     if (d >= w) return thin_piece(a, b, x);
     const bool beside = at > 0 && at < 1;
     const Point tangent = beside ? (1 / sqrt(length2)) * l : Point{0, 0, 0};
-    // on the axis any direction across will do
+    // on the axis any perpendicular direction serves
     const Point across = fabs(l.x) < fabs(l.y) ? cross(l, {1, 0, 0}) : cross(l, {0, 1, 0});
     const Point n = d > 0 ? (1 / d) * away : (1 / norm(across)) * across;
-    return InWire{n, tangent, d, w, 1}.inner(thin_piece(a, b, axis + w * n));
+    return InWire{n, tangent, d, w, 1}.inner_field(thin_piece(a, b, axis + w * n));
 }
 
-// A chain of pieces between the points of the table, of parameter radius w of the wire [m]; strength: amperes times
-// turns.
-CUDA_CALLABLE inline FieldAt polyline_field(const AppliedSource& source, Point x) {
-    FieldAt total = {};
+// Polyline through the points of the table. Parameter: wire radius w [m]. Strength: ampere-turns [A].
+CUDA_CALLABLE inline PointField polyline_field(const AppliedSource& source, Point x) {
+    PointField total = {};
     for (int k = 0; k + 1 < source.count; ++k)
         total += piece_field(source.table[k], source.table[k + 1], source.parameters[0], x);
     return 0.25 * INVERSE_PI * source.strength.x * total;

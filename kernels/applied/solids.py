@@ -1,16 +1,18 @@
-"""Tables of the polyhedra that bound permanent bodies; they belong to shapes, and serve all bodies of that shape.
+"""Tables of permanent bodies, and of the polyhedra that bound them.
 
-    shape: First row and number of edges, of faces, first entry of ``begin``, first corner, first and number of points
-        on edges and on faces, shape [shapes, 10].
-    edge, face, corner, begin: See ``polyhedron.h``; flat.
-    edge_point, face_point: Points on edges and faces (``warpmag.shapes.polyhedra``), rows of ``native.CHUNK`` side by
-        side, those of each shape filled up with points of no weight; flat.
+Bodies of one shape share its tables:
 
-Bodies refer to them:
+    shape: First row and number of edges and of faces, first entry of ``begin``, first corner, first and number of
+        points on edges and on faces, shape [shapes, 10].
+    edge, face, corner, begin: As in ``polyhedron.h``; flat.
+    edge_point, face_point: Quadrature points on edges and faces (``warpmag.shapes.polyhedra``), in chunks of
+        ``native.CHUNK`` side by side. Chunks are filled up with points of weight 0; flat.
 
-    body: Shape, first moment, number of moments of each, and whether it yields to fields, shape [bodies, 4].
-    size: 1/V of its first moment [1/m³], or its response if it yields, reach, radius of the ball around it, middle and
-        half sides of its box [m], shape [bodies, 9].
+Each body has a row in two tables:
+
+    body: Shape, first moment, number of moments, and whether it responds to fields, shape [bodies, 4].
+    size: 1/V of its first moment [1/m³], or the response k of a body that responds; reach, radius of the bounding
+        sphere, center and half sides of the box [m], shape [bodies, 9].
 """
 
 from dataclasses import dataclass
@@ -21,22 +23,24 @@ import numpy as np
 from warpmag.kernels.shared.native import CHUNK
 
 INTEGER_TABLES = ("shape", "begin", "body")
-"""Tables of whole numbers; the others have the scalar type of the moments."""
+"""Tables of integers; the others have the scalar type of the moments."""
 
 
 @dataclass(frozen=True)
 class SolidMagnet:
-    """A permanent body that is uniformly magnetized, or nearly: one that yields to fields has moments that induction
-    solves for, and the closed form stands for what its remanence alone would make of a ball.
+    """A permanent body whose field near it has a closed form.
+
+    The body is uniformly magnetized, or responds to fields. Then induction solves for its moments, and the closed form
+    has the magnetization that the remanence alone gives a ball.
 
     Attributes:
-        first, count: Its moments.
-        volume: Volume of the first of them [m³].
+        first, count: First moment, and number of moments.
+        volume: Volume of the first moment [m³].
         world: Its world.
-        reach: Distance up to which the closed form counts [m].
+        reach: Distance up to which the closed form is used [m].
         shape: The ``warpmag.shapes.polyhedra.Polyhedron`` that bounds it, in the frame of its body.
-        movable: Whether the force on it is wanted.
-        response: k = 3χ/(3 + χ) of one that yields to fields; 0 of others.
+        movable: Whether the force on it is computed.
+        response: k = 3χ/(3 + χ) if it responds to fields, else 0.
     """
 
     first: int
@@ -49,42 +53,42 @@ class SolidMagnet:
     response: float = 0.0
 
     def size(self) -> list[float]:
-        """Return its row of ``size``."""
+        """Return the body's row of ``size``."""
         lower, upper = self.shape.corners.min(axis=0), self.shape.corners.max(axis=0)
-        middle = 0.5 * (lower + upper)
-        radius = np.linalg.norm(self.shape.corners - middle, axis=1).max()
+        center = 0.5 * (lower + upper)
+        radius = np.linalg.norm(self.shape.corners - center, axis=1).max()
         return [
             self.response or 1.0 / self.volume,
             self.reach,
             radius,
-            *middle,
+            *center,
             *(0.5 * (upper - lower)),
         ]
 
 
 def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
-    """Return the tables of the bodies' shapes, with more points on faces if ``fine``, and of the bodies."""
-    shapes = {id(one.shape): one.shape for one in solids}
+    """Return all tables of some bodies, with more points on faces if ``fine``."""
+    shapes = {id(solid.shape): solid.shape for solid in solids}
     number = {key: k for k, key in enumerate(shapes)}
-    rows, tables = _tables(shapes.values(), fine)
+    rows, tables = _shape_tables(shapes.values(), fine)
     tables["shape"] = rows
     tables["body"] = np.array(
-        [(number[id(one.shape)], one.first, one.count, one.response > 0.0) for one in solids], np.int32
+        [(number[id(solid.shape)], solid.first, solid.count, solid.response > 0.0) for solid in solids], np.int32
     )
-    tables["size"] = np.array([one.size() for one in solids])
+    tables["size"] = np.array([solid.size() for solid in solids])
     return tables
 
 
 def _in_chunks(points) -> np.ndarray:
-    """Points of a shape as rows of CHUNK side by side, filled up with the first point of no weight, flat."""
+    """Return a shape's points in chunks side by side, filled up with the first point at weight 0, flat."""
     count = -(-len(points) // CHUNK) * CHUNK
     filled = np.concatenate([points, np.repeat(points[:1], count - len(points), axis=0)])
     filled[len(points) :, -1] = 0.0
     return filled.reshape(-1, CHUNK, points.shape[1]).transpose(0, 2, 1)
 
 
-def _tables(shapes, fine: bool):
-    """Rows of the shapes' table, and what stands in the others."""
+def _shape_tables(shapes, fine: bool):
+    """Return the table ``shape``, and the other tables by name."""
     rows, parts = [], {name: [] for name in ("edge", "face", "corner", "begin", "edge_point", "face_point")}
     counts = np.zeros(6, int)  # edges, faces, entries of begin, corners, points on edges, points on faces
     for shape in shapes:

@@ -333,14 +333,15 @@ template <class Arrays> CUDA_CALLABLE inline void downward_pass(const Arrays& a,
 }
 
 template <Step S, Quantity Q, class Word, class Arrays>
-CUDA_CALLABLE inline void run_step(int thread, int threads, Word*, const Arrays& a) {
+CUDA_CALLABLE inline void expansion_step(int thread, int threads, Word*, const Arrays& a) {
     const int block = thread / THREADS, leaf = a.leaves.data[0] + block;
     if constexpr (S == Step::UPWARD) upward_pass(a, block);
     else if constexpr (S == Step::DOWNWARD) downward_pass(a, block, threads);
     else if (leaf < a.leaves.data[1]) leaf_fields<Q>(a, leaf);
 }
 #else
-template <Step S, Quantity Q, class Word, class Arrays> void run_step(int, int threads, Word* team, const Arrays& a) {
+template <Step S, Quantity Q, class Word, class Arrays>
+void expansion_step(int, int threads, Word* team, const Arrays& a) {
     const int levels = a.counts.data[0], *const begin = a.level_begin.data;
     const auto for_range = [&](const int* run, auto work) {
         share_out(team, threads, run[1] - run[0], 4, [&](int i) { work(run[0] + i); });

@@ -13,7 +13,7 @@ import warp as wp
 from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.fmm.translate import Translation, pitch
 from warpmag.kernels.pairs.pair_law import Quantity
-from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.native import native_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
 _THREADS = 128
@@ -216,19 +216,9 @@ def _sparse_derivatives(tables: ExpansionTables):
 
 @cache
 def _kernel(dtype, step: _Step, quantity: Quantity, constants):
-    arrays_struct = _arrays_type(dtype)
-    call = f"run_step<warpmag::Step({step:d}), warpmag::Quantity({quantity:d})>"
-
-    @wp.func_native(f"warpmag::{call}(thread, threads, team.data, arrays);")
-    def run(thread: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        module_options=native_options("fmm/expansions.h", dtype=dtype, **dict(constants)),
+    call = (
+        f"expansion_step<warpmag::Step({step:d}), warpmag::Quantity({quantity:d})>(thread, threads, team.data, arrays)"
     )
-    def expand(threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct):
-        run(wp.tid(), threads, team, arrays)
-
-    return expand
+    arguments = {"threads": int, "team": wp.array2d[wp.uint64], "arrays": _arrays_type(dtype)}
+    launch = {"grid_stride": False}
+    return native_kernel(call, "fmm/expansions.h", arguments, dtype=dtype, launch=launch, **dict(constants))

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.work_list import tile_size
-from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
+from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
 _LEAVES_PER_THREAD = 16
@@ -80,19 +80,8 @@ def _cpu_kernel(dtype, quantity: Quantity):
 
 @cache
 def _cuda_kernel(dtype, quantity: Quantity):
-    arrays_struct = _arrays_type(dtype)
-
-    @wp.func_native(f"warpmag::sum_leaf<warpmag::Quantity({quantity:d}), {_WARPS}>(thread, arrays);")
-    def run(thread: int, arrays: arrays_struct): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=(32 * _WARPS, _BLOCKS[_TARGETS_PER_LANE][quantity] if dtype is wp.float32 else 1),
-        module_options=native_options("fmm/near.h", dtype=dtype, TARGETS_PER_LANE=_TARGETS_PER_LANE),
-    )
-    def near_sums_cuda(arrays: arrays_struct):
-        run(wp.tid(), arrays)
-
-    return near_sums_cuda
+    call = f"sum_leaf<warpmag::Quantity({quantity:d}), {_WARPS}>(thread, arrays)"
+    blocks = _BLOCKS[_TARGETS_PER_LANE][quantity] if dtype is wp.float32 else 1
+    launch = {"grid_stride": False, "launch_bounds": (32 * _WARPS, blocks)}
+    constants = {"TARGETS_PER_LANE": _TARGETS_PER_LANE}
+    return native_kernel(call, "fmm/near.h", {"arrays": _arrays_type(dtype)}, dtype=dtype, launch=launch, **constants)

@@ -422,7 +422,7 @@ template <Pass P, class Arrays> CUDA_CALLABLE inline void finish_pass(const Arra
 
 // Runs one pass over ``count`` items. On a GPU each block of BLOCK threads takes one item, or each thread does.
 template <Pass P, class Word, class Arrays>
-CUDA_CALLABLE inline void build(int thread, int count, int round, int threads, Word* team, const Arrays& a) {
+CUDA_CALLABLE inline void build_octree(int thread, int count, int round, int threads, Word* team, const Arrays& a) {
 #if defined(__CUDA_ARCH__)
     if (takes_blocks<P>()) run_item<P>(a, thread / BLOCK);
     else if (thread < count) run_item<P>(a, thread);

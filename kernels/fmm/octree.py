@@ -14,7 +14,7 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.pairs.packing import PACKED_ROWS, PITCH
-from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.native import native_kernel
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 _BLOCK = 256
@@ -200,22 +200,7 @@ def join_moments(first, second) -> tuple[wp.array, wp.array]:
 
 @cache
 def _kernel(dtype, build_pass: _Pass):
-    arrays_struct = _arrays_type(dtype)
-
-    @wp.func_native(
-        f"warpmag::build<warpmag::Pass({build_pass:d})>(thread, count, round_number, threads, team.data, arrays);"
-    )
-    def run(
-        thread: int, count: int, round_number: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct
-    ): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        module_options=native_options("fmm/octree.h", dtype=dtype),
-    )
-    def build_boxes(count: int, round_number: int, threads: int, team: wp.array2d[wp.uint64], arrays: arrays_struct):
-        run(wp.tid(), count, round_number, threads, team, arrays)
-
-    return build_boxes
+    call = f"build_octree<warpmag::Pass({build_pass:d})>(thread, count, round_number, threads, team.data, arrays)"
+    arguments = {"count": int, "round_number": int, "threads": int, "team": wp.array2d[wp.uint64]}
+    arguments["arrays"] = _arrays_type(dtype)
+    return native_kernel(call, "fmm/octree.h", arguments, dtype=dtype, launch={"grid_stride": False})

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
+from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
 _BOXES_PER_THREAD = 64
@@ -192,26 +192,13 @@ def _cpu_kernel(dtype, constants):
 
 @cache
 def _cuda_kernel(dtype, splits: int, constants):
-    sizes = dict(constants)
-    threads = _threads(sizes["ROWS"])
-    arrays_struct = _arrays_type(dtype)
+    """Return the kernel and the threads of its blocks."""
+    constants = dict(constants)
+    threads = _threads(constants["ROWS"])
     blocks = max(1, _WARPS_TOGETHER // (threads // 32)) if dtype is wp.float32 else 1
-    numbers = f"{_BOXES}, {_slice(dtype)}, {splits}"
-
-    @wp.func_native(f"warpmag::translate_block<{numbers}>(thread, arrays);")
-    def run(thread: int, arrays: arrays_struct): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=(threads, blocks),
-        module_options=native_options("fmm/translate_cuda.h", dtype=dtype, **sizes),
-    )
-    def translate_cuda(arrays: arrays_struct):
-        run(wp.tid(), arrays)
-
-    return translate_cuda, threads
+    call = f"translate_block<{_BOXES}, {_slice(dtype)}, {splits}>(thread, arrays)"
+    arguments, launch = {"arrays": _arrays_type(dtype)}, {"grid_stride": False, "launch_bounds": (threads, blocks)}
+    return native_kernel(call, "fmm/translate_cuda.h", arguments, dtype=dtype, launch=launch, **constants), threads
 
 
 @cache

@@ -1,26 +1,28 @@
-// Anderson acceleration: the small least squares that mixes the last few iterates.
+// Anderson acceleration: least squares for the mixture of the last iterates.
 //
-// With the differences Δr_j of the present residual r to the last few, the coefficients are
-// α = argmin ‖φ (r − Σ_j α_j Δr_j)‖, j = 0 the latest. Their normal equations are sums over all moments in float64: the
-// right side ⟨φΔr_a, φr⟩, then the upper triangle of the matrix ⟨φΔr_a, φΔr_b⟩, row by row. Takes DEPTH, the changes
-// between iterates that are kept, in a ring, and mixed.
+// With Δr_j the changes of the residual r between the last iterates, j = 0 the latest, the coefficients are
+//
+//     α = argmin ‖φ (r − Σ_j α_j Δr_j)‖.
+//
+// The normal equations are sums over all moments in float64: the right side ⟨φΔr_a, φr⟩, then the upper triangle of the
+// matrix ⟨φΔr_a, φΔr_b⟩ by rows. Takes DEPTH from Python, the number of changes in the ring buffer.
 #pragma once
 
 namespace warpmag {
 
-constexpr double RIDGE = 1.0e-9;  // relative; below it differences of float32 residuals are rounding
-constexpr double LARGEST = 1.0e4; // sum of |α_j| beyond which the iterates are as good as dependent
+constexpr double RIDGE = 1.0e-9;  // relative; float32 residuals differ by rounding below it
+constexpr double LARGEST = 1.0e4; // sum of |α_j| above which iterates count as linearly dependent
 
-// Slot of the change ``age`` before the one in slot ``newest``.
+// Slot of the change that is ``age`` steps older than the one in slot ``newest``.
 CUDA_CALLABLE inline int slot_of(int newest, int age) { return (newest - age + DEPTH) % DEPTH; }
 
-// Place of the product of changes a ≤ b among the sums.
+// Column of ⟨φΔr_a, φΔr_b⟩ among the sums, a ≤ b.
 CUDA_CALLABLE inline constexpr int matrix_column(int a, int b) { return DEPTH + a * DEPTH - a * (a - 1) / 2 + b - a; }
 
-// Coefficients α_j of the last ``kept`` changes; zeros if they are of no use.
+// Coefficients α_j of the last ``kept`` changes; zeros if the changes are linearly dependent.
 CUDA_CALLABLE inline wp::vec_t<DEPTH, double> solve_anderson(const double* sums, int kept) {
 #if !defined(__CUDA_ARCH__)
-#pragma clang fp contract(off) // no rounding of a compiler's choice where changes are nearly dependent
+#pragma clang fp contract(off) // same rounding on every CPU where changes are nearly dependent
 #endif
     double m[DEPTH][DEPTH], x[DEPTH], size = 0.0;
     bool regular = true;
@@ -31,7 +33,7 @@ CUDA_CALLABLE inline wp::vec_t<DEPTH, double> solve_anderson(const double* sums,
         for (int b = a; b < DEPTH; ++b, ++column)
             m[a][b] = b < kept ? sums[column] * (a == b ? 1.0 + RIDGE : 1.0) : (a == b ? 1.0 : 0.0);
     }
-    // elimination in the upper triangle of a symmetric positive definite matrix
+    // Gaussian elimination in the upper triangle of a symmetric positive definite matrix
 #pragma unroll
     for (int p = 0; p < DEPTH; ++p) {
         regular = regular && m[p][p] > 0.0;

@@ -1,16 +1,15 @@
 """Energy of moments in equilibrium.
 
-The moments' energy is that of their magnetization curves and their interaction,
+The energy of the magnetization curves and of the interactions is
 
     E = μ0 Σ_i [V Φ(M) − ½ m·(H − H0) − m·H0]  −  μ0 Σ_p [½ m·H_p + m·H_e],
 
-over inducible moments i in the field H0 of everything that they do not magnetize themselves, and permanent ones p in
-each other's field H_p and the external one H_e. Φ' = f⁻¹, so that E is least in equilibrium, where V Φ = m·H − V Ψ(H)
-with the co-energy Ψ' = f: there it is
+over inducible moments i in the applied field H0, and permanent moments p in each other's field H_p and the external
+field H_e. Φ' = f⁻¹, so E is minimal in equilibrium. There V Φ = m·H − V Ψ(H), with the co-energy Ψ' = f, and
 
     E = μ0 Σ_i [½ m·(H − H0) − V Ψ(H)]  −  μ0 Σ_p [½ m·H_p + m·H_e],
 
-and, being least, its gradient by positions is minus Kelvin's force (Kim and Han 2022, Eqs. 13, 14).
+Since E is minimal, its gradient by positions is minus Kelvin's force (Kim and Han 2022, Eqs. 13, 14).
 """
 
 from functools import cache
@@ -67,16 +66,16 @@ def _energy_kernel(dtype):
 
 
 def launch_energy(radii, moments, material, h, h0, h_permanent, external_field, energies):
-    """Write each moment's share of the energy [J].
+    """Launch each moment's share of the energy [J].
 
     Args:
         radii: Radii of the moments' balls [m], shape [n].
         moments: Moments in equilibrium [A·m²], shape [n].
-        material: Their ``curves.CurveParameters``.
-        h, h0: Field at the inducible moments, and what of it is applied [A/m], shape [n].
-        h_permanent: Field of other permanent moments at the permanent ones [A/m], shape [n].
+        material: Materials of the moments (``curves.CurveParameters``).
+        h, h0: Total and applied field at the inducible moments [A/m], shape [n].
+        h_permanent: Field of other permanent moments at permanent moments [A/m], shape [n].
         external_field: External field [A/m], shape [n].
-        energies: Out, shape [n], float64.
+        energies: Out: energies, float64, shape [n].
     """
     inputs = [material.inducible, radii, moments, material.saturation, material.slope, material.curve, material.tables]
     wp.launch(

@@ -1,14 +1,14 @@
-// Worlds of an induction solve: how one begins, and when it has converged (Kim and Han 2022, Eq. 12).
+// Worlds of an induction solve: their start, and their convergence (Kim and Han 2022, Eq. 12).
 //
 // ``State`` is the struct of solve_state.py.
 #pragma once
 
 namespace warpmag {
 
-constexpr int STEADY = 3; // solves in a row that make two changes to extrapolate from
-enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // what a world does next
+constexpr int STEADY = 3; // consecutive solves that give two changes, enough to extrapolate
+enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // next action of a world
 
-// Lets a world iterate.
+// Starts the iteration of a world.
 template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w) {
     auto& world = state.worlds.data[w];
     world.active = state.condition.data[0] = 1;
@@ -18,14 +18,14 @@ template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w
     if (state.warm.data[w] == 0) world.kept = 0, world.slowness = 0.0;
 }
 
-// Residual of sums ‖M − f(H)‖² and ‖f(H)‖² (Eq. 12): relative, save where there is no field.
+// Residual (Eq. 12) from ‖M − f(H)‖² and ‖f(H)‖²: relative, or absolute where there is no field.
 CUDA_CALLABLE inline double relative_residual(double deviation2, double goal2) {
     const double deviation = wp::sqrt(deviation2), goal = wp::sqrt(goal2);
     return goal > 0.0 ? deviation / goal : deviation;
 }
 
-// Whether a world ends after another evaluation, with a residual and an error. A state that is not finite is no start
-// for the next solve.
+// Records an evaluation, and returns whether the world ends with it. A state that is not finite makes the next solve
+// start cold.
 template <class State>
 CUDA_CALLABLE inline bool check_convergence(State& state, int w, double residual, double error, bool finite,
                                             bool hopeless) {

@@ -1,42 +1,41 @@
-"""State of an induction solve on the device and its convergence (Kim and Han 2022, Eq. 12), for every dynamics.
+"""State of an induction solve on the device, and its convergence (Kim and Han 2022, Eq. 12), for every dynamics.
 
-How the moments move is another matter: ``theta_flow`` is the product, ``submagnetization`` its rivals. Each world
-iterates and converges for itself, see ``solve_state.h``. Sums go by fixed chunks of a world's moments in a fixed order,
-in float64.
+``theta_flow`` and the baselines in ``submagnetization`` move the moments. Each world iterates and converges on its own
+(``solve_state.h``). Sums run over fixed chunks of a world's moments in a fixed order, in float64.
 
 The state of n moments, m of them inducible, in w worlds and c chunks:
 
-    packed, moments: Moments, packed and plain [A·m²], shapes [8, n] and [n]; the inducible ones are written.
-    neighbor, neighbor_count, overlap, overlap_count, searching: Their lists (``PackedMoments``).
-    saturation, slope, curve: What they are made of (``curves.CurveParameters``).
+    packed, moments: Moments, packed and plain [A·m²], shapes [8, n] and [n]; inducible ones are written.
+    neighbor, neighbor_count, overlap, overlap_count, searching: Lists of neighbors (``PackedMoments``).
+    saturation, slope, curve: Materials (``curves.CurveParameters``).
     rtol: Error at which a world ends.
-    max_evaluations: Field evaluations after which a world gives up.
-    responds: Whether a moment is a cell of a body that responds as a whole (``body_response``), shape [n].
-    row: Number, world, and the world's inducible moments from and to, of each inducible moment, shape [m].
-    chunk: Rows from and to, and world, of each chunk, shape [c].
+    max_evaluations: Field evaluations after which a world ends unconverged.
+    responds: Whether a moment is a cell of a body with a collective response (``body_response``), shape [n].
+    row: Moment, world, and range of the world's inducible moments, for each inducible moment, shape [m].
+    chunk: Range of rows, and world, of each chunk, shape [c].
     chunk_begin: First chunk of each world, shape [w + 1].
-    near: On a CPU rows of the neighbours of a chunk's moments, shape [c, CAPACITY, CHUNK].
-    near_count: How many the longest list of each vector has.
-    h0: Applied field [A/m]: external and from permanent magnets, shape [n].
-    h: Whole field [A/m], shape [n].
+    near: On a CPU rows of the neighbors of a chunk's moments, shape [c, CAPACITY, CHUNK].
+    near_count: Length of the longest list of each vector.
+    h0: Applied field [A/m], external and of permanent magnets, shape [n].
+    h: Total field [A/m], shape [n].
     s: Dual variable [dimensionless], shape [n].
-    iterate_s, iterate_r: The last iterate, and its residual, shape [n].
+    iterate_s, iterate_r: Last iterate, and its residual, shape [n].
     history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
-    best_s, best_r: Those of the smallest merit, shape [n].
+    best_s, best_r: Iterate of the smallest merit, and its residual, shape [n].
     step: Step length of each moment, shape [n].
     mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
     mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
-    past_field, past_g: Field of the inducible moments at the last two solutions [A/m], and the reduced whole field; the
+    past_field, past_g: Field of the inducible moments at the last two solutions [A/m], and the reduced total field; the
         last first, shape [2, n].
-    past: Place [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
-    now, swept: Place [m], radius and what a step or a first sweep adds to the moment, shape [rows, LINE].
+    past: Position [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
+    now, swept: Position [m], radius, and change of moment by a step or by the first sweep, shape [rows, LINE].
     sums: Sums of each chunk, on a CPU of each vector, shape [c, COLUMNS].
-    arrived: Chunks of each world whose sums are done, shape [w].
+    arrived: Number of each world's chunks whose sums are complete, shape [w].
     worlds: State of each world, shape [w].
-    warm: Solves of each world since it began cold, as far as it matters, shape [w].
+    warm: Number of solves of each world since its cold start, at most ``STEADY``, shape [w].
     residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w].
-    error: Its relative error: an estimate of ``theta_flow``, the residual of its rivals, shape [w].
-    evaluations, converged: What a solve took, and whether it reached its goal, shape [w].
+    error: Relative error of each world: the estimate of ``theta_flow``, or the residual of a baseline, shape [w].
+    evaluations, converged: Number of evaluations of the last solve, and whether it converged, shape [w].
     condition: Whether any world still iterates, shape [1].
 """
 
@@ -50,34 +49,34 @@ from warpmag.kernels.shared.native import CHUNK, LINE
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5
-"""Changes between iterates that are kept and mixed, see ``anderson.h``."""
+"""Changes between iterates that are stored and mixed (``anderson.h``)."""
 COLUMNS = 7 + DEPTH + DEPTH * (DEPTH + 1) // 2
 """Sums over the moments of a chunk or world; as in ``theta_step.h``."""
 BLOCK_CHUNK = 128
-"""Moments in a chunk on a GPU, each of them for a thread of a block; on a CPU a chunk has ``native.CHUNK``."""
+"""Moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``."""
 
 
 @wp.struct
 class World:
-    """State of a world between evaluations; in one cache line, up to the last, what every moment needs of it.
+    """State of a world between evaluations; the fields that every moment reads share a cache line.
 
     Attributes:
         active: Whether it still iterates.
         evaluations: Field evaluations of this solve.
-        in_field: Whether there is an applied field, until its first evaluation.
-        next: What it does next, of ``Next`` in ``solve_state.h``.
-        linked: Whether the next iterate's change from the last one is worth keeping.
-        kept: Changes that are kept, in ``history``.
-        newest: Slot of the newest of them.
-        used: How many of them the next step mixes.
+        in_field: Whether there is an applied field, until the first evaluation.
+        next: Its next action, of ``Next`` in ``solve_state.h``.
+        linked: Whether the change from the last iterate to the next one is stored.
+        kept: Number of stored changes in ``history``.
+        newest: Slot of the newest stored change.
+        used: Number of changes that the next step mixes.
         improved: Whether the last iterate is the best so far.
-        plain_steps: Steps to be taken without mixing.
-        damping: Part of the moments' step lengths that is taken.
-        ahead: Part of the last change from solve to solve that the next start adds.
-        best: Smallest merit of this solve, negative before the first.
+        plain_steps: Steps left without mixing.
+        damping: Factor of the moments' step lengths.
+        ahead: Factor β of the last change from solve to solve in the next start.
+        best: Smallest merit of this solve, negative before the first evaluation.
         alpha: Anderson coefficients.
-        slowness: Sum of the steps to come over the last one, if they go on as they do.
-        gain: Size of each kept change of the iterate over that of its residual, by slot.
+        slowness: Predicted sum of the remaining steps over the last step.
+        gain: Size of each stored change of the iterate over that of its residual, by slot.
     """
 
     active: int
@@ -100,7 +99,7 @@ class World:
 
 @cache
 def state_type(dtype):
-    """Type of the state of a solve; the module says what its arrays are."""
+    """Return the struct of a solve's state; the module describes its arrays."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
@@ -156,11 +155,11 @@ def state_type(dtype):
 
 
 def allocate(worlds, inducible, dtype, device):
-    """Allocate the state of a solve; :func:`bind` has what is not its own.
+    """Allocate the state of a solve; :func:`bind` sets the arrays that it shares.
 
     Args:
         worlds: World of each moment, non-decreasing, shape [n].
-        inducible: Whether a moment is inducible, shape [n]; in each world these come first.
+        inducible: Whether a moment is inducible, shape [n]; in each world inducible moments come first.
         dtype: Warp scalar type.
         device: Warp device.
     """
@@ -168,12 +167,12 @@ def allocate(worlds, inducible, dtype, device):
     on_cpu = wp.get_device(device).is_cpu
     size = CHUNK if on_cpu else BLOCK_CHUNK
     target = np.flatnonzero(inducible)
-    world, held = worlds[target], np.bincount(worlds[target], minlength=world_count)
+    world, counts = worlds[target], np.bincount(worlds[target], minlength=world_count)
     begin = np.searchsorted(worlds, np.arange(world_count))
-    rows = np.stack([target, world, begin[world], (begin + held)[world]], axis=1)
-    ends = np.cumsum(held)
-    chunks = [(a, min(a + size, end), w) for w, end in enumerate(ends) for a in range(end - held[w], end, size)]
-    chunk_begin = np.append(0, np.cumsum(-(-held // size)))
+    rows = np.stack([target, world, begin[world], (begin + counts)[world]], axis=1)
+    ends = np.cumsum(counts)
+    chunks = [(a, min(a + size, end), w) for w, end in enumerate(ends) for a in range(end - counts[w], end, size)]
+    chunk_begin = np.append(0, np.cumsum(-(-counts // size)))
     vec3 = wp.types.vector(3, dtype)
 
     def put(values, kind):
@@ -187,7 +186,7 @@ def allocate(worlds, inducible, dtype, device):
         "row": put(rows, wp.vec4i),
         "chunk": put(np.reshape(chunks, (-1, 3)), wp.vec3i),
         "chunk_begin": put(chunk_begin, wp.int32),
-        "converged": put(np.ones(world_count), wp.int32),  # without inducible moments there is nothing to converge
+        "converged": put(np.ones(world_count), wp.int32),  # worlds without inducible moments count as converged
         **zeros("near", (count if on_cpu else 0, CAPACITY, CHUNK)),
         **zeros("near_count", count * vectors),
         **zeros("h0 h s iterate_s iterate_r best_s best_r mixed_g mixed_moment", n, vec3),
@@ -209,22 +208,22 @@ def allocate(worlds, inducible, dtype, device):
 
 
 def carried_arrays(state) -> dict:
-    """Return the arrays of a state that a solve hands on to the next one, by name."""
+    """Return the arrays of a state that persist from one solve to the next, by name."""
     names = "near near_count s iterate_s iterate_r history_s history_r best_s best_r mixed_g mixed_moment past_field"
     names += " past_g past now swept worlds warm residual error evaluations converged"
     return {name: getattr(state, name) for name in names.split()}
 
 
 def bind(state, packed, material, moments, rtol: float, max_evaluations: int) -> None:
-    """Let a solve move moments.
+    """Set the moments of a solve, and when it ends.
 
     Args:
         state: State of the solve.
         packed: All moments, packed (``PackedMoments``).
-        material: What they are made of (``curves.CurveParameters``).
+        material: Materials of the moments (``curves.CurveParameters``).
         moments: Moments [A·m²], shape [n].
         rtol: Error at which a world ends.
-        max_evaluations: Field evaluations after which a world gives up.
+        max_evaluations: Field evaluations after which a world ends unconverged.
     """
     state.packed, state.moments, state.searching = packed.packed, moments, packed.searching
     state.neighbor, state.neighbor_count = packed.neighbors, packed.neighbor_counts
@@ -236,7 +235,7 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
 
 @wp.func
 def is_last_of_world(lane: int, w: int, chunks: int, arrived: wp.array[int]):
-    """Whether this block is the last of those that sum the ``chunks`` of world ``w``, whose sums it can then read."""
+    """Return whether this block is the last to sum one of the ``chunks`` of world ``w``; it can then read all sums."""
     last = int(0)
     if lane == 0:
         fence()
@@ -249,15 +248,15 @@ def is_last_of_world(lane: int, w: int, chunks: int, arrived: wp.array[int]):
 
 @cache
 def world_summation(dtype, columns: int):
-    """Warp function by which the last block of a world adds up its sums.
+    """Return the Warp function with which the last block of a world adds up the world's sums.
 
-    Every thread of a block brings its own; the first one of the last block gets all of them, and others ``False``.
+    Every thread passes its terms. The first thread of the last block gets (True, totals), all others False.
     """
     vector = wp.types.vector(columns, wp.float64)
 
     @wp.func
-    def sum_world(mine: vector, c: int, lane: int, w: int, state: state_type(dtype)):
-        total = block_sum(mine)
+    def sum_world(terms: vector, c: int, lane: int, w: int, state: state_type(dtype)):
+        total = block_sum(terms)
         begin = state.chunk_begin[w]
         end = state.chunk_begin[w + 1]
         if end - begin == 1:
@@ -274,3 +273,27 @@ def world_summation(dtype, columns: int):
         return lane == 0, block_sum(rest)
 
     return sum_world
+
+
+@cache
+def _bias_kernel(vec3):
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_bias(bias: wp.array[vec3], moments: wp.array[int], h0: wp.array[vec3]):
+        i = moments[wp.tid()]
+        h0[i] = h0[i] + bias[i]
+
+    return add_bias
+
+
+def launch_add_bias(bias, moments, h0):
+    """Add the bias M_r/χ of permanent magnets that respond to the field, M = M_r + χ H' with the inner field H'.
+
+    The curve of such a magnet's ball is M = k (H + M_r/χ), k = 3χ/(3 + χ): linear in the field H plus a bias. The bias
+    is part of a solve's applied field only, and exerts no force.
+
+    Args:
+        bias: M_r/χ [A/m], shape [n].
+        moments: Indices of the moments that have a bias.
+        h0: Applied field [A/m], shape [n].
+    """
+    wp.launch(_bias_kernel(h0.dtype), dim=len(moments), inputs=[bias, moments, h0], device=h0.device)

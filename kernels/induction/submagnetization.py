@@ -1,24 +1,24 @@
-"""Pairs of submagnetizations (Kim and Han 2022, Eqs. 5, 6, 8, 9, 11): the dynamics that ``theta_flow`` replaces.
+"""Baseline dynamics by pairs of submagnetizations (Kim and Han 2022, Eqs. 5, 6, 8, 9, 11), without acceleration.
 
-Every inducible moment is the mean of two submagnetizations of length Ms, M = (M1 + M2)/2, held here as unit vectors
+Every inducible moment is the mean of two submagnetizations of length Ms, M = (M1 + M2)/2, stored as unit vectors
 u = M_i/Ms. With the reduced effective field h = H_eff/Ms, one explicit step of each dynamics is
 
 | dynamics | step | source |
 |---|---|---|
 | theta-euler | Δθ = −κ‖h‖ Θ(θ), θ in [0, π], Θ = sin θ below π/2, 2 − sin θ above | Kim and Han 2022, Eqs. 8, 9 |
 | llg | Δu = −κ (u × (u × h) + u × h/α) | Eq. 6, after Kim et al. 2018 |
-| llg-damping | Δu = −κ u × (u × h) | the damping term of Eq. 6 as is |
+| llg-damping | Δu = −κ u × (u × h) | damping term of Eq. 6 |
 
-H_eff = H − γM, γ = ‖f⁻¹(M)‖/‖M‖ (Eq. 11; the paper prints the numerator alone, which is not dimensionless), bounded
-near saturation; on the clamped curve γ = 1/k, the constant γ_D = 1/3 of Eq. 5. κ = βΔtMs is dimensionless; for LLG
-β = γ_g α/((1 + α²) Ms) with the gyromagnetic ratio γ_g, where α/Ms is meant where the paper writes α. At one κ all
-three thus damp alike to first order, and LLG precesses κ/α on top.
+H_eff = H − γM with γ = ‖f⁻¹(M)‖/‖M‖, bounded near saturation (Eq. 11; the paper prints the numerator alone, which is
+not dimensionless). On the clamped curve γ = 1/k, the constant γ_D = 1/3 of Eq. 5. κ = βΔtMs is dimensionless. For LLG β
+= γ_g α/((1 + α²) Ms) with the gyromagnetic ratio γ_g; the paper's α is α/Ms here. At equal κ all three dynamics have
+the same damping to first order, and LLG precesses by κ/α in addition.
 
-An angle to H_eff is never negative: a step that would carry M_i past H_eff ends on it. LLG's explicit step leaves the
-sphere ‖M_i‖ = Ms, and M_i is scaled back, as micromagnetics does.
+The angle to H_eff is never negative: a step past H_eff ends at H_eff. LLG's explicit step leaves the sphere ‖M_i‖ = Ms,
+and M_i is normalized again, as in micromagnetics.
 
-A moment starts demagnetized, M1 = −M2, across its applied field, along the coordinate axis farthest from it. Pairs
-outlive a solve: the next one goes on from them.
+A moment starts demagnetized, M1 = −M2, perpendicular to its applied field, in the plane of the field and the coordinate
+axis farthest from it. Pairs persist: the next solve continues from them.
 """
 
 from functools import cache
@@ -42,36 +42,36 @@ LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
 
 @wp.func
 def effective_field(h: Any, m: Any, slope: Any, curve: int, tables: Any):
-    """Reduced effective field H_eff/Ms (Eqs. 5 and 11) of reduced field ``h`` and reduced magnetization ``m``."""
+    """Return the reduced effective field H_eff/Ms (Eqs. 5, 11) of reduced field ``h`` and magnetization ``m``."""
     return h - (inverse_curve_ratio(wp.length(m), curve, tables) / slope) * m
 
 
 @wp.func
-def across(axis: Any):
-    """Unit vector across a unit ``axis``, along the coordinate axis farthest from it."""
+def perpendicular(axis: Any):
+    """Return the unit vector perpendicular to ``axis`` and nearest to the coordinate axis farthest from it."""
     x = wp.abs(axis[0])
     y = wp.abs(axis[1])
     z = wp.abs(axis[2])
-    far = axis - axis
+    coordinate_axis = axis - axis  # zero
     k = wp.where(z <= wp.min(x, y), 2, wp.where(y <= x, 1, 0))
-    far[k] = type(x)(1.0)
-    return wp.normalize(far - axis[k] * axis)
+    coordinate_axis[k] = type(x)(1.0)
+    return wp.normalize(coordinate_axis - axis[k] * axis)
 
 
 @wp.func
 def theta_step(u: Any, h_eff: Any, kappa: Any, side: Any):
-    """Turn ``u`` towards ``h_eff`` in their common plane (Eqs. 8, 9); ``side`` ±1 picks it where they are parallel."""
+    """Return ``u`` turned towards ``h_eff`` in their plane (Eqs. 8, 9); ``side`` ±1 chooses it if they are parallel."""
     strength = wp.length(h_eff)
     if not strength > type(strength)(0.0):
         return u
     axis = h_eff / strength
     cosine = wp.dot(u, axis)
-    off = u - cosine * axis
-    sine = wp.length(off)
-    # nearly parallel the plane is rounding; M1 and M2 then part to opposite sides
-    plane = side * across(axis)
+    transverse = u - cosine * axis
+    sine = wp.length(transverse)
+    # For nearly parallel vectors rounding would define the plane; M1 and M2 then turn to opposite sides.
+    plane = side * perpendicular(axis)
     if sine > type(sine)(1.0e-6):
-        plane = off / sine
+        plane = transverse / sine
     rate = wp.where(cosine > type(cosine)(0.0), sine, type(sine)(2.0) - sine)
     theta = wp.max(wp.atan2(sine, cosine) - kappa * strength * rate, type(sine)(0.0))
     return wp.cos(theta) * axis + wp.sin(theta) * plane
@@ -79,14 +79,14 @@ def theta_step(u: Any, h_eff: Any, kappa: Any, side: Any):
 
 @wp.func
 def llg_step(u: Any, h_eff: Any, kappa: Any, precession: Any):
-    """Explicit step of the LLG equation (Eq. 6), not scaled back; ``precession`` is 1/α, or 0 for damping only."""
-    turn = wp.cross(u, h_eff)
-    return u - kappa * (wp.cross(u, turn) + precession * turn)
+    """Return an explicit step of Eq. 6 (LLG), not normalized; ``precession`` is 1/α, or 0 for damping only."""
+    torque = wp.cross(u, h_eff)
+    return u - kappa * (wp.cross(u, torque) + precession * torque)
 
 
 @wp.func
 def step_submagnetization(u: Any, h_eff: Any, kappa: Any, precession: Any, side: Any, law: int):
-    """One step of dynamics ``law``, ending on the unit sphere."""
+    """Return one step of dynamics ``law``, normalized."""
     if law == wp.static(THETA_EULER):
         return theta_step(u, h_eff, kappa, side)
     return wp.normalize(llg_step(u, h_eff, kappa, precession))
@@ -103,19 +103,19 @@ def _options(dtype) -> dict:
 
 @cache
 def pairs_type(dtype):
-    """Type of the pairs of submagnetizations of n moments, and of how they move."""
+    """Return the struct of the pairs of n moments and the parameters of their dynamics."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
     class Pairs:
-        """Pairs of submagnetizations.
+        """Pairs of submagnetizations, and parameters of their dynamics.
 
         Attributes:
             first: Directions M1/Ms, shape [n].
             second: Directions M2/Ms, shape [n].
             law: ``THETA_EULER``, ``LLG`` or ``LLG_DAMPING``.
             kappa: Step κ = βΔtMs [dimensionless].
-            precession: Precession over damping, 1/α or 0 [dimensionless].
+            precession: Ratio of precession to damping, 1/α or 0 [dimensionless].
         """
 
         first: wp.array[vec3]
@@ -151,9 +151,9 @@ def _start_kernel(dtype):
     def start_pairs(state: state_type(dtype), pairs: pairs_type(dtype)):
         row = state.row[wp.tid()]
         i = row[0]
-        # without a field the one solution is no magnetization, where a cold start begins
+        # without an applied field the only solution is zero magnetization, where a cold start begins
         if state.warm[row[1]] == 0 or state.worlds[row[1]].in_field == 0:
-            u = across(wp.normalize(state.h0[i]))
+            u = perpendicular(wp.normalize(state.h0[i]))
             pairs.first[i] = u
             pairs.second[i] = -u
         mean = dtype(0.5) * state.saturation[i] * (pairs.first[i] + pairs.second[i])
@@ -175,9 +175,9 @@ def _split_kernel(dtype):
         if length > dtype(1.0):
             m = m / length
             length = dtype(1.0)
-        half = wp.sqrt(dtype(1.0) - length * length) * across(wp.normalize(m))
-        pairs.first[i] = m + half
-        pairs.second[i] = m - half
+        transverse = wp.sqrt(dtype(1.0) - length * length) * perpendicular(wp.normalize(m))
+        pairs.first[i] = m + transverse
+        pairs.second[i] = m - transverse
         state.warm[row[1]] = 1
 
     return split_magnetizations
@@ -185,7 +185,7 @@ def _split_kernel(dtype):
 
 @cache
 def _convergence_kernel(dtype):
-    """Kernel whose blocks sum a chunk of a world each, the last of which ends its world if it has converged."""
+    """Return the kernel that sums chunks of worlds; the last block of a world ends it if it has converged."""
     state_struct = state_type(dtype)
     sum_world = world_summation(dtype, 2)
 
@@ -201,16 +201,16 @@ def _convergence_kernel(dtype):
         chunk = state.chunk[c]
         if state.worlds[chunk[2]].active == 0:
             return
-        mine = wp.vec2d()
+        terms = wp.vec2d()
         for row in range(chunk[0] + lane, chunk[1], wp.block_dim()):
             i = state.row[row][0]
             limit = state.saturation[i]
             g = (state.slope[i] / limit) * state.h[i]
             goal = (limit * curve_ratio(wp.length(g), state.curve[i], state.curve_tables)) * g
-            # lengths, not squares: a field of 1e-20 A/m squared is no float32
+            # lengths, not squares: the square of 1e-20 A/m underflows float32
             deviation = wp.float64(wp.length(goal - (dtype(0.5) * limit) * (pairs.first[i] + pairs.second[i])))
-            mine += wp.vec2d(deviation * deviation, wp.float64(wp.length(goal)) * wp.float64(wp.length(goal)))
-        last, total = sum_world(mine, c, lane, chunk[2], state)
+            terms += wp.vec2d(deviation * deviation, wp.float64(wp.length(goal)) * wp.float64(wp.length(goal)))
+        last, total = sum_world(terms, c, lane, chunk[2], state)
         if last:
             finite = wp.isfinite(total[0]) and wp.isfinite(total[1])
             end_world(state, chunk[2], relative_residual(total[0], total[1]), finite)
@@ -245,7 +245,7 @@ def _step_kernel(dtype):
 
 
 def make_pairs(state, law: str, kappa: float, precession: float):
-    """Return the pairs that stand for the moments of ``state``, of a dynamics in ``LAW_IDS``."""
+    """Return pairs for the moments of ``state``, with dynamics ``law`` of ``LAW_IDS``."""
     dtype = state.packed.dtype
     pairs = pairs_type(dtype)()
     pairs.first, pairs.second = wp.zeros_like(state.h), wp.zeros_like(state.h)
@@ -258,19 +258,19 @@ def _launch(kernel, state, *inputs):
 
 
 def launch_split(state, pairs, magnetizations):
-    """Let pairs, symmetric about them, stand for given magnetizations [A/m], shape [n]; ends the worlds' cold start."""
+    """Launch the split of magnetizations [A/m], shape [n], into symmetric pairs; the next solve starts from them."""
     _launch(_split_kernel, state, magnetizations, state, pairs)
 
 
 def launch_begin(state, pairs):
-    """Begin a solve from the applied field and, in worlds that are warm, from the pairs as they are."""
+    """Launch the start of a solve, cold from the applied field, or warm from the present pairs."""
     _launch(_begin_kernel, state, state)
     _launch(_start_kernel, state, state, pairs)
 
 
 def launch_iteration(state, pairs):
-    """Check the convergence of every world in the field ``state.h``, and step the pairs of those that go on."""
-    state.condition.zero_()  # until a world wants another evaluation
+    """Launch the check of convergence in the field ``state.h``, and a step of the pairs of worlds that iterate on."""
+    state.condition.zero_()  # set again by any world that needs another evaluation
     wp.launch_tiled(
         _convergence_kernel(state.packed.dtype),
         dim=[state.chunk.shape[0]],

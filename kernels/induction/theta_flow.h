@@ -1,9 +1,9 @@
-// The accelerated θ flow (Kim and Han 2022, Eqs. 8, 9 and 11, exact in time), in passes over the inducible moments;
-// theta_flow.py has its equations, theta_step.h what a world does next.
+// The accelerated θ flow (Kim and Han 2022, Eqs. 8, 9 and 11, exact in time), in passes over the inducible moments.
+// theta_flow.py has its equations; theta_step.h chooses the next step of a world.
 //
-// On a CPU a pass works on a vector of moments, which are all of one world; on a GPU a group of threads has a moment.
-// Takes CAPACITY, DEPTH, GROUP and INVERSE_4PI, and RESPONDING, whether any moments belong to bodies that respond as
-// wholes; ``State`` is the struct of solve_state.py.
+// On a CPU a pass works on a vector of moments of one world; on a GPU a group of threads works on one moment. Takes
+// CAPACITY, DEPTH, GROUP and INVERSE_4PI from Python. RESPONDING tells whether any moments belong to bodies with a
+// collective response (body_response.h). ``State`` is the struct of solve_state.py.
 #pragma once
 #include "induction/theta_step.h"
 #include "material/curves.h"
@@ -13,21 +13,22 @@
 
 namespace warpmag {
 
-constexpr double SWEEP_STEP = 1.4; // step length of a sweep over that of a step: long chains of balls want more
+// Step length of a sweep over that of a step: long chains of balls converge faster above 1.
+constexpr double SWEEP_STEP = 1.4;
 
 enum Pass { START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE }; // as in theta_flow.py
 
-// Inducible moments of one world from number i on, ``held`` of them; their lists and lines stand at ``row``, and the
-// world's inducible moments are those from begin to end.
-struct Place {
-    int row, i, held, world, begin, end;
+// ``count`` consecutive inducible moments of one world, from moment i on. Their neighbor lists and cache lines start at
+// ``row``. The world's inducible moments are those from begin to end.
+struct Span {
+    int row, i, count, world, begin, end;
 };
 
 #if defined(__CUDA_ARCH__)
 typedef double Wide;
 CUDA_CALLABLE inline Wide wide(Number x) { return x; }
 
-template <class State> CUDA_CALLABLE inline Place place(const State& state, int row) {
+template <class State> CUDA_CALLABLE inline Span span_at(const State& state, int row) {
     const int4 moment = ((const int4*)state.row.data)[row];
     return {row, moment.x, 1, moment.y, moment.z, moment.w};
 }
@@ -35,23 +36,23 @@ template <class State> CUDA_CALLABLE inline Place place(const State& state, int 
 typedef double Wide __attribute__((ext_vector_type(WIDTH)));
 inline Wide wide(Number x) { return __builtin_convertvector(x, Wide); }
 
-template <class State> inline Place place(const State& state, int row) {
-    const auto& chunk = state.chunk.data[row / CHUNK]; // first and last row of the work list, world
+template <class State> inline Span span_at(const State& state, int row) {
+    const auto& chunk = state.chunk.data[row / CHUNK]; // range of rows, world
     const auto& first = state.row.data[chunk[0]];
     const int offset = row % CHUNK, left = chunk[1] - chunk[0] - offset;
     return {row, first[0] + offset, left < 0 ? 0 : left > WIDTH ? WIDTH : left, chunk[2], first[2], first[3]};
 }
 #endif
 
-// Vectors of moments in row ``number`` of an array, and numbers of them.
-template <class Array> CUDA_CALLABLE inline Real* entries(const Array& array, const Place& at, int number = 0) {
+// Elements of a span in row ``number`` of an array: their address, and vectors read and written there.
+template <class Array> CUDA_CALLABLE inline Real* entries(const Array& array, const Span& at, int number = 0) {
     return (Real*)((char*)array.data + number * (size_t)array.strides[0]) + sizeof(*array.data) / sizeof(Real) * at.i;
 }
-template <class Array> CUDA_CALLABLE inline Vector get(const Array& array, const Place& at, int number = 0) {
-    return vectors(entries(array, at, number), at.held);
+template <class Array> CUDA_CALLABLE inline Vector get(const Array& array, const Span& at, int number = 0) {
+    return vectors(entries(array, at, number), at.count);
 }
-template <class Array> CUDA_CALLABLE inline void set(const Array& array, const Place& at, Vector v, int number = 0) {
-    put_vectors(entries(array, at, number), at.held, v);
+template <class Array> CUDA_CALLABLE inline void set(const Array& array, const Span& at, Vector v, int number = 0) {
+    put_vectors(entries(array, at, number), at.count, v);
 }
 CUDA_CALLABLE inline Vector vector_of(Four f) { return {f.x, f.y, f.z}; }
 
@@ -59,23 +60,24 @@ struct Material {
     Number saturation, slope;
     Curves curves;
 };
-// Part of a magnetization that an error is relative to: of a permanent moment that responds what could be induced.
+// Share of a magnetization that errors are relative to: 1, or k for a permanent moment that responds, whose remanence
+// is not induced.
 CUDA_CALLABLE inline Number induced_share(const Material& material) {
-    const Number all = material.slope * 0 + 1;
+    const Number full = material.slope * 0 + 1;
 #if !defined(__CUDA_ARCH__)
-    if (material.curves.common == MIXED) return mask_of(material.curves.each == Index(LINEAR)) ? material.slope : all;
+    if (material.curves.common == MIXED) return mask_of(material.curves.each == Index(LINEAR)) ? material.slope : full;
 #endif
-    return material.curves.common == LINEAR ? material.slope : all;
+    return material.curves.common == LINEAR ? material.slope : full;
 }
-template <class State> CUDA_CALLABLE inline Material material_of(const State& state, const Place& at) {
-    return {numbers_or(entries(state.saturation, at), at.held, 1), numbers_or(entries(state.slope, at), at.held, 1),
-            curves_of(state.curve.data, state.common_curve, state.curve_tables.data, at.i, at.held)};
+template <class State> CUDA_CALLABLE inline Material material_of(const State& state, const Span& at) {
+    return {numbers_or(entries(state.saturation, at), at.count, 1), numbers_or(entries(state.slope, at), at.count, 1),
+            curves_of(state.curve.data, state.common_curve, state.curve_tables.data, at.i, at.count)};
 }
 
 // Positions and radii [m].
-template <class State> CUDA_CALLABLE inline Four balls_at(const State& state, const Place& at) {
+template <class State> CUDA_CALLABLE inline Four balls_at(const State& state, const Span& at) {
     Number x[4];
-    for (int c = 0; c < 4; ++c) x[c] = numbers_or(entries(state.packed, at, c), at.held, 0);
+    for (int c = 0; c < 4; ++c) x[c] = numbers_or(entries(state.packed, at, c), at.count, 0);
     return {x[0], x[1], x[2], x[3]};
 }
 
@@ -85,35 +87,35 @@ CUDA_CALLABLE inline Vector moments_of(Material material, Number radius, Vector 
     return volume * material.saturation * curve_ratio(length(s), material.curves) * s;
 }
 
-template <class State> CUDA_CALLABLE inline void store_moments(State& state, const Place& at, Vector m) {
+template <class State> CUDA_CALLABLE inline void store_moments(State& state, const Span& at, Vector m) {
     set(state.moments, at, m);
-    put_first(entries(state.packed, at, 4), at.held, m.x);
-    put_first(entries(state.packed, at, 5), at.held, m.y);
-    put_first(entries(state.packed, at, 6), at.held, m.z);
+    put_first(entries(state.packed, at, 4), at.count, m.x);
+    put_first(entries(state.packed, at, 5), at.count, m.y);
+    put_first(entries(state.packed, at, 6), at.count, m.z);
 }
 
-// Whether moments are cells of a body that responds as a whole (body_response.h).
-template <class State> CUDA_CALLABLE inline Mask responding(const State& state, const Place& at) {
-    Index which = 0;
+// Mask of moments that are cells of a body with a collective response (body_response.h).
+template <class State> CUDA_CALLABLE inline Mask responding(const State& state, const Span& at) {
+    Index flags = 0;
 #if defined(__CUDA_ARCH__)
-    if constexpr (RESPONDING) which = state.responds.data[at.i];
+    if constexpr (RESPONDING) flags = state.responds.data[at.i];
 #else
-    for (int l = 0; RESPONDING && l < at.held; ++l) which[l] = state.responds.data[at.i + l];
+    for (int l = 0; RESPONDING && l < at.count; ++l) flags[l] = state.responds.data[at.i + l];
 #endif
-    return mask_of(which != Index(0));
+    return mask_of(flags != Index(0));
 }
-// Whether moments i and j are cells of one such body.
+// Whether moments i and j are cells of the same such body.
 template <class State> CUDA_CALLABLE inline bool respond_together(const State& state, int i, int j) {
     if (!RESPONDING || state.responds.data[i] == 0) return false;
     const Real* const labels = (const Real*)((const char*)state.packed.data + 7 * (size_t)state.packed.strides[0]);
     return labels[i] == labels[j];
 }
 
-// Calls visit(row, listed) for the inducible neighbours of moments, save those that respond together with them; a
-// moment whose list is full has none.
+// Calls visit(rows, mask) for the inducible neighbors of moments, except cells of the same body with a collective
+// response. A moment whose list overflowed has no neighbors.
 #if defined(__CUDA_ARCH__)
 template <class State, class Visit>
-CUDA_CALLABLE inline void visit_neighbors(const State& state, const Place& at, Visit visit) {
+CUDA_CALLABLE inline void visit_neighbors(const State& state, const Span& at, Visit visit) {
     const int* const list = state.neighbor.data + (size_t)CAPACITY * at.i;
     const int count = state.neighbor_count.data[at.i];
     for (int s = share(); s < (count > CAPACITY ? 0 : count); s += SHARES) {
@@ -122,7 +124,7 @@ CUDA_CALLABLE inline void visit_neighbors(const State& state, const Place& at, V
     }
 }
 #else
-template <class State, class Visit> inline void visit_neighbors(const State& state, const Place& at, Visit visit) {
+template <class State, class Visit> inline void visit_neighbors(const State& state, const Span& at, Visit visit) {
     Index self;
     for (int l = 0; l < WIDTH; ++l) self[l] = at.row + l;
     for (int s = 0; s < state.near_count.data[at.row / WIDTH]; ++s) {
@@ -131,13 +133,13 @@ template <class State, class Visit> inline void visit_neighbors(const State& sta
     }
 }
 
-// Lists the rows of neighbours side by side for a vector; shorter lists are filled up with the moment itself.
-template <class State> inline void list_neighbors(State& state, const Place& at) {
+// Writes the neighbor lists of a vector of moments side by side. Shorter lists are padded with the moment itself.
+template <class State> inline void list_neighbors(State& state, const Span& at) {
     int* const lists = list_at(state.near.data, CAPACITY, 0, at.row);
     int counts[WIDTH] = {};
-    for (int l = 0; l < at.held; ++l) {
-        const int i = at.i + l, found = state.neighbor_count.data[i];
-        for (int s = 0; s < found && found <= CAPACITY; ++s) {
+    for (int l = 0; l < at.count; ++l) {
+        const int i = at.i + l, length = state.neighbor_count.data[i];
+        for (int s = 0; s < length && length <= CAPACITY; ++s) {
             const int j = state.neighbor.data[(size_t)CAPACITY * i + s];
             if (j >= at.begin && j < at.end && !respond_together(state, i, j))
                 lists[CHUNK * counts[l]++ + l] = j - at.i + at.row;
@@ -152,29 +154,29 @@ template <class State> inline void list_neighbors(State& state, const Place& at)
 
 // Step lengths ω of moments.
 template <class State, class World>
-CUDA_CALLABLE inline Number step_of(const State& state, const Place& at, const World& world) {
-    return (Real)world.damping * numbers_or(entries(state.step, at), at.held, 1);
+CUDA_CALLABLE inline Number step_of(const State& state, const Span& at, const World& world) {
+    return (Real)world.damping * numbers_or(entries(state.step, at), at.count, 1);
 }
 
-// Volume that balls share with other inducible ones, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
+// Volume that balls share with other inducible balls, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
 //
-// Uniformly magnetized balls carry a field energy of at most ½μ0 ∫‖Σ M_i‖², so the eigenvalues of the coupling lie
-// above 1/3 − (1 + max o_i), which is −2/3 without overlap, and in the metric of 2/3 + o_i above −1, as the matrix of
-// shared volumes is at most the diagonal one of its row sums: hence step lengths that converge for any arrangement, and
-// are short only where balls overlap. Cells of a body that responds as a whole do not overlap.
-template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Place& at) {
+// The field energy of uniformly magnetized balls is at most ½μ0 ∫‖Σ M_i‖². The eigenvalues of the coupling therefore
+// lie above 1/3 − (1 + max o_i), which is −2/3 without overlap. In the metric of 2/3 + o_i they lie above −1, since the
+// matrix of shared volumes is bounded by the diagonal matrix of its row sums. The resulting step lengths converge for
+// any arrangement, and are short only where balls overlap. Cells of one body with a collective response do not overlap.
+template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Span& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
     const Mask whole = responding(state, at), each = mask_of(Index(0) == Index(0));
     auto others = [=](Index i, Index j) {
         return mask_of(j != i) & (whole ? mask_of(collect(labels, i) != collect(labels, j)) : each);
     };
-    return shared_volumes(state, at.i, at.held, at.begin, at.end, others);
+    return shared_volumes(state, at.i, at.count, at.begin, at.end, others);
 }
 
-// 4π times the field [A/m] of neighbours at the last solution, further by ``ahead`` of its change from the one before.
-// For cells that respond as a whole less that of the neighbours where they are now, which no sweep is to add.
+// 4π times the neighbors' field [A/m] at the last solution plus ``ahead`` times its last change. Cells of bodies with a
+// collective response subtract the neighbors' field at present positions, since sweeps do not add it.
 template <class State>
-CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& at, Four ball, Real ahead) {
+CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Span& at, Four ball, Real ahead) {
     const Real *const past = (const Real*)state.past.data, *const packed = (const Real*)state.packed.data;
     const size_t pitch = state.packed.strides[0] / sizeof(Real);
     const Vector x0 = vector_of(own_four(past, 0, at.row)), x1 = vector_of(own_four(past, 2, at.row));
@@ -197,8 +199,8 @@ CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Place& 
     return group_sums(total);
 }
 
-// Starts a solve: step lengths, and first moments from the applied field and from what the last solves left.
-template <class State> CUDA_CALLABLE inline void start(State& state, const Place& at) {
+// Starts a solve: writes step lengths, and first moments from the applied field and the last solutions.
+template <class State> CUDA_CALLABLE inline void start(State& state, const Span& at) {
     auto& world = state.worlds.data[at.world];
     const int warm = state.warm.data[at.world];
     const Real ahead = (Real)world.ahead;
@@ -208,11 +210,11 @@ template <class State> CUDA_CALLABLE inline void start(State& state, const Place
     Vector near = {0, 0, 0};
     if (warm == STEADY) near = extrapolated_field(state, at, ball, ahead);
     if (share() != 0) return;
-    put_first(entries(state.step, at), at.held, omega);
+    put_first(entries(state.step, at), at.count, omega);
     const Vector h0 = get(state.h0, at);
     if (any(mask_of(length(h0) > Real(0)))) raise_flag(world.in_field);
     Vector s = get(state.s, at);
-    // the θ flow with κ = k from no magnetization: exact for a lone ball
+    // θ flow with κ = k from zero magnetization: exact for an isolated ball
     if (warm == 0) s = (whole_step<Real>(omega) * material.slope / material.saturation) * h0;
     if (warm == STEADY) s = s + ahead * (get(state.past_g, at) - get(state.past_g, at, 1));
     set(state.s, at, s);
@@ -228,9 +230,9 @@ template <class State> CUDA_CALLABLE inline void start(State& state, const Place
     put_four(state.now.data, 1, at.row, {m.x, m.y, m.z, 0});
 }
 
-// Sweeps once over neighbours, whose changes stand in a cache line with their places; the last sweep stores moments.
-template <class State> CUDA_CALLABLE inline void sweep(State& state, const Place& at, bool last) {
-    if (at.row == 0 && share() == 0) state.condition.data[0] = 0; // until a world wants another evaluation
+// Sweeps once over the neighbors' changes of moment, s ← s + ω' (ḡ + (k/Ms) G' ΔM − s). The last sweep stores moments.
+template <class State> CUDA_CALLABLE inline void sweep(State& state, const Span& at, bool last) {
+    if (at.row == 0 && share() == 0) state.condition.data[0] = 0; // worlds that iterate on set it again
     const auto& world = state.worlds.data[at.world];
     if (world.next != STEP_AND_SWEEP) return;
     Real* const from = last ? state.swept.data : state.now.data;
@@ -261,8 +263,9 @@ CUDA_CALLABLE inline Wide wide_dot(Vector a, Vector b) {
     return wide(a.x) * wide(b.x) + wide(a.y) * wide(b.y) + wide(a.z) * wide(b.z);
 }
 
-// Keeps an iterate and its residual, and calls put(column, value) for what moments add to the sums of their world.
-template <class State, class Put> CUDA_CALLABLE inline void measure(State& state, const Place& at, Put put) {
+// Stores an iterate and its residual r = g − s, and calls put(column, value) with the moments' terms of the world's
+// sums.
+template <class State, class Put> CUDA_CALLABLE inline void measure(State& state, const Span& at, Put put) {
     const auto& world = state.worlds.data[at.world];
     const History history = history_of(world);
     const Material material = material_of(state, at);
@@ -277,12 +280,13 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     set(state.iterate_s, at, s);
     set(state.iterate_r, at, r);
     const Number length_s = length(s), length_g = length(g);
-    const Number worth_s = material.saturation * curve_ratio(length_s, material.curves);
-    const Number worth_g = material.saturation * curve_ratio(length_g, material.curves);
-    // lengths, not squares: a field of 1e-20 A/m squared is no float32
-    const Wide goal = wide(induced_share(material) * worth_g * length_g),
-               deviation = wide(length(worth_g * g - worth_s * s));
-    const Wide weight = wide(length_s > length_g ? worth_s : worth_g), square = weight * weight;
+    // M(s) = ratio_s s
+    const Number ratio_s = material.saturation * curve_ratio(length_s, material.curves);
+    const Number ratio_g = material.saturation * curve_ratio(length_g, material.curves);
+    // lengths, not squares: the square of 1e-20 A/m underflows float32
+    const Wide goal = wide(induced_share(material) * ratio_g * length_g),
+               deviation = wide(length(ratio_g * g - ratio_s * s));
+    const Wide weight = wide(length_s > length_g ? ratio_s : ratio_g), square = weight * weight;
     const Wide merit = weight * wide(length(r));
     put(DEVIATION, deviation * deviation);
     put(GOAL, goal * goal);
@@ -304,13 +308,15 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     }
 }
 
-// Keeps what the start of the next solve needs of a world's last iterate: its mixture, which is nearer to the solution.
+// Stores the mixture of the last iterate for the start of the next solve; it is closer to the solution than the
+// iterate.
 template <class State>
-CUDA_CALLABLE inline void keep_solution(State& state, const Place& at, Material material, Vector mixed, Vector g) {
+CUDA_CALLABLE inline void keep_solution(State& state, const Span& at, Material material, Vector mixed, Vector g) {
     const Four ball = own_four(state.now.data, 0, at.row);
     const Vector m = moments_of(material, ball.w, mixed), h = material.saturation / material.slope * g;
     Real* const past = state.past.data;
-    for (int quarter = 0; quarter < 2; ++quarter) put_four(past, 2 + quarter, at.row, own_four(past, quarter, at.row));
+    for (int quarter = 0; quarter < 2; ++quarter) // the last solution becomes the one before
+        put_four(past, 2 + quarter, at.row, own_four(past, quarter, at.row));
     put_four(past, 0, at.row, ball);
     put_four(past, 1, at.row, {m.x, m.y, m.z, 0});
     set(state.past_field, at, get(state.past_field, at), 1);
@@ -319,8 +325,8 @@ CUDA_CALLABLE inline void keep_solution(State& state, const Place& at, Material 
     set(state.past_g, at, g);
 }
 
-// Takes the step that the world has chosen.
-template <class State> CUDA_CALLABLE inline void advance(State& state, const Place& at) {
+// Takes the world's chosen step: s̄ = s − Σ α_j Δs_j, r̄ = r − Σ α_j Δr_j, s ← s̄ + ω r̄.
+template <class State> CUDA_CALLABLE inline void advance(State& state, const Span& at) {
     const auto& world = state.worlds.data[at.world];
     if (world.next == NOTHING) return;
     Vector mixed = {0, 0, 0}, r = {0, 0, 0};
@@ -335,24 +341,24 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
             set(state.best_r, at, r);
         }
         for (int a = 0; a < world.used; ++a) {
-            const int old = slot_of(world.newest, a);
+            const int slot = slot_of(world.newest, a);
             const Real alpha = (Real)world.alpha[a];
-            mixed -= alpha * get(state.history_s, at, old);
-            r -= alpha * get(state.history_r, at, old);
+            mixed -= alpha * get(state.history_s, at, slot);
+            r -= alpha * get(state.history_r, at, slot);
         }
     }
-    const Number omega = step_of(state, at, world), longer = whole_step<Real>(omega);
-    const Vector g = mixed + r, next = mixed + (responding(state, at) ? longer : omega) * r;
+    const Number omega = step_of(state, at, world), whole = whole_step<Real>(omega);
+    const Vector g = mixed + r, next = mixed + (responding(state, at) ? whole : omega) * r;
     const Material material = material_of(state, at);
     set(state.s, at, next);
-    // what ends takes a whole step, where moments and field are the material's; s is the next solve's start
+    // A converged world returns moments and field of a whole step, on the curve; s starts the next solve.
     const bool ended = !world.active;
-    const Vector shown = ended ? (mixed + longer * r) : next;
-    const Number radius = numbers_or(entries(state.packed, at, 3), at.held, 0);
-    const Vector m = moments_of(material, radius, shown);
+    const Vector result = ended ? (mixed + whole * r) : next;
+    const Number radius = numbers_or(entries(state.packed, at, 3), at.count, 0);
+    const Vector m = moments_of(material, radius, result);
     store_moments(state, at, m);
     if (ended) {
-        set(state.h, at, material.saturation / material.slope * shown);
+        set(state.h, at, material.saturation / material.slope * result);
         return keep_solution(state, at, material, mixed, g);
     }
     if (world.next != STEP_AND_SWEEP) return;
@@ -363,15 +369,15 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Pla
 }
 
 #if defined(__CUDA_ARCH__)
-// What moment ``row`` adds to the sums of its world.
-template <class State> CUDA_CALLABLE inline wp::vec_t<COLUMNS, double> measured(State& state, int row) {
+// Terms of the moment at ``row`` in the sums of its world.
+template <class State> CUDA_CALLABLE inline wp::vec_t<COLUMNS, double> world_sums(State& state, int row) {
     wp::vec_t<COLUMNS, double> sums;
-    measure(state, place(state, row), [&](int column, Wide value) { sums[column] = value; });
+    measure(state, span_at(state, row), [&](int column, Wide value) { sums[column] = value; });
     return sums;
 }
 #else
-// Sums of a vector of moments.
-template <class State> inline void measure_vector(State& state, const Place& at) {
+// Writes the sums of a vector of moments.
+template <class State> inline void measure_vector(State& state, const Span& at) {
     double* const sums = state.sums.data + (size_t)COLUMNS * (at.row / WIDTH);
     for (int column = 0; column < COLUMNS; ++column) sums[column] = 0;
     measure(state, at, [=](int column, Wide lanes) {
@@ -382,7 +388,7 @@ template <class State> inline void measure_vector(State& state, const Place& at)
     });
 }
 
-// Adds up the sums of a world's vectors and lets it choose its next step.
+// Adds up the sums of a world's vectors, and chooses its next step.
 template <class State> inline void choose_for_world(State& state, int w) {
     constexpr int VECTORS = CHUNK / WIDTH;
     double total[COLUMNS] = {};
@@ -391,9 +397,10 @@ template <class State> inline void choose_for_world(State& state, int w) {
     choose_step(state, w, total);
 }
 
-template <class State> inline void make_pass(State& state, int pass, int row) {
-    const Place at = place(state, row);
-    if (at.held == 0) return;
+// Runs one pass for a vector of moments.
+template <class State> inline void run_pass(State& state, int pass, int row) {
+    const Span at = span_at(state, row);
+    if (at.count == 0) return;
     auto& world = state.worlds.data[at.world];
     if (pass == START) {
         if (state.searching.data[0]) list_neighbors(state, at);
@@ -413,7 +420,7 @@ template <class State> inline void make_pass(State& state, int pass, int row) {
 
 template <class State> inline void theta_flow(int first, int last, int threads, Word* team, State& state) {
     run_passes(team, threads, first, last, CHUNK * state.chunk.shape[0], WIDTH,
-               [&](int pass, int row) { make_pass(state, pass, row); });
+               [&](int pass, int row) { run_pass(state, pass, row); });
 }
 #endif
 }

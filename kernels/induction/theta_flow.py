@@ -1,51 +1,52 @@
 """The accelerated θ flow (Kim and Han 2022, Eqs. 8, 9 and 11, exact in time), kept wholly on the device.
 
-With M1 and M2 symmetric about H_eff, ‖M‖ = Ms cos θ, and ln cot(θ/2) = artanh(‖M‖/Ms) grows linearly in time. Unknown
-is therefore the dual variable s = k f⁻¹(M)/Ms of every inducible moment, so that M = Ms c(‖s‖) ŝ: the exact flow over a
-step is s ← (1 − ω) s + ω k H/Ms, ω = κ/k, κ = βΔtMs. One field evaluation gives the target g = k H(M)/Ms and the
+With M1 and M2 symmetric about H_eff, ‖M‖ = Ms cos θ, and ln cot(θ/2) = artanh(‖M‖/Ms) grows linearly in time. The
+unknown is therefore the dual variable s = k f⁻¹(M)/Ms of every inducible moment, with M = Ms c(‖s‖) ŝ. The exact flow
+over a step is s ← (1 − ω) s + ω k H/Ms, ω = κ/k, κ = βΔtMs. One field evaluation gives the target g = k H(M)/Ms and the
 residual r = g − s. With the last few changes Δs_j, Δr_j from one evaluation to the next, Anderson's step is
 
-    s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖,
+    s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖.
 
-weighted by φ = Ms c(a)/a, a = max(‖s‖, ‖g‖): what a residual is worth in magnetization, so that a saturated moment's
-huge s does not drown the rest. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, convex for the
-ball-averaged kernel: with L_i = 1 + k (2/3 + o_i) it descends from anywhere for ω_i ≤ 1/L_i, and close to the solution
-converges for ω_i < 2/L_i, o_i being the volume that a ball shares with others (``total_overlap`` in ``theta_flow.h``).
-Steps are short where balls overlap, and nowhere else.
+The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to magnetization, so that the large s of saturated
+moments does not dominate. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, which is convex for
+the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that a ball shares with others
+(``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the
+steps converge for ω_i < 2/L_i. Steps are short only where balls overlap.
 
-A step changes most the field at near neighbours, and their part is known without another evaluation of the whole field:
-with the coupling G' of the neighbours that ``neighbors`` lists, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
-follow, ḡ = s̄ + r̄, ω' a little above ω. From cold they spare a pile of touching balls 1 or 2 of 8 to 10 evaluations to
+A step changes the field most at near neighbors, and their part follows without another evaluation of the whole field.
+With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s) follow each step;
+ḡ = s̄ + r̄, and ω' is a little above ω. In cold starts of touching balls they save 1 or 2 of 8 to 10 evaluations to
 1e-3, and more where balls overlap.
 
-An accelerated step or a swept one that leaves the merit ‖φ r‖ more than twice the best is taken back, and a few plain
-steps follow from the best iterate.
+A step with mixing or sweeps is rejected if it leaves the merit ‖φ r‖ more than twice the best. A few plain steps from
+the best iterate follow.
 
-**What a solve returns, and its error.** The residual that ends a solve is good for one more step. Returned are M and H
-of s̄ + ω₁ r̄, M = f(H), with the whole step ω₁ = 1 that solves a lone ball, or less where balls overlap. What the mixture
-removes of r has a known worth in s: at most γ times itself, γ = max ‖φ Δs_j‖/‖φ Δr_j‖. What it leaves, r̄, the step
-corrects, and as much error again is allowed for. Hence the estimate is an amplification of the residual (Eq. 12) of the
-last iterate,
+**Result and error.** The last residual allows one more step. A solve returns M and H of s̄ + ω₁ r̄, with M = f(H). The
+whole step ω₁ is 1, which solves an isolated ball, or less where balls overlap. The part of r that the mixture removes
+changes s by at most γ times that part, γ = max ‖φ Δs_j‖/‖φ Δr_j‖. The step corrects the rest, r̄, and the estimate
+allows the same error again. So the estimate amplifies the residual (Eq. 12) of the last iterate,
 
     error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),   λ = ‖φ (2 − ω₁) r‖/‖φ r‖.
 
-With slow convergence many steps like the last one are to come: σ is their geometric series ρ/(1 − ρ), ρ being ‖φ r‖
-over the smallest before, and at least 1; half of a σ outlives an evaluation. An error below a hundredth of the last
-‖φ Δs‖ is not believed: sweeps over near contacts lag behind the moments. Rounding comes on top of all that, and a
-residual that is no more than rounding is not amplified. ``python -m bench.accuracy arrangements`` compares the estimate
-with the truth.
+With slow convergence many steps like the last one remain. σ is their geometric series ρ/(1 − ρ) and at least 1, with ρ
+the ratio of ‖φ r‖ to its smallest earlier value. Half of a σ carries over to the next evaluation. The error is at least
+a hundredth of the last ‖φ Δs‖, since sweeps over near contacts lag behind the moments. Rounding is not included, and a
+residual at the level of rounding is not amplified. ``python -m bench.accuracy arrangements`` compares the estimate with
+the true error.
 
-s̄ + ω r̄, further by β Δg, is where the next solve starts, Δg the last change of g from solve to solve. Sweeps over
-neighbours go before its first evaluation: the field of the neighbours is computed where they are now, and the field of
-all others, F = H − H0 − G' M, is extrapolated as F₁ + β (F₁ − F₂), F of the last solve and of the one before for the
-present neighbours. Both are those of s̄ and ḡ, which are nearer to the solution than the last iterate. β is what would
-have predicted the last change from the one before it, β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within [0, 1], one for a world: smooth
-motion is followed, noise is not. The changes Δs_j, Δr_j outlive a solve, since the coupling hardly changes: a slow
-mode, as of long columns of balls, costs one evaluation instead of three. All that leaves 1.2 evaluations a solve
-where 243 balls jump (Balls Up). Whatever a start is worth, the solve converges to the one solution.
+**Warm start.** The next solve starts at s̄ + ω r̄ + β Δg, with Δg the last change of g from solve to solve. Sweeps over
+neighbors precede its first evaluation. The neighbors' field is computed at their present positions. The field of all
+other sources, F = H − H0 − G' M, is extrapolated as F₁ + β (F₁ − F₂) from the last two solves. Both F are those of s̄
+and ḡ, which are closer to the solution than the last iterate. Each world has a factor β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within
+[0, 1], which would have predicted the last change from the one before: the start follows smooth motion, and ignores
+noise.
 
-Bodies of few cells respond as wholes to each field that is evaluated (``body_response``). The flow takes the field in
-which they have responded for the field, and whole steps for them, as for lone balls; sweeps leave them out.
+The changes Δs_j, Δr_j outlive a solve, since the coupling hardly changes. A slow mode, such as that of long columns of
+balls, then costs one evaluation instead of three. Balls Up, where 243 balls jump, takes 1.2 evaluations per solve. The
+solve converges to the one solution from any start.
+
+Bodies of few cells respond collectively to each evaluated field (``body_response``). The flow then uses the field after
+their response, and takes whole steps for them, as for isolated balls. Sweeps exclude them.
 """
 
 from functools import cache
@@ -62,12 +63,11 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)
-"""The passes, in order; as in ``theta_flow.h``."""
-_BEGINNERS = 4
+"""Passes in order; as in ``theta_flow.h``."""
+_START_BLOCKS = 4
 """Blocks of a GPU that share a chunk of moments at the start of a solve, where a moment takes a group of threads."""
-
-_RESIDENT = {wp.float32: (3, 5), wp.float64: (2, 3)}
-"""Blocks of 256 threads that a multiprocessor is to hold at the start and in sweeps: compilers take more registers."""
+_RESIDENT_BLOCKS = {wp.float32: (3, 5), wp.float64: (2, 3)}
+"""Blocks of 256 threads per multiprocessor at the start and in sweeps; limits the registers that compilers use."""
 
 
 def _constants(group: int, responding: bool) -> dict:
@@ -81,7 +81,7 @@ def _options(dtype, group: int, responding: bool) -> dict:
 
 @cache
 def _passes_kernel(dtype, responding: bool):
-    """Kernel of passes on a CPU."""
+    """Return the kernel of all passes on a CPU."""
     call = "theta_flow(first, last, threads, team.data, arrays)"
     arguments = {**PASS_ARGUMENTS, "arrays": state_type(dtype)}
     return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(1, responding))
@@ -91,7 +91,7 @@ def _passes_kernel(dtype, responding: bool):
 def _begin_kernel(dtype, group: int, responding: bool):
     state_struct = state_type(dtype)
 
-    @wp.func_native("warpmag::start(state, warpmag::place(state, row));")
+    @wp.func_native("warpmag::start(state, warpmag::span_at(state, row));")
     def start(state: state_struct, row: int): ...
 
     @wp.func_native("warpmag::begin_world(state, w);")
@@ -101,16 +101,16 @@ def _begin_kernel(dtype, group: int, responding: bool):
         module="unique",
         enable_backward=False,
         module_options=_options(dtype, group, responding),
-        launch_bounds=(256, _RESIDENT[dtype][0]),
+        launch_bounds=(256, _RESIDENT_BLOCKS[dtype][0]),
     )
     def begin_flow(state: state_struct):
         block, lane = wp.tid()
-        chunk = state.chunk[block // wp.static(_BEGINNERS)]
-        at_once = wp.block_dim() // wp.static(group)
-        begin = chunk[0] + at_once * (block % wp.static(_BEGINNERS)) + lane // wp.static(group)
-        for row in range(begin, chunk[1], at_once * wp.static(_BEGINNERS)):
+        chunk = state.chunk[block // wp.static(_START_BLOCKS)]
+        moments_per_block = wp.block_dim() // wp.static(group)
+        begin = chunk[0] + moments_per_block * (block % wp.static(_START_BLOCKS)) + lane // wp.static(group)
+        for row in range(begin, chunk[1], moments_per_block * wp.static(_START_BLOCKS)):
             start(state, row)
-        if block == wp.static(_BEGINNERS) * state.chunk_begin[chunk[2]] and lane == 0:
+        if block == wp.static(_START_BLOCKS) * state.chunk_begin[chunk[2]] and lane == 0:
             begin_world(state, chunk[2])
 
     return begin_flow
@@ -118,31 +118,20 @@ def _begin_kernel(dtype, group: int, responding: bool):
 
 @cache
 def _sweep_kernel(dtype, group: int, responding: bool):
-    state_struct = state_type(dtype)
-
-    @wp.func_native("warpmag::sweep(state, warpmag::place(state, row), last == 1);")
-    def sweep_neighbors(state: state_struct, row: int, last: int): ...
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        module_options=_options(dtype, group, responding),
-        launch_bounds=(256, _RESIDENT[dtype][1]),
-    )
-    def sweep(last: int, state: state_struct):
-        sweep_neighbors(state, wp.tid() // wp.static(group), last)
-
-    return sweep
+    call = "sweep(state, warpmag::span_at(state, thread / warpmag::GROUP), last == 1)"
+    arguments, constants = {"last": int, "state": state_type(dtype)}, _constants(group, responding)
+    launch = {"launch_bounds": (256, _RESIDENT_BLOCKS[dtype][1])}
+    return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, launch=launch, **constants)
 
 
 @cache
 def _convergence_kernel(dtype, group: int, responding: bool):
-    """Kernel whose blocks measure a chunk of a world each, the last of which chooses its world's next step."""
+    """Return the kernel that sums chunks of worlds; the last block of a world chooses its next step."""
     state_struct = state_type(dtype)
     columns = wp.types.vector(COLUMNS, wp.float64)
     sum_world = world_summation(dtype, COLUMNS)
 
-    @wp.func_native("return warpmag::measured(state, row);")
+    @wp.func_native("return warpmag::world_sums(state, row);")
     def measure(state: state_struct, row: int) -> columns: ...
 
     @wp.func_native("warpmag::choose_step(state, w, &sums[0]);")
@@ -157,10 +146,10 @@ def _convergence_kernel(dtype, group: int, responding: bool):
             if c == state.chunk_begin[w] and lane == 0:
                 state.worlds[w].next = 0
             return
-        mine = columns()
+        terms = columns()
         if chunk[0] + lane < chunk[1]:
-            mine = measure(state, chunk[0] + lane)
-        last, total = sum_world(mine, c, lane, w, state)
+            terms = measure(state, chunk[0] + lane)
+        last, total = sum_world(terms, c, lane, w, state)
         if last:
             choose_step(state, w, total)
 
@@ -169,16 +158,8 @@ def _convergence_kernel(dtype, group: int, responding: bool):
 
 @cache
 def _advance_kernel(dtype, group: int, responding: bool):
-    state_struct = state_type(dtype)
-
-    @wp.func_native("warpmag::advance(state, warpmag::place(state, row));")
-    def advance_moment(state: state_struct, row: int): ...
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group, responding))
-    def advance(state: state_struct):
-        advance_moment(state, wp.tid())
-
-    return advance
+    call, arguments = "advance(state, warpmag::span_at(state, thread))", {"state": state_type(dtype)}
+    return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(group, responding))
 
 
 @cache
@@ -197,21 +178,21 @@ def _set_kernel(dtype):
 
 
 def launch_set_state(state, magnetizations):
-    """Take given magnetizations [A/m], shape [n], for the last solution of all worlds."""
+    """Launch the start of the next solve from magnetizations [A/m], shape [n], as the last solution of all worlds."""
     wp.launch(
         _set_kernel(state.packed.dtype), dim=state.row.shape[0], inputs=[magnetizations, state], device=state.h.device
     )
 
 
 class Launches:
-    """Launches of the flow on one state, recorded once, which spares packing its arrays every time."""
+    """Recorded launches of the flow on one state, which saves packing its arrays each time."""
 
     def __init__(self, state, bodies: BodyResponses | None):
         """Record the launches for a state that is bound to its moments (``solve_state.bind``).
 
         Args:
             state: The state.
-            bodies: Bodies among the moments that respond as wholes.
+            bodies: Bodies with a collective response; None without them.
         """
         device, dtype, count, chunks = state.h.device, state.packed.dtype, state.row.shape[0], state.chunk.shape[0]
         group, responding = group_threads(device), bodies is not None
@@ -230,9 +211,9 @@ class Launches:
             self.begin, self.sweeps = [passes(START, START)], [passes(FIRST_SWEEP, LAST_SWEEP)]
             self.iteration = [passes(MEASURE, ADVANCE)]
         else:
-            width = group * BLOCK_CHUNK // _BEGINNERS
+            width = group * BLOCK_CHUNK // _START_BLOCKS
             self.begin = [
-                record(_begin_kernel(dtype, group, responding), (_BEGINNERS * chunks, width), block_dim=width)
+                record(_begin_kernel(dtype, group, responding), (_START_BLOCKS * chunks, width), block_dim=width)
             ]
             self.sweeps = [record(_sweep_kernel(dtype, group, responding), group * count, last) for last in (0, 1)]
             self.iteration = [

@@ -31,7 +31,7 @@ class ThetaFlow:
     """Exact flow of the θ dynamics (Kim and Han 2022, Eqs. 8, 9), accelerated, with an automatic step."""
 
     def __init__(self, state, responses: BodyResponses | None = None):
-        """Prepare the dynamics of the moments of ``state``; ``responses`` are the bodies that respond as wholes."""
+        """Act on the moments of ``state``; ``responses`` are the bodies with a collective response."""
         self._state, self._responses = state, responses
 
     def carried(self) -> dict:
@@ -107,8 +107,8 @@ def make_dynamics(name: str, state, *, responses=None, step: float | None = None
 
     Args:
         name: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``.
-        state: State of the solve, after ``solve_state.bind``.
-        responses: Bodies that respond as wholes (``BodyResponses``), or None; only ``theta`` uses them.
+        state: State of the solve, bound to its moments.
+        responses: Bodies with a collective response (``BodyResponses``), or None; only ``theta`` uses them.
         step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means :data:`STEP`.
         damping: Damping α [dimensionless] of ``llg``; None means :data:`DAMPING`.
 

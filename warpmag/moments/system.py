@@ -11,14 +11,14 @@ from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, check_force, 
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.solids import SolidMagnet
-from warpmag.kernels.applied.sources import AppliedSource, Sources
+from warpmag.kernels.applied.sources import AppliedSource, FieldSources
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.eddy.eddy import EddyCurrents
 from warpmag.kernels.fmm.evaluation import sampled_error
 from warpmag.kernels.induction import solve_state
-from warpmag.kernels.induction.bias import launch_add_bias
-from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, WholeBody
+from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, RespondingBody
 from warpmag.kernels.induction.energy import launch_energy
+from warpmag.kernels.induction.solve_state import launch_add_bias
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, uneven
 from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
@@ -131,7 +131,7 @@ class MomentSystem:
         error: Relative error of each world's magnetization, estimated by ``theta`` (see ``kernels.induction``); other
             dynamics give the residual; shape [worlds].
         residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world at its last field evaluation, the computable form of
-            Eq. 12, shape [worlds]; ``theta`` takes one more step after it. For bodies that respond as wholes (see
+            Eq. 12, shape [worlds]; ``theta`` takes one more step after it. For bodies with a collective response (see
             ``kernels.induction.body_response``) H is the field of that response.
         evaluations: Field evaluations of the last solve, shape [worlds].
         converged: 1 where the last solve reached ``rtol``, shape [worlds].
@@ -217,7 +217,7 @@ class MomentSystem:
         self.sources = self.source_interaction = None
         self._magnetizing_field = self._acting_field = self.external_field
         if sources or solids:
-            self.sources = Sources(sources, solids, self._packed, len(layout.ranges()), self.bias)
+            self.sources = FieldSources(sources, solids, self._packed, len(layout.ranges()), self.bias)
             self.source_interaction = AppliedForces(
                 self.sources, layout.worlds, self.external_field, layout.movable,
                 balls=layout.balls if self.settings.contact_model == "multipole" else None,
@@ -242,7 +242,7 @@ class MomentSystem:
         self._inducible_field = PairEvaluation(Quantity.FIELD, of_inducible, packed, packed, state.h0, self.h, **more)
 
     def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
-        """Prepare the corrections between cells. If ``whole``, small bodies respond as wholes."""
+        """Prepare the corrections between cells; ``whole`` is True if small bodies respond collectively."""
         worlds = [(first, middle) for first, middle, _ in layout.ranges()]
         self._cells = self.rotations = None
         if couplings:
@@ -251,9 +251,9 @@ class MomentSystem:
             self.rotations = self._cells.rotations
 
     def _make_responses(self, layout: MomentLayout, couplings) -> BodyResponses | None:
-        """Prepare the response of the bodies that are small enough to respond as wholes."""
+        """Prepare the collective response of bodies of few cells."""
         bodies = [
-            WholeBody(first, int(layout.worlds[first]), number, int(self._cells.rows[number]), coupling.dense)
+            RespondingBody(first, int(layout.worlds[first]), number, int(self._cells.rows[number]), coupling.dense)
             for number, (first, coupling) in enumerate(couplings)
             if len(coupling.radii) <= MOST_CELLS
         ]

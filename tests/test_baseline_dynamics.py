@@ -1,4 +1,4 @@
-"""The rivals of the θ flow: pairs of submagnetizations, against closed forms and the float64 oracle."""
+"""Baseline dynamics: pairs of submagnetizations, against closed forms and the float64 oracle."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from warpmag.declarations import magnets
 from warpmag.errors import InputError
 
 MS = 1.7e6
-RIVALS = ("theta-euler", "llg", "llg-damping")
+BASELINES = ("theta-euler", "llg", "llg-damping")
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_theta_step_parts_from_the_far_pole_and_stops_at_the_field(march):
 
 
 @pytest.mark.parametrize("curve", ["tanh", "clamped"])
-@pytest.mark.parametrize("dynamics", RIVALS)
+@pytest.mark.parametrize("dynamics", BASELINES)
 def test_lone_moment_converges_to_its_curve(dynamics, curve, device):
     """Eq. 7 or Eq. 10, from weak fields to twice saturation; also from a magnetization in another direction."""
     step = 0.05 if dynamics == "llg" else 0.3  # precession is 1/α = 5 times as fast
@@ -145,9 +145,9 @@ def test_theta_euler_is_the_exact_flow_to_first_order(device):
         system.begin()
         system.iterate()
         s = (1.0 - kappa / 3.0) * np.arctanh(start) + kappa * 0.2
-        found = system.magnetizations().numpy()
-        differences.append(np.linalg.norm(found - MS * np.tanh(s) * unit) / MS)
-        assert np.linalg.norm(np.cross(found, unit)) < 1e-12 * MS
+        magnetization = system.magnetizations().numpy()
+        differences.append(np.linalg.norm(magnetization - MS * np.tanh(s) * unit) / MS)
+        assert np.linalg.norm(np.cross(magnetization, unit)) < 1e-12 * MS
     assert differences[0] < 0.08**2
     assert np.divide(differences[:-1], differences[1:]) == pytest.approx([4.0, 4.0], rel=0.1)
 
@@ -157,8 +157,8 @@ def test_theta_euler_is_the_exact_flow_to_first_order(device):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dynamics", RIVALS)
-def test_rivals_find_the_oracles_equilibrium(dynamics, device):
+@pytest.mark.parametrize("dynamics", BASELINES)
+def test_baseline_dynamics_find_the_oracles_equilibrium(dynamics, device):
     """Section 6.3: one solution, in a touching pack. LLG needs a step small enough for its precession."""
     x, h0 = fcc_block((2, 2, 1)), np.array([2e5, -1e5, 4e5])
     exact = oracle.equilibrium(x, 0.005, h0, saturation=MS)

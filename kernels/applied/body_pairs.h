@@ -1,0 +1,69 @@
+// Forces between permanent bodies near each other: the surface charges of one body in the field of the other.
+#pragma once
+#include "applied/target_field.h"
+
+namespace warpmag {
+
+constexpr int EDGE_POINT = 19, FACE_POINT = 7; // numbers of a point on an edge and on a face
+
+// Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those of the two lattices. The surface charges of q are
+// summed in the field of s. The torque is about the first moment of q; all results are in the world.
+template <class Arrays>
+CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const Body& q, const Body& s, Real3& force, Real3& torque,
+                                      Real& energy) {
+    const Real3 center = reference_point(arrays, q);
+    const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)q.shape;
+    const Vector m = broadcast(s.m), m_target = broadcast(q.m);
+    Wrench wrench = zero_wrench();
+    auto potentials = [&](Vector x, Number& phi, Vector& a) { // scalar and vector potential of s, in the frame of q
+        const Vector g = potentials_of(s.solid, s.pose.point_to_body(q.pose.to_world(x) + broadcast(q.pose.origin)));
+        phi = dot(m, g);
+        a = q.pose.to_body(s.pose.to_world(cross(m, g)));
+    };
+    const Vector center_in_body = q.pose.point_to_body(broadcast(center));
+    auto vector_of = [](const Real* rows, int k) {
+        return Vector{numbers(rows + k * CHUNK), numbers(rows + (k + 1) * CHUNK), numbers(rows + (k + 2) * CHUNK)};
+    };
+    const Number negligible = Number(Real(0)) + Real(1e-12) * dot(q.m, q.m);
+    for (int i = tables[6] + WIDTH * share(); i < tables[6] + tables[7]; i += WIDTH * SHARES) {
+        const Real* const at = rows_at(arrays.solids.edge_point.data, EDGE_POINT, i);
+        const Vector n1 = vector_of(at, 12), n2 = vector_of(at, 15), x = vector_of(at, 0);
+        const Number s1 = dot(m_target, n1), s2 = dot(m_target, n2), weight = numbers(at + 18 * CHUNK);
+        if (!any((s1 * s1 + s2 * s2 > negligible) & (weight > 0))) continue;
+        Number phi;
+        Vector a;
+        potentials(x, phi, a);
+        const Number a_tangent = dot(a, vector_of(at, 3));
+        const Vector normal = s1 * vector_of(at, 6) + s2 * vector_of(at, 9);
+        const Vector f = weight * (a_tangent * (s1 * n1 - s2 * n2) - phi * normal);
+        wrench.force += f;
+        wrench.torque += cross(x - center_in_body, f);
+    }
+    for (int i = tables[8] + WIDTH * share(); i < tables[8] + tables[9]; i += WIDTH * SHARES) {
+        const Real* const at = rows_at(arrays.solids.face_point.data, FACE_POINT, i);
+        const Vector n = vector_of(at, 3);
+        const Number charge = dot(m_target, n) * numbers(at + 6 * CHUNK);
+        if (!any((dot(m_target, n) * dot(m_target, n) > negligible) & (charge != 0))) continue;
+        Number phi;
+        Vector a;
+        potentials(vector_of(at, 0), phi, a);
+        wrench.torque += charge * (a - dot(a, n) * n);
+        wrench.energy += charge * phi;
+    }
+    wrench.force = q.pose.to_world(wrench.force), wrench.torque = q.pose.to_world(wrench.torque);
+    const Number minus = Number(Real(-INVERSE_4PI));
+    for (int i = q.first + WIDTH * share(); i < q.first + q.count; i += WIDTH * SHARES) {
+        const size_t pitch = arrays.packed.strides[0] / sizeof(Real);
+        const Real* const rows = arrays.packed.data + i;
+        const Vector x = {numbers(rows), numbers(rows + pitch), numbers(rows + 2 * pitch)};
+        const Mask occupied = first_lanes(q.first + q.count - i);
+        const Number radius = numbers(rows + 3 * pitch);
+        const Vector moment =
+            q.responds ? (Real(4.18879020478639) * radius * radius * radius * broadcast(q.m_world))
+                       : Vector{numbers(rows + 4 * pitch), numbers(rows + 5 * pitch), numbers(rows + 6 * pitch)};
+        const CurlFreeField field = lattice_field(arrays, s, x, radius, occupied, 0, 1);
+        add_wrench(wrench, occupied, target_field(field), minus * moment, x, center);
+    }
+    force = total_of(wrench.force), torque = total_of(wrench.torque), energy = total_of(wrench.energy);
+}
+}
