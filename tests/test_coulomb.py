@@ -13,7 +13,7 @@ import warp as wp
 
 from tests.test_engine_xpbd import CAPACITY, CONTACT, DT, NewtonsXPBD, heap, substep
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
-from warpmag.kernels.contacts.solve import PUSH_OUT
+from warpmag.kernels.contacts.solve import RECOVERY_SPEED
 from warpmag.kernels.shared.native import CHUNK
 
 G = 9.81  # m/s²
@@ -86,7 +86,7 @@ def surface_velocities(one, qd):
 
 def opening_speed(one, v):
     """By which surfaces open faster than they have to; those that are moved do not close gaps."""
-    return (one.gives[1] * v[1] - one.gives[0] * v[0]) @ one.normal + max(one.gap / DT, -PUSH_OUT)
+    return (one.gives[1] * v[1] - one.gives[0] * v[0]) @ one.normal + max(one.gap / DT, -RECOVERY_SPEED)
 
 
 def solve(solver, model, state, contacts):
@@ -95,10 +95,9 @@ def solve(solver, model, state, contacts):
     begin.assign(state)
     solver.step(begin, end, None, contacts, DT)
     arrays = solver._solve.arrays
-    given = arrays["given"].numpy().reshape(-1, 12, CHUNK)[:, :3].swapaxes(1, 2).reshape(-1, 3).astype(float)
-    impulses = dict(
-        zip(arrays["entry"].numpy()[: len(given)].tolist()[::-1], given[::-1], strict=True)
-    )  # the first count
+    last = arrays.impulse.numpy().reshape(-1, 12, CHUNK)[:, :3].swapaxes(1, 2).reshape(-1, 3).astype(float)
+    listed = arrays.entry.numpy()[: len(last)].tolist()
+    impulses = dict(zip(listed[::-1], last[::-1], strict=True))  # of a repeated entry, the first one counts
     return contact_ends(model, state, contacts, impulses), end.body_qd.numpy().astype(float)
 
 

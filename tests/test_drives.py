@@ -116,7 +116,7 @@ def test_a_joint_outside_of_its_limits_goes_back_slowly(device):
     bar, _ = hinge(builder, 0.0, limit_lower=0.5, limit_upper=1.5)
     simulation = Simulation(builder, device=device, step=STEP)
     path = angles(simulation, bar, (0.0, 1.0, 0.0), 300)
-    assert np.diff(path).max() < 1.05 * 10.0 * STEP  # rad, _TURNING of kernels.contacts.joints
+    assert np.diff(path).max() < 1.05 * 10.0 * STEP  # rad, _RETURN_RATE of kernels.contacts.joints
     assert path[100] > 0.499 and path[100:].min() > 0.499 and path.max() < 1.501
     assert simulation.statistics.substeps == 600
 

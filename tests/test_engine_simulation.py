@@ -15,7 +15,7 @@ from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.stepping.simulation import Simulation
 from warpmag.engine.stepping.statistics import find_held
 from warpmag.engine.stepping.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
-from warpmag.kernels.rigid.monitor import FREE
+from warpmag.kernels.rigid.monitor import UNCONSTRAINED_WEIGHT
 from warpmag.kernels.shared.scan import launch_scan
 from warpmag.scenes_usd import authoring
 
@@ -143,7 +143,7 @@ def test_substeps_follow_the_speed(device):
     )
     [first] = advance(stepper)
     assert first.substeps == 4  # 15 m/s × 1 ms / 4 is 0.75 radii, a ball alone may move one
-    assert first.travel == pytest.approx(FREE * 15.0 * 1e-3 / 4 / R, rel=1e-5)
+    assert first.travel == pytest.approx(UNCONSTRAINED_WEIGHT * 15.0 * 1e-3 / 4 / R, rel=1e-5)
     assert first.travel < TRAVEL_LIMIT < 2.0 * first.travel
     advance(stepper, 5)
     assert stepper.state.body_q.numpy()[0, 0] < 0.05  # it did not pass the wall, which is thinner than a step

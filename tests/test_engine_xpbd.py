@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
-from warpmag.kernels.contacts.solve import PUSH_OUT
+from warpmag.kernels.contacts.solve import RECOVERY_SPEED
 
 R, DT = 0.005, 5e-4  # m, s
 OVERLAP = 2e-4  # of balls over their radius, where friction should not depend on it
@@ -191,7 +191,7 @@ def test_a_substep_pushes_as_little_as_it_has_to(kind, device):
     moved = np.einsum("bij,cbj->cbi", inverse, rows)
     before = state.body_qd.numpy().astype(float)
     system = np.einsum("cbi,dbi->cd", rows, moved)
-    start = np.einsum("cbi,bi->c", rows, before) + np.maximum(gaps / DT, -PUSH_OUT)
+    start = np.einsum("cbi,bi->c", rows, before) + np.maximum(gaps / DT, -RECOVERY_SPEED)
     impulse = ahead = np.zeros(len(gaps))
     step = 1.0 / np.linalg.eigvalsh(system)[-1]
     for iteration in range(10_000):  # Nesterov's, begun anew where it goes too far
@@ -261,7 +261,7 @@ def test_a_substep_repeats_bit_by_bit(kind, device):
     """
     on_gpu = wp.get_device(device).is_cuda
     model, state, contacts = heap(kind, device)
-    forms = [({}, {}), ({"cluster": 0}, {"cluster": 0})] if on_gpu else [({}, {"most": 3})]
+    forms = [({}, {}), ({"cluster": 0}, {"cluster": 0})] if on_gpu else [({}, {"limit": 3})]
     first = [substep(altered(**changes), model, state, contacts, count=2) for changes, _ in forms]
     order = np.arange(contacts.rigid_contact_count.numpy()[0])
     if on_gpu:
@@ -304,7 +304,7 @@ def test_a_cluster_solves_as_launches_do(kind, device):
     """What is too much for it, launches solve to the same bits; compilers may round what it solves otherwise."""
     model, state, contacts = heap(kind, device)
     launches, left, cluster = (
-        substep(altered(**changes), model, state, contacts) for changes in ({"cluster": 0}, {"most": 10}, {})
+        substep(altered(**changes), model, state, contacts) for changes in ({"cluster": 0}, {"limit": 10}, {})
     )
     for value, expected in zip(left, launches, strict=True):
         np.testing.assert_array_equal(value, expected)

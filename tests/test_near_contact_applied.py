@@ -107,7 +107,7 @@ def field_of(source, device):
 
 @pytest.mark.parametrize("name", SOURCES)
 @pytest.mark.parametrize(("size", "place"), [(R, (0.011, 0.0, 0.004)), (0.008, (0.005, 0.003, -0.012))])
-def test_force_in_an_uneven_field(name, size, place, device):
+def test_force_in_a_nonuniform_field(name, size, place, device):
     """A radius or more away from wires within 0.5 % of the exact series; dipoles lack up to 26 %."""
     source, field = SOURCES[name], field_of(SOURCES[name], device)
     for susceptibility in (math.inf, 1.0):

@@ -56,10 +56,16 @@ class Rules:
 
 @pytest.fixture
 def machine(device):
-    limits = {"travel": TRAVEL, "shared_travel": SHARED_TRAVEL, "overlap": OVERLAP, "ease": EASE, "futile": FUTILE}
-    machine = stepping.StepMachine(16, 1, device, **limits, fewest=FEWEST)
+    limits = {
+        "travel": TRAVEL,
+        "shared_travel": SHARED_TRAVEL,
+        "overlap": OVERLAP,
+        "growth_margin": EASE,
+        "futile_ratio": FUTILE,
+    }
+    machine = stepping.StepMachine(16, 1, device, **limits, first_level_substeps=FEWEST)
     machine.arrays.capacities.fill_(CAPACITY)
-    machine.keep([wp.zeros(1, dtype=float, device=device)], [wp.zeros(1, dtype=float, device=device)])
+    machine.set_state_arrays([wp.zeros(1, dtype=float, device=device)], [wp.zeros(1, dtype=float, device=device)])
     return machine
 
 
@@ -139,7 +145,7 @@ def test_the_device_follows_the_rules(machine):
 
 def test_time_is_counted_for_the_stage_that_it_was_spent_in(machine):
     arrays = machine.arrays
-    watched = machine.watched(np.zeros(0), np.zeros(0))
+    watched = machine.make_monitor(np.zeros(0), np.zeros(0))
     machine.begin_step()
     work = wp.zeros(1 << 20, dtype=float, device=arrays.ticks.device)
     for _ in range(20):
@@ -160,7 +166,7 @@ def test_a_state_of_any_arrays_is_saved_and_restored(machine, device, flags):
     if flags:
         own.append(wp.array(rng.random(flags) < 0.5, dtype=wp.bool, device=device))
     saved = [wp.zeros_like(one) for one in own]
-    machine.keep(own, saved)
+    machine.set_state_arrays(own, saved)
     before = [one.numpy() for one in own]
 
     machine.set_status(stepping.STATUS_HALT, stepping.PAUSED)
@@ -182,14 +188,39 @@ def test_a_state_of_any_arrays_is_saved_and_restored(machine, device, flags):
         np.testing.assert_array_equal(one.numpy(), expected)
 
 
+WEIGHT = monitor.UNCONSTRAINED_WEIGHT
 GLIDING = {  # velocities of two balls of radius 1 beside each other along x, their gap, what tells within 0.1, and 0.2
-    "together": ((0.0, 9.0, 0.0), (0.0, 9.0, 0.0), 0.0, 0.9 * monitor.FREE, 0.9 * monitor.FREE),
+    "together": (
+        (0.0, 9.0, 0.0),
+        (0.0, 9.0, 0.0),
+        0.0,
+        0.9 * WEIGHT,
+        0.9 * WEIGHT,
+    ),
     "gliding, pressed": ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), -0.001, 0.2, 0.2),
-    "gliding, parting": ((-0.1, -1.0, 0.0), (0.1, 1.0, 0.0), 0.001, 0.1005 * monitor.FREE, 0.1005 * monitor.FREE),
+    "gliding, parting": (
+        (-0.1, -1.0, 0.0),
+        (0.1, 1.0, 0.0),
+        0.001,
+        0.1005 * WEIGHT,
+        0.1005 * WEIGHT,
+    ),
     "gliding, touching soon": ((0.2, -1.0, 0.0), (0.0, 1.0, 0.0), 0.01, 0.2, 0.2),
-    "gliding, touching later": ((0.2, -1.0, 0.0), (0.0, 1.0, 0.0), 0.03, 0.102 * monitor.FREE, 0.2),
-    "gliding past": ((0.2, -1.0, 0.0), (0.0, 1.0, 0.0), 0.05, 0.102 * monitor.FREE, 0.102 * monitor.FREE),
-    "meeting": ((2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), 0.1, 0.2 * monitor.FREE, 0.2 * monitor.FREE),
+    "gliding, touching later": ((0.2, -1.0, 0.0), (0.0, 1.0, 0.0), 0.03, 0.102 * WEIGHT, 0.2),
+    "gliding past": (
+        (0.2, -1.0, 0.0),
+        (0.0, 1.0, 0.0),
+        0.05,
+        0.102 * WEIGHT,
+        0.102 * WEIGHT,
+    ),
+    "meeting": (
+        (2.0, 0.0, 0.0),
+        (-2.0, 0.0, 0.0),
+        0.1,
+        0.2 * WEIGHT,
+        0.2 * WEIGHT,
+    ),
 }
 
 
@@ -205,13 +236,13 @@ def test_what_tells_is_how_bodies_glide_along_each_other_where_they_touch(case, 
     model = builder.finalize(device=device)
     sizes = body_sizes(model)
     solver = RigidSolver(model, sizes)
-    watched = machine.watched(sizes.thickness, sizes.reach)
+    watched = machine.make_monitor(sizes.thickness, sizes.reach)
     watched.fills = wp.array(solver.fills(), dtype=wp.uint64, device=device)
     watched.counts = wp.zeros(monitor.COUNT_CAPACITIES + len(solver.buffers), dtype=wp.int32, device=device)
     machine.set_status(stepping.STATUS_LEVEL, level)
     state = model.state()
     solver.collide(state, 0.4)
-    for substep, where in ((1, monitor.PEAK_TRAVEL), (monitor.NEXT, monitor.PEAK_NEXT_TRAVEL)):
+    for substep, where in ((1, monitor.PEAK_TRAVEL), (monitor.NEXT_SUBSTEP, monitor.PEAK_NEXT_TRAVEL)):
         watched.peaks.zero_()
         solver.watch(watched, state, substep=substep, longest=0.1 * 2**level, threshold=0.0)
         peaks = watched.peaks.numpy()
@@ -230,7 +261,7 @@ def test_what_tells_is_how_far_forces_pull(level, machine, device):
     builder.add_body(is_kinematic=True)  # which forces do not move
     model = builder.finalize(device=device)
     sizes = body_sizes(model)
-    watched = machine.watched(sizes.thickness, sizes.reach)
+    watched = machine.make_monitor(sizes.thickness, sizes.reach)
     machine.set_status(stepping.STATUS_LEVEL, level)
     state = model.state()
     forces = np.zeros((2, 6), dtype=np.float32)

@@ -11,7 +11,7 @@ from small_stages import CHAIN, FIELD, IRON, LEFT, PERMANENT, RIGHT, A, B, C, G,
 import warpmag
 from warpmag.engine.stepping.simulation import Simulation
 from warpmag.errors import SimulationError
-from warpmag.kernels.contacts.solve import PUSH_OUT
+from warpmag.kernels.contacts.solve import RECOVERY_SPEED
 
 
 def advance(simulation, seconds):
@@ -301,7 +301,7 @@ def test_two_letters_at_one_place_come_apart_and_a_line_says_why(device, tmp_pat
     assert np.isfinite(velocities).all()
     # masses are equal; what pushes letters apart rounds as speeds up to the fastest on the way do
     np.testing.assert_allclose(velocities.sum(axis=0), 0.0, atol=1e-4 * simulation.finish().peak_speed)
-    assert np.abs(velocities).max() < 2.0 * PUSH_OUT  # of points; centres may go faster than these
+    assert np.abs(velocities).max() < 2.0 * RECOVERY_SPEED  # of points; centres may go faster than these
 
 
 def test_what_leaves_all_finite_numbers_is_told_with_what_was_wrong_before(device, tmp_path):

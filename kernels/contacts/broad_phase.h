@@ -1,8 +1,9 @@
-// Pairs of shapes whose boxes meet within a substep, those of Newton's broad phase; of balls, their contacts.
+// Broad phase: pairs of shapes whose bounding boxes overlap in a substep, as in Newton's broad phase; and the contacts
+// of balls.
 //
-// Targets are balls, then the other shapes, numbered as in broad_phase.py. A ball finds other balls in its list of
-// neighbours; the boxes of other shapes stand in rows of a table, side by side for a vector of them, those of all
-// worlds first.
+// Targets are the balls, then the other shapes, numbered as in broad_phase.py. A ball finds other balls in its neighbor
+// list. The boxes of other shapes are columns of a table, so that a vector of them is read at once. Shapes of all
+// worlds come first.
 #pragma once
 #include "contacts/ball_contacts.h"
 #include "contacts/box_gap.h"
@@ -19,12 +20,12 @@ CUDA_CALLABLE inline const Real* row_of(const wp::array_t<wp::vec3>& vectors, in
     return (const Real*)vectors.data + 3 * (size_t)i;
 }
 
-// Displacement [m] of a shape within the substep; shapes of still scenes have none.
+// Component of a shape's displacement in the substep [m]; 0 if the array is empty.
 template <class Arrays> CUDA_CALLABLE inline Real displacement(const Arrays& arrays, int shape, int c) {
     return arrays.displacement.shape[0] ? row_of(arrays.displacement, shape)[c] : Real(0);
 }
 
-// Box of all places of a shape's box within the substep.
+// Box that encloses a shape's box throughout the substep.
 template <class Arrays> CUDA_CALLABLE inline Box swept_box(const Arrays& arrays, int shape) {
     Box box;
     for (int c = 0; c < 3; ++c) {
@@ -36,15 +37,15 @@ template <class Arrays> CUDA_CALLABLE inline Box swept_box(const Arrays& arrays,
 }
 
 #if defined(__CUDA_ARCH__)
-// Takes a distance of contact into the largest, which was set to zero; positive numbers are in the order of their bits.
-template <class Lists> __device__ inline void note_reach(const Lists& lists, double reach) {
+// Raises the search distance, which starts at zero. Positive floating-point numbers compare like their bits.
+template <class Lists> __device__ inline void raise_search_distance(const Lists& lists, double reach) {
     auto* const largest = (unsigned long long*)lists.reach.data;
     const auto bits = (unsigned long long)__double_as_longlong(reach);
     if (isfinite(reach) && bits > *largest) atomicMax(largest, bits);
 }
 #else
-// The largest distance of contact, once all balls are placed.
-template <class Lists> inline void find_reach(const Lists& lists) {
+// Finds the search distance of neighbors, twice the largest radius, once all balls are placed.
+template <class Lists> inline void find_search_distance(const Lists& lists) {
     const Balls balls = balls_of(lists);
     Real radius = 0;
     for (int i = 0; i < lists.group.shape[0]; ++i) radius = balls.radius[i] > radius ? balls.radius[i] : radius;
@@ -52,9 +53,9 @@ template <class Lists> inline void find_reach(const Lists& lists) {
 }
 #endif
 
-// Stores where a ball is in the middle of the substep, with a radius that holds all of its places, and whether the
-// lists are too old for it; or the swept box of another shape. A ball that moves farther than contacts are sought ahead
-// is taken where it is, with that farthest distance around it.
+// Stores the swept box of a shape, or for a ball the center and radius of a ball that encloses it throughout the
+// substep, and whether its neighbor list is out of date. For a ball that moves farther than ``farthest``, the enclosing
+// ball is at its present position, with that distance added to its radius.
 template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arrays, int target) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     if (target >= balls) {
@@ -68,30 +69,30 @@ template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arr
     }
     const size_t pitch = arrays.lists.packed.strides[0] / sizeof(Real);
     Real* const packed = (Real*)arrays.lists.packed.data + target;
-    const Real* const found_at = row_of(arrays.lists.found_at, target);
-    Real d[3], way = 0, moved = 0;
-    for (int c = 0; c < 3; ++c) d[c] = displacement(arrays, shape, c), way += d[c] * d[c];
-    way = sqrt(way);
-    const bool far = way > arrays.farthest;
+    const Real* const list_position = row_of(arrays.lists.found_at, target);
+    Real d[3], motion = 0, moved = 0;
+    for (int c = 0; c < 3; ++c) d[c] = displacement(arrays, shape, c), motion += d[c] * d[c];
+    motion = sqrt(motion);
+    const bool far = motion > arrays.farthest;
     for (int c = 0; c < 3; ++c) {
         const Real sides = row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c];
         const Real x = Real(0.5) * (far ? sides : sides + d[c]);
         packed[c * pitch] = x;
-        moved += (x - found_at[c]) * (x - found_at[c]);
+        moved += (x - list_position[c]) * (x - list_position[c]);
     }
-    packed[3 * pitch] = arrays.radius.data[target] + (far ? arrays.farthest : Real(0.5) * way);
+    packed[3 * pitch] = arrays.radius.data[target] + (far ? arrays.farthest : Real(0.5) * motion);
 #if defined(__CUDA_ARCH__)
-    note_reach(arrays.lists, 2.0 * packed[3 * pitch]);
+    raise_search_distance(arrays.lists, 2.0 * packed[3 * pitch]);
 #endif
-    const Real found_radius = packed[4 * pitch], grown = packed[3 * pitch] - found_radius;
-    if (!(sqrt(moved) + (grown > 0 ? grown : 0) <= SKIN * found_radius)) arrays.lists.moved.data[0] = 1;
+    const Real list_radius = packed[4 * pitch], grown = packed[3 * pitch] - list_radius;
+    if (!(sqrt(moved) + (grown > 0 ? grown : 0) <= SKIN * list_radius)) arrays.lists.moved.data[0] = 1;
 }
 
-// Whether collision groups a and b collide: a positive one with itself and negative ones, a negative one with all but
-// itself, zero with none.
+// True if collision groups a and b collide. A positive group collides with itself and with negative ones, a negative
+// group with all but itself, group 0 with none.
 CUDA_CALLABLE inline bool groups_collide(int a, int b) { return a && b && (a > 0 ? a == b || b < 0 : a != b); }
 
-// Whether a pair is listed among the excluded, which are sorted.
+// True if a pair is in the sorted list of excluded pairs.
 template <class Arrays> CUDA_CALLABLE inline bool is_excluded(const Arrays& arrays, int a, int b) {
     int low = 0, high = arrays.excluded_count;
     while (low < high) {
@@ -107,7 +108,7 @@ template <class Arrays> CUDA_CALLABLE inline bool is_fixed(const Arrays& arrays,
     return body < 0 || (arrays.body_flags.shape[0] && arrays.body_flags.data[body] & KINEMATIC);
 }
 
-// Whether shapes a < b may collide at all, unless they are excluded.
+// True if the bodies, worlds and collision groups of shapes a < b allow a collision.
 template <class Arrays> CUDA_CALLABLE inline bool may_collide(const Arrays& arrays, int a, int b) {
     const int body_a = arrays.body.data[a], body_b = arrays.body.data[b];
     const int world_a = arrays.world.data[a], world_b = arrays.world.data[b];
@@ -116,8 +117,8 @@ template <class Arrays> CUDA_CALLABLE inline bool may_collide(const Arrays& arra
     return groups_collide(arrays.group.data[a], arrays.group.data[b]);
 }
 
-// Whether the boxes of two shapes, which move evenly, meet at some time of the substep.
-template <class Arrays> CUDA_CALLABLE inline bool boxes_meet(const Arrays& arrays, int a, int b) {
+// True if the boxes of two shapes, moving at constant velocity, overlap at some time of the substep.
+template <class Arrays> CUDA_CALLABLE inline bool boxes_overlap(const Arrays& arrays, int a, int b) {
     Real enter = 0, leave = 1;
     for (int c = 0; c < 3; ++c) {
         const Real before = row_of(arrays.lower, b)[c] - row_of(arrays.upper, a)[c];
@@ -134,31 +135,31 @@ template <class Arrays> CUDA_CALLABLE inline bool boxes_meet(const Arrays& array
     return enter <= leave;
 }
 
-// Tries the pair of a target's shape and another: calls found(a, b) if Newton is to look for contacts of a < b, or
-// found(a, b, touch) if they are in contact.
-template <class Arrays, class Found>
-CUDA_CALLABLE inline void try_pair(const Arrays& arrays, int shape, int other, Found found) {
+// Tests a pair of shapes. Calls report(a, b), a < b, for a pair of Newton's narrow phase, and report(a, b, contact) for
+// a contact of a ball.
+template <class Arrays, class Report>
+CUDA_CALLABLE inline void test_pair(const Arrays& arrays, int shape, int other, Report report) {
     const int a = shape < other ? shape : other, b = shape < other ? other : shape;
-    if (!may_collide(arrays, a, b) || !boxes_meet(arrays, a, b) || is_excluded(arrays, a, b)) return;
-    if (!is_touch(arrays, a, b)) {
-        if (!are_boxes(arrays, a, b) || !boxes_apart(arrays, a, b)) found(a, b);
+    if (!may_collide(arrays, a, b) || !boxes_overlap(arrays, a, b) || is_excluded(arrays, a, b)) return;
+    if (!involves_ball(arrays, a, b)) {
+        if (!are_boxes(arrays, a, b) || !boxes_separated(arrays, a, b)) report(a, b);
         return;
     }
-    const Touch touch = touch_of(arrays, a, b);
-    if (is_contact(arrays, touch)) found(a, b, touch);
+    const BallContact contact = detect_ball_contact(arrays, a, b);
+    if (is_contact(arrays, contact)) report(a, b, contact);
 }
 
-// Calls visit(lane) for those lanes of a vector that are wanted.
-template <class Visit> CUDA_CALLABLE inline void each_of(Mask wanted, Visit visit) {
+// Calls visit(lane) for the set lanes of a mask.
+template <class Visit> CUDA_CALLABLE inline void for_each_lane(Mask mask, Visit visit) {
 #if defined(__CUDA_ARCH__)
-    if (wanted) visit(0);
+    if (mask) visit(0);
 #else
-    for (unsigned bits = bits_of(wanted); bits; bits &= bits - 1) visit(__builtin_ctz(bits));
+    for (unsigned bits = bits_of(mask); bits; bits &= bits - 1) visit(__builtin_ctz(bits));
 #endif
 }
 
-// Whether the swept boxes in columns from ``first`` on meet another.
-CUDA_CALLABLE inline Mask meeting(const Real* boxes, size_t pitch, int first, const Box& own) {
+// Lanes of the vector of swept boxes from column ``first`` on that overlap another box.
+CUDA_CALLABLE inline Mask overlapping(const Real* boxes, size_t pitch, int first, const Box& own) {
     Mask meet = mask_of(lanes() == lanes());
     for (int c = 0; c < 3; ++c)
         meet &= (numbers(boxes + c * pitch + first) <= own.upper[c])
@@ -166,40 +167,41 @@ CUDA_CALLABLE inline Mask meeting(const Real* boxes, size_t pitch, int first, co
     return meet;
 }
 
-// Tries a target's shape with the other shapes ``begin`` to ``end`` whose swept boxes meet its own.
-template <class Arrays, class Found>
-CUDA_CALLABLE inline void try_boxes(const Arrays& arrays, int shape, const Box& own, int begin, int end, Found found) {
+// Tests a target's shape with other shapes ``begin`` to ``end`` whose swept boxes overlap its own.
+template <class Arrays, class Report>
+CUDA_CALLABLE inline void test_boxes(const Arrays& arrays, int shape, const Box& own, int begin, int end,
+                                     Report report) {
     const int* const others = arrays.shape.data + arrays.lists.group.shape[0];
 #if defined(__CUDA_ARCH__)
-    // what a group finds is tried by all of its threads together
-    constexpr int ROOM = 64;
-    __shared__ int lists[BLOCK / GROUP][ROOM];
+    // the threads of a group first list the overlapping boxes, then share the tests
+    constexpr int LIST_CAPACITY = 64;
+    __shared__ int lists[BLOCK / GROUP][LIST_CAPACITY];
     int* const list = lists[threadIdx.x / GROUP];
     int count = 0;
     for (int first = begin; first < end; first += GROUP) {
         const int i = first + share();
-        count += append(list + count, i, i < end && meeting(arrays.boxes.data, arrays.boxes.shape[1], i, own));
-        if (count <= ROOM - GROUP && first + GROUP < end) continue;
+        count += append(list + count, i, i < end && overlapping(arrays.boxes.data, arrays.boxes.shape[1], i, own));
+        if (count <= LIST_CAPACITY - GROUP && first + GROUP < end) continue;
         __syncwarp(group_mask());
-        for (int n = share(); n < count; n += GROUP) try_pair(arrays, shape, others[list[n]], found);
+        for (int n = share(); n < count; n += GROUP) test_pair(arrays, shape, others[list[n]], report);
         __syncwarp(group_mask());
         count = 0;
     }
 #else
     for (int block = begin / WIDTH; block * WIDTH < end; block += WIDTH) {
-        each_of(meeting(arrays.bounds.data, arrays.bounds.shape[1], block, own), [&](int b) {
+        for_each_lane(overlapping(arrays.bounds.data, arrays.bounds.shape[1], block, own), [&](int b) {
             const int first = (block + b) * WIDTH;
-            const Mask meet = meeting(arrays.boxes.data, arrays.boxes.shape[1], first, own)
+            const Mask meet = overlapping(arrays.boxes.data, arrays.boxes.shape[1], first, own)
                               & mask_of((lanes() >= begin - first) & (lanes() < end - first));
-            each_of(meet, [&](int l) { try_pair(arrays, shape, others[first + l], found); });
+            for_each_lane(meet, [&](int l) { test_pair(arrays, shape, others[first + l], report); });
         });
     }
 #endif
 }
 
-// Finds all pairs and contacts of which this target is the later one.
-template <class Arrays, class Found>
-CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Found found) {
+// Finds all pairs and contacts of a target with targets of smaller index.
+template <class Arrays, class Report>
+CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Report report) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     int last = arrays.boxes.shape[1];
     if (target < balls) {
@@ -214,29 +216,29 @@ CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Found 
             const Vector r = {own.x[target] - collect(own.x, place), own.y[target] - collect(own.y, place),
                               own.z[target] - collect(own.z, place)};
             const Number reach = own.radius[target] + collect(own.radius, place);
-            each_of((dot(r, r) <= reach * reach) & mask_of(earlier),
-                    [&](int l) { try_pair(arrays, shape, arrays.shape.data[lane_of(place, l)], found); });
+            for_each_lane((dot(r, r) <= reach * reach) & mask_of(earlier),
+                          [&](int l) { test_pair(arrays, shape, arrays.shape.data[lane_of(place, l)], report); });
         }
     } else {
         last = target - balls;
     }
     const Box own = swept_box(arrays, shape);
     const wp::vec2i range = arrays.range.data[target];
-    try_boxes(arrays, shape, own, 0, arrays.shared < last ? arrays.shared : last, found);
-    // in a world those that cannot move come first, and do not collide with each other
+    test_boxes(arrays, shape, own, 0, arrays.shared < last ? arrays.shared : last, report);
+    // shapes of a world that cannot move do not collide with each other
     if (target < balls || arrays.body.data[shape] >= 0)
-        try_boxes(arrays, shape, own, range[0], range[1] < last ? range[1] : last, found);
+        test_boxes(arrays, shape, own, range[0], range[1] < last ? range[1] : last, report);
 }
 
-// Remembers the radius that a ball was listed with.
-template <class Arrays> CUDA_CALLABLE inline void keep_radius(const Arrays& arrays, int target) {
+// Stores the radius that a ball's neighbor list was made with.
+template <class Arrays> CUDA_CALLABLE inline void store_list_radius(const Arrays& arrays, int target) {
     const size_t pitch = arrays.lists.packed.strides[0] / sizeof(Real);
     Real* const packed = (Real*)arrays.lists.packed.data + target;
     if (target < arrays.lists.group.shape[0] && arrays.lists.searching.data[0]) packed[4 * pitch] = packed[3 * pitch];
 }
 
 #if !defined(__CUDA_ARCH__)
-// Boxes around those of each vector of other shapes; none around what pads the last.
+// Finds the bounding box of each vector of swept boxes. Padding contains empty boxes.
 template <class Arrays> inline void bound_boxes(const Arrays& arrays) {
     const size_t pitch = arrays.boxes.shape[1], blocks = arrays.bounds.shape[1];
     for (size_t first = 0; first + WIDTH <= pitch; first += WIDTH)
@@ -248,46 +250,48 @@ template <class Arrays> inline void bound_boxes(const Arrays& arrays) {
 }
 #endif
 
+// Stores the enclosing balls and swept boxes of all targets.
 template <class Word, class Arrays>
 CUDA_CALLABLE inline void place_targets(int thread, int threads, Word* team, const Arrays& arrays) {
 #if defined(__CUDA_ARCH__)
     if (thread < arrays.shape.shape[0]) place_target(arrays, thread);
 #else
     share_out(team, threads, arrays.shape.shape[0], TARGETS_AT_ONCE, [&](int t) { place_target(arrays, t); });
-    find_reach(arrays.lists);
+    find_search_distance(arrays.lists);
     bound_boxes(arrays);
 #endif
 }
 
-// Writes pair n, and contact n; more may be found than there is room for.
-template <class Arrays> CUDA_CALLABLE inline void put_found(const Arrays& arrays, int n, int a, int b) {
+// Writes pair n, or contact n; results beyond the capacity are only counted.
+template <class Arrays> CUDA_CALLABLE inline void write_result(const Arrays& arrays, int n, int a, int b) {
     if (n < arrays.pairs.shape[0]) arrays.pairs.data[n] = wp::vec2i(a, b);
 }
-template <class Arrays> CUDA_CALLABLE inline void put_found(const Arrays& arrays, int n, int, int, const Touch& touch) {
-    if (n < arrays.contacts.shape0.shape[0]) put_contact(arrays, touch, n);
+template <class Arrays>
+CUDA_CALLABLE inline void write_result(const Arrays& arrays, int n, int, int, const BallContact& contact) {
+    if (n < arrays.contacts.shape0.shape[0]) write_contact(arrays, contact, n);
 }
 
-// Writes all pairs and the contacts of balls, on a CPU in the order of targets.
+// Writes all pairs and the contacts of balls; on a CPU in the order of targets.
 template <class Word, class Arrays>
 CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const Arrays& arrays) {
 #if defined(__CUDA_ARCH__)
     const int target = thread / GROUP;
-    if (share() == 0) keep_radius(arrays, target);
+    if (share() == 0) store_list_radius(arrays, target);
     if (thread == 0) arrays.lists.reach.data[0] = 0; // for the next search
-    find_pairs_of(arrays, target, [&](int a, int b, auto... touch) {
-        int* const count = sizeof...(touch) ? arrays.contacts.count.data : arrays.pair_count.data;
-        put_found(arrays, atomicAdd(count, 1), a, b, touch...);
+    find_pairs_of(arrays, target, [&](int a, int b, auto... contact) {
+        int* const count = sizeof...(contact) ? arrays.contacts.count.data : arrays.pair_count.data;
+        write_result(arrays, atomicAdd(count, 1), a, b, contact...);
     });
 #else
-    // chunks of targets note what they find; where that is too much, it is found again
-    struct Note {
+    // a chunk of targets buffers its results; if the buffer is too small, the search is repeated
+    struct Result {
         int a, b;
-        Touch touch; // if the pair is one of a ball
+        BallContact contact; // of a pair with a ball
     };
-    static_assert(sizeof(Note) == NOTE * sizeof(int), "broad_phase.py gives each note its room");
-    const int targets = arrays.shape.shape[0], chunks = arrays.found.shape[0];
-    auto counts_of = [&](int chunk) { return arrays.found.data + (size_t)arrays.found.shape[1] * chunk; };
-    auto notes_of = [&](int chunk) { return (Note*)(counts_of(chunk) + 2); };
+    static_assert(sizeof(Result) == RESULT_SIZE * sizeof(int), "broad_phase.py has the size of a result");
+    const int targets = arrays.shape.shape[0], chunks = arrays.results.shape[0];
+    auto counts_of = [&](int chunk) { return arrays.results.data + (size_t)arrays.results.shape[1] * chunk; };
+    auto results_of = [&](int chunk) { return (Result*)(counts_of(chunk) + 2); };
     auto each_target = [&](int chunk, auto visit) {
         const int first = chunk * TARGETS_AT_ONCE, last = first + TARGETS_AT_ONCE;
         for (int t = first; t < (last < targets ? last : targets); ++t) visit(t);
@@ -295,11 +299,11 @@ CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const 
     share_out(team, threads, chunks, 1, [&](int chunk) {
         int count[2] = {}; // of pairs and contacts
         each_target(chunk, [&](int t) {
-            keep_radius(arrays, t);
-            find_pairs_of(arrays, t, [&](int a, int b, auto... touch) {
+            store_list_radius(arrays, t);
+            find_pairs_of(arrays, t, [&](int a, int b, auto... contact) {
                 const int n = count[0] + count[1];
-                if (n < NOTES) notes_of(chunk)[n] = {a, b, Touch(touch)...};
-                ++count[sizeof...(touch)];
+                if (n < RESULTS) results_of(chunk)[n] = {a, b, BallContact(contact)...};
+                ++count[sizeof...(contact)];
             });
         });
         counts_of(chunk)[0] = count[0], counts_of(chunk)[1] = count[1];
@@ -317,12 +321,14 @@ CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const 
         const int *const first = counts_of(chunk), *const next = chunk + 1 < chunks ? counts_of(chunk + 1) : total;
         int at[2] = {first[0], first[1]};
         const int count = next[0] - at[0] + next[1] - at[1];
-        auto put = [&](int a, int b, auto... touch) { put_found(arrays, at[sizeof...(touch)]++, a, b, touch...); };
-        if (count > NOTES) return each_target(chunk, [&](int t) { find_pairs_of(arrays, t, put); });
+        auto put = [&](int a, int b, auto... contact) {
+            write_result(arrays, at[sizeof...(contact)]++, a, b, contact...);
+        };
+        if (count > RESULTS) return each_target(chunk, [&](int t) { find_pairs_of(arrays, t, put); });
         for (int n = 0; n < count; ++n) {
-            const Note& note = notes_of(chunk)[n];
-            if (is_touch(arrays, note.a, note.b)) put(note.a, note.b, note.touch);
-            else put(note.a, note.b);
+            const Result& result = results_of(chunk)[n];
+            if (involves_ball(arrays, result.a, result.b)) put(result.a, result.b, result.contact);
+            else put(result.a, result.b);
         }
     });
 #endif

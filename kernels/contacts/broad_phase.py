@@ -1,17 +1,17 @@
-"""Pairs of shapes whose bounding boxes meet within a substep, and contacts of balls: for piles among other shapes.
+"""Broad phase for piles of balls among other shapes, and the contacts of balls.
 
-Newton's broad phase sorts all boxes along an axis and compares those whose projections overlap, N^(5/3) in a heap of N
-balls. Here balls find each other through the lists of neighbours that moments have, too (``pairs.neighbors``): these
-hold what is near, and are made anew only once a ball has moved by a part of its radius. All other shapes are compared
-with everything, a vector of boxes at a time. Which pairs are kept is decided as Newton does: by worlds, collision
-groups, bodies and excluded pairs, and by whether the boxes meet as they move.
+Newton's broad phase sorts all bounding boxes along an axis and compares those whose projections overlap: N^(5/3)
+comparisons in a heap of N balls. Here balls find each other in neighbor lists (``pairs.neighbors``), which are rebuilt
+only after a ball has moved by a fraction of its radius. All other shapes are compared with all targets, a vector of
+boxes at a time. Pairs are selected by Newton's rules: worlds, collision groups, bodies, excluded pairs, and boxes that
+overlap as they move.
 
-A ball is taken as the ball about the middle of its way that holds it all along, or, if it moves farther than contacts
-are sought ahead, about where it is. Of two balls whose boxes meet but whose
-surfaces do not come as near as contacts are sought, the pair is left out.
+A ball is represented by a ball that encloses it throughout the substep. If it moves farther than ``farthest``, the
+enclosing ball is about its present position. Two balls whose boxes overlap, but whose surfaces stay farther apart than
+contacts are detected, are not a pair.
 
-Pairs of a ball and a ball, plane, box or capsule become contacts at once (``ball_contacts.h``), all others are left to
-Newton's narrow phase.
+Pairs of a ball and a ball, plane, box or capsule become contacts directly (``ball_contacts.h``). Newton's narrow phase
+takes all others.
 """
 
 from dataclasses import dataclass
@@ -28,28 +28,28 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import team, threads_for
 
 _SKIN = 0.3
-"""Part of its radius that a ball may move before the lists are made anew."""
+"""Fraction of its radius that a ball may move before the neighbor lists are rebuilt."""
 _LARGEST = 2.0
-"""Balls of more than so many times the median radius are compared with everything, like other shapes: the largest
-radius sets how wide the search's cells are."""
+"""Radius [median radii] beyond which a ball is compared with all targets, like other shapes: the largest radius of the
+others sets the width of the search's cells."""
 _PADDING = 16
-"""Boxes that vectors may read beyond the last."""
+"""Boxes that vectors may read after the last one."""
 _TARGETS_PER_THREAD = 120
-"""Shapes that make another thread of a CPU worth waking."""
+"""Shapes that justify another thread of a CPU."""
 _TARGETS_AT_ONCE = 64
-"""Targets that a thread of a CPU takes at a time."""
+"""Targets in a chunk of a CPU thread."""
 _MOST_COMPARISONS = 2e7
-"""With other shapes; more take longer than to sort all boxes."""
+"""Comparisons with other shapes beyond which Newton's sort is faster."""
 _FEW = 25_000
-"""Shapes beyond which the sort, too, compares more than that, N^(5/3), and each pair by itself."""
+"""Shapes beyond which the limit grows as N^(5/3), like the comparisons of Newton's sort."""
 _MANY = 64
-"""Other shapes from which a warp of a GPU shares a target, in place of a group of threads."""
+"""Other shapes from which on a warp of a GPU shares a target, instead of a group of threads."""
 _BLOCK = 128
-_NOTES, _NOTE = 16 * _TARGETS_AT_ONCE, 12
-"""Pairs and contacts that such a chunk of targets notes, and the numbers of each, as in ``broad_phase.h``."""
+_RESULTS, _RESULT_SIZE = 16 * _TARGETS_AT_ONCE, 12
+"""Results that a chunk of targets can buffer, and the numbers of each, as in ``broad_phase.h``."""
 _PACKED_ROWS = 5
 PARTNERS = ("plane", "ball", "capsule", "box")
-"""Shapes whose contacts with balls are found here, as in ``ball_contacts.h``."""
+"""Shapes whose contacts with balls are detected here, as in ``ball_contacts.h``."""
 _KINEMATIC = 2
 """Newton's flag of bodies that forces do not move."""
 _lists_type = neighbors.lists_type(wp.float32)
@@ -57,37 +57,38 @@ _lists_type = neighbors.lists_type(wp.float32)
 
 @wp.struct
 class BroadPhaseArrays:
-    """Shapes, s of them, and the t targets among them that collide: b balls, then o others.
+    """Arrays of the broad phase, for s shapes, of which t targets can collide: b balls, then o others.
 
     Attributes:
-        lower, upper: Boxes of the shapes [m], enlarged by how far contacts are sought, shape [s].
-        displacement: Motion of the shapes within the substep [m], shape [s], or none.
+        lower, upper: Bounding boxes of the shapes, enlarged by the detection distance of contacts [m], shape [s].
+        displacement: Displacement of the shapes in the substep [m], shape [s], or empty.
         group, world, body: Collision group, world and body of the shapes, shape [s].
-        kind: Index of each shape's kind in ``PARTNERS``, or their number if its contacts are left to Newton, shape [s].
-        scale: Radius of balls and capsules, half of a capsule's length, half of a box's sides [m], shape [s].
-        margin, gap: Distance of each surface from the shape, and up to which contacts are found [m], shape [s].
+        kind: Index of each shape's type in ``PARTNERS``, or ``len(PARTNERS)`` for other types, shape [s].
+        scale: Radius of balls and capsules, half length of capsules, half extents of boxes [m], shape [s].
+        margin, gap: Distance of each surface from the shape, and detection distance of contacts [m], shape [s].
         frame, placement: Pose of the shapes in the world and in their bodies, shape [s].
         body_qd: Velocities of the bodies, see ``BodyView``.
-        dt: Substep [s].
+        dt: Length of the substep [s].
         body_flags: Newton's flags of the bodies.
-        excluded: Sorted pairs of shapes that do not collide; the first ``excluded_count`` count.
-        fixed_pairs: Whether shapes that forces do not move collide with each other.
-        farthest: How far ahead of a shape contacts are sought, along an axis [m].
-        shape: Shape of each target, shape [t]; the others of all worlds first, then by world, first those that cannot
-            move.
-        range: Others in the world of each target, begin and end, shape [t].
-        shared: Others of all worlds.
-        radius: Radii of the balls with how far contacts are sought [m], shape [b].
-        lists: Neighbour lists of the balls; packed row 4 holds the radius that a ball was listed with, and the reach is
-            that of the balls as they are.
-        boxes: Swept boxes of the others [m], lower then upper, shape [6, o padded].
-        bounds: On a CPU, boxes around those of each vector of others, shape [6, o / 16 padded].
-        found: On a CPU, how many pairs and contacts chunks of targets find, and notes of them, shape [chunks, 2 + NOTE
-            NOTES].
-        pairs, pair_count: Out, the pairs and how many there are, also beyond their room.
-        contacts: Out, contacts of balls; Newton's are appended.
+        excluded: Sorted pairs of shapes that do not collide, ``excluded_count`` of them.
+        fixed_pairs: 1 if shapes that forces do not move collide with each other.
+        farthest: Largest displacement of a shape for which contacts are detected in advance, along an axis [m].
+        shape: Shape of each target, shape [t]. Others of all worlds come first, then others by world, the immovable
+            ones first.
+        range: First other in the world of each target, and the one after the last, shape [t].
+        shared: Number of others of all worlds.
+        radius: Radii of the balls, plus the detection distance [m], shape [b].
+        lists: Neighbor lists of the balls. Packed row 4 holds the radius that a list was made with. The search distance
+            is that of the present balls.
+        boxes: Swept boxes of the others, lower then upper [m], shape [6, o padded].
+        bounds: CPU: bounding box of each vector of swept boxes, shape [6, o / 16 padded].
+        results: CPU: numbers of pairs and contacts of each chunk of targets, and the results, shape [chunks,
+            2 + RESULT_SIZE RESULTS].
+        pairs, pair_count: Out, the pairs and their number, which may exceed the capacity.
+        contacts: Out, contacts of balls; Newton appends its own.
     """
 
+    # Model:
     lower: wp.array[wp.vec3]
     upper: wp.array[wp.vec3]
     displacement: wp.array[wp.vec3]
@@ -107,6 +108,7 @@ class BroadPhaseArrays:
     excluded_count: int
     fixed_pairs: int
     farthest: float
+    # Targets and work:
     shape: wp.array[int]
     range: wp.array[wp.vec2i]
     shared: int
@@ -114,7 +116,8 @@ class BroadPhaseArrays:
     lists: _lists_type
     boxes: wp.array2d[float]
     bounds: wp.array2d[float]
-    found: wp.array2d[int]
+    results: wp.array2d[int]
+    # Data out:
     pairs: wp.array[wp.vec2i]
     pair_count: wp.array[int]
     contacts: ContactView
@@ -125,7 +128,7 @@ class PairSearch:
     """Buffers of the search on one device.
 
     Attributes:
-        arrays: What the passes work on.
+        arrays: Arrays of the search, :class:`BroadPhaseArrays`.
         targets: Number of targets.
         group: Threads of a GPU that share a target.
     """
@@ -136,18 +139,15 @@ class PairSearch:
 
 
 def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, device) -> PairSearch | None:
-    """Plan the search.
+    """Return the buffers, or None where comparing all other shapes would take too long.
 
     Args:
         shape_world: World of each shape, -1 for all worlds, shape [s].
-        shape_body: Body of each shape, -1 for one that cannot move, shape [s].
-        colliding: Whether a shape collides at all, shape [s].
-        ball_radius: Radius [m] of a ball with how far contacts are sought, NaN for other shapes, shape [s].
-        farthest: How far ahead of a shape contacts are sought [m].
+        shape_body: Body of each shape, -1 for an immovable shape, shape [s].
+        colliding: True for shapes that collide at all, shape [s].
+        ball_radius: Radius of a ball plus the detection distance of contacts [m], NaN for other shapes, shape [s].
+        farthest: Largest displacement of a shape for which contacts are detected in advance [m].
         device: Warp device.
-
-    Returns:
-        The buffers; None where comparing all other shapes would take too long.
     """
     worlds = np.where(colliding, shape_world, -1)
     worlds = worlds if (worlds >= 0).any() else np.zeros_like(worlds)
@@ -171,7 +171,7 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
     arrays.radius = wp.array(ball_radius[balls], dtype=float, device=device)
     packed = wp.zeros((_PACKED_ROWS, max(len(balls), 1)), dtype=float, device=device)
     group = integers(worlds[balls])
-    # the reach is that of the present balls
+    # the search distance follows the present balls
     arrays.lists = neighbors.allocate(len(balls), packed, group, reach=0.0, ratio=1.0 + _SKIN)
     sizes = -(-len(others) // _PADDING) * _PADDING, len(others) // _PADDING
     arrays.boxes, arrays.bounds = (wp.empty((6, n + _PADDING), dtype=float, device=device) for n in sizes)
@@ -179,7 +179,7 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
         boxes[:3].fill_(np.inf)
         boxes[3:].fill_(-np.inf)
     chunks = -(-len(shape) // _TARGETS_AT_ONCE) if device.is_cpu else 0
-    arrays.found = wp.zeros((chunks, 2 + _NOTE * _NOTES), dtype=int, device=device)
+    arrays.results = wp.zeros((chunks, 2 + _RESULT_SIZE * _RESULTS), dtype=int, device=device)
     arrays.farthest = farthest
     return PairSearch(arrays, len(shape), 32 if len(others) >= _MANY else group_threads(device))
 
@@ -190,12 +190,12 @@ def _kernel(call: str, group: int):
         f"{call}(thread, threads, team.data, arrays)", "contacts/broad_phase.h",
         {**PASS_ARGUMENTS, "arrays": BroadPhaseArrays}, dtype=wp.float32,
         CAPACITY=neighbors.CAPACITY, GROUP=group, BLOCK=_BLOCK, SKIN=_SKIN,
-        KINEMATIC=_KINEMATIC, TARGETS_AT_ONCE=_TARGETS_AT_ONCE, NOTES=_NOTES, NOTE=_NOTE,
+        KINEMATIC=_KINEMATIC, TARGETS_AT_ONCE=_TARGETS_AT_ONCE, RESULTS=_RESULTS, RESULT_SIZE=_RESULT_SIZE,
     )  # fmt: skip
 
 
 def launch_find_shape_pairs(search: PairSearch) -> None:
-    """Find the pairs of shapes whose boxes meet; ``search.arrays`` has the boxes, and gets pairs and contacts."""
+    """Find the pairs of shapes whose boxes overlap, and the contacts of balls; ``search.arrays`` receives them."""
     if search.targets == 0:
         return
     arrays = search.arrays

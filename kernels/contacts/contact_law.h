@@ -1,36 +1,36 @@
-// XPBD for rigid bodies in contact, for a substep: the impulses of a contact in one iteration, and how they move a
-// body.
+// XPBD for rigid bodies in contact: the impulse of a contact in one iteration, and the motion that it causes.
 //
-// Newton's conditions (newton/_src/solvers/xpbd/kernels.py: solve_body_contact_positions): at the end of the substep
-// surfaces do not overlap, and friction stops what slips, spins and rolls as far as the push in a contact allows it.
-// XPBD moves bodies with their new velocities, x' = x + dt v', so that these are conditions on velocities, taken to
-// first order in the turn of a substep: exact for balls. Three things differ from Newton's kernels:
+// The conditions are Newton's (newton/_src/solvers/xpbd/kernels.py: solve_body_contact_positions). At the end of the
+// substep surfaces do not overlap. Friction stops slip, spin and roll as far as the normal impulse allows. XPBD moves
+// bodies with their new velocities, x' = x + dt v', so these are conditions on velocities. They are linear in the
+// rotation during a substep, which is exact for balls. Five things differ from Newton's kernels:
 //
-// A contact keeps the sum of its impulses, and an iteration may take back what was too much of it, down to no push:
-// projected gradients with Nesterov's momentum (Mazhar, Heyn, Negrut and Tasora 2015, "Using Nesterov's Method to
-// Accelerate Multibody Dynamics with Friction and Contact"). Pushes that are never taken back, as in Newton's kernels,
-// end somewhere without overlap; these end at the least impulses that do it.
+// 1. Accumulated impulses. A contact keeps the sum of its impulses, and an iteration may reduce it, down to zero normal
+//    impulse: projected gradients with Nesterov's momentum (Mazhar, Heyn, Negrut and Tasora 2015, "Using Nesterov's
+//    Method to Accelerate Multibody Dynamics with Friction and Contact"). Newton's iterations only ever add, and end at
+//    some state without overlap. These converge to the smallest impulses that prevent overlap.
 //
-// What overlaps is moved apart at no more than PUSH_OUT (from Python), so that bodies that were put into each other do
-// not fly off.
+// 2. Penetration recovery. Overlapping bodies separate at RECOVERY_SPEED (from Python) at most. So bodies that were
+//    placed into each other do not fly apart.
 //
-// The sum acts at one point between the surfaces on both bodies, where they are before the substep, nearer to the
-// surface of the lighter one.
-// Positions that move with their own velocity keep their momentum, so angular momentum is kept, too. Lever arms at the
-// new poses have turned by ω dt and do not: bodies that strong forces press together would turn ever faster, at the
-// rate a dt/r for accelerations a.
+// 3. Conserved angular momentum. The impulse acts at one point on both bodies. That point lies between the surfaces
+//    where they are before the substep, nearer to the surface of the lighter body. Lever arms at the new poses have
+//    rotated by ω dt and would not conserve angular momentum: bodies that strong forces press together would spin up at
+//    the rate a dt/r for accelerations a.
 //
-// No speed is too low to be kept.
+// 4. No rest threshold. Low speeds are not set to zero.
 //
-// What sticks remembers how far it has slipped, and goes back. Iterations that end early leave it to slip a little, in
-// each substep the same way, so that heaps would creep. An overlap is pushed out sooner or later, whatever is left of
-// it in a substep; a slip would be forgotten. It is kept as long as surfaces touch (Cundall and Strack 1979, "A
-// Discrete Numerical Model for Granular Assemblies"), and so is what rolls and spins. Where friction gives way, it is
-// kept as far as all of the friction may bring it back. That is position, not impulse: impulses that were kept from
-// substep to substep would hold what undoes overlap, too, and throw a chain of 1,000 balls apart.
+// 5. Static friction with memory. A sticking contact stores its accumulated slip and returns by it. Iterations that
+// stop
+//    early leave a little slip, in every substep in the same direction, so that heaps would creep. Overlap needs no
+//    such memory: the next substep sees it. The slip, as well as the accumulated rolling and spinning angle, is stored
+//    as long as the surfaces touch (Cundall and Strack 1979, "A Discrete Numerical Model for Granular Assemblies"). At
+//    sliding contacts it is limited to the slip that the full friction force can return. The memory is a displacement,
+//    not an impulse: impulses carried over from the last substep would include those that removed overlap, and throw a
+//    chain of 1,000 balls apart.
 //
-// A contact is seen from one of its two bodies, the own one, and looks the same from the other: its impulses there are
-// opposite to the last bit, whichever of the two computes them.
+// A contact is evaluated from one of its two bodies, called the own body. Evaluated from the other body, its impulses
+// are opposite to the last bit.
 #pragma once
 #include "shared/inverse_root.h"
 #include "shared/vectors.h"
@@ -41,203 +41,222 @@ struct Quaternion {
     Number x, y, z, w;
 };
 
-CUDA_CALLABLE inline Vector turned(Quaternion q, Vector a) {
+// Vector rotated by a unit quaternion.
+CUDA_CALLABLE inline Vector rotate(Quaternion q, Vector a) {
     const Vector axis = {q.x, q.y, q.z}, t = 2 * cross(axis, a);
     return a + q.w * t + cross(axis, t);
 }
-// A tensor of a frame that was turned.
-CUDA_CALLABLE inline Symmetric turned(Quaternion q, const Symmetric& s) {
-    const Number none = q.w * Real(0), one = none + 1;
-    auto row = [&](Vector axis) { return turned(q, s * turned({-q.x, -q.y, -q.z, q.w}, axis)); };
-    const Vector x = row({one, none, none}), y = row({none, one, none}), z = row({none, none, one});
+// Tensor R s Rᵀ for the rotation R of a unit quaternion.
+CUDA_CALLABLE inline Symmetric rotate(Quaternion q, const Symmetric& s) {
+    const Number zero = q.w * Real(0), unit = zero + 1;
+    auto row = [&](Vector axis) { return rotate(q, s * rotate({-q.x, -q.y, -q.z, q.w}, axis)); };
+    const Vector x = row({unit, zero, zero}), y = row({zero, unit, zero}), z = row({zero, zero, unit});
     return {x.x, y.y, z.z, x.y, y.z, z.x};
 }
 
-// Where a body is before the substep: its centre of mass and orientation.
+// Center of mass [m] and orientation of a body before the substep.
 struct Pose {
     Vector x;
     Quaternion q;
 };
-// How it moves, and its inverse mass and, if it is ROUND (from Python: all bodies are), inverse inertia about any axis.
+// Velocity [m/s], angular velocity [rad/s] and inverse mass [1/kg] of a body. Where ROUND (from Python) is set, all
+// bodies have the same inertia about every axis, and ``inv_inertia`` is its inverse [1/(kg·m²)].
 struct Body {
-    Vector v, spin;
+    Vector v, omega;
     Number inv_mass, inv_inertia;
 };
-// If it is not, its inverse inertia in the world's frame; and the number of shares that contacts split it into
-// (mass_splitting.py).
+// Inverse inertia in the world's frame for bodies that are not ROUND, and the number of shares into which mass
+// splitting divides the body (mass_splitting.py).
 struct Inertia {
     Symmetric inverse;
     Number shares;
 };
-// A contact as it was found, from its own body's side: points about the centres of mass in the bodies' frames, where
-// surfaces rub, the unit normal from the other body to the own one, the sum of the margins, coefficients of friction,
-// and whether the own and the other body are kinematic: 1 or 0.
-struct Touch {
-    Vector point, other_point, rub, other_rub, normal;
+// A detected contact, from the own body's side. ``point`` and ``surface`` are relative to the centers of mass, in the
+// frames of the bodies: the contact point, and the point on the surface where friction acts. ``normal`` points from the
+// other body to the own one, ``margin`` is the sum of the margins. Then the coefficients of friction, and 1 for each
+// body that is kinematic, else 0.
+struct DetectedContact {
+    Vector point, other_point, surface, other_surface, normal;
     Number margin, mu, torsional, rolling, kinematic, other_kinematic;
 };
-// How far or how fast the own surface of a contact slips and turns on the other one.
+// Slip of the own surface on the other one: displacement and rotation [m, rad], or slip velocity [m/s, rad/s].
 struct Slip {
-    Vector linear, turn;
+    Vector linear, angular;
 };
-// A contact as iterations need it: arms from the centres of mass to where impulses act, the speed at which a gap may
-// close, impulses for a unit of speed that pushes, slips and turns, and the speed at which what sticks goes back to
-// where it stuck.
+// A contact prepared for the iterations: normal and lever arms about the centers of mass; the speed at which the gap
+// may close; the effective masses, times the relaxation, of normal, tangential and angular impulses [kg, kg, kg·m²];
+// the coefficients of friction; and the slip velocity with which a sticking contact returns.
 struct Contact {
     Vector normal, arm, other_arm;
-    Number gap_speed, push_rate, rub_rate, turn_rate, mu, torsional, rolling;
-    Slip back;
+    Number gap_speed, normal_mass, tangential_mass, angular_mass, mu, torsional, rolling;
+    Slip return_velocity;
 };
-// On the own body, and the angular one besides that of its arm; the other body gets the opposite.
+// Impulse on the own body [N·s], and the angular impulse in addition to that of its lever arm [N·m·s]. The other body
+// receives the opposite.
 struct Impulse {
-    Vector linear, turn;
+    Vector linear, angular;
 };
 
-CUDA_CALLABLE inline Vector spun(const Body& body, const Inertia& inertia, Vector torque) {
-    if constexpr (ROUND) return body.inv_inertia * torque;
-    return inertia.inverse * torque;
-}
-// How easily impulses at an arm along a and along b move a share of a body along b and along a.
-CUDA_CALLABLE inline Number ease(const Body& body, const Inertia& inertia, Vector arm, Vector a, Vector b) {
-    return inertia.shares * (body.inv_mass * dot(a, b) + dot(cross(arm, a), spun(body, inertia, cross(arm, b))));
-}
-// How easily an angular impulse turns a share of a body at most.
-CUDA_CALLABLE inline Number turn_ease(const Body& body, const Inertia& inertia) {
-    if constexpr (ROUND) return inertia.shares * body.inv_inertia;
-    const Symmetric& s = inertia.inverse;
-    auto size = [](Number x) { return larger(x, -x); };
-    const Number xy = size(s.xy), yz = size(s.yz), zx = size(s.zx);
-    return inertia.shares * larger(s.xx + xy + zx, larger(s.yy + xy + yz, s.zz + yz + zx));
-}
-// Quotients of nothing are nothing.
-CUDA_CALLABLE inline Number quotient(Number a, Number b) { return b > 0 ? a / b : a * Real(0); }
-
+// a / b, or 0 where b ≤ 0.
+CUDA_CALLABLE inline Number divide_or_zero(Number a, Number b) { return b > 0 ? a / b : a * Real(0); }
 CUDA_CALLABLE inline Number inverse_length(Vector a) {
     const Number square = dot(a, a);
     return square > Real(1e-30) ? Real(0.5) * twice_inverse_root(square) : square * Real(0);
 }
-CUDA_CALLABLE inline Vector at_most(Vector a, Number length) {
-    const Number one = length * Real(0) + 1;
-    return (dot(a, a) > length * length ? length * inverse_length(a) : one) * a;
+// Vector shortened to ``length`` where it is longer.
+CUDA_CALLABLE inline Vector clamp_length(Vector a, Number length) {
+    const Number unit = length * Real(0) + 1;
+    return (dot(a, a) > length * length ? length * inverse_length(a) : unit) * a;
 }
-// What of a vector is across a unit vector.
+// Component of a vector perpendicular to the unit vector n.
 CUDA_CALLABLE inline Vector tangential(Vector a, Vector n) { return a - dot(a, n) * n; }
-// What is limited to ``across`` across a unit vector, and to ``about`` along it.
-CUDA_CALLABLE inline Vector limited(Vector a, Vector n, Number across, Number about) {
-    const Number along = dot(a, n);
-    return at_most(tangential(a, n), across) + larger(smaller(along, about), -about) * n;
+// Vector with its component perpendicular to n limited to ``across``, and the one along n to ``along``.
+CUDA_CALLABLE inline Vector clamp_components(Vector a, Vector n, Number across, Number along) {
+    const Number axial = dot(a, n);
+    return clamp_length(tangential(a, n), across) + larger(smaller(axial, along), -along) * n;
 }
-// Some unit vector across a unit vector.
-CUDA_CALLABLE inline Vector across(Vector n) {
-    const Number none = n.x * Real(0);
+// Unit vector perpendicular to the unit vector n.
+CUDA_CALLABLE inline Vector perpendicular(Vector n) {
+    const Number zero = n.x * Real(0);
     const auto steep = n.x * n.x > Real(0.5);
-    const Vector t = {steep ? n.y : none, steep ? -n.x : n.z, steep ? none : -n.y};
+    const Vector t = {steep ? n.y : zero, steep ? -n.x : n.z, steep ? zero : -n.y};
     return inverse_length(t) * t;
 }
 
-// What sticks goes back by this part of its slip in a substep: all at once, layers that fall on each other come back at
-// the speed of what the first impact left, and overlap three times as far.
-constexpr Real RETURN = Real(0.3);
-
-// How easily an impulse across a unit vector moves a share of a body along itself at most.
-CUDA_CALLABLE inline Number easiest_across(const Body& body, const Inertia& inertia, Vector arm, Vector n) {
-    const Vector a = across(n), b = cross(n, a);
-    const Number aa = ease(body, inertia, arm, a, a), ab = ease(body, inertia, arm, a, b);
-    const Number bb = ease(body, inertia, arm, b, b), half = Real(0.5) * (aa - bb);
+// Change of a body's angular velocity by an angular impulse: ω = I⁻¹ L.
+CUDA_CALLABLE inline Vector angular_response(const Body& body, const Inertia& inertia, Vector angular) {
+    if constexpr (ROUND) return body.inv_inertia * angular;
+    return inertia.inverse * angular;
+}
+// Inverse effective mass [1/kg] of a body's share for impulses at a lever arm r, along a and b:
+// shares (a·b/m + (r × a)·I⁻¹ (r × b)).
+CUDA_CALLABLE inline Number mobility(const Body& body, const Inertia& inertia, Vector arm, Vector a, Vector b) {
+    return inertia.shares
+           * (body.inv_mass * dot(a, b) + dot(cross(arm, a), angular_response(body, inertia, cross(arm, b))));
+}
+// Largest inverse effective mass of a body's share for impulses perpendicular to n: the larger eigenvalue of the
+// symmetric 2 × 2 mobility in the tangent plane.
+CUDA_CALLABLE inline Number tangential_mobility(const Body& body, const Inertia& inertia, Vector arm, Vector n) {
+    const Vector a = perpendicular(n), b = cross(n, a);
+    const Number aa = mobility(body, inertia, arm, a, a), ab = mobility(body, inertia, arm, a, b);
+    const Number bb = mobility(body, inertia, arm, b, b), half = Real(0.5) * (aa - bb);
     return Real(0.5) * (aa + bb) + root(half * half + ab * ab);
 }
+// Upper bound of the inverse inertia of a body's share about any axis [1/(kg·m²)]: the largest absolute row sum.
+CUDA_CALLABLE inline Number angular_mobility(const Body& body, const Inertia& inertia) {
+    if constexpr (ROUND) return inertia.shares * body.inv_inertia;
+    const Symmetric& s = inertia.inverse;
+    auto magnitude = [](Number x) { return larger(x, -x); };
+    const Number xy = magnitude(s.xy), yz = magnitude(s.yz), zx = magnitude(s.zx);
+    return inertia.shares * larger(s.xx + xy + zx, larger(s.yy + xy + yz, s.zz + yz + zx));
+}
 
-// Prepares a contact, which has slipped so far while it stuck, for iterations that relax it by a part of what it lacks.
-CUDA_CALLABLE inline Contact prepared(const Touch& t, const Pose& own, const Pose& other, const Body& body,
-                                      const Body& other_body, const Inertia& inertia, const Inertia& other_inertia,
-                                      const Slip& slipped, Real relaxation, Real dt) {
+// Fraction of its accumulated slip by which a sticking contact returns in a substep. With 1, layers that fall on each
+// other return at the speed that the first impact left, and overlap three times as far.
+constexpr Real SLIP_RETURN = Real(0.3);
+
+// Prepares a contact with accumulated ``slip`` for iterations that apply the fraction ``relaxation`` of each
+// correction.
+CUDA_CALLABLE inline Contact prepare_contact(const DetectedContact& t, const Pose& own, const Pose& other,
+                                             const Body& body, const Body& other_body, const Inertia& inertia,
+                                             const Inertia& other_inertia, const Slip& slip, Real relaxation, Real dt) {
     const Vector n = t.normal, apart = own.x - other.x;
-    const Vector rub = turned(own.q, t.rub), other_rub = turned(other.q, t.other_rub);
+    const Vector surface = rotate(own.q, t.surface), other_surface = rotate(other.q, t.other_surface);
     const Number total = body.inv_mass + other_body.inv_mass;
-    const Vector apart_there = apart + (rub - other_rub);
+    const Vector surfaces_apart = apart + (surface - other_surface);
     Contact c;
     c.normal = n;
-    c.arm = rub - quotient(other_body.inv_mass, total) * apart_there;
-    c.other_arm = other_rub + quotient(body.inv_mass, total) * apart_there;
-    const Vector points = turned(own.q, t.point) - turned(other.q, t.other_point);
-    // kinematic bodies stand where they do at the end already, and lend their surfaces a velocity besides; without it
-    // the gap is the one that they and others were found with
-    const Vector drift = body.v + cross(body.spin, c.arm), its = cross(other_body.spin, c.other_arm);
-    const Vector other_drift = other_body.v + its;
-    const Number lent = t.kinematic * dot(n, drift) - t.other_kinematic * dot(n, other_drift);
-    c.gap_speed = larger((dot(n, apart + points) - t.margin) / dt - lent, n.x * Real(0) - PUSH_OUT);
-    // the sums over both bodies that mass_splitting.py bounds
-    const Number none = n.x * Real(0), push_ease = ease(body, inertia, c.arm, n, n),
-                 other_push_ease = ease(other_body, other_inertia, c.other_arm, n, n);
-    const Number rub_ease = easiest_across(body, inertia, c.arm, n),
-                 other_rub_ease = easiest_across(other_body, other_inertia, c.other_arm, n);
-    c.push_rate = quotient(none + relaxation, push_ease + other_push_ease);
-    c.rub_rate = quotient(none + Real(FRICTION) * relaxation, rub_ease + other_rub_ease);
-    c.turn_rate =
-        quotient(none + Real(FRICTION) * relaxation, turn_ease(body, inertia) + turn_ease(other_body, other_inertia));
+    c.arm = surface - divide_or_zero(other_body.inv_mass, total) * surfaces_apart;
+    c.other_arm = other_surface + divide_or_zero(body.inv_mass, total) * surfaces_apart;
+    const Vector points = rotate(own.q, t.point) - rotate(other.q, t.other_point);
+    // a kinematic body is already at its pose of the substep's end, yet its surface moves with its velocity: without
+    // that velocity the gap is the one that contacts were detected with
+    const Vector own_velocity = body.v + cross(body.omega, c.arm);
+    const Vector other_rotation = cross(other_body.omega, c.other_arm);
+    const Vector other_velocity = other_body.v + other_rotation;
+    const Number kinematic_speed = t.kinematic * dot(n, own_velocity) - t.other_kinematic * dot(n, other_velocity);
+    c.gap_speed = larger((dot(n, apart + points) - t.margin) / dt - kinematic_speed, n.x * Real(0) - RECOVERY_SPEED);
+    // mass_splitting.py bounds these sums of the mobilities of both bodies
+    const Number zero = n.x * Real(0), own_normal = mobility(body, inertia, c.arm, n, n),
+                 other_normal = mobility(other_body, other_inertia, c.other_arm, n, n);
+    const Number own_tangential = tangential_mobility(body, inertia, c.arm, n),
+                 other_tangential = tangential_mobility(other_body, other_inertia, c.other_arm, n);
+    c.normal_mass = divide_or_zero(zero + relaxation, own_normal + other_normal);
+    c.tangential_mass = divide_or_zero(zero + Real(FRICTION) * relaxation, own_tangential + other_tangential);
+    c.angular_mass = divide_or_zero(zero + Real(FRICTION) * relaxation,
+                                    angular_mobility(body, inertia) + angular_mobility(other_body, other_inertia));
     c.mu = t.mu, c.torsional = t.torsional, c.rolling = t.rolling;
-    c.back = {RETURN / dt * tangential(slipped.linear, n), RETURN / dt * slipped.turn};
+    c.return_velocity = {SLIP_RETURN / dt * tangential(slip.linear, n), SLIP_RETURN / dt * slip.angular};
     return c;
 }
 
-// How the own surface of a contact moves on the other one.
-CUDA_CALLABLE inline Slip slip_of(const Contact& c, const Body& own, const Body& other) {
-    const Vector mine = own.v + cross(own.spin, c.arm), its = other.v + cross(other.spin, c.other_arm);
-    return {mine - its, own.spin - other.spin};
+// Velocity of the own surface of a contact relative to the other one.
+CUDA_CALLABLE inline Slip relative_velocity(const Contact& c, const Body& own, const Body& other) {
+    const Vector own_velocity = own.v + cross(own.omega, c.arm);
+    const Vector other_velocity = other.v + cross(other.omega, c.other_arm);
+    return {own_velocity - other_velocity, own.omega - other.omega};
 }
-// The impulse of a contact after an iteration, from one that its bodies have and from how they move: it does not pull,
-// and its push limits friction.
-CUDA_CALLABLE inline Impulse relaxed(const Contact& c, const Body& own, const Body& other, Impulse p) {
-    const Slip slip = slip_of(c, own, other);
-    const Number opening = dot(slip.linear, c.normal), none = opening * Real(0);
-    const Number push = larger(dot(p.linear, c.normal) - c.push_rate * (opening + c.gap_speed), none);
-    const Vector pressed = push * c.normal;
-    if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return {pressed, none * c.normal};
-    const Vector linear = p.linear - c.rub_rate * (slip.linear + c.back.linear);
-    const Vector turn = p.turn - c.turn_rate * (slip.turn + c.back.turn);
-    const Vector rub = at_most(tangential(linear, c.normal), c.mu * push);
-    return {rub + pressed, limited(turn, c.normal, c.rolling * push, c.torsional * push)};
+// Impulse p of a contact after a relaxation step from the bodies' present velocities, projected onto the friction cone:
+// the normal impulse is at least 0, and friction at most μ times it.
+CUDA_CALLABLE inline Impulse relax_impulse(const Contact& c, const Body& own, const Body& other, Impulse p) {
+    const Slip velocity = relative_velocity(c, own, other);
+    const Number opening = dot(velocity.linear, c.normal), zero = opening * Real(0);
+    const Number push = larger(dot(p.linear, c.normal) - c.normal_mass * (opening + c.gap_speed), zero);
+    const Vector normal_impulse = push * c.normal;
+    if (!any(c.mu > 0) && !any(c.torsional > 0) && !any(c.rolling > 0)) return {normal_impulse, zero * c.normal};
+    const Vector linear = p.linear - c.tangential_mass * (velocity.linear + c.return_velocity.linear);
+    const Vector angular = p.angular - c.angular_mass * (velocity.angular + c.return_velocity.angular);
+    const Vector friction = clamp_length(tangential(linear, c.normal), c.mu * push);
+    return {friction + normal_impulse, clamp_components(angular, c.normal, c.rolling * push, c.torsional * push)};
 }
 
-CUDA_CALLABLE inline Impulse change(Impulse from, Impulse to) { return {to.linear - from.linear, to.turn - from.turn}; }
+CUDA_CALLABLE inline Impulse difference(Impulse from, Impulse to) {
+    return {to.linear - from.linear, to.angular - from.angular};
+}
 
-// What a contact has given its bodies: its impulse after the last iteration, and that with momentum, which they have.
-struct Given {
-    Impulse last, ahead;
+// Accumulated impulse of a contact after the last iteration, and its extrapolation by Nesterov's momentum. The bodies'
+// velocities contain the extrapolated one.
+struct AccumulatedImpulse {
+    Impulse last, extrapolated;
 };
-// Nesterov's momentum: the part of its last change that an impulse goes on by. It is bounded, so that nothing has to
-// tell when to begin anew, and the last iteration leaves impulses that contacts admit.
+// Nesterov's momentum: the fraction of its last change by which an impulse is extrapolated. It is bounded, which makes
+// restarts unnecessary. It is 0 in the last iteration, so that the final impulses are in the friction cone.
 CUDA_CALLABLE inline Real momentum_at(int iteration, int iterations) {
     const Real part = Real(iteration) / (iteration + 3), most = Real(MOMENTUM);
     return iteration == iterations - 1 ? 0 : part < most ? part : most;
 }
-// One iteration of a contact: returns the impulse that it adds.
-CUDA_CALLABLE inline Impulse press(const Contact& c, const Body& own, const Body& other, Given& given, Real momentum) {
-    const Impulse now = relaxed(c, own, other, given.ahead), gain = change(given.last, now);
-    const Impulse ahead = {now.linear + momentum * gain.linear, now.turn + momentum * gain.turn};
-    const Impulse added = change(given.ahead, ahead);
-    given = {now, ahead};
+// Performs an iteration of a contact and returns the impulse to add to the bodies.
+CUDA_CALLABLE inline Impulse iterate_contact(const Contact& c, const Body& own, const Body& other,
+                                             AccumulatedImpulse& impulse, Real momentum) {
+    const Impulse now = relax_impulse(c, own, other, impulse.extrapolated), gain = difference(impulse.last, now);
+    const Impulse extrapolated = {now.linear + momentum * gain.linear, now.angular + momentum * gain.angular};
+    const Impulse added = difference(impulse.extrapolated, extrapolated);
+    impulse = {now, extrapolated};
     return added;
 }
-// How far a contact has slipped while it stuck, at the end of a substep whose iterations left an impulse.
-CUDA_CALLABLE inline Slip slipped_so_far(const Contact& c, const Body& own, const Body& other, Impulse p,
-                                         Real relaxation, Real dt) {
-    const Slip slip = slip_of(c, own, other);
-    auto after = [&](Vector back, Vector now) { return dt * (1 / RETURN * back + now); };
-    const Vector linear = after(c.back.linear, tangential(slip.linear, c.normal));
-    const Vector turn = after(c.back.turn, slip.turn);
-    const Number push = Real(FRICTION) * relaxation * dt / RETURN * dot(p.linear, c.normal);
-    const Number per_turn = quotient(push, c.turn_rate);
-    return {at_most(linear, quotient(c.mu * push, c.rub_rate)),
-            limited(turn, c.normal, c.rolling * per_turn, c.torsional * per_turn)};
+// Accumulated slip of a contact [m, rad] at the end of a substep whose iterations ended at the impulse p.
+CUDA_CALLABLE inline Slip accumulated_slip(const Contact& c, const Body& own, const Body& other, Impulse p,
+                                           Real relaxation, Real dt) {
+    const Slip velocity = relative_velocity(c, own, other);
+    auto after = [&](Vector returning, Vector now) { return dt * (1 / SLIP_RETURN * returning + now); };
+    const Vector linear = after(c.return_velocity.linear, tangential(velocity.linear, c.normal));
+    const Vector angular = after(c.return_velocity.angular, velocity.angular);
+    const Number push = Real(FRICTION) * relaxation * dt / SLIP_RETURN * dot(p.linear, c.normal);
+    const Number per_angle = divide_or_zero(push, c.angular_mass);
+    return {clamp_length(linear, divide_or_zero(c.mu * push, c.tangential_mass)),
+            clamp_components(angular, c.normal, c.rolling * per_angle, c.torsional * per_angle)};
 }
-// The angular impulses of an impulse about the centres of mass.
-CUDA_CALLABLE inline Vector on_own(const Contact& c, Impulse p) { return cross(c.arm, p.linear) + p.turn; }
-CUDA_CALLABLE inline Vector on_other(const Contact& c, Impulse p) { return -(cross(c.other_arm, p.linear) + p.turn); }
+// Angular impulses about the centers of mass of the two bodies.
+CUDA_CALLABLE inline Vector own_angular_impulse(const Contact& c, Impulse p) {
+    return cross(c.arm, p.linear) + p.angular;
+}
+CUDA_CALLABLE inline Vector other_angular_impulse(const Contact& c, Impulse p) {
+    return -(cross(c.other_arm, p.linear) + p.angular);
+}
 
-// Moves a body by the sums of impulses and angular impulses.
-CUDA_CALLABLE inline void apply(Body& body, const Inertia& inertia, Vector linear, Vector angular) {
+// Changes a body's velocities by an impulse and an angular impulse: v += p/m, ω += I⁻¹ L.
+CUDA_CALLABLE inline void apply_impulse(Body& body, const Inertia& inertia, Vector linear, Vector angular) {
     body.v += body.inv_mass * linear;
-    body.spin += spun(body, inertia, angular);
+    body.omega += angular_response(body, inertia, angular);
 }
 }

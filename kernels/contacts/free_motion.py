@@ -1,8 +1,8 @@
-"""How bodies move in a substep: forces and torques change velocities, then velocities change poses.
+"""Motion of free bodies in a substep: forces and torques change velocities, then velocities change poses.
 
-Contacts are solved between the two, so that they see poses as they were found at. Both halves together are symplectic
-Euler for centres of mass. Angular momentum is kept to rounding: a body that turns gets the angular velocity that its
-angular momentum has at its new orientation, in place of Newton's explicit gyroscopic term, and no spin is damped.
+Contacts are solved between the two, at the poses at which they were detected. Both halves together are symplectic Euler
+for centers of mass. Angular momentum is conserved to rounding: the new angular velocity is the one that the body's
+angular momentum implies at its new orientation. Newton adds an explicit gyroscopic term instead, and damps rotation.
 """
 
 import warp as wp
@@ -13,14 +13,14 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def _about(q: wp.quat, tensor: wp.mat33, vector: wp.vec3) -> wp.vec3:
-    """Apply a tensor of the frame of a body to a vector of the world's."""
+def _apply_tensor(q: wp.quat, tensor: wp.mat33, vector: wp.vec3) -> wp.vec3:
+    """Return the product of a tensor in a body's frame, of orientation q, and a vector in the world's frame."""
     return wp.quat_rotate(q, tensor * wp.quat_rotate_inv(q, vector))
 
 
 @wp.func
-def _turn(q: wp.quat, rotation: wp.vec3) -> wp.quat:
-    """Turn an orientation by a rotation vector of the world's frame [rad]."""
+def _rotate(q: wp.quat, rotation: wp.vec3) -> wp.quat:
+    """Return the orientation q rotated by a rotation vector of the world's frame [rad], to first order."""
     return wp.normalize(q + 0.5 * wp.quat(rotation, 0.0) * q)
 
 
@@ -46,9 +46,10 @@ def _accelerate(
             for k in range(6):
                 force[k] += joint_f_in[free_dof_in[body] + k]
         gravity = gravity_in[bodies.world[body]] * wp.nonzero(inv_mass)
-        gain = _about(wp.transform_get_rotation(bodies.q[body]), bodies.inv_inertia[body], wp.spatial_bottom(force))
+        rotation, torque = wp.transform_get_rotation(bodies.q[body]), wp.spatial_bottom(force)
+        angular = _apply_tensor(rotation, bodies.inv_inertia[body], torque)
         v = wp.spatial_top(velocity) + dt * (inv_mass * wp.spatial_top(force) + gravity)
-        qd_out[body] = wp.spatial_vector(v, wp.spatial_bottom(velocity) + dt * gain)
+        qd_out[body] = wp.spatial_vector(v, wp.spatial_bottom(velocity) + dt * angular)
 
 
 @wp.kernel
@@ -67,19 +68,19 @@ def _move(
     pose, velocity = bodies.q[body], bodies.qd[body]
     inertia, inverse, com = bodies.inertia[body], bodies.inv_inertia[body], bodies.com[body]
     v, q = wp.spatial_top(velocity), wp.transform_get_rotation(pose)
-    spin = wp.spatial_bottom(velocity)
-    turned = _turn(q, dt * spin)
+    omega = wp.spatial_bottom(velocity)
+    rotated = _rotate(q, dt * omega)
     if bodies.inv_mass[body] > 0.0:
-        momentum = _about(q, inertia, spin)
-        turned = _turn(q, dt * _about(_turn(q, 0.5 * dt * spin), inverse, momentum))
-        spin = _about(turned, inverse, momentum)
+        momentum = _apply_tensor(q, inertia, omega)  # L = I ω
+        rotated = _rotate(q, dt * _apply_tensor(_rotate(q, 0.5 * dt * omega), inverse, momentum))
+        omega = _apply_tensor(rotated, inverse, momentum)  # ω' = I'⁻¹ L
     center = wp.transform_get_translation(pose) + wp.quat_rotate(q, com) + dt * v
-    q_out[body] = wp.transform(center - wp.quat_rotate(turned, com), turned)
-    qd_out[body] = wp.spatial_vector(v, spin)
+    q_out[body] = wp.transform(center - wp.quat_rotate(rotated, com), rotated)
+    qd_out[body] = wp.spatial_vector(v, omega)
 
 
 def launch_accelerate(bodies: BodyView, gravity, kinematic_flag: int, dt: float, q, qd, free_dof=None, joint_f=None):
-    """Write the poses of bodies as they are and the velocities that forces and torques lend them in ``dt`` [s].
+    """Write the present poses of bodies, and their velocities after forces and torques have acted for ``dt`` [s].
 
     Args:
         bodies: The bodies.
@@ -87,19 +88,93 @@ def launch_accelerate(bodies: BodyView, gravity, kinematic_flag: int, dt: float,
         kinematic_flag: Newton's flag of kinematic bodies.
         dt: Length of the substep [s].
         q, qd: Out, poses and velocities, shape [bodies].
-        free_dof: First degree of freedom of each body's free joint, -1 without, shape [bodies]; None if forces of
-            joints are none, or in the bodies' own.
-        joint_f: Forces of degrees of freedom, those of a free joint about the centre of mass [N, N·m], shape [dofs].
+        free_dof: First degree of freedom of each body's free joint, -1 without one, shape [bodies]; None to ignore
+            ``joint_f``.
+        joint_f: Forces of degrees of freedom, about the center of mass for a free joint [N, N·m], shape [dofs].
     """
     inputs = [bodies, gravity, free_dof, joint_f, kinematic_flag, dt]
     wp.launch(_accelerate, dim=len(q), inputs=inputs, outputs=[q, qd], device=q.device)
 
 
 def launch_move(bodies: BodyView, kinematic_flag: int, dt: float, q=None, qd=None):
-    """Move bodies with their velocities for ``dt`` [s]; their spins change as they turn, their momenta do not.
+    """Move bodies with their velocities for ``dt`` [s], at constant linear and angular momentum.
 
-    Poses and velocities are written into ``q`` and ``qd``, if there are any, where kinematic bodies stay as they are.
+    Poses and velocities are written to ``q`` and ``qd``, by default those of ``bodies``. Kinematic bodies are skipped.
     """
     inputs = [bodies, kinematic_flag, dt]
     outputs = [bodies.q if q is None else q, bodies.qd if qd is None else qd]
     wp.launch(_move, dim=len(bodies.q), inputs=inputs, outputs=outputs, device=bodies.q.device)
+
+
+@wp.func
+def velocity_change(bodies: BodyView, body: int, linear: wp.vec3, angular: wp.vec3):
+    """Return the changes of a body's velocities by an impulse and an angular impulse about its center of mass."""
+    if body < 0:
+        return wp.vec3(0.0), wp.vec3(0.0)
+    rotation = wp.transform_get_rotation(bodies.q[body])
+    omega = wp.quat_rotate(rotation, bodies.inv_inertia[body] * wp.quat_rotate_inv(rotation, angular))
+    return bodies.inv_mass[body] * linear, omega
+
+
+@wp.kernel
+def _apply_impulses(
+    # inputs:
+    bodies: BodyView,
+    deltas_io: wp.array[wp.spatial_vector],
+    # outputs:
+    qd_out: wp.array[wp.spatial_vector],
+):
+    body = wp.tid()
+    delta = deltas_io[body]
+    deltas_io[body] = wp.spatial_vector()
+    v, omega = velocity_change(bodies, body, wp.spatial_top(delta), wp.spatial_bottom(delta))
+    qd_out[body] += wp.spatial_vector(v, omega)
+
+
+def launch_apply_impulses(bodies: BodyView, deltas):
+    """Change the velocities of bodies by impulses, and set the impulses to zero.
+
+    Args:
+        bodies: The bodies.
+        deltas: In and out, impulses and angular impulses about the centers of mass [N·s, N·m·s], shape [bodies].
+    """
+    wp.launch(_apply_impulses, dim=len(deltas), inputs=[bodies, deltas], outputs=[bodies.qd], device=deltas.device)
+
+
+@wp.kernel
+def _apply_corrections(
+    # inputs:
+    bodies: BodyView,
+    deltas_in: wp.array[wp.spatial_vector],
+    inv_weights_in: wp.array[float],
+    dt: float,
+    # outputs:
+    q_out: wp.array[wp.transform],
+    qd_out: wp.array[wp.spatial_vector],
+):
+    body = wp.tid()
+    weight = float(1.0)
+    if inv_weights_in and inv_weights_in[body] > 0.0:
+        weight = 1.0 / inv_weights_in[body]
+    delta, pose, com = deltas_in[body] * weight, bodies.q[body], bodies.com[body]
+    v, omega = velocity_change(bodies, body, wp.spatial_top(delta), wp.spatial_bottom(delta))
+    q = wp.transform_get_rotation(pose)
+    rotated = wp.normalize(q + 0.5 * wp.quat(dt * omega, 0.0) * q)
+    center = wp.transform_point(pose, com) + dt * v
+    q_out[body] = wp.transform(center - wp.quat_rotate(rotated, com), rotated)
+    qd_out[body] = bodies.qd[body] + wp.spatial_vector(v, omega)
+
+
+def launch_apply_corrections(bodies: BodyView, deltas, inv_weights, dt: float, q, qd):
+    """Write the poses and velocities after position corrections; as in Newton's kernel, without its rest threshold.
+
+    Args:
+        bodies: The bodies.
+        deltas: Corrections as impulses and angular impulses about the centers of mass [N·s, N·m·s], shape [bodies].
+        inv_weights: Divisor of the impulses of each body, shape [bodies], or None.
+        dt: Length of the substep [s].
+        q: Out, poses, shape [bodies].
+        qd: Out, velocities, shape [bodies].
+    """
+    inputs = [bodies, deltas, inv_weights, dt]
+    wp.launch(_apply_corrections, dim=len(deltas), inputs=inputs, outputs=[q, qd], device=deltas.device)

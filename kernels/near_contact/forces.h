@@ -1,12 +1,12 @@
-// Forces between near balls, in units of μ0/4π: of the short-range parts, of quadrupoles and of contacts; and torques.
-// Products of sources leave float32's range where balls are small or large, so that lengths are in radii of the ball.
+// Forces and torques between near balls, in units of μ0/4π: of short-range parts, of quadrupoles and of contacts.
+// Lengths are in radii of the ball, so that products of sources stay in float32's range.
 #pragma once
 #include "near_contact/sweeps.h"
 
 namespace warpmag {
 
-// What a ball has of its contacts' forces: derivatives of ½ e ΔC e by the other ball's place. ``g`` are the derivatives
-// of A to P by the distance.
+// Derivative of ½ e ΔC e by the other ball's position, for the ball's own half of ΔC. ``g`` holds the derivatives of A
+// to P by the distance.
 CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductances& f,
                                           const Rows<CONDUCTANCE_SLOPE_ROWS>& g, Vector u, Number inverse,
                                           const Drive& own, const Drive& other) {
@@ -14,26 +14,27 @@ CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductanc
     const ContactDrive a = at_contact(own, u, 1), b = at_contact(other, u, -1);
     const Number square = dot(a.field, a.field) - a.alpha * a.alpha;
     const Number mixed = dot(a.field, b.field) + a.alpha * b.alpha;
-    // what both share counts half for each
+    // terms in both balls' halves count half for each
     const Number doubled = a.phi * (g[0] * a.phi + g[1] * b.phi) + a.alpha * (g[4] * a.alpha + g[5] * b.alpha)
                            + g[6] * square + g[7] * mixed + a.gamma * (g[12] * a.gamma + g[13] * b.gamma);
     const Number radial = Real(0.5) * doubled
                           + a.phi * (g[2] * a.alpha + g[3] * b.alpha + g[8] * a.gamma + g[9] * b.gamma)
                           + a.alpha * (g[10] * a.gamma + g[11] * b.gamma);
-    const Number by_alpha = f[2] * a.phi + of_other(arrays, f, 3) * b.phi + (f[4] - f[6]) * a.alpha
+    const Number by_alpha = f[2] * a.phi + other_conductance(arrays, f, 3) * b.phi + (f[4] - f[6]) * a.alpha
                             + (f[5] + f[7]) * b.alpha + f[10] * a.gamma + f[11] * b.gamma;
     const Number by_gamma = 2
-                            * (f[8] * a.phi + of_other(arrays, f, 9) * b.phi + f[10] * a.alpha
-                               + of_other(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
+                            * (f[8] * a.phi + other_conductance(arrays, f, 9) * b.phi + f[10] * a.alpha
+                               + other_conductance(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
     const Number rest = w * radial - w * inverse * (by_alpha * a.alpha + by_gamma * a.gamma);
     const Number x = w * inverse * by_alpha, y = w * inverse * by_gamma;
     return rest * u + x * a.field + y * a.gradient;
 }
 
-CUDA_CALLABLE inline void find_contact_forces(const Arrays& a, int i) {
+// Writes the forces of a ball's contacts by its own half of ΔC.
+CUDA_CALLABLE inline void store_contact_forces(const Arrays& a, int i) {
     Partners<CONTACT_SLOTS> partners(a.near, i);
     const int slots = most(a.contact_count + i);
-    const Drive own = drive_at(a, Own(i).at);
+    const Drive own = drive_at(a, OwnIndices(i).at);
     for (int s = share(); s - share() < slots; s += SHARES) {
         const Conductances f(a.conductance(s, i));
         const Rows<CONDUCTANCE_SLOPE_ROWS> g(a.conductance_slope(s, i));
@@ -43,13 +44,13 @@ CUDA_CALLABLE inline void find_contact_forces(const Arrays& a, int i) {
     }
 }
 
-// Force on a ball by another one in direction u: along u, and what else there is.
+// Force on a ball by another one in direction u: a part along u, and other terms.
 struct PairForce {
     Number radial;
     Vector across;
 };
 
-// Of sources and dipoles: of what is left of them, less the actual ones. ``third`` is g3 d³.
+// Force of smooth sources and dipoles, less the force of the actual dipoles. ``third`` is g3 d³.
 CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& other, Vector u, Number source,
                                             Number g2, Number inverse, Number third) {
     const Vector t = own.t, m = own.m, t_j = other.t, m_j = other.m;
@@ -63,8 +64,8 @@ CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& o
     return {radial, on * t_j + on_j * t + across};
 }
 
-// Of quadrupoles with sources, dipoles and each other: derivatives of their energy by the distance and the direction,
-// with their window w and its ``slope``; none where they are so close that powers of 1/d overflow.
+// Force of quadrupoles on sources, dipoles and each other: derivatives of their energy by distance and direction, with
+// the window w and its ``slope``. It is 0 where balls are so close that powers of 1/d overflow.
 CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Sources& other, Vector u, Number g2,
                                                 Number inverse, Number third, Number w, Number slope) {
     const Vector t = own.t, t_j = other.t;
@@ -82,36 +83,41 @@ CUDA_CALLABLE inline PairForce quadrupole_force(const Sources& own, const Source
     const Number energy_4 = fourth * on_dipoles;
     const Number energy_5 = fifth * (2 * product - 20 * dot(v, v_j) + 35 * f_j * f) * Real(1.0 / 3.0);
     const Vector z = theta_j * t - theta * t_j, x = theta * v_j + theta_j * v;
-    auto turn_of = [=](Number t, Number t_j, Number v, Number v_j, Number z, Number x) -> Number {
+    auto direction_derivative = [=](Number t, Number t_j, Number v, Number v_j, Number z, Number x) -> Number {
         return 2 * k3 * (q * v_j + q_j * v) + fourth * (5 * (f_j * t - f * t_j) + 10 * (a * v_j - a_j * v) - 2 * z)
                + fifth * (Real(70.0 / 3.0) * (f_j * v + v_j * f) - Real(20.0 / 3.0) * x);
     };
-    const Vector turn = {turn_of(t.x, t_j.x, v.x, v_j.x, z.x, x.x), turn_of(t.y, t_j.y, v.y, v_j.y, z.y, x.y),
-                         turn_of(t.z, t_j.z, v.z, v_j.z, z.z, x.z)};
+    const Vector across = {direction_derivative(t.x, t_j.x, v.x, v_j.x, z.x, x.x),
+                           direction_derivative(t.y, t_j.y, v.y, v_j.y, z.y, x.y),
+                           direction_derivative(t.z, t_j.z, v.z, v_j.z, z.z, x.z)};
     const Number second = g2 * inverse;
     const Number radial = slope * (k3 * on_sources + energy_4 + energy_5)
                           + w * Real(1.0 / 3.0) * (third + 2 * second) * on_sources
-                          - w * inverse * (4 * energy_4 + 5 * energy_5 + dot(turn, u));
-    return {radial, w * inverse * turn};
+                          - w * inverse * (4 * energy_4 + 5 * energy_5 + dot(across, u));
+    return {radial, w * inverse * across};
 }
 
-// Sources, with lengths in another unit, of which a metre has so many.
-CUDA_CALLABLE inline Sources in_units(const Sources& o, Number metre) {
-    const Number square = metre * metre, cube = square * metre;
+// Sources with lengths in radii of the ball.
+CUDA_CALLABLE inline Sources in_radii(const Sources& o, Number inverse_radius) {
+    const Number square = inverse_radius * inverse_radius, cube = square * inverse_radius;
     const Traceless t = o.theta;
-    return {square * o.t, square * o.m, metre * o.q, {cube * t.xx, cube * t.yy, cube * t.xy, cube * t.yz, cube * t.zx}};
+    return {square * o.t,
+            square * o.m,
+            inverse_radius * o.q,
+            {cube * t.xx, cube * t.yy, cube * t.xy, cube * t.yz, cube * t.zx}};
 }
 
+// Sum of the forces on a ball by its near balls [μ0/4π].
 CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& sources) {
-    const Number size = numbers(a.radius + i), zero = size * Real(0), square = size * size, metre = 1 / size;
-    const Sources own = in_units(sources, metre);
+    const Number size = numbers(a.radius + i), zero = size * Real(0), square = size * size, inverse_radius = 1 / size;
+    const Sources own = in_radii(sources, inverse_radius);
     Vector total = {zero, zero, zero};
     Partners<NEAR_SLOTS> partners(a.near, i);
     const int near_slots = most(a.near_count + i), contact_slots = most(a.contact_count + i);
     for (int s = share(); s - share() < near_slots; s += SHARES) {
         const Rows<PAIR_ROWS> row(a.pair(s, i));
         const Rows<PAIR_SLOPE_ROWS> slope(a.pair_slope(s, i));
-        const Sources other = in_units(sources_at(a, partners.of(s)), metre);
+        const Sources other = in_radii(sources_at(a, partners.of(s)), inverse_radius);
         const Vector u = {row[0], row[1], row[2]};
         const Number g1 = square * row[4], g2 = square * size * row[5], g3 = square * (square * slope[0]), w = row[7];
         const Number inverse = size * row[6], apart = w > zero ? inverse : zero;
@@ -123,22 +129,23 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& so
     for (int s = share(); s - share() < contact_slots; s += SHARES) {
         const int* place = list_at(a.counterpart, CONTACT_SLOTS, s, i);
         const Real* forces = a.pair_forces;
-        const Vector theirs = {gather(forces, place), gather(forces + CHUNK, place), gather(forces + 2 * CHUNK, place)};
-        total += (theirs - own_vector(a.pair_force(s, i)));
+        const Vector other_force = {gather(forces, place), gather(forces + CHUNK, place),
+                                    gather(forces + 2 * CHUNK, place)};
+        total += (other_force - own_vector(a.pair_force(s, i)));
     }
     return {group_total(total.x), group_total(total.y), group_total(total.z)};
 }
 
-// Adds forces, and torques m × 4π H_near, to those of the moments that move and turn.
+// Adds forces to movable moments, and torques m × 4π H_near to rotatable ones.
 CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
-    const Sources own = sources_at(a, Own(i).at);
+    const Sources own = sources_at(a, OwnIndices(i).at);
     const Vector force = sum_forces(a, i, own);
     if (share() > 0) return;
     add_to(a.forces, i, force, a.movable);
-    add_to(a.torques, i, cross(own.m, own_vector(rows_at(a.field, 3, i))), a.turned);
+    add_to(a.torques, i, cross(own.m, own_vector(rows_at(a.field, 3, i))), a.rotatable);
 }
 
-// Sweeps, what each ball has of its contacts' forces beside the last step, then the sums with what the others have.
+// Sweeps, with contact forces in the pass of the last step, then a pass for the sums of forces.
 struct Forces {
     const Arrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
@@ -148,7 +155,7 @@ struct Forces {
         }
         const Vector h = sweep_pass(a, pass, i);
         if (pass == 2 * SWEEPS - 1 && share() == 0) put_vector(rows_at(a.field, 3, i), h);
-        if (pass == 2 * SWEEPS) find_contact_forces(a, i);
+        if (pass == 2 * SWEEPS) store_contact_forces(a, i);
     }
 };
 }

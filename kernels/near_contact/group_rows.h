@@ -1,5 +1,6 @@
-// How the threads of a group (``group.h``) divide the numbers and the slots of a ball among themselves: thread c mod
-// SHARES has number c of its ball, as its part c / SHARES, and slot s mod SHARES. On a CPU a thread has all of them.
+// Distribution of the numbers and the slots of a ball over the threads of a group (``group.h``). Thread c mod SHARES
+// has number c of its ball, as its part c / SHARES, and thread s mod SHARES has slot s. On a CPU a thread has all of
+// them.
 //
 // From Python: NEAR_SLOTS, the slots of a ball's list.
 #pragma once
@@ -8,11 +9,11 @@
 namespace warpmag {
 
 CUDA_CALLABLE inline constexpr int parts(int count) { return (count + SHARES - 1) / SHARES; }
-// Where a loop over slots ends: after whole rounds of the threads of a group.
+// Slots rounded up to whole rounds of the threads of a group.
 CUDA_CALLABLE inline int whole_rounds(int slots) { return parts(slots) * SHARES; }
 
 #if defined(__CUDA_ARCH__)
-// Numbers of a ball, STEP rows of CHUNK apart: on a GPU all are read side by side, on a CPU each where it is used.
+// Numbers of a ball, STEP rows of CHUNK apart. A GPU reads all of them at once, a CPU reads each where it is used.
 template <int COUNT, int STEP = 1> struct Rows {
     Number at[COUNT];
     CUDA_CALLABLE explicit Rows(const Real* place) {
@@ -21,7 +22,7 @@ template <int COUNT, int STEP = 1> struct Rows {
     CUDA_CALLABLE Number operator[](int row) const { return at[row]; }
 };
 
-// The other balls of the slots of a list; a thread of a GPU reads those of all its slots side by side.
+// Other balls in the slots of a list; a thread of a GPU reads all of its slots at once.
 template <int SLOTS> struct Partners {
     int at[SLOTS / GROUP], other;
     CUDA_CALLABLE Partners(int* lists, int i) {
@@ -39,8 +40,8 @@ template <class Part> CUDA_CALLABLE inline Number number(const Part& part, int c
     return __shfl_sync(~0u, part[c / GROUP], c % GROUP, GROUP);
 }
 
-// Sums over the threads of a group of those of 16 numbers that are ``used``: number c goes to sum[c / GROUP * GROUP] of
-// its thread. Each exchange halves what a thread has.
+// Sums 16 numbers over the threads of a group, those whose bits are set in ``used``. The total of number c goes to
+// sum[c / GROUP * GROUP] of its thread. Each exchange halves the numbers of a thread.
 CUDA_CALLABLE inline void group_totals(Number (&sum)[16], unsigned used) {
 #pragma unroll
     for (int step = GROUP / 2; step > 0; step /= 2) {
@@ -71,7 +72,7 @@ template <class Part> inline Number number(const Part& part, int c) { return par
 inline void group_totals(Number (&)[16], unsigned) {}
 #endif
 
-// What a thread has of ``COUNT`` numbers of its ball in rows of CHUNK.
+// The thread's parts of COUNT numbers of its ball, in rows of CHUNK.
 template <int COUNT> struct Parts : Rows<parts(COUNT), SHARES> {
     CUDA_CALLABLE explicit Parts(const Real* rows) : Rows<parts(COUNT), SHARES>(rows + share() * CHUNK) {}
 };

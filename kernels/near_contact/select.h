@@ -1,14 +1,14 @@
-// Near balls of each ball, from candidates, those that nearly touch first; and how far a ball takes part in the model.
+// Selects the near balls of each ball from candidates, contacts first, and computes the weight of each ball in the
+// model.
 //
-// From Python: MARGIN of a search, CANDIDATES and HALF_REACH of it, CONTACT_GAP_HIGH, MOST_SHARED_LOW and
-// MOST_SHARED_HIGH.
+// From Python: MARGIN, CANDIDATES and HALF_REACH of the search, CONTACT_GAP_HIGH, MOST_SHARED_LOW and MOST_SHARED_HIGH.
 #pragma once
 #include "near_contact/state.h"
 #include "pairs/pair_law.h"
 
 namespace warpmag {
 
-// A factor that fades what near balls add, and its derivative.
+// A smooth factor between 0 and 1, and its derivative.
 struct Fade {
     Number value, slope;
 };
@@ -16,31 +16,33 @@ CUDA_CALLABLE inline Fade smoothstep(Number x) {
     const Number zero = x * Real(0), t = smaller(larger(x, zero), zero + 1);
     return {t * t * (3 - 2 * t), 6 * t * (1 - t)};
 }
-// Fades from a gap ``near`` to ``far`` and from an overlap ``shallow`` to ``deep``.
+// Window that falls from 1 to 0 between the gaps ``near`` and ``far``, and between the overlaps ``shallow`` and
+// ``deep``.
 CUDA_CALLABLE inline Fade window(Number gap, Real near, Real far, Real shallow, Real deep) {
     const Real width = 1 / (far - near), depth = 1 / (deep - shallow);
     const Fade outer = smoothstep((far - gap) * width), inner = smoothstep((deep + gap) * depth);
     return {outer.value * inner.value, outer.value * inner.slope * depth - outer.slope * inner.value * width};
 }
 
-// Places, radii and kinds as others read them, and whether a ball has moved so far that near ones are sought anew.
-CUDA_CALLABLE inline void publish_place(const Arrays& a, int i) {
+// Writes positions, radii and kinds to lines, and raises a flag if a ball has moved so far that candidates are searched
+// again.
+CUDA_CALLABLE inline void store_position(const Arrays& a, int i) {
     if (share() > 0) return;
     const size_t stride = a.moment_stride;
     const Real* row = a.packed + i;
     const Number size = numbers(row + 3 * stride), zero = size * Real(0);
-    put_four(a.places, 0, i, {numbers(row), numbers(row + stride), numbers(row + 2 * stride), size});
-    put_four(a.places, 1, i, {zero, number_of(indices(a.kind + i)), zero, zero});
+    put_four(a.positions, 0, i, {numbers(row), numbers(row + stride), numbers(row + 2 * stride), size});
+    put_four(a.positions, 1, i, {zero, number_of(indices(a.kind + i)), zero, zero});
     for (int l = 0; l < WIDTH; ++l) {
         if (a.group[i + l] < 0) continue;
-        const Real* found = a.found_at + 3 * (size_t)(i + l);
-        const Real x = row[l] - found[0], y = row[stride + l] - found[1], z = row[2 * stride + l] - found[2];
+        const Real* listed = a.found_at + 3 * (size_t)(i + l);
+        const Real x = row[l] - listed[0], y = row[stride + l] - listed[1], z = row[2 * stride + l] - listed[2];
         const Real limit = MARGIN * row[3 * stride + l];
         if (!(x * x + y * y + z * z <= limit * limit)) raise_flag(*a.moved);
     }
 }
 
-// Enters those of balls j that are chosen, 1 or 0, in the lists of balls i, of which so many slots are filled.
+// Appends balls j, where ``chosen`` is 1, to the lists of balls i. ``filled`` counts them, also beyond ``slots``.
 CUDA_CALLABLE inline void append(const Arrays& a, int i, const int* j, Index chosen, int slots, int* filled) {
 #if defined(__CUDA_ARCH__)
     const unsigned group = group_mask(), all = __ballot_sync(group, chosen) & group;
@@ -57,6 +59,7 @@ CUDA_CALLABLE inline void append(const Arrays& a, int i, const int* j, Index cho
 #endif
 }
 
+// Lists the near balls of balls i and writes their counts and weights. Balls with too many near balls have none.
 CUDA_CALLABLE inline void select(const Arrays& a, int i) {
     int own[WIDTH], filled[WIDTH], touching[WIDTH], largest = 0;
     for (int l = 0; l < WIDTH; ++l) {
@@ -64,20 +67,20 @@ CUDA_CALLABLE inline void select(const Arrays& a, int i) {
         largest = own[l] > largest ? own[l] : largest;
         filled[l] = 0;
     }
-    const Four at = own_four(a.places, 0, i);
-    const Number counts = number_of(indices(own)), size = at.w, zero = size * Real(0), one = zero + 1;
+    const Four at = own_four(a.positions, 0, i);
+    const Number counts = number_of(indices(own)), size = at.w, zero = size * Real(0), unit = zero + 1;
     Number shared = zero;
     for (int apart = 0; apart < 2; ++apart) {
         for (int first = 0; first < largest; first += SHARES) {
             const int k = first + share();
             int j[WIDTH];
             for (int l = 0; l < WIDTH; ++l) j[l] = k < own[l] ? a.candidate[(size_t)(i + l) * CANDIDATES + k] : i + l;
-            const Four o = four_at(a.places, 0, j);
+            const Four o = four_at(a.positions, 0, j);
             const Vector r = {o.x - at.x, o.y - at.y, o.z - at.z};
             const Number d2 = dot(r, r), d = root(d2), sum = size + o.w;
             const auto near = (counts > Real(k)) & (d < HALF_REACH * sum);
             const auto close = (d - sum) * sum < 2 * CONTACT_GAP_HIGH * size * o.w;
-            const Number chosen = near ? (close ? one - apart : zero + apart) : zero;
+            const Number chosen = near ? (close ? unit - apart : zero + apart) : zero;
             append(a, i, j, whole(chosen), apart ? NEAR_SLOTS : CONTACT_SLOTS, filled);
             const auto overlap = near & (d < sum);
             if (!apart && any(overlap)) shared += shared_volume(d2, size, o.w, near);
@@ -90,12 +93,13 @@ CUDA_CALLABLE inline void select(const Arrays& a, int i) {
         const bool fits = own[l] > 0 && filled[l] <= NEAR_SLOTS && touching[l] <= CONTACT_SLOTS && lane_of(part, l) > 0;
         a.near_count[i + l] = fits ? filled[l] : 0;
         a.contact_count[i + l] = fits ? touching[l] : 0;
-        a.places[LINE * (size_t)(i + l) + 4] = fits ? lane_of(part, l) : 0;
+        a.positions[LINE * (size_t)(i + l) + 4] = fits ? lane_of(part, l) : 0;
     }
 }
 
-struct Places {
+// Pass over all balls before candidates are searched.
+struct Positions {
     const Arrays a;
-    CUDA_CALLABLE void operator()(int, int i) const { publish_place(a, i); }
+    CUDA_CALLABLE void operator()(int, int i) const { store_position(a, i); }
 };
 }

@@ -1,6 +1,6 @@
-// What passes over near pairs work on: the arrays, and what balls publish for others to read, a cache line each.
+// Arrays of the passes over near pairs, and cache lines that balls write for others to read.
 //
-// near_pairs.py has the meaning of all arrays, and passes the numbers of their rows and slots, and UNIT, μ0/4π [T·m/A].
+// near_pairs.py documents the arrays. It passes the numbers of their rows and slots, and UNIT, μ0/4π [T·m/A].
 #pragma once
 #include "material/curves.h"
 #include "near_contact/group_rows.h"
@@ -9,18 +9,37 @@
 
 namespace warpmag {
 
-// As ``ContactArrays`` in near_pairs.py: pointers that sweeps read stand side by side, for a GPU to read together.
+// Data of ``contact_arrays`` in near_pairs.py, without shapes and strides.
 struct Arrays {
-    int *group, *field_row, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *turned, *near,
-        *near_count, *contact_count, *curve, *other_begin, *other_end, *pushed;
     int balls, moment_stride, kinds, common_curve;
-    Real *packed, *radius, *unsaturated, *curve_slope, *hardness, *relaxation, *pairs, *conductances, *state,
-        *last_state, *sources, *drives, *field, *kept, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
-        *found_at, *tables, *places, *forces, *torques, *curve_tables, *alone, *response, *bounds, *expansion;
+    int *group, *field_row, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *rotatable,
+        *near, *near_count, *contact_count, *curve, *partner_begin, *partner_end, *magnet_movable;
+    Real *packed, *radius, *inverse_saturation, *curve_slope, *hardness, *relaxation, *pairs, *conductances, *state,
+        *last_state, *sources, *drives, *field, *cached, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
+        *found_at, *tables, *positions, *forces, *torques, *curve_tables, *single, *response, *bounds, *expansion;
 
-    template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
-        static_assert(sizeof(*this) == sizeof(addresses), "ContactArrays has the same members in the same order");
-        memcpy((void*)this, &addresses, sizeof(*this));
+    template <class Given> CUDA_CALLABLE explicit Arrays(const Given& a) {
+        balls = a.balls, moment_stride = a.moment_stride, kinds = a.kinds, common_curve = a.common_curve;
+        // moments
+        packed = a.packed.data, group = a.group.data, field_row = a.field_row.data, kind = a.kind.data;
+        radius = a.radius.data, inverse_saturation = a.inverse_saturation.data, curve_slope = a.curve_slope.data;
+        hardness = a.hardness.data, curve = a.curve.data, curve_tables = a.curve_tables.data, tables = a.tables.data;
+        movable = a.movable.data, rotatable = a.rotatable.data;
+        // near pairs
+        candidate = a.candidate.data, candidate_count = a.candidate_count.data, moved = a.moved.data;
+        found_at = (Real*)a.found_at.data, positions = a.positions.data, near = a.near.data, used = a.used.data;
+        near_count = a.near_count.data, contact_count = a.contact_count.data, counterpart = a.counterpart.data;
+        pairs = a.pairs.data, pair_slopes = a.pair_slopes.data, conductances = a.conductances.data;
+        conductance_slopes = a.conductance_slopes.data, relaxation = a.relaxation.data;
+        // sweeps and forces
+        state = a.state.data, last_state = a.last_state.data, sources = a.sources.data, drives = a.drives.data;
+        cached = a.cached.data, pair_forces = a.pair_forces.data, field = a.field.data;
+        partial = (Real*)a.partial.data, forces = (Real*)a.forces.data, torques = (Real*)a.torques.data;
+        // permanent moments
+        const auto& magnets = a.magnets;
+        partner_begin = magnets.partner_begin.data, partner_end = magnets.partner_end.data;
+        magnet_movable = magnets.movable.data, single = magnets.single.data, bounds = magnets.bounds.data;
+        response = magnets.response.data, expansion = magnets.expansion.data;
     }
 
     CUDA_CALLABLE Real* pair(int s, int i) const { return slot_at(pairs, NEAR_SLOTS, PAIR_ROWS, s, i); }
@@ -35,7 +54,7 @@ struct Arrays {
     }
     CUDA_CALLABLE Real* pair_force(int s, int i) const { return slot_at(pair_forces, CONTACT_SLOTS, 3, s, i); }
     CUDA_CALLABLE Curves curves(int i) const { return curves_of(curve, common_curve, curve_tables, i, WIDTH); }
-    // Components of the moments m, of their three rows.
+    // Row of a component of the moments m.
     CUDA_CALLABLE const Real* moment(int component, int i) const {
         return packed + (size_t)(4 + component) * moment_stride + i;
     }
@@ -44,20 +63,21 @@ struct Arrays {
     }
 };
 
-// What is left of a ball's sources without those of its contacts, ã = (−q, t, theta) with t = m − N, and m itself.
+// Smooth sources of a ball, ã = (−q, t, Θ̃) with t = m − N, and its moment m.
 struct Sources {
     Vector t, m;
     Number q;
     Traceless theta;
 };
-// A ball's drive: φ, R e_m and R² e_Θ, and the weight that falls as the ball saturates.
+// Drive e of a ball: φ, R e_m and R² e_Θ, and a weight that falls as the ball saturates.
 struct Drive {
     Number phi, weight;
     Vector e;
     Traceless t;
 };
 
-// Sources of balls j. On a GPU, which has no pass that publishes m before the others, it comes from where moments are.
+// Sources of balls j. A CPU reads m from the line of the ball. A GPU has no pass that writes it there, and reads the
+// packed moments.
 CUDA_CALLABLE inline Sources sources_at(const Arrays& arrays, const int* j) {
     const Four a = four_at(arrays.sources, 0, j), b = four_at(arrays.sources, 1, j), c = four_at(arrays.sources, 2, j);
 #if defined(__CUDA_ARCH__)
@@ -71,18 +91,33 @@ CUDA_CALLABLE inline Drive drive_at(const Arrays& arrays, const int* j) {
     const Four a = four_at(arrays.drives, 0, j), b = four_at(arrays.drives, 1, j), c = four_at(arrays.drives, 2, j);
     return {c.x, c.y, {b.y, b.z, b.w}, {a.x, a.y, a.z, a.w, b.x}};
 }
-// Balls i themselves, for the functions above.
-struct Own {
+// Indices of balls i, as an argument of the functions above.
+struct OwnIndices {
     int at[WIDTH];
-    CUDA_CALLABLE explicit Own(int i) {
+    CUDA_CALLABLE explicit OwnIndices(int i) {
         for (int l = 0; l < WIDTH; ++l) at[l] = i + l;
     }
 };
 
-// Adds UNIT times vectors to those of the moments in an array that are ``wanted``.
-CUDA_CALLABLE inline void add_to(Real* array, int i, Vector v, const int* wanted) {
+// Slope k_d of the curve at the ball's moment, from 0 to 3 (an ideally permeable ball). The differential susceptibility
+// χ_d follows from 1/χ_d = 1/k_d − 1/3, so multipoles soften as a ball saturates.
+CUDA_CALLABLE inline Number differential_slope(const Arrays& a, int i) {
+    const Number slope = numbers(a.curve_slope + i), zero = slope * Real(0);
+    const Vector reduced = numbers(a.inverse_saturation + i) * a.own_moment(i);
+    const Number steepness = curve_steepness(dot(reduced, reduced), a.curves(i));
+    return smaller(larger(slope * steepness, zero), zero + 3);
+}
+
+// Polarizability lχ/(lχ + 2l + 1) of a ball's multipoles of degree l, divided by R^(2l+1), at a slope of the curve.
+CUDA_CALLABLE inline Number polarizability(Number slope, Real degree) {
+    const Real stiffness = 2 + 1 / degree;
+    return slope / (stiffness + slope * (1 - stiffness * Real(1.0 / 3.0)));
+}
+
+// Adds UNIT times vectors to an array of vectors, for moments whose ``flags`` are not 0.
+CUDA_CALLABLE inline void add_to(Real* array, int i, Vector v, const int* flags) {
     for (int l = 0; l < WIDTH; ++l) {
-        if (wanted[i + l] == 0) continue;
+        if (flags[i + l] == 0) continue;
         Real* const own = array + 3 * (size_t)(i + l);
         own[0] += UNIT * lane_of(v.x, l);
         own[1] += UNIT * lane_of(v.y, l);
@@ -90,8 +125,8 @@ CUDA_CALLABLE inline void add_to(Real* array, int i, Vector v, const int* wanted
     }
 }
 
-// Publishes numbers 0 to 7 and 13 of a ball, and more that goes with them.
-CUDA_CALLABLE inline void publish(Real* lines, int i, const Number* part, Vector more) {
+// Writes numbers 0 to 7 and 13 of a ball to its line, followed by a vector.
+CUDA_CALLABLE inline void store_line(Real* lines, int i, const Number* part, Vector more) {
 #if defined(__CUDA_ARCH__)
     lines[LINE * (size_t)i + share()] = part[0];
     if (share() == 5) put_four(lines, 2, i, {part[1], more.x, more.y, more.z});
@@ -102,8 +137,8 @@ CUDA_CALLABLE inline void publish(Real* lines, int i, const Number* part, Vector
 #endif
 }
 
-// Passes ``first`` to ``last``, of which a launch on a GPU makes one: a launch is where its threads wait for each
-// other.
+// Makes passes ``first`` to ``last``. A launch on a GPU makes one pass, because threads synchronize only between
+// launches.
 template <class Passes, class Addresses>
 CUDA_CALLABLE inline void make_passes(int thread, int first, int last, int threads, unsigned long long* team,
                                       const Addresses& addresses) {

@@ -1,26 +1,27 @@
-// Sweeps over near pairs: the drive e = M ã of all balls, then contact sources and quadrupoles a step towards ΔC e.
+// Sweeps over near pairs. A sweep computes the drive e = M ã of all balls, then moves contact sources and quadrupoles a
+// step towards ΔC e.
 //
-// The numbers of a ball's state, and of sums over its slots, are: 0 to 4 xx, yy, xy, yz, zx of a quadrupole, 5 to 7 a
+// Numbers of a ball's state, and of sums over its slots: 0 to 4 are xx, yy, xy, yz, zx of a quadrupole, 5 to 7 a
 // dipole, 13 a source. From Python: PACE and MOMENTUM of a step, OWN_SOURCE and OWN_DIPOLE of M, SWEEPS.
 #pragma once
-#include "near_contact/softness.h"
+#include "near_contact/state.h"
 
 namespace warpmag {
 
-constexpr unsigned DRIVES = 0x20ff, DRIVES_AND_FIELD = 0xe1ff; // numbers of a drive; and 8, 14, 15 of (M_sr a)_m
+constexpr unsigned DRIVES = 0x20ff,
+                   DRIVES_AND_FIELD = 0xe1ff; // bits of the numbers of a drive; and 8, 14, 15 for (M_sr a)_m
 
+// Polarizability p of a ball's quadrupole, and p relative to its value in a small field.
 struct Softness {
     Number p, weight;
 };
-
-// Polarizability p of a ball's quadrupole, and p over that of a small field.
 CUDA_CALLABLE inline Softness softness_of(const Arrays& a, int i) {
     const Number p = polarizability(differential_slope(a, i), 2);
     return {p, p * numbers(a.hardness + i)};
 }
 
-// Adds what the sources of another ball make to sums of φ, e_m and e_Θ; ``row`` is what ``tabulate.h`` wrote of the
-// pair.
+// Adds the drive by the sources of another ball to sums of φ, e_m and e_Θ. ``row`` holds the pair's numbers of
+// ``tabulate.h``.
 CUDA_CALLABLE inline void add_drive(Number (&sum)[16], const Rows<PAIR_ROWS>& row, const Sources& o) {
     const Vector u = {row[0], row[1], row[2]}, t = o.t;
     const Number q = o.q, along = dot(u, t), source = row[4], g2 = row[5], inverse = row[6], w = row[7];
@@ -33,7 +34,7 @@ CUDA_CALLABLE inline void add_drive(Number (&sum)[16], const Rows<PAIR_ROWS>& ro
     sum[5] += radial * u.x - g1 * t.x - 2 * k4 * v.x;
     sum[6] += radial * u.y - g1 * t.y - 2 * k4 * v.y;
     sum[7] += radial * u.z - g1 * t.z - 2 * k4 * v.z;
-    // 3/2 of what is symmetric and traceless of y u
+    // 3/2 of the symmetric traceless part of y u
     const Number c = k3 * q - 5 * k4 * along + Real(35.0 / 3.0) * k5 * f;
     const Number k = 2 * k4, b = Real(-20.0 / 3.0) * k5;
     const Vector y = {k * t.x + b * v.x + c * u.x, k * t.y + b * v.y + c * u.y, k * t.z + b * v.z + c * u.z};
@@ -45,7 +46,7 @@ CUDA_CALLABLE inline void add_drive(Number (&sum)[16], const Rows<PAIR_ROWS>& ro
     sum[4] += Real(0.75) * (u.z * y.x + u.x * y.z) + k5 * o.theta.zx;
 }
 
-// Adds what the moment of another ball makes to (M_sr a)_m, numbers 8, 14 and 15.
+// Adds the field of another ball's moment to (M_sr a)_m, numbers 8, 14 and 15.
 CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_ROWS>& row, Vector m) {
     const Vector u = {row[0], row[1], row[2]};
     const Number g1 = row[4] * row[6], radial = -row[5] * dot(u, m);
@@ -54,10 +55,10 @@ CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_RO
     sum[15] += radial * u.z - g1 * m.z;
 }
 
-// Sums e = M ã over near balls, those that nearly touch last. What the others make, and what moments make, is summed by
-// the first of an evaluation's passes and kept for those that follow.
+// Sums e = M ã over near balls, contacts last. The first sweep of an evaluation caches the sum over the other near
+// balls and the field of the moments; the following sweeps only add contacts.
 template <bool FIRST>
-CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<KEPT_ROWS>& kept) {
+CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<CACHED_ROWS>& cached) {
     Partners<NEAR_SLOTS> partners(a.near, i);
     const int contact_end = whole_rounds(most(a.contact_count + i));
     const int end = FIRST ? whole_rounds(most(a.near_count + i)) : contact_end;
@@ -65,8 +66,8 @@ CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], c
     Number far[16];
 #pragma unroll
     for (int c = 0; c < 16; ++c) {
-        // one thread of a group goes on from what was kept
-        sum[c] = !FIRST && DRIVES >> c & 1 && c % SHARES == share() ? kept[c / SHARES] : zero;
+        // one thread of a group starts from the cached number
+        sum[c] = !FIRST && DRIVES >> c & 1 && c % SHARES == share() ? cached[c / SHARES] : zero;
         far[c] = zero;
     }
 #pragma unroll 1
@@ -83,7 +84,7 @@ CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], c
     group_totals(sum, FIRST ? DRIVES_AND_FIELD : DRIVES);
     if (!FIRST) return;
     group_totals(far, DRIVES);
-    Real* const rows = rows_at(a.kept, KEPT_ROWS, i);
+    Real* const rows = rows_at(a.cached, CACHED_ROWS, i);
 #pragma unroll
     for (int c = 0; c < 16; ++c) {
         if (c % SHARES != share()) continue;
@@ -92,19 +93,20 @@ CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], c
     }
 }
 
-// Finds the drive, and what quadrupoles move towards; returns 4π H_near = (M_sr a − e)_m, but not the first time.
+// Writes the drive and the target of the quadrupoles, Θ̃ = −p R⁵ e' − (1 − p) n_Θ. Returns 4π H_near = (M_sr a − e)_m,
+// or 0 in the first sweep.
 template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const Arrays& a, int i) {
-    Real* const rows = rows_at(a.kept, KEPT_ROWS, i);
-    const Parts<KEPT_ROWS> kept(rows);
+    Real* const rows = rows_at(a.cached, CACHED_ROWS, i);
+    const Parts<CACHED_ROWS> cached(rows);
     const Parts<STATE_ROWS> state(rows_at(a.state, STATE_ROWS, i));
     const Number size = numbers(a.radius + i), zero = size * Real(0);
-    const Softness soft = FIRST ? softness_of(a, i) : Softness{number(kept, 17), number(kept, 18)};
+    const Softness soft = FIRST ? softness_of(a, i) : Softness{number(cached, 17), number(cached, 18)};
     Number sum[16], drive[parts(16)], difference[parts(16)], m[parts(8)];
     for (int k = 0; k < parts(8); ++k) {
         const int component = k * SHARES + share() - 5;
         m[k] = component < 0 ? zero : numbers(a.moment(component < 0 ? 0 : component, i));
     }
-    sum_drive<FIRST>(a, i, sum, kept);
+    sum_drive<FIRST>(a, i, sum, cached);
     const Number p = soft.p, square = size * size, inverse = 1 / size, cube = inverse * inverse * inverse;
     const Number source = OWN_SOURCE * inverse, dipole = OWN_DIPOLE * cube, fifth = cube * inverse * inverse;
 #pragma unroll
@@ -112,7 +114,7 @@ template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const Arrays& a, in
         const int c = k * SHARES + share();
         const Number other = sum[k * SHARES];
         if (k * SHARES >= 8) {
-            drive[k] = other - source * state[k]; // of number 13 only
+            drive[k] = other - source * state[k]; // number 13 only
             continue;
         }
         const bool quadrupole = c < 5;
@@ -121,17 +123,17 @@ template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const Arrays& a, in
         drive[k] = quadrupole ? square * (1 - p) * difference[k] : size * (difference[k] + dipole * m[k]);
         if (quadrupole) put(rows + (c + 8) * CHUNK, (p - 1) * own - p * square * square * size * other);
     }
-    publish(a.drives, i, drive, {soft.weight, zero, zero});
+    store_line(a.drives, i, drive, {soft.weight, zero, zero});
     if (FIRST && share() == 0) {
         put(rows + 17 * CHUNK, soft.p);
         put(rows + 18 * CHUNK, soft.weight);
     }
     if (FIRST) return {zero, zero, zero};
-    const Vector dipoles = {number(kept, 16), number(kept, 22), number(kept, 23)};
+    const Vector dipoles = {number(cached, 16), number(cached, 22), number(cached, 23)};
     return dipoles - Vector{number(difference, 5), number(difference, 6), number(difference, 7)};
 }
 
-// What a ball's drive is at a contact in direction u: φ, α, γ, R e_m, and R² e_Θ u.
+// Drive of a ball at a contact in direction u: φ, α, γ, R e_m, and R² e_Θ u.
 struct ContactDrive {
     Number phi, alpha, gamma;
     Vector field, gradient;
@@ -141,12 +143,12 @@ CUDA_CALLABLE inline ContactDrive at_contact(const Drive& o, Vector u, int sign)
     return {o.phi, sign * dot(o.e, u), dot(gradient, u), o.e, gradient};
 }
 typedef Rows<CONDUCTANCE_ROWS> Conductances;
-// D', J' or L' of the other ball, which balls of one kind have in common with D, J and L, rows 3, 9 and 11.
-CUDA_CALLABLE inline Number of_other(const Arrays& a, const Conductances& f, int row) {
+// D', J' or L' of the other ball, for row 3, 9 or 11. With one kind of material they equal D, J and L.
+CUDA_CALLABLE inline Number other_conductance(const Arrays& a, const Conductances& f, int row) {
     return a.kinds > 1 ? f[row == 3 ? 14 : row == 9 ? 15 : 16] : f[row];
 }
 
-// Adds the sources ΔC e of a contact that a ball of radius ``size`` has, driven as ``own``, with the other ball.
+// Adds the sources ΔC e of a contact of a ball of radius ``size``, from the drives of both balls.
 CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum)[16], const Conductances& f, Vector u,
                                               Number size, const Drive& own, const Drive& other) {
     const Number w = own.weight * other.weight;
@@ -154,15 +156,15 @@ CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum
     sum[13] += w * (f[0] * a.phi + f[1] * b.phi + f[2] * a.alpha + f[3] * b.alpha + f[8] * a.gamma + f[9] * b.gamma);
     const Number g = f[6], h = f[7];
     const Number along = w
-                         * (f[2] * a.phi + of_other(arrays, f, 3) * b.phi + (f[4] - g) * a.alpha + (f[5] + h) * b.alpha
-                            + f[10] * a.gamma + f[11] * b.gamma);
+                         * (f[2] * a.phi + other_conductance(arrays, f, 3) * b.phi + (f[4] - g) * a.alpha
+                            + (f[5] + h) * b.alpha + f[10] * a.gamma + f[11] * b.gamma);
     const Number on = w * g, on_b = w * h;
     sum[5] += size * (along * u.x + on * a.field.x + on_b * b.field.x);
     sum[6] += size * (along * u.y + on * a.field.y + on_b * b.field.y);
     sum[7] += size * (along * u.z + on * a.field.z + on_b * b.field.z);
     const Number axial = w
-                         * (f[8] * a.phi + of_other(arrays, f, 9) * b.phi + f[10] * a.alpha
-                            + of_other(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
+                         * (f[8] * a.phi + other_conductance(arrays, f, 9) * b.phi + f[10] * a.alpha
+                            + other_conductance(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
     const Number turned = Real(1.5) * size * size * axial, third = Real(0.5) * size * size * axial;
     sum[0] += turned * u.x * u.x - third;
     sum[1] += turned * u.y * u.y - third;
@@ -171,16 +173,17 @@ CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum
     sum[4] += turned * u.z * u.x;
 }
 
-// Contact sources towards ΔC e, and quadrupoles towards their place, by a step of heavy-ball relaxation.
+// Moves contact sources towards ΔC e, and quadrupoles towards their target, by a heavy-ball step:
+// n ← n + α s (ΔC e − n) + β (n − n').
 CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
     Partners<CONTACT_SLOTS> partners(a.near, i);
     Real *const rows = rows_at(a.state, STATE_ROWS, i), *const last_rows = rows_at(a.last_state, STATE_ROWS, i);
     const Parts<STATE_ROWS> state(rows), last(last_rows);
-    const Parts<KEPT_ROWS> kept(rows_at(a.kept, KEPT_ROWS, i));
+    const Parts<CACHED_ROWS> cached(rows_at(a.cached, CACHED_ROWS, i));
     const Number of_source = numbers(a.relaxation + i), of_dipole = numbers(a.relaxation + a.balls + i);
     const int slots = most(a.contact_count + i);
-    const Drive own = drive_at(a, Own(i).at);
-    const Number size = numbers(a.radius + i), zero = size * Real(0), one = zero + 1;
+    const Drive own = drive_at(a, OwnIndices(i).at);
+    const Number size = numbers(a.radius + i), zero = size * Real(0), unit = zero + 1;
     Number sum[16], moved[parts(16)];
 #pragma unroll
     for (int c = 0; c < 16; ++c) sum[c] = zero;
@@ -193,36 +196,37 @@ CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
 #pragma unroll
     for (int k = 0; k < parts(14); ++k) {
         const int c = k * SHARES + share();
-        const bool contact_quadrupole = c >= 8 && c < 13; // of the sums number c − 8
+        const bool contact_quadrupole = c >= 8 && c < 13; // number c − 8 of the sums
         const Number now = state[k];
         const Number contact = contact_quadrupole ? sum[k % parts(8) * SHARES] : sum[k * SHARES];
-        const Number there = c < 5 ? kept[k + parts(8)] : contact;
-        const Number pace = PACE * (c == 13 ? of_source : c >= 5 && c < 8 ? of_dipole : one);
-        const Number next = now + pace * (there - now) + MOMENTUM * (now - last[k]);
+        const Number target = c < 5 ? cached[k + parts(8)] : contact;
+        const Number pace = PACE * (c == 13 ? of_source : c >= 5 && c < 8 ? of_dipole : unit);
+        const Number next = now + pace * (target - now) + MOMENTUM * (now - last[k]);
         moved[k] = next - next == zero ? next : zero;
         put(last_rows + c * CHUNK, now);
         put(rows + c * CHUNK, moved[k]);
     }
-    publish(a.sources, i, moved, SHARES == 1 ? a.own_moment(i) : Vector{zero, zero, zero});
+    store_line(a.sources, i, moved, SHARES == 1 ? a.own_moment(i) : Vector{zero, zero, zero});
 }
 
-// Moments beside the published sources.
-CUDA_CALLABLE inline void publish_moment(const Arrays& a, int i) {
+// Writes moments to the lines of sources.
+CUDA_CALLABLE inline void store_moment(const Arrays& a, int i) {
     const Vector m = a.own_moment(i);
     put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
 }
 
-// On a CPU pass 0 publishes moments; then a drive and a step for each sweep. Returns 4π H_near after the last drive.
+// Pass 0 writes moments on a CPU; then each sweep is a pass for the drive and one for the step. Returns 4π H_near after
+// the last drive.
 CUDA_CALLABLE inline Vector sweep_pass(const Arrays& a, int pass, int i) {
     if (pass == 1) return find_drive<true>(a, i);
     if (pass % 2 == 1) return find_drive<false>(a, i);
     if (pass > 0) relax(a, i);
-    else if (SHARES == 1) publish_moment(a, i);
+    else if (SHARES == 1) store_moment(a, i);
     const Number zero = numbers(a.radius + i) * Real(0);
     return {zero, zero, zero};
 }
 
-// Sweeps of a field evaluation. The pass of the last drive writes the near contacts' part of the field sums.
+// Sweeps of a field evaluation. The pass of the last drive writes 4π H_near to the partial sums of the field.
 struct Sweeps {
     const Arrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {

@@ -1,5 +1,5 @@
-// Tables of the near pairs of one arrangement: directions, radial factors, windows, conductances by the table of two
-// balls, and where to find the other ball's part of a contact's force.
+// Tables of the near pairs of one arrangement: directions, radial factors, windows, conductances from the table of two
+// balls, and the index of the other ball's part of a contact's force.
 //
 // From Python: the windows of contact_table.py, and the nodes of its table.
 #pragma once
@@ -7,9 +7,10 @@
 
 namespace warpmag {
 
-// A near pair: radii, directed distance, and how far both balls take part.
+// A near pair: radii a and b, their sum and its inverse ``unit`` [1/m], distance d and 1/d, weight of both balls,
+// window of the ratio of radii, and lanes of weight > 0.
 struct NearPair {
-    Number a, b, sum, unit, d, inverse, weight, alike;
+    Number a, b, sum, unit, d, inverse, weight, similarity;
     Mask live;
 };
 
@@ -27,7 +28,7 @@ CUDA_CALLABLE inline Potential potential(Number d, Number a, Number b, Number ap
             overlap ? g.g3 : f.g3};
 }
 
-// Writes the rows of slot s of ball i, a pair in direction u, zeros where none is.
+// Writes the rows of slot s of ball i, a pair in direction u; zeros in lanes without a pair.
 CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vector u, const NearPair& p) {
     const Number a = p.a, b = p.b, unit = p.unit, zero = a * Real(0);
     Real *const rows = arrays.pair(s, i), *const slopes = arrays.pair_slope(s, i);
@@ -35,11 +36,11 @@ CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vect
     keep(0, u.x);
     keep(1, u.y);
     keep(2, u.z);
-    // in units of the distance in contact: powers of metres overflow float32
+    // lengths in units of the distance in contact, because powers of meters overflow float32
     const Number y = unit * p.d, third = unit * unit * unit, x = HALF_RANGE * unit;
     const Number apart = larger(a - b, b - a);
     const Potential all = potential(y, unit * a, unit * b, unit * apart), far = potential(y, x * a, x * b, x * apart);
-    const Number short_range = y < HALF_RANGE ? p.weight : zero; // balls leave the model gradually
+    const Number short_range = y < HALF_RANGE ? p.weight : zero; // fades with the balls' weights
     keep(3, short_range * unit * (all.u - far.u));
     keep(4, short_range * unit * unit * (all.g1 - far.g1));
     keep(5, short_range * third * (all.g2 - far.g2));
@@ -47,22 +48,22 @@ CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vect
     put(slopes, p.live ? short_range * third * (unit * (all.g3 - far.g3)) : zero);
     const Fade quadrupole =
         window(2 * y - 2, QUADRUPOLE_GAP_LOW, QUADRUPOLE_GAP_HIGH, QUADRUPOLE_OVERLAP_LOW, QUADRUPOLE_OVERLAP_HIGH);
-    keep(7, p.weight * p.alike * quadrupole.value);
-    put(slopes + CHUNK, p.live ? p.weight * p.alike * 2 * unit * quadrupole.slope : zero);
+    keep(7, p.weight * p.similarity * quadrupole.value);
+    put(slopes + CHUNK, p.live ? p.weight * p.similarity * 2 * unit * quadrupole.slope : zero);
 }
 
-// Where the spline of a gap [radii] is read: first of four nodes, their weights, and those of the derivative.
+// B-spline at a gap [radii]: first of four nodes, their weights, and the weights of the derivative.
 struct Spline {
     Index node;
     Number weight[4], slope[4];
 
     CUDA_CALLABLE explicit Spline(Number gap) {
-        const Number zero = gap * Real(0), one = zero + 1, outside = larger(gap, one * SMALLEST_GAP);
+        const Number zero = gap * Real(0), unit = zero + 1, outside = larger(gap, unit * SMALLEST_GAP);
         const Number z = smaller(gap - SMALLEST_GAP, zero) * (1 / SOFTNESS), steep = 1 / root(1 + z * z);
         Number x = logarithm(outside) + (SOFTNESS / SMALLEST_GAP) * z * steep;
-        x = smaller(larger((x - FIRST_NODE) * NODES_PER_UNIT, zero), one * (NODES - 1));
-        node = whole(smaller(x, one * (NODES - 2)));
-        const Number v = x - number_of(node), u = 1 - v, sixth = one * Real(1.0 / 6.0);
+        x = smaller(larger((x - FIRST_NODE) * NODES_PER_UNIT, zero), unit * (NODES - 1));
+        node = whole(smaller(x, unit * (NODES - 2)));
+        const Number v = x - number_of(node), u = 1 - v, sixth = unit * Real(1.0 / 6.0);
         const Number scale = Real(0.5) * NODES_PER_UNIT * steep * steep * steep / outside;
         weight[0] = sixth * u * u * u;
         weight[1] = sixth * (4 - 6 * v * v + 3 * v * v * v);
@@ -75,7 +76,7 @@ struct Spline {
     }
 };
 
-// Adds to values and to derivatives of four of the table's functions, at nodes that begin at ``lines``.
+// Interpolates values and derivatives of four of the table's functions, at the nodes from ``lines`` on.
 CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int* lines, const Spline& spline,
                                       Four& value, Four& change) {
     const Number zero = spline.weight[0] * Real(0);
@@ -89,12 +90,14 @@ CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int
     }
 }
 
-// Writes the conductances of slot s of ball i and their derivatives, and adds those of its own sources and dipoles.
+// Writes the conductances of slot s of ball i and their derivatives. Adds the ball's self-conductances to ``sources``
+// and
+// ``dipoles``.
 CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both,
-                                           Index kind, Index its_kind, Number& sources, Number& dipoles) {
+                                           Index kind, Index other_kind, Number& sources, Number& dipoles) {
     const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit;
     const auto touches = both > zero;
-    const Number gap = touches ? (p.d - p.sum) / scale : zero + 1; // a point dipole's would be no number
+    const Number gap = touches ? (p.d - p.sum) / scale : zero + 1; // NaN for a point dipole
     Real *const rows = arrays.conductance(s, i), *const slopes = arrays.conductance_slope(s, i);
     const Spline spline(gap);
     const Fade fade = window(gap, CONTACT_GAP_LOW, CONTACT_GAP_HIGH, DEEPEST_LOW, DEEPEST_HIGH);
@@ -106,7 +109,7 @@ CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, c
         put(slopes + row * CHUNK, touches ? part_change * change + part_slope * value : zero);
     };
     int lines[WIDTH];
-    put_indices(lines, (kind * arrays.kinds + its_kind) * (NODES + 2) + spline.node);
+    put_indices(lines, (kind * arrays.kinds + other_kind) * (NODES + 2) + spline.node);
     Four value, change;
     for (int quarter = 0; quarter < 4; ++quarter) {
         interpolate(arrays.tables, quarter, lines, spline, value, change);
@@ -119,7 +122,7 @@ CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, c
         store(4 * quarter + 3, value.w, change.w);
     }
     if (arrays.kinds == 1) return;
-    put_indices(lines, (its_kind * arrays.kinds + kind) * (NODES + 2) + spline.node);
+    put_indices(lines, (other_kind * arrays.kinds + kind) * (NODES + 2) + spline.node);
     interpolate(arrays.tables, 0, lines, spline, value, change);
     keep(14, value.w);
     interpolate(arrays.tables, 2, lines, spline, value, change);
@@ -127,10 +130,10 @@ CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, c
     keep(16, value.w);
 }
 
-// Finds where the other ball of a contact has its part of the force; the last place, of zeros, is for none.
+// Finds the index of the other ball's part of a contact's force; the last one, of zeros, where there is none.
 CUDA_CALLABLE inline void find_counterpart(const Arrays& a, int i, int s, int j) {
     int place = -1;
-    auto takes_part = [&](int ball) { return a.places[LINE * (size_t)ball + 4] > 0; };
+    auto takes_part = [&](int ball) { return a.positions[LINE * (size_t)ball + 4] > 0; };
     if (s < a.contact_count[i] && takes_part(i) && takes_part(j))
         for (int slot = 0; slot < a.contact_count[j]; ++slot)
             place = *list_at(a.near, NEAR_SLOTS, slot, j) == i ? slot : place;
@@ -138,49 +141,50 @@ CUDA_CALLABLE inline void find_counterpart(const Arrays& a, int i, int s, int j)
         place < 0 ? CONTACT_SLOTS * 3 * a.balls : (int)(a.pair_force(place, j) - a.pair_forces);
 }
 
-// A ball that has no near ball any more starts cold when it has one again.
-CUDA_CALLABLE inline void forget_where_alone(const Arrays& a, int i, Mask alone) {
-    if (!any(alone)) return;
+// Sets the state of balls without near balls to zero, so that they start cold when they have one again.
+CUDA_CALLABLE inline void reset_isolated(const Arrays& a, int i, Mask isolated) {
+    if (!any(isolated)) return;
     const Number zero = numbers(a.radius + i) * Real(0);
     for (int quarter = 0; quarter < 3; ++quarter) {
         const Four f = own_four(a.sources, quarter, i);
         put_four(a.sources, quarter, i,
-                 {alone ? zero : f.x, alone ? zero : f.y, alone ? zero : f.z, alone ? zero : f.w});
+                 {isolated ? zero : f.x, isolated ? zero : f.y, isolated ? zero : f.z, isolated ? zero : f.w});
     }
     for (int c = 0; c < 2 * STATE_ROWS; ++c) {
         Real* const row = rows_at(c < STATE_ROWS ? a.state : a.last_state, STATE_ROWS, i) + c % STATE_ROWS * CHUNK;
-        put(row, alone ? zero : numbers(row));
+        put(row, isolated ? zero : numbers(row));
     }
 }
 
-// Tabulates the slots of a ball. Those that are no longer used are emptied: they hold the ball itself, and zeros.
+// Tabulates the slots of a ball. Slots that are no longer used are emptied: they hold the ball itself, and zeros.
 CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
     int *const used = a.used + i, *const used_contacts = used + a.balls;
     const int contact_slots = most(a.contact_count + i), counted = most(a.near_count + i), emptied = most(used);
     const int slots = counted > emptied ? counted : emptied, emptied_contacts = most(used_contacts);
     const Number counts = number_of(indices(a.near_count + i)),
                  contact_counts = number_of(indices(a.contact_count + i));
-    const Four own = own_four(a.places, 0, i), own_part = own_four(a.places, 1, i);
-    const Number size = own.w, zero = size * Real(0), one = zero + 1;
+    const Four own = own_four(a.positions, 0, i), own_part = own_four(a.positions, 1, i);
+    const Number size = own.w, zero = size * Real(0), unit = zero + 1;
     Number sources = zero, dipoles = zero;
     for (int s = share(); s < slots; s += SHARES) {
         int* const list = list_at(a.near, NEAR_SLOTS, s, i);
         for (int l = 0; l < WIDTH; ++l)
-            if (s >= a.near_count[i + l]) list[l] = i + l; // others read the slots in use meanwhile
-        const Four other = four_at(a.places, 0, list), part = four_at(a.places, 1, list);
+            if (s >= a.near_count[i + l]) list[l] = i + l; // other threads read only the slots in use
+        const Four other = four_at(a.positions, 0, list), part = four_at(a.positions, 1, list);
         const Number weight = counts > Real(s) ? own_part.x * part.x : zero;
         const Mask live = weight > zero;
-        const Number b = live ? other.w : size + (size > zero ? zero : one), sum = size + b;
+        const Number b = live ? other.w : size + (size > zero ? zero : unit), sum = size + b;
         const Vector r = {other.x - own.x, other.y - own.y, other.z - own.z};
         const Polar apart = polar(1 / sum * r);
-        // bounded: powers of 1/d that nothing comes of, since the balls overlap, may not overflow
+        // bounded below, so that powers of 1/d do not overflow; overlapping balls do not use them
         const Number d = live ? sum * larger(apart.d, zero + Real(1e-12)) : sum;
         const Number ratio = smaller(size, b) / larger(size, b);
-        const Number alike = smoothstep((ratio - LEAST_RATIO_LOW) * (1 / (LEAST_RATIO_HIGH - LEAST_RATIO_LOW))).value;
-        const NearPair pair = {size, b, sum, 1 / sum, d, 1 / d, weight, alike, live};
+        const Number similarity =
+            smoothstep((ratio - LEAST_RATIO_LOW) * (1 / (LEAST_RATIO_HIGH - LEAST_RATIO_LOW))).value;
+        const NearPair pair = {size, b, sum, 1 / sum, d, 1 / d, weight, similarity, live};
         tabulate_pair(a, i, s, apart.u, pair);
         if (s >= contact_slots && s >= emptied_contacts) continue;
-        const Number both = contact_counts > Real(s) ? weight * alike : zero;
+        const Number both = contact_counts > Real(s) ? weight * similarity : zero;
         tabulate_contact(a, i, s, pair, both, whole(own_part.y), whole(part.y), sources, dipoles);
         for (int l = 0; l < WIDTH; ++l) find_counterpart(a, i + l, s, list[l]);
     }
@@ -191,7 +195,7 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
     put(a.relaxation + a.balls + i, size / (size + OWN_DIPOLE * dipoles));
     put_indices(used, indices(a.near_count + i));
     put_indices(used_contacts, indices(a.contact_count + i));
-    forget_where_alone(a, i, counts == zero);
+    reset_isolated(a, i, counts == zero);
 }
 
 // Two passes: select near balls, then tabulate them.

@@ -1,38 +1,38 @@
-"""Between rigid bodies and their magnetic moments.
+"""Coupling of rigid bodies and their magnetic moments: positions and moments from bodies, wrenches to bodies.
 
 A magnet's moments are fixed in the frame of its body. Every substep they are transformed to the world frame, and the
-force F and torque τ on each are added to the wrench of its body about the centre of mass c (Newton's convention):
+force F and torque τ on each are added to the wrench of its body about the center of mass c (Newton's convention):
 
     F_body = Σ F_i,    τ_body = Σ τ_i + (x_i − c) × F_i
 
-Sums run in a fixed order and without atomics, so that a run repeats bit by bit: on a GPU a warp sums the moments of a
-body.
+Sums have a fixed order and use no atomics, so that runs are repeatable bit by bit. On a GPU a warp sums the moments of
+a body.
 """
 
 import warp as wp
 
-from warpmag.kernels.rigid.newton_views import BodyView
+from warpmag.kernels.rigid.newton_views import BodyView, velocity_at, view_bodies
 from warpmag.kernels.shared.reductions import group_sum
 
 wp.set_module_options({"enable_backward": False})
 
-_SHARES = 32
-"""Threads of a GPU that sum the moments of a body: a warp."""
+_THREADS = 32
+"""Threads of a GPU that sum the moments of a body, a warp."""
 _sum_group = group_sum(wp.spatial_vectord)
 
 
 @wp.struct
 class BodyMoments:
-    """Which moments belong to which body, for n moments in r runs on b bodies.
+    """Moments and their bodies, for n moments in r runs of consecutive moments on b bodies.
 
     Attributes:
         body: Body of each moment, -1 where the magnet is fixed in the world, shape [n].
-        permanent: Whether the moment is permanent, shape [n].
+        permanent: True for permanent moments, shape [n].
         local_positions: Position in the body's frame [m], shape [n].
         volumes: Volume of each moment [m³], shape [n].
-        shape: Shape that the moment belongs to, shape [n].
-        shape_frames, magnetizations: Frame of each shape in its body's, and its permanent magnetization in that frame
-            [A/m]: arrays of the model, shape [shapes].
+        shape: Shape of each moment, shape [n].
+        shape_frames, magnetizations: Frame of each shape in its body's frame, and its permanent magnetization in the
+            shape's frame [A/m]: arrays of the model, shape [shapes].
         body_list, body_run_start: Bodies with moments, and the first run of each, shape [b] and [b + 1].
         runs: First moment of each run, and the one after its last, shape [r].
         kinematic_flag: Newton's flag of bodies that forces do not move.
@@ -53,10 +53,10 @@ class BodyMoments:
 
 @wp.struct
 class ShapeMagnets:
-    """What the shapes of a model say about magnets, arrays of the model or copies of them, shape [shapes].
+    """Magnetic attributes of a model's shapes: arrays of the model or copies of them, shape [shapes].
 
     Attributes:
-        kind: 0 for a shape that is no magnet.
+        kind: Kind of magnet, 0 for other shapes.
         saturation, susceptibility, curve, recoil_permeability, moment_spacing, conductivity: As in
             ``warpmag.engine.magnets.attributes``.
     """
@@ -71,15 +71,16 @@ class ShapeMagnets:
 
 
 @wp.func
-def _alike(now: ShapeMagnets, then: ShapeMagnets, shape: int) -> bool:
-    if now.kind[shape] != then.kind[shape]:
+def _have_same_magnet(a: ShapeMagnets, b: ShapeMagnets, shape: int) -> bool:
+    """Return true if a shape has the same attributes in both structs."""
+    if a.kind[shape] != b.kind[shape]:
         return False
-    if now.kind[shape] == 0:
+    if a.kind[shape] == 0:
         return True
-    same = now.saturation[shape] == then.saturation[shape] and now.susceptibility[shape] == then.susceptibility[shape]
-    same = same and now.recoil_permeability[shape] == then.recoil_permeability[shape]
-    same = same and now.conductivity[shape] == then.conductivity[shape]
-    return same and now.curve[shape] == then.curve[shape] and now.moment_spacing[shape] == then.moment_spacing[shape]
+    same = a.saturation[shape] == b.saturation[shape] and a.susceptibility[shape] == b.susceptibility[shape]
+    same = same and a.recoil_permeability[shape] == b.recoil_permeability[shape]
+    same = same and a.conductivity[shape] == b.conductivity[shape]
+    return same and a.curve[shape] == b.curve[shape] and a.moment_spacing[shape] == b.moment_spacing[shape]
 
 
 @wp.kernel
@@ -87,16 +88,16 @@ def _gather_moments(
     # inputs:
     body_q_in: wp.array[wp.transform],
     magnets: BodyMoments,
-    now: ShapeMagnets,
-    then: ShapeMagnets,
+    present: ShapeMagnets,
+    initial: ShapeMagnets,
     # outputs:
     positions_out: wp.array[wp.vec3],
     moments_out: wp.array[wp.vec3],
     changed_out: wp.array[wp.int32],
 ):
     i = wp.tid()
-    if i < now.kind.shape[0]:
-        if not _alike(now, then, i):
+    if i < present.kind.shape[0]:
+        if not _have_same_magnet(present, initial, i):
             wp.atomic_max(changed_out, 0, i + 1)
     if i >= positions_out.shape[0]:
         return
@@ -111,14 +112,18 @@ def _gather_moments(
         moments_out[i] = wp.transform_vector(frame, wp.transform_vector(magnets.shape_frames[shape], moment))
 
 
-def gather_moments(body_q, magnets: BodyMoments, now: ShapeMagnets, then: ShapeMagnets, positions, moments, changed):
-    """Write the world positions of all moments, and the world moments of the permanent ones.
+def gather_moments(
+    body_q, magnets: BodyMoments, present: ShapeMagnets, initial: ShapeMagnets, positions, moments, changed
+):
+    """Write the positions of all moments and the moments of permanent magnets, in the world's frame.
 
-    ``changed`` [1] becomes a shape, plus one, of which the model says something else now than then, if there is any.
+    If the present attributes of a shape differ from the initial ones, its index plus 1 is written to ``changed`` [1].
     """
     outputs = [positions, moments, changed]
-    dim = max(len(positions), len(now.kind))
-    wp.launch(_gather_moments, dim, inputs=[body_q, magnets, now, then], outputs=outputs, device=positions.device)
+    dim = max(len(positions), len(present.kind))
+    wp.launch(
+        _gather_moments, dim, inputs=[body_q, magnets, present, initial], outputs=outputs, device=positions.device
+    )
 
 
 @wp.kernel
@@ -141,7 +146,8 @@ def _gather_bias(
 
 
 def gather_bias(body_q, magnets: BodyMoments, moments, factors, bias):
-    """Write the field that stands for the remanence of some ``moments``, ``factors`` times it [A/m], world frame."""
+    """Write the bias field of ``moments`` with a remanence, ``factors`` times their magnetization [A/m], world
+    frame."""
     inputs = [body_q, magnets, moments, factors]
     wp.launch(_gather_bias, len(moments), inputs=inputs, outputs=[bias], device=bias.device)
 
@@ -156,7 +162,7 @@ def _gather_rotations(
 
 
 def gather_rotations(body_q, bodies, rotations):
-    """Write the rotations of ``bodies``; that of one fixed in the world, −1, stays."""
+    """Write the rotations of ``bodies``, except for index −1, the world."""
     wp.launch(_gather_rotations, len(bodies), [body_q, bodies], [rotations], device=rotations.device)
 
 
@@ -170,7 +176,7 @@ def _gather_frames(
 
 
 def gather_frames(body_q, bodies, frames):
-    """Write where ``bodies`` are; that of one fixed in the world, −1, stays."""
+    """Write the poses of ``bodies``, except for index −1, the world."""
     wp.launch(_gather_frames, len(bodies), [body_q, bodies], [frames], device=frames.device)
 
 
@@ -190,7 +196,7 @@ def _set_magnetization(
 
 
 def set_magnetization(magnetization, shapes, model, magnets: BodyMoments):
-    """Give shapes a permanent magnetization [A/m], shape [1], in the frame of their body, their own where static."""
+    """Set the permanent magnetization [A/m], shape [1], of shapes, in their body's frame, or their own if static."""
     inputs = [magnetization, shapes, model.shape_body, magnets.shape_frames]
     wp.launch(_set_magnetization, len(shapes), inputs=inputs, outputs=[magnets.magnetizations], device=shapes.device)
 
@@ -204,7 +210,7 @@ def _set_external_field(
 
 
 def set_external_field(field, worlds, external_field):
-    """Give each moment the external field [A/m] of its world, or the only one there is."""
+    """Set the external field [A/m] of each moment to that of its world; ``field`` may have one entry for all worlds."""
     wp.launch(_set_external_field, len(worlds), inputs=[field, worlds], outputs=[external_field], device=worlds.device)
 
 
@@ -218,37 +224,71 @@ def _add_wrenches(
     positions_in: wp.array[wp.vec3],
     forces_in: wp.array[wp.vec3],
     torques_in: wp.array[wp.vec3],
-    shares: int,
+    threads: int,
     # outputs:
     body_f_out: wp.array[wp.spatial_vector],
 ):
-    k = wp.tid() // shares
-    share = wp.tid() % shares
+    k = wp.tid() // threads
+    thread = wp.tid() % threads
     body = magnets.body_list[k]
     if (body_flags_in[body] & magnets.kinematic_flag) != 0:
         return
     center = wp.transform_point(body_q_in[body], body_com_in[body])
-    mine = wp.spatial_vectord()
+    partial = wp.spatial_vectord()
     for run in range(magnets.body_run_start[k], magnets.body_run_start[k + 1]):
-        for i in range(magnets.runs[run][0] + share, magnets.runs[run][1], shares):
+        for i in range(magnets.runs[run][0] + thread, magnets.runs[run][1], threads):
             force = forces_in[i]
             torque = torques_in[i] + wp.cross(positions_in[i] - center, force)
             for c in range(3):
-                mine[c] += wp.float64(force[c])
-                mine[c + 3] += wp.float64(torque[c])
-    total = _sum_group(mine, shares)
-    if share == 0:
+                partial[c] += wp.float64(force[c])
+                partial[c + 3] += wp.float64(torque[c])
+    total = _sum_group(partial, threads)
+    if thread == 0:
         force = wp.vec3(float(total[0]), float(total[1]), float(total[2]))
         torque = wp.vec3(float(total[3]), float(total[4]), float(total[5]))
         body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
 
 
 def add_wrenches(magnets: BodyMoments, model, state, positions, forces, torques):
-    """Add the force and torque of every moment to the wrench of its body in ``state``, unless that is kinematic."""
+    """Add the force and torque of every moment to the wrench of its body in ``state``, except for kinematic bodies."""
     device = positions.device
-    shares = _SHARES if device.is_cuda else 1
-    inputs = [magnets, state.body_q, model.body_com, model.body_flags, positions, forces, torques, shares]
-    wp.launch(_add_wrenches, shares * len(magnets.body_list), inputs=inputs, outputs=[state.body_f], device=device)
+    threads = _THREADS if device.is_cuda else 1
+    inputs = [magnets, state.body_q, model.body_com, model.body_flags, positions, forces, torques, threads]
+    wp.launch(_add_wrenches, threads * len(magnets.body_list), inputs=inputs, outputs=[state.body_f], device=device)
+
+
+@wp.kernel
+def _gather_motion(
+    # inputs:
+    bodies: BodyView,
+    magnets: BodyMoments,
+    positions_in: wp.array[wp.vec3],
+    # outputs:
+    motion_out: wp.array2d[float],
+):
+    i = wp.tid()
+    body = magnets.body[i]
+    if body < 0:
+        return
+    velocity = velocity_at(bodies, body, positions_in[i])
+    spin = wp.spatial_bottom(bodies.qd[body])
+    for c in range(3):
+        motion_out[c, i] = velocity[c]
+        motion_out[c + 3, i] = spin[c]
+    if (bodies.flags[body] & magnets.kinematic_flag) == 0:
+        inverse = bodies.inv_inertia[body]
+        motion_out[6, i] = bodies.inv_mass[body]
+        motion_out[7, i] = wp.max(inverse[0, 0], wp.max(inverse[1, 1], inverse[2, 2]))
+
+
+def gather_motion(magnets: BodyMoments, model, state, positions, motion):
+    """Write the velocity, angular velocity, inverse mass and largest inverse inertia of each moment, by rows.
+
+    Columns of moments that are fixed in the world are skipped. Kinematic bodies keep their inverse mass and inertia of
+    0.
+    """
+    inputs = [view_bodies(model, state), magnets, positions]
+    wp.launch(_gather_motion, len(positions), inputs=inputs, outputs=[motion], device=positions.device)
 
 
 @wp.kernel
@@ -257,13 +297,16 @@ def _predict_poses(bodies: BodyView, substeps_in: wp.array[wp.int32], dt: float,
     seconds = 0.5 * float(substeps_in[0] - 1) * dt
     center = wp.transform_point(bodies.q[body], bodies.com[body]) + seconds * wp.spatial_top(bodies.qd[body])
     rotation = wp.transform_get_rotation(bodies.q[body])
-    turn = 0.5 * seconds * wp.spatial_bottom(bodies.qd[body])
-    rotation = wp.normalize(rotation + wp.quat(turn, 0.0) * rotation)
+    half_turn = 0.5 * seconds * wp.spatial_bottom(bodies.qd[body])
+    rotation = wp.normalize(rotation + wp.quat(half_turn, 0.0) * rotation)
     body_q_out[body] = wp.transform(center - wp.quat_rotate(rotation, bodies.com[body]), rotation)
 
 
 def predict_poses(bodies: BodyView, substeps, dt: float, body_q):
-    """Write the poses, by velocities, half-way between those that ``substeps`` [1] of ``dt`` each start from."""
+    """Write the poses at the middle of ``substeps`` [1] substeps of ``dt`` [s], predicted from velocities.
+
+    The middle is halfway between the starts of the first and the last substep.
+    """
     inputs = [bodies, substeps, dt]
     wp.launch(_predict_poses, dim=len(body_q), inputs=inputs, outputs=[body_q], device=body_q.device)
 
@@ -278,5 +321,5 @@ def _sum_moments(part_start_in: wp.array[wp.int32], moments_in: wp.array[wp.vec3
 
 
 def sum_moments(part_start, moments, totals):
-    """Write the total moment [A·m²] of each run of moments from ``part_start[k]`` to ``part_start[k + 1]``."""
+    """Write the total moment [A·m²] of moments ``part_start[k]`` to ``part_start[k + 1]``, for each k."""
     wp.launch(_sum_moments, dim=len(totals), inputs=[part_start, moments], outputs=[totals], device=totals.device)

@@ -1,9 +1,9 @@
-"""Poses of kinematic bodies whose transforms are keyed.
+"""Poses and velocities of kinematic bodies with time-sampled transforms.
 
-A body's frame is a product of transforms, each of which follows keys of its own, as in USD: what turns by angles goes
-along arcs, not along chords between poses. The product is taken in double precision at the moment that is asked for.
-Velocities are those that lead from one moment to another: v = (c₁ − c₀)/Δt of the centre of mass, ω = the rotation
-vector from q₀ to q₁ over Δt. A solver that moves everything by its velocities sees the body go where it stands next.
+A body's frame is a product of transforms, and each transform has keys of its own, as in USD. So a body that rotates by
+angles moves along arcs, not along chords between poses. The product is evaluated in double precision at the given time.
+Velocities are those between two times: v = (c₁ − c₀)/Δt of the center of mass, and ω = the rotation vector from q₀ to
+q₁ over Δt. A solver that moves bodies by their velocities moves the body to its next pose.
 """
 
 from collections.abc import Sequence
@@ -15,11 +15,11 @@ import warp as wp
 
 from warpmag.kernels.rigid.keys import (
     KeyedValues,
+    fraction_after,
+    interpolate_number,
+    interpolate_quaternion,
     key_before,
-    keyed_number,
-    keyed_quaternion,
     keyed_values,
-    part_after,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -38,13 +38,13 @@ class KeyedPoses:
 
     Attributes:
         keyed: The keys, a curve for each transform.
-        kind: Index of each in ``TRANSFORMS``, shape [o].
-        inverse: 1 for those that are undone, shape [o].
-        first: First transform of each body, the outermost, and the one after the last, shape [b + 1].
-        body: The bodies, shape [b].
-        com: Centres of mass in the frames of all bodies [m].
-        joint: Free joint of each body, -1 if it has none, shape [b].
-        joint_q_start, joint_qd_start, parent_frame, child_frame: Newton's, of all joints.
+        kind: Index of each transform's type in ``TRANSFORMS``, shape [o].
+        inverse: 1 for inverted transforms, shape [o].
+        first: First (outermost) transform of each body, and the one after the last, shape [b + 1].
+        body: Index of each body in the model, shape [b].
+        com: Centers of mass of all bodies in their frames [m].
+        joint: Free joint of each body, -1 for bodies without one, shape [b].
+        joint_q_start, joint_qd_start, parent_frame, child_frame: Newton's arrays of all joints.
     """
 
     keyed: KeyedValues
@@ -61,15 +61,16 @@ class KeyedPoses:
 
 
 @wp.func
-def _about(axis: int, angle: wp.float64) -> wp.quatd:
+def _axis_rotation(axis: int, angle: wp.float64) -> wp.quatd:
+    """Return the rotation about a coordinate axis by an angle [degrees]."""
     unit = wp.vec3d()
     unit[axis] = wp.float64(1.0)
     return wp.quat_from_axis_angle(unit, angle * _RADIANS)
 
 
 @wp.func
-def _turned_by(order: int, angles: wp.vec3d) -> wp.quatd:
-    """Rotation by three angles [degrees]; of the six orders of axes, each pair begins with the same one."""
+def _euler_rotation(order: int, angles: wp.vec3d) -> wp.quatd:
+    """Return the rotation by three angles [degrees]; orders 2 k and 2 k + 1 of the six begin with axis k."""
     first = order // 2
     second = (first + 1) % 3
     if order % 2 == 0:
@@ -77,51 +78,56 @@ def _turned_by(order: int, angles: wp.vec3d) -> wp.quatd:
     else:
         second = wp.where(first == 2, 1, 2)
     third = 3 - first - second
-    return _about(third, angles[third]) * _about(second, angles[second]) * _about(first, angles[first])
+    return (
+        _axis_rotation(third, angles[third])
+        * _axis_rotation(second, angles[second])
+        * _axis_rotation(first, angles[first])
+    )
 
 
 @wp.func
-def _placed(position: wp.vec3d, rotation: wp.mat33d) -> wp.mat44d:
-    none = wp.float64(0.0)
+def _matrix_of(position: wp.vec3d, rotation: wp.mat33d) -> wp.mat44d:
+    """Return the matrix of a rotation, or any linear map, followed by a translation."""
+    zero = wp.float64(0.0)
     return wp.mat44d(
         rotation[0, 0], rotation[0, 1], rotation[0, 2], position[0],
         rotation[1, 0], rotation[1, 1], rotation[1, 2], position[1],
         rotation[2, 0], rotation[2, 1], rotation[2, 2], position[2],
-        none, none, none, wp.float64(1.0),
+        zero, zero, zero, wp.float64(1.0),
     )  # fmt: skip
 
 
 @wp.func
-def _operation(poses: KeyedPoses, o: int, time: wp.float64) -> wp.mat44d:
-    """Matrix of a transform at a time, which acts on columns."""
+def _transform_at(poses: KeyedPoses, o: int, time: wp.float64) -> wp.mat44d:
+    """Return the matrix of a transform at a time; it multiplies column vectors."""
     key = key_before(poses.keyed, o, time)
-    part = part_after(poses.keyed, o, key, time)
+    fraction = fraction_after(poses.keyed, o, key, time)
     kind = poses.kind[o]
     matrix = wp.identity(n=4, dtype=wp.float64)
     if kind == _MATRIX:
         for i in range(4):
             for j in range(4):
-                matrix[i, j] = keyed_number(poses.keyed, o, key, part, 4 * j + i)
+                matrix[i, j] = interpolate_number(poses.keyed, o, key, fraction, 4 * j + i)
         return matrix
-    none = wp.vec3d()
+    zero = wp.vec3d()
     if kind == _ORIENT:
-        return _placed(none, wp.quat_to_matrix(keyed_quaternion(poses.keyed, o, key, part)))
-    three = wp.vec3d()
+        return _matrix_of(zero, wp.quat_to_matrix(interpolate_quaternion(poses.keyed, o, key, fraction)))
+    values = wp.vec3d()
     for i in range(3):
-        three[i] = keyed_number(poses.keyed, o, key, part, i)
+        values[i] = interpolate_number(poses.keyed, o, key, fraction, i)
     if kind == _TRANSLATE:
-        return _placed(three, wp.identity(n=3, dtype=wp.float64))
+        return _matrix_of(values, wp.identity(n=3, dtype=wp.float64))
     if kind == _SCALE:
-        return _placed(none, wp.diag(three))
-    return _placed(none, wp.quat_to_matrix(_turned_by(kind - _ROTATE, three)))
+        return _matrix_of(zero, wp.diag(values))
+    return _matrix_of(zero, wp.quat_to_matrix(_euler_rotation(kind - _ROTATE, values)))
 
 
 @wp.func
 def _pose(poses: KeyedPoses, k: int, time: wp.float64) -> wp.transformd:
-    """Frame of a body at a time: its scale is left out, as Newton does."""
+    """Return the frame of a body at a time, without its scale, as in Newton."""
     matrix = wp.identity(n=4, dtype=wp.float64)
     for o in range(poses.first[k], poses.first[k + 1]):
-        step = _operation(poses, o, time)
+        step = _transform_at(poses, o, time)
         if poses.inverse[o] != 0:
             step = wp.inverse(step)
         matrix = matrix * step
@@ -135,7 +141,7 @@ def _pose(poses: KeyedPoses, k: int, time: wp.float64) -> wp.transformd:
 
 
 @wp.func
-def _single(v: wp.vec3d) -> wp.vec3:
+def _to_float32(v: wp.vec3d) -> wp.vec3:
     return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
 
 
@@ -144,7 +150,7 @@ def _write_joint(
     poses: KeyedPoses, joint: int, pose: wp.transform, qd: wp.spatial_vector, joint_q: wp.array[float],
     joint_qd: wp.array[float],
 ):  # fmt: skip
-    """Coordinates and speeds of a free joint, which count from its frames."""
+    """Write the coordinates and velocities of a free joint, relative to its frames."""
     parent = poses.parent_frame[joint]
     local = wp.transform_inverse(parent) * pose * poses.child_frame[joint]
     for k in range(7):
@@ -157,7 +163,7 @@ def _write_joint(
 
 
 @wp.kernel
-def _place(
+def _write_poses(
     # inputs:
     poses: KeyedPoses,
     time_in: wp.array[wp.float64],
@@ -172,21 +178,21 @@ def _place(
 ):
     k = wp.tid()
     body = poses.body[k]
-    here, there = _pose(poses, k, time_in[0] + begin), _pose(poses, k, time_in[0] + begin + duration)
+    pose0, pose1 = _pose(poses, k, time_in[0] + begin), _pose(poses, k, time_in[0] + begin + duration)
     com = wp.vec3d(poses.com[body])
-    moved = wp.transform_point(there, com) - wp.transform_point(here, com)
-    turn = wp.transform_get_rotation(there) * wp.quat_inverse(wp.transform_get_rotation(here))
+    moved = wp.transform_point(pose1, com) - wp.transform_point(pose0, com)
+    turn = wp.transform_get_rotation(pose1) * wp.quat_inverse(wp.transform_get_rotation(pose0))
     axis, w = wp.vec3d(turn[0], turn[1], turn[2]), turn[3]
     if w < wp.float64(0.0):
         axis, w = -axis, -w
     sine = wp.length(axis)
-    rate = wp.float64(2.0)  # of a small angle over its sine
+    rate = wp.float64(2.0)  # limit of angle / sin(angle / 2) at small angles
     if sine > wp.float64(1e-12):
         rate = wp.float64(2.0) * wp.atan2(sine, w) / sine
-    qd = wp.spatial_vector(_single(moved / duration), _single((rate / duration) * axis))
-    at = wp.where(at_end != 0, there, here)
+    qd = wp.spatial_vector(_to_float32(moved / duration), _to_float32((rate / duration) * axis))
+    at = wp.where(at_end != 0, pose1, pose0)
     p, q = wp.transform_get_translation(at), wp.transform_get_rotation(at)
-    pose = wp.transform(_single(p), wp.quat(float(q[0]), float(q[1]), float(q[2]), float(q[3])))
+    pose = wp.transform(_to_float32(p), wp.quat(float(q[0]), float(q[1]), float(q[2]), float(q[3])))
     body_q_out[body] = pose
     body_qd_out[body] = qd
     if poses.joint[k] >= 0:
@@ -198,7 +204,7 @@ class PosedBodies:
     """Bodies of a model that follow keys by a clock.
 
     Attributes:
-        arrays: What the kernels are given.
+        arrays: Arrays of the kernels, :class:`KeyedPoses`.
         time: Time on the device [s], shape [1].
     """
 
@@ -210,20 +216,20 @@ def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time:
     """Return bodies that follow keys.
 
     Args:
-        bodies: Of each body its transforms, the outermost first, with ``kind``, ``keys`` and ``inverse``.
-        joints: Free joint of each of these bodies, -1 if it has none.
+        bodies: Transforms of each body, the outermost first, with ``kind``, ``keys`` and ``inverse``.
+        joints: Free joint of each of these bodies, -1 for bodies without one.
         model: Newton's model.
         time: Time on the device [s], float64, shape [1].
     """
-    operations = [one for own in bodies.values() for one in own]
+    transforms = [transform for own in bodies.values() for transform in own]
 
     def put(values):
         return wp.array(np.array(values, np.int32), dtype=wp.int32, device=time.device)
 
     a = KeyedPoses()
-    a.keyed = keyed_values([one.keys for one in operations], time.device)
-    a.kind = put([TRANSFORMS.index(one.kind) for one in operations])
-    a.inverse = put([one.inverse for one in operations])
+    a.keyed = keyed_values([transform.keys for transform in transforms], time.device)
+    a.kind = put([TRANSFORMS.index(transform.kind) for transform in transforms])
+    a.inverse = put([transform.inverse for transform in transforms])
     a.first, a.body, a.joint = put(np.cumsum([0, *map(len, bodies.values())])), put(list(bodies)), put(joints)
     a.com = model.body_com
     if model.joint_count:
@@ -233,15 +239,15 @@ def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time:
 
 
 def launch_place(bodies: PosedBodies, state, begin: float, duration: float, *, at_end: bool):
-    """Place bodies of a state, and give them the velocities that lead them through a time; capturable in a graph.
+    """Write poses, and the mean velocities over an interval, of bodies to a state; capturable in a graph.
 
     Args:
         bodies: The bodies.
-        state: Newton's state; its free joints get the same.
-        begin: When that time begins [s], since the clock's.
-        duration: How long it is [s].
-        at_end: Whether they are to stand where they do at its end, not at its beginning.
+        state: Newton's state; coordinates of free joints are written, too.
+        begin: Start of the interval [s], relative to the clock.
+        duration: Length of the interval [s].
+        at_end: True for the poses at the interval's end, false for those at its start.
     """
     inputs = [bodies.arrays, bodies.time, wp.float64(begin), wp.float64(duration), int(at_end)]
     outputs = [state.body_q, state.body_qd, state.joint_q, state.joint_qd]
-    wp.launch(_place, dim=len(bodies.arrays.body), inputs=inputs, outputs=outputs, device=bodies.time.device)
+    wp.launch(_write_poses, dim=len(bodies.arrays.body), inputs=inputs, outputs=outputs, device=bodies.time.device)

@@ -1,20 +1,20 @@
-"""Watches a simulation on the device: what decides whether a substep holds (``stepping``).
+"""Monitor of a simulation on the device: the quantities by which ``stepping`` accepts or rejects a step.
 
-Every kernel writes into two small arrays that are cleared before an attempt at a step and judged after it. Maxima and
-minima do not depend on the order of threads, so that a run repeats bit by bit.
+All kernels write to two small arrays, which are cleared before an attempt at a step and evaluated after it. Maxima and
+minima do not depend on the order of threads, so runs are repeatable bit by bit.
 
 ``peaks`` [float32]: maxima, see the ``PEAK_*`` indices.
-``counts`` [int32]: see the ``COUNT_*`` indices; from ``COUNT_CAPACITIES`` on, the fill of each buffer watched.
+``counts`` [int32]: see the ``COUNT_*`` indices; from ``COUNT_CAPACITIES`` on, the use of each monitored buffer.
 
-A substep takes the plane between two bodies that are about to touch for what it was when the substep began. So it must
-be short where bodies glide along each other and touch: they would be stopped where they pass, and slip between others
-that no plane keeps them from. Bodies that fly together do not glide, those that fly alone or straight at each other
-only have to be seen coming, and those that part do not touch. Motion is measured by velocities: they say how far a body
-has come in the last substep, held by its contacts.
+**Sliding.** In a substep the contact plane between two bodies is fixed. So substeps must be short where bodies in
+contact slide along each other. In a long substep a body would stop at a plane that it has passed, or enter a gap that
+no plane closes. Only the tangential relative velocity of closing contacts counts. The motion of a single body counts
+with a smaller weight: its contacts only have to be detected in time. Motion is computed from velocities, which contacts
+have limited in the last substep.
 
-How far forces would pull a body in a substep matters where contacts hold it: that is what the solver has to undo, and
-what it leaves of it keeps a pile hot (held balls of Sakura Tree, under 1,500 times their weight, move at 9 cm/s after
-0.6 s in substeps of 0.5 ms, and at 2 in such of 0.25 ms).
+**Pull of forces.** The displacement by forces within a substep counts, too: where contacts hold the body, the solver
+has to undo it, and the remainder heats a pile. In Sakura Tree, balls are held under 1,500 times their weight. After 0.6
+s they move at 9 cm/s with substeps of 0.5 ms, and at 2 cm/s with 0.25 ms.
 """
 
 import warp as wp
@@ -23,16 +23,16 @@ from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bo
 
 wp.set_module_options({"enable_backward": False})
 
-PEAK_TRAVEL = 0  # motion in a substep that tells, over the thickness of the thinner body [1]
-PEAK_NEXT_TRAVEL = 1  # the same in the substep that would follow
-PEAK_LONG_TRAVEL = 2  # the same in any of these if it were twice as long
-PEAK_SPEED = 3  # speed of a body's centre of mass [m/s]
+PEAK_TRAVEL = 0  # weighted motion in a substep, over the thickness of the thinner body [1]
+PEAK_NEXT_TRAVEL = 1  # the same, predicted for the substep after the attempt
+PEAK_LONG_TRAVEL = 2  # the largest of both, for substeps of twice the length
+PEAK_SPEED = 3  # speed of a body's center of mass [m/s]
 PEAK_OVERLAP = 4  # penetration over the thickness of the thinner body [1]
 PEAK_DEPTH = 5  # penetration [m]
 PEAK_ERROR = 6  # magnetization error [1]
 PEAKS = 7
 
-COUNT_BAD_BODY = 0  # first body whose state was not finite, by substeps; else NO_BODY
+COUNT_BAD_BODY = 0  # first body whose state was not finite, plus bodies times substeps; else NO_BODY
 COUNT_EVALUATIONS = 1  # field evaluations, summed over substeps
 COUNT_UNCONVERGED = 2  # substeps whose induction did not converge
 COUNT_OVERLAPS = 3  # contacts deeper than a threshold
@@ -41,32 +41,31 @@ COUNT_CAPACITIES = 4
 NO_BODY = 2**31 - 1
 
 STAGES = 3
-"""Stages whose time is measured: induction, forces, rigid bodies."""
+"""Stages with a timer: induction, forces, rigid bodies."""
 INDUCTION, FORCE, RIGID = range(STAGES)
 
-FREE = 0.25
-"""Weight of a body's own motion against gliding along another: contacts are sought as far ahead as twice its thickness,
-and two bodies may meet."""
+UNCONSTRAINED_WEIGHT = 0.25
+"""Weight of a single body's motion relative to sliding: contacts are detected up to twice its thickness ahead, and two
+bodies may approach each other."""
 
-
-NEXT = -1
-"""Number of the substep that would follow those of an attempt."""
+NEXT_SUBSTEP = -1
+"""Index of the substep after those of an attempt."""
 
 
 @wp.struct
-class Watched:
-    """What is watched, and where it goes.
+class Monitor:
+    """Arrays of the monitor.
 
     Attributes:
-        thickness: How far a body may move before it can pass through another [m], the radius of a ball; infinite for
-            bodies that do not move by forces. Shape [body_count].
-        reach: How far a turn moves the surface of a body per radian [m], zero for a ball. Shape [body_count].
-        fills: Addresses of the numbers that tell how full each buffer is, 0 for what :func:`watch_flags` watches.
-        level: How often substeps were halved, shape [1].
-        substeps: Substeps done in this attempt, shape [1].
-        ticks: Time spent in each stage since the last step was accepted, then the time of the last mark; nanoseconds on
-            a GPU, clock cycles on a CPU.
-        peaks, counts: See above.
+        thickness: Distance that a body may move before it can pass through another [m], the radius of a ball; infinite
+            for bodies that forces do not move. Shape [body_count].
+        reach: Largest displacement of a body's surface per radian [m], zero for a ball. Shape [body_count].
+        fills: Addresses of the number of used entries of each buffer; 0 for buffers of :func:`watch_flags`.
+        level: Number of times that substeps were halved, shape [1].
+        substeps: Number of completed substeps of this attempt, shape [1].
+        ticks: Time of each stage since the last accepted step, then the clock at the last mark; nanoseconds on a GPU,
+            clock cycles on a CPU.
+        peaks, counts: See the module's docstring.
     """
 
     thickness: wp.array[float]
@@ -90,56 +89,56 @@ class Watched:
     return __builtin_readcyclecounter();
 #endif
 """)
-def now() -> wp.uint64:
-    """Time of the device: nanoseconds on a GPU, clock cycles on a CPU."""
+def read_clock() -> wp.uint64:
+    """Return the device's clock: nanoseconds on a GPU, clock cycles on a CPU."""
 
 
 @wp.func
 def mark_time(ticks: wp.array[wp.uint64], stage: int):
-    """Count the time since the last mark as spent in ``stage``."""
-    time = now()
+    """Add the time since the last mark to ``stage``."""
+    time = read_clock()
     ticks[stage] = ticks[stage] + time - ticks[STAGES]
     ticks[STAGES] = time
 
 
 @wp.func
-def _raise(peaks: wp.array[float], which: int, value: float):
-    """Take a value into a maximum; most are below it, and need no atomic."""
-    if value > peaks[which]:
-        wp.atomic_max(peaks, which, value)
+def _raise_maximum(peaks: wp.array[float], index: int, value: float):
+    """Raise a maximum to a value; most values are below it and need no atomic operation."""
+    if value > peaks[index]:
+        wp.atomic_max(peaks, index, value)
 
 
 @wp.func
-def _take_travel(w: Watched, travel: float, long_travel: float, substep: int):
-    _raise(w.peaks, wp.where(substep == NEXT, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
-    _raise(w.peaks, PEAK_LONG_TRAVEL, long_travel)
+def _raise_travel(m: Monitor, travel: float, long_travel: float, substep: int):
+    _raise_maximum(m.peaks, wp.where(substep == NEXT_SUBSTEP, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
+    _raise_maximum(m.peaks, PEAK_LONG_TRAVEL, long_travel)
 
 
 @wp.func
-def _watch_body(w: Watched, bodies: BodyView, body: int, substep: int, dt: float):
-    """Note a body that is not finite; take how far it moves into the peaks, weighed as alone."""
+def _watch_body(m: Monitor, bodies: BodyView, body: int, substep: int, dt: float):
+    """Detect a body that is not finite, and raise the peaks by its motion."""
     total = wp.abs(bodies.q[body][0])
     for k in range(1, 7):
         total += wp.abs(bodies.q[body][k])
     for k in range(6):
         total += wp.abs(bodies.qd[body][k])
-    # a spin whose square is infinite leaves an orientation of zero
+    # an angular velocity whose square overflows leaves an orientation of zero
     if not wp.isfinite(total) or wp.length(wp.transform_get_rotation(bodies.q[body])) < 0.5:
-        wp.atomic_min(w.counts, COUNT_BAD_BODY, (w.substeps[0] + wp.max(substep, 0)) * bodies.qd.shape[0] + body)
-    thickness = w.thickness[body]
+        wp.atomic_min(m.counts, COUNT_BAD_BODY, (m.substeps[0] + wp.max(substep, 0)) * bodies.qd.shape[0] + body)
+    thickness = m.thickness[body]
     if thickness < wp.inf:
         speed = wp.length(wp.spatial_top(bodies.qd[body]))
-        turning = w.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
-        travel = FREE * (speed + turning) * dt / thickness
-        _take_travel(w, travel, 2.0 * travel, substep)
-        _raise(w.peaks, PEAK_SPEED, speed)
+        turning = m.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
+        travel = UNCONSTRAINED_WEIGHT * (speed + turning) * dt / thickness
+        _raise_travel(m, travel, 2.0 * travel, substep)
+        _raise_maximum(m.peaks, PEAK_SPEED, speed)
 
 
 @wp.func
-def _body_thickness(w: Watched, body: int) -> float:
+def _body_thickness(m: Monitor, body: int) -> float:
     if body < 0:
         return wp.inf
-    return w.thickness[body]
+    return m.thickness[body]
 
 
 @wp.func
@@ -151,7 +150,7 @@ def _body_velocity(bodies: BodyView, body: int) -> wp.vec3:
 
 @wp.func
 def _watch_contact(
-    w: Watched,
+    m: Monitor,
     contacts: ContactView,
     bodies: BodyView,
     i: int,
@@ -160,30 +159,30 @@ def _watch_contact(
     overlap_threshold: float,
     overlaps: wp.array[float],
 ):
-    """Note a contact's depth; take how far its bodies glide along each other into the peaks if they touch."""
+    """Raise the peaks by a contact's depth, and by the sliding of its bodies where it closes."""
     overlaps[i] = -wp.inf
     body0, body1 = contact_bodies(contacts, i)
-    thickness = wp.min(_body_thickness(w, body0), _body_thickness(w, body1))
+    thickness = wp.min(_body_thickness(m, body0), _body_thickness(m, body1))
     if thickness == wp.inf:
         return
     depth = contact_depth(contacts, bodies.q, i)
     overlap = depth / thickness
     overlaps[i] = overlap
-    _raise(w.peaks, PEAK_DEPTH, depth)
-    _raise(w.peaks, PEAK_OVERLAP, overlap)
+    _raise_maximum(m.peaks, PEAK_DEPTH, depth)
+    _raise_maximum(m.peaks, PEAK_OVERLAP, overlap)
     if overlap > overlap_threshold:
-        wp.atomic_add(w.counts, COUNT_OVERLAPS, 1)
+        wp.atomic_add(m.counts, COUNT_OVERLAPS, 1)
     moved = (_body_velocity(bodies, body1) - _body_velocity(bodies, body0)) * (dt / thickness)
     apart = wp.dot(contacts.normal[i], moved)
     along = wp.length(moved - apart * contacts.normal[i])
-    touch, touch_later = apart < overlap, 2.0 * apart < overlap
-    _take_travel(w, wp.where(touch, along, 0.0), wp.where(touch_later, 2.0 * along, 0.0), substep)
+    closes, closes_later = apart < overlap, 2.0 * apart < overlap
+    _raise_travel(m, wp.where(closes, along, 0.0), wp.where(closes_later, 2.0 * along, 0.0), substep)
 
 
 @wp.kernel
 def _watch(
     # inputs:
-    w: Watched,
+    m: Monitor,
     contacts: ContactView,
     bodies: BodyView,
     substep: int,
@@ -193,66 +192,67 @@ def _watch(
     overlaps_out: wp.array[float],
 ):
     i = wp.tid()
-    dt = longest / float(1 << w.level[0])
+    dt = longest / float(1 << m.level[0])
     if i == 0:
-        mark_time(w.ticks, RIGID)
-    if i < w.fills.shape[0]:
-        if w.fills[i] != wp.uint64(0):
-            fill = wp.array(ptr=w.fills[i], shape=(1,), dtype=wp.int32)
-            w.counts[COUNT_CAPACITIES + i] = wp.max(w.counts[COUNT_CAPACITIES + i], fill[0])
+        mark_time(m.ticks, RIGID)
+    if i < m.fills.shape[0]:
+        if m.fills[i] != wp.uint64(0):
+            fill = wp.array(ptr=m.fills[i], shape=(1,), dtype=wp.int32)
+            m.counts[COUNT_CAPACITIES + i] = wp.max(m.counts[COUNT_CAPACITIES + i], fill[0])
     if i < bodies.qd.shape[0]:
-        _watch_body(w, bodies, i, substep, dt)
+        _watch_body(m, bodies, i, substep, dt)
     if i < contact_count(contacts):
-        _watch_contact(w, contacts, bodies, i, substep, dt, overlap_threshold, overlaps_out)
+        _watch_contact(m, contacts, bodies, i, substep, dt, overlap_threshold, overlaps_out)
 
 
-def watch(w: Watched, contacts: ContactView, bodies: BodyView, overlaps, *, substep, longest: float, threshold: float):
-    """Take a state whose contacts were just found into ``peaks`` and ``counts``, and mark the time of rigid bodies.
+def watch(m: Monitor, contacts: ContactView, bodies: BodyView, overlaps, *, substep, longest: float, threshold: float):
+    """Update ``peaks`` and ``counts`` by a state with new contacts, and mark the time of rigid bodies.
 
-    ``COUNT_BAD_BODY`` is the lowest body that was not finite in the first such substep, plus the number of that substep
-    times that of the bodies: magnets pass what is not finite to all others within a substep.
+    ``COUNT_BAD_BODY`` is the lowest body that was not finite in the first such substep, plus the index of that substep
+    times the number of bodies. Only the first counts, because magnets spread infinite values to all others in a
+    substep.
 
     Args:
-        w: What is watched.
+        m: The monitor.
         contacts: The contacts.
         bodies: The bodies.
         overlaps: Out, depth of each contact over the thickness of its thinner body, shape [contact_max].
-        substep: Substeps since ``w.substeps`` were counted, or ``NEXT``.
+        substep: Index of the substep after ``m.substeps``, or ``NEXT_SUBSTEP``.
         longest: Length of the substeps of the first level [s].
-        threshold: Overlap from which on a contact is counted.
+        threshold: Overlap above which a contact is counted.
     """
-    dim = max(len(overlaps), len(w.thickness), len(w.fills), 1)
-    inputs = [w, contacts, bodies, substep, longest, threshold]
-    wp.launch(_watch, dim=dim, inputs=inputs, outputs=[overlaps], device=w.peaks.device)
+    dim = max(len(overlaps), len(m.thickness), len(m.fills), 1)
+    inputs = [m, contacts, bodies, substep, longest, threshold]
+    wp.launch(_watch, dim=dim, inputs=inputs, outputs=[overlaps], device=m.peaks.device)
 
 
 @wp.kernel
-def _watch_forces(w: Watched, bodies: BodyView, gravity_in: wp.array[wp.vec3], longest: float):
+def _watch_forces(m: Monitor, bodies: BodyView, gravity_in: wp.array[wp.vec3], longest: float):
     body = wp.tid()
     if body == 0:
-        mark_time(w.ticks, FORCE)
-    if body < w.thickness.shape[0]:
-        thickness = w.thickness[body]
+        mark_time(m.ticks, FORCE)
+    if body < m.thickness.shape[0]:
+        thickness = m.thickness[body]
         if thickness < wp.inf:
-            dt = longest / float(1 << w.level[0])
+            dt = longest / float(1 << m.level[0])
             force = wp.spatial_top(bodies.f[body])
             acceleration = wp.length(force * bodies.inv_mass[body] + gravity_in[bodies.world[body]])
-            pulled = 0.5 * acceleration * dt * dt / thickness
-            _raise(w.peaks, PEAK_TRAVEL, pulled)
-            _raise(w.peaks, PEAK_LONG_TRAVEL, 4.0 * pulled)
+            pull = 0.5 * acceleration * dt * dt / thickness
+            _raise_maximum(m.peaks, PEAK_TRAVEL, pull)
+            _raise_maximum(m.peaks, PEAK_LONG_TRAVEL, 4.0 * pull)
 
 
-def watch_forces(w: Watched, bodies: BodyView, gravity, longest: float):
-    """Take how far forces would pull bodies within a substep into ``peaks``, and mark the time of forces.
+def watch_forces(m: Monitor, bodies: BodyView, gravity, longest: float):
+    """Raise ``peaks`` by the displacement of bodies by forces within a substep, and mark the time of forces.
 
     Args:
-        w: What is watched.
+        m: The monitor.
         bodies: The bodies, forces evaluated.
         gravity: Gravity of each world [m/s²].
         longest: Length of the substeps of the first level [s].
     """
-    inputs = [w, bodies, gravity, longest]
-    wp.launch(_watch_forces, dim=max(len(w.thickness), 1), inputs=inputs, device=w.peaks.device)
+    inputs = [m, bodies, gravity, longest]
+    wp.launch(_watch_forces, dim=max(len(m.thickness), 1), inputs=inputs, device=m.peaks.device)
 
 
 @wp.kernel
@@ -269,12 +269,12 @@ def watch_flags(flags, index: int, counts):
 @wp.kernel
 def _watch_induction(
     # inputs:
-    w: Watched,
+    m: Monitor,
     error_in: wp.array[wp.float64],
     evaluations_in: wp.array[wp.int32],
     converged_in: wp.array[wp.int32],
 ):
-    mark_time(w.ticks, INDUCTION)
+    mark_time(m.ticks, INDUCTION)
     error = error_in[0]
     evaluations = evaluations_in[0]
     converged = converged_in[0]
@@ -282,12 +282,12 @@ def _watch_induction(
         error = wp.max(error, error_in[world])
         evaluations = wp.max(evaluations, evaluations_in[world])
         converged = wp.min(converged, converged_in[world])
-    w.peaks[PEAK_ERROR] = wp.max(w.peaks[PEAK_ERROR], float(error))
-    w.counts[COUNT_EVALUATIONS] = w.counts[COUNT_EVALUATIONS] + evaluations
+    m.peaks[PEAK_ERROR] = wp.max(m.peaks[PEAK_ERROR], float(error))
+    m.counts[COUNT_EVALUATIONS] = m.counts[COUNT_EVALUATIONS] + evaluations
     if converged == 0:
-        w.counts[COUNT_UNCONVERGED] = w.counts[COUNT_UNCONVERGED] + 1
+        m.counts[COUNT_UNCONVERGED] = m.counts[COUNT_UNCONVERGED] + 1
 
 
-def watch_induction(w: Watched, error, evaluations, converged):
-    """Take the outcome of one induction, an entry per world, into ``peaks`` and ``counts``, and mark its time."""
-    wp.launch(_watch_induction, dim=1, inputs=[w, error, evaluations, converged], device=w.peaks.device)
+def watch_induction(m: Monitor, error, evaluations, converged):
+    """Update ``peaks`` and ``counts`` by the result of an induction, an entry per world, and mark its time."""
+    wp.launch(_watch_induction, dim=1, inputs=[m, error, evaluations, converged], device=m.peaks.device)

@@ -1,6 +1,7 @@
-"""Newton's bodies and contacts as structs of arrays, and what several kernels compute from them.
+"""Structs of Newton's arrays of bodies and contacts, and functions that several kernels share.
 
-The structs copy nothing. They are filled at launch: states alternate, and contact buffers are replaced when they grow.
+The structs refer to Newton's arrays without copies. They are filled before each launch, because states alternate and
+contact buffers are replaced when they grow.
 """
 
 import warp as wp
@@ -10,13 +11,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyView:
-    """Bodies in one state, arrays of shape [bodies].
+    """Bodies of a model in one state, arrays of shape [bodies].
 
     Attributes:
         q: Pose.
-        qd: Velocity of the centre of mass and angular velocity [m/s, rad/s].
-        f: Force and torque about the centre of mass [N, N·m].
-        com: Centre of mass in the body's frame [m].
+        qd: Velocity of the center of mass and angular velocity [m/s, rad/s].
+        f: Force and torque about the center of mass [N, N·m].
+        com: Center of mass in the body's frame [m].
         inertia: Inertia in the body's frame [kg·m²].
         inv_mass: Inverse mass, zero for bodies that forces do not move [1/kg].
         inv_inertia: Inverse inertia in the body's frame [1/(kg·m²)].
@@ -37,17 +38,17 @@ class BodyView:
 
 @wp.struct
 class ContactView:
-    """Contacts of rigid bodies and the shapes that touch.
+    """Contacts of rigid bodies, and their shapes.
 
     Attributes:
-        count: Contacts found, more than ``contact_max`` if some were dropped, shape [1].
+        count: Number of contacts, more than ``contact_max`` if some were dropped, shape [1].
         shape0, shape1: Shapes of each contact, shape [contact_max].
         point0, point1: Contact points in the frames of the two bodies [m], shape [contact_max].
-        offset0, offset1: From the points to where the surfaces rub, in those frames [m], shape [contact_max].
+        offset0, offset1: Vectors from the contact points to the surfaces, in those frames [m], shape [contact_max].
         margin0, margin1: Distance of the surface from each point [m], shape [contact_max].
         normal: Unit vector from the first shape to the second, shape [contact_max].
         shape_body: Body of each shape, -1 for the world, shape [shapes].
-        shape_gap: Distance up to which contacts are found [m], shape [shapes].
+        shape_gap: Distance up to which contacts are detected [m], shape [shapes].
         mu, mu_torsional, mu_rolling: Coefficients of friction of each shape, shape [shapes].
     """
 
@@ -91,19 +92,27 @@ def view_contacts(model, contacts) -> ContactView:
 
 
 @wp.func
+def velocity_at(bodies: BodyView, body: int, x: wp.vec3):
+    """Return the velocity of a point x, in the world's frame, of a body [m/s]."""
+    center = wp.transform_point(bodies.q[body], bodies.com[body])
+    return wp.spatial_top(bodies.qd[body]) + wp.cross(wp.spatial_bottom(bodies.qd[body]), x - center)
+
+
+@wp.func
 def contact_count(contacts: ContactView) -> int:
-    """Contacts that the buffers hold."""
+    """Return the number of contacts in the buffers."""
     return wp.min(contacts.count[0], contacts.shape0.shape[0])
 
 
 @wp.func
 def contact_bodies(contacts: ContactView, i: int):
-    """The two bodies of contact i, -1 for the world."""
+    """Return the two bodies of contact i, -1 for the world."""
     return contacts.shape_body[contacts.shape0[i]], contacts.shape_body[contacts.shape1[i]]
 
 
 @wp.func
 def _world_point(body_q: wp.array[wp.transform], body: int, point: wp.vec3) -> wp.vec3:
+    """Return a point of a body's frame in the world's frame."""
     if body < 0:
         return point
     return wp.transform_point(body_q[body], point)
@@ -111,7 +120,7 @@ def _world_point(body_q: wp.array[wp.transform], body: int, point: wp.vec3) -> w
 
 @wp.func
 def contact_depth(contacts: ContactView, body_q: wp.array[wp.transform], i: int) -> float:
-    """Penetration of contact i at the poses ``body_q`` [m], negative where there is a gap."""
+    """Return the penetration of contact i at the poses ``body_q`` [m], negative for a gap."""
     body0, body1 = contact_bodies(contacts, i)
     apart = _world_point(body_q, body1, contacts.point1[i]) - _world_point(body_q, body0, contacts.point0[i])
     return contacts.margin0[i] + contacts.margin1[i] - wp.dot(contacts.normal[i], apart)

@@ -1,22 +1,23 @@
-"""Between rigid bodies and the sources of fields on them: frames to sources, reactions back."""
+"""Coupling of rigid bodies to the sources of fields and the sensors on them: frames and motion, reactions, readings."""
 
 import warp as wp
 
-from warpmag.kernels.rigid.newton_views import BodyView, view_bodies
+from warpmag.kernels.rigid.newton_views import BodyView, velocity_at, view_bodies
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class SourceShapes:
-    """Shapes that s sources of fields are, on b bodies.
+    """Shapes of s sources of fields, on b bodies.
 
     Attributes:
         shape: Shape of each source, shape [s].
-        shape_body, shape_frames: Body of each shape, and its frame there: arrays of the model, shape [shapes].
+        shape_body, shape_frames: Body of each shape, and its frame in that body's frame: arrays of the model, shape
+            [shapes].
         strengths: Strength of each shape, an array of the model, shape [shapes].
-        body_list, run_start: Bodies that sources push, and the first of each in ``order``, shape [b] and [b + 1].
-        order: Sources by body.
+        body_list, run_start: Bodies with sources, and the first source of each in ``order``, shape [b] and [b + 1].
+        order: Sources sorted by body.
         kinematic_flag: Newton's flag of bodies that forces do not move.
     """
 
@@ -50,9 +51,35 @@ def _gather_sources(
 
 
 def gather_sources(body_q, sources: SourceShapes, frames, strengths):
-    """Write where in the world all sources are, and how strong."""
+    """Write the frames of all sources in the world, and their strengths."""
     outputs = [frames, strengths]
     wp.launch(_gather_sources, len(frames), inputs=[body_q, sources], outputs=outputs, device=frames.device)
+
+
+@wp.kernel
+def _gather_source_motion(
+    # inputs:
+    bodies: BodyView,
+    sources: SourceShapes,
+    frames_in: wp.array[wp.transform],
+    # outputs:
+    motion_out: wp.array2d[float],
+):
+    s = wp.tid()
+    body = sources.shape_body[sources.shape[s]]
+    if body < 0:
+        return
+    velocity = velocity_at(bodies, body, wp.transform_get_translation(frames_in[s]))
+    spin = wp.spatial_bottom(bodies.qd[body])
+    for c in range(3):
+        motion_out[s, c] = velocity[c]
+        motion_out[s, c + 3] = spin[c]
+
+
+def gather_source_motion(sources: SourceShapes, model, state, frames, motion):
+    """Write the velocity of the origin and the angular velocity of each source, except for those fixed in the world."""
+    inputs = [view_bodies(model, state), sources, frames]
+    wp.launch(_gather_source_motion, len(frames), inputs=inputs, outputs=[motion], device=frames.device)
 
 
 @wp.kernel
@@ -74,15 +101,15 @@ def _add_reactions(
     torque = wp.vec3()
     for place in range(sources.run_start[k], sources.run_start[k + 1]):
         s = sources.order[place]
-        pull = wp.vec3(wrenches_in[s, 0], wrenches_in[s, 1], wrenches_in[s, 2])
-        turn = wp.vec3(wrenches_in[s, 3], wrenches_in[s, 4], wrenches_in[s, 5])
-        force += pull
-        torque += turn + wp.cross(wp.transform_get_translation(frames_in[s]) - center, pull)
+        source_force = wp.vec3(wrenches_in[s, 0], wrenches_in[s, 1], wrenches_in[s, 2])
+        source_torque = wp.vec3(wrenches_in[s, 3], wrenches_in[s, 4], wrenches_in[s, 5])
+        force += source_force
+        torque += source_torque + wp.cross(wp.transform_get_translation(frames_in[s]) - center, source_force)
     body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
 
 
 def add_reactions(sources: SourceShapes, model, state, frames, wrenches):
-    """Add force and torque about its frame of every source to the wrench of its body, unless that is kinematic."""
+    """Add the wrench of each source, about its frame's origin, to that of its body, except for kinematic bodies."""
     inputs = [sources, view_bodies(model, state), frames, wrenches]
     outputs = [state.body_f]
     wp.launch(_add_reactions, len(sources.body_list), inputs=inputs, outputs=outputs, device=frames.device)
@@ -95,5 +122,91 @@ def _set_strengths(values_in: wp.array[float], shapes_in: wp.array[wp.int32], st
 
 
 def set_strengths(values, shapes, strengths):
-    """Give each of ``shapes`` its strength, or all of them the only one there is."""
+    """Set the strengths of ``shapes``; ``values`` may have one entry for all."""
     wp.launch(_set_strengths, len(shapes), inputs=[values, shapes], outputs=[strengths], device=shapes.device)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Sites of sensors
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@wp.struct
+class Sites:
+    """Sites of s sensors.
+
+    Attributes:
+        shape: Shape of each site, shape [s].
+        shape_body, shape_frames: Body of each shape, and its frame in that body's frame: arrays of the model, shape
+            [shapes].
+    """
+
+    shape: wp.array[wp.int32]
+    shape_body: wp.array[wp.int32]
+    shape_frames: wp.array[wp.transform]
+
+
+@wp.func
+def _frame_of(sites: Sites, body_q: wp.array[wp.transform], i: int) -> wp.transform:
+    shape = sites.shape[i]
+    frame = sites.shape_frames[shape]
+    body = sites.shape_body[shape]
+    if body >= 0:
+        frame = body_q[body] * frame
+    return frame
+
+
+@wp.kernel
+def _find_sites(body_q_in: wp.array[wp.transform], sites: Sites, points_out: wp.array[wp.vec3]):
+    i = wp.tid()
+    points_out[i] = wp.transform_get_translation(_frame_of(sites, body_q_in, i))
+
+
+def find_sites(body_q, sites: Sites, points):
+    """Write the positions of the sites [m], world frame."""
+    wp.launch(_find_sites, len(points), inputs=[body_q, sites], outputs=[points], device=points.device)
+
+
+@wp.kernel
+def _read_sites(
+    # inputs:
+    body_q_in: wp.array[wp.transform],
+    sites: Sites,
+    field_in: wp.array[wp.vec3],
+    noise: float,
+    limit: float,
+    seed: int,
+    reading_count_in: wp.array[wp.int32],
+    # outputs:
+    readings_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    rotation = wp.transform_get_rotation(_frame_of(sites, body_q_in, i))
+    reading = wp.quat_rotate_inv(rotation, field_in[i])
+    random = wp.rand_init(seed, reading_count_in[0] * field_in.shape[0] + i)
+    for c in range(3):
+        reading[c] = wp.clamp(reading[c] + noise * wp.randn(random), -limit, limit)
+    readings_out[i] = reading
+
+
+@wp.kernel
+def _count_reading(reading_count_out: wp.array[wp.int32]):
+    reading_count_out[0] = reading_count_out[0] + 1
+
+
+def read_sites(body_q, sites: Sites, field, *, noise: float, limit: float, seed: int, reading_count, readings):
+    """Write the readings of a vector field by sensors at the sites.
+
+    Args:
+        body_q: Poses of bodies.
+        sites: The sites.
+        field: Field at the sites, world frame, shape [s].
+        noise: Standard deviation of the noise of each component, in the unit of the field.
+        limit: Largest magnitude of a component that a sensor reads; infinite for no limit.
+        seed: Seed of the noise.
+        reading_count: In and out, number of previous readings, shape [1].
+        readings: Out, in the frames of the sites, shape [s].
+    """
+    inputs = [body_q, sites, field, noise, limit, seed, reading_count]
+    wp.launch(_read_sites, len(readings), inputs=inputs, outputs=[readings], device=readings.device)
+    wp.launch(_count_reading, 1, inputs=[reading_count], device=readings.device)

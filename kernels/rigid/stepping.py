@@ -1,47 +1,47 @@
-"""The state machine of a step, on the device: what to do next, whether an attempt holds, and what to report.
+"""State machine of a step on the device: the next action, the acceptance of an attempt, and the log.
 
-A step is attempted in substeps of one of ``LEVELS`` lengths, each half as long as that of the level before. What the
-``monitor`` found decides: the step is accepted and logged, or the state is restored and the step attempted at the next
-level, or stepping halts, because a buffer was too small or a state was not finite. While halted, steps do nothing, so
-that the host may look at any time and continue from there.
+A step is attempted in substeps of one of ``LEVELS`` lengths, each half as long as that of the level before. The results
+of the ``monitor`` decide. Either the step is accepted and logged, or the state is restored and the step is attempted at
+the next level, or stepping halts, because a buffer was too small or a state was not finite. While halted, steps do
+nothing, so that the host can read the status at any time and continue from there.
 
-Substeps come in pairs. Where they are shorter than those of the first level, several share their magnetic forces, for
-no longer than forces act at that level: substeps are short because of contacts between bodies that are fast or pressed
-together. The forces are those half-way between the poses that the first and the last of these substeps start from, as
-predicted by velocities, so that they neither lag nor lead. Two substeps always share them; more, up to as many as make
-one of the first level, while the motion in the last attempt keeps their poses close to each other.
+Substeps are launched in pairs. Beyond the first level, several substeps share their magnetic forces, for at most the
+length of a substep of the first level. Short substeps serve contacts between fast or strongly pressed bodies, and
+forces vary more slowly. Shared forces are evaluated halfway between the poses at which the first and the last of these
+substeps start, as predicted from velocities, so that they neither lag nor lead. Two substeps always share forces. More
+share them, up to the length of one of the first level, while the motion of the last attempt keeps their poses close.
 """
 
 import numpy as np
 import warp as wp
 
 from warpmag.kernels.rigid import monitor
-from warpmag.kernels.rigid.monitor import STAGES, now
+from warpmag.kernels.rigid.monitor import STAGES, read_clock
 
 wp.set_module_options({"enable_backward": False})
 
 LEVELS = 5
-"""Lengths of substeps, each half the one before."""
+"""Number of lengths of substeps, each half the one before."""
 
-FLAG_ATTEMPT = 0  # the step is to be attempted (again)
+FLAG_ATTEMPT = 0  # the step must be attempted (again)
 FLAG_REJECTED = 1  # the last attempt was rejected
-FLAG_FORCES = 2  # the next substeps need forces of their own
-FLAG_CONTACTS = 3  # the contacts known are not those of the present state
-FLAG_LEVEL = 4  # first of LEVELS: substeps of this level remain to be done
+FLAG_FORCES = 2  # the next substeps need new forces
+FLAG_CONTACTS = 3  # the contacts are not those of the present state
+FLAG_LEVEL = 4  # first of LEVELS flags: substeps of this level remain
 FLAGS = FLAG_LEVEL + LEVELS
 
-STATUS_HALT = 0  # why steps do nothing: one of the reasons below
-STATUS_DONE = 1  # steps done
+STATUS_HALT = 0  # reason why steps do nothing, see below
+STATUS_DONE = 1  # number of completed steps
 STATUS_LEVEL = 2  # level of the substeps
-STATUS_ATTEMPTS = 3  # attempts at the step under way
-STATUS_REMAINING = 4  # pairs of substeps that this attempt still has to do
-STATUS_SUBSTEPS = 5  # substeps that it has done
-STATUS_REGROWN = 6  # buffers grew since the last step; set by the host
-STATUS_SHARING = 7  # substeps that share their forces, a power of two; beyond the first level
+STATUS_ATTEMPTS = 3  # number of attempts at the present step
+STATUS_REMAINING = 4  # remaining pairs of substeps of this attempt
+STATUS_SUBSTEPS = 5  # completed substeps of this attempt
+STATUS_REGROWN = 6  # 1 if buffers grew since the last step; set by the host
+STATUS_SHARING = 7  # number of substeps that share forces beyond the first level, a power of two
 STATUSES = 8
 
 RUNNING, OVERFLOW, NOT_FINITE, PAUSED = range(4)
-"""Values of ``STATUS_HALT``; the host pauses."""
+"""Values of ``STATUS_HALT``; the host sets ``PAUSED``."""
 _CHUNK = 16
 """Words of a state that a thread copies."""
 
@@ -58,19 +58,19 @@ class StepArrays:
     Attributes:
         flags: Conditions of the loops around a step, see ``FLAG_*``.
         status: Present state, see ``STATUS_*``.
-        peaks, counts: What the ``monitor`` writes.
-        last_overlap: Deepest penetration of the last step done; and of the last attempt at the present step that was
-            rejected for it, else infinite.
-        ticks: Time spent in each stage since the last step was accepted, then the time of the last mark; nanoseconds on
-            a GPU, clock cycles on a CPU.
-        log: A ring with a record of each step done, see ``LOG_*``, shape [records, LOG_FIELDS].
-        capacities: Size of each buffer whose fill is watched.
-        travel: Largest motion in a substep over a body's thickness.
-        shared_travel: The same while more than two substeps share their forces.
-        overlap: Deepest new penetration over the thickness of the thinner body.
-        ease: Substeps become longer again where the motion in twice their length is below this part of ``travel``.
-        futile: Substeps that leave more than this part of a penetration that was too deep do not become shorter still.
-        fewest: Substeps of the first level, an even number.
+        peaks, counts: Arrays of the ``monitor``.
+        last_overlap: Deepest penetration of the last step; and of the last attempt at the present step that was
+            rejected for its penetration, else infinite.
+        ticks: Time of each stage since the last accepted step, then the clock at the last mark; nanoseconds on a GPU,
+            clock cycles on a CPU.
+        log: Ring buffer with a record of each step, see ``LOG_*``, shape [records, LOG_FIELDS].
+        capacities: Size of each monitored buffer.
+        travel: Limit of the motion in a substep over a body's thickness.
+        shared_travel: Limit of that motion while more than two substeps share forces.
+        overlap: Limit of a new penetration over the thickness of the thinner body.
+        growth_margin: Substeps double in length if the predicted motion stays below this fraction of ``travel``.
+        futile_ratio: Substeps are not shortened further if they leave more than this fraction of a penetration.
+        first_level_substeps: Substeps of a step at the first level, an even number.
     """
 
     flags: wp.array[wp.int32]
@@ -84,19 +84,19 @@ class StepArrays:
     travel: float
     shared_travel: float
     overlap: float
-    ease: float
-    futile: float
-    fewest: int
+    growth_margin: float
+    futile_ratio: float
+    first_level_substeps: int
 
 
 @wp.struct
 class StateCopies:
-    """Arrays of a state and of its copy, as addresses.
+    """Addresses of the arrays of a state and of its copy.
 
     Attributes:
-        own, saved: Where each array begins, shape [arrays].
+        own, saved: Address of each array, shape [arrays].
         sizes: Bytes of each array, shape [arrays].
-        ends: Whole words of all arrays up to the end of each, shape [arrays].
+        ends: Cumulative number of whole words of the arrays, shape [arrays].
     """
 
     own: wp.array[wp.uint64]
@@ -107,7 +107,7 @@ class StateCopies:
 
 @wp.func
 def _copy_chunk(chunk: int, copies: StateCopies, sources: wp.array[wp.uint64], targets: wp.array[wp.uint64]):
-    """Copy some words, and with the first ones the bytes that fill none."""
+    """Copy a chunk of words; the first chunk also copies the trailing bytes of each array."""
     parts = copies.ends.shape[0]
     part = int(0)
     begin = int(0)
@@ -128,11 +128,11 @@ def _copy_chunk(chunk: int, copies: StateCopies, sources: wp.array[wp.uint64], t
 
 
 @wp.func
-def _open_attempt(a: StepArrays):
-    """Clear what the monitor writes and open the loop of the present level."""
+def _begin_attempt(a: StepArrays):
+    """Clear the monitor's arrays and start the loop of the present level."""
     level = a.status[STATUS_LEVEL]
     a.status[STATUS_ATTEMPTS] = a.status[STATUS_ATTEMPTS] + 1
-    a.status[STATUS_REMAINING] = (a.fewest // 2) << level
+    a.status[STATUS_REMAINING] = (a.first_level_substeps // 2) << level
     a.status[STATUS_SUBSTEPS] = 0
     a.flags[FLAG_ATTEMPT] = 1
     a.flags[FLAG_FORCES] = 1
@@ -143,7 +143,7 @@ def _open_attempt(a: StepArrays):
     for k in range(a.counts.shape[0]):
         a.counts[k] = 0
     a.counts[monitor.COUNT_BAD_BODY] = monitor.NO_BODY
-    a.ticks[STAGES] = now()
+    a.ticks[STAGES] = read_clock()
 
 
 @wp.kernel
@@ -151,7 +151,7 @@ def _begin_step(a: StepArrays, copies: StateCopies):
     if a.status[STATUS_HALT] == RUNNING:
         _copy_chunk(wp.tid(), copies, copies.own, copies.saved)
         if wp.tid() == 0:
-            _open_attempt(a)
+            _begin_attempt(a)
 
 
 @wp.kernel
@@ -166,7 +166,7 @@ def _set_status(a: StepArrays, index: int, value: int):
 
 
 @wp.kernel
-def _forget_contacts(a: StepArrays):
+def _invalidate_contacts(a: StepArrays):
     a.flags[FLAG_CONTACTS] = 1
 
 
@@ -177,21 +177,24 @@ def _end_pair(a: StepArrays, level: int):
     a.status[STATUS_SUBSTEPS] = a.status[STATUS_SUBSTEPS] + 2
     a.flags[FLAG_CONTACTS] = 1
     a.flags[FLAG_LEVEL + level] = wp.where(remaining > 0, 1, 0)
-    # when forces are due, the pairs that remain are a multiple of those that share them
+    # forces are due when the remaining substeps are a multiple of those that share them
     a.flags[FLAG_FORCES] = wp.where((2 * remaining) % wp.max(a.status[STATUS_SHARING], 2) == 0, 1, 0)
 
 
 @wp.kernel
-def _tell_time(a: StepArrays, step: wp.float64, longest: wp.float64, time_out: wp.array[wp.float64]):
+def _write_time(a: StepArrays, step: wp.float64, longest: wp.float64, time_out: wp.array[wp.float64]):
     substeps = wp.float64(a.status[STATUS_SUBSTEPS]) / wp.float64(1 << a.status[STATUS_LEVEL])
     time_out[0] = wp.float64(a.status[STATUS_DONE]) * step + substeps * longest
 
 
 @wp.func
-def _sharing(level: int, long_travel: float, seen_at: int, limit: float) -> int:
-    """Number of substeps of ``level`` to share forces, from the motion in two substeps of level ``seen_at``."""
+def _sharing_substeps(level: int, long_travel: float, travel_level: int, limit: float) -> int:
+    """Return the number of substeps of ``level`` that share forces.
+
+    ``long_travel`` is the motion in twice the length of a substep of ``travel_level``.
+    """
     count = 1 << level
-    travel = 0.5 * long_travel * float(1 << seen_at)
+    travel = 0.5 * long_travel * float(1 << travel_level)
     while count > 2 and not travel <= limit:
         count /= 2
         travel *= 0.5
@@ -200,10 +203,10 @@ def _sharing(level: int, long_travel: float, seen_at: int, limit: float) -> int:
 
 @wp.func
 def _log_step(a: StepArrays, level: int):
-    """Write the record of a step that was done at ``level``."""
+    """Write the record of a step that was completed at ``level``."""
     record = a.status[STATUS_DONE] % a.log.shape[0]
     capped = a.peaks[monitor.PEAK_TRAVEL] > a.travel
-    a.log[record, LOG_SUBSTEPS] = wp.float64(a.fewest << level)
+    a.log[record, LOG_SUBSTEPS] = wp.float64(a.first_level_substeps << level)
     a.log[record, LOG_ATTEMPTS] = wp.float64(a.status[STATUS_ATTEMPTS])
     a.log[record, LOG_CAPPED] = wp.where(capped, wp.float64(1.0), wp.float64(0.0))
     a.log[record, LOG_REGROWN] = wp.float64(a.status[STATUS_REGROWN])
@@ -231,18 +234,18 @@ def _judge(a: StepArrays):
     level = a.status[STATUS_LEVEL]
     overlap = a.peaks[monitor.PEAK_OVERLAP]
     long_travel = a.peaks[monitor.PEAK_LONG_TRAVEL]
-    pressed = overlap > wp.max(a.overlap, a.last_overlap[0])
-    # shorter substeps undo what was pressed too fast, but not a contact that found another normal
-    helped = overlap < a.futile * a.last_overlap[1]
-    lost = a.counts[monitor.COUNT_BAD_BODY] != monitor.NO_BODY
-    if (a.peaks[monitor.PEAK_TRAVEL] > a.travel or (pressed and helped) or lost) and level + 1 < LEVELS:
+    is_deeper = overlap > wp.max(a.overlap, a.last_overlap[0])
+    # shorter substeps reduce a penetration by fast bodies, but not one by a contact whose normal has changed
+    improves = overlap < a.futile_ratio * a.last_overlap[1]
+    not_finite = a.counts[monitor.COUNT_BAD_BODY] != monitor.NO_BODY
+    if (a.peaks[monitor.PEAK_TRAVEL] > a.travel or (is_deeper and improves) or not_finite) and level + 1 < LEVELS:
         a.status[STATUS_LEVEL] = level + 1
-        a.status[STATUS_SHARING] = _sharing(level + 1, long_travel, level, a.shared_travel)
-        if pressed:
+        a.status[STATUS_SHARING] = _sharing_substeps(level + 1, long_travel, level, a.shared_travel)
+        if is_deeper:
             a.last_overlap[1] = overlap
-        _open_attempt(a)
+        _begin_attempt(a)
         return
-    if lost:
+    if not_finite:
         a.status[STATUS_HALT] = NOT_FINITE
         return
 
@@ -251,46 +254,46 @@ def _judge(a: StepArrays):
     a.last_overlap[0] = overlap
     a.last_overlap[1] = wp.inf
     _log_step(a, level)
-    calm = overlap < 0.5 * a.overlap or (pressed and not helped)
+    may_grow = overlap < 0.5 * a.overlap or (is_deeper and not improves)
     next_level = int(level)
     if a.peaks[monitor.PEAK_NEXT_TRAVEL] > a.travel:
         next_level = wp.min(level + 1, LEVELS - 1)
-    elif calm and long_travel < a.ease * a.travel and level > 0:
+    elif may_grow and long_travel < a.growth_margin * a.travel and level > 0:
         next_level = level - 1
     a.status[STATUS_LEVEL] = next_level
-    a.status[STATUS_SHARING] = _sharing(next_level, long_travel, level, a.shared_travel)
+    a.status[STATUS_SHARING] = _sharing_substeps(next_level, long_travel, level, a.shared_travel)
 
 
 @wp.kernel
 def _read_clock(time_out: wp.array[wp.uint64]):
-    time_out[0] = now()
+    time_out[0] = read_clock()
 
 
 def launch_read_clock(time):
-    """Write the device's time into ``time`` [1]."""
+    """Write the device's clock to ``time`` [1]."""
     wp.launch(_read_clock, dim=1, outputs=[time], device=time.device)
 
 
 class StepMachine:
-    """The state machine on one device; every method only launches a kernel.
+    """State machine of a step on a device. Its methods only launch kernels.
 
     Attributes:
-        arrays: Its arrays and limits.
-        attempting: Condition: the step is to be attempted (again).
-        forces_due: Condition: the next substeps need forces of their own.
-        contacts_due: Condition: the contacts known are not those of the present state.
-        sharing: Number of substeps that share their forces, shape [1].
-        remaining: Condition for each level: substeps of it remain to be done.
+        arrays: Arrays and limits.
+        attempting: Condition that the step must be attempted (again).
+        forces_due: Condition that the next substeps need new forces.
+        contacts_due: Condition that the contacts are not those of the present state.
+        sharing: Number of substeps that share forces, shape [1].
+        remaining: For each level, the condition that substeps of it remain.
     """
 
     def __init__(self, records: int, capacities: int, device, **limits: float):
         """Allocate the arrays.
 
         Args:
-            records: Steps that the log holds.
-            capacities: How many buffers are watched.
-            device: Device.
-            **limits: The limits of ``StepArrays``.
+            records: Capacity of the log, in steps.
+            capacities: Number of monitored buffers.
+            device: Warp device.
+            **limits: Limits of ``StepArrays``.
         """
 
         def zeros(shape, dtype):
@@ -308,75 +311,73 @@ class StepMachine:
             a.flags[k : k + 1] for k in range(FLAGS)
         )
         self.sharing = a.status[STATUS_SHARING : STATUS_SHARING + 1]
-        self.forget_contacts()
+        self.invalidate_contacts()
 
-    def watched(self, thickness, reach) -> monitor.Watched:
-        """Return what the monitor is to watch.
+    def make_monitor(self, thickness, reach) -> monitor.Monitor:
+        """Return the arrays of the monitor.
 
         Args:
             thickness, reach: Sizes of the bodies [m], see ``monitor``, shape [body_count].
         """
-        a, watched = self.arrays, monitor.Watched()
-        watched.thickness, watched.reach = (
-            wp.array(values, dtype=float, device=a.status.device) for values in (thickness, reach)
-        )
-        watched.fills = wp.zeros(len(a.capacities), dtype=wp.uint64, device=a.status.device)
-        watched.level = a.status[STATUS_LEVEL : STATUS_LEVEL + 1]
-        watched.substeps = a.status[STATUS_SUBSTEPS : STATUS_SUBSTEPS + 1]
-        watched.ticks, watched.peaks, watched.counts = a.ticks, a.peaks, a.counts
-        return watched
+        a, m = self.arrays, monitor.Monitor()
+        m.thickness, m.reach = (wp.array(values, dtype=float, device=a.status.device) for values in (thickness, reach))
+        m.fills = wp.zeros(len(a.capacities), dtype=wp.uint64, device=a.status.device)
+        m.level = a.status[STATUS_LEVEL : STATUS_LEVEL + 1]
+        m.substeps = a.status[STATUS_SUBSTEPS : STATUS_SUBSTEPS + 1]
+        m.ticks, m.peaks, m.counts = a.ticks, a.peaks, a.counts
+        return m
 
     def _launch(self, kernel, *inputs, dim: int = 1) -> None:
         wp.launch(kernel, dim=dim, inputs=[self.arrays, *inputs], device=self.arrays.status.device)
 
     def set_status(self, index: int, value: int) -> None:
-        """Change one of the ``STATUS_*`` entries, for the host."""
+        """Set one of the ``STATUS_*`` entries."""
         self._launch(_set_status, index, value)
 
-    def forget_contacts(self) -> None:
-        """Have contacts found anew before the next substep: the state, or what finds them, may have changed."""
-        self._launch(_forget_contacts)
+    def invalidate_contacts(self) -> None:
+        """Request new contacts before the next substep, after a change of the state or of the contact pipeline."""
+        self._launch(_invalidate_contacts)
 
-    def keep(self, state: list, saved: list) -> None:
-        """Say which arrays make up a state, and which their copies.
+    def set_state_arrays(self, state: list, saved: list) -> None:
+        """Set the arrays of the state that steps save and restore, and their copies.
 
         Args:
             state: Contiguous arrays.
-            saved: Arrays like them.
+            saved: Arrays of the same types and sizes.
         """
         device = self.arrays.status.device
-        sizes = np.array([one.size * wp.types.type_size_in_bytes(one.dtype) for one in state], np.int32)
+        sizes = np.array([array.size * wp.types.type_size_in_bytes(array.dtype) for array in state], np.int32)
         ends = np.cumsum(sizes // 4, dtype=np.int32)
-        self._kept = state, saved  # alive: kernels know addresses alone
+        self._arrays_alive = state, saved  # kernels hold only addresses
         self._chunks = max(1, -(-int(ends[-1]) // _CHUNK))
         self._copies = copies = StateCopies()
         copies.own, copies.saved = (
-            wp.array(np.array([one.ptr for one in arrays], np.uint64), device=device) for arrays in (state, saved)
+            wp.array(np.array([array.ptr for array in arrays], np.uint64), device=device) for arrays in (state, saved)
         )
         copies.sizes, copies.ends = (wp.array(values, device=device) for values in (sizes, ends))
 
     def begin_step(self) -> None:
-        """Save the state and let a step be attempted, unless stepping is halted."""
+        """Save the state and begin the first attempt at a step, unless stepping is halted."""
         self._launch(_begin_step, self._copies, dim=self._chunks)
 
     def restore(self) -> None:
-        """Take the state back to where the step began if the attempt was rejected."""
+        """Restore the state at the beginning of the step if the attempt was rejected."""
         self._launch(_restore, self._copies, dim=self._chunks)
 
-    def tell_time(self, step: float, longest: float, time) -> None:
-        """Write the time at which the next two substeps begin [s] into ``time`` [1].
+    def write_time(self, step: float, longest: float, time) -> None:
+        """Write the time at which the next two substeps begin [s] to ``time`` [1].
 
         Args:
             step: Length of a step [s].
             longest: Length of the substeps of the first level [s].
             time: Out.
         """
-        self._launch(_tell_time, wp.float64(step), wp.float64(longest), time)
+        self._launch(_write_time, wp.float64(step), wp.float64(longest), time)
 
     def end_pair(self, level: int) -> None:
-        """Count two substeps of ``level`` as done."""
+        """Count two completed substeps of ``level``."""
         self._launch(_end_pair, level)
 
     def judge(self) -> None:
-        """Accept and log the attempt that was just made, or order another one, or halt."""
+        """Accept and log the last attempt, or begin another one, or halt."""
         self._launch(_judge)

@@ -20,7 +20,7 @@ from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, R
 from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.induction.solve_state import launch_add_bias
 from warpmag.kernels.material.curves import LINEAR
-from warpmag.kernels.near_contact import near_pairs, uneven
+from warpmag.kernels.near_contact import near_pairs, nonuniform
 from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_law import Quantity
@@ -221,7 +221,7 @@ class MomentSystem:
             self.source_interaction = AppliedForces(
                 self.sources, layout.worlds, self.external_field, layout.movable,
                 balls=layout.balls if self.settings.contact_model == "multipole" else None,
-                constants=uneven.expansion_constants(),
+                constants=nonuniform.expansion_constants(),
             )  # fmt: skip
             self._magnetizing_field = self.source_interaction.field
             self._acting_field = self.source_interaction.acting
@@ -292,8 +292,8 @@ class MomentSystem:
             magnets[solid.first : solid.first + solid.count] = solid.response > 0.0
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.balls, susceptibility, self.material,
-            ranges=self.world_ranges, magnets=magnets, lone=layout.single, field=self._inducible_field,
-            movable=layout.movable, turned=turned, forces=self.forces, torques=self.torques,
+            ranges=self.world_ranges, magnets=magnets, single=layout.single, field=self._inducible_field,
+            movable=layout.movable, rotatable=turned, forces=self.forces, torques=self.torques,
             expansion=None if self.source_interaction is None else self.source_interaction.expansion,
         )  # fmt: skip
 
@@ -504,6 +504,6 @@ class MomentSystem:
             near_pairs.launch_add_forces(near)
         if interaction is not None:
             effective = self._effective if force == "zeeman" else self._packed.moments
-            interaction.add(effective, self.forces, self.torques, near.arrays["response"] if expanded else None)
+            interaction.add(effective, self.forces, self.torques, near.arrays.magnets.response if expanded else None)
         if self.eddy is not None:
             self.eddy.finish(self.moments, self.torques)

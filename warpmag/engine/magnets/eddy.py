@@ -6,8 +6,7 @@ import numpy as np
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.bodies import BodyMoments
-from warpmag.kernels.rigid.motion import gather_motion
+from warpmag.kernels.rigid.bodies import BodyMoments, gather_motion
 from warpmag.moments.system import MomentSystem
 
 

@@ -11,7 +11,7 @@ import warp as wp
 from warpmag.declarations.checks import check_not_negative, check_whole, short_repr
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.sites import Sites, find_sites, read_sites
+from warpmag.kernels.rigid.sources import Sites, find_sites, read_sites
 
 
 class SensorMagnetometer:
@@ -86,7 +86,7 @@ class SensorMagnetometer:
             self._sites,
             self._probe.b,
             noise=self._noise,
-            most=self._saturation,
+            limit=self._saturation,
             seed=self._seed,
             reading_count=self._count,
             readings=self.flux_density,

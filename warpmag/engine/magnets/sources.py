@@ -12,8 +12,13 @@ from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import SourceRecord, check_strength
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
-from warpmag.kernels.rigid.motion import gather_source_motion
-from warpmag.kernels.rigid.sources import SourceShapes, add_reactions, gather_sources, set_strengths
+from warpmag.kernels.rigid.sources import (
+    SourceShapes,
+    add_reactions,
+    gather_source_motion,
+    gather_sources,
+    set_strengths,
+)
 from warpmag.moments.arrays import host_array
 from warpmag.moments.system import MomentSystem
 

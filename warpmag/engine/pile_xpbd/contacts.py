@@ -15,7 +15,7 @@ from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
 from warpmag.errors import InputError, extra
-from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, Watched, watch, watch_flags
+from warpmag.kernels.rigid.monitor import COUNT_CAPACITIES, Monitor, watch, watch_flags
 from warpmag.kernels.rigid.newton_views import view_bodies, view_contacts
 
 _NEWTON_GAP = 0.1
@@ -250,7 +250,7 @@ class RigidSolver:
         fills = [buffer.fill for buffer in self.buffers]
         return np.array([0 if fill.dtype is wp.bool else fill.ptr for fill in fills], np.uint64)
 
-    def watch(self, watched: Watched, state: newton.State, *, substep: int, longest: float, threshold: float) -> None:
+    def watch(self, watched: Monitor, state: newton.State, *, substep: int, longest: float, threshold: float) -> None:
         """Write the overlaps at ``state`` and the fills of the buffers to the monitor; capturable in a graph.
 
         Args:

@@ -15,7 +15,7 @@ import warp as wp
 from newton._src.solvers.xpbd import kernels as newton_kernels
 
 from warpmag.kernels.contacts import joints as kernels
-from warpmag.kernels.contacts.free_motion import launch_accelerate, launch_move
+from warpmag.kernels.contacts.free_motion import launch_accelerate, launch_apply_impulses, launch_move
 from warpmag.kernels.rigid.newton_views import BodyView, view_contacts
 
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
@@ -85,7 +85,7 @@ class JointSolve:
         view.effort, view.dof_start = model.joint_effort_limit, model.joint_qd_start
         view.lower, view.upper = model.joint_limit_lower, model.joint_limit_upper
         view.slides, view.pins, view.one_axis = self._slides, self._pins, self._one_axis
-        view.row_joint, view.row_dof, view.row_target, view.row_turns = self._rows
+        view.row_joint, view.row_dof, view.row_target, view.row_is_angular = self._rows
         return view
 
     def step(self, before: BodyView, after: BodyView, contact_masses: Callable, control, contacts, dt: float) -> None:
@@ -106,8 +106,8 @@ class JointSolve:
         before.f = self._forces
         launch_accelerate(before, model.gravity, _KINEMATIC, dt, after.q, after.qd)
         masses = contact_masses()
-        kernels.launch_align(joints, before, dt, self._frames, self._axes, self._limits)
-        kernels.launch_limit_push_out(view_contacts(model, contacts), after, _KINEMATIC, dt, self._margin)
+        kernels.launch_prepare_joints(joints, before, dt, self._frames, self._axes, self._limits)
+        kernels.launch_limit_recovery_speed(view_contacts(model, contacts), after, _KINEMATIC, dt, self._margin)
         wp.copy(self._q, after.q)
         wp.copy(self._qd, after.qd)
         self._drive_impulses.zero_()
@@ -121,7 +121,7 @@ class JointSolve:
             for _ in range(unrolled):
                 launch_move(after, _KINEMATIC, dt, self._q, self._qd)
                 solve_contacts()
-                kernels.launch_apply(after, self._deltas)
+                launch_apply_impulses(after, self._deltas)
                 launch_move(after, _KINEMATIC, dt, self._q, self._qd)
                 solve_joints()
                 self._correct_joints(joints, after, control, dt)
@@ -132,10 +132,12 @@ class JointSolve:
 
     def _correct_joints(self, joints: kernels.JointView, bodies: BodyView, control, dt: float) -> None:
         """Correct the lever arms of Newton's joint impulses, and add drives."""
-        kernels.launch_turn_levers(joints, bodies, self._q, self._impulses, self._deltas)
+        kernels.launch_correct_lever_arms(joints, bodies, self._q, self._impulses, self._deltas)
         targets, impulses = (control.joint_target_q, control.joint_target_qd), self._drive_impulses
-        kernels.launch_drive(joints, bodies, targets, impulses, self._deltas, relaxation=self._relaxations[1], dt=dt)
-        kernels.launch_apply(bodies, self._deltas)
+        kernels.launch_add_drives(
+            joints, bodies, targets, impulses, self._deltas, relaxation=self._relaxations[1], dt=dt
+        )
+        launch_apply_impulses(bodies, self._deltas)
 
     def _add_joint_forces(self, body_q, joint_f, dt: float) -> None:
         outputs = {"body_f": self._forces, "joint_impulse": None}

@@ -23,8 +23,7 @@ import warp as wp
 
 from warpmag.engine.pile_xpbd.joints import JointSolve
 from warpmag.kernels.contacts import solve as contact_solve
-from warpmag.kernels.contacts.free_motion import launch_accelerate, launch_move
-from warpmag.kernels.contacts.joints import launch_move_by
+from warpmag.kernels.contacts.free_motion import launch_accelerate, launch_apply_corrections, launch_move
 from warpmag.kernels.contacts.mass_splitting import ENTRIES, launch_find_shares, launch_split_masses
 from warpmag.kernels.rigid.newton_views import BodyView, view_bodies, view_contacts
 
@@ -165,7 +164,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
         self._body_delta_counter = 1 - self._body_delta_counter
         bodies = view_bodies(model, now)
         bodies.inv_mass, bodies.inv_inertia = self._whole
-        launch_move_by(bodies, body_deltas, rigid_contact_inv_weight, dt, then.body_q, then.body_qd)
+        launch_apply_corrections(bodies, body_deltas, rigid_contact_inv_weight, dt, then.body_q, then.body_qd)
         return then.body_q, then.body_qd
 
 

@@ -127,13 +127,13 @@ class Stepper:
             travel=TRAVEL_LIMIT,
             shared_travel=_SHARED_TRAVEL_LIMIT,
             overlap=OVERLAP_LIMIT,
-            ease=_GROWTH_MARGIN,
-            futile=_FUTILE_RATIO,
-            fewest=self._fewest,
+            growth_margin=_GROWTH_MARGIN,
+            futile_ratio=_FUTILE_RATIO,
+            first_level_substeps=self._fewest,
         )
-        self._machine.keep(_arrays(self._state), _arrays(self._saved))
+        self._machine.set_state_arrays(_arrays(self._state), _arrays(self._saved))
         self._arrays = self._machine.arrays
-        self._watched = self._machine.watched(sizes.thickness, sizes.reach)
+        self._watched = self._machine.make_monitor(sizes.thickness, sizes.reach)
         self._mirrors = self._make_mirrors()
         self._clock = _Clock(self._device)
         self._workspace = Workspace(self._device) if self._device.is_cuda else None
@@ -156,7 +156,7 @@ class Stepper:
         """Set the sizes of the solver's buffers, whose number is constant, and discard the graph."""
         self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
         self._watched.fills.assign(self._solver.fills())
-        self._machine.forget_contacts()
+        self._machine.invalidate_contacts()
         self._graph, self._warm = None, False
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ class Stepper:
     @property
     def state(self) -> newton.State:
         """The present state; call :meth:`look` first. It may be changed."""
-        self._machine.forget_contacts()
+        self._machine.invalidate_contacts()
         return self._state
 
     @property
@@ -331,7 +331,7 @@ class Stepper:
                 break
             self._prepare()
         peaks, counts = self._read("peaks"), self._read("counts")
-        self._machine.forget_contacts()
+        self._machine.invalidate_contacts()
         depths = float(peaks[monitor.PEAK_OVERLAP]), float(peaks[monitor.PEAK_DEPTH])
         return *depths, int(counts[monitor.COUNT_OVERLAPS])
 
@@ -351,14 +351,14 @@ class Stepper:
         machine = self._machine
         for level, remaining in enumerate(machine.remaining):
             wp.capture_while(remaining, self._advance_twice, level=level)
-        self._find_first_contacts(substep=monitor.NEXT)
+        self._find_first_contacts(substep=monitor.NEXT_SUBSTEP)
         machine.judge()
         machine.restore()
 
     def _advance_twice(self, level: int) -> None:
         machine, dt = self._machine, self._longest / (1 << level)
         if self._drive:
-            machine.tell_time(self._step, self._longest, self._drive.time)
+            machine.write_time(self._step, self._longest, self._drive.time)
         wp.capture_if(machine.contacts_due, self._find_first_contacts, substep=0)
         if level == 1:  # exactly two substeps share forces
             self._share_forces(dt)
