@@ -56,7 +56,7 @@ _MOVED = {
 
 
 class _MovedModules:
-    """Imports a module by its earlier name, with a DeprecationWarning that gives the present one."""
+    """Finder that imports a module by its earlier name, with a DeprecationWarning that names the present module."""
 
     @classmethod
     def find_spec(cls, name, path=None, target=None):
@@ -74,4 +74,4 @@ class _MovedModules:
         vars(module).update({name: value for name, value in contents if not name.startswith("__")})
 
 
-sys.meta_path.append(_MovedModules)  # after the finders of files, so it sees only what they do not find
+sys.meta_path.append(_MovedModules)  # last, so that it applies only to modules without a file

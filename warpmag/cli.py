@@ -26,7 +26,7 @@ _OUTPUT_FOLDER = Path("warpmag_out")
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are :class:`InputError`."""
+    """A parser that raises :class:`InputError`."""
 
     def error(self, message: str):
         raise InputError(f"{message} (see {self.prog} --help)")

@@ -20,8 +20,8 @@ _DEGREES = (
     (1e-2, 5, 57), (3e-3, 6, 57), (1e-3, 8, 57), (3e-4, 9, 57), (1e-4, 10, 70), (3e-5, 12, 90), (1e-5, 14, 100),
 )  # fmt: skip
 """Relative error, degree of the expansions, and moments of a leaf box. The largest measured errors of fields and forces
-are a third to four fifths of the relative error. The test cases are random and aligned moments in boxes and balls, in
-equilibrium and near saturation, in a shell, a chain and two distant clumps."""
+are a third to four fifths of the relative error. The cases are random and aligned moments in boxes and balls, moments in
+equilibrium and near saturation, a shell, a chain, and two distant clumps."""
 DEFAULT_RTOL = 1e-3
 """Relative error of the method ``fmm`` if the caller gives none."""
 LEAST_RTOL = _DEGREES[-1][0]
@@ -159,8 +159,8 @@ class SystemSums(FastSums):
     def uses_multipoles(self, quantity: Quantity, pairs: float) -> bool:
         """Return True if multipoles sum this number of pairs of a target and an acting moment.
 
-        Few pairs are summed one by one. That is faster, and avoids an error that is relatively large if no moment is
-        near, as in the field of a few magnets at many balls.
+        Few pairs are summed one by one, which is faster. It also avoids an error that is relatively large if no moment
+        is near, as in the field of a few magnets at many balls.
         """
         count, rtol, device = self._costs
         kind = Quantity.FIELD if quantity == Quantity.FIELD else Quantity.WRENCH
@@ -172,7 +172,7 @@ class SystemSums(FastSums):
 
 
 class NoFastSums:
-    """Replacement of :class:`SystemSums` for systems in which all pairs are summed one by one."""
+    """Replacement of :class:`SystemSums` for systems that sum all pairs one by one."""
 
     def build(self):
         """Do nothing."""

@@ -154,8 +154,8 @@ def multipole_to_local(degree: int, offsets) -> np.ndarray:
 def _shift_terms(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the two terms of each entry of ``multipole_to_local``: factors and indices of harmonics at the offset.
 
-    A complex harmonic V of degree n and order m at d + u is Σ (−1)^k conj(W) V(d). Here W are the regular
-    harmonics of degree k and order j at u, and V(d) those of degree n + k and order m + j. The orders ±j give the terms
+    A complex harmonic V of degree n and order m at d + u is Σ (−1)^k conj(W) V(d). Here W are the regular harmonics of
+    degree k and order j at u. V(d) are the harmonics of degree n + k and order m + j at d. The orders ±j give the terms
     m + |j| and m − |j|.
     """
     n, m, sine = degrees(degree), np.abs(orders(degree)), orders(degree) < 0

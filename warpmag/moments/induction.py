@@ -337,7 +337,7 @@ def _check_strength(dtype, strongest: float, saturation):
 def _check_finite(dtype, count: int, arguments: dict, **results):
     """Raise ``InputError`` if one of the first ``count`` rows of a result is not finite.
 
-    The message names the arguments whose values are unusually large or small, or all arguments.
+    The message names the arguments with unusually large or small values, or all arguments if there are none.
     """
     rows = {name: first_not_finite(array, count) for name, array in results.items()}
     failures = [f"the {name} of ball {row}" for name, row in rows.items() if row is not None]

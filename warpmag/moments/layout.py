@@ -96,7 +96,7 @@ def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayou
 
 
 def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
-    """Return the layout in which the moments of ``couplings`` are cells: not aligned, even if a body has only one."""
+    """Return the layout with the moments of ``couplings`` as cells: not aligned, even if a body has a single one."""
     cells = np.zeros(len(layout.radii), bool)
     for first, coupling in couplings:
         cells[first : first + len(coupling.start) - 1] = True

@@ -1,6 +1,6 @@
 """Sums over pairs for calls on arrays. Buffers and recorded launches are cached for the next call of the same shape.
 
-The cache serves CPUs only. Making the buffers takes a millisecond, in which a core sums the field of 2000 moments.
+The cache is for CPUs only. Making the buffers takes a millisecond, as long as a core sums the field of 2000 moments.
 """
 
 import os

@@ -124,8 +124,8 @@ def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -
     """Simulate many worlds in groups, which the ranks of ``mpirun`` share.
 
     Each rank simulates its groups on its own. At the end all ranks receive all results. The groups do not depend on the
-    number of ranks. Worlds of one model may share their substeps and the form of their sums, so that results are
-    bitwise those of a single process on any device.
+    number of ranks. Worlds of one model may share their substeps and the form of their sums. The results
+    are bitwise those of a single process, on any device.
 
     Args:
         simulate: Function of the numbers of the worlds of a group. Its result is sent to all ranks and must be

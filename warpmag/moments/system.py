@@ -74,7 +74,7 @@ class SolverSettings:
 
 
 class MomentSystem:
-    """Moments whose magnetic equilibrium and forces are computed repeatedly, in buffers allocated once.
+    """Moments with buffers, allocated once, in which magnetic equilibrium and forces are computed repeatedly.
 
     Moments are ordered by world, and within a world the inducible ones come first. Moments of different worlds do not
     interact. :meth:`solve` and :meth:`apply_forces` only launch kernels. They neither allocate nor wait for the device,
@@ -86,7 +86,7 @@ class MomentSystem:
         permanent: True for a permanent moment, shape [n]; None means that all are inducible.
         bodies: Body of each moment, shape [n]; moments of one body exert no force on each other. None means that each
             is a body.
-        movable: True for a moment whose force is needed, shape [n]; None means all.
+        movable: True for a moment that needs a force, shape [n]; None means all.
         body_extent: Largest distance [m] between two moments of a movable body. The method ``fmm`` needs it if such a
             body has several moments, because it sums their pairs one by one. None means unknown.
         material: Material of the inducible moments.

@@ -14,7 +14,7 @@ _MOST_SPLITS = 8
 """Largest number of test points along each axis of a cell, if several shapes share a grid."""
 
 _FLATTEST = 4.0
-"""Largest ratio of spacing to cell side in a shared grid, in which thin shapes have several cells across."""
+"""Largest ratio of spacing to cell side in a shared grid, where thin shapes get several cells across."""
 
 _SMALL = 0.1
 """Shapes below this share of the largest shape's volume do not make the cells of a shared grid narrower."""

@@ -50,8 +50,9 @@ AUTOMATIC_COUNT = 729
 """Largest number of moments of a body at automatic spacing: 9³, see the table above."""
 
 LEAST_ACROSS = 3
-"""Smallest number of cells across an inducible shape at automatic spacing. The force of a ferrite cube of 20 mm on a
-plate of 40:40:5 mm at 0.5 mm is 4 % too small with 3 cells across, and 6 % with 2. More are flatter and slower."""
+"""Smallest number of cells across an inducible shape at automatic spacing. The test case is a ferrite cube of 20 mm at
+0.5 mm from a plate of 40:40:5 mm. The force is 4 % too small with 3 cells across, and 6 % with 2. More cells are
+flatter and slower."""
 
 LARGEST_COUNT = 20_000
 """Largest number of moments of a body at any spacing; a smaller spacing raises an error."""

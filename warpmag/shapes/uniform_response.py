@@ -56,7 +56,7 @@ _NEAR_DISTANCE = 6.0
 """Distance up to which a facet's potential is integrated, in distances from its center to its farthest corner."""
 
 _ON_EDGE = 1e-15
-"""Relative rounding error of r1 + r2 − l on an edge of length l. It bounds a logarithm whose factor is 0 there."""
+"""Relative rounding error of r1 + r2 − l on an edge of length l. It bounds a logarithm multiplied by 0 there."""
 
 _RESIDUAL = 1e-3
 """Relative residual of the cells' magnetization. The moment's error is its square over the smallest eigenvalue."""
@@ -71,8 +71,8 @@ _CHUNK = 1 << 18
 def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
     """Return the coupling with a matrix of the common fields that gives the body the response of its surface.
 
-    The coupling is returned unchanged if the body consists of separate parts, if it has too many facets or cells, or if
-    shapes coincide, because their facets then coincide, too.
+    The coupling is returned unchanged if the body has separate parts, or too many facets or cells. So it is if shapes
+    coincide, because their facets then coincide, too.
     """
     if len(lattice.volumes) > MOST_MOMENTS or not _is_connected(coupling):
         return coupling
@@ -122,7 +122,7 @@ def surface_polarizability(coupling: Coupling, surface: np.ndarray) -> np.ndarra
     step = max(1, _CHUNK // len(potential))
     for start in range(0, len(potential), step):
         matrix[start : min(start + step, len(potential)), :-1] = potentials(centroids[start : start + step], surface)
-    matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # unknown potential of the body, whose charge is zero
+    matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # unknown potential of the body, total charge zero
     charges = np.linalg.solve(matrix, np.append(potential, np.zeros((1, count)), axis=0))[:-1]
     result = (charges * areas[:, None]).T @ potential
     return 0.5 * (result + result.T)
