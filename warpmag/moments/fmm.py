@@ -20,8 +20,8 @@ _DEGREES = (
     (1e-2, 5, 57), (3e-3, 6, 57), (1e-3, 8, 57), (3e-4, 9, 57), (1e-4, 10, 70), (3e-5, 12, 90), (1e-5, 14, 100),
 )  # fmt: skip
 """Relative error, degree of the expansions, and moments of a leaf box. The largest measured errors of fields and forces
-are a third to four fifths of the relative error. The cases are random and aligned moments in boxes and balls, moments in
-equilibrium and near saturation, a shell, a chain, and two distant clumps."""
+are a third to four fifths of the relative error. The cases are random and aligned moments in boxes and balls, in
+equilibrium and near saturation, and in a shell, a chain and two distant clumps."""
 DEFAULT_RTOL = 1e-3
 """Relative error of the method ``fmm`` if the caller gives none."""
 LEAST_RTOL = _DEGREES[-1][0]
