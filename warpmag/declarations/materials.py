@@ -35,8 +35,8 @@ class Material:
         source: Source of the numbers.
         curve: Measured magnetization curve of an inducible material, or None.
         conductivity: Electrical conductivity [S/m], 0 where the source has none. Magnets do not take it from the
-            material, because eddy currents cost a sum over pairs: pass it to ``add_inducible(..., conductivity=...)``,
-            for balls.
+            material: pass it to ``add_inducible(..., conductivity=...)``, for balls. Eddy currents cost a sum over
+            pairs.
     """
 
     name: str
