@@ -7,13 +7,13 @@ Each error has its own reference:
 | rounding | fields and forces in float32 and float64 | the float64 oracle |
 | iteration | magnetizations at a tolerance | a float64 Newton solution |
 | model | forces of two permeable balls as dipoles, or with the near-contact model | exact multipole solution |
-| clusters | the same of three balls in a row and of thirteen, and their moments | ``bench.reference.clusters`` |
+| clusters | forces and moments of three balls in a row and of thirteen balls | ``bench.reference.clusters`` |
 | time step | energy of two balls that fall towards each other | conservation |
 | boxes | forces of two box magnets | ``bench.reference.magnet_pairs`` |
 | price | time of the near-contact model in a touching pile | dipoles alone |
 | arrangements | magnetizations of many arrangements, and the estimate of the solve | a float64 Newton solution |
 
-Prints a table of each error, or of the named ones, and writes ``accuracy.jsonl``; of all errors also ``accuracy.png``.
+Prints a table of each error, or of the named ones, and writes ``accuracy.jsonl``, and ``accuracy.png`` for all errors.
 """
 
 import argparse
@@ -40,7 +40,7 @@ from warpmag.moments.system import MomentSystem
 SIZES = (243, 1032, 2560, 10000)
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 BLOCK = 1000
-"""Balls of the pile whose iteration error is measured: the most that the dense Newton solution can solve."""
+"""Number of balls of the pile for the iteration error: the most that the dense Newton solution can handle."""
 PERMEABILITIES = (2.0, 4.0, 10.0, 1000.0, np.inf)
 GAPS = (0.01, 0.03, 0.1, 0.3, 0.5, 0.9, 1.2, 3.0)
 """Gaps between two balls over their radius."""
@@ -146,14 +146,14 @@ def cluster_errors(device) -> Iterator[dict]:
     field = 1e3
     for row in clusters.load():
         exact = field**2 * RADIUS**2 * np.array(row["forces"])
-        key = {name: row[name] for name in ("cluster", "gap", "permeability", "field")}
+        line = {name: row[name] for name in ("cluster", "gap", "permeability", "field")}
         x = RADIUS * clusters.positions(row["cluster"], row["gap"])
         h0 = field * np.array(clusters.FIELDS[row["cluster"]][row["field"]])
         for kind in CONTACT_MODELS:
             system = _solve(x, h0, row["permeability"], kind, device)
-            key[kind] = relative(system.forces.numpy(), exact)
+            line[kind] = relative(system.forces.numpy(), exact)
         exact = field * RADIUS**3 * np.array(row["moments"])
-        yield {**key, "moments": relative(system.moments.numpy(), exact)}
+        yield {**line, "moments": relative(system.moments.numpy(), exact)}
 
 
 def time_step(device) -> Iterator[dict]:

@@ -49,8 +49,8 @@ def _shell(count):
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     angle, across = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count), np.sqrt(1.0 - z * z)
     unit = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
-    apart = np.linalg.norm(unit[:, None] - unit, axis=-1) + 9.0 * np.eye(count)
-    return 2.0 * RADIUS / apart.min() * unit
+    distances = np.linalg.norm(unit[:, None] - unit, axis=-1) + 9.0 * np.eye(count)
+    return 2.0 * RADIUS / distances.min() * unit
 
 
 def _grid(*counts):
@@ -74,7 +74,7 @@ def _heap(count):
 
 
 def _heap_with_ten_in_one():
-    """A heap whose last ten balls share the place of another ball."""
+    """A heap with its last ten balls at the position of another ball."""
     x = _heap(120)
     x[-10:] = x[20]
     return x

@@ -1,8 +1,9 @@
 """Compares warpmag and its peers on the same arrays: ``python -m bench.compare [--device cuda:0] [--sizes 243]``.
 
-Timed is the field of n dipoles at each other, with data and results in place: evaluations in sequence and one wait at
-their end; for ``h_field`` the whole call. Peers take turns. Each field is compared with the float64 oracle at some
-targets. Each measurement is one JSON line; a peer that fails, or whose library is missing, gets a line with the error.
+The timed work is the field of n dipoles at each other, with data and results on the device: evaluations in sequence
+and one wait at their end. For ``h_field`` it is the whole call. Peers take turns. Each field is compared with the
+float64 oracle at some targets. Each measurement is one JSON line. A peer that fails, or is not installed, gets a line with
+the error.
 """
 
 import argparse
@@ -90,8 +91,8 @@ def compare(peers: list[Peer], count: int, device: str, seconds: float) -> dict[
         try:
             with contextlib.redirect_stdout(sys.stderr):  # some libraries print
                 return call(*arguments)
-        except Exception as problem:  # a peer's failure is a result: the others go on
-            lines[name] = {"failed": f"{type(problem).__name__}: {problem}".splitlines()[0][:200]}
+        except Exception as error:  # a peer's failure is a result: the others go on
+            lines[name] = {"failed": f"{type(error).__name__}: {error}".splitlines()[0][:200]}
 
     for peer in peers:
         running[peer.name] = attempt(peer.name, Measurement, peer, positions, moments, device, seconds)

@@ -1,4 +1,4 @@
-"""Machine, versions and commit of a measurement, and the JSON lines that carry them."""
+"""Machine, versions and commit of a measurement, and the JSON lines that contain them."""
 
 import json
 import os

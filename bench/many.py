@@ -1,9 +1,11 @@
 """Time and error over the number of moments, by all pairs and by the fast multipole method: ``python -m bench.many``.
 
-Timed are field, and force with torque, of moments of random directions in a jittered cubic lattice that fills a cube,
-with data in place; building the cells is included. Errors are those of some moments relative to sums over all pairs in
-float64. Each measurement is one JSON line; ``--draw`` draws such lines. Peers are fast multipole methods for dipoles
-or, if they have none, for point charges, which are cheaper; their errors are relative to the sums that they replace.
+The timed quantities are the field, and the force with torque, of moments of random directions in a jittered cubic
+lattice that fills a cube. Data are on the device, and times include building the cells. Errors at some moments are
+relative to float64 sums over all pairs. Each measurement is one JSON line; ``--draw`` draws such lines.
+
+Peers are fast multipole methods for dipoles or, in libraries without dipoles, for point charges, which are cheaper.
+Errors of the latter are relative to sums over all pairs of charges.
 """
 
 import argparse
@@ -113,7 +115,7 @@ def run_size(count: int, device, slowest: float, seconds: dict):
         count: Number of moments.
         device: Warp device.
         slowest: Expected time [s] beyond which sums over all pairs are skipped.
-        seconds: Times of all pairs by quantity and count; the measured ones are added.
+        seconds: Times of all pairs by quantity and count; measured times are added.
     """
     places, moments = lattice(count)
     rows = np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
@@ -124,8 +126,10 @@ def run_size(count: int, device, slowest: float, seconds: dict):
         expected = exact.out.numpy()[rows]
         for rtol in RTOLS:
             began = time.perf_counter()
-            expects = min((t * (count / n) ** 2 for (q, n), t in seconds.items() if q == quantity), default=0.0)
-            if rtol is None and expects > slowest:
+            expected_seconds = min(
+                (t * (count / n) ** 2 for (q, n), t in seconds.items() if q == quantity), default=0.0
+            )
+            if rtol is None and expected_seconds > slowest:
                 continue
             work = own.work(quantity, rtol)
             work()
@@ -157,8 +161,8 @@ def run_peer(peer: Peer, count: int, device) -> dict:
             evaluation.wait()
             times.append(time.perf_counter() - began)
         fields = evaluation.result()[rows]
-    except Exception as problem:  # a peer's failure is a result: the others go on
-        return line | {"failed": f"{type(problem).__name__}: {problem}".splitlines()[0][:200]}
+    except Exception as error:  # a peer's failure is a result: the others go on
+        return line | {"failed": f"{type(error).__name__}: {error}".splitlines()[0][:200]}
     if peer.charges:
         expected = field_of_charges(places, strengths, rows)
     else:
@@ -186,7 +190,7 @@ def draw(lines, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt  # noqa: PLC0415
 
-    figure, (times, wrong) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
+    figure, (times, accuracy) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
     series: dict[tuple, list] = {}
     for x in sorted((x for x in lines if "seconds" in x), key=lambda x: x["count"]):
         series.setdefault((x["method"], x["rtol"], x["quantity"]), []).append(x)
@@ -194,16 +198,16 @@ def draw(lines, path: Path) -> None:
     colors = dict(zip(methods, plt.rcParams["axes.prop_cycle"].by_key()["color"], strict=False))
     words = {"direct": "all pairs", "fmm": "multipoles"}
     for (method, rtol, quantity), points in series.items():
-        own = {"color": colors[method, rtol], "linestyle": "-" if quantity == "field" else "--", "marker": "."}
+        style = {"color": colors[method, rtol], "linestyle": "-" if quantity == "field" else "--", "marker": "."}
         label = f"{words.get(method, method)}{f', rtol {rtol:g}' if rtol else ''}"
         counts = [x["count"] for x in points]
         named = f"{label}: {'field' if quantity == 'field' else 'force, torque'}"
-        times.plot(counts, [1e3 * x["seconds"] for x in points], label=named, **own)
-        wrong.plot(counts, [x["error"] for x in points], **own)
+        times.plot(counts, [1e3 * x["seconds"] for x in points], label=named, **style)
+        accuracy.plot(counts, [x["error"] for x in points], **style)
     times.set(xscale="log", yscale="log", xlabel="moments", ylabel="time [ms]")
-    wrong.set(xscale="log", yscale="log", xlabel="moments", ylabel="relative error")
+    accuracy.set(xscale="log", yscale="log", xlabel="moments", ylabel="relative error")
     times.legend(fontsize="x-small")
-    for axis in (times, wrong):
+    for axis in (times, accuracy):
         axis.grid(True, alpha=0.3)
     figure.suptitle(f"{machine_of(lines[0])}, commit {lines[0]['commit']}")
     figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})

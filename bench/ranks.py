@@ -22,7 +22,7 @@ CASES = ((131_072, None), (1_000_000, None), (1_000_000, 1e-3), (4_019_679, 1e-3
 
 
 def run_case(count: int, quantity: Quantity, rtol: float | None, all_ranks: Ranks, device) -> dict:
-    """Measure the sums of one rank and those of all ranks; ``cells_seconds`` is the time of the cells, built by all."""
+    """Measure the sums of one rank and of all ranks; ``cells_seconds`` is the time to build the cells on every rank."""
     own = Moments(*lattice(count), wp.float32, device)
     results = []
     for sharing in (without_ranks(), nullcontext()):

@@ -93,18 +93,18 @@ def draw_roofline(lines, path: Path) -> None:
 def table(lines) -> str:
     """A Markdown table of all lines of a device."""
     rows = [
-        "| what | n | time | pairs/s | of the limit | error | first call | commit |",
+        "| case | n | time | pairs/s | of the limit | error | first call | commit |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for x in sorted(lines, key=lambda x: (x["case"], x["count"], x.get("seconds", float("inf")))):
-        what = x.get("peer") or f"{x['case']} {x['dtype']}"
+        name = x.get("peer") or f"{x['case']} {x['dtype']}"
         if "failed" in x:
-            rows.append(f"| {what} | {x['count']:,} | {x['failed']} | | | | | {x['commit']} |")
+            rows.append(f"| {name} | {x['count']:,} | {x['failed']} | | | | | {x['commit']} |")
             continue
         rate, limit = x.get("pairs_per_second"), limit_of(x)
         share = f"{rate / limit:.1%}" if rate and limit else ""
         rows.append(
-            f"| {what} | {x['count']:,} | {duration(x['seconds'])} | {f'{rate:.3g}' if rate else ''} | {share} "
+            f"| {name} | {x['count']:,} | {duration(x['seconds'])} | {f'{rate:.3g}' if rate else ''} | {share} "
             f"| {x['error']:.1e} | {x['first_call_seconds']:.1f} s | {x['commit']} |"
         )
     return "\n".join(rows)

@@ -12,8 +12,8 @@ _CHAINED = 10
 def measure(work, device, *, seconds: float = 1.0, repeats: int = 5, chained: int = _CHAINED) -> float:
     """Median time [s] of ``work``, a function that only launches kernels.
 
-    On a GPU the work is captured ``chained`` times in one graph between two events. So the launch of a graph, 5 µs, is
-    spread over all repetitions: a step of a simulation is part of a longer graph, too.
+    On a GPU the work is captured ``chained`` times in one graph between two events. This spreads the launch of a graph,
+    5 µs, over all repetitions, as in a simulation, where a step is part of a longer graph.
     """
     work()
     if device.is_cpu:

@@ -44,7 +44,7 @@ def make(name: str, folder: Path, balls: int | None = None) -> Path:
     try:
         module.author(path, balls=count)
     except MemoryError:
-        raise InputError(f"balls: there is no room for {count}") from None
+        raise InputError(f"balls: not enough memory for {count}") from None
     return path
 
 

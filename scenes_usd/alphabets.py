@@ -28,7 +28,7 @@ PAINTS = {
 
 _GAP = 1.12
 """Distance of neighboring letters over their largest size along the axis."""
-_SKIN = 0.03
+_MARGIN = 0.03
 """Collision margin over the thickness of the letters.
 
 The margin keeps the boxes apart, so that a contact has the direction between nearest points, which is continuous. The
@@ -131,8 +131,8 @@ def _define_letter(
         cube.AddScaleOp().Set(Gf.Vec3f(float(sides[0]), thickness, float(sides[1])))
         UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
         cube.GetPrim().AddAppliedSchema("NewtonCollisionAPI")
-        skin = cube.GetPrim().CreateAttribute("newton:contactMargin", Sdf.ValueTypeNames.Float, custom=False)
-        skin.Set(_SKIN * thickness)
+        margin = cube.GetPrim().CreateAttribute("newton:contactMargin", Sdf.ValueTypeNames.Float, custom=False)
+        margin.Set(_MARGIN * thickness)
         UsdShade.MaterialBindingAPI.Apply(cube.GetPrim()).Bind(material)
     return size * np.ptp(np.concatenate(curves), axis=0), lettering.area(curves) * size**2 * thickness
 

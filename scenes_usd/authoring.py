@@ -30,7 +30,7 @@ GROUND_COLOR = (0.32, 0.33, 0.35)
 CONTACT_PATCH = 1e-4
 """Size of the contact patch of two bodies [m], the coefficient of rolling and torsional friction.
 
-Newton's default for rolling; without it balls circle a magnet forever."""
+Newton's default for rolling friction. Without rolling friction balls circle a magnet forever."""
 
 BALL_SPACING = 2.002
 """Distance of neighboring balls in radii: a gap of a thousandth, so that rounding never makes them overlap."""
@@ -117,9 +117,10 @@ def add_material(
         color: Linear RGB.
         metallic: Metalness, 0 to 1.
         roughness: Roughness, 0 to 1.
-        coat: Clear lacquer over it, 0 to 1.
+        coat: Weight of a clear coat, 0 to 1.
         density: Mass density [kg/m³] of bodies with this material.
-        friction: Coefficient of static and dynamic friction; if positive, also rolling and torsional friction are.
+        friction: Coefficient of static and dynamic friction. If positive, rolling and torsional friction are
+            :data:`CONTACT_PATCH`, otherwise zero.
         restitution: Coefficient of restitution.
     """
     UsdGeom.Scope.Define(stage, "/World/Materials")
@@ -195,7 +196,7 @@ def add_ball(
 
 
 def add_ball_prims(stage: Usd.Stage, positions, radius: float, material: UsdShade.Material, *, digits=4, **options):
-    """Author balls below ``/World/Balls``, with numbers of so many digits in their names; see :func:`add_ball`."""
+    """Author balls below ``/World/Balls``, named by numbers of ``digits`` digits; see :func:`add_ball`."""
     UsdGeom.Scope.Define(stage, "/World/Balls")
     for number, position in enumerate(positions):
         add_ball(stage, f"/World/Balls/Ball_{number:0{digits}d}", position, radius, material, **options)
@@ -273,14 +274,14 @@ def add_capsule(
 def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], *, field_of_view: float = 35.0) -> None:
     """Author a camera at ``eye`` [m] that looks at ``target`` [m], ``field_of_view`` [degrees] wide, and the lights.
 
-    The film is 36 mm wide; UsdGeom has film and focal length in tenths of the stage's unit.
+    The film is 36 mm wide; UsdGeom measures film and focal length in tenths of the stage's unit.
     """
     camera = UsdGeom.Camera.Define(stage, "/World/Camera")
-    camera.AddTransformOp().Set(_looking(eye, target))
-    tenth = 10.0 / UsdGeom.GetStageMetersPerUnit(stage)
-    camera.CreateHorizontalApertureAttr(tenth * _FILM)
-    camera.CreateVerticalApertureAttr(tenth * _FILM * 9.0 / 16.0)
-    camera.CreateFocalLengthAttr(tenth * 0.5 * _FILM / math.tan(math.radians(0.5 * field_of_view)))
+    camera.AddTransformOp().Set(_look_at(eye, target))
+    tenths_per_meter = 10.0 / UsdGeom.GetStageMetersPerUnit(stage)
+    camera.CreateHorizontalApertureAttr(tenths_per_meter * _FILM)
+    camera.CreateVerticalApertureAttr(tenths_per_meter * _FILM * 9.0 / 16.0)
+    camera.CreateFocalLengthAttr(tenths_per_meter * 0.5 * _FILM / math.tan(math.radians(0.5 * field_of_view)))
     camera.CreateFStopAttr(_F_STOP)
     distance = math.dist(eye, target)
     camera.CreateClippingRangeAttr(Gf.Vec2f(0.01 * distance, 100.0 * distance))
@@ -305,11 +306,11 @@ def _add_lights(stage: Usd.Stage, target: Sequence[float], distance: float) -> N
         box.CreateIntensityAttr(intensity)
         box.CreateNormalizeAttr(False)
         box.CreateColorAttr(Gf.Vec3f(*color))
-        box.MakeMatrixXform().Set(_looking(np.add(target, np.multiply(distance, place)), target))
+        box.MakeMatrixXform().Set(_look_at(np.add(target, np.multiply(distance, place)), target))
         box.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(box, Usd.TimeCode.Default()))
 
 
-def _looking(eye: Sequence[float], target: Sequence[float]) -> Gf.Matrix4d:
+def _look_at(eye: Sequence[float], target: Sequence[float]) -> Gf.Matrix4d:
     """Return the transform whose -z axis points from ``eye`` to ``target``, z up."""
     up = Gf.Vec3d(0.0, 0.0, 1.0)
     return Gf.Matrix4d().SetLookAt(Gf.Vec3d(*map(float, eye)), Gf.Vec3d(*map(float, target)), up).GetInverse()

@@ -61,8 +61,8 @@ def author(
     places = [(x - 0.5 * (columns - 1), z - 0.5 * (rows - 1)) for z in range(rows) for x in range(columns)]
     around = [(x, z) for x, z in places if abs(x) > 0.5 * bar or abs(z) > 0.5 * bar_rows]
     positions = [(x * spacing, 0.0, z * spacing) for x, z in around]
-    looks = {"motion": authoring.KINEMATIC, "magnet": Magnet(), "color": CRYSTAL_COLOR}
-    authoring.add_ball_prims(stage, positions, radius, crystal, **looks)
+    options = {"motion": authoring.KINEMATIC, "magnet": Magnet(), "color": CRYSTAL_COLOR}
+    authoring.add_ball_prims(stage, positions, radius, crystal, **options)
     reach = spacing * max(columns, 1.78 * rows)
     authoring.add_camera(stage, (0.35 * reach, -1.75 * reach, 0.3 * reach), (0.0, 0.0, 0.0))
     authoring.save(stage, path)

@@ -20,11 +20,11 @@ _ANGLES = 12
 """Number of directions of boxes over a quarter turn, besides those of straight strokes."""
 _STRAIGHT = 0.3
 """Smallest length of the edges of straight strokes."""
-_COVERED, _WORTH = 0.96, 0.025
-"""Boxes are added until they cover the first part of the letter, or the next one would add less than the second."""
+_COVERED, _LEAST_GAIN = 0.96, 0.025
+"""Boxes are added until they cover the first fraction of the letter, or the next box would add less than the second."""
 _THINNEST = 0.16
 """Smallest side of a box: strokes are 0.19 wide, and thin boxes require short time steps."""
-_OUT = 0.015
+_OVERHANG = 0.015
 """Largest overhang of a box beyond the letter, besides half a cell: curved strokes then need fewer boxes."""
 
 
@@ -43,7 +43,7 @@ class Box:
     angle: float
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return true for points inside, shape [n, 2]."""
+        """Return whether each of ``points``, shape [n, 2], is inside, shape [n]."""
         return np.max(np.abs(_turned(points - self.center, -self.angle)) - self.half, axis=1) <= 0.0
 
 
@@ -119,7 +119,7 @@ def extruded(curves: list[np.ndarray], depth: float, bevel: float) -> tuple[np.n
         bevel: Width of the bevel, small compared with the strokes.
 
     Returns:
-        Points, shape [n, 3], z across the letter, zero in its middle; faces as indices, counterclockwise from outside.
+        Points, shape [n, 3], z normal to the letter, zero in its middle; faces as indices, counterclockwise outside.
     """
     insets = [_inset(curve, bevel) for curve in curves]
     rims, inner = np.concatenate(curves), np.concatenate(insets)
@@ -146,7 +146,7 @@ def boxes(curves: list[np.ndarray]) -> list[Box]:
     covered = 0.0
     while covered < _COVERED * whole:
         gain, box = max((grid.best() for grid in grids), key=lambda pair: pair[0])
-        if gain < _WORTH * whole:
+        if gain < _LEAST_GAIN * whole:
             break
         covered += gain
         chosen.append(box)
@@ -171,7 +171,7 @@ class _Grid:
         self._angle = angle
         self._cell = 1.0 / _CELLS
         turned = [_turned(curve, -angle) for curve in curves]
-        around = [_inset(curve, -_OUT) for curve in turned]
+        around = [_inset(curve, -_OVERHANG) for curve in turned]
         corners = np.concatenate(around)
         self._lower = corners.min(axis=0)
         columns, rows = np.ceil(np.ptp(corners, axis=0) / self._cell - 1e-6).astype(int)

@@ -35,9 +35,9 @@ _TAPER = 1.015
 _BALLS_APART = 0.75
 """Smallest distance of the balls in the sky over their mean spacing; beyond 0.9 random places run out."""
 _USUAL = 2500
-"""Number of balls whose rain is as wide as the crown; more balls make the rain wider and higher in proportion."""
+"""Number of balls of a rain as wide as the crown; more balls make the rain wider and higher in proportion."""
 _MANY = 10_000
-"""Number of balls beyond which they are instances, at places of a jittered lattice."""
+"""Larger numbers of balls are authored as instances, at places of a jittered lattice."""
 _CROWN_CENTER, _CROWN = (0.0, 0.0, 0.66), (0.56, 0.56, 0.34)
 """Center and semi-axes of the ellipsoid of the crown, over the tree's height."""
 _TRUNK = ((0.0, 0.0, 0.0), (0.01, -0.006, 0.05), (0.012, -0.014, 0.1), (0.002, -0.018, 0.15), (-0.012, -0.01, 0.2))
@@ -118,7 +118,7 @@ def author(
 
 
 def _add_tree(stage, tree, bark, bud, bud_radius, magnetization) -> None:
-    """Author the tree as one kinematic body, so that balls that cling to it cling to a magnet."""
+    """Author the tree as one kinematic body, so that balls that touch any part of it count as held by a magnet."""
     authoring.add_body(stage, "/World/Tree", (0.0, 0.0, 0.0), kinematic=True)
     for node in range(1, len(tree.nodes)):
         start, end = tree.nodes[tree.parents[node]], tree.nodes[node]

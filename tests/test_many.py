@@ -208,7 +208,7 @@ def test_a_scene_that_cannot_be_made_is_told_in_one_line(tmp_path, capsys):
     (tmp_path / "file").write_text("no folder")
     for balls, folder, reason in (
         (3, "file", f"{tmp_path}/file/million_3.usdc: cannot be written (File exists)"),
-        (10**15, "new", f"balls: there is no room for {10**15}"),
+        (10**15, "new", f"balls: not enough memory for {10**15}"),
     ):
         assert main(["run", "million", "--balls", str(balls), "-o", str(tmp_path / folder / "out.usda")]) == BAD_INPUT
         assert capsys.readouterr().err == f"warpmag: {reason}\n"

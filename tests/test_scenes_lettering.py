@@ -84,7 +84,7 @@ def test_boxes_cover_the_strokes(letter):
     covered = np.any([box.contains(points) for box in boxes], axis=0)
     assert (covered & inside).sum() > 0.88 * inside.sum()
     # What sticks out does so by the margin and half a cell, along all edges: allowed are both margins and a cell.
-    reach = lettering._OUT + 1.0 / lettering._CELLS
+    reach = lettering._OVERHANG + 1.0 / lettering._CELLS
     outer = [lettering._inset(curve, -reach) for curve in curves]
     assert (covered & ~lettering._inside(points, outer)).sum() < 0.01 * inside.sum()
     for box in boxes:

@@ -38,8 +38,8 @@ def run(output: Output):
         points, densities, pitch = reading(LEVELS[level], output)
         sizes = {law: np.linalg.norm(density, axis=1) for law, density in densities.items()}
         _draw_row(row, f"{name}, {level} magnet", points, densities, sizes, pitch)
-        felt = sizes["kelvin"] > 1e-3 * sizes["kelvin"].mean()  # the force in the middle is rounding
-        ratio = sizes["zeeman"][felt] / sizes["kelvin"][felt]
+        significant = sizes["kelvin"] > 1e-3 * sizes["kelvin"].mean()  # the force in the middle is rounding
+        ratio = sizes["zeeman"][significant] / sizes["kelvin"][significant]
         values = {
             "mean_kelvin": float(sizes["kelvin"].mean()),
             "mean_zeeman": float(sizes["zeeman"].mean()),

@@ -26,12 +26,12 @@ PATIENCE = 5000
 def run(output: Output):
     """Run the experiment."""
     figure, axes = plt.subplots(1, len(PANELS), figsize=(15.0, 4.4), sharey=True)
-    courses = {}
+    histories = {}
     for axis, (title, methods) in zip(axes, PANELS, strict=True):
         for dynamics, curve in methods:
             for name in crystal_balls.STRENGTHS:
                 errors = _errors(dynamics, curve, name, output)
-                courses[dynamics, name] = errors
+                histories[dynamics, name] = errors
                 style = {"color": COLORS[name], "ls": "-" if dynamics != "theta-euler" else "--"}
                 marker = "o" if dynamics == "theta" else None
                 label = f"{dynamics}, {name} bar"
@@ -42,7 +42,7 @@ def run(output: Output):
     axes[0].set_ylabel("$e_M$ (Eq. 12)")
     figure.tight_layout()
     others = "" if output.small else _second_choices(output)
-    output.report(_text(output.save(figure), courses, others))
+    output.report(_text(output.save(figure), histories, others))
     plt.close(figure)
 
 
@@ -76,7 +76,7 @@ def _outcome(iterations, error) -> str:
 
 
 def _second_choices(output: Output) -> str:
-    """Return the section about other steps, strengths, arrangements and starts than the figure's."""
+    """Return the section on choices other than the figure's: steps, strengths, arrangements and starts."""
     methods = [method for _, panel in PANELS for method in panel]
     explicit = [method for method in methods if method[0] != "theta"]
 
@@ -123,8 +123,10 @@ submagnetization moves only perpendicular to itself, so M along the pair's axis 
 {table(["dynamics", "bar", *crystal_balls.PAIRS], starts)}"""
 
 
-def _text(image, courses, others) -> str:
-    rows = [[f"`{dynamics}`", name, _outcome(len(errors), errors[-1])] for (dynamics, name), errors in courses.items()]
+def _text(image, histories, others) -> str:
+    rows = [
+        [f"`{dynamics}`", name, _outcome(len(errors), errors[-1])] for (dynamics, name), errors in histories.items()
+    ]
     return f"""## Fig. 8: magnetization error over iterations
 
 **Paper:** (a) Kim et al. 2018 do not converge under the strong bar and slowly under the weak one; (b) the paper's

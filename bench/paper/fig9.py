@@ -1,8 +1,8 @@
 """Fig. 9: iterations that one moment needs, over time step and field strength, for random directions of the field.
 
-The paper multiplies its 100 ns by 1.0 to 1.5 and takes ‖H‖ as 0 to 10 times ‖M‖, here Ms. It does not say which κ its
-100 ns is. The flow takes κ0 = k = 3, the step that ends on the curve in one iteration. The explicit dynamics take the
-κ0 of Fig. 8, and others as second choices.
+The paper multiplies its 100 ns by 1.0 to 1.5 and takes ‖H‖ as 0 to 10 times ‖M‖, here Ms. It does not say to which κ
+its 100 ns corresponds. The flow takes κ0 = k = 3, the step that ends on the curve in one iteration. The explicit
+dynamics take the κ0 of Fig. 8, and others as second choices.
 
 One test follows a moment of slope k = 3 in the field H until ‖M − f(H)‖ ≤ tolerance ‖f(H)‖ (Ms replaces ‖f(H)‖ where
 H = 0). It fails after ``MOST_ITERATIONS``. It starts from a pair M1, M2 open by an angle, the flow from their mean. All
@@ -173,7 +173,7 @@ def _pair_step(u, v, h, kappa, case: Case) -> list[np.ndarray]:
 
 
 def _theta_step(u, h_eff, kappa, side: float) -> np.ndarray:
-    """Turn u towards h_eff in their common plane (Eqs. 8, 9); ``side`` ±1 chooses it where they are parallel."""
+    """Turn u towards h_eff in their common plane (Eqs. 8, 9); ``side`` ±1 selects the plane if they are parallel."""
     strength = _size(h_eff)
     axis = h_eff / np.where(strength > 0.0, strength, 1.0)
     cosine = (u * axis).sum(axis=1, keepdims=True)

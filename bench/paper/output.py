@@ -12,8 +12,8 @@ ORDER = ("fig7", "fig8", "fig9", "fig10", "uniqueness", "stability", "table1")
 _MARK = "<!-- section {} -->"
 _HEAD = """# The paper's experiments, repeated
 
-Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation". Each section gives what the paper shows, in its
-words or numbers (its images are not redistributed here), beside what was measured. Written by `python -m bench.paper`.
+Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation". Each section states the paper's result, in its
+words or numbers (its images are not redistributed here), and the measured one. Written by `python -m bench.paper`.
 """
 
 

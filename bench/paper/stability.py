@@ -12,7 +12,7 @@ from warpmag.moments.dynamics import STEP
 
 SECONDS, SMALL_SECONDS = 5.0, 0.1
 PATIENCE = 300.0
-"""Time after which a run is ended [s]."""
+"""Wall time after which a run is ended [s]."""
 SATURATED = {
     "balls_up": {"saturation": 5e4},
     "alphabets": {"saturation": 1e4, "moment": 40.0},

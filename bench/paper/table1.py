@@ -13,7 +13,7 @@ SECONDS, SMALL_SECONDS = 1.0, 0.05
 RTOL = 1e-2
 """Magnetization error at which induction ends: below it ``theta-euler`` converges slowly in a pile of balls."""
 PATIENCE = {"cpu": 55.0, "gpu": 4.0}
-"""Time after which a run is ended [s]: the twelve runs take 15 minutes on two cores, two minutes on a GPU."""
+"""Wall time after which a run is ended [s]: the twelve runs take 15 minutes on two cores, two minutes on a GPU."""
 PAPERS_TIMES = {
     ("balls_up", "kim2018"): (20, 3.5, 14),
     ("balls_up", "paper"): (1.8, 3.8, 14),

@@ -26,7 +26,7 @@ SCENES = ("balls_up", "alphabets", "falling_magnet", "sakura_tree")
 _CORES = 2
 """Cores of a trial on a CPU."""
 _AS_PUBLISHED = {"balls_up": {"conductivity": 0.0}}
-"""Parameters that remove features which the paper does not have."""
+"""Parameters that remove features beyond the paper's method."""
 
 
 _FIGURES = "magnets held held_rms_speed held_median_speed rms_speed peak_speed overlap farthest".split()
@@ -42,7 +42,7 @@ class Trial:
         method: Name of a published method, of :data:`warpmag.declarations.magnets.PRESETS`.
         seconds: Simulated time [s].
         device: Name of the Warp device.
-        patience: Time after which the run is ended [s], without the first step.
+        patience: Wall time after which the run is ended [s], without the first step.
         rtol: Magnetization error at which induction ends.
         max_evaluations: Largest number of field evaluations of an induction.
         pair_step: Step κ of pairs of submagnetizations, see ``warpmag.moments.dynamics``.
@@ -98,21 +98,21 @@ def run_trial(trial: Trial) -> dict:
         simulation.run(steps, on_frame=lambda frame: time.perf_counter() - began < trial.patience)
     except SimulationError as error:
         ended = str(error)
-    figures = simulation.finish()
-    induction, force, rigid = figures.milliseconds
-    done = max(figures.steps, 1)
+    statistics = simulation.finish()
+    induction, force, rigid = statistics.milliseconds
+    done = max(statistics.steps, 1)
     return {
         **asdict(trial),
         "simulated": simulation.time,
         "ended": ended,
-        "steps": figures.steps,
-        "substeps": figures.substeps / done,
+        "steps": statistics.steps,
+        "substeps": statistics.substeps / done,
         "ti_ms": induction,
         "tf_ms": force,
         "tr_ms": rigid,
-        "evaluations_per_substep": sum(figures.evaluations) / max(figures.substeps, 1),
-        "unconverged": figures.unconverged / max(figures.substeps, 1),
-        **{name: getattr(figures, name) for name in _FIGURES},
+        "evaluations_per_substep": sum(statistics.evaluations) / max(statistics.substeps, 1),
+        "unconverged": statistics.unconverged / max(statistics.substeps, 1),
+        **{name: getattr(statistics, name) for name in _FIGURES},
     }
 
 

@@ -19,7 +19,7 @@ class Evaluation:
 
     Attributes:
         run: Starts one evaluation.
-        wait: Returns after all evaluations that were started.
+        wait: Waits for all evaluations that were started.
         result: Returns the field [A/m] of the last evaluation, shape [n, 3].
         kept: Objects that must live as long as this one: a captured graph does not hold the arrays that it uses.
     """
@@ -66,7 +66,7 @@ class Peer:
 PEERS = (
     Peer("warpmag", "with_warp", "warpmag: native loop and overlap pass, captured in a graph", ("cpu", "cuda")),
     Peer("h_field", "with_warp", "warpmag.h_field of points, the whole call", ("cpu",)),
-    Peer("warp_plain", "with_warp", "Warp: one thread a target, the textbook loop, in a graph", ("cpu", "cuda")),
+    Peer("warp_plain", "with_warp", "Warp: one thread per target, the textbook loop, in a graph", ("cpu", "cuda")),
     Peer("warp_tile", "with_warp", "Warp: its tile n-body example adapted to dipoles, in a graph", ("cuda",)),
     Peer("torch", "with_torch", "PyTorch: broadcast over blocks of targets, torch.compile", ("cpu", "cuda")),
     Peer("jax", "with_jax", "JAX: broadcast over blocks of targets, jit", ("cpu", "cuda")),

@@ -1,4 +1,4 @@
-"""CuPy, KeOps, magpylib and FMM3D: each imports its library itself, since they are installed one by one."""
+"""CuPy, KeOps, magpylib and FMM3D: each function imports its own library, since they are installed separately."""
 
 from typing import Any
 

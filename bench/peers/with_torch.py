@@ -19,7 +19,7 @@ def _block_field(at, x, m):
 
 
 def torch(positions, moments, device) -> Evaluation:
-    """See the module."""
+    """Broadcast over a block of targets, compiled."""
     device = device.partition(":")[0]
     x, m = (library.from_numpy(a).to(device) for a in (positions, moments))
     return evaluation_of(

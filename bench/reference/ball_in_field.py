@@ -1,6 +1,6 @@
-"""An inducible ball in the non-uniform field of permanent magnets, in float64 with NumPy: exact, and as modeled.
+"""An inducible ball in the non-uniform field of permanent magnets, in float64 with NumPy: exact and model solutions.
 
-Exact: no other body responds. The applied potential of degree l leaves on the ball's surface the charge
+Exact: no other body responds. The applied potential of degree l induces on the ball's surface the charge
 
     σ_l = p_l (2l + 1)/l H_r,l,    p_l = lχ/(lχ + 2l + 1),
 
@@ -121,7 +121,7 @@ def _response(degree, susceptibility):
 
 
 def model_weight(distance, radius, magnet_radius, alone):
-    """Factor by which permanent moments take part in the multipoles of a ball, at distances [m], shape [n]."""
+    """Weight of permanent moments at distances [m] in the multipoles of a ball, shape [n]."""
     rho, size = distance / radius, magnet_radius / radius
     depth = np.maximum(np.where(alone, size, CELL_DEPTH * size), LEAST_MAGNET)
     far = smoothstep((MAGNET_REACH[1] - rho) / (MAGNET_REACH[1] - MAGNET_REACH[0]))[0]

@@ -27,7 +27,7 @@ STRENGTH = 1e3
 
 
 def ellipsoid_moments(semi_axes, susceptibilities=SUSCEPTIBILITIES) -> np.ndarray:
-    """Moments over V H0 along each axis, shape [susceptibilities, 3]; factors by their integrals (Osborn 1945)."""
+    """Moments over V H0 along each axis, shape [susceptibilities, 3]; factors by quadrature (Osborn 1945)."""
     a = np.asarray(semi_axes, float)
     nodes, weights = np.polynomial.legendre.leggauss(200)
     s = np.exp(0.5 * (nodes + 1.0) * 60.0 - 30.0)[:, None]  # from e^-30 to e^30

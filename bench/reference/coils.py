@@ -12,7 +12,7 @@ def wire_field(places, steps, points):
 
     Args:
         places: Places of the pieces [m], shape [k, 3].
-        steps: Lengths of the pieces along the current [m], shape [k, 3].
+        steps: Vectors from start to end of the pieces, along the current [m], shape [k, 3].
         points: Field points [m], shape [p, 3].
 
     Returns:

@@ -1,8 +1,8 @@
 """Energy and momentum of soft balls that fall towards each other, for errors of the time step.
 
 The energy is kinetic plus the free energy of soft magnets in equilibrium, from the float64 oracle. The integrator is
-symplectic Euler, whose velocities are half a step ahead: velocities at the time of the positions are the mean of those
-before and after the step. The error of the energy is of second order in the step, that of positions of first order.
+symplectic Euler. Its velocities are half a step ahead, so the mean of the velocities before and after the step belongs
+to the time of the positions. The error of the energy is of second order in the step, that of positions of first order.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Fall:
 
 
 def free_energy(positions) -> float:
-    """Magnetic free energy [J] of soft balls in equilibrium, whose gradient is the Kelvin force."""
+    """Magnetic free energy [J] of soft balls in equilibrium; minus its gradient is the Kelvin force."""
     solution = oracle.equilibrium(positions, RADIUS, FIELD, saturation=SATURATION)
     m, g = solution.magnetizations, oracle.coupling_matrix(positions, RADIUS)
     s = np.linalg.norm(m, axis=1) / SATURATION

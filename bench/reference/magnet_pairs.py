@@ -77,16 +77,16 @@ def _corner(u, v, w) -> np.ndarray:
 
 
 def cylinder_force(radius, height1, height2, gap, magnetization1: float, magnetization2: float) -> float:
-    """Force [N] along the axis on the upper of two coaxial cylinders of one ``radius``, magnetized along the axis.
+    """Force [N] along the axis on the upper of two coaxial cylinders of equal radius, magnetized along the axis.
 
     Only the ends are charged. A charged disc has the spectrum 2πR J1(kR)/k, and the pairs of ends add up to
 
         F = −π μ0 M1 M2 R² ∫ J1(q)²/q · (1 − exp(−q h1/R)) (1 − exp(−q h2/R)) exp(−q g/R) dq.
 
     Args:
-        radius: Radius of both [m].
-        height1, height2: Heights of the lower and of the upper one [m].
-        gap: Gap between them [m]; zero in contact.
+        radius: Radius of both cylinders [m].
+        height1, height2: Heights of the lower and of the upper cylinder [m].
+        gap: Gap between the cylinders [m]; zero in contact.
         magnetization1, magnetization2: Magnetizations along the axis [A/m].
     """
 

@@ -1,6 +1,7 @@
 """Dense reference of the near-contact model that ``warpmag.kernels.near_contact`` describes, in float64 with NumPy.
 
-Tests compare the device with it, and it with exact solutions of other references. Names are those of the model.
+Tests compare the device with this module, and this module with exact solutions of other references. Names are
+those of the model.
 """
 
 import numpy as np

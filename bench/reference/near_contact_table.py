@@ -2,8 +2,8 @@
 
 For two equal balls of unit radius the exact solution is reduced to sources, dipoles and, on the axis, quadrupoles,
 driven by the potentials and fields of a conducting surface: K = M_LL − M_LH (M_HH + δ)⁻¹ M_HL. M is the matrix of two
-perfect conductors in multipoles, L are these low degrees, H the higher ones, and δ_l = (2l+1)/(l(μr−1)) is the part of
-a finite permeability. K minus the long-range part M_lr is the short-range resistance of the pair. K₂ is the part of K
+perfect conductors in multipoles, L are these low degrees, H the higher ones, and δ_l = (2l+1)/(l(μr−1)) describes a
+finite permeability. K minus the long-range part M_lr is the short-range resistance of the pair. K₂ is the part of K
 that the model has without the table: no degrees beyond 2, no coupling of sources with quadrupoles. The conductance of
 the pair is ΔC = (K − M_lr)⁻¹ − (K₂ − M_lr)⁻¹.
 """
@@ -22,7 +22,7 @@ from warpmag.kernels.near_contact.contact_table import FUNCTIONS, HARDNESSES, LO
 def reduced_resistance(
     distance: float, permeabilities, m: int, highest: int, order: int, source_quadrupole=1.0
 ) -> np.ndarray:
-    """K of two balls of unit radius for order m, reduced to degrees up to ``highest``, with degrees up to ``order``.
+    """K of order m of two balls of unit radius: computed up to degree ``order``, reduced to degrees up to ``highest``.
 
     For m = 0 a ball has a source; its coupling to the other's quadrupole is scaled by ``source_quadrupole``.
     """
@@ -45,8 +45,8 @@ def reduced_resistance(
 def pair_conductance(distance: float, permeabilities, tolerance: float = 1e-7) -> np.ndarray:
     """Functions of the first of two balls of unit radius and given μr, in the order of the table."""
     u, g1, g2, _ = long_range(np.array(distance), 1.0, 1.0)
-    # part of 3/d³, the coupling of a source with a quadrupole, that U_sr leaves
-    left = 1.0 - g2 * distance**5 / 3.0
+    # fraction of 3/d³, the coupling of a source with a quadrupole, in U_sr
+    short_range = 1.0 - g2 * distance**5 / 3.0
     self_source, self_dipole = long_range_self(1.0)
     # potential of a dipole and field of a source on the axis have the radial derivative U' = g1 d
     axial = np.zeros((3, 3))
@@ -59,7 +59,7 @@ def pair_conductance(distance: float, permeabilities, tolerance: float = 1e-7) -
     ):
         far = np.block([[own, coupling.T], [coupling, own]])
         exact = reduced_resistance(distance, permeabilities, m, highest, order)
-        plain = reduced_resistance(distance, permeabilities, m, highest, 2, left)
+        plain = reduced_resistance(distance, permeabilities, m, highest, 2, short_range)
         parts.append(np.linalg.inv(exact - far) - np.linalg.inv(plain - far))
     x, y = parts
     return np.array(
@@ -82,7 +82,7 @@ def spline_coefficients(values: np.ndarray) -> np.ndarray:
 
 
 def make_table() -> np.ndarray:
-    """The table, shape [gap nodes + 2, hardness nodes + 2, hardness nodes + 2, 8]."""
+    """The table, shape [gap nodes + 2, hardness nodes + 2, hardness nodes + 2, FUNCTIONS]."""
     gaps = np.exp(np.linspace(*LOG_GAPS))
     permeabilities = [math.inf if y == 0.0 else y**-2.0 for y in np.linspace(*HARDNESSES)]
     values = np.zeros((len(gaps), len(permeabilities), len(permeabilities), FUNCTIONS))
@@ -90,8 +90,8 @@ def make_table() -> np.ndarray:
         for j, own in enumerate(permeabilities):
             for k, other in enumerate(permeabilities):
                 # a ball of μr = 1 has no higher multipoles
-                soft = [min(max(mu, 1.0 + 1e-9), 1e12) for mu in (own, other)]
-                values[i, j, k] = pair_conductance(2.0 + gap, soft)
+                finite = [min(max(mu, 1.0 + 1e-9), 1e12) for mu in (own, other)]
+                values[i, j, k] = pair_conductance(2.0 + gap, finite)
     for axis in (0, 1, 2):
         values = np.moveaxis(spline_coefficients(np.moveaxis(values, axis, 0)), 0, axis)
     return values.astype(np.float32)

@@ -1,14 +1,14 @@
 """Reference implementation of warpmag's physics in NumPy, float64.
 
-Every kernel is tested against this module. It is short, slow and does not use Warp. Formulas have a form that is
-independent of the kernels' where there is one.
+Every kernel is tested against this module. It is short, slow and does not use Warp. Where possible, formulas have
+another form than in the kernels.
 
 | symbol | shape | unit | meaning |
 |---|---|---|---|
 | positions | [n, 3] | m | positions of the moments |
 | moments | [n, 3] | A·m² | m = V M |
 | radii | [n] | m | radius of the uniformly magnetized ball of a moment; 0 is a point dipole |
-| h | [n, 3] | A/m | field without that of the moment itself |
+| h | [n, 3] | A/m | field of all other moments |
 | gradients | [n, 3, 3] | A/m² | ∂H_k/∂x_l |
 
 References: Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation", Eqs. 1, 4, 7, 10, 13, 14.
@@ -148,7 +148,7 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
 def field_gradient(
     positions, moments, targets=None, *, radii=None, target_radii=None, bodies=None, smoothing=0.0, chunk=256
 ):
-    """Gradient ∂H_k/∂x_l [A/m²] of the moments' field, shape [t, 3, 3]; arguments as of :func:`h_field`."""
+    """Gradient ∂H_k/∂x_l [A/m²] of the moments' field, shape [t, 3, 3]; arguments as in :func:`h_field`."""
     positions, moments, targets, radii, target_radii, exclude = _prepare(
         positions, moments, targets, radii, target_radii, bodies
     )

@@ -65,7 +65,7 @@ def _rectangles(half, magnet, count: int):
     return tuple(np.concatenate(arrays) for arrays in zip(*faces, strict=True))
 
 
-def of_model(gap: float, aside: float, device="cpu") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def model_forces(gap: float, aside: float, device="cpu") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Force on the plate, its moment, and force on the magnet, of a Newton model with warpmag's magnets."""
     import newton  # noqa: PLC0415 - the reference itself needs NumPy alone
     import warp as wp  # noqa: PLC0415
@@ -94,7 +94,7 @@ def main() -> None:
         (coarse, _), (fine, moment) = force(gap, aside, 9), force(gap, aside, 18)
         change = np.abs(fine - coarse).max().round(4)
         print(gap, aside, "N", fine.round(4), "A·m²", moment.round(4), "change", change, flush=True)
-        pull, magnetized, reaction = of_model(gap, aside)
+        pull, magnetized, reaction = model_forces(gap, aside)
         errors = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in ((pull, fine), (magnetized, moment))]
         rest = np.linalg.norm(pull + reaction) / np.linalg.norm(pull)
         print(f"  model: force {100 * errors[0]:.2f} %, moment {100 * errors[1]:.2f} %; sum of forces {rest:.0e}")

@@ -37,7 +37,7 @@ class Solution:
         forces: Forces [N], shape [n, 3].
         multipoles: Coefficients of the real irregular harmonics around each ball [A m^(l+1)], l = 1..L, m = −l..l,
             sines for m < 0, cosines for m > 0, shape [n, L (L + 2)]; their potential is ψ.
-        energy: Free energy −½ μ0 Σ m·H0 [J], whose gradient the forces are.
+        energy: Free energy U = −½ μ0 Σ m·H0 [J]; the forces are −∂U/∂x.
         truncation: Relative change of the forces against two thirds of the order: an upper bound of their error.
         order: Order L of the expansions.
     """

@@ -5,8 +5,8 @@ Any susceptibility: M = −∇w in the body, and w/χ is the total potential. On
     (1/χ + 1/2) w − (1/4π) ∫ w dΩ = H0·x,
 
 with dΩ the solid angle of dA. The moment is ∫ w n dA. w is constant on each rectangle of a box or ring of a cylinder
-and takes its value at the center. The error falls with the square of their number along a side, so results of two
-numbers are extrapolated: they are good to 0.3 %, compared with twice as many.
+and takes its value at the center. The error falls with the square of the number of rectangles along a side, so
+results of two numbers are extrapolated. They agree to 0.3 % with results of twice as many.
 
 Infinite susceptibility, body bounded by rectangles: the surface is at one potential, (1/4π) ∫ σ/‖x − y‖ dA = H0·x, and
 the moment is ∫ σ x dA. With twice the rectangles along each side results change by less than 0.2 %.
@@ -118,7 +118,7 @@ def _areas(lower, upper, axis) -> np.ndarray:
 
 
 def _seen_from(points, lower, upper, axes, axis: int):
-    """Indices of the rectangles across ``axis``, their heights over points, and signs and places of their corners."""
+    """Indices of rectangles normal to ``axis``, their heights over points, and signs and places of their corners."""
     own, (a, b) = np.flatnonzero(axes == axis), ((axis + 1) % 3, (axis + 2) % 3)
     corners = []
     for i, j in np.ndindex(2, 2):
@@ -160,7 +160,7 @@ def cylinder_moments(length: float, susceptibilities, rings=(20, 30)) -> np.ndar
 def _cylinder(length: float, susceptibilities, count: int) -> np.ndarray:
     """As :func:`cylinder_moments`, with ``count`` rings on half of the side and as many on a cap.
 
-    w is constant around a ring for a field along the axis, and goes as the cosine of the azimuth for one across it.
+    w is constant around a ring for a field along the axis, and varies as the cosine of the azimuth for one across it.
     """
     radius, half = 0.5, 0.5 * length
     at = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, count + 1))
