@@ -2,8 +2,8 @@
 
 The timed work is the field of n dipoles at each other, with data and results on the device: evaluations in sequence
 and one wait at their end. For ``h_field`` it is the whole call. Peers take turns. Each field is compared with the
-float64 oracle at some targets. Each measurement is one JSON line. A peer that fails, or is not installed, gets a line with
-the error.
+float64 oracle at some targets. Each measurement is one JSON line. A peer that fails, or is not installed, gets a line
+with the error.
 """
 
 import argparse

@@ -192,18 +192,18 @@ def draw(lines, path: Path) -> None:
 
     figure, (times, accuracy) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
     series: dict[tuple, list] = {}
-    for x in sorted((x for x in lines if "seconds" in x), key=lambda x: x["count"]):
-        series.setdefault((x["method"], x["rtol"], x["quantity"]), []).append(x)
+    for line in sorted((line for line in lines if "seconds" in line), key=lambda line: line["count"]):
+        series.setdefault((line["method"], line["rtol"], line["quantity"]), []).append(line)
     methods = sorted({key[:2] for key in series}, key=lambda m: (m[0] not in ("direct", "fmm"), m[0], -(m[1] or 1.0)))
     colors = dict(zip(methods, plt.rcParams["axes.prop_cycle"].by_key()["color"], strict=False))
     words = {"direct": "all pairs", "fmm": "multipoles"}
     for (method, rtol, quantity), points in series.items():
         style = {"color": colors[method, rtol], "linestyle": "-" if quantity == "field" else "--", "marker": "."}
         label = f"{words.get(method, method)}{f', rtol {rtol:g}' if rtol else ''}"
-        counts = [x["count"] for x in points]
+        counts = [line["count"] for line in points]
         named = f"{label}: {'field' if quantity == 'field' else 'force, torque'}"
-        times.plot(counts, [1e3 * x["seconds"] for x in points], label=named, **style)
-        accuracy.plot(counts, [x["error"] for x in points], **style)
+        times.plot(counts, [1e3 * line["seconds"] for line in points], label=named, **style)
+        accuracy.plot(counts, [line["error"] for line in points], **style)
     times.set(xscale="log", yscale="log", xlabel="moments", ylabel="time [ms]")
     accuracy.set(xscale="log", yscale="log", xlabel="moments", ylabel="relative error")
     times.legend(fontsize="x-small")
@@ -229,7 +229,7 @@ def main(arguments=None) -> None:
     options = parser.parse_args(arguments)
     if options.draw:
         kept = {
-            (x["method"], x["rtol"], x["quantity"], x["count"]): x for x in read(options.draw)
+            (line["method"], line["rtol"], line["quantity"], line["count"]): line for line in read(options.draw)
         }  # the last line of each
         draw(list(kept.values()), options.output or Path("bench_out/many.png"))
         return

@@ -29,7 +29,10 @@ def read(paths) -> list[dict]:
 
 def latest(lines) -> list[dict]:
     """The last line of each measurement: files may contain several runs."""
-    kept = {(x["device"], x["case"], x.get("peer", ""), x.get("dtype", ""), x["count"]): x for x in lines}
+    kept = {
+        (line["device"], line["case"], line.get("peer", ""), line.get("dtype", ""), line["count"]): line
+        for line in lines
+    }
     return list(kept.values())
 
 
@@ -40,21 +43,25 @@ def machine_of(line: dict) -> str:
 
 def draw_pareto(lines, path: Path) -> None:
     """Draw speed against error of every peer, one panel per size."""
-    sizes = sorted({x["count"] for x in lines})
+    sizes = sorted({line["count"] for line in lines})
     columns = min(4, len(sizes))
     rows = -(-len(sizes) // columns)
     figure, axes = plt.subplots(rows, columns, squeeze=False, sharex=True, sharey=True, layout="constrained")
     figure.set_size_inches(3.4 * columns, 3.2 * rows)
-    peers = sorted({x["peer"] for x in lines}, key=lambda name: (name != "warpmag", name))
+    peers = sorted({line["peer"] for line in lines}, key=lambda name: (name != "warpmag", name))
     colors = dict(zip(peers, matplotlib.color_sequences["tab20"], strict=False))
     for axis in axes.flat[len(sizes) :]:
         axis.set_visible(False)
     for axis, size in zip(axes.flat, sizes, strict=False):
-        for x in lines:
-            if x["count"] == size:
-                marker, scale = ("*", 160) if x["peer"] == "warpmag" else ("o", 40)
+        for line in lines:
+            if line["count"] == size:
+                marker, scale = ("*", 160) if line["peer"] == "warpmag" else ("o", 40)
                 axis.scatter(
-                    max(x["error"], 1e-16), x["pairs_per_second"], scale, color=colors[x["peer"]], marker=marker
+                    max(line["error"], 1e-16),
+                    line["pairs_per_second"],
+                    scale,
+                    color=colors[line["peer"]],
+                    marker=marker,
                 )
         axis.set(xscale="log", yscale="log", title=f"{size:,} dipoles")
         axis.grid(True, alpha=0.3)
@@ -78,8 +85,10 @@ def draw_roofline(lines, path: Path) -> None:
     """Draw each peer's share of the limit against the size."""
     figure, axis = plt.subplots(figsize=(7.0, 4.5), layout="constrained")
     series = defaultdict(list)
-    for x in lines:
-        series[x.get("peer") or f"{x['case']} {x['dtype']}"].append((x["count"], x["pairs_per_second"] / limit_of(x)))
+    for line in lines:
+        series[line.get("peer") or f"{line['case']} {line['dtype']}"].append(
+            (line["count"], line["pairs_per_second"] / limit_of(line))
+        )
     for name, points in sorted(series.items()):
         axis.plot(*zip(*sorted(points), strict=True), marker="o", label=name, linewidth=3 if name == "warpmag" else 1)
     axis.axhline(1.0, color="black", linewidth=0.8)
@@ -96,16 +105,16 @@ def table(lines) -> str:
         "| case | n | time | pairs/s | of the limit | error | first call | commit |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for x in sorted(lines, key=lambda x: (x["case"], x["count"], x.get("seconds", float("inf")))):
-        name = x.get("peer") or f"{x['case']} {x['dtype']}"
-        if "failed" in x:
-            rows.append(f"| {name} | {x['count']:,} | {x['failed']} | | | | | {x['commit']} |")
+    for line in sorted(lines, key=lambda line: (line["case"], line["count"], line.get("seconds", float("inf")))):
+        name = line.get("peer") or f"{line['case']} {line['dtype']}"
+        if "failed" in line:
+            rows.append(f"| {name} | {line['count']:,} | {line['failed']} | | | | | {line['commit']} |")
             continue
-        rate, limit = x.get("pairs_per_second"), limit_of(x)
+        rate, limit = line.get("pairs_per_second"), limit_of(line)
         share = f"{rate / limit:.1%}" if rate and limit else ""
         rows.append(
-            f"| {name} | {x['count']:,} | {duration(x['seconds'])} | {f'{rate:.3g}' if rate else ''} | {share} "
-            f"| {x['error']:.1e} | {x['first_call_seconds']:.1f} s | {x['commit']} |"
+            f"| {name} | {line['count']:,} | {duration(line['seconds'])} | {f'{rate:.3g}' if rate else ''} | {share} "
+            f"| {line['error']:.1e} | {line['first_call_seconds']:.1f} s | {line['commit']} |"
         )
     return "\n".join(rows)
 
@@ -129,11 +138,11 @@ def main(arguments=None) -> None:
     sections = []
     for machine, lines in machines.items():
         name = "".join(c if c.isalnum() else "_" for c in machine).strip("_").lower()
-        measured = [x for x in lines if "pairs_per_second" in x]
-        compared = [x for x in measured if x["case"] == "compare"]
+        measured = [line for line in lines if "pairs_per_second" in line]
+        compared = [line for line in measured if line["case"] == "compare"]
         if compared:
             draw_pareto(compared, options.output / f"{name}_pareto.png")
-        limited = [x for x in measured if limit_of(x)]
+        limited = [line for line in measured if limit_of(line)]
         if limited:
             draw_roofline(limited, options.output / f"{name}_roofline.png")
         sections.append(f"## {machine}\n\n{table(lines)}\n")

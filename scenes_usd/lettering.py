@@ -119,7 +119,8 @@ def extruded(curves: list[np.ndarray], depth: float, bevel: float) -> tuple[np.n
         bevel: Width of the bevel, small compared with the strokes.
 
     Returns:
-        Points, shape [n, 3], z normal to the letter, zero in its middle; faces as indices, counterclockwise outside.
+        Points, shape [n, 3], z normal to the letter, zero in its middle; faces as indices, counterclockwise seen
+        from outside.
     """
     insets = [_inset(curve, bevel) for curve in curves]
     rims, inner = np.concatenate(curves), np.concatenate(insets)

@@ -15,7 +15,7 @@ from warpmag.declarations.schemas import SCHEMAS
 SCHEMA_FILE = Path(__file__).parent / "schema" / "generatedSchema.usda"
 _WIDTH = 120
 _INTRODUCTION = (
-    "Codeless applied API schemas of warpmag. Lengths are in units of the stage, as those of shapes are. "
+    "Codeless applied API schemas of warpmag. Lengths are in the unit of the stage, like those of shapes. "
     "Magnetizations, fields, currents and moments are SI in every stage: USD has no unit for a current."
 )
 

@@ -17,7 +17,7 @@ from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
 from warpmag.errors import InputError
 from warpmag.usd.read.clock import stage_clock
 from warpmag.usd.read.keys import KeyReader
-from warpmag.usd.read.prims import is_body
+from warpmag.usd.read.prims import body_of
 from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.schemas import author_schema, has_api, read_fields, world_matrix
 from warpmag.usd.values import Finding, finding_of, instance_finding, number
@@ -80,7 +80,7 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
         return
     try:
         position, rotation, scale = _frame(prim)
-        owner = _body_of(prim)
+        owner = body_of(prim)
         body = owner and str(owner.GetPath())
         if keys.moves(prim, owner):
             yield Finding(path, f"keys move it within its rigid body {body}: a run holds it still there", "warning")
@@ -193,12 +193,3 @@ def _frame(prim):
     quaternion = Gf.Matrix3d((axes / scales[:, None]).tolist()).ExtractRotation().GetQuat()
     rotation = (*quaternion.GetImaginary(), quaternion.GetReal())
     return tuple(np.array(matrix)[3, :3].tolist()), rotation, float(scales.mean())
-
-
-def _body_of(prim) -> Usd.Prim | None:
-    """Return the nearest rigid body at or above a prim, None without one."""
-    while prim and not prim.IsPseudoRoot():
-        if is_body(prim):
-            return prim
-        prim = prim.GetParent()
-    return None
