@@ -61,7 +61,7 @@ def advance(stepper, steps=1):
     reports = []
     for _ in range(steps):
         stepper.advance()
-        reports += stepper.look()
+        reports += stepper.read_reports()
     return reports
 
 
@@ -122,7 +122,7 @@ def test_buffers_that_overflow_are_grown_and_the_step_repeated(reference, device
     for _ in range(30 // ahead):
         for _ in range(ahead):
             stepper.advance()
-        reports += stepper.look()
+        reports += stepper.read_reports()
     assert len(reports) == 30
     assert any(report.regrown for report in reports)
     assert all(after.limit >= limit for after, limit in zip(solver.buffers, before, strict=True))

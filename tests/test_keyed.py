@@ -68,10 +68,10 @@ def test_bodies_go_where_usd_composes_them(tmp_path, device, motion, kinematic):
     assert list(report.contents.motions) == report.contents.kinematic == ["/World/Rig/Part"]
     simulation, stage = Simulation(path, device=device), Usd.Stage.Open(str(path))
     body, dt = body_of(simulation, "Rig/Part"), 5e-4
-    drive, state = simulation._stepper._drive, simulation.model.state()
+    keyed_values, state = simulation._stepper._keyed_values, simulation.model.state()
     for seconds in (0.0, 0.01, 1.0 / RATE, 0.41, 0.6251, 0.9, 1.3, 50.0):
-        drive.time.fill_(seconds)
-        drive.place(state, 0.0, dt)
+        keyed_values.time.fill_(seconds)
+        keyed_values.pose_for_contacts(state, 0.0, dt)
         (x, turn), (y, turned) = (pose_of(stage, "/World/Rig/Part", 5.0 + RATE * t) for t in (seconds, seconds + dt))
         q, qd = state.body_q.numpy()[body].astype(float), state.body_qd.numpy()[body].astype(float)
         # single precision of what is found, and of no sample

@@ -292,7 +292,7 @@ def test_alike_balls_are_imported_as_each_would_be_by_itself(tmp_path, monkeypat
     places = "[(0, 0, 0), (0.1, 0, 0), (0.2, 0.1, 0), (0, 0.2, 0.3)]"
     path = write(tmp_path, instancer(["Ball"], [0, 0, 0, 0], places, lines, turned))
     found = import_scene(path)
-    assert [len(balls.others) for balls in found.apart] == [1, 1]
+    assert [len(balls.others) for balls in found.identical_balls] == [1, 1]
     monkeypatch.setattr(scenes, "open_deferred", lambda path, time: (open_stage(path, time), []))
     wanted = import_scene(path)
     assert found.bodies.keys() == wanted.bodies.keys()

@@ -12,7 +12,7 @@ from warpmag.engine.magnets.magnetics import Magnetics as Magnetics
 from warpmag.engine.magnets.magnetometer import SensorMagnetometer as SensorMagnetometer
 from warpmag.engine.magnets.usd_import import register_attributes as register_attributes
 from warpmag.engine.magnets.usd_import import register_custom_attributes as register_custom_attributes
-from warpmag.engine.stepping.drive import KeyedCurrents as KeyedCurrents
+from warpmag.engine.stepping.keyed_values import KeyedCurrents as KeyedCurrents
 from warpmag.engine.stepping.simulation import Simulation as Simulation
 from warpmag.errors import ConvergenceWarning as ConvergenceWarning
 from warpmag.errors import InputError as InputError

@@ -1,4 +1,4 @@
-"""Contacts and the solver of piles.
+"""Contact search and rigid-body solver for piles.
 
-The only room that uses internals of Newton and Warp. May import ``declarations``.
+The only package that uses internals of Newton and Warp. May import ``declarations``.
 """

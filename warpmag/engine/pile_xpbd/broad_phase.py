@@ -1,4 +1,4 @@
-"""Broad phase from neighbor lists of balls, in place of Newton's sort of all shapes, with the contacts of balls."""
+"""Broad phase with neighbor lists of balls, in place of Newton's sort of all shapes; also writes their contacts."""
 
 import newton
 import numpy as np
@@ -15,15 +15,15 @@ _TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, n
 class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
     """Broad phase of a ``CollisionPipeline``: lists the pairs of shapes that may touch.
 
-    After :meth:`write_contacts` it also writes the contacts of balls, and lists no pairs for them. The method, and the
-    pairs of balls that are never listed, are explained in ``kernels.contacts.broad_phase``.
+    After :meth:`write_contacts` it also writes the contacts of balls, and lists no pairs for them. See
+    ``kernels.contacts.broad_phase`` for the method and for the pairs of balls that are never listed.
 
     Attributes:
         leaves_pairs: True if the narrow phase of the pipeline may have pairs to process.
     """
 
     def __init__(self, model: newton.Model, farthest: float):
-        """Allocate the search; Newton's sweep is used where the search would take longer.
+        """Allocate the search, or set up Newton's sweep where the sweep is faster.
 
         Args:
             model: The model.
@@ -50,11 +50,11 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         a.scale, a.margin, a.gap = model.shape_scale, model.shape_margin, model.shape_gap
 
     def write_contacts(self, pipeline: newton.CollisionPipeline, contacts: newton.Contacts) -> None:
-        """Write the contacts of balls from now on.
+        """Also write the contacts of balls in every later :meth:`launch`.
 
         Args:
             pipeline: The pipeline that uses this broad phase.
-            contacts: Contacts that the pipeline writes.
+            contacts: Contact buffer of the pipeline.
         """
         if self._search is None:
             return
@@ -67,17 +67,17 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         a.contacts = view_contacts(self._model, contacts)
 
     def _may_leave_pairs(self, kinds: np.ndarray) -> bool:
-        """Return true if a moving shape is no ball, or if there are shapes whose contacts with balls Newton finds."""
+        """Return true if a moving shape is not a ball, or if Newton has to find contacts of balls with some shape."""
         model, kinematic = self._model, newton.BodyFlags.KINEMATIC
         colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
-        flags = np.append(model.body_flags.numpy(), kinematic)  # the last for shapes without a body
+        flags = np.append(model.body_flags.numpy(), kinematic)  # the last entry is for shapes without a body, -1
         body: np.ndarray = model.shape_body.numpy()
         moving = (flags[body] & kinematic) == 0
         others = colliding & (kinds != PARTNERS.index("ball"))
         return bool((others & (moving | (kinds == len(PARTNERS)))).any())
 
     def set_motion(self, state: newton.State, dt: float) -> None:
-        """Set the velocities, those of ``state``, and the time ``dt`` [s] ahead for which pairs are searched."""
+        """Set the velocities, from ``state``, and the time ``dt`` [s] that the search looks ahead."""
         if self._search is not None:
             self._search.arrays.body_qd, self._search.arrays.dt = state.body_qd, dt
 
@@ -90,7 +90,7 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
 
     def launch(self, shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count,
                candidate_pair, candidate_pair_count, **options) -> None:  # fmt: skip
-        """List the pairs; arguments as those of Newton's sweep."""
+        """List the pairs; takes the arguments of Newton's sweep."""
         if self._search is None:
             super().launch(
                 *(shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count),

@@ -1,8 +1,8 @@
 """Removes memory allocations from a substep, so that it can be a conditional node of a CUDA graph.
 
-The body of such a node may hold kernels, copies and further conditional nodes, but no allocations. Newton allocates in
-two places. Solvers make temporary arrays: here they come from a :class:`Workspace`. Collision sums counts with Warp's
-``array_scan``, which takes scratch memory from the device's pool: here a kernel without scratch replaces it.
+Such a node may contain kernels, copies and further conditional nodes, but no allocations. Newton allocates in two
+places. Solvers make temporary arrays, here from the memory of a :class:`Workspace`. Collision sums counts with Warp's
+``array_scan``, which allocates scratch memory; here a kernel without scratch memory replaces it.
 """
 
 import contextlib

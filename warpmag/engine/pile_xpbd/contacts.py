@@ -1,7 +1,7 @@
 """Collision and rigid-body solver for piles of small bodies that strong forces press together.
 
-Newton's defaults are for bodies of a meter. Here contact gaps follow the sizes of the bodies, and contact and pair
-buffers that overflow are enlarged.
+Newton's defaults suit bodies of about a meter. Here contact gaps are proportional to the sizes of bodies, and contact
+and pair buffers grow when they overflow.
 """
 
 import warnings
@@ -23,11 +23,11 @@ _NEWTON_GAP = 0.1
 _GAP = 0.1
 """Contact gap of a shape over the thickness of its body: contacts are found a tenth of a radius ahead."""
 _CONTACTS_PER_BALL, _CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 8, 12, 40
-"""First sizes of the buffers. The densest packing has 6 contacts per ball, a wall of boxes 12 per box.
+"""Initial sizes of the buffers. The densest packing has 6 contacts per ball, a wall of boxes 12 per box.
 A contact takes about 600 bytes on a GPU."""
 _GROWTH = 1.5
-"""New size of a buffer over the number of entries that overflowed it."""
-_SORTABLE = 2**20
+"""Ratio of the new size of a buffer to the number of entries that it had to store."""
+_MAX_SORTED_PAIRS = 2**20
 """Largest number of triangle pairs that Newton sorts."""
 _KINDS = ("contact", "pair", "triangle")
 """Kinds of buffers."""
@@ -35,10 +35,10 @@ _KINDS = ("contact", "pair", "triangle")
 
 @dataclass(frozen=True)
 class BodySizes:
-    """Lengths that motions and penetrations are compared with.
+    """Lengths of bodies and shapes, the scales of motions and penetrations.
 
     Attributes:
-        thickness: Half of the smallest dimension of the body's colliding shapes [m], the radius of a ball. Infinite
+        thickness: Half of the smallest dimension of the body's colliding shapes [m], for a ball its radius. Infinite
             for bodies that forces do not move. Shape [body_count].
         reach: Distance from the center of mass to the farthest point of a colliding shape [m], zero for a ball around
             its center of mass. Shape [body_count].
@@ -94,8 +94,8 @@ class Buffer:
 
     Attributes:
         kind: ``pair``, ``contact`` or ``triangle``.
-        fill: Number of entries that had to be stored, on the device, shape [1]; entries beyond ``limit`` were dropped.
-            Or flags that are true where entries were dropped, shape [n].
+        fill: Number of entries to store, on the device, shape [1]; entries beyond ``limit`` were dropped. Or flags,
+            true where entries were dropped, shape [n].
         limit: Number of entries that fit; 0 for flags.
     """
 
@@ -105,7 +105,7 @@ class Buffer:
 
 
 def scale_gaps(model: newton.Model, sizes: BodySizes) -> None:
-    """Replace Newton's default contact gap, where a shape has it, by one that fits the size of the shape.
+    """Replace Newton's default contact gap of shapes by a gap in proportion to the size of the shape.
 
     Static shapes get the gap of the thickest moving body: the gaps of two shapes add up, and a plane has no size.
     """
@@ -126,8 +126,8 @@ class RigidSolver:
 
     Attributes:
         contacts: Contacts of the last :meth:`collide`.
-        overlaps: Depth of each contact over the thickness of its thinner body after :meth:`watch`, on the device, shape
-            [rigid_contact_max].
+        overlaps: Depth of each contact over the thickness of its thinner body, as of the last :meth:`watch`, on the
+            device, shape [rigid_contact_max].
         buffers: The buffers that can overflow.
     """
 
@@ -145,7 +145,7 @@ class RigidSolver:
             model: The model; contact gaps of its shapes are changed by :func:`scale_gaps`.
             sizes: Sizes of its bodies.
             solver: Name of the solver, from ``SOLVERS``.
-            capacity: Factor of the first sizes of the contact and pair buffers.
+            capacity: Factor on the initial sizes of the contact and pair buffers.
 
         Raises:
             InputError: The solver is unknown, is not installed, or cannot run this model.
@@ -181,7 +181,7 @@ class RigidSolver:
             self.contacts = self._pipeline.contacts()
             self._broad_phase = NeighborBroadPhase(self._model, self._speculation)
             self._pipeline.broad_phase = self._broad_phase
-            if not self._pipeline.deterministic:  # else Newton sorts the contacts
+            if not self._pipeline.deterministic:  # otherwise Newton writes and sorts the contacts of balls, too
                 self._broad_phase.write_contacts(self._pipeline, self.contacts)
             if not self._broad_phase.leaves_pairs:
                 self._pipeline.narrow_phase.launch_custom_write = lambda **arguments: None  # saves its launches
@@ -204,28 +204,28 @@ class RigidSolver:
                 Buffer("triangle", narrow.triangle_pairs_count, narrow.triangle_pairs.shape[0]),
                 Buffer("triangle", self.contacts.contact_counters[2:3], 0),  # contacts lost during reduction
             ]
-        lost = getattr(self._solver, "constraint_overflow", None)
-        if lost is not None:
-            self.buffers.append(Buffer("contact", lost, 0))
+        overflow_flags = getattr(self._solver, "constraint_overflow", None)
+        if overflow_flags is not None:
+            self.buffers.append(Buffer("contact", overflow_flags, 0))
 
     def _sorts_contacts(self) -> bool:
-        """Return true if Newton has to sort contacts, so that contacts of meshes on a GPU are the same in every run.
+        """Return true if Newton has to sort contacts: with meshes on a GPU, so that every run has the same contacts.
 
-        Contacts of other shapes arrive in any order; the solver sorts them. Newton sorts at most ``_SORTABLE`` pairs of
-        triangles.
+        Contacts of other shapes arrive in any order; the solver sorts them. Newton sorts at most
+        ``_MAX_SORTED_PAIRS`` pairs of triangles.
         """
         colliding = (self._model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
         kinds = self._model.shape_type.numpy()[colliding]
         meshes = np.isin(kinds, (newton.GeoType.MESH, newton.GeoType.HFIELD)).any()
         on_gpu = wp.get_device(self._model.device).is_cuda
-        return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _SORTABLE)
+        return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _MAX_SORTED_PAIRS)
 
     def limits(self) -> np.ndarray:
         """Return the sizes of the buffers for :meth:`set_limits`; 0 stands for Newton's estimate."""
         return np.array([self._limits[kind] or 0 for kind in _KINDS])
 
     def set_limits(self, limits: np.ndarray) -> None:
-        """Set the buffer sizes that :meth:`limits` returned; contacts and captured graphs are void afterwards."""
+        """Set the buffer sizes that :meth:`limits` returned; contacts and captured graphs become invalid."""
         new_limits = {kind: int(limit) or None for kind, limit in zip(_KINDS, limits, strict=True)}
         if new_limits != self._limits:
             self._limits = new_limits
@@ -237,7 +237,7 @@ class RigidSolver:
         return self._broad_phase.carried() | solver
 
     def collide(self, state: newton.State, dt: float) -> None:
-        """Find the contacts at ``state`` and those expected within ``dt`` [s]; capturable in a graph."""
+        """Find the contacts at ``state`` and the contacts expected within ``dt`` [s]; capturable in a graph."""
         self._broad_phase.set_motion(state, dt)
         self._pipeline.collide(state, self.contacts, dt=dt)
 
@@ -246,7 +246,7 @@ class RigidSolver:
         self._solver.step(state_in, state_out, control, self.contacts, dt)
 
     def fills(self) -> np.ndarray:
-        """Return the address of the fill of each buffer, 0 for flags."""
+        """Return the device address of the fill of each buffer, 0 for flags."""
         fills = [buffer.fill for buffer in self.buffers]
         return np.array([0 if fill.dtype is wp.bool else fill.ptr for fill in fills], np.uint64)
 
@@ -254,9 +254,9 @@ class RigidSolver:
         """Write the overlaps at ``state`` and the fills of the buffers to the monitor; capturable in a graph.
 
         Args:
-            watched: Arrays of the monitor; its ``fills`` are those of this solver.
+            watched: Arrays of the monitor, with the :meth:`fills` of this solver.
             state: State of the last :meth:`collide`.
-            substep: Substeps since the monitor counted them, or its ``NEXT``.
+            substep: Number of substeps since the monitor updated its count, or its ``NEXT``.
             longest: Length of the substeps of the first level [s].
             threshold: Overlap above which a contact is counted, over the thickness of the thinner body.
         """
@@ -267,10 +267,10 @@ class RigidSolver:
                 watch_flags(buffer.fill, COUNT_CAPACITIES + index, watched.counts)
 
     def grow(self, fills: np.ndarray) -> bool:
-        """Enlarge the buffers that overflowed; contacts and graphs are void afterwards.
+        """Enlarge the buffers that overflowed; contacts and captured graphs become invalid.
 
         Args:
-            fills: Entries that each of ``buffers`` had to store.
+            fills: Number of entries that each of :attr:`buffers` had to store.
 
         Returns:
             True if a buffer grew.

@@ -1,6 +1,6 @@
 """XPBD for bodies with joints: iterations find velocities that satisfy joints, drives and contacts.
 
-Newton's kernels evaluate the errors of joints and contacts at the poses that the velocities lead to.
+Newton's kernels evaluate the errors of joints and contacts at the predicted poses at the end of the substep.
 ``kernels.contacts.joints`` corrects their lever arms and their drives. The bodies move once, after the iterations.
 """
 
@@ -92,10 +92,10 @@ class JointSolve:
         """Advance by ``dt`` [s].
 
         Args:
-            before: The bodies at the start, with their whole masses.
-            after: Out, the bodies at the end.
-            contact_masses: Called when ``after`` has the velocities without contacts and joints; returns the inverse
-                masses and inertias that contacts act on.
+            before: The bodies at the start, with masses that are not split among contacts.
+            after: Output, the bodies at the end.
+            contact_masses: Function that returns the inverse masses and inertias for contacts. It is called once
+                ``after`` has the velocities without contacts and joints.
             control: Forces and targets of the joints.
             contacts: Newton's contacts.
             dt: Length of the substep [s].
@@ -190,20 +190,20 @@ class JointSolve:
         )
 
     def _bind(self, kernel, dim: int, **arguments) -> Callable:
-        """Return a launch of a Newton kernel. Other arguments are the model's arrays of the same names."""
+        """Return a launch of a Newton kernel. Arguments that are not given are the model's arrays of the same names."""
         names = [argument.label for argument in kernel.adj.args]
         values = [arguments[name] if name in arguments else getattr(self._model, name) for name in names]
         return partial(wp.launch, kernel, dim=dim, inputs=values, device=self._model.device)
 
 
 def _axis_counts(model: newton.Model) -> np.ndarray:
-    """Return the numbers of sliding and of turning axes of each joint, shape [joints, 2]."""
-    counts: Any = model.joint_dof_dim  # Newton's declaration hides that it is an array
+    """Return the numbers of linear and angular axes of each joint, shape [joints, 2]."""
+    counts: Any = model.joint_dof_dim  # Newton's annotation hides that it is an array
     return counts.numpy()
 
 
 def are_pins(model: newton.Model) -> np.ndarray:
-    """Return true for each joint that keeps two points together, shape [joints]."""
+    """Return true for each joint that keeps two points together and does not slide, shape [joints]."""
     return np.isin(model.joint_type.numpy(), _PINS) & (_axis_counts(model)[:, 0] == 0)
 
 
@@ -211,8 +211,8 @@ def _drive_rows(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
     """List the axes whose drives ``kernels.contacts.joints`` evaluates.
 
     Returns:
-        Joint, degree of freedom, index of the target, and 1 for a turning axis, shape [rows, 4]; and true for each
-        degree of freedom whose drive Newton evaluates, shape [dofs]: joints that turn about several axes have them.
+        Joint, degree of freedom, index of the target, and 1 for an angular axis, shape [rows, 4]. And true for each
+        degree of freedom with a drive that Newton evaluates, shape [dofs]: axes of joints with several angular axes.
     """
     rows, newton_dofs = [], np.ones(model.joint_dof_count, dtype=bool)
     types, counts = model.joint_type.numpy(), _axis_counts(model)

@@ -14,32 +14,32 @@ class SolverKind:
     """One kind of rigid-body solver.
 
     Attributes:
-        make: Returns the solver for a model and the capacity of its contact buffer.
-        maximal: The coordinates are the poses of bodies, so that joints need no articulation.
-        resumable: A step depends on nothing that the solver keeps to itself, so that a checkpoint is complete.
-        ends_closed: Contacts are closed at the end of a step, where kinematic bodies have to stand beforehand.
-        warning: Known weakness, a line for the user; empty if there is none.
+        make: Function of a model and the capacity of its contact buffer that returns the solver.
+        maximal: The solver uses maximal coordinates, the poses of bodies, so that joints need no articulation.
+        resumable: The solver has no hidden state between steps, so that a checkpoint is complete.
+        contacts_at_end: The solver evaluates contacts at the end of a step, and needs kinematic bodies posed there.
+        warning: Known weakness, in one line for the user; empty if there is none.
     """
 
     make: Callable
     maximal: bool = False
     resumable: bool = True
-    ends_closed: bool = False
+    contacts_at_end: bool = False
     warning: str = ""
 
 
 def _xpbd(model, contact_max: int):
     from warpmag.engine.pile_xpbd.xpbd import PileXPBD  # noqa: PLC0415 - imports Newton
 
-    # Contacts are relaxed all at once. Beyond a third of each correction the many contacts of a ball overshoot
-    # together, and a pile never settles: on Balls Up the RMS speed after 1.5 s is 0.15 cm/s at 0.35, 1.6 at 0.5 and
-    # 10 at Newton's 0.8. Averaging over the contacts of a body would need far more iterations. The iterations of
-    # ``kernels.contacts.solve`` have momentum: on Balls Up after 5 s, 30 of them leave the same speeds as 60, and an
-    # overlap of 0.5 % of the radius instead of 0.2 %.
+    # All contacts are relaxed in parallel. With more than a third of each correction the many contacts of a ball
+    # overshoot together, and a pile never settles: on Balls Up the RMS speed after 1.5 s is 0.15 cm/s at 0.35, 1.6 at
+    # 0.5 and 10 at Newton's 0.8. Averaging over the contacts of a body would need far more iterations.
+    # ``kernels.contacts.solve`` accelerates its iterations: on Balls Up after 5 s, 30 of them leave the same speeds as
+    # 60, and an overlap of 0.5 % of the radius instead of 0.2 %.
     settings = {"iterations": 60, "rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
     settings["contact_iterations"] = 30
-    # Joints are relaxed equally along and about their axes. With Newton's 0.7 and 0.4 hinged bodies swing as if they
-    # were heavier: a quarter swing ends at 84.9 instead of 90 degrees. Two joints at one place are stable up to 0.5.
+    # Linear and angular joint relaxation are equal. With Newton's 0.7 and 0.4 hinged bodies swing as if they were
+    # heavier: a quarter swing ends at 84.9 instead of 90 degrees. Two joints at the same place are stable up to 0.5.
     settings |= {"joint_linear_relaxation": 0.4, "joint_angular_relaxation": 0.4}
     return PileXPBD(model, contact_max, **settings)
 
@@ -60,7 +60,7 @@ def _mujoco(model, contact_max: int):
 
 
 SOLVERS = {
-    "xpbd": SolverKind(_xpbd, maximal=True, ends_closed=True),
+    "xpbd": SolverKind(_xpbd, maximal=True, contacts_at_end=True),
     "steel": SolverKind(_steel),
     "mujoco": SolverKind(_mujoco, resumable=False),
     "semi-implicit": SolverKind(lambda model, contact_max: _newton("SolverSemiImplicit", model), maximal=True),
@@ -80,7 +80,7 @@ SOLVERS = {
         "bodies lose several percent of a swing; xpbd does not have these faults",
     ),
 }
-"""Rigid-body solvers by name; the first is the default and the one that piles are tested with."""
+"""Rigid-body solvers by name. The first is the default, and piles are tested with it."""
 MAXIMAL = tuple(name for name, kind in SOLVERS.items() if kind.maximal)
 """Names of the solvers whose joints need no articulation."""
 

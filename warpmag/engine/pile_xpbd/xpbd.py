@@ -1,17 +1,17 @@
-"""Newton's XPBD with a contact solver for piles: momentum is kept, and every run gives the same bits.
+"""Newton's XPBD with a contact solver for piles that conserves momentum and is bitwise repeatable.
 
-Newton's solver launches every iteration over the whole contact buffer and sums with atomics, in another order in every
-run. Free bodies are solved by ``kernels.contacts.solve`` instead. It meets the same contact conditions, works on the
-contacts found only, and sums in a fixed order. It keeps momentum and angular momentum, which Newton's lever arms and
-damping of spins do not, and needs half the iterations (``kernels/contacts/contact_law.h``).
+Newton's solver launches every iteration over the whole contact buffer and sums with atomics, in an order that differs
+between runs. Here ``kernels.contacts.solve`` moves free bodies. It enforces the same contact conditions, processes
+active contacts only, and sums in a fixed order. It conserves momentum and angular momentum, unlike Newton's lever arms
+and damping of spins, and needs half the iterations (``kernels/contacts/contact_law.h``).
 
-Where no push overshoots, the result is Newton's. In heaps pushes overshoot. Newton never takes them back, so that its
-result depends on its relaxation. Here the result without friction is the least pushes that leave no overlap, and with
-friction it satisfies Coulomb's law. Contacts that stick remember how far they slipped, so that heaps do not creep.
-Bodies that overlap are moved apart at 2 m/s at most.
+Where no impulse overshoots, the result equals Newton's. In heaps impulses overshoot. Newton never reduces them, so that
+its result depends on the relaxation factor. Here the result without friction is the smallest impulses that leave no
+overlap; with friction it satisfies Coulomb's law. Sticking contacts store their slip distance, so that heaps do not
+creep. Overlapping bodies are moved apart at 2 m/s at most.
 
-Corners of boxes that lie face to face overshoot together. Bodies are therefore split among their contacts
-(``kernels.contacts.mass_splitting``).
+Contacts at the corners of boxes that lie face to face overshoot together. The mass of each body is therefore split
+among its contacts (``kernels.contacts.mass_splitting``).
 """
 
 import contextlib
@@ -29,17 +29,17 @@ from warpmag.kernels.rigid.newton_views import BodyView, view_bodies, view_conta
 
 _KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 _SIMILAR = 0.1
-"""Relative spread of radii and inverse masses up to which balls stay whole."""
+"""Relative spread of radii and inverse masses up to which the masses of balls are not split."""
 
 
 class PileXPBD(newton.solvers.SolverXPBD):
-    """Newton's XPBD with masses split among contacts, and impulses that keep momentum and angular momentum.
+    """Newton's XPBD with masses split among contacts, and impulses that conserve momentum and angular momentum.
 
-    The features of a model choose the steps:
+    The step depends on the model:
 
-    * rigid bodies without joints, free joints apart: ``kernels.contacts.solve``;
+    * rigid bodies without joints, or with free joints only: ``kernels.contacts.solve``;
     * other joints: :mod:`warpmag.engine.pile_xpbd.joints`;
-    * particles, tendons, restitution, moving surfaces, mimic joints: Newton's own steps, with split masses.
+    * particles, tendons, restitution, moving surfaces, mimic joints: Newton's own step, with split masses.
     """
 
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
@@ -78,7 +78,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             )
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
-        """Advance by ``dt`` [s]; arguments as those of Newton's solver."""
+        """Advance by ``dt`` [s]; takes the arguments of Newton's solver."""
         if self._solve is not None and contacts.rigid_contact_surface_velocity is None:
             self._step_bodies(state_in, state_out, control, contacts, dt)
             return
@@ -135,14 +135,14 @@ class PileXPBD(newton.solvers.SolverXPBD):
         self._joints.step(before, after, contact_masses, control, contacts, dt)
 
     def _view_bodies(self, state) -> BodyView:
-        """Return the bodies with their effective masses; those of kinematic bodies are infinite."""
+        """Return the bodies with their effective masses, infinite for kinematic bodies."""
         bodies = view_bodies(self.model, state)
         bodies.inv_mass, bodies.inv_inertia = self.body_inv_mass_effective, self.body_inv_inertia_effective
         return bodies
 
     @contextlib.contextmanager
     def _splitting(self) -> Iterator[None]:
-        """Set the masses that Newton's contacts act on to the shares of the bodies."""
+        """Replace the masses in Newton's contacts by the split masses within the context."""
         self._whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
         self.body_inv_mass_effective, self.body_inv_inertia_effective = self._contact_masses()
         try:
@@ -151,7 +151,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             self.body_inv_mass_effective, self.body_inv_inertia_effective = self._whole
 
     def _contact_masses(self) -> tuple[wp.array, wp.array]:
-        """Return the inverse masses and inertias that contacts act on."""
+        """Return the inverse masses and inertias for contacts, split where bodies are split."""
         whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
         if self._splits is None:
             return whole
@@ -159,13 +159,14 @@ class PileXPBD(newton.solvers.SolverXPBD):
         return self._split
 
     def _apply_body_deltas(self, model, state_in, state_out, body_deltas, dt, rigid_contact_inv_weight=None):
-        """Apply impulses on shares to whole bodies; the states alternate. Newton's version stops slow bodies."""
-        now, then = (state_in, state_out) if self._body_delta_counter else (state_out, state_in)
+        """Apply the impulses of an iteration to the unsplit bodies. Newton's version stops slow bodies."""
+        # the two states alternate
+        source, target = (state_in, state_out) if self._body_delta_counter else (state_out, state_in)
         self._body_delta_counter = 1 - self._body_delta_counter
-        bodies = view_bodies(model, now)
+        bodies = view_bodies(model, source)
         bodies.inv_mass, bodies.inv_inertia = self._whole
-        launch_apply_corrections(bodies, body_deltas, rigid_contact_inv_weight, dt, then.body_q, then.body_qd)
-        return then.body_q, then.body_qd
+        launch_apply_corrections(bodies, body_deltas, rigid_contact_inv_weight, dt, target.body_q, target.body_qd)
+        return target.body_q, target.body_qd
 
 
 def _free_dofs(model: newton.Model) -> np.ndarray | None:
@@ -183,9 +184,9 @@ def _free_dofs(model: newton.Model) -> np.ndarray | None:
 
 
 def _splits(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:
-    """Return 1 for each body that contacts may split, else 0, shape [body_count].
+    """Return 1 for each body with a mass to split among contacts, else 0, shape [body_count].
 
-    Balls that are all similar stay whole: in their heaps each neighbor takes half of a correction.
+    If all balls are similar, their masses are not split: two similar balls share each correction equally.
     """
     colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
     shape_body, types = model.shape_body.numpy(), model.shape_type.numpy()

@@ -1,4 +1,4 @@
-"""Checks of a model: what its solver cannot move, joints whose ends are apart, and controls that do not fit."""
+"""Checks a model: articulations and stability for its solver, gaps of joints, and the arrays of a control."""
 
 from typing import Any
 
@@ -16,9 +16,7 @@ SPRING_STIFFNESS = 1e4
 
 
 def articulate(builder: newton.ModelBuilder, solver: str) -> None:
-    """Make an articulation of each single joint between a body and the world, for solvers that move articulations only.
-
-    Such solvers leave other bodies where they are.
+    """Make an articulation of each joint between a body and the world, for solvers that move articulations only.
 
     Raises:
         InputError: Another joint is outside all articulations.
@@ -40,7 +38,7 @@ def articulate(builder: newton.ModelBuilder, solver: str) -> None:
 
 
 def check_model(model: newton.Model, solver: str, dt: float) -> None:
-    """Raise :class:`InputError` if the solver is unstable with substeps of ``dt`` [s], or a body's start not finite."""
+    """Raise :class:`InputError` if an initial state is not finite, or the solver is unstable with ``dt`` [s]."""
     _check_joint_springs(model, solver, dt)
     for name, quantity in (("body_q", "position or orientation"), ("body_qd", "velocity")):
         bad = ~np.isfinite(getattr(model, name).numpy()).all(axis=1)
@@ -66,7 +64,7 @@ def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
 
 
 def solver_warnings(solver: str) -> list[str]:
-    """Return the known weakness of the solver, a line, if there is one."""
+    """Return the known weakness of the solver as a list of at most one line."""
     return list(filter(None, [SOLVERS[solver].warning]))
 
 
@@ -74,20 +72,22 @@ def check_control(control: newton.Control, model: newton.Model) -> None:
     """Raise :class:`InputError` unless ``control`` fits ``model``."""
     if not isinstance(control, newton.Control):
         raise InputError(f"control: must be a newton.Control, got {short_repr(control)}")
-    for name, own in vars(model.control()).items():
-        if isinstance(own, wp.array):
+    for name, model_array in vars(model.control()).items():
+        if isinstance(model_array, wp.array):
             array = getattr(control, name, None)
-            if not (isinstance(array, wp.array) and (array.shape, array.dtype) == (own.shape, own.dtype)):
+            if not (
+                isinstance(array, wp.array) and (array.shape, array.dtype) == (model_array.shape, model_array.dtype)
+            ):
                 raise InputError(f"control: {name} does not fit the model, make one with simulation.model.control()")
-            if array.device != own.device:
-                raise InputError(f"control: {name} is on {array.device}, the model is on {own.device}")
+            if array.device != model_array.device:
+                raise InputError(f"control: {name} is on {array.device}, the model is on {model_array.device}")
 
 
 def joint_gaps(model: newton.Model) -> dict[str, float]:
     """Return the distances between the ends of joints at the start [m], by joint label, where they are apart.
 
-    Motion that a joint leaves free does not count. Such joints pull at the start. Newton does not place bodies by their
-    joints: call ``newton.eval_fk``, or add the bodies with ``xform``.
+    Displacements along free axes of a joint do not count. A joint with a gap pulls at the start. Newton does not place
+    bodies by their joints: call ``newton.eval_fk``, or add the bodies with ``xform``.
     """
     if not model.joint_count:
         return {}
@@ -106,22 +106,22 @@ def joint_gaps(model: newton.Model) -> dict[str, float]:
 
 
 def _to_world(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points of frames with ``poses`` [n, 7] in the world, shape [n, 3]."""
+    """Transform points [n, 3] from frames with ``poses`` [n, 7] to the world."""
     return poses[:, :3] + _rotate(poses, points)
 
 
 def _rotate(poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return vectors of frames with ``poses`` [n, 7] in the world, shape [n, 3]."""
+    """Rotate vectors [n, 3] from frames with ``poses`` [n, 7] to the world."""
     axes = poses[:, 3:6]
     return vectors + 2.0 * np.cross(axes, np.cross(axes, vectors) + poses[:, 6:] * vectors)
 
 
-def _host(array: Any) -> np.ndarray:  # Newton's declarations hide that these are arrays
+def _host(array: Any) -> np.ndarray:  # Newton's annotations hide that these are arrays
     return array.numpy()
 
 
 def joint_gap_warnings(gaps: dict[str, float]) -> list[str]:
-    """Return a warning for :func:`joint_gaps`, at most a line. Stages have warnings of their own, by prim."""
+    """Return a warning about :func:`joint_gaps` as a list of at most one line; stages have warnings by prim instead."""
     if not gaps:
         return []
     label, more = next(iter(gaps)), len(gaps) - 1

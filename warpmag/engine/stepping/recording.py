@@ -25,8 +25,8 @@ _STATISTICS = "stat."
 class Recorder:
     """Records the frames of a simulation.
 
-    Frames are written one by one. With a GPU a frame is written during the next steps. Signals that end the process are
-    delayed until a frame is complete.
+    Frames are written one by one. With a GPU a frame is written while the next steps run. Signals that end the process
+    are delayed until a frame is complete.
 
     Attributes:
         written: Time of the last written frame since the start of the stage [s]; None before the first.
@@ -61,16 +61,16 @@ class Recorder:
             ranks: Processes of the run; the first one writes. None for a single process.
         """
         shapes = list(scene.magnet_shapes.values())
-        row = {shape: index for index, shape in enumerate(magnetics.shapes.tolist())}
+        row_of_shape = {shape: row for row, shape in enumerate(magnetics.shapes.tolist())}
         self._magnetics, self._stepper, self._statistics = magnetics, stepper, statistics
         self._output, self._resumable = output, resumable
-        self._taken: tuple[float, bool, dict[str, np.ndarray] | None] | None = None
+        self._pending: tuple[float, bool, dict[str, np.ndarray] | None] | None = None
         state = stepper.state
-        self._mirrors = _Mirrors((state.body_q, state.body_qd, magnetics.sum_moments()))
+        self._host_copies = _HostCopies((state.body_q, state.body_qd, magnetics.sum_moments()))
         # keyed bodies already have time samples
         recorded = {prim: body for prim, body in scene.bodies.items() if body not in scene.keys.motions}
         self._bodies = np.array(list(recorded.values()), dtype=int)
-        self._shapes = np.array([row[shape] for prim_shapes in shapes for shape in prim_shapes], dtype=int)
+        self._shapes = np.array([row_of_shape[shape] for prim_shapes in shapes for shape in prim_shapes], dtype=int)
         self._first_shapes = np.cumsum([0, *map(len, shapes[:-1])]) if shapes else np.zeros(0, dtype=int)
         self._ranks, self.written = ranks, None
         self._writer: CacheWriter | _NoWriter = _NoWriter()
@@ -125,7 +125,7 @@ class Recorder:
     def add_frame(self, time: float, state) -> None:
         """Record a frame. With a GPU it is written by the next :meth:`write`, while steps run.
 
-        The moments are those of the last substep. Before the first step they are solved without an effect on the run.
+        The moments are those of the last substep. Before the first step they are solved, without effect on later steps.
 
         Args:
             time: Time since the start [s].
@@ -136,30 +136,30 @@ class Recorder:
             self._magnetics.sum_moments()
         else:
             self._magnetics.moments_at(state)
-        self._mirrors.take()
+        self._host_copies.copy()
         due = self._writer.save_due
-        self._taken = time, due, self._save() if due and self._resumable else None
+        self._pending = time, due, self._save() if due and self._resumable else None
         if not self._magnetics.device.is_cuda:
             self.write()
 
     def _save(self) -> dict[str, np.ndarray]:
         """Return the arrays of a checkpoint of the present state."""
-        figures = {f"{_STATISTICS}{name}": value for name, value in self._statistics.save().items()}
-        return self._stepper.save() | figures
+        statistics = {f"{_STATISTICS}{name}": value for name, value in self._statistics.save().items()}
+        return self._stepper.save() | statistics
 
     def write(self) -> None:
-        """Write the recorded frame, and a checkpoint if one is due; nothing if that was done."""
+        """Write the pending frame, if there is one, and a checkpoint if one is due."""
         with _signals_delayed():
-            if self._taken is None:
+            if self._pending is None:
                 return
-            (time, due, saved), self._taken = self._taken, None
-            body_q, body_qd, moments = self._mirrors.read()
+            (time, due, checkpoint), self._pending = self._pending, None
+            body_q, body_qd, moments = self._host_copies.read()
             moments = moments[self._shapes]
             totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
             self._writer.add_frame(time, body_q[self._bodies], body_qd[self._bodies], totals)
             self.written = time
             if due:
-                self._writer.save(saved)
+                self._writer.save(checkpoint)
 
     def close(self, complete: bool) -> None:
         """Close the files. A run that is not complete can be resumed."""
@@ -173,7 +173,7 @@ class Recorder:
 
 
 class _NoWriter:
-    """Writer of the ranks other than the first: it writes nothing."""
+    """Writer of all ranks but the first; it writes nothing."""
 
     save_due = False
 
@@ -190,27 +190,27 @@ class _NoWriter:
         """Do nothing."""
 
 
-class _Mirrors:
-    """Copies of device arrays on the host, made without waiting."""
+class _HostCopies:
+    """Copies of device arrays on the host, made without waiting for the device."""
 
     def __init__(self, arrays: Sequence[wp.array]):
         """Allocate copies of arrays of one device."""
         self._arrays, device = arrays, arrays[0].device
         self._copies = [wp.empty_like(array, device="cpu", pinned=device.is_cuda) for array in arrays]
-        self._taken = wp.Event(device) if device.is_cuda else None
+        self._copied = wp.Event(device) if device.is_cuda else None
 
-    def take(self) -> None:
-        """Copy the arrays after all work launched so far."""
-        for copy, array in zip(self._copies, self._arrays, strict=True):
-            wp.copy(copy, array)
-        if self._taken:
-            self._arrays[0].device.stream.record_event(self._taken)
+    def copy(self) -> None:
+        """Queue copies of the arrays, after all work launched so far."""
+        for host_copy, array in zip(self._copies, self._arrays, strict=True):
+            wp.copy(host_copy, array)
+        if self._copied:
+            self._arrays[0].device.stream.record_event(self._copied)
 
     def read(self) -> list[np.ndarray]:
-        """Return the copies; the next :meth:`take` overwrites them."""
-        if self._taken:
-            wp.synchronize_event(self._taken)
-        return [copy.numpy() for copy in self._copies]
+        """Return the copies; the next :meth:`copy` overwrites them."""
+        if self._copied:
+            wp.synchronize_event(self._copied)
+        return [host_copy.numpy() for host_copy in self._copies]
 
 
 @contextlib.contextmanager

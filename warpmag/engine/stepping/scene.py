@@ -15,7 +15,7 @@ from warpmag.engine.magnets.attributes import declare_attributes, mark_shapes
 from warpmag.engine.magnets.balls import copy_ball
 from warpmag.engine.magnets.declared_magnets import axis_rotation, in_shape_frame, magnet_shapes
 from warpmag.engine.magnets.declared_sources import add_placed_source
-from warpmag.engine.stepping.drawn import StageBuilder
+from warpmag.engine.stepping.replaced_meshes import StageBuilder
 from warpmag.errors import InputError
 from warpmag.usd import (
     MOMENTS_PRIMVAR,
@@ -44,19 +44,19 @@ class ImportedScene:
     """An imported stage.
 
     Attributes:
-        opened: The open stage, without prims for instances of equal balls.
-        apart: The instances of equal balls.
+        opened: The open stage, without prims for instances of identical balls.
+        identical_balls: The instances of identical balls.
         builder: Bodies, shapes and joints, in the world frame and the units of the stage.
         clock: Times, frame rate and physics step of the stage.
         magnets: Magnets and magnetic settings of the stage.
         bodies: Body of each rigid-body prim.
         magnet_shapes: Shapes of each magnet prim.
         keys: Keys from time samples.
-        warnings: Warnings about the stage, a line each.
+        warnings: Warnings about the stage, one line each.
     """
 
     opened: Any
-    apart: list[IdenticalBalls]
+    identical_balls: list[IdenticalBalls]
     builder: newton.ModelBuilder
     clock: StageClock
     magnets: StageMagnets
@@ -68,13 +68,13 @@ class ImportedScene:
     @cached_property
     def stage(self) -> Any:
         """The open stage with a prim for each body, except for bodies of :attr:`swarms`."""
-        complete_instances([balls for balls in self.apart if not balls.stays_instancer])
+        complete_instances([balls for balls in self.identical_balls if not balls.stays_instancer])
         return self.opened
 
     @cached_property
     def swarms(self) -> list[BallInstancer]:
         """Instancers with too many bodies to have prims."""
-        return ball_instancers(self.opened, self.apart)
+        return ball_instancers(self.opened, self.identical_balls)
 
 
 def import_scene(
@@ -88,9 +88,9 @@ def import_scene(
 
     Args:
         path: USD file.
-        visuals: Also import shapes that are only drawn, for a viewer.
+        visuals: Also import visual shapes that do not collide, for a viewer.
         time_code: Time code of the poses of bodies; by default the start of the stage.
-        articulations: Keep articulations, for solvers with generalized coordinates.
+        articulations: Keep articulations, for solvers in generalized coordinates.
 
     Raises:
         InputError: The stage cannot be read, or Newton does not import one of its bodies, joints or magnets.
@@ -100,7 +100,7 @@ def import_scene(
 
 
 def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, articulations: bool) -> ImportedScene:
-    stage, apart = open_deferred(path, time_code)
+    stage, identical_balls = open_deferred(path, time_code)
     report = inspect(stage, path)
     if report.errors:
         raise InputError(str(report.errors[0]))
@@ -111,7 +111,7 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     builder = StageBuilder()
     declare_attributes(builder)
     imported = _add_stage(builder, stage, path, visuals)
-    _let_frictionless_roll(builder)
+    _remove_default_rolling_friction(builder)
     bodies, shapes, joints = (imported[f"path_{kind}_map"] for kind in ("body", "shape", "joint"))
     for prim in contents.bodies:
         if prim not in bodies:
@@ -121,28 +121,28 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
         if joint_path not in joints:
             raise InputError(f"{joint_path}: Newton does not import this joint")
     for joint in grounded:
-        _place_on_ground(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
-    covered = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
+        _correct_grounded_joint(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
+    shapes_of_magnets = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
     currents = _add_sources(builder, contents.sources, bodies)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
-    keys = _scene_keys(builder, stage, contents, clock, bodies, covered, currents)
-    for balls in apart:
-        _copy_balls(builder, stage, balls, bodies, covered, magnets)
+    keys = _scene_keys(builder, stage, contents, clock, bodies, shapes_of_magnets, currents)
+    for balls in identical_balls:
+        _copy_balls(builder, stage, balls, bodies, shapes_of_magnets, magnets)
     return ImportedScene(
         opened=stage,
-        apart=apart,
+        identical_balls=identical_balls,
         builder=builder,
         clock=clock,
         magnets=magnets,
         bodies=bodies,
-        magnet_shapes=covered,
+        magnet_shapes=shapes_of_magnets,
         keys=keys,
         warnings=tuple(map(str, report.warnings)),
     )
 
 
 def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[str, int]) -> None:
-    """Raise :class:`InputError` if a free body has a volume but no mass, as with an open mesh: it would not move."""
+    """Raise :class:`InputError` if a free body has a volume but no mass, for example an open mesh, and cannot move."""
     for path in contents.bodies:
         free = path not in contents.kinematic
         if free and not builder.body_mass[bodies[path]] > 0.0 and has_volume(stage, path):
@@ -162,27 +162,31 @@ def _copy_balls(
     stage,
     balls: IdenticalBalls,
     bodies: dict[str, int],
-    covered: dict[str, list[int]],
+    shapes_of_magnets: dict[str, list[int]],
     magnets: StageMagnets,
 ) -> None:
-    """Copy the body, the shapes and the magnet of the first of equal balls for the others."""
+    """Copy the body, the shapes and the magnet of the first of identical balls for the other balls."""
     first, others = balls.bodies()
     body = bodies[first]
     frames = BallFrames(stage, balls, np.array(builder.body_q[body], float)[3:])
-    speeds = frames.velocities(balls.arrays, np.array(builder.body_qd[body], float))
-    added = copy_ball(builder, body, frames.poses(balls.arrays)[1:], speeds[1:], first, others)
+    velocities = frames.velocities(balls.arrays, np.array(builder.body_qd[body], float))
+    added = copy_ball(builder, body, frames.poses(balls.arrays)[1:], velocities[1:], first, others)
     bodies |= dict(zip(others, added.bodies, strict=True))
     moments = balls.arrays[MOMENTS_PRIMVAR]
-    for prim in [path for path in covered if path == first or path.startswith(f"{first}/")]:
+    for prim in [path for path in shapes_of_magnets if path == first or path.startswith(f"{first}/")]:
         copies = balls.copies_of(prim)
-        covered |= zip(copies, ([shape] for shape in added.shapes), strict=True)
+        shapes_of_magnets |= zip(copies, ([shape] for shape in added.shapes), strict=True)
         magnets.magnets.update(dict.fromkeys(copies, magnets.magnets[prim]))
         if prim in magnets.initial_moments:
-            each = moments[1:].astype(float).tolist() if len(moments) else [magnets.initial_moments[prim]] * len(copies)
-            magnets.initial_moments.update({path: (x, y, z) for path, (x, y, z) in zip(copies, each, strict=True)})
+            copied_moments = (
+                moments[1:].astype(float).tolist() if len(moments) else [magnets.initial_moments[prim]] * len(copies)
+            )
+            magnets.initial_moments.update(
+                {path: (x, y, z) for path, (x, y, z) in zip(copies, copied_moments, strict=True)}
+            )
 
 
-def _place_on_ground(
+def _correct_grounded_joint(
     builder: newton.ModelBuilder, joint: GroundedJoint, number: int, body: int, shapes: dict[str, int]
 ) -> None:
     """Correct Newton's import of a joint between a body and a fixed prim or the world.
@@ -210,23 +214,23 @@ def _mark_magnets(
     builder: StageBuilder, stage, magnets: dict[str, Magnet], bodies: dict[str, int], shapes: dict[str, int]
 ) -> dict[str, list[int]]:
     """Mark the shapes of the magnet prims as magnets; return the shapes of each prim."""
-    covered = {}
+    shapes_of_magnets = {}
     for prim, magnet in magnets.items():
         if prim in bodies:
-            covered[prim] = magnet_shapes(builder, bodies[prim])
+            shapes_of_magnets[prim] = magnet_shapes(builder, bodies[prim])
         elif prim in shapes:
-            covered[prim] = magnet_shapes(builder, -1, shapes[prim])
+            shapes_of_magnets[prim] = magnet_shapes(builder, -1, shapes[prim])
         else:
             raise InputError(f"{prim}: Newton imports neither body nor shape of this magnet")
-        covered[prim] = builder.as_drawn(covered[prim])
-        for shape in covered[prim]:
+        shapes_of_magnets[prim] = builder.with_original_meshes(shapes_of_magnets[prim])
+        for shape in shapes_of_magnets[prim]:
             rotation = _shape_rotation(builder, stage, prim, shape, bodies)
             mark_shapes(builder, [shape], in_shape_frame(magnet, rotation))
-    return covered
+    return shapes_of_magnets
 
 
 def _scene_keys(
-    builder, stage, contents: StageContents, clock: StageClock, bodies, covered, currents: dict[int, Keys]
+    builder, stage, contents: StageContents, clock: StageClock, bodies, shapes_of_magnets, currents: dict[int, Keys]
 ) -> SceneKeys:
     """Return the keys of the stage, with times in seconds, by Newton's bodies and shapes."""
 
@@ -241,14 +245,14 @@ def _scene_keys(
     magnetizations = {
         shape: in_shape(in_seconds(keys), prim, shape)
         for prim, keys in contents.magnetization_keys.items()
-        for shape in covered[prim]
+        for shape in shapes_of_magnets[prim]
     }
     currents = {shape: in_seconds(keys) for shape, keys in currents.items()}
     return SceneKeys(motions, magnetizations, currents, contents.field_keys and in_seconds(contents.field_keys))
 
 
 def _shape_rotation(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
-    """Return the rotation of a shape's frame from the frame of its magnet prim."""
+    """Return the rotation from a shape's frame to the frame of its magnet prim."""
     return builder.shape_transform[shape].q if prim in bodies else axis_rotation(shape_axis(stage, prim))
 
 
@@ -267,7 +271,7 @@ def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) 
     return currents
 
 
-def _let_frictionless_roll(builder: newton.ModelBuilder) -> None:
+def _remove_default_rolling_friction(builder: newton.ModelBuilder) -> None:
     """Remove Newton's default torsional and rolling friction, which USD does not have, from frictionless shapes."""
     default = builder.default_shape_cfg
     for values, default_value in (

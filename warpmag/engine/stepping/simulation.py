@@ -18,7 +18,7 @@ from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
-from warpmag.engine.stepping.drive import Drive
+from warpmag.engine.stepping.keyed_values import KeyedValues
 from warpmag.engine.stepping.model_checks import (
     articulate,
     check_control,
@@ -39,15 +39,15 @@ DEFAULT_STEP = 1e-3
 LONGEST_SUBSTEP = 5e-4
 """Upper limit of a substep [s]. With it and XPBD's 60 iterations piles of 5 mm balls come to rest."""
 _OVERLAP = 1e-4
-"""Overlap at the start that causes a warning, over the thickness."""
+"""Overlap at the start over the thickness above which a warning is issued."""
 _TOUCHING = 0.05
 """Largest gap of touching bodies over their thickness, for the count of held bodies."""
 _FRAME_RATE = 60.0
 """Output frame rate of a builder [Hz]."""
 _AHEAD = 16
-"""Steps launched on a GPU before the host writes the last frame. Launches block from about 20 steps on."""
+"""Steps queued on a GPU before the host writes the last frame. Launches block with about 20 queued steps."""
 _STRONGEST_FIELD = 1e8
-"""Field, magnetization [A/m] or current [A] that an error names as its cause, ten times the strongest real ones."""
+"""Field, magnetization [A/m] or current [A] above which an error names it as the cause; ten times real maxima."""
 
 
 class Simulation:
@@ -67,7 +67,7 @@ class Simulation:
         model: Newton's model.
         step_size: Time step [s].
         frame_rate: Output frames per second [Hz].
-        frame_count: Output frames of the stage without the first; None if it has no time range.
+        frame_count: Output frames of the stage after the first; None if it has no time range.
     """
 
     @collection_paused()
@@ -92,8 +92,8 @@ class Simulation:
         """Import the scene and prepare the first step.
 
         Args:
-            scene: USD file, or a builder with magnets. Articulations and colors that ``solver`` needs are added to a
-                builder.
+            scene: USD file, or a builder with magnets. The builder gets the articulations and colors that
+                ``solver`` needs.
             step: Time step [s]; by default the stage's, else 1 ms. Fast motion splits it into substeps.
             solver: Newton's solver: ``xpbd``, ``steel``, ``mujoco``, ``semi-implicit``, ``featherstone``, ``kamino`` or
                 ``vbd``.
@@ -101,13 +101,13 @@ class Simulation:
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``.
             method: Summation method: ``direct``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
-            rtol: Relative magnetization error at which induction ends; by default the stage's, else 1e-3.
-            max_evaluations: Field evaluations after which induction ends without convergence.
+            rtol: Relative magnetization error at which the induction solve ends; by default the stage's, else 1e-3.
+            max_evaluations: Field evaluations after which an unconverged induction solve ends.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
             curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
             device: Warp device; by default Warp's.
-            graphs: Replay captured graphs, in place of launching each kernel.
-            visuals: Also import shapes that are only drawn, for a viewer.
+            graphs: Replay captured CUDA graphs, in place of launching each kernel.
+            visuals: Also import visual shapes that do not collide, for a viewer.
 
         Raises:
             InputError: The scene or an argument is invalid; the message names the prim or the argument.
@@ -117,16 +117,18 @@ class Simulation:
             check_flag(name, flag)
         self.device, self._ranks = resolve_device(device), current_ranks()
         graphs &= self._ranks is None  # sums over ranks cannot be captured
-        own = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
-        solve = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
+        overrides = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
+        solve_options = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
         with errors_on_all_ranks(self._ranks):
-            builder, settings, own_step = self._open(scene, visuals=visuals, articulations=not SOLVERS[solver].maximal)
-            self.step_size = _time_step(step, own_step)
+            builder, settings, scene_step = self._open(
+                scene, visuals=visuals, articulations=not SOLVERS[solver].maximal
+            )
+            self.step_size = _time_step(step, scene_step)
             self.model = self._finalize(builder, solver, scene)
-            settings = settings.replaced(external_field=external_field, **own)
-            self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **solve, **vars(settings))
-            self._prepare(solver, graphs, self._drive(solver, own_field=external_field is None))
-            self._options = self._options_of(settings, solver, **solve)
+            settings = settings.replaced(external_field=external_field, **overrides)
+            self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **solve_options, **vars(settings))
+            self._prepare(solver, graphs, self._keyed_values(solver, keyed_field=external_field is None))
+            self._options = self._options_of(settings, solver, **solve_options)
             if self._ranks is not None:
                 self._ranks.check_equal(self._options | {"scene": list(self._stepper.save().values())})
 
@@ -154,7 +156,7 @@ class Simulation:
         return {name.replace("_", " "): str(value) for name, value in options.items()}
 
     def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
-        """Return the model."""
+        """Return the model of a builder, with the articulations and colors that the solver needs."""
         articulate(builder, solver)
         if not builder.body_count:  # Newton needs a body; one without shapes has no effect
             extended = newton.ModelBuilder()
@@ -163,22 +165,22 @@ class Simulation:
             builder = extended
         if solver == "vbd":
             builder.color()  # VBD moves bodies of one color at once
-        with wp.ScopedDevice(self.device), self._refusals(scene):
+        with wp.ScopedDevice(self.device), self._newton_errors(scene):
             model = builder.finalize(device=self.device, skip_validation_joints=SOLVERS[solver].maximal)
         check_model(model, solver, LONGEST_SUBSTEP)
         self._joint_gaps = joint_gaps(model) if SOLVERS[solver].maximal else {}
         return model
 
-    def _drive(self, solver: str, own_field: bool) -> Drive | None:
-        """Return the keyed values of the stage, without the external field unless ``own_field``; None without keys."""
+    def _keyed_values(self, solver: str, keyed_field: bool) -> KeyedValues | None:
+        """Return the keyed values of the stage, with its external field if ``keyed_field``; None without keys."""
         if self._scene is None:
             return None
-        keys = self._scene.keys if own_field else replace(self._scene.keys, field=None)
+        keys = self._scene.keys if keyed_field else replace(self._scene.keys, field=None)
         if not any(vars(keys).values()):
             return None
-        return Drive(self.model, self._magnetics, keys, ends_closed=SOLVERS[solver].ends_closed)
+        return KeyedValues(self.model, self._magnetics, keys, contacts_at_end=SOLVERS[solver].contacts_at_end)
 
-    def _prepare(self, solver: str, graphs: bool, drive: Drive | None) -> None:
+    def _prepare(self, solver: str, graphs: bool, keyed_values: KeyedValues | None) -> None:
         """Set up solver and stepper, and measure overlaps at the start."""
         self._sizes = sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver)
@@ -190,7 +192,7 @@ class Simulation:
             step=self.step_size,
             longest_substep=LONGEST_SUBSTEP,
             graphs=graphs,
-            drive=drive,
+            keyed_values=keyed_values,
         )
         bodies = {magnet.body for magnet in self._magnetics.magnets}
         self._moving = np.array(sorted(body for body in bodies if self._moves(body)), dtype=int)
@@ -199,11 +201,11 @@ class Simulation:
             self._start_from_stage()
         self._center = self._positions(self.state).mean(axis=0) if len(self._moving) else np.zeros(3)
         overlap, _, self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)
-        self._stepper.begin_from(overlap)
+        self._stepper.set_initial_overlap(overlap)
         self._statistics.coarseness = self._coarseness()
 
-    def _refusals(self, scene):
-        """Return a context that turns Newton's errors about a stage into one line; none for a builder."""
+    def _newton_errors(self, scene):
+        """Return a context that shortens Newton's errors about a stage to one line; for a builder it does nothing."""
         if self._scene is None:
             return contextlib.nullcontext()
         from warpmag.usd import newton_errors  # noqa: PLC0415 - a builder can do without USD
@@ -222,7 +224,7 @@ class Simulation:
         return float(np.spacing(farthest) / self._sizes.thickness[moving].min())
 
     def _start_from_stage(self) -> None:
-        """Start induction from the moments of the stage, for example of an earlier run."""
+        """Start the induction from the moments of the stage, for example the result of an earlier run."""
         magnetizations = {}
         volumes = dict(zip(self._magnetics.shapes.tolist(), self._magnetics.shape_volumes.tolist(), strict=True))
         for prim, moment in self._scene.magnets.initial_moments.items():
@@ -239,21 +241,21 @@ class Simulation:
         Raises:
             SimulationError: A step led to a state that is not finite. The state is that of the last accepted step.
         """
-        self._look()
+        self._read_reports()
         return self._stepper.state
 
     @property
     def control(self) -> newton.Control:
         """Forces and targets of joints, initially those of the scene.
 
-        Change its arrays between steps, by ``simulation.control.joint_target_q.assign(...)`` or by kernels. Captured
-        steps read them too. If another control of this model is assigned, the step is captured again.
+        Change its arrays between steps, by ``simulation.control.joint_target_q.assign(...)`` or by kernels; captured
+        steps read them, too. Assigning another control of this model captures the step again.
         """
         return self._stepper.control
 
     @control.setter
     def control(self, control: newton.Control) -> None:
-        self._look()
+        self._read_reports()
         check_control(control, self.model)
         if control is not self._stepper.control:
             self._stepper.control = control
@@ -261,29 +263,29 @@ class Simulation:
     @property
     def magnetics(self) -> Magnetics:
         """The magnets at the present state; waits for the device."""
-        self._look()
+        self._read_reports()
         return self._magnetics
 
     @property
     def statistics(self) -> Statistics:
         """Statistics of the run so far; :meth:`finish` adds those of the end. Waits for the device."""
-        self._look()
+        self._read_reports()
         return self._statistics
 
     def warnings(self) -> list[str]:
-        """Return the warnings about the scene and the run so far, a line each; waits for the device."""
+        """Return the warnings about the scene and the run so far, one line each; waits for the device."""
         scene_warnings = self._scene.warnings if self._scene else tuple(joint_gap_warnings(self._joint_gaps))
         scene_warnings += tuple(solver_warnings(self._options["solver"]))
-        lines, figures, rtol = [], self.statistics, self._magnetics.rtol
-        if figures.field_error > rtol:
+        lines, statistics, rtol = [], self.statistics, self._magnetics.rtol
+        if statistics.field_error > rtol:
             lines = [
-                f"fields by multipoles have an error of {figures.field_error:.2g} > rtol {rtol:g}; use method direct"
+                f"fields by multipoles have an error of {statistics.field_error:.2g} > rtol {rtol:g}; use method direct"
             ]
-        return [*scene_warnings, *figures.warnings(), *lines]
+        return [*scene_warnings, *statistics.warnings(), *lines]
 
     @property
     def capture_failure(self) -> str:
-        """Reason why steps are launched from Python, which is slower than a graph; empty for a graph."""
+        """Reason why steps are launched from Python and not as a faster graph; empty for a graph."""
         return self._stepper.capture_failure
 
     @property
@@ -292,19 +294,20 @@ class Simulation:
         return self._stepper.steps * self.step_size
 
     def step(self) -> None:
-        """Advance by one step; a GPU is not waited for.
+        """Advance by one step; does not wait for a GPU.
 
         Raises:
-            SimulationError: A step led to a state that is not finite. On a GPU raised up to 64 steps later.
+            SimulationError: A step led to a state that is not finite. A GPU raises it up to 64 steps later.
         """
         self._stepper.advance()
-        if self._stepper.due:
-            self._look()
+        if self._stepper.reports_due:
+            self._read_reports()
 
-    def _look(self) -> None:
+    def _read_reports(self) -> None:
+        """Add the reports of the last steps to the statistics; waits for the device."""
         self._magnetics.check_model()
         try:
-            for report in self._stepper.look():
+            for report in self._stepper.read_reports():
                 self._statistics.add_step(report)
         except SimulationError as error:
             if not (cause := self._cause()):
@@ -345,16 +348,16 @@ class Simulation:
     ) -> Statistics:
         """Simulate, and record frames on a USD stage.
 
-        A frame is recorded at the step nearest to its time, with the time of that step. Frames are written one by one,
-        so that they survive an interruption.
+        A frame is recorded at the nearest step, with the time of that step. Frames are written one by one, so that they
+        survive an interruption.
 
         Args:
             frames: Output frames after the first; by default those of the stage, else one second.
             output: USD file to write; only for a scene from a stage.
-            copy_scene: Copy the scene beside the output, in place of a reference to it. A scene with unsaved edits is
-                always copied.
-            resume: Continue the run at the output, of the same scene with the same options, if there is one. On a CPU
-                the result is bitwise identical to an uninterrupted run.
+            copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always
+                copied.
+            resume: Continue the run at the output, if there is one; scene and options must be the same. On a CPU the
+                result is bitwise identical to an uninterrupted run.
             on_frame: Called after each frame with its number, from 0; the run ends if it returns False.
 
         Returns:
@@ -391,31 +394,31 @@ class Simulation:
 
     def _run_frames(self, frames: int, recorder, on_frame: Callable[[int], bool | None] | None, resumed: bool) -> bool:
         """Simulate and record, without the first frame if ``resumed``; return true if all frames are done."""
-        figures, before = self._statistics, self._statistics.wall_seconds
+        statistics, before = self._statistics, self._statistics.wall_seconds
         began = time.perf_counter()
         try:
             for frame in range(frames + 1):
                 target = self._steps_at(frame)
                 if target <= self._stepper.steps and (frame or resumed):
-                    continue  # already recorded; or steps are longer than frames, and two frames would have one time
+                    continue  # already recorded, or two frames of one long step would have the same time
                 ahead = min(self._stepper.steps + _AHEAD, target)
                 while self._stepper.steps < target:
                     self.step()
                     if recorder and self._stepper.steps == ahead:
                         recorder.write()
                 state = self.state
-                self._follow(state)
-                figures.wall_seconds = before + time.perf_counter() - began
+                self._update_farthest(state)
+                statistics.wall_seconds = before + time.perf_counter() - began
                 if recorder:
                     recorder.add_frame(self.time, state)
                 if on_frame and on_frame(frame) is False:
                     return frame == frames
             return True
         finally:
-            figures.wall_seconds = before + time.perf_counter() - began
+            statistics.wall_seconds = before + time.perf_counter() - began
 
     def frames_of(self, frames: int | None) -> int:
-        """Return the number of frames of a run; None stands for that of the scene.
+        """Return the number of frames of a run, by default that of the scene.
 
         Raises:
             InputError: ``frames`` is not a positive whole number.
@@ -448,30 +451,34 @@ class Simulation:
         """Return the number of steps before a frame."""
         return round(frame / (self.frame_rate * self.step_size))
 
-    def _follow(self, state: newton.State) -> None:
+    def _update_farthest(self, state: newton.State) -> None:
+        """Update the largest distance of a magnet from the mean initial position."""
         if len(self._moving):
             distance = np.linalg.norm(self._positions(state) - self._center, axis=1).max()
             self._statistics.farthest = max(self._statistics.farthest, float(distance))
 
     def finish(self) -> Statistics:
-        """Return the statistics with those of the end; waits for the device."""
-        figures = self.statistics
-        figures.field_error = self._magnetics.field_error()
-        figures.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
-        figures.overlap, figures.depth = max(figures.overlap, figures.final_overlap), max(figures.depth, depth)
+        """Return the statistics, complete with those of the final state; waits for the device."""
+        statistics = self.statistics
+        statistics.field_error = self._magnetics.field_error()
+        statistics.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
+        statistics.overlap, statistics.depth = (
+            max(statistics.overlap, statistics.final_overlap),
+            max(statistics.depth, depth),
+        )
         speeds = np.linalg.norm(self.state.body_qd.numpy()[:, :3], axis=1)
-        held = np.intersect1d(np.flatnonzero(self._held()), self._moving)
-        figures.held = len(held)
-        figures.held_rms_speed = float(np.sqrt(np.mean(speeds[held] ** 2))) if len(held) else 0.0
-        figures.held_median_speed = float(np.median(speeds[held])) if len(held) else 0.0
-        figures.rms_speed = float(np.sqrt(np.mean(speeds[self._moving] ** 2))) if len(self._moving) else 0.0
-        return figures
+        held = np.intersect1d(np.flatnonzero(self._held_bodies()), self._moving)
+        statistics.held = len(held)
+        statistics.held_rms_speed = float(np.sqrt(np.mean(speeds[held] ** 2))) if len(held) else 0.0
+        statistics.held_median_speed = float(np.median(speeds[held])) if len(held) else 0.0
+        statistics.rms_speed = float(np.sqrt(np.mean(speeds[self._moving] ** 2))) if len(self._moving) else 0.0
+        return statistics
 
-    def _held(self) -> np.ndarray:
+    def _held_bodies(self) -> np.ndarray:
         """Return true for each body that a magnet holds, shape [body_count]."""
         model, contacts = self.model, self._solver.contacts
         shape_body = model.shape_body.numpy()
-        # static shapes count as bodies of their own, behind the bodies of the model
+        # each static shape counts as a body, numbered after the bodies of the model
         node = np.where(shape_body >= 0, shape_body, model.body_count + np.arange(model.shape_count))
         fixed = np.ones(model.body_count + model.shape_count, dtype=bool)
         fixed[: model.body_count] = ~np.isfinite(self._sizes.thickness)

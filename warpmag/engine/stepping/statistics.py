@@ -9,11 +9,11 @@ import numpy as np
 from warpmag.engine.stepping.stepper import StepReport
 
 _COARSE = 1e-3
-"""Coarseness of positions that causes a warning. Contacts settle to about a thousandth of the thickness."""
+"""Coarseness of positions above which a warning is issued. Contacts settle to about a thousandth of the thickness."""
 _UNTIMED = (math.nan,) * 3
-"""Times of a step that compiled kernels."""
+"""Placeholder for the times of a step that compiled kernels."""
 _DEEP = 0.05
-"""Penetration over the thickness that causes a warning."""
+"""Penetration over the thickness above which a warning is issued."""
 
 
 @dataclass
@@ -38,7 +38,7 @@ class Statistics:
         rms_speed: Root mean square speed of the magnets at the end [m/s].
         held: Bodies held by a permanent or fixed magnet at the end, see :func:`find_held`.
         held_rms_speed: Root mean square speed of held bodies [m/s].
-        held_median_speed: Median speed of held bodies [m/s]; smaller where single bodies slide without friction.
+        held_median_speed: Median speed of held bodies [m/s]; below the RMS if single bodies slide without friction.
         farthest: Largest distance of a magnet from the mean initial position, in any frame [m].
         overlapping: Number of overlapping contacts at the start.
         coarseness: Spacing of single-precision positions at the start over the thickness of the thinnest body.
@@ -95,27 +95,27 @@ class Statistics:
         return self.milliseconds_since(0)
 
     def milliseconds_since(self, step: int) -> tuple[float, float, float]:
-        """Return :attr:`milliseconds` of the steps from number ``step`` on."""
+        """Return :attr:`milliseconds` of the steps from index ``step`` on."""
         seconds = np.array(self._seconds, dtype=float).reshape(-1, len(_UNTIMED))[step:]
         timed = seconds[np.isfinite(seconds).all(axis=1)]
         return tuple((1e3 * timed.mean(axis=0)).tolist()) if len(timed) else (0.0, 0.0, 0.0)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return copies of all values by name; steps go on while they are written."""
+        """Return copies of all values by name, since steps continue while the values are written."""
         return {entry.name: np.array(getattr(self, entry.name)) for entry in fields(self)}
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
         """Set the values that :meth:`save` returned."""
         for entry in fields(self):
-            own, value = getattr(self, entry.name), saved[entry.name].tolist()
-            setattr(self, entry.name, array(own.typecode, value) if isinstance(own, array) else value)
+            current, value = getattr(self, entry.name), saved[entry.name].tolist()
+            setattr(self, entry.name, array(current.typecode, value) if isinstance(current, array) else value)
 
     def warnings(self) -> list[str]:
-        """Return warnings about the accuracy of the run, a line each."""
+        """Return warnings about the accuracy of the run, one line each."""
         lines = []
         if self.overlapping:
-            many = self.overlapping > 1
-            lines.append(f"{self.overlapping} pair{'s' * many} of bodies overlap{'s' * (not many)} at the start")
+            plural = self.overlapping > 1
+            lines.append(f"{self.overlapping} pair{'s' * plural} of bodies overlap{'s' * (not plural)} at the start")
         if self.coarseness > _COARSE:
             percent = 100.0 * self.coarseness
             lines.append(
@@ -166,6 +166,7 @@ def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.n
     """
 
     def neighbors(bodies: np.ndarray) -> np.ndarray:
+        """Return true for each body that touches one of ``bodies``."""
         touched = np.zeros(len(fixed), dtype=bool)
         for first, second in (pairs.T, pairs.T[::-1]):
             touched[second[bodies[first]]] = True
@@ -175,7 +176,7 @@ def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.n
     touching = neighbors(holders) & ~fixed & ~holders
     held = touching
     while True:
-        more = touching | (neighbors(held & ~grounded) & ~grounded & ~fixed & ~holders)
-        if (more == held).all():
+        next_held = touching | (neighbors(held & ~grounded) & ~grounded & ~fixed & ~holders)
+        if (next_held == held).all():
             return held
-        held = more
+        held = next_held

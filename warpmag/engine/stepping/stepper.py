@@ -1,13 +1,13 @@
 """Advances a model by the user's time step, in as many substeps as its motion needs.
 
 A substep clears the forces, solves the induction, adds magnetic forces, finds contacts and runs the rigid-body solver.
-Substeps shorter than the longest ones share their forces with others.
+Substeps shorter than the maximum share forces: several use one evaluation.
 
-A step is attempted and then judged. If a body moved too far in a substep, or bodies were pressed into each other, the
-state is restored and the step repeated with shorter substeps. The device makes these decisions
-(``kernels.rigid.stepping``), so that a step is one graph that the host launches without waiting. The host reads the
-reports of several steps at once. If a buffer overflows or the state is not finite, the device halts, and later steps do
-nothing until the host acts.
+A step is attempted and then checked. If a body moved too far in a substep, or contacts became too deep, the state is
+restored and the step repeated with shorter substeps. The device makes these decisions (``kernels.rigid.stepping``), so
+that a step is one graph that the host launches without waiting. The host reads the reports of several steps at once. If
+a buffer overflows or the state is not finite, the device halts, and later steps do nothing until the host enlarges the
+buffer or raises an error.
 
 Steps that cannot be captured in a graph are launched from Python by the same code.
 """
@@ -24,7 +24,7 @@ import warp as wp
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.capture import Workspace, without_allocations
 from warpmag.engine.pile_xpbd.contacts import BodySizes, RigidSolver
-from warpmag.engine.stepping.drive import Drive
+from warpmag.engine.stepping.keyed_values import KeyedValues
 from warpmag.errors import SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
@@ -32,18 +32,18 @@ from warpmag.kernels.rigid.newton_views import view_bodies
 from warpmag.moments.arrays import restore_snapshot, snapshot_views
 
 TRAVEL_LIMIT = 0.25
-"""Largest sliding of a body along another, or motion by forces, in a substep, over the body's thickness; see
+"""Largest sliding along another body, or displacement by forces, in a substep, over the body's thickness; see
 ``kernels.rigid.monitor``."""
 _SHARED_TRAVEL_LIMIT = 0.5
 """The same limit while more than two substeps share their forces. A free ball then moves at most two radii."""
 OVERLAP_LIMIT = 0.008
 """Largest new penetration in a step over the thickness of the thinner body."""
 _GROWTH_MARGIN = 0.8
-"""Substeps double when the predicted motion stays below this fraction of the limit."""
+"""The substep doubles when the predicted motion stays below this fraction of the limit."""
 _FUTILE_RATIO = 0.8
 """If halved substeps leave more than this fraction of a penetration, even shorter ones are not tried."""
 _RECORDS = 64
-"""Largest number of steps without a :meth:`Stepper.look`. On a CPU the host looks after each step."""
+"""Largest number of steps without :meth:`Stepper.read_reports`. On a CPU the host reads them after each step."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Stepper:
         step: float,
         longest_substep: float,
         graphs: bool = True,
-        drive: Drive | None = None,
+        keyed_values: KeyedValues | None = None,
     ):
         """Allocate states and the state machine.
 
@@ -109,17 +109,18 @@ class Stepper:
             step: Time step [s].
             longest_substep: Upper limit of a substep [s].
             graphs: Capture a step in a graph where the device and the solver allow it.
-            drive: Keyed values of the model.
+            keyed_values: Keyed values of the model.
         """
-        self._model, self._magnetics, self._solver, self._drive = model, magnetics, solver, drive
+        self._model, self._magnetics, self._solver = model, magnetics, solver
+        self._keyed_values = keyed_values
         self._device = wp.get_device(model.device)
         self._step = step
-        # an even number, so that a step ends in the state object that it began in
-        self._fewest = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
-        self._longest = step / self._fewest
+        # an even number, so that a step ends in the same state object as it begins
+        self._min_substeps = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
+        self._longest = step / self._min_substeps
         self._state, self._other, self._saved = model.state(), model.state(), model.state()
         self._control = model.control()
-        self._shared = model.state()  # poses and forces that several substeps share
+        self._shared = model.state()  # predicted poses, and forces that several substeps share
         self._machine = stepping.StepMachine(
             _RECORDS,
             len(solver.buffers),
@@ -129,7 +130,7 @@ class Stepper:
             overlap=OVERLAP_LIMIT,
             growth_margin=_GROWTH_MARGIN,
             futile_ratio=_FUTILE_RATIO,
-            first_level_substeps=self._fewest,
+            first_level_substeps=self._min_substeps,
         )
         self._machine.set_state_arrays(_arrays(self._state), _arrays(self._saved))
         self._arrays = self._machine.arrays
@@ -139,10 +140,10 @@ class Stepper:
         self._workspace = Workspace(self._device) if self._device.is_cuda else None
         self._capture, self._graph = graphs, None
         self.capture_failure = ""
-        self._cold: set[int] = set()
+        self._untimed: set[int] = set()
         self.steps = self._reported = 0
-        if drive:
-            drive.place(self._state, 0.0, self._longest)
+        if keyed_values:
+            keyed_values.pose_for_contacts(self._state, 0.0, self._longest)
         self._prepare()
 
     def _make_mirrors(self) -> dict[str, wp.array]:
@@ -153,7 +154,7 @@ class Stepper:
         return mirrors
 
     def _prepare(self) -> None:
-        """Set the sizes of the solver's buffers, whose number is constant, and discard the graph."""
+        """Update the sizes of the solver's buffers, and discard the graph. The number of buffers is constant."""
         self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
         self._watched.fills.assign(self._solver.fills())
         self._machine.invalidate_contacts()
@@ -165,7 +166,7 @@ class Stepper:
 
     @property
     def state(self) -> newton.State:
-        """The present state; call :meth:`look` first. It may be changed."""
+        """The present state, which may be changed; call :meth:`read_reports` first."""
         self._machine.invalidate_contacts()
         return self._state
 
@@ -180,35 +181,35 @@ class Stepper:
         self._graph, self._warm = None, False
 
     @property
-    def due(self) -> bool:
-        """True if :meth:`look` has to be called before the next step."""
+    def reports_due(self) -> bool:
+        """True if :meth:`read_reports` has to be called before the next step."""
         return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
 
     def advance(self) -> None:
-        """Advance :attr:`state` by one step; a GPU is not waited for.
+        """Advance :attr:`state` by one step; does not wait for a GPU.
 
         Raises:
-            RuntimeError: :meth:`look` was not called for too many steps.
+            RuntimeError: Too many steps since the last :meth:`read_reports`.
         """
         if self.steps - self._reported >= _RECORDS:
-            raise RuntimeError(f"look() must be called every {_RECORDS} steps")
+            raise RuntimeError(f"read_reports() must be called every {_RECORDS} steps")
         self.steps += 1
         self._launch()
 
-    def look(self) -> Iterator[StepReport]:
-        """Wait for all steps so far.
+    def read_reports(self) -> Iterator[StepReport]:
+        """Wait for all steps so far, and act on overflows and states that are not finite.
 
         Yields:
-            A report of each step since the last look.
+            A report of each step since the last call.
 
         Raises:
             SimulationError: A step led to a state that is not finite. The state is that of the last accepted step.
         """
         while self.steps > self._reported:
             status = self._read("status")
-            yield from self._reports(int(status[stepping.STATUS_DONE]))
+            yield from self._reports_until(int(status[stepping.STATUS_DONE]))
             if status[stepping.STATUS_HALT] == stepping.NOT_FINITE:
-                self._give_up()
+                self._raise_not_finite()
             if self.steps > self._reported:
                 assert status[stepping.STATUS_HALT] == stepping.OVERFLOW, "the device left steps undone"
                 self._solver.grow(self._fills())
@@ -218,15 +219,16 @@ class Stepper:
                 for _ in range(self.steps - self._reported):
                     self._launch()
 
-    def _reports(self, done: int) -> list[StepReport]:
-        """Read the records of the steps up to ``done``."""
-        self._clock.look()
+    def _reports_until(self, done: int) -> list[StepReport]:
+        """Return the reports of the steps since the last call, up to step ``done``."""
+        self._clock.calibrate()
         log = self._read("log")
         numbers = range(self._reported, done)
         self._reported = done
-        return [self._report(log[number % _RECORDS], number not in self._cold) for number in numbers]
+        return [self._report(log[number % _RECORDS], number not in self._untimed) for number in numbers]
 
     def _report(self, record: np.ndarray, timed: bool) -> StepReport:
+        """Return the report of a record of the device's log."""
         peaks = record[stepping.LOG_PEAKS :]
         ticks = record[stepping.LOG_TICKS :]
         return StepReport(
@@ -244,7 +246,8 @@ class Stepper:
             seconds=tuple((self._clock.seconds_per_tick * ticks).tolist()) if timed else None,
         )
 
-    def _give_up(self) -> None:
+    def _raise_not_finite(self) -> None:
+        """Raise :class:`SimulationError` for the first body with a state that is not finite."""
         body = int(self._read("counts")[monitor.COUNT_BAD_BODY]) % self._model.body_count
         self.steps, number = self._reported, self._reported + 1
         for status in (stepping.STATUS_LEVEL, stepping.STATUS_ATTEMPTS):
@@ -265,7 +268,7 @@ class Stepper:
         return mirror.numpy()
 
     def _launch(self) -> None:
-        """Launch a step: the first from Python, which compiles its kernels, later ones as a graph if possible."""
+        """Launch a step: the first from Python, which compiles its kernels, later steps as a graph if possible."""
         if self._graph:
             wp.capture_launch(self._graph)
             return
@@ -273,7 +276,7 @@ class Stepper:
             self._run_step()
             if not self._warm:
                 self._warm = True
-                self._cold.add(self._reported)
+                self._untimed.add(self._reported)
                 if self._capture and self._read("status")[stepping.STATUS_HALT] == stepping.RUNNING:
                     self._capture_step()
 
@@ -285,13 +288,13 @@ class Stepper:
             self._machine.set_status(stepping.STATUS_HALT, stepping.PAUSED)
             wp.capture_launch(capture.graph)
             self._graph = capture.graph
-        except Exception as error:  # steps that cannot be captured are launched from Python
+        except Exception as error:  # such a step is launched from Python
             self._capture, self.capture_failure = False, " ".join(str(error).split()) or type(error).__name__
-            _clear_error(self._device)
+            _clear_capture_error(self._device)
         self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return the arrays that the next step depends on; call :meth:`look` first. A step may overwrite them."""
+        """Return the arrays that the next step depends on, and may overwrite; call :meth:`read_reports` first."""
         numbers = {"steps": np.array(self.steps), "buffers": self._solver.limits()}
         return numbers | snapshot_views(self._carried())
 
@@ -315,7 +318,7 @@ class Stepper:
         return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
-        """Find the contacts of the present state; call :meth:`look` first.
+        """Find the contacts of the present state; call :meth:`read_reports` first.
 
         Returns:
             Deepest penetration over the thickness of the thinner body, deepest penetration [m], and number of contacts
@@ -335,7 +338,7 @@ class Stepper:
         depths = float(peaks[monitor.PEAK_OVERLAP]), float(peaks[monitor.PEAK_DEPTH])
         return *depths, int(counts[monitor.COUNT_OVERLAPS])
 
-    def begin_from(self, overlap: float) -> None:
+    def set_initial_overlap(self, overlap: float) -> None:
         """Set the deepest penetration at the start over the thickness; steps do not press bodies deeper."""
         self._arrays.last_overlap.assign(np.array([overlap, math.inf], np.float32))
 
@@ -348,6 +351,7 @@ class Stepper:
         wp.capture_while(self._machine.attempting, self._attempt)
 
     def _attempt(self) -> None:
+        """Run all substeps at the present level, then accept the step or restore the state."""
         machine = self._machine
         for level, remaining in enumerate(machine.remaining):
             wp.capture_while(remaining, self._advance_twice, level=level)
@@ -356,11 +360,12 @@ class Stepper:
         machine.restore()
 
     def _advance_twice(self, level: int) -> None:
+        """Run a pair of substeps of the longest length over ``2**level``."""
         machine, dt = self._machine, self._longest / (1 << level)
-        if self._drive:
-            machine.write_time(self._step, self._longest, self._drive.time)
+        if self._keyed_values:
+            machine.write_time(self._step, self._longest, self._keyed_values.time)
         wp.capture_if(machine.contacts_due, self._find_first_contacts, substep=0)
-        if level == 1:  # exactly two substeps share forces
+        if level == 1:  # two substeps share forces
             self._share_forces(dt)
         elif level > 1:
             wp.capture_if(machine.forces_due, self._share_forces, dt=dt)
@@ -368,8 +373,8 @@ class Stepper:
             if half:
                 self._find_contacts(now, dt, half)
             if level == 0:
-                if self._drive:
-                    self._drive.set_values(half * dt)
+                if self._keyed_values:
+                    self._keyed_values.set_values(half * dt)
                 self._magnetize(now)
             else:
                 wp.copy(now.body_f, self._shared.body_f)
@@ -378,16 +383,16 @@ class Stepper:
 
     def _move(self, now: newton.State, then: newton.State, begin: float, dt: float) -> None:
         """Run the solver for a substep of ``dt`` [s] that begins ``begin`` [s] after its pair of substeps."""
-        if self._drive:
-            self._drive.lead(now, begin, dt)
+        if self._keyed_values:
+            self._keyed_values.pose_for_solver(now, begin, dt)
         self._solver.step(now, then, dt, self._control)
-        if self._drive:
-            self._drive.place(then, begin + dt, self._longest)
+        if self._keyed_values:
+            self._keyed_values.pose_for_contacts(then, begin + dt, self._longest)
 
     def _find_first_contacts(self, substep: int) -> None:
-        """Find the contacts at the start of two substeps.
+        """Find the contacts at the start of a pair of substeps.
 
-        They reach as far as the longest substep needs, so that contacts at the end of a step also serve the next one.
+        The search looks ahead by the longest substep, so that contacts at the end of a step also serve the next step.
         """
         self._find_contacts(self._state, self._longest, substep)
 
@@ -396,14 +401,16 @@ class Stepper:
         self._solver.watch(self._watched, state, substep=substep, longest=self._longest, threshold=0.0)
 
     def _share_forces(self, dt: float) -> None:
+        """Evaluate the forces that the next substeps of ``dt`` [s] share, at predicted poses."""
         predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
         if self._magnetics.needs_velocities:
             wp.copy(self._shared.body_qd, self._state.body_qd)
-        if self._drive:
-            self._drive.set_values(0.0, shared=self._machine.sharing, substep=dt)
+        if self._keyed_values:
+            self._keyed_values.set_values(0.0, shared=self._machine.sharing, substep=dt)
         self._magnetize(self._shared)
 
     def _magnetize(self, state: newton.State) -> None:
+        """Solve the induction and write the magnetic forces at ``state``."""
         magnetics = self._magnetics
         state.clear_forces()
         magnetics.induce(state)
@@ -413,15 +420,15 @@ class Stepper:
         monitor.watch_forces(self._watched, bodies, self._model.gravity, self._longest)
 
 
-def _clear_error(device) -> None:
-    """Sort an empty array: after a failed capture the first sort on a GPU has no effect."""
+def _clear_capture_error(device) -> None:
+    """Sort a dummy array: after a failed capture the first sort on a GPU has no effect."""
     if device.is_cuda:
-        nothing = wp.zeros(2, dtype=wp.int32, device=device)
-        wp.utils.radix_sort_pairs(nothing, wp.zeros_like(nothing), 1)
+        keys = wp.zeros(2, dtype=wp.int32, device=device)
+        wp.utils.radix_sort_pairs(keys, wp.zeros_like(keys), 1)
 
 
 def _arrays(state: newton.State | newton.Control) -> list[wp.array]:
-    """Return the arrays of a state or a control, flat, without forces: each substep clears them."""
+    """Return the arrays of a state or a control, flattened, without forces, which each substep clears."""
     arrays = []
     for name, value in vars(state).items():
         if isinstance(value, newton.Model.AttributeNamespace):
@@ -435,7 +442,7 @@ class _Clock:
     """Measures the tick of the device's clock.
 
     Attributes:
-        seconds_per_tick: Length of a tick [s], after a :meth:`look`.
+        seconds_per_tick: Length of a tick [s], after :meth:`calibrate`.
     """
 
     def __init__(self, device):
@@ -448,7 +455,7 @@ class _Clock:
         stepping.launch_read_clock(self._time)
         return int(self._time.numpy()[0]), time.perf_counter()
 
-    def look(self) -> None:
+    def calibrate(self) -> None:
         """Compare the device's clock with the host's. The clock of a GPU counts nanoseconds."""
         if not self._fixed:
             ticks, seconds = np.subtract(self._read(), self._began)

@@ -1,6 +1,6 @@
-"""Keyed values of a model in motion: poses of kinematic bodies, magnetizations, currents, the external field.
+"""Sets keyed values of a model: poses of kinematic bodies, magnetizations, currents, the external field.
 
-Keys are interpolated on the device at its own time, so that repeated and shortened substeps read the right values.
+Keys are interpolated at a time stored on the device, so that repeated and shortened substeps read the right values.
 """
 
 import newton
@@ -17,24 +17,24 @@ from warpmag.kernels.rigid.keys import follow, launch_follow
 from warpmag.moments.arrays import host_array
 
 
-class Drive:
-    """Sets keyed values of one model. Every method only launches kernels.
+class KeyedValues:
+    """Sets the keyed values of one model. Every method only launches kernels.
 
     Attributes:
-        time: Time on the device [s], which the stepper sets, float64, shape [1].
+        time: Time [s] on the device, float64, shape [1]; the stepper sets it.
     """
 
-    def __init__(self, model: newton.Model, magnetics: Magnetics, keys: SceneKeys, *, ends_closed: bool):
+    def __init__(self, model: newton.Model, magnetics: Magnetics, keys: SceneKeys, *, contacts_at_end: bool):
         """Copy the keys to the device.
 
         Args:
             model: The model.
             magnetics: Its magnets.
             keys: Keys by body and by shape.
-            ends_closed: The solver reads kinematic bodies at their poses at the end of a step.
+            contacts_at_end: The solver needs kinematic bodies at their poses at the end of a substep.
         """
         self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
-        self._magnetics, self._ends_closed = magnetics, ends_closed
+        self._magnetics, self._contacts_at_end = magnetics, contacts_at_end
         self._bodies = None
         if keys.motions:
             operations = {body: motion.operations for body, motion in keys.motions.items()}
@@ -66,15 +66,15 @@ class Drive:
         if self._field is not None:
             self._magnetics.set_external_field(self._field)
 
-    def lead(self, state: newton.State, begin: float, dt: float) -> None:
+    def pose_for_solver(self, state: newton.State, begin: float, dt: float) -> None:
         """Pose kinematic bodies for a substep of ``dt`` [s] that begins ``begin`` [s] after :attr:`time`."""
         if self._bodies is not None:
-            launch_place(self._bodies, state, begin, dt, at_end=self._ends_closed)
+            launch_place(self._bodies, state, begin, dt, at_end=self._contacts_at_end)
 
-    def place(self, state: newton.State, begin: float, horizon: float) -> None:
-        """Pose kinematic bodies as ``begin`` [s] after :attr:`time`, with mean velocities over ``horizon`` [s].
+    def pose_for_contacts(self, state: newton.State, begin: float, horizon: float) -> None:
+        """Pose kinematic bodies for the contact search ``begin`` [s] after :attr:`time`.
 
-        The search for contacts uses these.
+        Their velocities are means over the next ``horizon`` [s].
         """
         if self._bodies is not None:
             launch_place(self._bodies, state, begin, horizon, at_end=False)
@@ -83,8 +83,8 @@ class Drive:
 class KeyedCurrents:
     """Time-sampled currents of coils that ``builder.add_usd`` imported, for programs with a loop of their own.
 
-    ``Simulation`` follows all keys of a stage by itself. ``KeyedCurrents`` has no motions and magnetizations:
-    ``add_usd`` imports their values at the start. Replicated worlds share keys::
+    ``Simulation`` sets all keyed values of a stage itself. ``KeyedCurrents`` sets currents only: ``add_usd`` imports
+    motions and magnetizations at the start of the stage, without keys. Replicated worlds share keys::
 
         currents = warpmag.KeyedCurrents(model)
         currents.set(0.25)  # 0.25 s after the start of the stage
