@@ -17,7 +17,7 @@ from warpmag.kernels.rigid.keys import follow, launch_follow
 from warpmag.moments.arrays import host_array
 
 
-class KeyedValues:
+class KeyedModelValues:
     """Sets the keyed values of one model. Every method only launches kernels.
 
     Attributes:

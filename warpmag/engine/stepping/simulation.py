@@ -18,7 +18,7 @@ from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
-from warpmag.engine.stepping.keyed_values import KeyedValues
+from warpmag.engine.stepping.keyed_values import KeyedModelValues
 from warpmag.engine.stepping.model_checks import (
     articulate,
     check_control,
@@ -171,16 +171,16 @@ class Simulation:
         self._joint_gaps = joint_gaps(model) if SOLVERS[solver].maximal else {}
         return model
 
-    def _keyed_values(self, solver: str, keyed_field: bool) -> KeyedValues | None:
+    def _keyed_values(self, solver: str, keyed_field: bool) -> KeyedModelValues | None:
         """Return the keyed values of the stage, with its external field if ``keyed_field``; None without keys."""
         if self._scene is None:
             return None
         keys = self._scene.keys if keyed_field else replace(self._scene.keys, field=None)
         if not any(vars(keys).values()):
             return None
-        return KeyedValues(self.model, self._magnetics, keys, contacts_at_end=SOLVERS[solver].contacts_at_end)
+        return KeyedModelValues(self.model, self._magnetics, keys, contacts_at_end=SOLVERS[solver].contacts_at_end)
 
-    def _prepare(self, solver: str, graphs: bool, keyed_values: KeyedValues | None) -> None:
+    def _prepare(self, solver: str, graphs: bool, keyed_values: KeyedModelValues | None) -> None:
         """Set up solver and stepper, and measure overlaps at the start."""
         self._sizes = sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver)

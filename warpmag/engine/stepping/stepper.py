@@ -24,7 +24,7 @@ import warp as wp
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.capture import Workspace, without_allocations
 from warpmag.engine.pile_xpbd.contacts import BodySizes, RigidSolver
-from warpmag.engine.stepping.keyed_values import KeyedValues
+from warpmag.engine.stepping.keyed_values import KeyedModelValues
 from warpmag.errors import SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
@@ -97,7 +97,7 @@ class Stepper:
         step: float,
         longest_substep: float,
         graphs: bool = True,
-        keyed_values: KeyedValues | None = None,
+        keyed_values: KeyedModelValues | None = None,
     ):
         """Allocate states and the state machine.
 
