@@ -1,14 +1,14 @@
 """Fields that coils, field maps and nearby permanent bodies apply to moments, and the reactions on these sources.
 
-May import ``shared``, ``material`` and ``pairs``. The field of such a source does not depend on its surroundings: it
+May import ``shared``, ``material`` and ``pairs``. The field of such a source does not depend on other sources. It
 follows from a closed form, or from a table, in the frame of the source.
 
-Fields of coils and maps act everywhere, in proportion to a strength. At a distance of a few lattice cells a lattice of
-moments represents a permanent body. Within its reach targets get a correction: the closed form of the body's field less
-the field of its lattice. Two bodies near each other get the force and torque between their surface charges, less those
-between their moments.
+Coils and maps act at any distance, in proportion to a strength. A permanent body acts as a lattice of moments. At
+targets within its reach, a few lattice cells, a correction is added: the closed form of the body's field less the field
+of its lattice. Two bodies near each other get the force and torque between their surface charges, less the force and
+torque between their moments.
 
-Fields are evaluated once a solve at all moments, and added to the external field. The reaction on a source is summed
+Fields are evaluated once per solve at all moments, and added to the external field. The reaction on a source is summed
 from the same fields, so that forces are opposite and equal. Without sources none of these kernels is launched.
 
 | module | content |
@@ -29,6 +29,6 @@ from the same fields, so that forces are opposite and equal. Without sources non
 | `solids.h`, `body_pairs.h` | permanent bodies, their lattices; forces between two bodies |
 | `polyhedron.h` | field, gradient and potentials of a uniformly magnetized polyhedron |
 
-A new kind of coil or map takes a header with its field, its include and case in ``sources.h``, and its name in
+A new kind of coil or map needs a header with its field, an include and a case in ``sources.h``, and a name in
 ``sources.SourceKind``.
 """

@@ -9,13 +9,13 @@ namespace warpmag {
 constexpr int POINTS = 12, TENSOR_ROWS = 21, EXPANSION_ROWS = 4 * TENSOR_ROWS; // as in expansion.py
 constexpr int VECTORS_PER_THREAD = CHUNK <= WIDTH * SHARES ? 1 : CHUNK / (WIDTH * SHARES);
 
-// A ball, and the sources' field at its CHUNK points, of which the first POINTS count. A thread has VECTORS_PER_THREAD
-// vectors of points.
+// A ball, and the sources' field at its CHUNK points. Points beyond the first POINTS are padding. A thread holds
+// VECTORS_PER_THREAD vectors of points.
 struct Ball {
     Real3 center;
     Real radius, label;
     int moment;
-    bool in_field; // whether any source acts on it
+    bool in_field; // true if any source acts on the ball
     TargetField fields[VECTORS_PER_THREAD];
 
     // First point of vector v.
@@ -79,8 +79,8 @@ template <class Arrays> CUDA_CALLABLE inline void add_coil(const Arrays& arrays,
         add_faded(ball.fields[v], fade, field);
     }
 }
-// Adds the field of a permanent body: its closed form within its reach, else its lattice, which keeps more digits
-// there.
+// Adds the field of a permanent body: the closed form within the body's reach, else the field of its lattice. Far away
+// the closed form would lose digits by cancellation.
 template <class Arrays> CUDA_CALLABLE inline void add_body(const Arrays& arrays, const Body& body, Ball& ball) {
     if (body.responds) return; // its moments are neighbors of the ball already
     const Fade fade = fade_of(ball, body.pose, body.box_center, body.box_half);
@@ -97,7 +97,8 @@ template <class Arrays> CUDA_CALLABLE inline void add_body(const Arrays& arrays,
     }
 }
 
-// Writes the tensors b of degrees 2 to 4, and the tensors whose contraction with the ball's response is its force.
+// Writes the tensors b of degrees 2 to 4, and their gradients. The product of the gradients and the ball's response is
+// the force on the ball.
 template <class Arrays> CUDA_CALLABLE inline void expand(const Arrays& arrays, int n) {
     const auto& row = arrays.balls.ball.data[n]; // moment, world, and the range of permanent bodies in that world
     Ball ball = ball_at(arrays, row[0]);

@@ -4,10 +4,12 @@
 
 namespace warpmag {
 
-constexpr int EDGE_POINT = 19, FACE_POINT = 7; // numbers of a point on an edge and on a face
+// Numbers of a point on an edge: position, direction of the edge, ν of both faces, n of both faces, weight; of a point
+// on a face: position, n, weight. polyhedron.h defines ν and n.
+constexpr int EDGE_POINT = 19, FACE_POINT = 7;
 
-// Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those of the two lattices. The surface charges of q are
-// summed in the field of s. The torque is about the first moment of q; all results are in the world.
+// Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those between the two lattices. The surface charges of q
+// are integrated in the field of s. The torque is about the first moment of q; all results are in the world's frame.
 template <class Arrays>
 CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const Body& q, const Body& s, Real3& force, Real3& torque,
                                       Real& energy) {

@@ -1,15 +1,17 @@
-"""Expansion of a field about a ball: points in the ball, and tables from the field there to tensors. NumPy.
+"""Expansion of a field about a ball's center: sample points, and tables that convert the field there to tensors. NumPy.
 
 With x the position relative to the center, in radii of the ball, a field without sources in the ball is
 
     4π H = −∇ Σ_l (2l − 1)!!/l! b_l:x^l,
 
-with b_l symmetric and traceless. ``near_contact`` has the b_l of magnets in closed form. For other sources the b_l of
-degrees 1 to 4 are least-squares fits to H at the corners of an icosahedron of radius ``POINT_DEPTH``, and so are linear
-in H. A higher degree l' contaminates them by its own tensor times ``POINT_DEPTH`` to the power l' − l.
+with b_l symmetric and traceless. ``near_contact`` computes the b_l of magnets in closed form. For other sources the b_l
+of degrees 1 to 4 are least-squares fits to H at the corners of an icosahedron of radius ``POINT_DEPTH``, and so are
+linear in H. The error of b_l by a higher degree l' is the tensor of that degree times ``POINT_DEPTH`` to the
+power l' − l.
 
-Derivatives of b_l by the position of the ball are the tensors of the field's derivatives. The ball has the energy
-−½ (μ0/4π) R³ Σ p (2l − 1)!!/l! b_l:b_l. The force on it is (μ0/4π) R³ Σ B_l:∂b_l with its response B_l.
+Derivatives of b_l by the position of the ball are the tensors of the field's derivatives. The energy of a ball with
+polarizabilities p_l is −½ (μ0/4π) R³ Σ p_l (2l − 1)!!/l! b_l:b_l. The force on it is (μ0/4π) R³ Σ B_l:∂b_l, with its
+response B_l (``near_contact.nonuniform``).
 """
 
 import itertools
@@ -24,7 +26,7 @@ POINT_DEPTH = 0.4
 TENSOR_ROWS = 21
 """Independent components of the tensors of degrees 2 to 4."""
 EXPANSION_ROWS = 4 * TENSOR_ROWS
-"""Components, and for each the three factors of the ball's response in the force along x, y and z."""
+"""Rows of an expansion: the components, then for each component its derivatives along x, y and z for the force."""
 _INDEPENDENT = {
     1: ("x", "y", "z"),
     2: ("xx", "yy", "xy", "yz", "zx"),
@@ -60,7 +62,7 @@ def tables() -> np.ndarray:
 
 
 def _components(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the powers of x, y, z of all components of a degree, and the components from the independent ones."""
+    """Return the powers of x, y, z of all components of a degree, and the matrix to them from the independent ones."""
     names = [tuple(name.count(axis) for axis in "xyz") for name in _INDEPENDENT[degree]]
     independent = dict(zip(names, np.eye(len(names)), strict=True))
 
@@ -73,7 +75,7 @@ def _components(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _multiplicities(powers: np.ndarray) -> np.ndarray:
-    """Return how often each component occurs in a symmetric tensor."""
+    """Return the number of times that each component occurs in a symmetric tensor."""
     return np.array([comb(i + j + k, i) * comb(j + k, j) for i, j, k in powers])
 
 

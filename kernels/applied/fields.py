@@ -5,7 +5,7 @@ force and torque
 
     F = μ0 ∇(m·H),   F_k = μ0 m_i ∂H_i/∂x_k,      τ = μ0 m × H,
 
-With Eq. 4 m is the effective moment (``pairs.wrench``). ∇(m·H) is the gradient of the co-energy; it equals (m·∇)H where
+By Eq. 4, m is the effective moment (``pairs.wrench``). ∇(m·H) is the gradient of the co-energy; it equals (m·∇)H where
 H has no curl. The reaction on the source is −ΣF and, about its origin o, −Σ(τ + (x − o) × F), over all moments of other
 bodies: momentum and angular momentum are conserved by construction. Forces on the multipoles of balls (``expansion``)
 act at the balls' centers.
@@ -55,7 +55,7 @@ class AppliedField:
         targets: The targets, packed (``packing.PackedMoments``); read at each launch, as is ``base``.
         worlds: World of each target, shape [t].
         base: Field that is added to [A/m], Warp array, shape [t].
-        points: Whether targets are points of a probe; else they are all moments.
+        points: True if targets are points of a probe, false if they are all moments.
 
     Attributes:
         field: Magnetizing field: base and the field of all sources [A/m], shape [t].
@@ -64,7 +64,7 @@ class AppliedField:
     """
 
     balls: tuple = (0, 0.0, 0.0, 0)
-    """Constants of ``balls.h``: whether fields are expanded about balls, range of fading, rows of the response."""
+    """Constants of ``balls.h``: 1 if fields are expanded about balls, range of fading, rows of the response."""
     rates: wp.array | None = None
     """Rate of the field of other bodies' sources [A/(m·s)], shape [t]; None unless :meth:`follow` was called."""
 
@@ -109,10 +109,10 @@ class AppliedField:
         """Launch passes: on a GPU with ``group`` threads per item, on a CPU with ``share`` items per thread."""
         cuda, key = self.device.is_cuda, (first, last)
         if items and key not in self._commands:
-            sources, form = self.sources, (first, group) if cuda else (-1, 1)
+            sources, pass_and_group = self.sources, (first, group) if cuda else (-1, 1)
             has_coils, has_solids = bool(sources.applied), bool(sources.solids)
             self._commands[key] = wp.launch(
-                _kernel(sources.dtype, *form, has_coils, has_solids, bool(self.rates), self.balls),
+                _kernel(sources.dtype, *pass_and_group, has_coils, has_solids, bool(self.rates), self.balls),
                 dim=group * items if cuda else 1,
                 inputs=[first, last + 1, threads_for(items, share), None if cuda else team(), self.arrays],
                 device=self.device,
@@ -197,17 +197,17 @@ class AppliedForces(AppliedField):
         sources: The sources.
         worlds: World of each moment, shape [n].
         base: Field at moments that is added to [A/m], Warp array, shape [n].
-        movable: Whether the force on a moment is computed, shape [n].
-        balls: Whether a moment is a ball whose multipoles respond to the field, shape [n]; None without such balls.
+        movable: True for moments whose force is computed, shape [n].
+        balls: True for balls whose multipoles respond to the field, shape [n]; None without such balls.
         constants: First and last distance from a source [radii] over which the multipoles fade, and the number of rows
             of ``response``.
 
     Attributes:
         expansion: Field expanded about the balls (``balls.h``), shape [chunks, rows, CHUNK]; None without balls.
-        wrenches: Force [N] and torque [N·m] on each source that is pushed, shape [sources, 7]. Torques are about the
-            source's origin, or about the first moment of a permanent body. Wrenches on the moments of a body are not
-            included. The last column is half the energy [J] of a permanent body with others, less that of their
-            moments.
+        wrenches: Force [N] and torque [N·m] on each source whose reaction is computed, shape [sources, 7]. Torques are
+            about the source's origin, or about the first moment of a permanent body. Wrenches on the moments of a body
+            are not included. The last column is half the energy [J] of a permanent body with other bodies, less that of
+            their moments.
     """
 
     def __init__(self, sources: FieldSources, worlds, base, movable, *, balls=None, constants=()):
@@ -237,7 +237,7 @@ class AppliedForces(AppliedField):
         self.expansion = balls.expansion = wp.zeros(shape, dtype=sources.dtype, device=self.device)
 
     def _lay_out_rows(self, worlds, ball_worlds):
-        """List the rows of the reaction on each source that is pushed: ranges of targets and of balls."""
+        """List the rows of each reaction that is computed: ranges of targets and of balls."""
         sources, rows, begin = self.sources, [], [0]
         pushed = [source.pushed for source in sources.applied] + [solid.movable for solid in sources.solids]
         for s, source in enumerate((*sources.applied, *sources.solids)):
@@ -255,10 +255,10 @@ class AppliedForces(AppliedField):
         self._reacts, self._adds = bool(rows), bool(rows) or world_has_several_solids
 
     def follow(self, motion):
-        """Evaluate rates of fields from now on, with the caller's ``motion`` and ``source_motion``.
+        """Evaluate the rates of change of fields from now on. The caller writes ``motion`` and ``source_motion``.
 
         Args:
-            motion: Motion of the moments (``eddy.eddy.MOTION_ROWS``), written by the caller, shape [8, n].
+            motion: Motion of the moments (``eddy.eddy.MOTION_ROWS``), shape [8, n].
         """
         arrays, sources = self.arrays, self.sources
         self.rates = arrays.targets.rate = wp.zeros_like(self.field)

@@ -80,8 +80,8 @@ CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
     return axisymmetric_field(x, e, at.axial(), -e - zz, f, zz);
 }
 
-// Returns whether x is less than w away from the circle of radius a about the z axis at ``height``. If so, writes the
-// point in the wire and the surface point.
+// Returns true if x is less than w away from the circle of radius a about the z axis at ``height``. In that case writes
+// the point in the wire and the surface point.
 CUDA_CALLABLE inline bool within_ring(double a, double w, double height, Point x, InWire& wire, Point& surface) {
     const double rho = sqrt(x.x * x.x + x.y * x.y), outward = rho - a, upward = x.z - height,
                  d = sqrt(outward * outward + upward * upward);

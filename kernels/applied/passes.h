@@ -1,11 +1,11 @@
 // Passes over targets and sources: fields at targets, fields about balls, and the reactions on sources.
 //
-// Fields and forces of a permanent body are corrections: its closed form less its lattice, which the sums over pairs
-// have already. On a CPU a pass works on a vector of targets or points. On a GPU a group of threads shares a target, a
-// ball, a row of targets, or a body.
+// Fields and forces of a permanent body are corrections, its closed form less its lattice: the sums over pairs contain
+// the lattice already. On a CPU a pass works on a vector of targets or points. On a GPU a group of threads shares a
+// target, a ball, a row of targets, or a body.
 //
-// Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, BALLS and RATES. PASS is the only pass
-// of a GPU's kernel, −1 on a CPU. ``Arrays`` is the struct of sources.py.
+// Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, BALLS and RATES. On a GPU a kernel runs
+// the one pass PASS; on a CPU PASS is −1 and a kernel runs several. ``Arrays`` is the struct of sources.py.
 #pragma once
 #include "applied/balls.h"
 #include "applied/body_pairs.h"
@@ -40,8 +40,8 @@ template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& ar
     return at;
 }
 
-// Returns the field of every ``step``-th coil or map of a list at targets, and writes into ``acting`` the field and
-// gradient of those on other bodies.
+// Returns the field of every ``step``-th coil or map of a list at targets. Writes into ``acting`` the field and
+// gradient of the coils and maps on other bodies.
 template <class Arrays>
 CUDA_CALLABLE inline Vector add_coil_fields(const Arrays& arrays, const int* list, int begin, int step, int count,
                                             const Targets& at, int held, TargetField& acting) {
@@ -66,7 +66,7 @@ template <class Arrays> CUDA_CALLABLE inline Mask within_reach(const Body& body,
     return mask_of(at.corrected != 0) & (box_distance2(body, body.pose.point_to_body(at.x)) < body.reach * body.reach);
 }
 
-// Writes the fields at a vector of targets; POINTS: they are points of a probe, not moments.
+// Writes the fields at a vector of targets. POINTS is true for points of a probe, false for moments.
 template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(const Arrays& arrays, int row) {
     // first target, number of targets, and range of permanent bodies in their world
     const auto& chunk = arrays.targets.chunk.data[row / CHUNK];
@@ -112,7 +112,7 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
     if constexpr (RATES) put_vectors((Real*)arrays.targets.rate.data + column, held, rate);
 }
 
-// Wrench of source s on the targets of a row, whose opposite is the reaction on the source.
+// Wrench of source s on the targets of a row. The reaction on the source is the opposite.
 template <class Arrays>
 CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const Body& body, int first, int last) {
     Wrench wrench = zero_wrench();
@@ -139,7 +139,7 @@ CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const
 }
 // Writes the reaction of a row of targets, or balls, on its source.
 template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, int row) {
-    const auto& range = arrays.row.data[row]; // source, range of targets, whether these are balls
+    const auto& range = arrays.row.data[row]; // source, range of targets or balls, 1 for balls
     const int s = range[0], coils = arrays.coils.kind.shape[0];
     const Body body = SOLIDS && s >= coils ? body_at(arrays, s - coils) : Body{};
     Real3 force = {0, 0, 0}, torque = force;
@@ -166,8 +166,8 @@ template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, in
     add_force_torque(out, force, torque, -MU0);
 }
 
-// Adds the wrenches of other permanent bodies on body b. Of two bodies the surface charges of the smaller one are
-// summed for both, so that action and reaction have the same bits.
+// Adds the wrenches of other permanent bodies on body b. For both bodies of a pair, the surface charges of the smaller
+// body are integrated, so that action and reaction are equal to the last bit.
 template <class Arrays>
 CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&total)[WRENCH_ROW]) {
     const Body body = body_at(arrays, b);

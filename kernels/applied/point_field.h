@@ -1,5 +1,5 @@
-// Field and gradient at one point in the frame of a coil or field map. All of it is in double precision: closed forms
-// are differences of large numbers, and few terms are summed.
+// Field and gradient at one point in the frame of a coil or field map. All numbers are in double precision, because
+// closed forms are differences of large numbers. The cost is small, because few terms are summed.
 #pragma once
 #include "pairs/pair_terms.h"
 

@@ -12,7 +12,8 @@
 // Their gravity is G; by Poisson's theorem the field of M is minus the gradient of M·G.
 //
 // Near an edge and on its line r − τ cancels, and is written as ρ²/(r + τ). Here ρ is the distance from the line, and τ
-// the distance along it. Targets nearer to an edge than ``least`` count as that far away, which bounds the gradient.
+// the distance along it. Targets nearer to an edge than the distance ``least`` count as that far away, which bounds the
+// gradient; ``least2`` is its square.
 #pragma once
 #include "shared/group.h"
 
@@ -163,7 +164,7 @@ CUDA_CALLABLE inline Vector potentials_of(const Solid& solid, Vector x) {
     return (zero + Real(0.07957747154594767)) * g;
 }
 
-// Whether x lies inside, in the frame of the solid.
+// Mask of the points x inside the solid, in its frame.
 CUDA_CALLABLE inline Mask inside_of(const Solid& solid, Vector x) {
     Mask inside = x.x == x.x;
     for (int f = 0; f < solid.faces; ++f) {

@@ -38,8 +38,8 @@ CUDA_CALLABLE inline Pose pose_from(const Real* at) {
 }
 
 // A permanent body. Its closed form has the magnetization ``m`` in the body's frame, and ``m_world`` in the world. If
-// the body responds to fields, that is the magnetization that its remanence alone gives a ball, whatever its moments
-// are.
+// the body responds to fields, this is the magnetization of a ball by the remanence alone, without the part that fields
+// induce.
 struct Body {
     Solid solid;
     Pose pose;
@@ -55,9 +55,9 @@ template <class Arrays> CUDA_CALLABLE inline Real3 packed_real3(const Arrays& ar
 }
 template <class Arrays> CUDA_CALLABLE inline Body body_at(const Arrays& arrays, int b) {
     const int* const row =
-        arrays.solids.body.data + 4 * (size_t)b; // shape, first moment, number of moments, whether it responds
+        arrays.solids.body.data + 4 * (size_t)b; // shape, first moment, number of moments, 1 if it responds
     const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)row[0];
-    // 1/V of the first moment or factor of its bias, reach, radius, box_center, box_half
+    // 1/V of the first moment, or k if the body responds; reach, radius, box_center, box_half
     const Real* const size = arrays.solids.size.data + SIZE_ROW * (size_t)b;
     const Solid solid = {arrays.solids.edge.data + EDGE_ROW * (size_t)tables[0],
                          arrays.solids.face.data + FACE_ROW * (size_t)tables[2],
@@ -85,7 +85,8 @@ template <class Arrays> CUDA_CALLABLE inline Body body_at(const Arrays& arrays, 
             row[3]};
 }
 
-// Moment j of a body's lattice, as far as the closed form stands for it.
+// Moment j of a body's lattice that the closed form replaces. If the body responds to fields, only the part by the
+// remanence.
 template <class Arrays> CUDA_CALLABLE inline Real3 moment_at(const Arrays& arrays, const Body& body, int j) {
     if (!body.responds) return packed_real3(arrays, 4, j);
     const Real radius = packed_at(arrays, 3, j), volume = Real(4.18879020478639) * radius * radius * radius;

@@ -10,7 +10,7 @@ Bodies of one shape share its tables:
 
 Each body has a row in two tables:
 
-    body: Shape, first moment, number of moments, and whether it responds to fields, shape [bodies, 4].
+    body: Shape, first moment, number of moments, and 1 if it responds to fields, shape [bodies, 4].
     size: 1/V of its first moment [1/m³], or the response k of a body that responds; reach, radius of the bounding
         sphere, center and half sides of the box [m], shape [bodies, 9].
 """
@@ -30,8 +30,8 @@ INTEGER_TABLES = ("shape", "begin", "body")
 class SolidMagnet:
     """A permanent body whose field near it has a closed form.
 
-    The body is uniformly magnetized, or responds to fields. Then induction solves for its moments, and the closed form
-    has the magnetization that the remanence alone gives a ball.
+    The body is uniformly magnetized, or responds to fields. If it responds, induction solves for its moments, and the
+    closed form has the magnetization of a ball by the remanence alone.
 
     Attributes:
         first, count: First moment, and number of moments.
@@ -39,7 +39,7 @@ class SolidMagnet:
         world: Its world.
         reach: Distance up to which the closed form is used [m].
         shape: The ``warpmag.shapes.polyhedra.Polyhedron`` that bounds it, in the frame of its body.
-        movable: Whether the force on it is computed.
+        movable: True if the force on it is computed.
         response: k = 3χ/(3 + χ) if it responds to fields, else 0.
     """
 
@@ -67,7 +67,7 @@ class SolidMagnet:
 
 
 def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
-    """Return all tables of some bodies, with more points on faces if ``fine``."""
+    """Return all tables of the bodies ``solids``, with more points on faces if ``fine``."""
     shapes = {id(solid.shape): solid.shape for solid in solids}
     number = {key: k for k, key in enumerate(shapes)}
     rows, tables = _shape_tables(shapes.values(), fine)

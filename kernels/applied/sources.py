@@ -14,7 +14,7 @@ import warp as wp
 from warpmag.kernels.applied.solids import INTEGER_TABLES, tables_of
 
 PARAMETERS = 9
-"""Most parameters of a source, beside its table."""
+"""Largest number of parameters of a source, in addition to its table."""
 
 
 class SourceKind(IntEnum):
@@ -31,11 +31,11 @@ class AppliedSource(NamedTuple):
 
     Attributes:
         kind: Its kind.
-        parameters: Its numbers, at most ``PARAMETERS``.
-        table: Its vectors, shape [k, 3]; sources with the same array object share it.
+        parameters: Numbers that its kind defines, at most ``PARAMETERS``.
+        table: Vectors that its kind defines, shape [k, 3]; sources with the same array object share it.
         world: World of the moments that it acts on; -1 means all worlds.
         body: Body that it is fixed to, numbered like the bodies of moments; -1 means none.
-        pushed: Whether the reaction on it is computed.
+        pushed: True if the reaction on it is computed.
     """
 
     kind: SourceKind
@@ -69,7 +69,7 @@ def coil_arrays_type(dtype):
         # Coils and maps, shape [coils]:
         kind: wp.array[int]
         parameters: wp.array2d[wp.float64]  # shape [coils, PARAMETERS]
-        table: wp.array[wp.vec3d]  # the tables of all, concatenated
+        table: wp.array[wp.vec3d]  # tables of all coils and maps, concatenated
         table_begin: wp.array[int]
         table_end: wp.array[int]
         label: wp.array[dtype]  # body, as in packed moments
@@ -119,7 +119,7 @@ def target_arrays_type(dtype):
     class TargetArrays:
         # Data in, shape [t]:
         packed: wp.array2d[dtype]  # packed targets, shape [8, t]
-        corrected: wp.array[int]  # 0 of moments of permanent bodies, 1 of others
+        corrected: wp.array[int]  # 0 for moments of permanent bodies, 1 for others
         base: wp.array[vec3]  # field that is added to [A/m]
         # Chunks of targets, each in one world, shape [chunks]:
         chunk: wp.array[wp.vec4i]  # first target, number of targets, range of permanent bodies
@@ -162,12 +162,12 @@ def source_arrays_type(dtype):
         # All moments:
         packed: wp.array2d[dtype]  # shape [8, n]
         effective: wp.array2d[dtype]  # effective moments of the force, shape [3, n]
-        motion: wp.array2d[dtype]  # ``pairs.eddy`` describes its rows, shape [8, n]
+        motion: wp.array2d[dtype]  # ``eddy.eddy`` describes its rows, shape [8, n]
         # Reactions on sources:
         row: wp.array[wp.vec4i]  # source, range of targets or balls, 1 for balls
         row_begin: wp.array[int]  # first row of each source
         partial: wp.array2d[dtype]  # force and torque of each row, shape [rows, 6]
-        wrench: wp.array2d[dtype]  # force, torque, half an energy of each source, shape [sources, 7]
+        wrench: wp.array2d[dtype]  # force, torque and half the energy of each source, shape [sources, 7]
 
     return SourceArrays
 
@@ -190,7 +190,7 @@ class FieldSources:
         strengths: Strength of each coil and map, as its kind defines it, vectors, shape [coils]; written by the caller.
         solid_frames: Frames of the permanent bodies, transforms, shape [bodies]; written by the caller.
         solid_worlds: World of each permanent body, NumPy.
-        lists: Begin of each world's coils and maps in their list, and the end, NumPy.
+        lists: First entry of each world in ``coil_arrays.list``, and the end of the list, NumPy.
     """
 
     def __init__(self, applied, solids, packed, world_count: int, bias=None):
@@ -246,7 +246,7 @@ class FieldSources:
         return np.stack([np.searchsorted(self.solid_worlds, worlds, side) for side in ("left", "right")], axis=-1)
 
     def _copy(self, values, kind) -> wp.array:
-        """Return an array on the device, from integers where ``kind`` has integers."""
+        """Return an array on the device, of integers or floating-point numbers as ``kind`` requires."""
         is_integer = kind in (wp.int32, wp.vec2i)
         values = np.ascontiguousarray(values, np.int32 if is_integer else float)
         return wp.array(values, dtype=kind, device=self.device)

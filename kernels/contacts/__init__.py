@@ -1,10 +1,10 @@
 """Contact solver for rigid bodies: broad phase, contact law, XPBD iterations over contacts and joints.
 
-An alternative to Newton's ``SolverXPBD`` on Newton's bodies, contacts and joints, without any magnetism. It gives
+An alternative to Newton's ``SolverXPBD`` on Newton's bodies, contacts and joints, without any magnetism:
 
-* conserved momentum and angular momentum, with static friction that does not creep and no rest threshold;
-* bitwise repeatable results: every sum has a fixed order, whatever the order of threads;
-* convergence in half the iterations, by accumulated impulses with Nesterov's momentum.
+* Momentum and angular momentum are conserved, static friction does not creep, and there is no rest threshold.
+* Results are bitwise repeatable: sums have a fixed order, for any order of threads.
+* It converges in half the iterations, by accumulated impulses with Nesterov's momentum.
 
 | module | contents |
 |---|---|

@@ -26,7 +26,7 @@ template <class Arrays> CUDA_CALLABLE inline Real contact_distance(const Arrays&
     return arrays.margin.data[a] + arrays.margin.data[b] + (gap > ahead ? gap : ahead) + rounding;
 }
 
-// True if two boxes are farther apart than contacts are detected.
+// True if two boxes are farther apart than the distance up to which contacts are detected.
 template <class Arrays> CUDA_CALLABLE inline bool boxes_separated(const Arrays& arrays, int a, int b) {
     const wp::transform from = arrays.frame.data[a], to = arrays.frame.data[b];
     const wp::vec3 size = arrays.scale.data[a], other = arrays.scale.data[b];

@@ -2,8 +2,8 @@
 // of balls.
 //
 // Targets are the balls, then the other shapes, numbered as in broad_phase.py. A ball finds other balls in its neighbor
-// list. The boxes of other shapes are columns of a table, so that a vector of them is read at once. Shapes of all
-// worlds come first.
+// list. The boxes of other shapes are columns of a table, so that a vector of them is read at once. Shapes that belong
+// to all worlds come first.
 #pragma once
 #include "contacts/ball_contacts.h"
 #include "contacts/box_gap.h"
@@ -53,9 +53,9 @@ template <class Lists> inline void find_search_distance(const Lists& lists) {
 }
 #endif
 
-// Stores the swept box of a shape, or for a ball the center and radius of a ball that encloses it throughout the
-// substep, and whether its neighbor list is out of date. For a ball that moves farther than ``farthest``, the enclosing
-// ball is at its present position, with that distance added to its radius.
+// Stores the swept box of a shape. For a ball, stores the center and radius of a ball that encloses it throughout the
+// substep, and sets a flag if its neighbor list is out of date. For a ball that moves farther than ``farthest``, the
+// enclosing ball is at the present position, and that distance is added to the radius.
 template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arrays, int target) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     if (target >= balls) {

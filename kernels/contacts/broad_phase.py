@@ -30,8 +30,8 @@ from warpmag.kernels.shared.team import team, threads_for
 _SKIN = 0.3
 """Fraction of its radius that a ball may move before the neighbor lists are rebuilt."""
 _LARGEST = 2.0
-"""Radius [median radii] beyond which a ball is compared with all targets, like other shapes: the largest radius of the
-others sets the width of the search's cells."""
+"""Radius [median radii] beyond which a ball is compared with all targets, like other shapes: the largest radius in the
+neighbor lists sets the width of the search's cells."""
 _PADDING = 16
 """Boxes that vectors may read after the last one."""
 _TARGETS_PER_THREAD = 120
@@ -43,7 +43,7 @@ _MOST_COMPARISONS = 2e7
 _FEW = 25_000
 """Shapes beyond which the limit grows as N^(5/3), like the comparisons of Newton's sort."""
 _MANY = 64
-"""Other shapes from which on a warp of a GPU shares a target, instead of a group of threads."""
+"""Fewest other shapes with which a warp of a GPU shares a target, instead of a smaller group of threads."""
 _BLOCK = 128
 _RESULTS, _RESULT_SIZE = 16 * _TARGETS_AT_ONCE, 12
 """Results that a chunk of targets can buffer, and the numbers of each, as in ``broad_phase.h``."""

@@ -5,10 +5,11 @@
 // bodies with their new velocities, x' = x + dt v', so these are conditions on velocities. They are linear in the
 // rotation during a substep, which is exact for balls. Five things differ from Newton's kernels:
 //
-// 1. Accumulated impulses. A contact keeps the sum of its impulses, and an iteration may reduce it, down to zero normal
-//    impulse: projected gradients with Nesterov's momentum (Mazhar, Heyn, Negrut and Tasora 2015, "Using Nesterov's
-//    Method to Accelerate Multibody Dynamics with Friction and Contact"). Newton's iterations only ever add, and end at
-//    some state without overlap. These converge to the smallest impulses that prevent overlap.
+// 1. Accumulated impulses. A contact keeps the sum of its impulses, and an iteration may reduce it, down to zero
+//    normal impulse: projected gradients with Nesterov's momentum (Mazhar, Heyn, Negrut and Tasora 2015, "Using
+//    Nesterov's Method to Accelerate Multibody Dynamics with Friction and Contact"). Newton's iterations only add
+//    impulses, and end at some state without overlap. The iterations here converge to the smallest impulses that
+//    prevent overlap.
 //
 // 2. Penetration recovery. Overlapping bodies separate at RECOVERY_SPEED (from Python) at most. So bodies that were
 //    placed into each other do not fly apart.
@@ -20,14 +21,13 @@
 //
 // 4. No rest threshold. Low speeds are not set to zero.
 //
-// 5. Static friction with memory. A sticking contact stores its accumulated slip and returns by it. Iterations that
-// stop
-//    early leave a little slip, in every substep in the same direction, so that heaps would creep. Overlap needs no
-//    such memory: the next substep sees it. The slip, as well as the accumulated rolling and spinning angle, is stored
-//    as long as the surfaces touch (Cundall and Strack 1979, "A Discrete Numerical Model for Granular Assemblies"). At
-//    sliding contacts it is limited to the slip that the full friction force can return. The memory is a displacement,
-//    not an impulse: impulses carried over from the last substep would include those that removed overlap, and throw a
-//    chain of 1,000 balls apart.
+// 5. Static friction with memory. A sticking contact stores its accumulated slip, and the surfaces return by that
+//    slip. Iterations that stop early leave a little slip, in every substep in the same direction, so that heaps
+//    would creep. Overlap needs no such memory: it is detected again in the next substep. The slip, as well as the
+//    accumulated rolling and spinning angle, is stored as long as the surfaces touch (Cundall and Strack 1979, "A
+//    Discrete Numerical Model for Granular Assemblies"). At sliding contacts it is limited to the slip that the full
+//    friction force can return. The memory is a displacement, not an impulse. Impulses from the last substep would
+//    include those that removed overlap, and throw a chain of 1,000 balls apart.
 //
 // A contact is evaluated from one of its two bodies, called the own body. Evaluated from the other body, its impulses
 // are opposite to the last bit.
@@ -73,8 +73,8 @@ struct Inertia {
 };
 // A detected contact, from the own body's side. ``point`` and ``surface`` are relative to the centers of mass, in the
 // frames of the bodies: the contact point, and the point on the surface where friction acts. ``normal`` points from the
-// other body to the own one, ``margin`` is the sum of the margins. Then the coefficients of friction, and 1 for each
-// body that is kinematic, else 0.
+// other body to the own one, ``margin`` is the sum of the margins. ``mu``, ``torsional`` and ``rolling`` are
+// coefficients of friction. ``kinematic`` and ``other_kinematic`` are 1 if the body is kinematic, else 0.
 struct DetectedContact {
     Vector point, other_point, surface, other_surface, normal;
     Number margin, mu, torsional, rolling, kinematic, other_kinematic;
@@ -169,8 +169,8 @@ CUDA_CALLABLE inline Contact prepare_contact(const DetectedContact& t, const Pos
     c.arm = surface - divide_or_zero(other_body.inv_mass, total) * surfaces_apart;
     c.other_arm = other_surface + divide_or_zero(body.inv_mass, total) * surfaces_apart;
     const Vector points = rotate(own.q, t.point) - rotate(other.q, t.other_point);
-    // a kinematic body is already at its pose of the substep's end, yet its surface moves with its velocity: without
-    // that velocity the gap is the one that contacts were detected with
+    // a kinematic body is already at its pose of the substep's end, but its velocity still moves its surface: the
+    // velocity is subtracted, so that the gap closes by the motion of other bodies only
     const Vector own_velocity = body.v + cross(body.omega, c.arm);
     const Vector other_rotation = cross(other_body.omega, c.other_arm);
     const Vector other_velocity = other_body.v + other_rotation;
@@ -234,7 +234,7 @@ CUDA_CALLABLE inline Impulse iterate_contact(const Contact& c, const Body& own, 
     impulse = {now, extrapolated};
     return added;
 }
-// Accumulated slip of a contact [m, rad] at the end of a substep whose iterations ended at the impulse p.
+// Accumulated slip of a contact [m, rad] at the end of a substep, with the impulse p after the last iteration.
 CUDA_CALLABLE inline Slip accumulated_slip(const Contact& c, const Body& own, const Body& other, Impulse p,
                                            Real relaxation, Real dt) {
     const Slip velocity = relative_velocity(c, own, other);

@@ -1,8 +1,9 @@
 """Motion of free bodies in a substep: forces and torques change velocities, then velocities change poses.
 
-Contacts are solved between the two, at the poses at which they were detected. Both halves together are symplectic Euler
-for centers of mass. Angular momentum is conserved to rounding: the new angular velocity is the one that the body's
-angular momentum implies at its new orientation. Newton adds an explicit gyroscopic term instead, and damps rotation.
+Contacts are solved between these two changes, at the poses at which they were detected. Both changes together are
+symplectic Euler for centers of mass. Angular momentum is conserved to rounding: the new angular velocity is the one
+that the body's angular momentum implies at its new orientation. Newton adds an explicit gyroscopic term instead, and
+damps rotation.
 """
 
 import warp as wp

@@ -33,24 +33,24 @@ _STEPS = wp.constant(16384.0)
 @wp.func
 def _cholesky(a: wp.mat33) -> wp.mat33:
     """Return the Cholesky factor L, L Lᵀ = a, of a positive semidefinite matrix; zero rows stay zero."""
-    r = wp.mat33()
+    factor = wp.mat33()
     for j in range(3):
         d = a[j, j]
         for k in range(j):
-            d -= r[j, k] * r[j, k]
+            d -= factor[j, k] * factor[j, k]
         if d > 1.0e-6 * a[j, j]:
-            r[j, j] = wp.sqrt(d)
+            factor[j, j] = wp.sqrt(d)
             for i in range(j + 1, 3):
                 t = a[i, j]
                 for k in range(j):
-                    t -= r[i, k] * r[j, k]
-                r[i, j] = t / r[j, j]
-    return r
+                    t -= factor[i, k] * factor[j, k]
+                factor[i, j] = t / factor[j, j]
+    return factor
 
 
 @wp.func
 def _row(arm: wp.vec3, n: wp.vec3, inv_mass: float, root: wp.mat33) -> wp.spatial_vector:
-    """Return M^-½ Jᵀ of an impulse along n at a lever arm, in the body's frame."""
+    """Return M^-½ Jᵀ of an impulse along n at a lever arm, in the body's frame, with I⁻¹ = ``root`` ``root``ᵀ."""
     return wp.spatial_vector(wp.sqrt(inv_mass) * n, wp.transpose(root) * wp.cross(arm, n))
 
 
@@ -179,8 +179,8 @@ def launch_find_shares(
         bodies: Bodies as contacts were detected, with their velocities without contacts.
         splits: 1 for bodies that may be divided, shape [bodies].
         entries: Work array of zeros, zero again afterwards, shape [``ENTRIES``, bodies].
-        shares: Out, number of shares, at least 1, shape [bodies]. Contacts count that are closed, nearly closed, or may
-            close in the substep.
+        shares: Out, number of shares, at least 1, shape [bodies]. Only contacts count that are closed, nearly closed,
+            or may close in the substep.
         relaxation: Fraction of its correction that each contact applies in an iteration.
         dt: Length of the substep [s].
     """

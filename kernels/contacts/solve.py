@@ -25,8 +25,7 @@ FRICTION, MOMENTUM = 0.35, 0.8
 """Relaxation of friction relative to that of normal impulses, because friction also rotates balls; and the largest
 Nesterov momentum of an iteration."""
 _GROUPS = ((100, 32), (400, 16), (6_000, 8), (20_000, 4), (2**31, 2))
-"""Threads of a GPU that share a body, as (most bodies, threads): the fastest ones with three contacts a body on an
-H200."""
+"""Threads of a GPU that share a body, as (most bodies, threads): fastest with three contacts per body on an H200."""
 _CLUSTER, _CLUSTER_CAPACITY, _SIDES_PER_BLOCK = 16, 50_000, 375
 """Blocks of a cluster; most contacts that it lists; and most sides per block that it iterates over. With more, launches
 are faster: Balls Up (1,500 sides) takes a third of a launch, Falling Magnet (10,000) takes longer."""
@@ -36,8 +35,8 @@ block's shared memory."""
 _BLOCK, _WIDE_BLOCKS = 128, 64
 """Threads of a block; and blocks for wide bodies, which a whole block shares."""
 _WIDE = 16, 4, 64
-"""A body is wide with more contacts than 16 + 4 for each thread of its group, 64 at most. So Letters, with up to 140
-contacts a body, takes 0.12 ms on an H200; it takes 0.14 ms where groups of 32 threads solve all bodies."""
+"""A body is wide with more contacts than 16 + 4 for each thread of its group, 64 at most. A solve of Letters, with up
+to 140 contacts per body, takes 0.12 ms on an H200, and 0.14 ms without wide bodies, in groups of 32 threads."""
 _CONTACTS_PER_THREAD = 100
 """Contacts that justify another thread of a CPU: an iteration over them takes 1 to 2 µs."""
 _ROUND = 1e-6
@@ -76,7 +75,7 @@ class SolveArrays:
         key: GPU: shapes of each side, shape [2P].
         other: GPU: line of the other body, then contact of each side, shape [2, 2c]. CPU: lines of the first and second
             body, then their records, shape [P / CHUNK, 4, CHUNK].
-        wide: GPU: lines of wide bodies, shape [b]. CPU: 1 where the records of a vector of contacts are zero.
+        wide: GPU: lines of wide bodies, shape [b]. CPU: 1 for each vector of contacts whose records are zero.
         world_first: First body of each world that has a block, and the one after the last, shape [worlds + 1].
         motion, next_motion: Lines of velocities, inverse masses and inertias, before and (GPU) after an iteration,
             shape [l, LINE].
@@ -131,7 +130,7 @@ class SolveBuffers:
         counters: ``totals``, ``side_count`` and ``filled`` in one array.
         round: True if every body has the same inertia about all axes.
         group: Threads of a GPU that share a body, 0 on a CPU.
-        cluster: Blocks of a GPU's cluster that lists the contacts and solves few of them; 0 for launches.
+        cluster: Blocks of a GPU's cluster, which lists the contacts and solves small scenes; 0 for launches.
         limit: Most threads of a CPU, or most sides that a cluster solves.
         worlds: Worlds that have a block of a GPU each, 0 for none.
         world_lines: Bodies that fit into such a block.
@@ -247,8 +246,8 @@ _ARGUMENTS = {
     **{"arrays": SolveArrays, "number": int, "relaxation": float, "dt": float, "limit": int},
     "team": wp.array2d[wp.uint64],
 }
-"""Arguments of the kernels. ``number`` is that of iterations or of one of them; ``limit`` one of threads, iterations or
-sides."""
+"""Arguments of the kernels. ``number`` is the number of iterations; in ``ITERATE`` the index of one; in ``FINISH`` 1 if
+their number is odd. ``limit`` is a number of threads, iterations or sides, as the call requires."""
 
 
 @cache

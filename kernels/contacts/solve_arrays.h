@@ -1,4 +1,4 @@
-// Arrays of the contact solver, and how contacts and bodies are read from them and written to them.
+// Arrays of the contact solver, and functions that read and write contacts and bodies.
 //
 // solve.py documents the arrays. Each participating body has a line of ``motion`` and of ``pose``, a cache line long.
 // Lines of bodies that contacts can move come first, without gaps. Lines of the immovable bodies that they touch
@@ -55,10 +55,11 @@ struct Arrays {
     CUDA_CALLABLE bool has_friction(int c) const { return mu[shape0[c]] + mu[shape1[c]] > 0; }
 };
 
-// Numbers of a contact, its return velocity, its accumulated impulse, a record, and the slip kept of a side.
+// Numbers of a contact, its return velocity, its accumulated impulse, a record, and a kept slip.
 constexpr int CONTACT_SIZE = 20, RETURN_SIZE = 8, IMPULSE_SIZE = 12, RECORD_SIZE = 8, KEPT_SIZE = 9;
 
-// Reading and writing by fours: the argument reads or writes quarter q of a line, four numbers.
+// Functions that read and write by fours. Their argument is a function that reads or writes quarter q of a line, four
+// numbers.
 template <class Fours> CUDA_CALLABLE inline Body read_body(Fours motion) {
     const Four a = motion(0), b = motion(1);
     return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, a.w, b.w};
@@ -203,7 +204,7 @@ CUDA_CALLABLE inline void write_detected(const Arrays& a, int c, int end, Real* 
     place[19 * stride] = a.is_kinematic(own_body) + 2 * a.is_kinematic(other_body);
 }
 
-// Stores the range of sides that are kept of body b.
+// Stores the range of the kept sides of body b.
 CUDA_CALLABLE inline void keep_range(const Arrays& a, int b, int first, int last) {
     a.kept_range[2 * (size_t)b] = first;
     a.kept_range[2 * (size_t)b + 1] = last;

@@ -195,9 +195,8 @@ __device__ inline void solve_tasks(const Arrays& a, const Plan& plan, BlockMemor
     }
 }
 
-// Solves a scene in one launch. With more than ``most`` sides or more bodies than fit, it only makes the lists, and
-// sets
-// ``totals[UNSOLVED]``.
+// Solves a scene in one launch. With more than ``most`` sides, or more bodies than fit, it only makes the lists and
+// sets ``totals[UNSOLVED]``.
 __device__ inline void solve_in_cluster(const Arrays& a, int iterations, int most, Real relaxation, Real dt) {
     __shared__ BlockMemory memory;
     build_lists(a, relaxation, dt);

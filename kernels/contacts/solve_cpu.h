@@ -15,7 +15,7 @@ struct Lists {
     int contacts, bodies, lines;
     bool frictional;
 };
-// Lists the contacts that move a body, assigns lines to bodies and counts the sides of each. One thread does it.
+// Lists the contacts that can move a body, assigns lines to bodies and counts the sides of each body, in one thread.
 inline Lists list_contacts(const Arrays& a) {
     Lists lists = {0, 0, 0, false};
     for (int b = 0; b < a.body_count; ++b) a.side_count[b] = 0, a.slot[b] = -1;

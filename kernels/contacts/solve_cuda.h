@@ -1,9 +1,9 @@
-// The contact solver on a GPU: a group of threads shares a body and loops over its contacts. Each iteration is a
+// The contact solver on a GPU. A group of threads shares a body and loops over its contacts. Each iteration is a
 // launch.
 //
 // Both bodies of a contact compute its impulse from the velocities after the last iteration. So no atomics are needed,
 // and no block waits for another. The positions of bodies and of their lists depend on the order of threads. Results do
-// not: the contacts of a body are sorted by their shapes and points.
+// not depend on it: the contacts of a body are sorted by their shapes and points.
 #pragma once
 #include "contacts/solve_arrays.h"
 #include "shared/group.h"

@@ -175,7 +175,8 @@ CUDA_CALLABLE inline void subtract_own_field(State& state, const Bodies& bodies,
     for_cells(body, cells, [&](Cell& cell) { cell.outside = cell.outside - weight * turned(rotation, cell.field); });
 }
 
-// Reads the cells of body b, in the field that was summed, or in the extrapolated field at the start of a solve.
+// Reads the cells of body b, with the summed field as outside field. At the start of a solve the outside field is the
+// applied field, or is extrapolated from the last solves.
 template <class State, class Bodies>
 CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, const Body& body, Cell* cells,
                                      bool begin, const Rotation& rotation) {

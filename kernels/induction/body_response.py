@@ -1,4 +1,4 @@
-"""Collective response of bodies of few cells: their magnetization in the field of everything else is solved for.
+"""Collective response of bodies of few cells: the equilibrium of all cells of a body in the field of everything else.
 
 Within a body of highly permeable cells, long waves of magnetization are slow modes of the θ flow. A slender body would
 take tens of evaluations of the whole field, and its warm starts several. The coupling of its cells, however, is a
@@ -7,7 +7,7 @@ replaced by the field after the cells' response to the outside field H − T m. 
 
     s = (k/Ms) (H − T m + T m(s)),    m(s) = V Ms c(‖s‖) ŝ.
 
-The θ flow then goes on as for isolated balls, whose response is exact, too: its residual and its error estimate are
+The θ flow then continues as for isolated balls, where the response is exact, too. Its residual and error estimate are
 those of the response. With E = √(k V D), D the derivative of c(‖s‖) ŝ by s, Newton's step is r + (k/Ms) T E z, where r
 is the residual. A few conjugate gradients solve the symmetric positive definite system
 
@@ -19,9 +19,9 @@ is rejected; the energy decreases for small enough steps.
 A warm start extrapolates the field of everything outside a body, with neighbors at their present positions, and solves
 for the response in the present rotation.
 
-Tables hold, for each shape, tensors T_ij [1/m³] between all of its cells: first the full ones, then those of the pair
-law, which the sums over pairs contain. For each chunk of ``CHUNK`` cells and each cell j there are rows xx, yy, zz, xy,
-xz, yz of ``CHUNK`` numbers.
+Tables hold, for each shape, tensors T_ij [1/m³] between all of its cells: first the full tensors, then the tensors of
+the pair law, which the sums over pairs contain. For each chunk of ``CHUNK`` cells and each cell j there are rows xx,
+yy, zz, xy, xz, yz of ``CHUNK`` numbers.
 """
 
 from dataclasses import dataclass
@@ -151,8 +151,8 @@ class BodyResponses:
         b.tensor, b.hardness, b.rotation = put(np.concatenate(tables), dtype), cells.hardness, cells.rotations
         b.past = wp.zeros((2, len(bodies)), dtype=wp.types.quaternion(dtype), device=device)
         self.cell_count = sum(body.cell_count for body in bodies)
-        cell = np.concatenate([body.first + np.arange(body.cell_count) for body in bodies])
-        state.responds.assign(np.isin(np.arange(len(state.responds)), cell).astype(np.int32))
+        responding = np.concatenate([body.first + np.arange(body.cell_count) for body in bodies])
+        state.responds.assign(np.isin(np.arange(len(state.responds)), responding).astype(np.int32))
         self.begin, self.respond = (self._record(state, begin, bodies) for begin in (1, 0))
 
     def _record(self, state, begin: int, bodies: list[RespondingBody]):

@@ -24,8 +24,8 @@ CUDA_CALLABLE inline double relative_residual(double deviation2, double goal2) {
     return goal > 0.0 ? deviation / goal : deviation;
 }
 
-// Records an evaluation, and returns whether the world ends with it. A state that is not finite makes the next solve
-// start cold.
+// Records an evaluation. Returns true if it is the last evaluation of the world. After a state that is not finite the
+// next solve starts cold.
 template <class State>
 CUDA_CALLABLE inline bool check_convergence(State& state, int w, double residual, double error, bool finite,
                                             bool hopeless) {

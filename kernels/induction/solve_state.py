@@ -10,7 +10,7 @@ The state of n moments, m of them inducible, in w worlds and c chunks:
     saturation, slope, curve: Materials (``curves.CurveParameters``).
     rtol: Error at which a world ends.
     max_evaluations: Field evaluations after which a world ends unconverged.
-    responds: Whether a moment is a cell of a body with a collective response (``body_response``), shape [n].
+    responds: 1 for cells of bodies with a collective response (``body_response``), shape [n].
     row: Moment, world, and range of the world's inducible moments, for each inducible moment, shape [m].
     chunk: Range of rows, and world, of each chunk, shape [c].
     chunk_begin: First chunk of each world, shape [w + 1].
@@ -23,7 +23,7 @@ The state of n moments, m of them inducible, in w worlds and c chunks:
     history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
     best_s, best_r: Iterate of the smallest merit, and its residual, shape [n].
     step: Step length of each moment, shape [n].
-    mixed_g: Reduced field of the mixed iterate, as far as it is known, shape [n].
+    mixed_g: Reduced field of the mixed iterate, without the changes that the sweeps add, shape [n].
     mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
     past_field, past_g: Field of the inducible moments at the last two solutions [A/m], and the reduced total field; the
         last first, shape [2, n].
@@ -35,8 +35,8 @@ The state of n moments, m of them inducible, in w worlds and c chunks:
     warm: Number of solves of each world since its cold start, at most ``STEADY``, shape [w].
     residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w].
     error: Relative error of each world: the estimate of ``theta_flow``, or the residual of a baseline, shape [w].
-    evaluations, converged: Number of evaluations of the last solve, and whether it converged, shape [w].
-    condition: Whether any world still iterates, shape [1].
+    evaluations, converged: Number of evaluations of the last solve, and 1 if it converged, shape [w].
+    condition: 1 while any world iterates, shape [1].
 """
 
 from functools import cache
@@ -61,15 +61,15 @@ class World:
     """State of a world between evaluations; the fields that every moment reads share a cache line.
 
     Attributes:
-        active: Whether it still iterates.
+        active: 1 while it iterates.
         evaluations: Field evaluations of this solve.
-        in_field: Whether there is an applied field, until the first evaluation.
+        in_field: 1 if there is an applied field, 0 after the first evaluation.
         next: Its next action, of ``Next`` in ``solve_state.h``.
-        linked: Whether the change from the last iterate to the next one is stored.
+        linked: 1 if the change from the last iterate to the next one is stored.
         kept: Number of stored changes in ``history``.
         newest: Slot of the newest stored change.
         used: Number of changes that the next step mixes.
-        improved: Whether the last iterate is the best so far.
+        improved: 1 if the last iterate is the best so far.
         plain_steps: Steps left without mixing.
         damping: Factor of the moments' step lengths.
         ahead: Factor β of the last change from solve to solve in the next start.
@@ -159,7 +159,7 @@ def allocate(worlds, inducible, dtype, device):
 
     Args:
         worlds: World of each moment, non-decreasing, shape [n].
-        inducible: Whether a moment is inducible, shape [n]; in each world inducible moments come first.
+        inducible: True for inducible moments, shape [n]; in each world inducible moments come first.
         dtype: Warp scalar type.
         device: Warp device.
     """
@@ -215,7 +215,7 @@ def carried_arrays(state) -> dict:
 
 
 def bind(state, packed, material, moments, rtol: float, max_evaluations: int) -> None:
-    """Set the moments of a solve, and when it ends.
+    """Set the moments of a solve, and the limits at which it ends.
 
     Args:
         state: State of the solve.
@@ -235,7 +235,7 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
 
 @wp.func
 def is_last_of_world(lane: int, w: int, chunks: int, arrived: wp.array[int]):
-    """Return whether this block is the last to sum one of the ``chunks`` of world ``w``; it can then read all sums."""
+    """Return true in the last block that sums one of the ``chunks`` of world ``w``; it can read all sums."""
     last = int(0)
     if lane == 0:
         fence()

@@ -2,8 +2,8 @@
 // theta_flow.py has its equations; theta_step.h chooses the next step of a world.
 //
 // On a CPU a pass works on a vector of moments of one world; on a GPU a group of threads works on one moment. Takes
-// CAPACITY, DEPTH, GROUP and INVERSE_4PI from Python. RESPONDING tells whether any moments belong to bodies with a
-// collective response (body_response.h). ``State`` is the struct of solve_state.py.
+// CAPACITY, DEPTH, GROUP and INVERSE_4PI from Python. RESPONDING is 1 if any moments belong to bodies with a collective
+// response (body_response.h). ``State`` is the struct of solve_state.py.
 #pragma once
 #include "induction/theta_step.h"
 #include "material/curves.h"
@@ -60,8 +60,8 @@ struct Material {
     Number saturation, slope;
     Curves curves;
 };
-// Share of a magnetization that errors are relative to: 1, or k for a permanent moment that responds, whose remanence
-// is not induced.
+// Share of a magnetization that errors are relative to: 1, or k for a permanent moment that responds, because its
+// remanence is not induced.
 CUDA_CALLABLE inline Number induced_share(const Material& material) {
     const Number full = material.slope * 0 + 1;
 #if !defined(__CUDA_ARCH__)
@@ -104,7 +104,7 @@ template <class State> CUDA_CALLABLE inline Mask responding(const State& state, 
 #endif
     return mask_of(flags != Index(0));
 }
-// Whether moments i and j are cells of the same such body.
+// True if moments i and j are cells of the same body with a collective response.
 template <class State> CUDA_CALLABLE inline bool respond_together(const State& state, int i, int j) {
     if (!RESPONDING || state.responds.data[i] == 0) return false;
     const Real* const labels = (const Real*)((const char*)state.packed.data + 7 * (size_t)state.packed.strides[0]);
@@ -308,7 +308,7 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     }
 }
 
-// Stores the mixture of the last iterate for the start of the next solve; it is closer to the solution than the
+// Stores the mixture of the last iterates for the start of the next solve; it is closer to the solution than the last
 // iterate.
 template <class State>
 CUDA_CALLABLE inline void keep_solution(State& state, const Span& at, Material material, Vector mixed, Vector g) {

@@ -13,10 +13,10 @@ the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that 
 (``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the
 steps converge for ω_i < 2/L_i. Steps are short only where balls overlap.
 
-A step changes the field most at near neighbors, and their part follows without another evaluation of the whole field.
-With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s) follow each step;
-ḡ = s̄ + r̄, and ω' is a little above ω. In cold starts of touching balls they save 1 or 2 of 8 to 10 evaluations to
-1e-3, and more where balls overlap.
+A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
+whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
+follow each step; ḡ = s̄ + r̄, and ω' is a little above ω. In cold starts of touching balls they save 1 or 2 of 8 to 10
+evaluations to 1e-3, and more where balls overlap.
 
 A step with mixing or sweeps is rejected if it leaves the merit ‖φ r‖ more than twice the best. A few plain steps from
 the best iterate follow.
@@ -38,12 +38,12 @@ the true error.
 neighbors precede its first evaluation. The neighbors' field is computed at their present positions. The field of all
 other sources, F = H − H0 − G' M, is extrapolated as F₁ + β (F₁ − F₂) from the last two solves. Both F are those of s̄
 and ḡ, which are closer to the solution than the last iterate. Each world has a factor β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within
-[0, 1], which would have predicted the last change from the one before: the start follows smooth motion, and ignores
-noise.
+[0, 1], the one that best predicts the last change Δg from the change Δg' before it. So the start follows smooth motion,
+and ignores noise.
 
-The changes Δs_j, Δr_j outlive a solve, since the coupling hardly changes. A slow mode, such as that of long columns of
-balls, then costs one evaluation instead of three. Balls Up, where 243 balls jump, takes 1.2 evaluations per solve. The
-solve converges to the one solution from any start.
+The changes Δs_j, Δr_j are kept for the next solve, since the coupling hardly changes. A slow mode, such as that of long
+columns of balls, then costs one evaluation instead of three. Balls Up, where 243 balls jump, takes 1.2 evaluations per
+solve. The solve converges to the same solution from any start.
 
 Bodies of few cells respond collectively to each evaluated field (``body_response``). The flow then uses the field after
 their response, and takes whole steps for them, as for isolated balls. Sweeps exclude them.

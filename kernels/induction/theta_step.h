@@ -10,7 +10,7 @@ constexpr double FLOW_STEP = 0.9;      // fraction of the largest convergent ste
 constexpr double WHOLE_STEP = 0.6;     // step length of balls without overlap
 constexpr double SLOWEST = 20.0;       // largest error amplification by slow convergence
 constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction of the last change
-constexpr double REMEMBERED = 0.5;     // fraction of the slowness that outlives an evaluation
+constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept at an evaluation
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual at rounding level
 
 // Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last change,
@@ -24,7 +24,7 @@ template <class S, class N> CUDA_CALLABLE inline N step_length(N stiffness) {
     return safe < longest ? safe : longest;
 }
 
-// Step ω₁ at the begin and the end of a solve: 1, which solves an isolated ball, or less where balls overlap.
+// Step ω₁ at the beginning and the end of a solve: 1, which solves an isolated ball, or less where balls overlap.
 template <class S, class N> CUDA_CALLABLE inline N whole_step(N step) {
     const N scaled = step * S(1.0 / WHOLE_STEP), whole = N(S(1));
     return scaled < whole ? scaled : whole;

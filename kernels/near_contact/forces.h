@@ -30,7 +30,7 @@ CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductanc
     return rest * u + x * a.field + y * a.gradient;
 }
 
-// Writes the forces of a ball's contacts by its own half of ΔC.
+// Writes the forces of a ball's contacts that the ball's own half of ΔC exerts.
 CUDA_CALLABLE inline void store_contact_forces(const Arrays& a, int i) {
     Partners<CONTACT_SLOTS> partners(a.near, i);
     const int slots = most(a.contact_count + i);
@@ -44,7 +44,8 @@ CUDA_CALLABLE inline void store_contact_forces(const Arrays& a, int i) {
     }
 }
 
-// Force on a ball by another one in direction u: a part along u, and other terms.
+// Force on a ball by another ball in direction u: the sum of ``radial`` u and ``across``, which also has a component
+// along u.
 struct PairForce {
     Number radial;
     Vector across;

@@ -40,7 +40,7 @@ template <class Part> CUDA_CALLABLE inline Number number(const Part& part, int c
     return __shfl_sync(~0u, part[c / GROUP], c % GROUP, GROUP);
 }
 
-// Sums 16 numbers over the threads of a group, those whose bits are set in ``used``. The total of number c goes to
+// Sums those of 16 numbers whose bits are set in ``used``, over the threads of a group. The total of number c goes to
 // sum[c / GROUP * GROUP] of its thread. Each exchange halves the numbers of a thread.
 CUDA_CALLABLE inline void group_totals(Number (&sum)[16], unsigned used) {
 #pragma unroll

@@ -39,7 +39,7 @@ from warpmag.kernels.shared.native import CHUNK, LINE, PASS_ARGUMENTS, native_ke
 from warpmag.kernels.shared.team import team, threads_for
 
 MOST_KINDS = 16
-"""Most different susceptibilities; beyond them, quantiles represent all."""
+"""Largest number of different susceptibilities; if there are more, quantiles represent all of them."""
 CANDIDATES = 64
 """Capacity of a ball's list of candidates, which are near or may become near."""
 MARGIN = 0.05
@@ -48,7 +48,7 @@ _RATIO = 0.5 * contact_table.REACH + MARGIN
 NEAR_SLOTS = 32
 """Slots for near balls; balls that do not overlap have at most about 24."""
 CONTACT_SLOTS = 16
-"""Slots for contacts, the first of them."""
+"""Slots for contacts: the first of the slots for near balls."""
 GROUP = 8
 """Threads of a GPU that share a ball."""
 SWEEPS = 2
@@ -162,7 +162,7 @@ class NearContactBuffers:
         threads: Threads of a CPU for passes over near pairs.
         nonuniform_threads: Threads of a CPU for forces of non-uniform fields; 0 if there are none.
         stream: Stream of a GPU that runs in parallel with the pair sums.
-        events: Events of that stream: its start, the field's part of the sums, and its end.
+        events: Events of that stream: its start, the write of H_near to the field's sums, and its end.
         commands: Recorded launches, so that the arrays are packed only once.
     """
 
@@ -187,7 +187,7 @@ class NearContactBuffers:
             getattr(self.arrays, name).zero_()
 
     def carried(self) -> dict:
-        """Return the arrays that a solve hands on to the next one, by name."""
+        """Return the arrays that persist from one solve to the next, by name."""
         return neighbors.carried_lists(self.lists) | {name: getattr(self.arrays, name) for name in _WARM}
 
 
@@ -275,7 +275,7 @@ def _set_materials(a, radii, eligible, susceptibility, material, padded) -> None
 
 
 def _set_pairs(a, balls: int, dtype, device) -> None:
-    """Set the arrays of the pairs to no pairs: slots hold the ball itself, and have no counterpart."""
+    """Set the arrays to no pairs: each slot holds the ball itself and has no counterpart."""
     chunks = balls // CHUNK
 
     def zeros(*shape, kind=dtype):
@@ -312,14 +312,14 @@ _HEADERS = {
 
 @cache
 def kernel(dtype, passes: str):
-    """Return a kernel that makes the passes of a struct in one of the headers."""
+    """Return a kernel that runs the passes of a struct in one of the headers."""
     call = f"make_passes<warpmag::{passes}>(thread, first, last, threads, team.data, arrays)"
     header, arguments = f"near_contact/{_HEADERS[passes]}.h", {**PASS_ARGUMENTS, "arrays": contact_arrays(dtype)}
     return native_kernel(call, header, arguments, dtype=dtype, **_constants())
 
 
 def _launch(b: NearContactBuffers, passes: str, first: int, last: int):
-    """Launch passes ``first`` to ``last``: all at once on a CPU, one by one on a GPU."""
+    """Launch passes ``first`` to ``last`` − 1: all at once on a CPU, one by one on a GPU."""
     cpu = b.device.is_cpu
     threads = b.nonuniform_threads if passes == "NonuniformField" else b.threads
     for begin, end in [(first, last)] if cpu else pairwise(range(first, last + 1)):
@@ -338,7 +338,7 @@ def _launch(b: NearContactBuffers, passes: str, first: int, last: int):
 
 @contextmanager
 def _beside(b: NearContactBuffers):
-    """Launch the block on a stream of its own on a GPU, after all previous launches."""
+    """Run the launches of a ``with`` block on a separate stream of a GPU, after all previous launches."""
     if b.stream is None:
         yield
         return

@@ -216,7 +216,7 @@ CUDA_CALLABLE inline MagnetForce magnet_force(const Get& b, const MomentView& s,
     return {low.force + high.force, low.field + high.field};
 }
 
-// Position [m], moment [A·m²] and radius [m] of moments, and whether each is the only one of its body.
+// Position [m], moment [A·m²] and radius [m] of moments. ``single`` is 1 for the only moment of a body.
 struct Magnet {
     Vector at, m;
     Number size, single;

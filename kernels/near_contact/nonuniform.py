@@ -14,7 +14,7 @@ are conserved.
 
 * **Degrees.** Degrees 2 to 4 are summed over all moments before they act, because the fields of a magnet's parts
   cancel. For a permanent ball that is alone on its body, all higher degrees follow in closed form from its own moment:
-  with x = 1/ρ² and a the component of m along ρ
+  with x = 1/ρ² and a the component of m along ρ,
 
       E = −½ (μ0/4π) R³ p_6 w² Σ_(l>4) x^(l+2) ((l + 1)² a² + ½ l (l + 1) (m² − a²)).
 
@@ -55,8 +55,8 @@ def magnet_arrays(dtype) -> Any:
     class MagnetArrays:
         """Arrays for permanent moments that act on balls."""
 
-        partner_begin: wp.array[wp.int32]  # first partner: a magnet of a ball's world, a ball of a movable magnet's
-        partner_end: wp.array[wp.int32]  # the one after the last partner [balls]
+        partner_begin: wp.array[wp.int32]  # first partner: a magnet for a ball, a ball for a movable magnet
+        partner_end: wp.array[wp.int32]  # index after the last partner [balls]
         movable: wp.array[wp.int32]  # 1 for permanent moments whose force is evaluated [balls]
         single: wp.array[dtype]  # 1 for the only moment of a body, 0 for a cell or a ball, −1 for others [balls]
         bounds: wp.array2d[dtype]  # center and radius of a chunk's enclosing ball, largest radius [chunks, 8]
@@ -76,7 +76,7 @@ def constants() -> dict[str, int | float]:
 
 
 def expansion_constants() -> tuple[float, float, int]:
-    """Return the range over which sources of fields fade, and the rows of a response, for ``applied/balls.h``."""
+    """Return the range over which the effect of sources fades, and the rows of a response, for ``applied/balls.h``."""
     return (*map(float, contact_table.MAGNET_REACH), RESPONSE_ROWS)
 
 

@@ -137,8 +137,8 @@ CUDA_CALLABLE inline void store_line(Real* lines, int i, const Number* part, Vec
 #endif
 }
 
-// Makes passes ``first`` to ``last``. A launch on a GPU makes one pass, because threads synchronize only between
-// launches.
+// Runs passes ``first`` to ``last`` − 1. A launch on a GPU runs only pass ``first``, because threads synchronize only
+// between launches.
 template <class Passes, class Addresses>
 CUDA_CALLABLE inline void make_passes(int thread, int first, int last, int threads, unsigned long long* team,
                                       const Addresses& addresses) {

@@ -91,8 +91,7 @@ CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int
 }
 
 // Writes the conductances of slot s of ball i and their derivatives. Adds the ball's self-conductances to ``sources``
-// and
-// ``dipoles``.
+// and to ``dipoles``.
 CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both,
                                            Index kind, Index other_kind, Number& sources, Number& dipoles) {
     const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit;
@@ -130,7 +129,8 @@ CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, c
     keep(16, value.w);
 }
 
-// Finds the index of the other ball's part of a contact's force; the last one, of zeros, where there is none.
+// Finds the index of the other ball's part of a contact's force. If there is none, it is the index of the last entries,
+// which are zero.
 CUDA_CALLABLE inline void find_counterpart(const Arrays& a, int i, int s, int j) {
     int place = -1;
     auto takes_part = [&](int ball) { return a.positions[LINE * (size_t)ball + 4] > 0; };

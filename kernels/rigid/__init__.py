@@ -3,8 +3,8 @@
 | module | contents |
 |---|---|
 | newton_views | structs of Newton's arrays of bodies and contacts |
-| bodies | positions and moments of magnets from their bodies, wrenches back |
-| sources | frames and motion of coils and field maps, wrenches back; readings at sites |
+| bodies | positions and moments of magnets from their bodies, wrenches on the bodies |
+| sources | frames and motion of coils and field maps, wrenches on their bodies; readings at sites |
 | keys, keyed_poses | time-sampled values, and poses of kinematic bodies that follow them |
 | monitor | largest motion, penetration, buffer use and induction error of a substep |
 | stepping | state machine of a step: length of substeps, attempts, log |

@@ -1,4 +1,4 @@
-"""Coupling of rigid bodies and their magnetic moments: positions and moments from bodies, wrenches to bodies.
+"""Coupling of rigid bodies and their magnetic moments: positions and moments from bodies, wrenches on bodies.
 
 A magnet's moments are fixed in the frame of its body. Every substep they are transformed to the world frame, and the
 force F and torque τ on each are added to the wrench of its body about the center of mass c (Newton's convention):
@@ -34,7 +34,7 @@ class BodyMoments:
         shape_frames, magnetizations: Frame of each shape in its body's frame, and its permanent magnetization in the
             shape's frame [A/m]: arrays of the model, shape [shapes].
         body_list, body_run_start: Bodies with moments, and the first run of each, shape [b] and [b + 1].
-        runs: First moment of each run, and the one after its last, shape [r].
+        runs: First moment of each run, and the index after its last, shape [r].
         kinematic_flag: Newton's flag of bodies that forces do not move.
     """
 

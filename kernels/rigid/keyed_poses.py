@@ -2,7 +2,7 @@
 
 A body's frame is a product of transforms, and each transform has keys of its own, as in USD. So a body that rotates by
 angles moves along arcs, not along chords between poses. The product is evaluated in double precision at the given time.
-Velocities are those between two times: v = (c₁ − c₀)/Δt of the center of mass, and ω = the rotation vector from q₀ to
+Velocities are means over an interval Δt: v = (c₁ − c₀)/Δt of the center of mass, and ω = the rotation vector from q₀ to
 q₁ over Δt. A solver that moves bodies by their velocities moves the body to its next pose.
 """
 
@@ -190,8 +190,8 @@ def _write_poses(
     if sine > wp.float64(1e-12):
         rate = wp.float64(2.0) * wp.atan2(sine, w) / sine
     qd = wp.spatial_vector(_to_float32(moved / duration), _to_float32((rate / duration) * axis))
-    at = wp.where(at_end != 0, pose1, pose0)
-    p, q = wp.transform_get_translation(at), wp.transform_get_rotation(at)
+    frame = wp.where(at_end != 0, pose1, pose0)
+    p, q = wp.transform_get_translation(frame), wp.transform_get_rotation(frame)
     pose = wp.transform(_to_float32(p), wp.quat(float(q[0]), float(q[1]), float(q[2]), float(q[3])))
     body_q_out[body] = pose
     body_qd_out[body] = qd

@@ -32,7 +32,7 @@ PEAK_DEPTH = 5  # penetration [m]
 PEAK_ERROR = 6  # magnetization error [1]
 PEAKS = 7
 
-COUNT_BAD_BODY = 0  # first body whose state was not finite, plus bodies times substeps; else NO_BODY
+COUNT_BAD_BODY = 0  # first body whose state was not finite, see ``watch``; else NO_BODY
 COUNT_EVALUATIONS = 1  # field evaluations, summed over substeps
 COUNT_UNCONVERGED = 2  # substeps whose induction did not converge
 COUNT_OVERLAPS = 3  # contacts deeper than a threshold
@@ -247,7 +247,7 @@ def watch_forces(m: Monitor, bodies: BodyView, gravity, longest: float):
 
     Args:
         m: The monitor.
-        bodies: The bodies, forces evaluated.
+        bodies: The bodies, with evaluated forces.
         gravity: Gravity of each world [m/s²].
         longest: Length of the substeps of the first level [s].
     """

@@ -1,9 +1,9 @@
 """State machine of a step on the device: the next action, the acceptance of an attempt, and the log.
 
 A step is attempted in substeps of one of ``LEVELS`` lengths, each half as long as that of the level before. The results
-of the ``monitor`` decide. Either the step is accepted and logged, or the state is restored and the step is attempted at
-the next level, or stepping halts, because a buffer was too small or a state was not finite. While halted, steps do
-nothing, so that the host can read the status at any time and continue from there.
+of the ``monitor`` decide: the step is accepted and logged, or the state is restored and the step is attempted at the
+next level. If a buffer was too small or a state was not finite, stepping halts. While halted, steps do nothing, so that
+the host can read the status at any time and continue from there.
 
 Substeps are launched in pairs. Beyond the first level, several substeps share their magnetic forces, for at most the
 length of a substep of the first level. Short substeps serve contacts between fast or strongly pressed bodies, and
@@ -46,6 +46,7 @@ _CHUNK = 16
 """Words of a state that a thread copies."""
 
 LOG_SUBSTEPS, LOG_ATTEMPTS, LOG_CAPPED, LOG_REGROWN, LOG_EVALUATIONS, LOG_UNCONVERGED = range(6)
+"""First entries of a record. ``LOG_CAPPED`` is 1 if the motion exceeded its limit although substeps were shortest."""
 LOG_PEAKS = 6  # first of monitor.PEAKS
 LOG_TICKS = LOG_PEAKS + monitor.PEAKS  # first of STAGES
 LOG_FIELDS = LOG_TICKS + STAGES
@@ -59,8 +60,8 @@ class StepArrays:
         flags: Conditions of the loops around a step, see ``FLAG_*``.
         status: Present state, see ``STATUS_*``.
         peaks, counts: Arrays of the ``monitor``.
-        last_overlap: Deepest penetration of the last step; and of the last attempt at the present step that was
-            rejected for its penetration, else infinite.
+        last_overlap: Deepest penetration over thickness, first of the last step, then of the last attempt at the
+            present step. The second number is infinite unless that attempt was rejected for its penetration.
         ticks: Time of each stage since the last accepted step, then the clock at the last mark; nanoseconds on a GPU,
             clock cycles on a CPU.
         log: Ring buffer with a record of each step, see ``LOG_*``, shape [records, LOG_FIELDS].
