@@ -3,10 +3,10 @@
 May import ``shared``, ``material`` and ``pairs``. The field of such a source does not depend on other sources. It
 follows from a closed form, or from a table, in the frame of the source.
 
-Coils and maps act at any distance, in proportion to a strength. A permanent body acts as a lattice of moments. At
-targets within its reach, a few lattice cells, a correction is added: the closed form of the body's field less the field
-of its lattice. Two bodies near each other get the force and torque between their surface charges, less the force and
-torque between their moments.
+Coils and maps act at any distance, in proportion to a strength. A permanent body acts as a lattice of moments. Targets
+within its reach, a few lattice cells, get a correction: the closed form of the body's field less that of its lattice.
+Two bodies near each other get the force and torque between their surface charges, less the force and torque between
+their moments.
 
 Fields are evaluated once per solve at all moments, and added to the external field. The reaction on a source is summed
 from the same fields, so that forces are opposite and equal. Without sources none of these kernels is launched.

@@ -4,8 +4,8 @@
 
 namespace warpmag {
 
-// Numbers of a point on an edge: position, direction of the edge, ν of both faces, n of both faces, weight; of a point
-// on a face: position, n, weight. polyhedron.h defines ν and n.
+// Numbers of a point on an edge: position, direction of the edge, ν of both faces, n of both faces, weight. Numbers of
+// a point on a face: position, n, weight. polyhedron.h defines ν and n.
 constexpr int EDGE_POINT = 19, FACE_POINT = 7;
 
 // Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those between the two lattices. The surface charges of q

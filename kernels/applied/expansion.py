@@ -5,9 +5,9 @@ With x the position relative to the center, in radii of the ball, a field withou
     4π H = −∇ Σ_l (2l − 1)!!/l! b_l:x^l,
 
 with b_l symmetric and traceless. ``near_contact`` computes the b_l of magnets in closed form. For other sources the b_l
-of degrees 1 to 4 are least-squares fits to H at the corners of an icosahedron of radius ``POINT_DEPTH``, and so are
-linear in H. The error of b_l by a higher degree l' is the tensor of that degree times ``POINT_DEPTH`` to the
-power l' − l.
+of degrees 1 to 4 are least-squares fits to H at the corners of an icosahedron of radius ``POINT_DEPTH``. So they are
+linear in H. The error of b_l by a higher degree l' is the tensor of that degree times ``POINT_DEPTH`` to the power l' −
+l.
 
 Derivatives of b_l by the position of the ball are the tensors of the field's derivatives. The energy of a ball with
 polarizabilities p_l is −½ (μ0/4π) R³ Σ p_l (2l − 1)!!/l! b_l:b_l. The force on it is (μ0/4π) R³ Σ B_l:∂b_l, with its

@@ -1,14 +1,14 @@
 """Fields of sources at targets and about balls, forces on moments, and reactions on sources.
 
-The field H(x) [A/m] of a source exerts on a moment m at x, with Kelvin's law (Kim and Han 2022, Eqs. 13 and 14), the
-force and torque
+By Kelvin's law (Kim and Han 2022, Eqs. 13 and 14), the field H(x) [A/m] of a source exerts on a moment m at x the force
+and torque
 
     F = μ0 ∇(m·H),   F_k = μ0 m_i ∂H_i/∂x_k,      τ = μ0 m × H,
 
 By Eq. 4, m is the effective moment (``pairs.wrench``). ∇(m·H) is the gradient of the co-energy; it equals (m·∇)H where
 H has no curl. The reaction on the source is −ΣF and, about its origin o, −Σ(τ + (x − o) × F), over all moments of other
-bodies: momentum and angular momentum are conserved by construction. Forces on the multipoles of balls (``expansion``)
-act at the balls' centers.
+bodies. So momentum and angular momentum are conserved by construction. Forces on the multipoles of balls
+(``expansion``) act at the balls' centers.
 """
 
 import itertools

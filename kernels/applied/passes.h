@@ -166,8 +166,8 @@ template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, in
     add_force_torque(out, force, torque, -MU0);
 }
 
-// Adds the wrenches of other permanent bodies on body b. For both bodies of a pair, the surface charges of the smaller
-// body are integrated, so that action and reaction are equal to the last bit.
+// Adds the wrenches of other permanent bodies on body b. Both bodies of a pair integrate the surface charges of the
+// smaller body, so that action and reaction are equal to the last bit.
 template <class Arrays>
 CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&total)[WRENCH_ROW]) {
     const Body body = body_at(arrays, b);

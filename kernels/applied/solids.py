@@ -11,7 +11,7 @@ Bodies of one shape share its tables:
 Each body has a row in two tables:
 
     body: Shape, first moment, number of moments, and 1 if it responds to fields, shape [bodies, 4].
-    size: 1/V of its first moment [1/m³], or the response k of a body that responds; reach, radius of the bounding
+    size: 1/V of its first moment [1/m³], or the response k of a body that responds. Then reach, radius of the bounding
         sphere, center and half sides of the box [m], shape [bodies, 9].
 """
 

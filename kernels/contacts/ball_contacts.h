@@ -28,8 +28,8 @@ template <class Arrays> CUDA_CALLABLE inline bool involves_ball(const Arrays& ar
     return (kind == BALL && other < KINDS) || (other == BALL && kind < KINDS);
 }
 
-// Finds the point of a box's surface nearest to c (in the frame of the box) and the direction from c to it, reversed
-// where c is inside. Returns the distance, negative inside.
+// Finds the point of a box's surface nearest to c, in the frame of the box, and the direction from c to it. Inside the
+// box the direction is reversed. Returns the distance, negative inside.
 CUDA_CALLABLE inline Real nearest_on_box(wp::vec3 size, wp::vec3 c, wp::vec3& core, wp::vec3& direction) {
     core = wp::min(size, wp::max(-size, c));
     direction = core - c;

@@ -54,7 +54,7 @@ template <class Lists> inline void find_search_distance(const Lists& lists) {
 #endif
 
 // Stores the swept box of a shape. For a ball, stores the center and radius of a ball that encloses it throughout the
-// substep, and sets a flag if its neighbor list is out of date. For a ball that moves farther than ``farthest``, the
+// substep. Sets a flag if the neighbor lists are out of date. For a ball that moves farther than ``farthest``, the
 // enclosing ball is at the present position, and that distance is added to the radius.
 template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arrays, int target) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];

@@ -6,9 +6,9 @@
 // rotation during a substep, which is exact for balls. Five things differ from Newton's kernels:
 //
 // 1. Accumulated impulses. A contact keeps the sum of its impulses, and an iteration may reduce it, down to zero
-//    normal impulse: projected gradients with Nesterov's momentum (Mazhar, Heyn, Negrut and Tasora 2015, "Using
-//    Nesterov's Method to Accelerate Multibody Dynamics with Friction and Contact"). Newton's iterations only add
-//    impulses, and end at some state without overlap. The iterations here converge to the smallest impulses that
+//    normal impulse. The method is projected gradients with Nesterov's momentum (Mazhar, Heyn, Negrut and Tasora 2015,
+//    "Using Nesterov's Method to Accelerate Multibody Dynamics with Friction and Contact"). Newton's iterations only
+//    add impulses, and end at some state without overlap. The iterations here converge to the smallest impulses that
 //    prevent overlap.
 //
 // 2. Penetration recovery. Overlapping bodies separate at RECOVERY_SPEED (from Python) at most. So bodies that were
@@ -16,7 +16,7 @@
 //
 // 3. Conserved angular momentum. The impulse acts at one point on both bodies. That point lies between the surfaces
 //    where they are before the substep, nearer to the surface of the lighter body. Lever arms at the new poses have
-//    rotated by ω dt and would not conserve angular momentum: bodies that strong forces press together would spin up at
+//    rotated by ω dt and would not conserve angular momentum. Bodies that strong forces press together would spin up at
 //    the rate a dt/r for accelerations a.
 //
 // 4. No rest threshold. Low speeds are not set to zero.
@@ -71,8 +71,8 @@ struct Inertia {
     Symmetric inverse;
     Number shares;
 };
-// A detected contact, from the own body's side. ``point`` and ``surface`` are relative to the centers of mass, in the
-// frames of the bodies: the contact point, and the point on the surface where friction acts. ``normal`` points from the
+// A detected contact, from the own body's side. ``point`` is the contact point and ``surface`` the point on the surface
+// where friction acts, relative to the centers of mass and in the frames of the bodies. ``normal`` points from the
 // other body to the own one, ``margin`` is the sum of the margins. ``mu``, ``torsional`` and ``rolling`` are
 // coefficients of friction. ``kinematic`` and ``other_kinematic`` are 1 if the body is kinematic, else 0.
 struct DetectedContact {
@@ -83,9 +83,9 @@ struct DetectedContact {
 struct Slip {
     Vector linear, angular;
 };
-// A contact prepared for the iterations: normal and lever arms about the centers of mass; the speed at which the gap
-// may close; the effective masses, times the relaxation, of normal, tangential and angular impulses [kg, kg, kg·m²];
-// the coefficients of friction; and the slip velocity with which a sticking contact returns.
+// A contact prepared for the iterations: the normal, lever arms about the centers of mass, and coefficients of
+// friction. The gap closes at ``gap_speed`` at most. ``normal_mass``, ``tangential_mass`` and ``angular_mass`` are
+// effective masses times the relaxation [kg, kg, kg·m²]. A sticking contact returns at ``return_velocity``.
 struct Contact {
     Vector normal, arm, other_arm;
     Number gap_speed, normal_mass, tangential_mass, angular_mass, mu, torsional, rolling;
@@ -169,8 +169,8 @@ CUDA_CALLABLE inline Contact prepare_contact(const DetectedContact& t, const Pos
     c.arm = surface - divide_or_zero(other_body.inv_mass, total) * surfaces_apart;
     c.other_arm = other_surface + divide_or_zero(body.inv_mass, total) * surfaces_apart;
     const Vector points = rotate(own.q, t.point) - rotate(other.q, t.other_point);
-    // a kinematic body is already at its pose of the substep's end, but its velocity still moves its surface: the
-    // velocity is subtracted, so that the gap closes by the motion of other bodies only
+    // a kinematic body is already at its pose of the substep's end, but its velocity still moves its surface; the gap
+    // speed excludes that velocity
     const Vector own_velocity = body.v + cross(body.omega, c.arm);
     const Vector other_rotation = cross(other_body.omega, c.other_arm);
     const Vector other_velocity = other_body.v + other_rotation;
@@ -196,8 +196,8 @@ CUDA_CALLABLE inline Slip relative_velocity(const Contact& c, const Body& own, c
     const Vector other_velocity = other.v + cross(other.omega, c.other_arm);
     return {own_velocity - other_velocity, own.omega - other.omega};
 }
-// Impulse p of a contact after a relaxation step from the bodies' present velocities, projected onto the friction cone:
-// the normal impulse is at least 0, and friction at most μ times it.
+// Impulse p of a contact after a relaxation step from the bodies' present velocities, projected onto the friction cone.
+// The normal impulse is at least 0, and friction at most μ times it.
 CUDA_CALLABLE inline Impulse relax_impulse(const Contact& c, const Body& own, const Body& other, Impulse p) {
     const Slip velocity = relative_velocity(c, own, other);
     const Number opening = dot(velocity.linear, c.normal), zero = opening * Real(0);

@@ -2,7 +2,7 @@
 
 Four things differ from Newton's kernels:
 
-* **Lever arms.** Newton evaluates lever arms at the poses of each iteration, which is implicit: a pendulum loses 1.5 %
+* **Lever arms.** Newton evaluates lever arms at the poses of each iteration, which is implicit. A pendulum loses 1.5 %
   of its amplitude in half a swing of 0.28 s. Here joints act where they are at the start of the substep, as in SHAKE
   (Ryckaert, Ciccotti and Berendsen 1977). That is symplectic: amplitudes stay.
 * **Penetration recovery.** Overlapping bodies separate at ``RECOVERY_SPEED`` at most, as in ``contact_law.h``. Newton's

@@ -65,8 +65,8 @@ class SolveArrays:
         kept_range: First of the sides of each body in the last substep, and the one after the last, shape [b, 2].
         kept_key: Shapes of these sides, shape [2P].
         kept: Their slip [m, rad], and their point on the body of the first shape [m], shape [2P, 9].
-        totals: GPU: numbers of bodies and sides that take part, of immovable bodies, of wide bodies, of bodies left to
-            launches, and 1 if a contact has friction, shape [6].
+        totals: GPU: numbers of bodies and sides that take part, of immovable, wide and unsolved bodies, and 1 if a
+            contact has friction, shape [6]. Launches solve the bodies that a cluster leaves unsolved.
         side_count, filled: Number of sides of each body, and (GPU) of those listed so far, shape [b].
         slot: Line of each body, shape [b].
         body: Body of each line, -1 for the world, shape [l].

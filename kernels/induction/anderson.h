@@ -4,8 +4,8 @@
 //
 //     α = argmin ‖φ (r − Σ_j α_j Δr_j)‖.
 //
-// The normal equations are sums over all moments in float64: the right side ⟨φΔr_a, φr⟩, then the upper triangle of the
-// matrix ⟨φΔr_a, φΔr_b⟩ by rows. Takes DEPTH from Python, the number of changes in the ring buffer.
+// The normal equations are sums over all moments in float64. The right side ⟨φΔr_a, φr⟩ comes first, then the upper
+// triangle of the matrix ⟨φΔr_a, φΔr_b⟩ by rows. Takes DEPTH from Python, the number of changes in the ring buffer.
 #pragma once
 
 namespace warpmag {

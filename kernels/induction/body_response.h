@@ -129,8 +129,8 @@ CUDA_CALLABLE inline void set_weights(Cell& cell) {
     cell.axis = (length_s > zero ? 1 / length_s : zero) * cell.s;
 }
 
-// One step of Newton's method from s with residual r: s ← s + r + (k/Ms) T E z, where (1 − E T E) z = E r Ms/k is
-// solved by conjugate gradients with one reduction per step (Chronopoulos and Gear 1989).
+// One step of Newton's method from s with residual r: s ← s + r + (k/Ms) T E z. Conjugate gradients with one reduction
+// per step solve (1 − E T E) z = E r Ms/k (Chronopoulos and Gear 1989).
 CUDA_CALLABLE inline void newton_step(const Body& body, Cell* cells) {
     for_cells(body, cells, [&](Cell& cell) {
         set_weights(cell);
@@ -204,8 +204,8 @@ CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, 
     subtract_own_field(state, bodies, b, body, cells, 1, -ahead);
 }
 
-// Computes the response of body b. At the start of a solve it writes dual variables and moments; after an evaluation it
-// writes the field of the response, from which the θ flow goes on.
+// Computes the response of body b. At the start of a solve it writes dual variables and moments. After an evaluation it
+// writes the field of the response, from which the θ flow continues.
 template <class State, class Bodies>
 CUDA_CALLABLE inline void respond(State& state, const Bodies& bodies, int b, bool begin, Real* vectors, double* parts) {
     const auto& row = bodies.body.data[b]; // first moment, cells, world, index of the rotation

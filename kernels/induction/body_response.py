@@ -2,8 +2,8 @@
 
 Within a body of highly permeable cells, long waves of magnetization are slow modes of the θ flow. A slender body would
 take tens of evaluations of the whole field, and its warm starts several. The coupling of its cells, however, is a
-constant matrix T in the body's frame (``kernels.cells``). So after each evaluation the field H at a body's cells is
-replaced by the field after the cells' response to the outside field H − T m. One step of Newton's method solves
+constant matrix T in the body's frame (``kernels.cells``). So after each evaluation the cells respond to the outside
+field H − T m, and the field after their response replaces H. One step of Newton's method solves
 
     s = (k/Ms) (H − T m + T m(s)),    m(s) = V Ms c(‖s‖) ŝ.
 
@@ -16,11 +16,11 @@ is the residual. A few conjugate gradients solve the symmetric positive definite
 The coupling between such bodies has no bound like that of balls. The step length ω is therefore halved whenever a step
 is rejected; the energy decreases for small enough steps.
 
-A warm start extrapolates the field of everything outside a body, with neighbors at their present positions, and solves
-for the response in the present rotation.
+A warm start extrapolates the field of everything outside a body, with neighbors at their present positions. The
+response is solved for in the present rotation.
 
-Tables hold, for each shape, tensors T_ij [1/m³] between all of its cells: first the full tensors, then the tensors of
-the pair law, which the sums over pairs contain. For each chunk of ``CHUNK`` cells and each cell j there are rows xx,
+Tables hold, for each shape, tensors T_ij [1/m³] between all of its cells. The full tensors come first, then the tensors
+of the pair law, which the sums over pairs contain. For each chunk of ``CHUNK`` cells and each cell j there are rows xx,
 yy, zz, xy, xz, yz of ``CHUNK`` numbers.
 """
 

@@ -5,7 +5,7 @@ The energy of the magnetization curves and of the interactions is
     E = μ0 Σ_i [V Φ(M) − ½ m·(H − H0) − m·H0]  −  μ0 Σ_p [½ m·H_p + m·H_e],
 
 over inducible moments i in the applied field H0, and permanent moments p in each other's field H_p and the external
-field H_e. Φ' = f⁻¹, so E is minimal in equilibrium, where V Φ = m·H − V Ψ(H), with the co-energy Ψ' = f, and
+field H_e. Φ' = f⁻¹, so E is minimal in equilibrium. In equilibrium V Φ = m·H − V Ψ(H), with the co-energy Ψ' = f, and
 
     E = μ0 Σ_i [½ m·(H − H0) − V Ψ(H)]  −  μ0 Σ_p [½ m·H_p + m·H_e],
 

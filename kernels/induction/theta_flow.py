@@ -15,8 +15,8 @@ steps converge for ω_i < 2/L_i. Steps are short only where balls overlap.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
-follow each step; ḡ = s̄ + r̄, and ω' is a little above ω. In cold starts of touching balls they save 1 or 2 of 8 to 10
-evaluations to 1e-3, and more where balls overlap.
+follow each step. Here ḡ = s̄ + r̄, and ω' is a little above ω. In cold starts of touching balls they save 1 or 2 of 8
+to 10 evaluations to 1e-3, and more where balls overlap.
 
 A step with mixing or sweeps is rejected if it leaves the merit ‖φ r‖ more than twice the best. A few plain steps from
 the best iterate follow.
@@ -28,11 +28,11 @@ allows the same error again. So the estimate amplifies the residual (Eq. 12) of 
 
     error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),   λ = ‖φ (2 − ω₁) r‖/‖φ r‖.
 
-With slow convergence many steps like the last one remain. σ is their geometric series ρ/(1 − ρ) and at least 1, with ρ
-the ratio of ‖φ r‖ to its smallest earlier value. Half of a σ carries over to the next evaluation. The error is at least
-a hundredth of the last ‖φ Δs‖, since sweeps over near contacts lag behind the moments. Rounding is not included, and a
-residual at the level of rounding is not amplified. ``python -m bench.accuracy arrangements`` compares the estimate with
-the true error.
+With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
+least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. Half of a σ carries over to the next evaluation. The
+error is at least a hundredth of the last ‖φ Δs‖, since sweeps over near contacts lag behind the moments. Rounding is
+not included, and a residual at the level of rounding is not amplified. ``python -m bench.accuracy arrangements``
+compares the estimate with the true error.
 
 **Warm start.** The next solve starts at s̄ + ω r̄ + β Δg, with Δg the last change of g from solve to solve. Sweeps over
 neighbors precede its first evaluation. The neighbors' field is computed at their present positions. The field of all

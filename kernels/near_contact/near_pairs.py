@@ -12,14 +12,15 @@ where e' is the e_Θ of other balls, and p the polarizability. Heavy-ball sweeps
 and the same for Θ̃, alternate with the evaluations of the induction, and start from the state of the last solve. s is
 the inverse diagonal of 1 + ΔC M.
 
-Only eligible balls take part, in pairs with one another: single inducible moments with no more near balls than slots,
-and no more shared volume than the model allows. Near balls are found as ``neighbors`` finds overlaps, and stored in
-slots, contacts first. ``select.h`` and ``tabulate.h`` have the passes that find them, ``sweeps.h`` the sweeps,
-``forces.h`` the forces. ``nonuniform.py`` has the forces of permanent moments, and their arrays. Ball i is number i mod
-CHUNK of chunk i div CHUNK.
+Only eligible balls take part, in pairs with one another. They are single inducible moments, with no more near balls
+than slots and no more shared volume than the model allows. Near balls are found as ``neighbors`` finds overlaps, and
+stored in slots, contacts first. ``select.h`` and ``tabulate.h`` have the passes that find them, ``sweeps.h`` the
+sweeps, ``forces.h`` the forces. ``nonuniform.py`` has the forces of permanent moments, and their arrays. Ball i is
+number i mod CHUNK of chunk i div CHUNK.
 
-Rows of ``cached``: 0 to 7 and 13 are the drive by balls that do not touch (e_Θ, e_m, φ), 8 to 12 the target of Θ̃, 16,
-22 and 23 (M_sr a)_m, 17 the polarizability of the quadrupole, 18 the weight that falls as a ball saturates.
+Rows of ``cached``: 0 to 7 and 13 are the drive by near balls that are no contacts (e_Θ, e_m, φ). Rows 8 to 12 are the
+target of Θ̃; 16, 22 and 23 are (M_sr a)_m. Row 17 is the polarizability of the quadrupole, and 18 the weight that falls
+as a ball saturates.
 """
 
 from contextlib import contextmanager

@@ -55,7 +55,7 @@ CUDA_CALLABLE inline MomentView view_moment(Vector r, Number inverse_radius, Num
 constexpr int FULL = 31;
 
 // Adds the derivatives of a moment's potential. At degree l they are w/d^(l+2) times the symmetric part of y u..u, with
-// y = l m − (2l + 1) (u·m) u; the traces are removed later.
+// y = l m − (2l + 1) (u·m) u. ``write_response`` removes the traces.
 CUDA_CALLABLE inline void add_derivatives(Number (&sum)[FULL], const MomentView& s, Vector m) {
     const Vector u = s.u;
     const Number a = dot(u, m), x = u.x * u.x, y = u.y * u.y, z = u.z * u.z;

@@ -8,9 +8,9 @@ its center, in radii R, and m divided by R³,
     b_l = Σ_j w_j (m_j·∇) ρ^<l>/ρ^(2l+1),    B_l = p_l (2l−1)!!/l! b_l,    p_l = lχ/(lχ + 2l + 1),
     E = −½ (μ0/4π) R³ Σ_l B_l:b_l,    Ψ(ρ) = Σ_l B_l:ρ^l/ρ^(2l+1),
 
-where <l> means the symmetric traceless part. The force on moment j is (μ0/4π) R² ∇(w m·∇Ψ), its torque (μ0/4π) R³ m ×
-w ∇Ψ, and the force on the ball the opposite of their sum. All are derivatives of E, so momentum and angular momentum
-are conserved.
+where <l> means the symmetric traceless part. The force on moment j is (μ0/4π) R² ∇(w m·∇Ψ), and its torque (μ0/4π) R³ m
+× w ∇Ψ. The force on the ball is the opposite of the sum of forces. All are derivatives of E, so momentum and angular
+momentum are conserved.
 
 * **Degrees.** Degrees 2 to 4 are summed over all moments before they act, because the fields of a magnet's parts
   cancel. For a permanent ball that is alone on its body, all higher degrees follow in closed form from its own moment:

@@ -56,7 +56,7 @@ CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_RO
 }
 
 // Sums e = M ã over near balls, contacts last. The first sweep of an evaluation caches the sum over the other near
-// balls and the field of the moments; the following sweeps only add contacts.
+// balls, and the field of the moments. The following sweeps only add contacts.
 template <bool FIRST>
 CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<CACHED_ROWS>& cached) {
     Partners<NEAR_SLOTS> partners(a.near, i);

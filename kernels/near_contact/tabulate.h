@@ -1,5 +1,5 @@
-// Tables of the near pairs of one arrangement: directions, radial factors, windows, conductances from the table of two
-// balls, and the index of the other ball's part of a contact's force.
+// Tables of the near pairs of one arrangement: directions, radial factors, windows, and conductances from the table of
+// two balls. For each contact also the index of the other ball's part of the force.
 //
 // From Python: the windows of contact_table.py, and the nodes of its table.
 #pragma once
@@ -90,8 +90,7 @@ CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int
     }
 }
 
-// Writes the conductances of slot s of ball i and their derivatives. Adds the ball's self-conductances to ``sources``
-// and to ``dipoles``.
+// Writes the conductances of slot s of ball i and their derivatives. Adds the ball's self-conductances to two sums.
 CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both,
                                            Index kind, Index other_kind, Number& sources, Number& dipoles) {
     const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit;

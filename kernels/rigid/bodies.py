@@ -1,7 +1,7 @@
 """Coupling of rigid bodies and their magnetic moments: positions and moments from bodies, wrenches on bodies.
 
-A magnet's moments are fixed in the frame of its body. Every substep they are transformed to the world frame, and the
-force F and torque τ on each are added to the wrench of its body about the center of mass c (Newton's convention):
+A magnet's moments are fixed in the frame of its body. Every substep they are transformed to the world frame. The force
+F and torque τ on each are added to the wrench of its body about the center of mass c (Newton's convention):
 
     F_body = Σ F_i,    τ_body = Σ τ_i + (x_i − c) × F_i
 

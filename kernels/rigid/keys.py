@@ -1,6 +1,6 @@
 """Time-sampled values on the device: interpolated between keys as in USD, and held before the first and after the last.
 
-Time is read from a clock on the device, an array of one number, so that a captured graph follows it for any length of
+Time is read from a clock on the device, an array of one number. So a captured graph follows it for any length of
 substeps.
 """
 

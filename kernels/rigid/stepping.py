@@ -1,15 +1,15 @@
 """State machine of a step on the device: the next action, the acceptance of an attempt, and the log.
 
-A step is attempted in substeps of one of ``LEVELS`` lengths, each half as long as that of the level before. The results
-of the ``monitor`` decide: the step is accepted and logged, or the state is restored and the step is attempted at the
+A step is attempted in substeps of one of ``LEVELS`` lengths, each half as long as that of the level before. By the
+results of the ``monitor``, the step is accepted and logged, or the state is restored and the step is attempted at the
 next level. If a buffer was too small or a state was not finite, stepping halts. While halted, steps do nothing, so that
 the host can read the status at any time and continue from there.
 
 Substeps are launched in pairs. Beyond the first level, several substeps share their magnetic forces, for at most the
 length of a substep of the first level. Short substeps serve contacts between fast or strongly pressed bodies, and
 forces vary more slowly. Shared forces are evaluated halfway between the poses at which the first and the last of these
-substeps start, as predicted from velocities, so that they neither lag nor lead. Two substeps always share forces. More
-share them, up to the length of one of the first level, while the motion of the last attempt keeps their poses close.
+substeps start, predicted from velocities. So they neither lag nor lead. Two substeps always share forces. More share
+them, up to the length of one of the first level, while the motion of the last attempt keeps their poses close.
 """
 
 import numpy as np
