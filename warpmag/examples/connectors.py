@@ -1,7 +1,7 @@
 """Two floating connectors with permanent magnets attract each other and mate.
 
-Each has a north and a south pole in its face, so they mate in one orientation only, and the twisted one turns. No other
-forces act, so momentum is conserved.
+Each has a north and a south pole in its face. They therefore mate in one orientation only, and the twisted connector
+turns. No other forces act, so momentum is conserved.
 """
 
 import math
@@ -75,10 +75,10 @@ class Example:
     def test_final(self):
         """Check that the connectors are mated, and that their total momentum is still zero.
 
-        Momentum is conserved to rounding. Contact impulses are opposite to the last bit. Forces are sums over 500
-        moments, each rounded to float32, and their root sum of squares is ten times the resultant: 10 · 6e-8 of it.
-        At rest this error repeats, so momentum grows in proportion to the impulse that the connectors exchange. The
-        tolerance is three such standard deviations.
+        Momentum is conserved to rounding. Contact impulses are bitwise opposite. Forces are sums over 500 moments,
+        each rounded to float32. Their root sum of squares is ten times the resultant, so the relative error is
+        10 · 6e-8. At rest this error repeats, so momentum grows in proportion to the impulse that the connectors
+        exchange. The tolerance is three such standard deviations.
         """
         place, angle = self.mating()
         np.testing.assert_allclose(place, (2 * HALF[0], 0.0, 0.0), atol=1e-4)

@@ -1,7 +1,7 @@
 """Coils switched one after another lift steel balls out of a tray, carry them along, and drop them.
 
-Brass balls stay in place. A coil lifts a steel ball if its current exceeds that of a closed form (see ``worlds``), here
-1,180 ampere-turns.
+Brass balls stay in place. A coil lifts a steel ball if its current exceeds a threshold, 1,180 ampere-turns here, with a
+closed form (see ``worlds``).
 """
 
 import newton

@@ -9,7 +9,7 @@
 | ``web_page``, ``glb`` | one web page of such a stage |
 | ``viewers`` | magnets in Newton's viewers |
 
-Only the command, the examples, ``scenes_usd`` and the public names of warpmag import this room. May import
+Only the command, the examples, ``scenes_usd`` and the public names of warpmag import this package. May import
 ``declarations``, ``shapes``, ``moments``, ``usd``, ``usd/read``, ``usd/write``, ``engine/magnets`` and
 ``engine/stepping``.
 """

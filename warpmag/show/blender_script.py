@@ -9,7 +9,7 @@ import sys
 _FEWEST = 3
 """Smallest number of bodies that the camera is zoomed to."""
 _OUTSIDE, _MARGIN = 0.1, 1.65
-"""Part of the bodies that may lie outside on each side, and width of the picture over the width of the others."""
+"""Fraction of bodies ignored on each side, and width of the picture over the width of the remaining bodies."""
 
 
 def draw(stage: str, output: str, frame: int, samples: int, width: int, height: int) -> str:
@@ -67,22 +67,22 @@ def _frame_bodies(bpy, camera, aspect: float) -> None:
     """
     from mathutils import Vector  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - of Blender
 
-    back = camera.matrix_world.inverted()
+    to_camera = camera.matrix_world.inverted()
     boxes = []
     for item in bpy.context.evaluated_depsgraph_get().object_instances:
         if item.is_instance:
-            corners = [back @ (item.matrix_world @ Vector(corner)) for corner in item.object.bound_box]
+            corners = [to_camera @ (item.matrix_world @ Vector(corner)) for corner in item.object.bound_box]
             if all(corner.z < 0.0 for corner in corners):
-                seen = [(corner.x / -corner.z, corner.y / -corner.z) for corner in corners]
-                boxes.append([(min(values), max(values)) for values in zip(*seen, strict=True)])
+                projected = [(corner.x / -corner.z, corner.y / -corner.z) for corner in corners]
+                boxes.append([(min(values), max(values)) for values in zip(*projected, strict=True)])
     if len(boxes) < _FEWEST:
         return
     sides = []
     for spans in zip(*boxes, strict=True):
-        few = int(_OUTSIDE * len(spans))
+        ignored = int(_OUTSIDE * len(spans))
         middles = sorted(0.5 * (low + high) for low, high in spans)
         size = sorted(high - low for low, high in spans)[len(spans) // 2]
-        sides.append((middles[few] - 0.5 * size, middles[-1 - few] + 0.5 * size))
+        sides.append((middles[ignored] - 0.5 * size, middles[-1 - ignored] + 0.5 * size))
     (left, right), (low, high) = sides
     lens = camera.data
     width = _MARGIN * max(right - left, aspect * (high - low), 1e-6)

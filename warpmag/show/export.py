@@ -13,7 +13,7 @@ from warpmag.show.renderer_stage import RendererStage
 from warpmag.usd import Recording, open_animated, read_recording, usable_path
 
 _TOP = 0.99
-"""Quantile of all values at the end of the color scale: a few collisions would leave one color for the rest."""
+"""Quantile of all values at the end of the color scale, so that a few collisions do not compress the scale."""
 
 
 def export(
@@ -39,9 +39,9 @@ def export(
         rate: Frames, and time codes, per second [1/s]; Blender plays at 24, a page in real time.
         color: Quantity that colors the bodies: ``magnetization``, ``speed``, or ``force`` (the magnetic force between
             the moments of the frame); by default bodies have their materials.
-        arrows: Whether to draw moments as arrows.
+        arrows: Draw moments as arrows.
         field_lines: Number of field lines from the permanent magnets, in the field of the moments and the external one.
-        materialx: Whether to describe materials in MaterialX, too.
+        materialx: Also describe materials in MaterialX.
         device: Warp device; by default Warp's.
 
     Returns:

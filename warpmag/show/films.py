@@ -60,16 +60,16 @@ def _write_each(output: Path, pictures: Iterable[np.ndarray], frames: list[int])
 
 
 def _write_gif(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
-    each = math.ceil(rate / _GIF_RATE)
-    images = (Image.fromarray(picture) for picture in itertools.islice(pictures, None, None, each))
-    lasts = 10 * round(100.0 * each / rate)  # ms; the format counts in hundredths of a second
-    next(images).save(output, save_all=True, append_images=images, duration=lasts, loop=0)
+    stride = math.ceil(rate / _GIF_RATE)
+    images = (Image.fromarray(picture) for picture in itertools.islice(pictures, None, None, stride))
+    duration = 10 * round(100.0 * stride / rate)  # ms; the format counts in hundredths of a second
+    next(images).save(output, save_all=True, append_images=images, duration=duration, loop=0)
 
 
 def _write_mp4(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
     writer = None
     for picture in pictures:
-        height, width = (2 * (size // 2) for size in picture.shape[:2])  # what yuv420p needs
+        height, width = (2 * (size // 2) for size in picture.shape[:2])  # yuv420p needs even sizes
         if writer is None:
             writer = _ffmpeg().write_frames(
                 str(output), (width, height), fps=rate, codec="libx264", quality=8, macro_block_size=2

@@ -33,7 +33,7 @@ class InstanceArrays:
 def author_instances(
     stage: Usd.Stage, path: Sdf.Path, prototypes: Sequence[Sdf.Path], codes: np.ndarray, placed: InstanceArrays
 ) -> None:
-    """Author instances of prototypes that exist already."""
+    """Author a PointInstancer of existing prototypes."""
     prim = UsdGeom.PointInstancer.Define(stage, path)
     prim.CreatePrototypesRel().SetTargets(list(prototypes))
     boxes = np.array([_box_of(stage.GetPrimAtPath(prototype)) for prototype in prototypes]).reshape(-1, 2, 3)

@@ -17,7 +17,7 @@ COLORS = {"magnetization": "A/m", "speed": "m/s", "force": "N"}
 _FAR = 4.0
 """Distance from the magnets at which field lines end, over the size of the largest magnet."""
 _FINE_COUNT, _COARSE_COUNT = 8, 27
-"""Up to so many shapes other than balls get the moments of a simulation; with more, each gets about 27."""
+"""Up to 8 shapes other than balls are sampled as in a simulation. Of more shapes, each gets about 27 moments."""
 _ARROW, _MOST_SIZES = 1.6, 2.5
 """Length of the longest arrow over the size of its magnet, which counts as at most this multiple of the median size."""
 _OFFSET = 0.03
@@ -220,7 +220,7 @@ def _moments_of(shapes: Sequence[DrawnShape], others: int) -> tuple[np.ndarray, 
 
 
 def _seeds(shapes: Sequence[DrawnShape], along: np.ndarray, count: int, offset: float) -> np.ndarray:
-    """Return points above the surface of a magnet, as dense as its magnetic charge M·n where that is positive.
+    """Return points above the surface of a magnet, with a density proportional to its positive magnetic charge M·n.
 
     Args:
         shapes: The shapes of the magnet.
@@ -238,7 +238,10 @@ def _seeds(shapes: Sequence[DrawnShape], along: np.ndarray, count: int, offset: 
     charge = np.cumsum(np.maximum(areas @ z, 0.0))
     order = np.arange(count) + 0.5
     chosen = np.searchsorted(charge, charge[-1] * order / count)
-    a, b = np.mod(order * 0.7548776662466927, 1.0), np.mod(order * 0.5698402909980532, 1.0)  # evenly in the plane
+    a, b = (
+        np.mod(order * 0.7548776662466927, 1.0),
+        np.mod(order * 0.5698402909980532, 1.0),
+    )  # R2 low-discrepancy sequence
     a, b = np.where(a + b > 1.0, (1.0 - a, 1.0 - b), (a, b))
     corners = triangles[chosen]
     places = corners[:, 0] + a[:, None] * (corners[:, 1] - corners[:, 0]) + b[:, None] * (corners[:, 2] - corners[:, 0])

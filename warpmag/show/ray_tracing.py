@@ -1,8 +1,8 @@
 """Draws frames of a stage by ray tracing on any device, a CPU too: pictures and films without a renderer.
 
 The stage may be a scene or the recording of a run: bodies stand at the poses of their time samples. Newton's camera
-sensor traces the model. It takes shapes, colors and the first camera from the stage; without a camera it looks at all
-bodies from above the front.
+sensor traces the model. It uses the shapes, colors and first camera of the stage. Without a camera, the view shows all
+bodies from the front and above.
 
 Newton's camera returns the light that each surface scatters. A metal scatters none: it mirrors its surroundings, here a
 sky that brightens towards the horizon, a ground and a sun, with Schlick's approximation of Fresnel's reflectance
@@ -36,7 +36,7 @@ _VIEW = (0.55, -0.75, 0.4)
 _FIELD_OF_VIEW = math.radians(30.0)
 _ARROW_COLOR = (1.0, 0.55, 0.05)
 _LEAST_SHOWN = 0.02
-"""Smallest moment over size cubed that gets an arrow, over the largest one."""
+"""Ratio of moment to cubed size, over the largest such ratio, up to which a magnet gets no arrow."""
 _SUN = (-0.4, 0.55, -0.73)
 """Direction of the sun's light."""
 _AMBIENT = ((0.5, 0.53, 0.58), (0.22, 0.21, 0.2))
@@ -65,7 +65,7 @@ def render(
         frame: Frame after the start, at the stage's frame rate; by default the last one, for films all.
         frames: First and last frame of several; the name of each picture contains the number of its frame.
         size: Width and height [px].
-        moments: Whether arrows show the moments of the recording.
+        moments: Show the moments of the recording as arrows.
         device: Warp device; by default Warp's.
 
     Returns:
@@ -83,9 +83,9 @@ def render(
     codes = [clock.start + number * clock.time_codes_per_second / clock.frames_per_second for number in numbers]
     with wp.ScopedDevice(resolve_device(device)):
         scene = import_scene(stage, visuals=True, time_code=min(codes[0], clock.end))
-        studio = _Studio(scene, stage, size, moments)
-        made = (studio.picture(code) for code in codes)
-        return films.write(output, made, numbers, clock.frames_per_second)
+        renderer = _Renderer(scene, stage, size, moments)
+        pictures = (renderer.picture(code) for code in codes)
+        return films.write(output, pictures, numbers, clock.frames_per_second)
 
 
 def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: tuple[int, int] | None) -> list[int]:
@@ -101,14 +101,14 @@ def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: 
     return list(range(first, final + 1))
 
 
-class _Studio:
+class _Renderer:
     """A stage and a camera.
 
     Args:
         scene: The stage, imported with its visual shapes.
         path: File of the stage.
         size: Width and height of the pictures [px].
-        moments: Whether arrows show moments.
+        moments: Show moments as arrows.
     """
 
     def __init__(self, scene: ImportedScene, path, size: tuple[int, int], moments: bool):
@@ -191,9 +191,9 @@ class _Arrows:
         builder = scene.builder
         self._holders = [scene.magnet_shapes[prim][0] for prim in self._prims]
         self._sizes = np.array([builder.shape_collision_radius[shape] for shape in self._holders])
-        looks = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
+        config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
         self._cones = [
-            builder.add_shape_cone(-1, radius=0.3 * size, half_height=0.4 * size, cfg=looks, color=_ARROW_COLOR)
+            builder.add_shape_cone(-1, radius=0.3 * size, half_height=0.4 * size, cfg=config, color=_ARROW_COLOR)
             for size in self._sizes
         ]
 

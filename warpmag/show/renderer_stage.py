@@ -29,7 +29,7 @@ from warpmag.usd.read.transforms import rigid_part
 from warpmag.usd.values import quiet
 
 _SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".html")
-_OWN = ("physics:", "newton:", "warpmag:", "collection:")
+_SIMULATION_PREFIXES = ("physics:", "newton:", "warpmag:", "collection:")
 """Prefixes of attributes that describe a simulation."""
 _SCHEMAS = ("Physics", "Newton", "Warpmag", "CollectionAPI")
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height", "width", "length", "axis", "extent", "doubleSided")
@@ -389,7 +389,7 @@ def _strip(
             del (spec.nameParent or layer.pseudoRoot).nameChildren[spec.name]
             continue
         for attribute in list(spec.properties):
-            if attribute.name.startswith(_OWN):
+            if attribute.name.startswith(_SIMULATION_PREFIXES):
                 spec.RemoveProperty(attribute)
 
 

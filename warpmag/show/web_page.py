@@ -20,7 +20,7 @@ from warpmag.usd.read.transforms import rigid_part, rotation_of
 _REACH = 2.0
 """Half the size of the scene in units of the page: viser's shadows and near plane suit this size."""
 _OUTSIDE = 0.02
-"""Part of the positions of bodies that the camera ignores on each side: a few bodies may fly far."""
+"""Fraction of body positions that the camera ignores on each side, since a few bodies may fly far."""
 _DIRECTION = (0.55, -0.75, 0.45)
 """Direction from the bodies to the camera of a stage that has none; z is up."""
 _FIELD_OF_VIEW = math.radians(35.0)
