@@ -28,7 +28,7 @@ from warpmag.kernels.shared.team import team, threads_for
 AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP = range(5)
 """Passes; as in ``passes.h``."""
 _TARGETS_PER_THREAD, _BALLS_PER_THREAD = 500, 50
-"""Pairs of a source and a target, and of a source and a ball, per thread of a CPU, at least."""
+"""Fewest pairs of a source and a target, and fewest pairs of a source and a ball, per thread of a CPU."""
 _TARGETS_PER_ROW, _BALLS_PER_ROW, _MOST_ROWS = 256, 8, 64
 """Fewest targets and fewest balls in a row of a reaction, and most rows of a source."""
 _GROUP = 32

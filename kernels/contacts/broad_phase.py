@@ -35,7 +35,7 @@ neighbor lists sets the width of the search's cells."""
 _PADDING = 16
 """Boxes that vectors may read after the last one."""
 _TARGETS_PER_THREAD = 120
-"""Shapes that justify another thread of a CPU."""
+"""Fewest shapes per thread of a CPU."""
 _TARGETS_AT_ONCE = 64
 """Targets in a chunk of a CPU thread."""
 _MOST_COMPARISONS = 2e7

@@ -38,7 +38,7 @@ _WIDE = 16, 4, 64
 """A body is wide with more contacts than 16 + 4 for each thread of its group, 64 at most. A solve of Letters, with up
 to 140 contacts per body, takes 0.12 ms on an H200, and 0.14 ms without wide bodies, in groups of 32 threads."""
 _CONTACTS_PER_THREAD = 100
-"""Contacts that justify another thread of a CPU: an iteration over them takes 1 to 2 µs."""
+"""Fewest contacts per thread of a CPU: an iteration over them takes 1 to 2 µs."""
 _ROUND = 1e-6
 """Relative difference of inverse inertias up to which a body counts as round: float32 rounding."""
 _CONTACT_SIZE, _RETURN_SIZE, _IMPULSE_SIZE, _RECORD_SIZE, _KEPT_SIZE = 20, 8, 12, 8, 9
@@ -283,12 +283,19 @@ FINISH = "finish(thread, warpmag::Arrays(arrays), number, relaxation, dt)"
 
 
 def launch_solve_contacts(
-    b: SolveBuffers, contacts: ContactView, bodies: BodyView, shares, *, iterations: int, relaxation: float, dt: float
+    buffers: SolveBuffers,
+    contacts: ContactView,
+    bodies: BodyView,
+    shares,
+    *,
+    iterations: int,
+    relaxation: float,
+    dt: float,
 ):
     """Change velocities so that bodies do not overlap at the end of a substep.
 
     Args:
-        b: Buffers.
+        buffers: Buffers of the solver.
         contacts: The contacts.
         bodies: The bodies as contacts were detected, with their velocities without contacts; ``qd`` of bodies with
             contacts is changed.
@@ -297,35 +304,39 @@ def launch_solve_contacts(
         relaxation: Fraction of its correction that each contact applies in an iteration.
         dt: Length of the substep [s].
     """
-    a, device = b.arrays, b.counters.device
+    a, device = buffers.arrays, buffers.counters.device
     a.contacts, a.bodies, a.shares = contacts, bodies, shares
 
     def launch(call, dim, number=0, blocks=0, limit=0, **form):
-        inputs = [a, number, relaxation, dt, limit or b.limit, team() if device.is_cpu else None]
-        kernel, block = solve_kernel(call, b.round, b.group, **form)
+        inputs = [a, number, relaxation, dt, limit or buffers.limit, team() if device.is_cpu else None]
+        kernel, block = solve_kernel(call, buffers.round, buffers.group, **form)
         wp.launch(kernel, dim or blocks * block, inputs=inputs, device=device, block_dim=block)
 
     if device.is_cpu:
         launch(ON_CPU, 1, iterations)
         return
-    if b.cluster:
-        launch(SOLVE, 0, iterations, b.cluster, cluster=b.cluster)
+    if buffers.cluster:
+        launch(SOLVE, 0, iterations, buffers.cluster, cluster=buffers.cluster)
     else:
-        b.counters.zero_()
+        buffers.counters.zero_()
         launch(COUNT, a.contact_max)
         launch(PLACE, -(-(a.body_count + 1) // 32) * 32)
         launch(LIST, a.contact_max)
         launch(WRITE, 2 * a.contact_max)
-    if b.worlds:
-        launch(SOLVE_WORLD, 0, iterations, b.worlds, cluster=1, lines=b.world_lines)
+    if buffers.worlds:
+        launch(SOLVE_WORLD, 0, iterations, buffers.worlds, cluster=1, lines=buffers.world_lines)
         return
-    threads = _WIDE_BLOCKS * _BLOCK + b.group * a.body_count
+    threads = _WIDE_BLOCKS * _BLOCK + buffers.group * a.body_count
 
     def iterate():
         for iteration in range(iterations):
             launch(ITERATE, threads, iteration, limit=iterations)
         launch(FINISH, threads, iterations % 2)
 
-    condition = _UNSOLVED if b.cluster else 0
-    if not b.cluster or 2 * a.contact_max > b.limit or a.body_count > b.cluster // 2 * _teams(b.group):
+    condition = _UNSOLVED if buffers.cluster else 0
+    if (
+        not buffers.cluster
+        or 2 * a.contact_max > buffers.limit
+        or a.body_count > buffers.cluster // 2 * _teams(buffers.group)
+    ):
         wp.capture_if(a.totals[condition : condition + 1], iterate)

@@ -41,7 +41,7 @@ MOST_CELLS = 64
 _GROUP = 4
 """Threads of a GPU that share a cell."""
 _BODIES_PER_THREAD = 8
-"""Bodies per thread of a CPU, at least."""
+"""Fewest bodies per thread of a CPU."""
 
 
 @dataclass(frozen=True)

@@ -63,9 +63,9 @@ _ROWS = dict(
 _WARM = ("state", "last_state", "sources")
 """Arrays from which the sweeps of the next solve start."""
 _BALLS_PER_THREAD = 500
-"""Balls that justify another thread of a CPU."""
+"""Fewest balls per thread of a CPU."""
 _PAIRS_PER_THREAD = 20000
-"""Pairs of a ball and a permanent moment that justify another thread of a CPU: 0.1 ms."""
+"""Fewest pairs of a ball and a permanent moment per thread of a CPU: 0.1 ms."""
 _LEAST, _MOST = 0.4, 4.0
 """Bounds of the eigenvalues of 1 + ΔC M, scaled by s, in piles of any permeability, touching or overlapping."""
 
@@ -319,89 +319,89 @@ def kernel(dtype, passes: str):
     return native_kernel(call, header, arguments, dtype=dtype, **_constants())
 
 
-def _launch(b: NearContactBuffers, passes: str, first: int, last: int):
+def _launch(buffers: NearContactBuffers, passes: str, first: int, last: int):
     """Launch passes ``first`` to ``last`` − 1: all at once on a CPU, one by one on a GPU."""
-    cpu = b.device.is_cpu
-    threads = b.nonuniform_threads if passes == "NonuniformField" else b.threads
+    cpu = buffers.device.is_cpu
+    threads = buffers.nonuniform_threads if passes == "NonuniformField" else buffers.threads
     for begin, end in [(first, last)] if cpu else pairwise(range(first, last + 1)):
         key = passes, begin, end
-        if key not in b.commands:
-            b.commands[key] = wp.launch(
-                kernel(b.dtype, passes),
-                dim=1 if cpu else GROUP * b.arrays.balls,
-                inputs=[begin, end, threads, team() if cpu else None, b.arrays],
-                device=b.device,
+        if key not in buffers.commands:
+            buffers.commands[key] = wp.launch(
+                kernel(buffers.dtype, passes),
+                dim=1 if cpu else GROUP * buffers.arrays.balls,
+                inputs=[begin, end, threads, team() if cpu else None, buffers.arrays],
+                device=buffers.device,
                 block_dim=128,
                 record_cmd=True,
             )
-        b.commands[key].launch()
+        buffers.commands[key].launch()
 
 
 @contextmanager
-def _beside(b: NearContactBuffers):
+def _beside(buffers: NearContactBuffers):
     """Run the launches of a ``with`` block on a separate stream of a GPU, after all previous launches."""
-    if b.stream is None:
+    if buffers.stream is None:
         yield
         return
-    b.stream.wait_event(wp.get_stream(b.stream.device).record_event(b.events[0]))
-    with wp.ScopedStream(b.stream, sync_enter=False):
+    buffers.stream.wait_event(wp.get_stream(buffers.stream.device).record_event(buffers.events[0]))
+    with wp.ScopedStream(buffers.stream, sync_enter=False):
         yield
-        b.stream.record_event(b.events[2])
+        buffers.stream.record_event(buffers.events[2])
 
 
-def launch_find_pairs(b: NearContactBuffers):
+def launch_find_pairs(buffers: NearContactBuffers):
     """Find the near pairs of the packed moments and tabulate them.
 
     On a GPU this runs in parallel with the following launches, until :func:`wait`.
     """
-    if b.reach == 0.0:
+    if buffers.reach == 0.0:
         return
-    with _beside(b):
-        _launch(b, "Positions", 0, 1)
-        neighbors.launch_find_neighbors(b.lists, b.lists)
-        _launch(b, "Pairs", 0, 2)
+    with _beside(buffers):
+        _launch(buffers, "Positions", 0, 1)
+        neighbors.launch_find_neighbors(buffers.lists, buffers.lists)
+        _launch(buffers, "Pairs", 0, 2)
 
 
-def launch_sweeps(b: NearContactBuffers):
+def launch_sweeps(buffers: NearContactBuffers):
     """Move the contact sources towards equilibrium with the packed moments, and write 4π H_near to the field sums.
 
     On a GPU this runs in parallel with the following launches, until :func:`wait_for_field` and :func:`wait`.
     """
-    if b.reach == 0.0:
+    if buffers.reach == 0.0:
         return
-    if b.stream is None:
-        _launch(b, "Sweeps", 0, _LAST + 1)
+    if buffers.stream is None:
+        _launch(buffers, "Sweeps", 0, _LAST + 1)
         return
-    with _beside(b):
-        _launch(b, "Sweeps", 1, _LAST)
-        b.stream.record_event(b.events[1])
-        _launch(b, "Sweeps", _LAST, _LAST + 1)
+    with _beside(buffers):
+        _launch(buffers, "Sweeps", 1, _LAST)
+        buffers.stream.record_event(buffers.events[1])
+        _launch(buffers, "Sweeps", _LAST, _LAST + 1)
 
 
-def wait_for_field(b: NearContactBuffers):
+def wait_for_field(buffers: NearContactBuffers):
     """Make the following launches wait for the field of :func:`launch_sweeps`."""
-    if b.reach > 0.0 and b.stream is not None:
-        wp.get_stream(b.stream.device).wait_event(b.events[1])
+    if buffers.reach > 0.0 and buffers.stream is not None:
+        wp.get_stream(buffers.stream.device).wait_event(buffers.events[1])
 
 
-def launch_begin_forces(b: NearContactBuffers):
+def launch_begin_forces(buffers: NearContactBuffers):
     """Begin the sweeps for the forces on a GPU, in parallel with the following launches."""
-    if b.reach > 0.0 and b.stream is not None:
-        with _beside(b):
-            _launch(b, "Forces", 1, _LAST + 1)
+    if buffers.reach > 0.0 and buffers.stream is not None:
+        with _beside(buffers):
+            _launch(buffers, "Forces", 1, _LAST + 1)
 
 
-def launch_add_forces(b: NearContactBuffers):
+def launch_add_forces(buffers: NearContactBuffers):
     """Add the forces [N] and torques [N·m] of near pairs, and of balls in non-uniform fields."""
-    if b.reach == 0.0:
+    if buffers.reach == 0.0:
         return
-    wait(b)
-    _launch(b, "Forces", 0 if b.stream is None else _LAST + 1, _LAST + 2)
-    if b.nonuniform_threads:
-        _launch(b, "NonuniformField", 0, 4)
+    wait(buffers)
+    _launch(buffers, "Forces", 0 if buffers.stream is None else _LAST + 1, _LAST + 2)
+    if buffers.nonuniform_threads:
+        _launch(buffers, "NonuniformField", 0, 4)
 
 
-def wait(b: NearContactBuffers):
+def wait(buffers: NearContactBuffers):
     """Make the following launches wait for the parallel stream."""
-    if b.reach > 0.0 and b.stream is not None:
-        wp.get_stream(b.stream.device).wait_event(b.events[2])
+    if buffers.reach > 0.0 and buffers.stream is not None:
+        wp.get_stream(buffers.stream.device).wait_event(buffers.events[2])
