@@ -29,6 +29,7 @@ struct Pose {
     }
     CUDA_CALLABLE CurlFreeField to_world(const CurlFreeField& n) const { return {to_world(n.h), to_world(n.t)}; }
 };
+// Pose from a transform: position and quaternion (x, y, z, w), normalized here.
 CUDA_CALLABLE inline Pose pose_from(const Real* at) {
     const Real x = at[3], y = at[4], z = at[5], w = at[6], n = 2 / (x * x + y * y + z * z + w * w);
     return {real3(at),
@@ -47,6 +48,7 @@ struct Body {
     Real reach, radius, label; // ``radius`` of its bounding sphere
     int first, count, shape, responds;
 };
+// One number of a packed moment. Rows are position (0 to 2), radius (3), moment (4 to 6) and label (7).
 template <class Arrays> CUDA_CALLABLE inline Real packed_at(const Arrays& arrays, int row, int i) {
     return arrays.packed.data[row * (arrays.packed.strides[0] / sizeof(Real)) + i];
 }

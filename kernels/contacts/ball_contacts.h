@@ -18,6 +18,7 @@ struct BallContact {
     Real separation;    // distance of the surfaces, less the margins [m]
 };
 
+// Component of a shape's size: radius, half length or half extent [m].
 template <class Arrays> CUDA_CALLABLE inline Real size_component(const Arrays& arrays, int shape, int c) {
     return arrays.scale.data[shape][c];
 }

@@ -104,6 +104,7 @@ template <class Arrays> CUDA_CALLABLE inline bool is_excluded(const Arrays& arra
     return low < arrays.excluded_count && arrays.excluded.data[low][0] == a && arrays.excluded.data[low][1] == b;
 }
 
+// True for the world and for kinematic bodies.
 template <class Arrays> CUDA_CALLABLE inline bool is_fixed(const Arrays& arrays, int body) {
     return body < 0 || (arrays.body_flags.shape[0] && arrays.body_flags.data[body] & KINEMATIC);
 }
