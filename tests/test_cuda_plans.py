@@ -330,10 +330,10 @@ def test_systems(which, launches):
 
 @pytest.mark.parametrize("which", ["fast", "most"])
 def test_systems_of_two_processes(which, launches, monkeypatch):
-    """Each has half of the boxes; or of the blocks of each pass, which is a run of whole splits."""
+    """Each process has half of the boxes, or half of the blocks of each pass, in whole splits."""
     ranks = Half()
     for module in (system, fmm):
-        monkeypatch.setattr(module, "ranks", lambda: ranks)
+        monkeypatch.setattr(module, "current_ranks", lambda: ranks)
     monkeypatch.setattr(sharing, "_LEAST_BOXES", {"cuda": 1})
     monkeypatch.setattr(evaluate, "_LEAST_SHARED", {"cuda": 1})
     monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", 2**20)
