@@ -63,7 +63,7 @@ class Moments:
         n = self.packed.count
         segments = [(0, n, 0, n)] if rows is None else [(row, row + 1, 0, n) for row in rows]
         return PairEvaluation(
-            quantity, segments, self.packed, self.packed, self._base, self.out, turned=self._turned,
+            quantity, segments, self.packed, self.packed, self._base, self.out, with_torque=self._turned,
             torques=self._torques, sums=sums, ranks=current_ranks(),
         )  # fmt: skip
 

@@ -1,8 +1,8 @@
-"""Warp kernels of warpmag, in rooms by physical stage. Each room imports only the rooms before it.
+"""Warp kernels of warpmag, in one folder per physical stage. Each folder imports only the folders before it.
 
-| room | content |
+| folder | content |
 |---|---|
-| shared | native code, threads of a CPU, vectors, reductions |
+| shared | native code, CPU threads, vectors, reductions |
 | material | magnetization curves |
 | pairs | fields and forces of moments, summed over all pairs |
 | fmm | the fast multipole method |

@@ -112,7 +112,7 @@ def evaluation(quantity, count, segments=None, *, among=True, dtype=wp.float32, 
     targets = moments if among else packed(count, dtype)
     turned = wp.ones(count, dtype=int, device="cpu")
     arrays = targets, moments, base, out
-    return PairEvaluation(quantity, segments, *arrays, turned=turned, torques=torques, **settings)
+    return PairEvaluation(quantity, segments, *arrays, with_torque=turned, torques=torques, **settings)
 
 
 def integers(array) -> np.ndarray:

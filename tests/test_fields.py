@@ -278,7 +278,7 @@ def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, groups=
     none, out, torques = (wp.zeros_like(vectors[0]) for _ in range(3))
     turned = wp.ones(len(x), dtype=int, device=device)
     evaluation = PairEvaluation(
-        quantity, segments, packed, packed, none, out, turned=turned, torques=torques, form=form
+        quantity, segments, packed, packed, none, out, with_torque=turned, torques=torques, form=form
     )
     evaluation.partial.fill_(np.nan)
     evaluation.launch()

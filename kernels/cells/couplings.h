@@ -1,9 +1,9 @@
 // Corrections of the field between cells of one body, H_i += Σ T_ij m_j, with tensors T_ij in the body's frame.
 //
 // Three passes: TURN rotates moments into the frame of their body; SHARE computes the low-order fields that all cells
-// of a body share; ADD sums the tensors' fields and rotates them into the world. At the start of a solve HARDEN treats
-// cells of different bodies that overlap. On a CPU a pass works on a vector of cells, on a GPU a group of threads has
-// one cell. From Python: CAPACITY and GROUP. ``Couplings`` is the struct of couplings.py.
+// of a body share; ADD sums the tensors' fields and rotates them into the world. At the start of a solve HARDEN raises
+// the demagnetizing factors of cells that overlap cells of other bodies. On a CPU a pass works on a vector of cells, on
+// a GPU a group of threads has one cell. From Python: CAPACITY and GROUP. ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
 #include "pairs/neighbor_lists.h"
@@ -21,7 +21,7 @@ template <class Couplings>
 CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const moments, int row) {
     const int chunk = row / CHUNK, lane = row % CHUNK;
     const int end = c.slot_begin.data[chunk + 1];
-    const size_t pitch = c.turned.strides[0] / sizeof(Real);
+    const size_t pitch = c.body_moments.strides[0] / sizeof(Real);
     Vector h = {0, 0, 0};
 #pragma unroll 4
     for (int slot = c.slot_begin.data[chunk] + share(); slot < end; slot += SHARES) {
@@ -44,14 +44,14 @@ CUDA_CALLABLE inline Vector common_field(const Real* a, Vector place) {
             a[2] + a[6] * x + a[7] * y - (a[3] + a[4]) * z};
 }
 
-// Coefficients of a body's low-order field: its matrix times the moments Σ m and Σ of first order.
+// Coefficients of a body's low-order field: its matrix times the sums of zeroth and first order, Σ m and Σ x_k m_l.
 template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings& c, int body) {
     const auto& rows = c.rows.data[body]; // range of the body's rows
     const int table = c.chunk.data[rows[0] / CHUNK][3] - rows[0];
-    const size_t pitch = c.turned.strides[0] / sizeof(Real), places = c.place.strides[0] / sizeof(Real);
+    const size_t pitch = c.body_moments.strides[0] / sizeof(Real), places = c.place.strides[0] / sizeof(Real);
     Vector sums[3] = {};
     for (int row = rows[0] + WIDTH * share(); row < rows[1]; row += WIDTH * SHARES) {
-        const Real *const own = c.turned.data + row, *const at = c.place.data + table + row;
+        const Real *const own = c.body_moments.data + row, *const at = c.place.data + table + row;
         const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
         const Number x = numbers(at), y = numbers(at + places), z = numbers(at + 2 * places);
         sums[0] += m;
@@ -105,10 +105,10 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
         return;
     }
     const Rotation rotation = rotation_of(c.rotation.data[body]);
-    Real* const own = c.turned.data + row;
-    const size_t pitch = c.turned.strides[0] / sizeof(Real);
+    Real* const own = c.body_moments.data + row;
+    const size_t pitch = c.body_moments.strides[0] / sizeof(Real);
     if (pass == TURN) {
-        const Vector m = turned_back(rotation, vectors((const Real*)c.moments.data + 3 * (size_t)i, held));
+        const Vector m = to_body(rotation, vectors((const Real*)c.moments.data + 3 * (size_t)i, held));
         if (share() != 0) return;
         put(own, m.x);
         put(own + pitch, m.y);
@@ -116,7 +116,7 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
         return;
     }
     const int in_table = row - chunk[2] + chunk[3];
-    const Vector sums = sum_entries(c, c.turned.data + chunk[2], in_table);
+    const Vector sums = sum_entries(c, c.body_moments.data + chunk[2], in_table);
     if (share() != 0) return;
     const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
     const size_t places = c.place.strides[0] / sizeof(Real);
@@ -125,7 +125,7 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
     const Vector common = common_field(c.common.data + (size_t)body * COMMON, place);
     const Vector h = sums + common - numbers(c.hardness.data + row) * m;
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
-    put_vectors(field, held, vectors(field, held) + turned(rotation, h));
+    put_vectors(field, held, vectors(field, held) + to_world(rotation, h));
 }
 
 template <class Word, class Couplings>

@@ -1,14 +1,15 @@
 """Corrections of the field between the cells of each body, and their launches.
 
-A table belongs to a shape and serves all bodies of that shape. It has a list of entries for each cell, in chunks of
-``native.CHUNK`` cells side by side, each with as many slots as its longest list. :func:`couplings_type` has the arrays.
+A table belongs to a shape and serves all bodies of that shape. It has a list of entries for each cell. Chunks of
+``native.CHUNK`` cells are stored side by side, with as many slots as the longest list of the chunk.
+:func:`couplings_type` has the arrays.
 
 Cells of different bodies act on each other as balls. Where bodies intersect, this would make the operator of induction
 indefinite, with several solutions. So the demagnetizing factor of a cell grows by the fraction of its volume that
 overlaps cells of other bodies, times ``Coupling.hardening``, the largest reduction of a demagnetizing factor by the
-couplings of the body. It is 0.1 for a cube, 0.2 for a ball, more for thin sheets. It was enough
-in all 140 arrangements that were tried, coincident bodies among them. Cubes that only touch overlap by a tenth of a
-cell, whose demagnetizing factor grows by 0.01.
+couplings of the body. It is 0.1 for a cube, 0.2 for a ball, more for thin sheets. It sufficed in all 140 arrangements
+that were tried, coincident bodies among them. Cubes that only touch overlap by a tenth of a cell, so that the
+demagnetizing factor of these cells grows by 0.01.
 """
 
 from functools import cache
@@ -55,7 +56,7 @@ def couplings_type(dtype):
         overlap: wp.array2d[int]
         overlap_count: wp.array[int]
         # Data out:
-        turned: wp.array2d[dtype]  # moments in the frames of their bodies, shape [3, chunks · CHUNK]
+        body_moments: wp.array2d[dtype]  # moments in the frames of their bodies, shape [3, chunks · CHUNK]
         common: wp.array[dtype]  # low-order coefficients in the frame of the body [A/m], COMMON per body
         hardness: wp.array[dtype]  # added demagnetizing factor over the volume [1/m³], shape [chunks · CHUNK]
         h: wp.array[vec3]  # field to which corrections are added [A/m], shape [n]
@@ -64,7 +65,7 @@ def couplings_type(dtype):
 
 
 def _table(start, other, tensor):
-    """Number of slots of each chunk of a table, and the entries: cells and tensors."""
+    """Return the number of slots of each chunk of a table, and the entries: cells and tensors."""
     counts = np.diff(start)
     chunks = -(-len(counts) // CHUNK)
     cell = np.repeat(np.arange(len(counts)), counts)
@@ -97,7 +98,8 @@ class CellCouplings:
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
-        whole: True for bodies that :meth:`launch_others` leaves out, shape [bodies]; None leaves out none.
+        whole: True for bodies solved as a whole (``induction``), which :meth:`launch_others` leaves out, shape
+            [bodies]; None means no such body.
 
     Attributes:
         rotations: Rotation from each body's frame to the world, shape [bodies]; written by the caller.
@@ -112,16 +114,16 @@ class CellCouplings:
         self._couplings = c = couplings_type(dtype)()
         c.moments, c.h, c.packed = moments, h, packed.packed
         c.overlap, c.overlap_count = packed.overlaps, packed.overlap_counts
-        left = self._lay_out(bodies, whole, np.asarray(worlds), dtype, h.device)
+        other_chunks = self._lay_out(bodies, whole, np.asarray(worlds), dtype, h.device)
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
         self.hardness = c.hardness
         self._start = self._record(c, HARDEN, HARDEN)
         self._launches, self._others = self._record_field(c), []
-        if left:
+        if other_chunks:
             part = couplings_type(dtype)()
             for name in couplings_type(dtype).vars:
                 setattr(part, name, getattr(c, name))
-            part.chunk = c.chunk[:left]
+            part.chunk = c.chunk[:other_chunks]
             self._others = self._record_field(part)
 
     def _record_field(self, couplings):
@@ -140,7 +142,7 @@ class CellCouplings:
 
     def _lay_out(self, bodies, whole, worlds, dtype, device) -> int:
         """Fill the arrays; return the number of chunks of the bodies that are not whole, which come first."""
-        c, first_rows, tables, places, chunks, body, left = self._couplings, {}, [], [], [], [], 0
+        c, first_rows, tables, places, chunks, body, other_chunks = self._couplings, {}, [], [], [], [], 0
         self.rows = np.zeros(len(bodies), int)
         whole = np.zeros(len(bodies), bool) if whole is None else np.asarray(whole, bool)
         for number in np.argsort(whole, kind="stable").tolist():
@@ -156,7 +158,7 @@ class CellCouplings:
             starts = range(0, count, CHUNK)
             chunks += [(first + k, min(CHUNK, count - k), row, first_rows[id(coupling)]) for k in starts]
             body += [number] * len(starts)
-            left += 0 if whole[number] else len(starts)
+            other_chunks += 0 if whole[number] else len(starts)
         slots, others, tensors = (np.concatenate(parts) for parts in zip(*tables, strict=True))
 
         def put(values, kind):
@@ -173,14 +175,14 @@ class CellCouplings:
         c.matrix = put(np.concatenate([coupling.common.ravel() for _, coupling in bodies]), dtype)
         c.hardening = put([coupling.hardening for _, coupling in bodies], dtype)
         c.common = wp.zeros(COMMON * len(bodies), dtype=dtype, device=device)
-        c.turned = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
+        c.body_moments = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
         c.hardness = wp.zeros(CHUNK * len(chunks), dtype=dtype, device=device)
         world = np.searchsorted(worlds[:, 0], [first for first, *_ in chunks], side="right") - 1
         c.world = put(worlds[world].astype(np.int32), wp.vec2i)
-        return left
+        return other_chunks
 
     def start(self):
-        """Launch the start of a solve, at the present positions of the moments."""
+        """Launch the pass at the start of a solve, which writes ``hardness`` for the present positions."""
         self._start.launch()
 
     def launch(self):

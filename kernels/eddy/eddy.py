@@ -28,7 +28,7 @@ Only the torque on inducible balls needs a separate sum, since the moments alone
 **Left out** are the response of neighbors' magnetizations to the change of the field (they move and rotate with their
 balls), the skin effect, and changes of the applied field other than by motion.
 
-**Time steps.** Explicit forces overshoot if they would stop the ball within a step Δt. So c is replaced by
+**Time steps.** Explicit forces overshoot if they would stop the ball within a step Δt. Therefore c is replaced by
 c / (1 + 2 Δt c K). K bounds the decay rate of the motion due to the braking forces: |N|² times the squared gradients of
 B over the masses of both moments of a pair, plus |N|² times the squares of B over their moments of inertia.
 """
@@ -47,8 +47,8 @@ from warpmag.kernels.shared.team import team, threads_for
 
 _RATES, _FIELDS = range(2)
 """The passes; as in ``rates.h``."""
-_SEEN_ROWS = 13
-"""Rows at a conductor: 4π times H, its rate, its gradient xx, yy, zz, xy, yz, zx; the sources' part of K/|N|²."""
+_FIELD_ROWS = 13
+"""Rows at a conductor: 4π times H, dH/dt and ∇H (xx, yy, zz, xy, yz, zx); the sources' part of K/|N|²."""
 MOTION_ROWS = 8
 """Rows: velocity [m/s], angular velocity [rad/s] of a moment; 1/mass [1/kg], 1/inertia [1/(kg·m²)] of its body."""
 _GROUP = 32
@@ -64,13 +64,13 @@ def _arrays_type(dtype):
 
     @wp.struct
     class EddyArrays:
-        # Model: conductors (``ball``) and inducible balls (``turned``), padded to chunks of CHUNK balls of one world
+        # Model: conductors, and inducible balls whose torque is computed, in padded chunks of CHUNK balls of one world
         ball: wp.array[int]  # moment of each place
         slot: wp.array[int]  # place of each conductor
         chunk: wp.array[wp.vec4i]  # number of balls, range of moments of their world
-        turned: wp.array[int]
-        turned_slot: wp.array[int]
-        turned_chunk: wp.array[wp.vec4i]  # number of balls, range of conductors of their world
+        torque_ball: wp.array[int]  # the same arrays for inducible balls
+        torque_slot: wp.array[int]
+        torque_chunk: wp.array[wp.vec4i]  # number of balls, range of conductors of their world
         conductor: wp.array[int]  # moment of each conductor
         number: wp.array[int]  # conductor of each inducible ball, or -1
         # Model: material of each moment
@@ -85,7 +85,7 @@ def _arrays_type(dtype):
         # Data in and out:
         packed: wp.array2d[dtype]
         # Data out:
-        seen: wp.array2d[dtype]  # rows of _SEEN_ROWS at conductors
+        at_conductor: wp.array2d[dtype]  # rows of _FIELD_ROWS at conductors
         h: wp.array[vec3]  # field at conductors [A/m]
         eddy: wp.array2d[dtype]  # eddy moments [A·m²]
         field: wp.array2d[dtype]  # 4π times the field of eddy moments at inducible balls
@@ -101,8 +101,8 @@ def _passes(dtype, group: int):
 
 
 @cache
-def _seen(dtype):
-    """Warp functions that read three rows of a table as a vector, and 4π times the gradient at a conductor."""
+def _field_readers(dtype):
+    """Warp functions that read a vector from three rows of a table, and 4π times the field gradient at a conductor."""
     vec3, mat33 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
 
     @wp.func
@@ -110,9 +110,9 @@ def _seen(dtype):
         return vec3(rows[row, i], rows[row + 1, i], rows[row + 2, i])
 
     @wp.func
-    def gradient(seen: wp.array2d[dtype], i: int):
-        xx, yy, zz = seen[6, i], seen[7, i], seen[8, i]
-        xy, yz, zx = seen[9, i], seen[10, i], seen[11, i]
+    def gradient(at_conductor: wp.array2d[dtype], i: int):
+        xx, yy, zz = at_conductor[6, i], at_conductor[7, i], at_conductor[8, i]
+        xy, yz, zx = at_conductor[9, i], at_conductor[10, i], at_conductor[11, i]
         return mat33(xx, xy, zx, xy, yy, yz, zx, yz, zz)
 
     return three, gradient
@@ -121,8 +121,8 @@ def _seen(dtype):
 @cache
 def _brake_kernel(dtype):
     vec3, eddy_arrays = wp.types.vector(3, dtype), _arrays_type(dtype)
-    three, gradient = _seen(dtype)
-    coefficient, part, mu0, unit = (dtype(x) for x in (2.0 * np.pi / 15.0, 2.0 / 3.0, MU0, INVERSE_4PI))
+    three, gradient = _field_readers(dtype)
+    coefficient, two_thirds, mu0, inverse_4pi = (dtype(x) for x in (2.0 * np.pi / 15.0, 2.0 / 3.0, MU0, INVERSE_4PI))
 
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
     def brake(
@@ -139,15 +139,15 @@ def _brake_kernel(dtype):
     ):
         slot = arrays.slot[wp.tid()]
         i = arrays.ball[slot]
-        h = unit * three(arrays.seen, 0, slot) + applied[i]
-        rate = unit * three(arrays.seen, 3, slot) - wp.cross(three(arrays.motion, 3, i), h)
-        t = unit * gradient(arrays.seen, slot)
+        h = inverse_4pi * three(arrays.at_conductor, 0, slot) + applied[i]
+        rate = inverse_4pi * three(arrays.at_conductor, 3, slot) - wp.cross(three(arrays.motion, 3, i), h)
+        t = inverse_4pi * gradient(arrays.at_conductor, slot)
         if applied_rates:
             rate += applied_rates[i]
             t += wp.matrix_from_cols(along_x[i], along_y[i], along_z[i])
         # K/|N|² = Σ over both bodies of μ0² (|∇H|²/mass + |H|²/inertia)
         own = arrays.motion[6, i] * wp.ddot(t, t) + arrays.motion[7, i] * wp.dot(h, h)
-        k = arrays.seen[12, slot] + mu0 * mu0 * own
+        k = arrays.at_conductor[12, slot] + mu0 * mu0 * own
         r = arrays.packed[3, i]
         # e = −c N dB/dt, dB/dt = μ0 N (dH/dt − ω × H), c = (2π/15) σ R⁵
         c = coefficient * arrays.conductivity[i] * r * r * r * r * r
@@ -156,10 +156,10 @@ def _brake_kernel(dtype):
             slope, saturation, curve = arrays.slope[i], arrays.saturation[i], arrays.curve[i]
             s = slope * wp.length(h) / saturation
             steepest = wp.max(curve_ratio(s, curve, arrays.tables), curve_slope(s, curve, arrays.tables))
-            largest = dtype(1.0) + part * slope * steepest
+            largest = dtype(1.0) + two_thirds * slope * steepest
             k *= largest * largest
             for _ in range(2):
-                e += part * curve_derivative_times(h, e, slope, saturation, curve, arrays.tables)
+                e += two_thirds * curve_derivative_times(h, e, slope, saturation, curve, arrays.tables)
         e *= c / (dtype(1.0) + dtype(2.0) * step * c * k)
         arrays.h[wp.tid()] = h
         for n in range(3):
@@ -174,14 +174,14 @@ def _brake_kernel(dtype):
 @cache
 def _turn_kernel(dtype):
     vec3, eddy_arrays = wp.types.vector(3, dtype), _arrays_type(dtype)
-    three, _ = _seen(dtype)
-    mu0, unit = dtype(MU0), dtype(INVERSE_4PI)
+    three, _ = _field_readers(dtype)
+    mu0, inverse_4pi = dtype(MU0), dtype(INVERSE_4PI)
 
     @wp.kernel(module="unique", enable_backward=False)
     def turn(arrays: eddy_arrays, torques: wp.array[vec3]):
-        slot = arrays.turned_slot[wp.tid()]
-        i = arrays.turned[slot]
-        torque = wp.cross(three(arrays.packed, 4, i), unit * three(arrays.field, 0, slot))
+        slot = arrays.torque_slot[wp.tid()]
+        i = arrays.torque_ball[slot]
+        torque = wp.cross(three(arrays.packed, 4, i), inverse_4pi * three(arrays.field, 0, slot))
         conductor = arrays.number[wp.tid()]
         if conductor >= 0:
             torque += wp.cross(three(arrays.eddy, 0, i), arrays.h[conductor])
@@ -210,7 +210,7 @@ class EddyCurrents:
         packed: Packed moments (``packing.PackedMoments``), whose positions the caller updates.
         ranges: Begin and end of the moments of each world.
         conductivity: Conductivity of each moment's ball [S/m], zero for insulators, shape [n].
-        turned: True for inducible balls whose torque is computed, shape [n].
+        with_torque: True for inducible balls whose torque is computed, shape [n].
         material: Magnetization curves of the moments.
         step: Time step Δt [s] of the forces.
 
@@ -218,7 +218,7 @@ class EddyCurrents:
         motion: Motion of each moment, ``MOTION_ROWS``, shape [8, n]; written by the caller.
     """
 
-    def __init__(self, packed, ranges, conductivity, turned, material: CurveParameters, step: float):
+    def __init__(self, packed, ranges, conductivity, with_torque, material: CurveParameters, step: float):
         """Allocate the results."""
         dtype, device = packed.dtype, packed.device
         self._packed, self._step, self._device = packed, step, device
@@ -230,19 +230,21 @@ class EddyCurrents:
         arrays.saturation, arrays.slope = material.saturation, material.slope
         arrays.inducible, arrays.curve = material.inducible, material.curve
         balls = [first + np.flatnonzero(conductivity[first:last]) for first, last in ranges]
-        turned_balls = [  # in worlds with a conductor
-            first + np.flatnonzero(turned[first:last]) if len(own) else own
+        torque_balls = [  # in worlds with a conductor
+            first + np.flatnonzero(with_torque[first:last]) if len(own) else own
             for (first, last), own in zip(ranges, balls, strict=True)
         ]
         ends = np.cumsum([0, *map(len, balls)])
         conductors = self._lay_out("ball", "chunk", "slot", balls, ranges)
         number = np.full(packed.count, -1)
         number[conductors] = np.arange(len(conductors))
-        also_turned = self._lay_out("turned", "turned_chunk", "turned_slot", turned_balls, itertools.pairwise(ends))
+        balls_with_torque = self._lay_out(
+            "torque_ball", "torque_chunk", "torque_slot", torque_balls, itertools.pairwise(ends)
+        )
         self._put("conductor", conductors)
-        self._put("number", number[also_turned])
-        arrays.seen = wp.zeros((_SEEN_ROWS, len(arrays.ball)), dtype=dtype, device=device)
-        arrays.field = wp.zeros((3, len(arrays.turned)), dtype=dtype, device=device)
+        self._put("number", number[balls_with_torque])
+        arrays.at_conductor = wp.zeros((_FIELD_ROWS, len(arrays.ball)), dtype=dtype, device=device)
+        arrays.field = wp.zeros((3, len(arrays.torque_ball)), dtype=dtype, device=device)
         arrays.h = wp.zeros(len(conductors), dtype=wp.types.vector(3, dtype), device=device)
         pairs = sum(len(own) * (last - first) for own, (first, last) in zip(balls, ranges, strict=True))
         self._threads = threads_for(pairs, _PAIRS_PER_THREAD)
@@ -251,7 +253,10 @@ class EddyCurrents:
         setattr(self._arrays, name, wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self._device))
 
     def _lay_out(self, name: str, chunks: str, slots: str, balls, sources) -> np.ndarray:
-        """Lay out the balls of all worlds in chunks with their sources, and the place of each; return all balls."""
+        """Store the balls of all worlds in chunks, with the range of their sources and the place of each ball.
+
+        Returns all balls.
+        """
         empty = np.zeros(0, int)
         places, rows, ball_slots = [empty], [], [empty]
         for own, (begin, end) in zip(balls, sources, strict=True):
@@ -289,13 +294,13 @@ class EddyCurrents:
         wp.launch(_brake_kernel(self._packed.dtype), len(self._arrays.slot), inputs=inputs, device=self._device)
 
     def finish(self, moments, torques):
-        """Add the torques on inducible balls, and subtract the eddy moments from the packed moments.
+        """Add the torques on inducible balls, and restore the packed moments without eddy moments.
 
         Args:
             moments: The moments [A·m²], shape [n].
             torques: In and out, torques [N·m], shape [n].
         """
         arrays, dtype, device = self._arrays, self._packed.dtype, self._device
-        self._make_pass(_FIELDS, len(arrays.turned))
-        wp.launch(_turn_kernel(dtype), len(arrays.turned_slot), inputs=[arrays, torques], device=device)
+        self._make_pass(_FIELDS, len(arrays.torque_ball))
+        wp.launch(_turn_kernel(dtype), len(arrays.torque_slot), inputs=[arrays, torques], device=device)
         wp.launch(_restore_kernel(dtype), len(arrays.slot), inputs=[arrays, moments], device=device)

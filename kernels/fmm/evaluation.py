@@ -30,7 +30,7 @@ class FmmSums:
         tables: Coefficients of the harmonics.
         quantity: Quantity that is summed; ``MUTUAL_FORCE`` is summed as ``FORCE``.
         first: Packed column of the first target in the octree.
-        sources: Whether each moment is a source, NumPy, shape [n]; None means all are.
+        sources: True for moments that are sources, NumPy, shape [n]; None means all moments.
         ranks: Processes that share the sums (``warpmag.moments.ranks.Ranks``); None means a single process.
     """
 
@@ -170,11 +170,11 @@ def sampled_error(sums, moments, ranges, target_base, base) -> float:
     Waits for the device.
 
     Args:
-        sums: Sums of the targets' field on each other, as ``PairEvaluation`` takes them; None means over all pairs.
+        sums: Sums of the targets' fields at each other, as ``PairEvaluation`` takes them; None sums over all pairs.
         moments: Packed moments.
         ranges: Columns of each world: begin and end of targets, and end of sources, integers [worlds, 3].
-        target_base: Field that the targets' sums are added to, with the other sources' field [A/m], shape [n].
-        base: Field that all sources' sums are added to [A/m], shape [n].
+        target_base: Base field of the targets' sums, including the field of other sources [A/m], shape [n].
+        base: Base field of the sums over all sources [A/m], shape [n].
     """
     ranges = np.reshape(ranges, (-1, 3))
     targets = np.concatenate([np.arange(begin, end) for begin, end, _ in ranges])

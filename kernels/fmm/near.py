@@ -46,7 +46,7 @@ def _arrays_type(dtype):
 def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_begin, leaves, sums):
     """Launch the sums of a quantity over all pairs in neighboring leaves.
 
-    Forces are fastest where labels within a leaf are close to each other. Single balls are best labeled by column.
+    Forces are fastest where the labels in a leaf are close to each other. Single balls are best labeled by column.
 
     Args:
         quantity: ``FIELD``, ``FORCE`` or ``WRENCH``.

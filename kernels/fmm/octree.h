@@ -24,7 +24,7 @@ CUDA_CALLABLE inline int highest_bit(Bits bits) {
 #endif
 }
 
-// The bits of x with two zeros between them (Morton code of one axis), and the inverse.
+// The bits of x with two zeros inserted between neighbors (Morton code of one axis), and the inverse.
 CUDA_CALLABLE inline Bits spread_bits(Bits x) {
     x = (x | x << 32) & 0x1f00000000ffffull;
     x = (x | x << 16) & 0x1f0000ff0000ffull;
@@ -346,16 +346,16 @@ template <class Arrays> CUDA_CALLABLE inline void invert_order(const Arrays& a, 
 // Lists the neighbors of a box. Neighbors along x follow each other in the sorted list.
 template <class Arrays> CUDA_CALLABLE inline void find_neighbors(const Arrays& a, int box, BoxIndex index) {
     const int begin = a.level_begin.data[index.height], end = a.level_begin.data[index.height + 1];
-    const int across = 1 << (leaf_level(a) - index.height);
+    const int boxes_per_axis = 1 << (leaf_level(a) - index.height);
     int* const neighbors = a.neighbors.data + 27 * (size_t)box;
     for (int row = 0; row < 9; ++row) {
         BoxIndex near = {index.height, index.world, index.x > 0 ? index.x - 1 : 0, index.y + row % 3 - 1,
                          index.z + row / 3 - 1};
         int* const slots = neighbors + 3 * row;
         slots[0] = slots[1] = slots[2] = -1;
-        if (near.y < 0 || near.z < 0 || near.y >= across || near.z >= across) continue;
+        if (near.y < 0 || near.z < 0 || near.y >= boxes_per_axis || near.z >= boxes_per_axis) continue;
         int next = lower_bound(a.box_keys.data, begin, end, row_key(a, near));
-        for (; near.x <= index.x + 1 && near.x < across && next < end; ++near.x)
+        for (; near.x <= index.x + 1 && near.x < boxes_per_axis && next < end; ++near.x)
             if (a.box_keys.data[next] == row_key(a, near)) slots[near.x - index.x + 1] = next++;
     }
 }
@@ -420,7 +420,8 @@ template <Pass P, class Arrays> CUDA_CALLABLE inline void finish_pass(const Arra
     if (P == Pass::BOUND || round == 0) set_frame(a, P == Pass::BOUND ? 0 : 1);
 }
 
-// Runs one pass over ``count`` items. On a GPU each block of BLOCK threads takes one item, or each thread does.
+// Runs one pass over ``count`` items. On a GPU a block of BLOCK threads takes one block of moments, or a thread one
+// item.
 template <Pass P, class Word, class Arrays>
 CUDA_CALLABLE inline void build_octree(int thread, int count, int round, int threads, Word* team, const Arrays& a) {
 #if defined(__CUDA_ARCH__)

@@ -1,7 +1,7 @@
 """Octree of moments: the occupied boxes of all levels, built on the device in buffers of fixed size.
 
 A cube around all moments is halved until its boxes hold about the target number of moments. Coarser leaves are chosen
-where the buffers have no room for finer ones. A first round measures how occupancy depends on the edge of the leaves;
+if the buffers are too small for finer ones. A first round measures how occupancy depends on the edge of the leaves;
 the second round sets the edge of the cube accordingly. Worlds share the cube, and have boxes of their own.
 
 Heights count from the leaves, 0, to the cube. Boxes are numbered height by height, and within a height by world, z, y
@@ -24,8 +24,8 @@ _MAX_LEVELS = 14
 passes Warp would copy the results."""
 _KEY_BITS, _HEIGHT_BITS, _OCTANT_BITS = 64, 4, 8
 _LEAVES_PER_BOX = 0.3
-"""Leaves of the target occupancy over the boxes that buffers have room for. Box counts of two levels differ by a factor
-of up to 8, and the nearer level is chosen."""
+"""Number of leaves at the target occupancy over the capacity for boxes. Box counts of two levels differ by a factor of
+up to 8, and the nearer level is chosen."""
 
 
 class _Pass(IntEnum):
@@ -96,7 +96,7 @@ class Octree:
         groups: World of each moment, shape [n].
         worlds: Number of worlds.
         occupancy: Target for the mean number of moments in a leaf.
-        reach: Largest distance of two moments in contact [m]: leaves are not smaller.
+        reach: Largest distance of two moments in contact [m]; leaves are at least as large.
 
     Attributes:
         count: Number of moments n.

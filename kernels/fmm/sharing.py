@@ -1,8 +1,8 @@
-"""One process's share of an octree's boxes: merged sums have the same bits as those of a single process.
+"""One process's share of an octree's boxes. Merged sums are bitwise identical to those of a single process.
 
 Every process has the octree and all multipoles. It takes a contiguous range of leaves, for near pairs and for fields at
 its moments. Multipoles are translated to these leaves and to their ancestors. Two processes may both compute an
-ancestor: there are few, and local expansions then need not be merged.
+ancestor. Ancestors are few, and local expansions then need not be merged.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ _LEAST_BOXES = {"cpu": 1, "cuda": 8193}
 
 
 def share_boxes(octree: Octree, ranks) -> "BoxShares | None":
-    """Return this rank's share of boxes; None for a single process, or where sharing does not pay."""
+    """Return this process's share of boxes; None for a single process, or where sharing would be slower."""
     worth_sharing = octree.capacity >= _LEAST_BOXES["cuda" if octree.device.is_cuda else "cpu"]
     return BoxShares(octree, ranks) if worth_sharing and ranks is not None else None
 
@@ -78,7 +78,7 @@ def _mark_boxes(
         leaves_out[1] = end
     if leaf >= begin and leaf < end:
         box = int(leaf)
-        while box >= 0 and marks_out[box] == 0:  # whoever marks a box goes on with its ancestors
+        while box >= 0 and marks_out[box] == 0:  # the thread that marks a box goes on with its ancestors
             marks_out[box] = 1
             box = parent[box]
 

@@ -4,8 +4,8 @@
 // displacements d = source − target. A component of d that changes sign flips the translation matrix in rows and
 // columns of odd parity only: T(σ|d|) = P T(|d|) P, with P the diagonal of the harmonics' signs under σ. Sources of
 // equal |d| are therefore summed before they are translated. Let σ be the n = 1, 2, 4 or 8 sign combinations.
-// Components 1 and 2 have both signs; a component 3 has one sign in an octant, and 0 has no_box. Then the rows of
-// parity class a are
+// Components 1 and 2 have both signs; a component 3 has one sign in an octant, and 0 has none. Then the rows of parity
+// class a are
 //
 //     L_a = Σ_k T(|d|)_ak u_p[k],    u_p[k] = Σ_σ χ_p(σ) χ_class(k)(σ) q_σ[k],
 //
@@ -48,8 +48,8 @@ CUDA_CALLABLE inline int deposit_axes(int bits, int axes) {
     return (bits & axes & 1) | ((bits >> y) << 1 & axes & 2) | ((bits >> z) << 2 & axes & 4);
 }
 
-// Source box at a displacement of magnitude ``code`` from a box in an octant, or ``no_box``. The displacement has the
-// octant's usual signs, reversed along the axes ``flipped``.
+// Source box at a displacement of magnitude ``code`` from a box in an octant, or ``no_box``. The components of
+// the displacement are positive in octant 0 and mirrored in other octants, and reversed along the axes ``flipped``.
 template <class Arrays>
 CUDA_CALLABLE inline int source_box(const Arrays& arrays, int parent, int octant, int code, int flipped, int no_box) {
     if (parent < 0) return no_box;

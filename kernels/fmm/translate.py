@@ -1,7 +1,7 @@
 """Multipole-to-local translation (M2L) of boxes of the octree; ``translate.h`` has the equations.
 
 Sources of a box's far field are children of its parent's neighborhood that are not its own neighbors: at most 189. Sums
-run in a fixed order without atomics, so results repeat bit by bit.
+run in a fixed order without atomics, so results are bitwise reproducible.
 """
 
 from functools import cache
@@ -21,7 +21,7 @@ _BOXES = 32
 _GROUP_ROWS = 8
 """Row slots per thread of a GPU."""
 _MOST_SPLIT = 8192
-"""Most boxes for which several blocks of a GPU share the displacements of the same boxes: few boxes do not fill it."""
+"""Most boxes for which several blocks of a GPU share the displacements of a box. Few boxes do not fill the GPU."""
 OCTANTS = 8
 
 
@@ -178,7 +178,7 @@ def _splits(rows: int) -> int:
 
 
 def _used_rows(classes: np.ndarray) -> int:
-    """Return the rows per thread of a GPU: 6 if parity classes then fill groups with a tenth less work, else 8."""
+    """Return the rows per thread of a GPU: 6 if groups of 6 take at least a tenth less work, else 8."""
     work = {used: used * _threads(len(_grouped_rows(classes, _GROUP_ROWS, used))) for used in (6, 8)}
     return 6 if work[6] <= 0.9 * work[8] else 8
 

@@ -170,9 +170,9 @@ CUDA_CALLABLE inline void subtract_own_field(State& state, const Bodies& bodies,
                                              int past, Real weight) {
     const Rotation rotation = rotation_of(bodies.past.data[past * bodies.body.shape[0] + b]);
     apply_tensors(body, cells, [&](const Cell& cell) {
-        return moments_of(cell.material, cell.radius, turned_back(rotation, get(state.past_g, cell.at, past)));
+        return moments_of(cell.material, cell.radius, to_body(rotation, get(state.past_g, cell.at, past)));
     });
-    for_cells(body, cells, [&](Cell& cell) { cell.outside = cell.outside - weight * turned(rotation, cell.field); });
+    for_cells(body, cells, [&](Cell& cell) { cell.outside = cell.outside - weight * to_world(rotation, cell.field); });
 }
 
 // Reads the cells of body b, with the summed field as outside field. At the start of a solve the outside field is the
@@ -194,7 +194,7 @@ CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, 
         cell.radius = numbers_or(entries(state.packed, cell.at, 3), count, 0);
         cell.scale = cell.material.slope / cell.material.saturation;
         cell.hardness = numbers_or(bodies.hardness.data + bodies.row.data[b] + offset, count, 0);
-        cell.s = turned_back(rotation, get(state.s, cell.at));
+        cell.s = to_body(rotation, get(state.s, cell.at));
         cell.outside = get(begin ? state.h0 : state.h, cell.at);
         if (steady) cell.outside = 1 / cell.scale * get(state.mixed_g, cell.at);
     }
@@ -221,14 +221,14 @@ CUDA_CALLABLE inline void respond(State& state, const Bodies& bodies, int b, boo
     for_cells(body, cells, [&](Cell& cell) {
         // the summed field contains the pair law between the body's own cells
         const Vector own = begin ? Vector{0, 0, 0} : sum_cells(body, body.pair_law, cell.number);
-        const Vector outside = turned_back(rotation, cell.outside) - own;
+        const Vector outside = to_body(rotation, cell.outside) - own;
         cell.residual = cell.scale * (outside + cell.field) - cell.s;
     });
     newton_step(body, cells);
     const int warm = state.warm.data[row[2]];
     if (share() == 0)
         for_cells(body, cells, [&](Cell& cell) {
-            const Vector s = turned(rotation, cell.s);
+            const Vector s = to_world(rotation, cell.s);
             if (!begin) return set(state.h, cell.at, 1 / cell.scale * s);
             if (warm != 0 && warm != STEADY) return; // s is given, or too few solves to extrapolate
             set(state.s, cell.at, s);

@@ -145,7 +145,7 @@ template <class State> inline void list_neighbors(State& state, const Span& at) 
                 lists[CHUNK * counts[l]++ + l] = j - at.i + at.row;
         }
     }
-    const int longest = most(counts);
+    const int longest = largest_count(counts);
     for (int l = 0; l < WIDTH; ++l)
         for (int s = counts[l]; s < longest; ++s) lists[CHUNK * s + l] = at.row + l;
     state.near_count.data[at.row / WIDTH] = longest;

@@ -10,24 +10,24 @@ namespace warpmag {
 enum Curve { MIXED = -1, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR }; // as in curves.py
 static_assert(LINEAR + 1 == FIRST_TABLE, "tables come after curves with a formula");
 
-// tanh(s)/s, 1 at s = 0. Very small s are cut off, where the quotient of two denormals has no digits.
+// tanh(s)/s, 1 at s = 0. Below 1e-18 it is set to 1, since a quotient of denormals is inaccurate.
 CUDA_CALLABLE inline Real tanh_ratio(Real s) { return s < Real(1e-18) ? Real(1) : wp::tanh(s) / s; }
 #if !defined(__CUDA_ARCH__)
-// The same for vectors, which have no hyperbolic functions. In float32 it is a quotient of two polynomials in s²,
-// fitted up to s = 9, where tanh is 1. Its error is at most 3e-7, and 4e-8 on average.
+// The same for vectors; there are no vector versions of hyperbolic functions. In float32 it is a quotient of two
+// polynomials in s², fitted up to s = 9, where tanh is 1. Its error is at most 3e-7, and 4e-8 on average.
 inline Number tanh_ratio(Number s) {
     if constexpr (sizeof(Real) == 8) {
         Number ratio;
         for (int l = 0; l < WIDTH; ++l) ratio[l] = tanh_ratio(s[l]);
         return ratio;
     }
-    constexpr Real above[5] = {1.0, 0.13380975, 0.0034955274, 2.0608056e-05, 1.3353217e-08};
-    constexpr Real below[5] = {1.0, 0.46714291, 0.025876754, 0.00032855341, 7.7759703e-07};
+    constexpr Real numerator[5] = {1.0, 0.13380975, 0.0034955274, 2.0608056e-05, 1.3353217e-08};
+    constexpr Real denominator[5] = {1.0, 0.46714291, 0.025876754, 0.00032855341, 7.7759703e-07};
     const Number z = s * s;
-    Number over = above[4], under = below[4];
-    for (int k = 3; k >= 0; --k) over = over * z + above[k], under = under * z + below[k];
+    Number top = numerator[4], bottom = denominator[4];
+    for (int k = 3; k >= 0; --k) top = top * z + numerator[k], bottom = bottom * z + denominator[k];
     const Mask saturated = s > Real(9);
-    return (saturated ? Number(1) : over) / (saturated ? s : under);
+    return (saturated ? Number(1) : top) / (saturated ? s : bottom);
 }
 #endif
 
@@ -85,7 +85,7 @@ CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
     return steepness;
 }
 
-// s/c of the reduced field s at reduced magnetization c. Saturation gets a large finite s.
+// Ratio s/c of the reduced field s to the reduced magnetization c. At saturation s is large but finite.
 CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve) {
     const Real bounded = c < Real(0.999999) ? c : Real(0.999999), z = bounded * bounded;
     if (bounded < Real(1e-18) || curve == CLAMPED || curve == LINEAR) return 1;
@@ -139,7 +139,7 @@ CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* 
 }
 
 #if !defined(__CUDA_ARCH__)
-// Values of moments with different curves, from by_formula(curve) and by_table(curves).
+// Values of moments with different curves: by_formula(curve) for curves with a formula, by_table(ids) for tables.
 template <class ByFormula, class ByTable>
 __attribute__((noinline)) inline Number of_mixed(const Curves& curves, ByFormula by_formula, ByTable by_table) {
     Number all = 0;

@@ -11,7 +11,7 @@ With the reduced field s = k‖H‖/Ms every curve reads ‖M‖ = Ms c(s), c(0)
 
 k = 3χ/(3+χ) is the initial slope of a ball of susceptibility χ. ``curves.h`` has the functions. Kernels that call the
 Warp functions of this module, for float32 or float64, take ``native_options("material/curves.h", dtype=dtype)``. The
-curve c = s has no token; it is the response of a permanent magnet.
+curve c = s (``LINEAR``) has no token; it is the response of a permanent magnet.
 
 **Measured curves.** A table gives M as a function of the field H' inside the material. With y = k H'/Ms and c = M/Ms,
 the reduced field at a ball is s = y + (k/3) c. Between two knots c is cubic in y,
@@ -27,8 +27,8 @@ and the iteration converges as for other curves. ``tables.h`` solves for t. The 
 | of a piece | s_i | c_i | span | c1, c2, c3 | ∫c dy from 0 to y_i | k/3 |
 | of the last knot | s_n | c_n | 0 | z_n, a, 0 | ∫c dy from 0 to y_n | k/3 |
 
-Rows that no field reaches pad all tables to one length, so that every search takes the same number of steps. The first
-row of all holds that length.
+All tables are padded to one length with rows that no field reaches, so that every search takes the same number of
+steps. Row 0 of the array, before the first table, holds that length.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED, "frohlich":
 """Ids of the curves with a token."""
 _COLUMNS = 8
 _BEYOND = 1e30
-"""Reduced field and magnetization that are never reached."""
+"""Reduced field and magnetization of the padding, which no field reaches."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,8 @@ def _rows(measured) -> np.ndarray:
     begin, end = span * slope[:-1], span * slope[1:]
     c1, c2, c3 = begin, 3.0 * rise - 2.0 * begin - end, begin + end - 2.0 * rise
     area = np.concatenate([[0.0], np.cumsum(span * (c[:-1] + c1 / 2.0 + c2 / 3.0 + c3 / 4.0))])
-    left = 1.0 - c[-1]
-    z, a = (left / slope[-1], left**2 / slope[-1]) if left > 0.0 else (1.0, 0.0)
+    unsaturated = 1.0 - c[-1]
+    z, a = (unsaturated / slope[-1], unsaturated**2 / slope[-1]) if unsaturated > 0.0 else (1.0, 0.0)
     pieces = [np.append(span, 0.0), np.append(c1, z), np.append(c2, a), np.append(c3, 0.0)]
     return np.stack([y + k / 3.0 * c, c, *pieces, area, np.full(len(y), k / 3.0)], axis=1)
 
@@ -124,19 +124,19 @@ for _dtype in (wp.float32, wp.float64):
 
     @wp.func_native("return warpmag::inverse_curve_ratio(c, curve, tables.data);")
     def inverse_curve_ratio(c: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
-        """s/c of the reduced field s at reduced magnetization ``c``; saturation gets a large finite s."""
+        """Ratio s/c of the reduced field s to the reduced magnetization ``c``; large but finite at saturation."""
         ...
 
 
 @wp.func
 def curve_derivative_times(h: Any, v: Any, k: Any, saturation: Any, curve: int, tables: Any):
-    """Product f'(H) v of the curve's derivative ∂M/∂H at field ``h`` [A/m] with a vector ``v``; Eq. 4 needs it."""
+    """Product f'(H) v of the curve's derivative ∂M/∂H at field ``h`` [A/m] with a vector ``v`` (for Eq. 4)."""
     norm = wp.length(h)
     s = k * norm / saturation
-    across = k * curve_ratio(s, curve, tables)
+    perpendicular = k * curve_ratio(s, curve, tables)
     if norm == type(norm)(0.0):
-        return across * v
+        return perpendicular * v
     unit = h / norm
-    along = k * curve_slope(s, curve, tables)
+    parallel = k * curve_slope(s, curve, tables)
     # f' v = k (c/s) v + k (c' − c/s) (u·v) u
-    return across * v + ((along - across) * wp.dot(unit, v)) * unit
+    return perpendicular * v + ((parallel - perpendicular) * wp.dot(unit, v)) * unit

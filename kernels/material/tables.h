@@ -10,7 +10,7 @@ constexpr int FIRST_TABLE = 5; // id of the first table's curve; as in curves.py
 enum TableColumn { KNOT_S, KNOT_C, KNOT_SPAN, KNOT_C1, KNOT_C2, KNOT_C3, KNOT_AREA, KNOT_SHEAR, TABLE_COLUMNS };
 
 #if defined(__CUDA_ARCH__)
-// not inlined, which leaves more registers to curves with a formula
+// not inlined, so that curves with a formula have more registers
 #define WARPMAG_CALLED __device__ __noinline__
 #else
 #define WARPMAG_CALLED __attribute__((noinline))
@@ -25,9 +25,8 @@ CUDA_CALLABLE inline Real table_entry(const Real* tables, int row, int column) {
 }
 
 // Solves t (a + t (b + t c)) = value for t in [0, 1], where the cubic increases, by Newton's iteration within bounds.
-template <class N> CUDA_CALLABLE inline N place_on_cubic(N value, N a, N b, N c) {
-    constexpr Real small =
-        sizeof(Real) == 4 ? 1e-5 : 1e-9; // relative step after which Newton's iteration has converged
+template <class N> CUDA_CALLABLE inline N solve_cubic(N value, N a, N b, N c) {
+    constexpr Real tolerance = sizeof(Real) == 4 ? 1e-5 : 1e-9; // of the relative step
     const N zero = value * 0, one = zero + 1, whole = a + b + c;
     N low = zero, high = one, t = value < whole ? value / whole : one;
     t = t > zero ? t : zero;
@@ -40,7 +39,7 @@ template <class N> CUDA_CALLABLE inline N place_on_cubic(N value, N a, N b, N c)
         next = next <= high ? next : Real(0.5) * (low + high);
         const N change = next > t ? next - t : t - next;
         t = next;
-        if (!any(change > small * t)) break;
+        if (!any(change > tolerance * t)) break;
     }
     return t;
 }
@@ -51,20 +50,20 @@ template <class N> struct Piece {
 
     // Parameter t in [0, 1] from this knot to the next, at a reduced field or a reduced magnetization.
     CUDA_CALLABLE N at_field(N field) const {
-        return place_on_cubic(field - s, span + shear * c1, shear * c2, shear * c3);
+        return solve_cubic(field - s, span + shear * c1, shear * c2, shear * c3);
     }
-    CUDA_CALLABLE N at_magnetization(N reduced) const { return place_on_cubic(reduced - c, c1, c2, c3); }
+    CUDA_CALLABLE N at_magnetization(N reduced) const { return solve_cubic(reduced - c, c1, c2, c3); }
     // (c(t) − c(0))/t and dc/dt
     CUDA_CALLABLE N rise(N t) const { return c1 + t * (c2 + t * c3); }
     CUDA_CALLABLE N slope(N t) const { return c1 + t * (2 * c2 + 3 * t * c3); }
-    // z beyond the last knot, at a reduced field: c = 1 − a/z, where z is y plus a constant.
+    // Variable z of the approach to saturation c = 1 − a/z beyond the last knot, at a reduced field.
     CUDA_CALLABLE N beyond(N field) const {
         const N z = c1, a = shear * c2, w = field - s + z - a / z, size = root(w * w + 4 * a);
         return w > s * 0 ? Real(0.5) * (w + size) : 2 * a / (size - w);
     }
 };
 
-// Row of a curve whose range of an increasing column contains a value, by bisection.
+// Row of a curve whose interval of an increasing column contains a value, by bisection.
 template <class N, class I> CUDA_CALLABLE inline Piece<N> piece_of(const Real* tables, I curve, N value, int column) {
     const int rows = (int)tables[0]; // rows per curve, a power of two, stored in the first row
     I row = 1 + rows * (curve - FIRST_TABLE);

@@ -33,7 +33,7 @@ CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductanc
 // Writes the forces of a ball's contacts that the ball's own half of ΔC exerts.
 CUDA_CALLABLE inline void store_contact_forces(const Arrays& a, int i) {
     Partners<CONTACT_SLOTS> partners(a.near, i);
-    const int slots = most(a.contact_count + i);
+    const int slots = largest_count(a.contact_count + i);
     const Drive own = drive_at(a, OwnIndices(i).at);
     for (int s = share(); s - share() < slots; s += SHARES) {
         const Conductances f(a.conductance(s, i));
@@ -114,7 +114,7 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& so
     const Sources own = in_radii(sources, inverse_radius);
     Vector total = {zero, zero, zero};
     Partners<NEAR_SLOTS> partners(a.near, i);
-    const int near_slots = most(a.near_count + i), contact_slots = most(a.contact_count + i);
+    const int near_slots = largest_count(a.near_count + i), contact_slots = largest_count(a.contact_count + i);
     for (int s = share(); s - share() < near_slots; s += SHARES) {
         const Rows<PAIR_ROWS> row(a.pair(s, i));
         const Rows<PAIR_SLOPE_ROWS> slope(a.pair_slope(s, i));

@@ -81,7 +81,7 @@ CUDA_CALLABLE inline void select(const Arrays& a, int i) {
             const auto near = (counts > Real(k)) & (d < HALF_REACH * sum);
             const auto close = (d - sum) * sum < 2 * CONTACT_GAP_HIGH * size * o.w;
             const Number chosen = near ? (close ? unit - apart : zero + apart) : zero;
-            append(a, i, j, whole(chosen), apart ? NEAR_SLOTS : CONTACT_SLOTS, filled);
+            append(a, i, j, truncated(chosen), apart ? NEAR_SLOTS : CONTACT_SLOTS, filled);
             const auto overlap = near & (d < sum);
             if (!apart && any(overlap)) shared += shared_volume(d2, size, o.w, near);
         }

@@ -60,8 +60,8 @@ CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_RO
 template <bool FIRST>
 CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<CACHED_ROWS>& cached) {
     Partners<NEAR_SLOTS> partners(a.near, i);
-    const int contact_end = whole_rounds(most(a.contact_count + i));
-    const int end = FIRST ? whole_rounds(most(a.near_count + i)) : contact_end;
+    const int contact_end = whole_rounds(largest_count(a.contact_count + i));
+    const int end = FIRST ? whole_rounds(largest_count(a.near_count + i)) : contact_end;
     const Number zero = numbers(a.radius + i) * Real(0);
     Number far[16];
 #pragma unroll
@@ -181,7 +181,7 @@ CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
     const Parts<STATE_ROWS> state(rows), last(last_rows);
     const Parts<CACHED_ROWS> cached(rows_at(a.cached, CACHED_ROWS, i));
     const Number of_source = numbers(a.relaxation + i), of_dipole = numbers(a.relaxation + a.balls + i);
-    const int slots = most(a.contact_count + i);
+    const int slots = largest_count(a.contact_count + i);
     const Drive own = drive_at(a, OwnIndices(i).at);
     const Number size = numbers(a.radius + i), zero = size * Real(0), unit = zero + 1;
     Number sum[16], moved[parts(16)];

@@ -62,7 +62,7 @@ struct Spline {
         const Number z = smaller(gap - SMALLEST_GAP, zero) * (1 / SOFTNESS), steep = 1 / root(1 + z * z);
         Number x = logarithm(outside) + (SOFTNESS / SMALLEST_GAP) * z * steep;
         x = smaller(larger((x - FIRST_NODE) * NODES_PER_UNIT, zero), unit * (NODES - 1));
-        node = whole(smaller(x, unit * (NODES - 2)));
+        node = truncated(smaller(x, unit * (NODES - 2)));
         const Number v = x - number_of(node), u = 1 - v, sixth = unit * Real(1.0 / 6.0);
         const Number scale = Real(0.5) * NODES_PER_UNIT * steep * steep * steep / outside;
         weight[0] = sixth * u * u * u;
@@ -158,8 +158,9 @@ CUDA_CALLABLE inline void reset_isolated(const Arrays& a, int i, Mask isolated) 
 // Tabulates the slots of a ball. Slots that are no longer used are emptied: they hold the ball itself, and zeros.
 CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
     int *const used = a.used + i, *const used_contacts = used + a.balls;
-    const int contact_slots = most(a.contact_count + i), counted = most(a.near_count + i), emptied = most(used);
-    const int slots = counted > emptied ? counted : emptied, emptied_contacts = most(used_contacts);
+    const int contact_slots = largest_count(a.contact_count + i), counted = largest_count(a.near_count + i),
+              emptied = largest_count(used);
+    const int slots = counted > emptied ? counted : emptied, emptied_contacts = largest_count(used_contacts);
     const Number counts = number_of(indices(a.near_count + i)),
                  contact_counts = number_of(indices(a.contact_count + i));
     const Four own = own_four(a.positions, 0, i), own_part = own_four(a.positions, 1, i);
@@ -184,7 +185,7 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
         tabulate_pair(a, i, s, apart.u, pair);
         if (s >= contact_slots && s >= emptied_contacts) continue;
         const Number both = contact_counts > Real(s) ? weight * similarity : zero;
-        tabulate_contact(a, i, s, pair, both, whole(own_part.y), whole(part.y), sources, dipoles);
+        tabulate_contact(a, i, s, pair, both, truncated(own_part.y), truncated(part.y), sources, dipoles);
         for (int l = 0; l < WIDTH; ++l) find_counterpart(a, i + l, s, list[l]);
     }
     sources = group_total(sources);

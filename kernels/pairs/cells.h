@@ -3,10 +3,10 @@
 
 namespace warpmag {
 
-constexpr double FARTHEST_CELL = 1e9; // from the origin; beyond it the cell's index overflows an int
+constexpr double FARTHEST_CELL = 1e9; // farthest index from the origin that safely fits an int
 
 struct alignas(16) Cell {
-    int x, y, z, group; // group −1: no cell
+    int x, y, z, group; // group −1 stands for no cell
 };
 
 // Positions [m] and radii [m] of packed moments.
@@ -20,7 +20,7 @@ template <class Lists> CUDA_CALLABLE inline Balls balls_of(const Lists& lists) {
     return {x, x + pitch, x + 2 * pitch, x + 3 * pitch};
 }
 
-// Inverse width of a cell, which exceeds the largest distance of neighbors despite rounding.
+// Inverse width of a cell. The width exceeds the largest distance of neighbors despite rounding.
 template <class Lists> CUDA_CALLABLE inline double cells_per_meter_of(const Lists& targets) {
     return 1.0 / ((targets.ratio + 1e-6) * targets.reach.data[0]);
 }

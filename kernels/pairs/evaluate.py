@@ -12,8 +12,8 @@ that results do not depend on scheduling, and corrects overlapping pairs. Only t
 | ``MIRRORED`` | ``mirror_cuda`` | many moments among themselves: each pair is evaluated once, for both its moments |
 | ``REFERENCE`` | ``reference`` | a plain Warp loop, exact for overlapping balls, or with the paper's smoothing |
 
-A caller may supply the sums, as room ``fmm`` does (``GIVEN``). Where several processes have the same moments, each
-process sums a part of the work list. The processes merge their partial sums, and each finishes all targets.
+A caller may supply the sums, as ``fmm`` does (``GIVEN``). Where several processes have the same moments, each process
+sums a part of the work list. The processes merge their partial sums, and each finishes all targets.
 """
 
 from functools import cache
@@ -44,13 +44,14 @@ from warpmag.kernels.shared.team import team, threads_for
 
 LOOP, FUSED, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "mirrored", "reference", "given"
 
-# Measured on an H200: most targets for which the fused form is fastest, and fewest for which the mirrored form is.
+# Measured on an H200: most targets for which the fused form is fastest, and fewest for which the mirrored form is
+# fastest.
 _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE: 2640, Quantity.WRENCH: 2640}
 _LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
 _LEAST_MUTUAL = 0.75
 """Least fraction of the sources that are targets, for which the mirrored form is faster."""
 _LEAST_SHARED = {"cpu": 800_000, "cuda": 1_000_000_000}
-"""Fewest pairs that several processes share, by kind of device."""
+"""Fewest pairs for which several processes share the sums, by kind of device."""
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
 
 
@@ -66,11 +67,11 @@ class PairEvaluation:
         segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
         targets: Packed targets with their overlapping sources (``packing.PackedMoments``), t of them.
         sources: Packed sources.
-        base: Base field, which also contributes to torques [A/m], shape [t].
+        base: Base field [A/m], which also exerts torques, shape [t].
         out: Out, field [A/m] or forces [N] at the targets of ``segments``, shape [t]. The form ``MIRRORED`` also writes
             other sources' elements.
         effective: Effective moments e [A·m²], shape [3, t]; None means the moments.
-        turned: Nonzero where a torque is computed, shape [t].
+        with_torque: Nonzero where a torque is computed, shape [t].
         torques: Out, torques [N·m], shape [t].
         extra_parts: Number of partial sums that the caller writes.
         smoothing: Length ℓ [m] of the paper's smoothing, with the form ``REFERENCE``.
@@ -88,7 +89,7 @@ class PairEvaluation:
     """
 
     def __init__(
-        self, quantity, segments, targets, sources, base, out, *, effective=None, turned=None, torques=None,
+        self, quantity, segments, targets, sources, base, out, *, effective=None, with_torque=None, torques=None,
         extra_parts=0, smoothing=0.0, form=None, sums=None, ranks=None,
     ):  # fmt: skip
         """Choose the form and allocate its buffers."""
@@ -114,7 +115,7 @@ class PairEvaluation:
         a.effective = targets.moments if effective is None else effective
         a.base, a.out = base, out
         if quantity != Quantity.FIELD:
-            a.turned, a.torques = turned, torques
+            a.with_torque, a.torques = with_torque, torques
         self._recorded = {}
 
     def _plan_sums(self, quantity, segments, targets, same_set, smoothing):

@@ -68,8 +68,8 @@ inline Mask nonzero_at(const int* values, const TargetRows& at) {
 }
 #endif
 
-// Totals over parts of three of the ROW sums of each target row, from number ``offset`` on. The threads of a group
-// share the parts.
+// Totals over all partial sums of three of the ROW numbers of each target row, from number ``offset`` on. The threads
+// of a group share the partial sums.
 template <int ROW, class Arrays>
 CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& at, int offset) {
     Vector total = {0, 0, 0};
@@ -118,8 +118,8 @@ CUDA_CALLABLE inline void store(const Arrays& arrays, const TargetRows& at, Vect
         put_vectors_at(out, at, MU0 * INVERSE_4PI * f);
         Vector torque = {0, 0, 0};
         if (Q == Quantity::WRENCH) {
-            const Mask turned = nonzero_at(arrays.turned.data, at);
-            add_where(turned, torque, MU0 * cross(e, INVERSE_4PI * h + base));
+            const Mask active = nonzero_at(arrays.with_torque.data, at);
+            add_where(active, torque, MU0 * cross(e, INVERSE_4PI * h + base));
         }
         put_vectors_at((Real*)arrays.torques.data, at, torque);
     }

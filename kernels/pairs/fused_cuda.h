@@ -67,8 +67,8 @@ CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_
     fold<LANES, VALUES>(r, lane, (Real*)staging + own * VALUES);
 }
 
-// Total of target `thread` of a tile, in the threads that have a target: its sums plus a correction. SHARES threads
-// compute the correction as the vector correct(column, share), for the packed column of the target.
+// Total of target `thread` of a tile, in the threads that have a target: sums over pairs plus a correction. SHARES
+// threads compute the correction as the vector correct(column, share), for the packed column of the target.
 template <Quantity Q, int HELD, int LANES, int WARPS, int UNROLLED, int SHARES, class Correct>
 CUDA_CALLABLE inline wp::vec_t<width(Q), Real>
 sum_fused(int block, int thread, const wp::array_t<int>& tiles, const wp::array_t<Real>& target_table,

@@ -1,4 +1,4 @@
-"""Shape of the fused all-pairs sums of few moments on a GPU, ``fused_cuda.h``."""
+"""Shapes of blocks for ``fused_cuda.h``: all-pairs sums of few moments on a GPU, in one kernel."""
 
 import math
 from dataclasses import dataclass

@@ -8,7 +8,7 @@ namespace warpmag {
 
 template <Quantity Q, int HELD, int LANES, int WARPS, int UNROLLED, class Arrays>
 CUDA_CALLABLE inline void sum_and_finish(const Arrays& arrays) {
-    // Warp's thread index takes a division, on which everything depends
+    // not Warp's thread index, whose division would delay everything that follows
     const int block = blockIdx.x, thread = threadIdx.x;
     const TileEntry& tile = ((const TileEntry*)arrays.tiles.data)[block];
     const int i = tile.column_begin + thread;

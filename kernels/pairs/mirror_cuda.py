@@ -1,4 +1,4 @@
-"""Plan and launch of the sums of many moments among themselves on a GPU, with each pair once, ``mirror_cuda.h``.
+"""Plan and launch of ``mirror_cuda.h``: sums of many moments among themselves on a GPU, each pair evaluated once.
 
 The finishing kernel adds up the partial sums in order, so that results do not depend on the order of blocks. If the
 partial sums would take too much memory, several passes add to the same partial sums.
@@ -24,7 +24,7 @@ class MirrorShape:
         moments: Moments per lane; a tile has at most 32 times as many.
         warps: Warps per block.
         blocks: Resident blocks per multiprocessor, in float32.
-        unrolled: Unrolled steps of a stage.
+        unrolled: Steps of a stage that are unrolled.
     """
 
     moments: int
@@ -49,9 +49,9 @@ _SLAB_BYTES = 2**28
 _MOST_SPLITS, _MOST_STAGES = 32, 32
 """Most blocks that share the walk of a tile, and most stages in a warp's sum: longer sums would lose digits."""
 _SPLITS_TOGETHER = 4
-"""The number of splits of several passes is a multiple of it, so that as many processes can share them."""
+"""With several passes the number of splits is a multiple of this, so that this many processes can share them."""
 _FIXED_COST = 0.1
-"""Start and end of a block, and sum over a split, each in the time of a warp's stage."""
+"""Cost of starting and ending a block, and of adding up a split, in units of a warp's stage."""
 
 
 @wp.struct

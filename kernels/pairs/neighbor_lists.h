@@ -23,8 +23,8 @@ CUDA_CALLABLE inline void walk_lists(const int* lists, const int* counts, int i,
 template <class Visit>
 inline void walk_lists(const int* lists, const int* counts, Index i, int held, Index begin, Index end, Visit visit) {
     Index own = i[0], first = 0, count = 0, full = 0;
-    int longest = 0, lowest = __INT_MAX__,
-        highest = 0; // longest list, and range of sources of the balls whose list is full
+    // length of the longest list, and range of sources of the balls whose list is full
+    int longest = 0, lowest = __INT_MAX__, highest = 0;
     for (int l = 0; l < held; ++l) {
         if (end[l] <= begin[l]) continue;
         own[l] = i[l], first[l] = begin[l];

@@ -25,7 +25,7 @@ CAPACITY = 64
 """Length of a list."""
 SKIN = 0.6
 """Fraction of its radius that a moment may move before the lists are rebuilt. A larger skin makes lists longer and
-rebuilds rarer. Longer lists also spare evaluations of the induction, which predicts the moments of neighbors
+rebuilds rarer. Longer lists also save field evaluations of the induction, which predicts the moments of neighbors
 (``theta_flow``)."""
 _BUCKETS_PER_MOMENT = 4
 _BLOCK = 128
@@ -46,7 +46,7 @@ def lists_type(dtype):
         reach: wp.array[wp.float64]  # largest contact distance [m], shape [1]
         # Data in:
         packed: wp.array2d[dtype]
-        moved: wp.array[int]  # 1 if a moment has moved too far since the last search, shape [1]; set by ``packing``
+        moved: wp.array[int]  # 1 if a moment has moved too far since the last search, shape [1]; from ``packing``
         # Data out:
         neighbor: wp.array2d[int]  # ascending indices of neighbors, shape [n, capacity]
         count: wp.array[int]  # number of neighbors, which may exceed the capacity, shape [n]
@@ -102,7 +102,7 @@ def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capac
 
 
 def carried_lists(lists) -> dict:
-    """Return the arrays that a search reads from the one before, by name."""
+    """Return the arrays that a search reads from the previous search, by name."""
     return {name: getattr(lists, name) for name in ("neighbor", "count", "found_at", "moved", "searching")}
 
 

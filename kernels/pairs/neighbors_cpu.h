@@ -11,9 +11,8 @@ namespace warpmag {
 
 constexpr int TARGETS = 64; // targets that a thread takes at a time
 
-// Sources in the order of their buckets: index, column, group, position and radius. ``begin[b]`` is the first of bucket
-// b.
-// ``bucket`` is the bucket of each source, −1 if none, in the order of sources.
+// Sources in the order of their buckets: index, column, group, position and radius. ``begin[b]`` is the first source of
+// bucket b. ``bucket`` has the bucket of each source, or −1, in the original order of sources.
 struct SortedSources {
     int buckets, pitch, *begin, *index;
     Real* x;
@@ -46,7 +45,7 @@ template <class Lists> inline SortedSources sort_sources(const Lists& sources, d
 
 struct Target {
     Real x, y, z, radius, ratio;
-    int self; // index among the sources, −1 if it is none of them
+    int self; // index among the sources, −1 if the target is not a source
 };
 
 // Appends the sources ``begin`` to ``end`` of a column that are near a target to a list, which keeps the first

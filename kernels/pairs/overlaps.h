@@ -8,8 +8,8 @@
 
 namespace warpmag {
 
-// append(list, j, active) writes the indices j of the active lanes, or of the active threads of a group, to a list and
-// returns their number. On a CPU it always writes WIDTH entries, without branches that would be mispredicted.
+// append(list, j, active) writes the indices j of active lanes, or of active threads of a group, to a list, and returns
+// their number. On a CPU it always writes WIDTH entries, since branches would be mispredicted.
 #if defined(__CUDA_ARCH__)
 CUDA_CALLABLE inline Index lanes() { return 0; }
 

@@ -88,7 +88,7 @@ class PackedMoments:
         Args:
             radii: Ball radii [m], Warp array, shape [n].
             largest_radius: Largest radius [m].
-            labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None for different bodies.
+            labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means one body each.
             groups: World of each moment, shape [n]; None means one world.
             moving: True if the moments move by small steps, for which neighbor lists with a skin are faster. Otherwise
                 the lists are rebuilt each time.
@@ -149,7 +149,7 @@ class PackedMoments:
         if reach == 0.0 or self.count == 0 or sources.count == 0:
             return
         if sources is not self or not self._moving:
-            self._lists.moved.fill_(1)  # motion is watched for these moments only
+            self._lists.moved.fill_(1)  # ``pack`` detects motion of these moments only
         if sources is not self:
             self._lists.reach.fill_(reach)
         neighbors.launch_find_neighbors(self._lists, sources._lists)

@@ -3,8 +3,8 @@
 //
 // At most TILE_SIZE sources (from Python) at a time are kept in the first-level cache. The field and Kelvin's force
 // among moments are summed for both moments of a pair at once, which share the separation and its powers. Two fields
-// take 33 vector operations, a single one 23; two forces take 44, a single one 34. The loop is compiled for each kind
-// of two tiles' pairs: different radii cost 3 more operations.
+// take 33 vector operations, a single one 23; two forces take 44, a single one 34. The loop is compiled for each Kind
+// of pairs of two tiles: different radii cost 3 more operations.
 //
 // Threads take shares of the tiles, the largest first. No two shares add to the same partial sums of a row, and the
 // finishing kernel adds the partial sums up in order. So results do not depend on which thread took which share.
@@ -28,9 +28,9 @@ constexpr int LANES = BYTES / (int)sizeof(Real), VECTORS = TILE_SIZE / LANES;
 typedef Real Simd __attribute__((ext_vector_type(LANES)));
 static_assert(W == 2); // inverse distances are twice_inverse_root(d²)
 
-// MUTUAL: a pair may be summed for both its moments. ROWS: the quantity summed for one moment of a pair.
+// MUTUAL: a pair may be summed for both its moments. ONE_SIDED: the quantity summed where only one moment is a target.
 template <Quantity Q> constexpr bool MUTUAL = Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE;
-template <Quantity Q> constexpr Quantity ROWS = Q == Quantity::MUTUAL_FORCE ? Quantity::FORCE : Q;
+template <Quantity Q> constexpr Quantity ONE_SIDED = Q == Quantity::MUTUAL_FORCE ? Quantity::FORCE : Q;
 
 // Numbers of Sums that a quantity uses, and their count.
 template <Quantity Q> constexpr bool is_summed(int k) {
@@ -102,7 +102,7 @@ struct Tile {
     }
 };
 
-// Finds radii and labels that the moments of a tile have in common.
+// Compare the radii and the labels of a tile's moments, for kind_of.
 inline void compare_radii(Tile& tile) {
     tile.radius = number(tile.rows[RADIUS], 0);
     Simd spread = 0;
@@ -131,7 +131,7 @@ inline void append(Tile& tile, const Table& table, int begin, int end) {
     tile.count += end - begin;
 }
 
-// Computes the rest of a tile from its moments.
+// Pads a tile, and computes its scaled moments, zero sums, radii and labels.
 template <Quantity Q> __attribute__((noinline)) void complete(Tile& tile) {
     tile.vectors = (tile.count + LANES - 1) / LANES;
     for (int r = 0; r < PACKED_ROWS; ++r) {
@@ -156,7 +156,7 @@ template <Quantity Q> inline void fill(Tile& tile, const Table& table, int begin
     complete<Q>(tile);
 }
 
-// While it exists, removes a target's own moment from the tile of sources: its own field is left out.
+// Removes a target's own moment from the tile of sources, and restores it at the end of the scope.
 struct Own {
     Tile& sources;
     int i;
@@ -217,7 +217,7 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
         Simd radius, label;
     };
     const Simd contact = targets.radius + sources.radius, clamp = contact * contact;
-    const bool diagonal = &targets == &sources, afresh = diagonal || sources.vectors < 2;
+    const bool diagonal = &targets == &sources, restarts = diagonal || sources.vectors < 2;
     const auto of_target = [&](int row, int i) { return splat(numbers(targets.rows + row, i)); };
     const auto target = [&](int i) -> Target {
         return {of_target(POSITION, i), number(targets.rows[RADIUS], i), number(targets.rows[LABEL], i)};
@@ -236,7 +236,7 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
     Separation now, next;
     Simd inv;
     const auto sum_row = [&](int i) __attribute__((always_inline)) -> Sums<Simd> {
-        const Target t = target(i), then = target(i + 1);
+        const Target t = target(i), next_target = target(i + 1);
         const Vec3<Simd> e = BOTH ? of_target(MOMENT, i) : splat(share.effective.vector(0, targets.begin + i));
         const Vec3<Simd> n = of_target(SCALED_MOMENT, i);
         Sums<Simd> sums;
@@ -252,7 +252,7 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
             add_mirrored_pair<Q>(sums.h, unused, s.r, others, sources.source(v), e, n);
             ++v;
         }
-        if (afresh || i == 0) {
+        if (restarts || i == 0) {
             now = separation(t, v), next = separation(t, v + 1);
             inv = inverse(t, now.c, v);
         }
@@ -266,11 +266,12 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
             }
             now = next, next = later, inv = next_inv;
         };
-        for (; v < sources.vectors - 2 * !afresh; ++v) sum_vector(separation(t, v + 2), inverse(t, next.c, v + 1));
+        for (; v < sources.vectors - 2 * !restarts; ++v) sum_vector(separation(t, v + 2), inverse(t, next.c, v + 1));
         // the next target's first separations
         for (; v < sources.vectors; ++v) {
             const int ahead = v + 2 - sources.vectors;
-            sum_vector(separation(then, ahead), ahead ? inverse(then, next.c, ahead - 1) : inverse(t, next.c, v + 1));
+            sum_vector(separation(next_target, ahead),
+                       ahead ? inverse(next_target, next.c, ahead - 1) : inverse(t, next.c, v + 1));
         }
         return sums;
     };
@@ -366,7 +367,7 @@ template <Quantity Q> inline void sum_share(const Share& share) {
         if (entry->mirrored) {
             if constexpr (MUTUAL<Q>) sum_mirrored<Q>(share, *entry, targets, tile);
         } else {
-            sum_sources<ROWS<Q>>(share, *entry, targets, tile);
+            sum_sources<ONE_SIDED<Q>>(share, *entry, targets, tile);
         }
     }
     targets.finish();

@@ -1,4 +1,4 @@
-"""Shape and launch of the all-pairs sums of a work list of tiles on a GPU, ``sums_cuda.h``.
+"""Shape and launch of ``sums_cuda.h``: all-pairs sums of a work list of tiles on a GPU.
 
 If there are few targets, several blocks share the sources of a tile. Each block writes separate partial sums, so that
 results do not depend on the order of blocks.
@@ -36,7 +36,7 @@ _SHAPES = {
 }
 _MOST_SPLITS = 32
 _FIXED_COST = 16
-"""Start and end of a block, in the time of a source."""
+"""Cost of starting and ending a block, in units of one source."""
 
 
 def choose_loop_shape(quantity: Quantity, count: int) -> LoopShape:

@@ -8,7 +8,7 @@ namespace warpmag {
 constexpr unsigned ALL_LANES = ~0u;
 constexpr int FAR = 1 << 30; // beyond all columns
 
-// 1/√c. The handling of denormals in the library's rsqrtf would take as many instructions as the rest of the pair law.
+// 1/√c. The library's rsqrtf handles denormals, with as many instructions as the rest of the pair law.
 CUDA_CALLABLE inline float inverse_root(float c) {
     float y;
     asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(c));
@@ -128,7 +128,7 @@ struct LabelRange {
 // column own_begin on. A step is plain if its sources all have the given radius and none is masked. Then the clamp is a
 // constant of the target, and a pair takes 20 instructions for the field and 31 for the force. In addition a source
 // takes about four for all targets of a lane, and the staging of 32 sources about sixty. A LONG sum takes the radius
-// from each stage, decides for the whole stage, and adds up parts, so that it keeps its digits.
+// from each stage and decides for the whole stage. It adds up partial sums, which keeps it accurate.
 template <int LANES, int UNROLLED, bool LONG, Quantity Q, int HELD, class TargetAt, class Sources>
 CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt target_at, const Sources& sources, int begin,
                                       int end, Real radius, int own_begin, unsigned own_count, int lane, Quad* staged) {

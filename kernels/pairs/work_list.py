@@ -17,11 +17,11 @@ from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 TILE_COLUMNS = 8
 """Columns of a work list, ``TileEntry`` of ``pair_terms.h``: target rows begin and end, packed column of the first
 target, sources begin and end, partial sums of the targets, 1 for a mirrored tile, partial sums of its sources. A
-mirrored tile stands also for the tile with targets and sources exchanged. A GPU reads a row as two vectors."""
+mirrored tile also stands for the tile with targets and sources exchanged. A GPU reads a row as two vectors."""
 PAIRS_PER_THREAD = 400_000
-"""Pairs per thread, at least: waking a thread takes 50 to 100 µs, in which it would sum half of them."""
+"""Pairs per thread, at least. Waking a thread takes 50 to 100 µs, the time of half as many pairs."""
 _LEAST_SHARE = 50_000
-"""Pairs per share, at least; small blocks are put together."""
+"""Pairs per share, at least; small blocks are joined into one share."""
 _TILE_BYTES = 2560
 """Bytes per component of a tile's sources that a CPU keeps in its first-level cache."""
 _LEAST_TARGETS = 32
@@ -31,7 +31,7 @@ _LANES = 16
 
 
 def target_rows(segments, device):
-    """Packed column, first source and end of sources of each target row, as Warp arrays.
+    """Return the packed column, first source and end of sources of each target row, as Warp arrays.
 
     Args:
         segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
@@ -44,12 +44,12 @@ def target_rows(segments, device):
 
 
 def row_starts(segments):
-    """First target row of each segment, and the number of target rows."""
+    """Return the first target row of each segment, then the number of target rows."""
     return np.concatenate([[0], np.cumsum(segments[:, 1] - segments[:, 0])])
 
 
 def block_tiles(segments, width: int, splits: int = 1):
-    """Tiles of at most ``width`` targets, one for each of ``splits`` parts of the sources."""
+    """Return the tiles of at most ``width`` targets, one for each of ``splits`` parts of the sources."""
     starts = row_starts(segments)
     counts = -(-np.diff(starts) // width)
     segment = np.repeat(np.arange(len(segments)), counts)
@@ -66,7 +66,7 @@ def block_tiles(segments, width: int, splits: int = 1):
 
 
 def loop_tiles(segments, shape: LoopShape, multiprocessors: int):
-    """Tiles of the looped sums on a GPU, each for one part of the sources, and the number of parts."""
+    """Return the tiles of ``LOOP`` sums on a GPU, each for one part of the sources, and the number of parts."""
     width = 32 * shape.targets
     longest = int(np.max(segments[:, 3] - segments[:, 2], initial=0))
     splits = choose_splits(shape, len(block_tiles(segments, width)), longest, multiprocessors)
@@ -79,7 +79,7 @@ def tile_size(dtype) -> int:
 
 
 def cpu_tiles(segments, mutual: bool, dtype):
-    """Tiles of a CPU, first tile of each share, number of partial sums, and number of threads.
+    """Return the tiles of a CPU, first tile of each share, number of partial sums, and number of threads.
 
     A segment of many pairs is cut into blocks: stripes of targets by stripes of sources. Blocks with common targets
     write separate partial sums. The cuts depend on the arguments alone, and so does the order of each sum, whatever the
@@ -97,7 +97,7 @@ def cpu_tiles(segments, mutual: bool, dtype):
 
 
 def tiles_of_rank(tiles, begin, ranks):
-    """Tiles of one of several processes, and first tile of each share: every ``ranks.size``-th share of the work list.
+    """Return every ``ranks.size``-th share of the work list: tiles of one process, and first tile of each share.
 
     Shares are sorted by size, so that the processes get about equal work.
     """
@@ -107,12 +107,12 @@ def tiles_of_rank(tiles, begin, ranks):
 
 
 @lru_cache(maxsize=4)
-def _cut(segments, mutual: bool, most: int):
-    """Tiles, first tile of each share, and number of partial sums; cached for repeated calls."""
+def _cut(segments, mutual: bool, largest_tile: int):
+    """Return tiles, first tile of each share, and number of partial sums; cached for repeated calls."""
     starts = row_starts(np.array(segments, np.int64).reshape(-1, 4)).tolist()
     blocks, written = [], []
     for segment, row in zip(segments, starts[:-1], strict=True):
-        segment_blocks, parts = _cut_segment(segment, row, mutual, most)
+        segment_blocks, parts = _cut_segment(segment, row, mutual, largest_tile)
         blocks += segment_blocks
         written.append(parts)
     parts = max([1, *written])
@@ -128,40 +128,41 @@ def _cut(segments, mutual: bool, most: int):
     return np.reshape(np.array(tiles, np.int32), (-1, TILE_COLUMNS)), [*begin, len(tiles)], parts
 
 
-def _cut_segment(segment, row, mutual, most):
-    """Work and tiles of each block of a segment whose first target has row ``row``, and number of partial sums."""
+def _cut_segment(segment, row, mutual, largest_tile):
+    """Return work and tiles of each block of a segment with first target row ``row``, and number of partial sums."""
     t0, t1, s0, s1 = segment
     count, shift, parts, blocks = t1 - t0, row - t0, 0, []
     pairs = count * (s1 - s0)
     busy = min(pairs // PAIRS_PER_THREAD, MOST_THREADS)
-    whole, grain = busy < 2, pairs / (2 * max(busy, 1))
+    single, pairs_per_block = busy < 2, pairs / (2 * max(busy, 1))
     rest = [(s0, s1)]
     if mutual and s0 <= t0 and t1 <= s1:
         # two blocks per thread, where a block on the diagonal counts half
-        stripe_count = 1 if whole or count**2 <= grain else 2 * math.ceil(count / math.sqrt(2.0 * grain))
+        divided = not single and count**2 > pairs_per_block
+        stripe_count = 2 * math.ceil(count / math.sqrt(2.0 * pairs_per_block)) if divided else 1
         stripes = _stripes(t0, t1, stripe_count)
-        cut = [_stripes(*ends, -(-(ends[1] - ends[0]) // most)) for ends in stripes]
+        cut = [_stripes(*ends, -(-(ends[1] - ends[0]) // largest_tile)) for ends in stripes]
         blocks = [_square(shift, cut, a, b) for a in range(len(cut)) for b in range(a, len(cut))]
         parts, rest = len(stripes), [(s0, t0), (t1, s1)]
     for j0, j1 in rest:
-        block_count = 1 if whole else math.ceil(count * (j1 - j0) / grain)
+        block_count = 1 if single else math.ceil(count * (j1 - j0) / pairs_per_block)
         rows = max(min(block_count, count // _LEAST_TARGETS), 1)
         edges = [t0 + count * k // rows for k in range(rows + 1)]
         sources = _stripes(j0, j1, -(-block_count // rows))
-        part = 0 if whole else parts
+        part = 0 if single else parts
         blocks += [
             ((i1 - i0) * (end - begin), [(i0 + shift, i1 + shift, i0, begin, end, part + k, 0, 0)])
             for k, (begin, end) in enumerate(sources)
             for i0, i1 in pairwise(edges)
         ]
         parts += len(sources)
-    if whole and blocks:  # one block with one partial sum
+    if single and blocks:  # one block with one partial sum
         return [(sum(work for work, _ in blocks), [tile for _, block in blocks for tile in block])], 1
     return blocks, parts
 
 
 def _idle_rows(starts, written, parts):
-    """Tiles without sources, which zero the partial sums that no block of a segment writes."""
+    """Return tiles without sources, which zero the partial sums that no block of a segment writes."""
     idle = [
         (begin, end, 0, 0, 0, part, 0, 0)
         for part in range(min(written, default=parts), parts)
@@ -179,7 +180,7 @@ def _idle_rows(starts, written, parts):
 
 
 def _square(shift, stripes, a, b):
-    """Work and mirrored tiles of targets in stripe a and sources in stripe b, on or above the diagonal.
+    """Return work and mirrored tiles of targets in stripe a and sources in stripe b, on or above the diagonal.
 
     Stripes are lists of ranges of at most a tile's width. A row is a column plus ``shift``.
     """
@@ -216,7 +217,7 @@ def arrays_type(dtype):
         tiles: wp.array2d[int]
         shares: wp.array[int]  # first tile of each share of a CPU, and the end
         same_set: int  # 1 if targets and sources are the same moments
-        turned: wp.array[int]  # 1 where a torque is computed
+        with_torque: wp.array[int]  # 1 where a torque is computed
         # Data in:
         targets: wp.array2d[dtype]
         sources: wp.array2d[dtype]

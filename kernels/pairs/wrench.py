@@ -2,16 +2,16 @@
 
 | law | force | source |
 |---|---|---|
-| kelvin | F = μ0 (m·∇)H | Kim and Han 2022, Eqs. 13 and 14 (both r⁴ of Eq. 14 are r⁵) |
+| kelvin | F = μ0 (m·∇)H | Kim and Han 2022, Eqs. 13 and 14 (r⁴, twice in Eq. 14, is a misprint of r⁵) |
 | zeeman | F = μ0 V [f'(H) ∇H (2M + H) + ∇H M] | Eq. 4 |
 
 Both are μ0 (e·∇)H for an effective moment e, which is m or m + f'(H)(2m + V H). The torque on a moment is τ = μ0 e × H.
 Pairs of moments of one body are left out: with Kelvin's law they add up to zero, which rounding would violate.
 
 With Eq. 4 the paper, which has no torque, also sums pairs of one body (Algorithm 1). In equilibrium e = λm, with λ from
-1 to 8, and m is parallel to the total field. If λ is uniform in a body, the torque of its own pairs is
-−λm × H_own = λm × H, which agrees with the sum without them. Otherwise they would also exert a net force of the body on
-itself.
+1 to 8, and m is parallel to the total field H + H_own. If λ is uniform in a body, the forces between its moments exert
+the torque −Σ λm × H_own = Σ λm × H. That is the torque computed here, where those forces are left out. If λ is not
+uniform, they would also exert a net force of the body on itself.
 """
 
 from functools import cache

@@ -1,4 +1,4 @@
-"""Shared code of all rooms: native kernels, threads of a CPU, vectors, sums over threads, prefix sums.
+"""Code that all kernels share: native kernels, CPU threads, vectors, sums over threads, prefix sums.
 
 Imports Warp and NumPy only.
 """

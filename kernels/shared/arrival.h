@@ -1,11 +1,11 @@
-// Work of the last block of a GPU's launch.
+// Detection of the last block of a GPU launch that finishes its work.
 #pragma once
 
 namespace warpmag {
 
 #if defined(__CUDA_ARCH__)
-// Returns whether this block is the last of ``count`` blocks to call this function. The last block may read what all
-// blocks wrote. ``arrived`` counts the calls: zero before the first and after the last.
+// Returns true in the last of ``count`` blocks that call this function. That block may read everything that the others
+// wrote before their calls. ``arrived`` counts the calls; it is zero before the first and after the last.
 CUDA_CALLABLE inline bool is_last_of(int* arrived, int count) {
     __shared__ bool last;
     __syncthreads();

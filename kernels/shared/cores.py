@@ -1,7 +1,7 @@
 """Number of cores that this process may use, from its affinity and the CPU quota of its cgroups.
 
-A container is often limited by a quota alone, for example to 2 cores' time on a machine of 64 cores. With more threads
-than that, all of them are stopped for the rest of each period.
+A container is often limited by a quota alone, for example to 2 cores' time on a machine of 64 cores. If more threads
+run, they use up the quota early, and the system stops all of them for the rest of each period.
 """
 
 import math
@@ -51,11 +51,11 @@ def cpu_quota(root: Path) -> float:
 
 
 def _mounts(mounts, unified: bool):
-    """Group and mount folder of each mounted cgroup hierarchy: unified (version 2) or of the CPU (1)."""
+    """Yield the group and the mount folder of each cgroup hierarchy: unified (version 2) or of the CPU (version 1)."""
     for line in mounts:
         # 36 35 98:0 /group /folder rw,noatime master:1 - cgroup cgroup rw,cpu,cpuacct
-        own, _, kind = line.partition(" - ")
-        fields, kinds = own.split(), kind.split()
+        mount, _, kind = line.partition(" - ")
+        fields, kinds = mount.split(), kind.split()
         if len(fields) < 5 or len(kinds) < 3:
             continue
         if kinds[0] == "cgroup2" if unified else kinds[0] == "cgroup" and "cpu" in kinds[2].split(","):

@@ -1,12 +1,12 @@
-// Groups of ``GROUP`` threads of a GPU that share a ball (from Python, a power of two). On a CPU a thread has a vector
-// of balls for itself.
+// Groups of ``GROUP`` GPU threads that share a ball; Python sets ``GROUP``, a power of two. On a CPU one thread
+// processes a vector of balls.
 #pragma once
 #include "shared/vectors.h"
 
 namespace warpmag {
 
 #if defined(__CUDA_ARCH__)
-constexpr int SHARES = GROUP;
+constexpr int SHARES = GROUP; // threads that share a ball
 // Index of this thread in its group.
 CUDA_CALLABLE inline int share() { return threadIdx.x % GROUP; }
 // Mask of the group's threads in the warp.
@@ -22,7 +22,7 @@ CUDA_CALLABLE inline Number group_sum(Number part) {
     return part;
 }
 // Largest count among a warp's balls.
-CUDA_CALLABLE inline int most(const int* counts) {
+CUDA_CALLABLE inline int largest_count(const int* counts) {
     int largest = *counts;
     for (int other = GROUP; other < 32; other *= 2) {
         const int count = __shfl_xor_sync(~0u, largest, other);
@@ -36,7 +36,7 @@ inline constexpr int share() { return 0; }
 inline Number group_total(Number part) { return part; }
 inline Number group_sum(Number part) { return part; }
 // Largest count among a vector's balls.
-inline int most(const int* counts) {
+inline int largest_count(const int* counts) {
     int largest = 0;
     for (int l = 0; l < WIDTH; ++l) largest = counts[l] > largest ? counts[l] : largest;
     return largest;

@@ -5,8 +5,8 @@ namespace warpmag {
 
 // 2/√c. On AVX-512 Newton's iteration refines an estimate of relative error 2⁻¹⁴, in 4 operations. A square root and a
 // division of a vector would occupy the divider for 22 cycles (Sapphire Rapids; 16 on Zen 4), as long as the rest of a
-// pair. On AVX2 they take half of that and overlap with the sums. Its estimate is good to 2⁻¹² only, so that Newton's
-// steps would cost at least as much.
+// pair. On AVX2 they take half of that and overlap with the sums. The estimate of AVX2 is good to 2⁻¹² only, so
+// that Newton's steps would cost at least as much.
 #if defined(__CUDA_ARCH__)
 CUDA_CALLABLE inline Real twice_inverse_root(Real c) { return 2 * rsqrt(c); }
 #else

@@ -1,9 +1,10 @@
-// Numbers of several balls at a time, so that one source serves both devices: on a CPU vectors of 64 bytes, on a GPU
-// one number per thread.
+// Number types for several balls at a time, so that one source serves both devices. On a CPU they are vectors of 64
+// bytes, on a GPU one number per thread.
 //
 // ``Number``, ``Index`` and ``Mask`` hold a Real, an int and a truth value for each of ``WIDTH`` balls. ``Four`` holds
-// four numbers of each ball's cache line. On a GPU ``GROUP`` threads (from Python, a power of two) share a ball. Arrays
-// have ``CHUNK`` balls along their last axis, so that a vector of balls is contiguous in memory.
+// four numbers of each ball's cache line. On a GPU ``GROUP`` threads share a ball; Python sets ``GROUP``, a power of
+// two. Arrays have ``CHUNK`` balls along their last axis, so that a vector of balls is contiguous in memory. ``gather``
+// reads its indices from memory, ``collect`` takes them in a vector.
 #pragma once
 
 namespace warpmag {
@@ -29,7 +30,7 @@ CUDA_CALLABLE inline Number angle(Number y, Number x) { return atan2(y, x); }
 CUDA_CALLABLE inline Number larger(Number a, Number b) { return a > b ? a : b; }
 CUDA_CALLABLE inline Number smaller(Number a, Number b) { return a < b ? a : b; }
 CUDA_CALLABLE inline Number number_of(Index n) { return (Number)n; }
-CUDA_CALLABLE inline Index whole(Number x) { return (int)x; }
+CUDA_CALLABLE inline Index truncated(Number x) { return (int)x; }
 CUDA_CALLABLE inline Mask mask_of(bool condition) { return condition; }
 CUDA_CALLABLE inline Number numbers(const Real* row) { return *row; }
 CUDA_CALLABLE inline Index indices(const int* row) { return *row; }
@@ -77,25 +78,25 @@ inline Number logarithm(Number x) {
 }
 // Angle between the x-axis and the point (x, y).
 inline Number angle(Number y, Number x) {
-    Number turned;
+    Number theta;
     if constexpr (sizeof(Real) == 8) {
-        for (int l = 0; l < WIDTH; ++l) turned[l] = atan2(y[l], x[l]);
-        return turned;
+        for (int l = 0; l < WIDTH; ++l) theta[l] = atan2(y[l], x[l]);
+        return theta;
     }
     // t = smaller/larger coordinate; atan t = 2 atan s with s = t / (1 + √(1 + t²)), whose series is good to float32
     const Number a = __builtin_elementwise_abs(x), b = __builtin_elementwise_abs(y);
     const Number large = __builtin_elementwise_max(a, b), small = __builtin_elementwise_min(a, b);
     const Number t = small / (large > 0 ? large : Number(Real(1))), s = t / (1 + root(1 + t * t)), z = s * s;
     const Number tail = Real(0.1999821) - z * (Real(0.14239976) - z * (Real(0.10572771) - z * Real(0.0603314)));
-    turned = 2 * s * (1 - z * (Real(0.33333307) - z * tail));
-    turned = b > a ? Real(1.5707963267948966) - turned : turned;
-    turned = x < 0 ? Real(3.141592653589793) - turned : turned;
-    return y < 0 ? -turned : turned;
+    theta = 2 * s * (1 - z * (Real(0.33333307) - z * tail));
+    theta = b > a ? Real(1.5707963267948966) - theta : theta;
+    theta = x < 0 ? Real(3.141592653589793) - theta : theta;
+    return y < 0 ? -theta : theta;
 }
 inline Number larger(Number a, Number b) { return __builtin_elementwise_max(a, b); }
 inline Number smaller(Number a, Number b) { return __builtin_elementwise_min(a, b); }
 inline Number number_of(Index n) { return __builtin_convertvector(n, Number); }
-inline Index whole(Number x) { return __builtin_convertvector(x, Index); }
+inline Index truncated(Number x) { return __builtin_convertvector(x, Index); }
 template <class Condition> inline Mask mask_of(Condition condition) { return __builtin_convertvector(condition, Mask); }
 inline Number numbers(const Real* row) {
     Number n;
@@ -156,7 +157,7 @@ template <class Half, int... L> inline auto joined(Half a, Half b, Sequence<int,
     return __builtin_shufflevector(a, b, L...);
 }
 
-// Loads four numbers of each ball from place(lane), transposed into vectors.
+// Loads four numbers of each ball from the address place(lane), and transposes them into four vectors.
 template <class Place> inline Four fours(Place place) {
     typedef __make_integer_seq<Sequence, int, 8> Eight;
     auto part = [=](int l) -> Quarter {
@@ -189,7 +190,7 @@ inline void put_four(Real* lines, int quarter, int i, Four f) {
 }
 #endif
 
-// Address of the rows of ball i in an array, or of the rows of its slot s. Rows are CHUNK numbers apart.
+// Address of the first row of ball i in an array, or of slot s of the ball. Rows are CHUNK numbers apart.
 CUDA_CALLABLE inline Real* rows_at(Real* array, int rows, int i) {
     return array + (unsigned)i / CHUNK * (rows * CHUNK) + (unsigned)i % CHUNK;
 }

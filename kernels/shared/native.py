@@ -1,7 +1,7 @@
-"""C++ headers beside kernels: the kernels that call them, and the options under which Warp compiles them.
+"""Kernels that call C++ headers, and the options under which Warp compiles them.
 
-A header is named by its path from ``kernels/``, such as ``pairs/pair_law.h``, and includes others by theirs. All of it
-is in namespace ``warpmag``. It may use ``Real``, the scalar type of the module, and the constants that its kernel sets.
+A header is named and included by its path from ``kernels/``, such as ``pairs/pair_law.h``. Its code is in namespace
+``warpmag``. It may use ``Real``, the scalar type of the module, and the constants that the kernel sets.
 """
 
 import linecache
@@ -13,9 +13,9 @@ import warp as wp
 CHUNK = 16
 """Lanes of the widest vectors of a CPU; as in ``lanes.h``. Arrays of balls are padded to a multiple of it."""
 LINE = 16
-"""Numbers in a ball's cache line; as in ``lanes.h``. A CPU transposes lines into vectors, which beats gathering."""
+"""Numbers in a ball's cache line; as in ``lanes.h``. Transposing lines into vectors is faster than gathering."""
 PASS_ARGUMENTS = {"first": int, "last": int, "threads": int, "team": wp.array2d[wp.uint64]}
-"""Arguments of a kernel that makes passes ``first`` to ``last`` over balls, before the struct of its arrays.
+"""Arguments of a kernel that makes passes ``first`` to ``last`` − 1 over balls, before the struct of its arrays.
 
 A pass is written once for both devices. On a CPU it works on a vector of balls, and ``threads`` threads of the ``team``
 share the balls. On a GPU a group of threads shares a ball.
@@ -25,10 +25,10 @@ _INCLUDE = re.compile(r'^#include "(.+)"$', re.MULTILINE)
 
 
 def native_kernel(call: str, header: str, arguments: dict, *, dtype, launch: dict | None = None, **constants):
-    """Kernel in which each thread calls a C++ function.
+    """Return a kernel in which each thread calls a C++ function.
 
     Args:
-        call: The call, of a function in namespace ``warpmag``, which also names the kernel. It may use the kernel's
+        call: Call of a function in namespace ``warpmag``, whose name the kernel gets. The call may use the kernel's
             arguments and ``thread``, the index of the thread.
         header: Path of the header from ``kernels/``.
         arguments: Warp types of the kernel's arguments, by name.
@@ -86,14 +86,14 @@ def native_options(*headers: str, dtype, **constants: int | float) -> dict:
         extra_cuda_preamble=preamble,
         extra_build_dependencies=sorted(_closure(headers)),
     )
-    # full AVX-512 vectors, of which clang uses half by default. The warning about passing vectors to code compiled
-    # without AVX-512 does not apply: there is no such code.
+    # AVX-512 vectors at full width: clang uses half of it by default. The warning about passing vectors to code without
+    # AVX-512 does not apply: there is no such code.
     flags = f"{wp.config.cpu_compiler_flags or '-march=native'} -mprefer-vector-width=512 -Wno-psabi"
     return {"extra_build_options": options, "cpu_compiler_flags": flags}
 
 
 def _closure(headers) -> set[Path]:
-    """Files of ``headers`` and of all headers that they include."""
+    """Return the files of ``headers`` and of all headers that they include."""
     files: set[Path] = set()
     pending = [_FOLDER / header for header in headers]
     while pending:

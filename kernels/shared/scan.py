@@ -34,7 +34,7 @@ def launch_scan(values, sums, inclusive: bool = True):
 
     Args:
         values: Integers, shape [n].
-        sums: Out, sum of the values up to each one, shape [n]; may be ``values``.
+        sums: Out, sum of the values up to each element, shape [n]; may be ``values``.
         inclusive: True if a value is part of its own sum.
     """
     wp.launch_tiled(

@@ -1,4 +1,4 @@
-// Threads of a CPU that share the work of a launch; team.py describes the team.
+// CPU threads that share the work of a launch; team.py describes the team.
 #pragma once
 
 #if !defined(__CUDA_ARCH__)
@@ -36,6 +36,7 @@ struct Member {
     Word lock[8], wake[8]; // storage of a mutex and of a condition variable
 };
 
+// Changes the state if it is ``from``, and returns true if it was.
 inline bool change(Member* member, Word from, Word to) {
     return __atomic_compare_exchange_n(&member->state, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
 }
@@ -140,8 +141,7 @@ void run_passes(Word* team, int threads, int first, int last, Items items, int w
         const int end = begin + taken_at_once < count ? begin + taken_at_once : count;
         for (int i = begin; i < end; i += width) make_pass(pass, i);
     };
-    // the caller takes chunks from the first on, the others from the last on, so that a thread finds its data in its
-    // cache
+    // the caller takes chunks from the first on, the others from the last on: the data are then often in their caches
     int taken[MOST_PASSES] = {}, ahead[MOST_PASSES] = {}, behind[MOST_PASSES] = {}, done[MOST_PASSES] = {};
     auto work = [&](int member) {
         for (int pass = first; pass < last; ++pass) {

@@ -1,4 +1,4 @@
-"""Team of threads of a CPU that share the work of a launch.
+"""Team of CPU threads that share the work of a launch.
 
 Warp launches serially on a CPU, and a launch may be part of a graph, which Python's threads cannot run. So native code
 shares its work with POSIX threads. They are started once, since starting a thread takes longer than many launches. A
@@ -8,8 +8,8 @@ The number of threads of a launch is chosen when the launch is prepared, from th
 never changes results: no sum is split or ordered by thread.
 
 A member of the team is a record in memory that all launches share: its state, its job, and its mutex and condition
-variable. A launch claims idle members, and takes back jobs that have not begun once its own part is done. So it never
-waits for a thread that does not run, and concurrent launches share the members.
+variable. A launch claims idle members. When the launching thread has finished its part, it takes back the jobs that
+have not begun. So it never waits for a thread that does not run, and concurrent launches share the members.
 """
 
 import atexit
@@ -48,7 +48,7 @@ def threads_for(count: int, each: int) -> int:
 def team() -> wp.array:
     """Records of the team's members, the argument of ``run_together`` in ``team.h``; one array per process.
 
-    There is a member for each further core. If the process gets more cores, more members are started.
+    There is a member for each core but the first. If the process gets more cores, more members are started.
     """
     members, started = _members()
     count = min(cores(), MOST_THREADS) - 1

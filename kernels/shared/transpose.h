@@ -1,10 +1,11 @@
-// Transposition of a square of numbers in vectors of a CPU.
+// Transposition of a square matrix in CPU vectors.
 #pragma once
 #include "shared/lanes.h"
 
 namespace warpmag {
 
-// Exchanges blocks of STEP lanes and more. ``lanes`` is the sequence 0, 1, ... of a vector's lanes.
+// Exchanges blocks of STEP, 2 STEP, ... lanes; from STEP = 1 on this transposes. ``lanes`` is the sequence 0, 1, ... of
+// a vector's lanes.
 template <int STEP, class Simd, int LANES, int... L>
 inline void transpose(Simd (&rows)[LANES], Sequence<int, L...> lanes) {
     if constexpr (STEP < LANES) {

@@ -87,7 +87,7 @@ template <int C, int... L> inline Number component(Number a, Number b, Number c,
     const Number low = __builtin_shufflevector(a, b, (3 * L + C < 2 * WIDTH ? 3 * L + C : 0)...);
     return __builtin_shufflevector(low, c, (3 * L + C < 2 * WIDTH ? L : 3 * L + C - WIDTH)...);
 }
-// Part N of three of the interleaved components of vectors.
+// Third N (0 to 2) of the interleaved components x, y, z of vectors v.
 template <int N, int... L> inline Number interleaved(Vector v, Sequence<int, L...>) {
     constexpr int F = N * WIDTH;
     const Number low = __builtin_shufflevector(v.x, v.y,

@@ -104,7 +104,7 @@ class PairSums:
         shape, count = self._shape, self.targets.count
         return PairEvaluation(
             shape.quantity, [(0, count, 0, shape.count)], self.targets, self.moments, self.base, self.out,
-            turned=self._turned, torques=self.torques, form=REFERENCE if shape.reference else None,
+            with_torque=self._turned, torques=self.torques, form=REFERENCE if shape.reference else None,
             smoothing=shape.smoothing, sums=sums, ranks=current_ranks(),
         )  # fmt: skip
 

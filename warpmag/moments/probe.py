@@ -93,7 +93,7 @@ class FieldProbe:
             self._base,
             self._rows[axis],
             effective=wp.array(unit, dtype=self._system.dtype, device=self._system.device),
-            turned=wp.zeros(count, dtype=wp.int32, device=self._system.device),
+            with_torque=wp.zeros(count, dtype=wp.int32, device=self._system.device),
             torques=self._zeros,
         )
 

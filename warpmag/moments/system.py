@@ -274,7 +274,7 @@ class MomentSystem:
             return [
                 PairEvaluation(
                     quantity, rows, self._packed, self._packed, self._acting_field, self.forces, effective=effective,
-                    turned=self._turned, torques=self.torques, sums=self._fast.sums_of(quantity, pairs),
+                    with_torque=self._turned, torques=self.torques, sums=self._fast.sums_of(quantity, pairs),
                     ranks=self._ranks,
                 )
                 for quantity, rows in parts
