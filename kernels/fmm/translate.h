@@ -3,7 +3,7 @@
 // Sources of a box's far field are the children of its parent's neighbors that are not its own neighbors, at up to 189
 // displacements d = source − target. A component of d that changes sign flips the translation matrix in rows and
 // columns of odd parity only: T(σ|d|) = P T(|d|) P, with P the diagonal of the harmonics' signs under σ. Sources of
-// equal |d| are therefore summed before they are translated. Let σ be the n = 1, 2, 4 or 8 sign combinations.
+// equal |d| are therefore summed before they are translated. Let σ run over the 1, 2, 4 or 8 combinations of signs.
 // Components 1 and 2 have both signs; a component 3 has one sign in an octant, and 0 has none. Then the rows of parity
 // class a are
 //

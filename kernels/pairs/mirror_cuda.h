@@ -4,9 +4,9 @@
 // The moments are cut into an odd number of equal tiles, arranged in a circle. Each tile is paired with the half of the
 // others that follows it. A block holds a home tile in registers: lane l holds its moments l, l + 32, ... The other
 // tiles are read in stages of 32 moments. At step s of a stage lane l pairs moment (l + s) mod 32 with all moments that
-// it holds. It then sends the sums of that moment to the lane that takes it next. After 32 steps lane l has the sums of
-// moment l from the home tile. A pair takes 30 instructions for both fields or 41 for both forces; loading a moment
-// takes about eight for all moments that a lane holds.
+// it holds. It then sends the sums of that moment to lane l − 1, which pairs the moment next. After 32 steps lane l has
+// the sums of moment l from the home tile. A pair takes 30 instructions for both fields or 41 for both forces; loading
+// a moment takes about eight for all moments that a lane holds.
 //
 // The sums of staged moments go to partial sums of the distance between the two tiles, which no other block writes. The
 // sums of the home tile go to partial sums of the block's share of the walk around the circle.

@@ -7,9 +7,9 @@ Neighbors are nearer than (1 + ``SKIN``) times the contact distance. The lists a
 ``SKIN`` times its radius; until then no other pair can touch. The neighbors that overlap are listed for every
 arrangement.
 
-The search sorts moments into cubic cells as wide as the largest distance of neighbors, with a hash table (``cells.h``).
-Each device has its own search: linked lists on a GPU need no prefix sum over buckets, and a counting sort on a CPU
-makes the candidates of a target contiguous.
+The search sorts moments into cubic cells as wide as the largest distance of neighbors, with a hash table
+(``neighbor_cells.h``). Each device has its own search. Linked lists on a GPU need no prefix sum over buckets. A
+counting sort on a CPU makes the candidates of a target contiguous.
 """
 
 import math

@@ -3,7 +3,7 @@
 // A counting sort orders the sources by bucket. The candidates of a target are in nine columns of three cells each, and
 // a column is contiguous in memory. Sources of other cells in the same buckets are skipped by comparing cell columns.
 #pragma once
-#include "pairs/cells.h"
+#include "pairs/neighbor_cells.h"
 #include "pairs/overlaps.h"
 #include "shared/team.h"
 

@@ -4,7 +4,7 @@
 //
 // The table is never cleared: each entry has the number of its search, and entries of older searches are ignored.
 #pragma once
-#include "pairs/cells.h"
+#include "pairs/neighbor_cells.h"
 #include "pairs/overlaps.h"
 
 #if defined(__CUDA_ARCH__)

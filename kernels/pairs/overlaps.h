@@ -2,7 +2,7 @@
 //
 // From Python: CAPACITY, the length of a list, and GROUP, the threads of a GPU that share a target.
 #pragma once
-#include "pairs/cells.h"
+#include "pairs/neighbor_cells.h"
 #include "shared/group.h"
 #include "shared/vectors.h"
 

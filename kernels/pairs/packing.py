@@ -17,8 +17,8 @@ from warpmag.kernels.pairs import neighbors
 
 PACKED_ROWS = 8
 PITCH = 128
-"""Rows are a multiple of this number of columns apart, with at least this number of empty columns at the end, for
-vector loads."""
+"""Rows are a multiple of this number of columns apart. For vector loads they have at least as many empty columns at the
+end."""
 
 
 @wp.func

@@ -9,9 +9,9 @@ import warp as wp
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedField
 from warpmag.kernels.pairs.evaluate import PairEvaluation
-from warpmag.kernels.pairs.inside import launch_field_of_worlds, launch_flux_density, launch_store_gradients
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_law import Quantity
+from warpmag.kernels.pairs.point_fields import launch_field_of_worlds, launch_flux_density, launch_store_gradients
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.moments.arrays import shape_message, vec3_type
 from warpmag.moments.system import MomentSystem
