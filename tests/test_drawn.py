@@ -122,4 +122,7 @@ def test_an_open_mesh_is_what_it_collides_as_and_says_so(tmp_path):
     assert model.shape_count == 1
     assert magnetics.magnets[0].lattice.volumes.sum() == pytest.approx(7 * 6e-6, rel=1e-5)
     (warning,) = scene.warnings
-    assert warning.startswith("/Tool/Blade: mesh: not closed") and "the convexHull that it collides as" in warning
+    assert (
+        warning.startswith("/Tool/Blade: mesh: not closed")
+        and "its approximation for collisions, convexHull" in warning
+    )

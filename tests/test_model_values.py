@@ -116,7 +116,7 @@ def test_a_measured_curve_of_all_magnets_is_not_bent(device):
     magnetics = warpmag.Magnetics(model, curve="M-19")
     write(model, "saturation", 0, 3e5)
     with pytest.raises(
-        warpmag.InputError, match=r"^shape0: warpmag\.saturation was changed, and a measured curve says"
+        warpmag.InputError, match=r"^shape0: warpmag\.saturation was changed, but a measured curve determines"
     ):
         magnetics.notify_model_changed()
 

@@ -267,7 +267,7 @@ def test_what_is_written_of_a_scene_edited_in_memory_has_the_edits(kind, scene, 
     layer = Sdf.Layer.FindOrOpen(str(path if kind == "package" else edited))
     rub(layer, 0.25)
     simulation = Simulation(path, device=device)
-    (warning,) = [line for line in simulation.warnings() if "not saved" in line]
+    (warning,) = [line for line in simulation.warnings() if "unsaved" in line]
     assert warning.startswith(f"{layer.realPath}: has unsaved edits in this process")
     if kind == "package":
         with pytest.raises(InputError, match=r"edited.usdz: has unsaved edits and is in a package"):
@@ -331,7 +331,7 @@ class Late(recording.Recorder):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(self, "write", lambda: None)
             super().add_frame(time, state)
-        self._taken = copy.deepcopy(self._taken)  # a checkpoint of a CPU is valid until the next step only
+        self._pending = copy.deepcopy(self._pending)  # a checkpoint of a CPU is valid until the next step only
 
 
 @pytest.mark.parametrize("recorder", [recording.Recorder, Late])

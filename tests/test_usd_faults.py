@@ -178,9 +178,9 @@ def test_an_open_mesh_that_its_hull_closes(tmp_path):
     body = mesh(CORNERS[:9], (3, 3, 3), more='uniform token physics:approximation = "convexHull"')
     (finding,) = survey(open_stage(write(tmp_path, body))).findings
     assert finding.severity == "warning"
-    assert "/Ball: mesh: not closed" in str(finding) and "the convexHull that it collides as is magnetized" in str(
+    assert "/Ball: mesh: not closed" in str(
         finding
-    )
+    ) and "its approximation for collisions, convexHull, is magnetized" in str(finding)
 
 
 @pytest.mark.parametrize(
@@ -446,7 +446,7 @@ def test_a_run_that_ends_names_a_strength_beyond_all_measure(device, tmp_path, m
     def end():
         raise SimulationError("step 1: /Ball has left")
 
-    monkeypatch.setattr(simulation._stepper, "look", end)
+    monkeypatch.setattr(simulation._stepper, "read_reports", end)
     with pytest.raises(SimulationError, match=rf"/Ball has left; {told} moves magnets too fast"):
         simulation.step()
         assert simulation.state  # waits for a GPU
@@ -458,7 +458,7 @@ def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
     def end():
         raise SimulationError("step 1: /Ball has left")
 
-    monkeypatch.setattr(simulation._stepper, "look", end)
+    monkeypatch.setattr(simulation._stepper, "read_reports", end)
     with pytest.raises(SimulationError, match="/Ball has left; the ends of the joint /Joint were apart at the start"):
         simulation.step()
         assert simulation.state
