@@ -17,6 +17,14 @@ UNDEFINED = (
     *("shift-base", "shift-exponent", "signed-integer-overflow", "unreachable", "vla-bound"),
 )
 """What Clang's driver calls ``undefined``, of what kernels can do; the compiler inside Warp knows no groups."""
+QUICK = {
+    *("structure", "oracle", "curves", "materials", "lattice", "harmonics", "pair_sums", "neighbors", "near_sums"),
+    *("eddy", "translation", "applied", "body_response", "baseline_dynamics", "system", "cells_compound", "coils"),
+    *("engine_attributes", "engine_magnetics", "engine_simulation", "engine_xpbd", "stepping", "balls", "broad_phase"),
+    *("ball_contacts", "coulomb", "near_contact_extremes", "usd_schemas", "usd_reader", "usd_crate", "usd_output"),
+    *("export", "viewers", "observables"),
+}
+"""Files of tests marked ``quick``: every room, in under a minute on two cores with compiled kernels."""
 SANITIZERS = {
     "address": f"-fsanitize={','.join(('address', *UNDEFINED))} -fsanitize-ignorelist={FOLDER}/sanitize_not.txt",
     "thread": "-fsanitize=thread -mllvm -tsan-instrument-memintrinsics=0",  # GCC's runtime lacks __tsan_memcpy
@@ -77,6 +85,9 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(config, items):
+    for item in items:
+        if item.path.stem.removeprefix("test_") in QUICK:
+            item.add_marker(pytest.mark.quick)
     if config.getoption("--only-device"):
         on_it = [x for x in items if "device" in x.fixturenames or x.get_closest_marker("cuda")]
         config.hook.pytest_deselected(items=[x for x in items if x not in on_it])
