@@ -1,12 +1,9 @@
 """The comparison with peers and its report: lines that agree with the oracle, peers that are missing, pictures."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench import compare, report
 from bench.peers import Peer
 

@@ -2,12 +2,10 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench import many
 from bench.peers import Evaluation, Peer
 from bench.timing import measure

@@ -1,8 +1,6 @@
 """Induction against the float64 Newton solution, closed forms and its own residual."""
 
 import itertools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +8,10 @@ import warp as wp
 from arrangements import as_float32, fcc_block, overlapping, pile, relative
 
 import warpmag
+from bench.arrangements import ARRANGEMENTS, arranged, trace
 from bench.reference import oracle
 from bench.systems import moment_system
 from warpmag.declarations import magnets
-
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
-from bench.arrangements import ARRANGEMENTS, arranged, trace
 
 MS = 1.7e6
 

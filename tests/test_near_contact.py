@@ -1,7 +1,6 @@
 """The near-contact model against the exact solution of two, three and thirteen balls, and against its own energy."""
 
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +9,13 @@ import warp as wp
 from arrangements import as_float32, fcc_block, relative
 
 import warpmag
+from bench.reference import clusters, oracle
 from bench.reference import near_contact as contact_oracle
-from bench.reference import oracle
 from bench.reference.near_contact import NearContacts
-from bench.systems import moment_system
-from warpmag.kernels.near_contact import contact_table
-
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
-from bench.reference import clusters
 from bench.reference.near_contact_table import pair_conductance
 from bench.reference.spheres import MU0, pair
+from bench.systems import moment_system
+from warpmag.kernels.near_contact import contact_table
 
 ALONG, ACROSS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 PERMEABILITIES = [2.0, 4.0, 10.0, 1000.0, np.inf]

@@ -1,13 +1,11 @@
 """Iron balls in the non-uniform field of coils, maps and boxes: exact series, what must be kept, and where it fades."""
 
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bench.reference import oracle
+from bench.reference import ball_in_field, oracle
 from bench.systems import moment_system
 from warpmag.declarations.coils import Coil, FieldMap
 from warpmag.kernels.applied.solids import SolidMagnet
@@ -15,9 +13,6 @@ from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.near_contact import contact_table
 from warpmag.moments.probe import FieldProbe
 from warpmag.shapes import polyhedra
-
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
-from bench.reference import ball_in_field
 
 A, R = 0.02, 0.005  # m, radius of coils and of balls
 LINEAR = 1e15

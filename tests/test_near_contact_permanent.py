@@ -1,8 +1,6 @@
 """Iron balls in the non-uniform field of permanent magnets: images, exact multipoles, energy, conservation laws."""
 
 import itertools
-import sys
-from pathlib import Path
 
 import newton
 import numpy as np
@@ -11,11 +9,9 @@ import warp as wp
 from arrangements import relative
 
 import warpmag
-from warpmag.kernels.near_contact import contact_table, near_pairs
-
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.reference import ball_in_field
 from bench.systems import moment_system
+from warpmag.kernels.near_contact import contact_table, near_pairs
 
 R = 0.005
 LINEAR = 1e15

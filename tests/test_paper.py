@@ -1,21 +1,17 @@
 """The paper's experiments: what its figures claim, on small versions of them, and the command that draws them."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from arrangements import relative
 
-from bench.reference import oracle
-
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.arrangements import trace
 from bench.paper import __main__ as command
 from bench.paper import crystal_balls
 from bench.paper.output import ORDER, Output
 from bench.paper.trials import Trial, run_trial
+from bench.reference import oracle
 
 MS = 1.7e6
 

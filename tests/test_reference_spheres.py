@@ -1,13 +1,9 @@
 """The exact multipole solution of permeable balls against boundary conditions, closed forms and its own energy."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.special import gammaln, lpmv, zeta
 
-sys.path.append(str(Path(__file__).parents[1]))  # bench/ is tested, not installed
 from bench.reference import clusters
 from bench.reference.spheres import MU0, pair, spheres
 
