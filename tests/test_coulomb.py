@@ -94,9 +94,9 @@ def solve(solver, model, state, contacts):
     begin, end = model.state(), model.state()
     begin.assign(state)
     solver.step(begin, end, None, contacts, DT)
-    arrays = solver._solve.arrays
-    last = arrays.impulse.numpy().reshape(-1, 12, CHUNK)[:, :3].swapaxes(1, 2).reshape(-1, 3).astype(float)
-    listed = arrays.entry.numpy()[: len(last)].tolist()
+    work = solver._solve.work
+    last = work["impulse"].numpy().reshape(-1, 12, CHUNK)[:, :3].swapaxes(1, 2).reshape(-1, 3).astype(float)
+    listed = work["entry"].numpy()[: len(last)].tolist()
     impulses = dict(zip(listed[::-1], last[::-1], strict=True))  # of a repeated entry, the first one counts
     return contact_ends(model, state, contacts, impulses), end.body_qd.numpy().astype(float)
 

@@ -9,7 +9,7 @@
 
 namespace warpmag {
 
-// Data of ``SolveArrays`` in solve.py, without shapes and strides.
+// Arrays at the addresses in ``SolveArrays`` of solve.py, field by field in the same order.
 struct Arrays {
     // sizes
     int contact_max, body_count, line_count, kinematic_flag;
@@ -18,32 +18,18 @@ struct Arrays {
     const Real *point0, *point1, *offset0, *offset1, *normal, *margin0, *margin1, *mu, *mu_torsional, *mu_rolling;
     // bodies
     const int* flags;
-    const Real *com, *inv_mass, *inv_inertia, *q, *shares;
+    const Real *com, *inv_mass, *inv_inertia, *q;
     Real* qd;
     // work
-    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *wide, *world_first, *kept_range;
+    const Real* shares;
+    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *quiet, *wide, *world_first, *kept_range;
     unsigned long long *key, *kept_key;
     Real *motion, *next_motion, *pose, *side, *return_velocity, *impulse, *record, *kept;
 
-    template <class Given> CUDA_CALLABLE explicit Arrays(const Given& a) {
-        contact_max = a.contact_max, body_count = a.body_count, line_count = a.line_count;
-        kinematic_flag = a.kinematic_flag;
-        const auto& c = a.contacts;
-        count = c.count.data, shape0 = c.shape0.data, shape1 = c.shape1.data, shape_body = c.shape_body.data;
-        point0 = reals(c.point0), point1 = reals(c.point1), offset0 = reals(c.offset0), offset1 = reals(c.offset1);
-        normal = reals(c.normal), margin0 = c.margin0.data, margin1 = c.margin1.data;
-        mu = c.mu.data, mu_torsional = c.mu_torsional.data, mu_rolling = c.mu_rolling.data;
-        const auto& b = a.bodies;
-        flags = b.flags.data, com = reals(b.com), inv_mass = b.inv_mass.data, inv_inertia = reals(b.inv_inertia);
-        q = reals(b.q), qd = reals(b.qd), shares = a.shares.data;
-        totals = a.totals.data, side_count = a.side_count.data, filled = a.filled.data, slot = a.slot.data;
-        body = a.body.data, range = a.range.data, entry = a.entry.data, other = a.other.data, wide = a.wide.data;
-        world_first = a.world_first.data, kept_range = a.kept_range.data;
-        key = (unsigned long long*)a.key.data, kept_key = (unsigned long long*)a.kept_key.data;
-        motion = a.motion.data, next_motion = a.next_motion.data, pose = a.pose.data, side = a.side.data;
-        return_velocity = a.return_velocity.data, impulse = a.impulse.data, record = a.record.data, kept = a.kept.data;
+    template <class Addresses> CUDA_CALLABLE explicit Arrays(const Addresses& addresses) {
+        static_assert(sizeof(*this) == sizeof(addresses), "SolveArrays has the same fields in the same order");
+        memcpy((void*)this, &addresses, sizeof(*this));
     }
-    template <class Vectors> CUDA_CALLABLE static Real* reals(const Vectors& vectors) { return (Real*)vectors.data; }
     CUDA_CALLABLE int contact_count() const { return *count < contact_max ? *count : contact_max; }
     CUDA_CALLABLE int body_of_shape(int shape) const { return shape_body[shape]; }
     CUDA_CALLABLE bool movable(int b) const { return b >= 0 && inv_mass[b] > 0; }

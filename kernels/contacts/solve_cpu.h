@@ -56,7 +56,7 @@ inline void write_contacts(const Arrays& a, const Lists& lists) {
             other[(2 + end) * CHUNK] = 2 * a.contact_max + k / WIDTH; // record of an immovable body
         }
         for (int r = 0; r < IMPULSE_SIZE; ++r) rows_at(a.impulse, IMPULSE_SIZE, k)[r * CHUNK] = 0;
-        a.wide[k / WIDTH] = 0;
+        a.quiet[k / WIDTH] = 0;
         if (k >= lists.contacts) {
             for (int r = 0; r < CONTACT_SIZE; ++r) place[r * CHUNK] = r == 3 ? -1 : 0;
             continue;
@@ -154,7 +154,7 @@ inline void iterate_contacts(const Arrays& a, int k, bool frictional, Real momen
     AccumulatedImpulse impulse = read_impulse(rows_of(rows));
     const Impulse added = iterate_contact(c, p.own, p.other, impulse, momentum);
     // after an iteration that added nothing, the records are zero and need not be written again
-    int& quiet = a.wide[k / WIDTH];
+    int& quiet = a.quiet[k / WIDTH];
     const bool adds = any(dot(added.linear, added.linear) + dot(added.angular, added.angular) != 0);
     write_impulse(impulse, put_rows(rows));
     if (!adds && quiet) return;
