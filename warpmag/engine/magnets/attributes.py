@@ -30,37 +30,31 @@ _SOURCE_ATTRIBUTES = {
     "strength": (wp.float32, 0.0),
     "current_keys": (str, ""),  # text of the ``Keys`` of a coil's current; empty where it is constant
 }
+"""Warp type and default of the attributes of sources."""
+_measured_curves: list[MagnetizationCurve] = []
+"""Measured curves of all shapes; a model stores the index in this list plus the length of ``CURVES``."""
 
 
 def declare_attributes(builder: newton.ModelBuilder, usd_value: Callable[[Any, dict], Any] | None = None) -> None:
     """Declare the attributes of magnets and sources on a builder; declaring twice does nothing.
 
-    Args:
-        builder: The builder.
-        usd_value: Function that Newton's ``add_usd`` calls for the value of a magnet's attribute on a shape.
+    Newton's ``add_usd`` calls ``usd_value`` for the value of a magnet's attribute on a shape.
     """
     check_builder(builder)
     from_usd = {} if usd_value is None else {"usd_attribute_name": "*", "usd_value_transformer": usd_value}
+
+    def declare(name, dtype, default, **options):
+        shape = newton.Model.AttributeFrequency.SHAPE
+        attribute = newton.ModelBuilder.CustomAttribute(
+            name, dtype, shape, namespace=NAMESPACE, default=default, **options
+        )
+        builder.add_custom_attribute(attribute)
+
     for row in MAGNET_ATTRIBUTES:
         default = NO_MAGNET if row.field == "kind" else _stored(row, row.default)
-        _declare(builder, row.field, _TYPES[row.usd_type], default, **from_usd)
+        declare(row.field, _TYPES[row.usd_type], default, **from_usd)
     for name, (dtype, default) in _SOURCE_ATTRIBUTES.items():
-        _declare(builder, name, dtype, default)
-
-
-def _declare(builder: newton.ModelBuilder, name: str, dtype: Any, default: Any, **from_usd: Any) -> None:
-    """Declare one shape attribute."""
-    builder.add_custom_attribute(
-        newton.ModelBuilder.CustomAttribute(
-            name=name,
-            dtype=dtype,
-            default=default,
-            frequency=newton.Model.AttributeFrequency.SHAPE,
-            assignment=newton.Model.AttributeAssignment.MODEL,
-            namespace=NAMESPACE,
-            **from_usd,
-        )
-    )
+        declare(name, dtype, default)
 
 
 def check_builder(builder: newton.ModelBuilder) -> None:
@@ -74,11 +68,6 @@ def check_registered(builder: newton.ModelBuilder) -> None:
     check_builder(builder)
     if f"{NAMESPACE}:source" not in builder.custom_attributes:
         raise InputError("builder: call warpmag.register_custom_attributes(builder) before magnets are added")
-
-
-def check_body(builder: newton.ModelBuilder, body: int) -> None:
-    """Raise :class:`InputError` unless ``builder`` has the body."""
-    check_index("body", body, builder.body_count, "bodies")
 
 
 def check_index(name: str, index: int, count: int, noun: str) -> None:
@@ -105,36 +94,18 @@ def _stored(row: Attribute, value: Any) -> Any:
     if row.field == "kind":
         return 1 + KINDS.index(value)
     if row.field == "curve":
-        return _curve_index(value)
+        if not isinstance(value, MagnetizationCurve):
+            return CURVES.index(value)
+        if value not in _measured_curves:
+            _measured_curves.append(value)
+        return len(CURVES) + _measured_curves.index(value)
     if row.usd_type == "vector3f":
         return wp.vec3(*(float(component) for component in value))
     return float(value)
 
 
-_measured_curves: list[MagnetizationCurve] = []
-"""Measured curves of all shapes; a model stores the index in this list plus the length of ``CURVES``."""
-
-
-def _curve_index(curve: str | MagnetizationCurve) -> int:
-    """Return the index that a model stores for a curve."""
-    if not isinstance(curve, MagnetizationCurve):
-        return CURVES.index(curve)
-    if curve not in _measured_curves:
-        _measured_curves.append(curve)
-    return len(CURVES) + _measured_curves.index(curve)
-
-
-def _curve_at(index: int) -> str | MagnetizationCurve:
-    """Return the curve of a stored index."""
-    return CURVES[index] if index < len(CURVES) else _measured_curves[index - len(CURVES)]
-
-
 def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
-    """Return the magnets of a finalized model by shape, with magnetizations in the frames of the shapes.
-
-    Raises:
-        InputError: The model has no magnets.
-    """
+    """Return the magnets of a model by shape, in the frames of the shapes; raise :class:`InputError` without any."""
     attributes = getattr(model, NAMESPACE, None)
     kinds = attributes.kind.numpy() if attributes is not None else np.zeros(0, int)
     marked = np.flatnonzero(kinds != NO_MAGNET)
@@ -164,7 +135,7 @@ def _magnet_of(values: list[np.ndarray]) -> Magnet:
         if row.field == "kind":
             fields["kind"] = KINDS[int(value[0]) - 1]
         elif row.field == "curve":
-            fields["curve"] = _curve_at(int(value[0]))
+            fields["curve"] = (*CURVES, *_measured_curves)[int(value[0])]
         else:
             fields[row.field] = tuple(value.tolist()) if row.usd_type == "vector3f" else float(value[0])
     return Magnet(**fields)

@@ -93,38 +93,29 @@ def add_balls(
     response = {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
     magnet = _magnet(material, response, magnetization, recoil_permeability)
     magnet.check("add_balls")
-    bodies = range(builder.body_count, builder.body_count + count)
-    shapes = range(builder.shape_count, builder.shape_count + count)
+    balls = _next_balls(builder, count)
     if count:
         config = _config(builder, density, friction)
         _add_copies(builder, _template(builder, radii[0], config, color), count)
         _place(builder, poses)
         _resize(builder, radii, config)
         _name(builder, count, label)
-        mark_shapes(builder, shapes, magnet)
-    return Balls(bodies, shapes)
+        mark_shapes(builder, balls.shapes, magnet)
+    return balls
 
 
 def copy_ball(
-    builder: newton.ModelBuilder,
-    body: int,
-    poses: np.ndarray,
-    velocities: np.ndarray,
-    prefix: str,
-    new_prefixes: list[str],
+    builder: newton.ModelBuilder, body: int, poses: np.ndarray, velocities: np.ndarray, prefix: str, prefixes: list[str]
 ) -> Balls:
-    """Add copies of a ball of the builder, magnet included, at other poses.
+    """Add copies of a free body with one shape, a ball, magnet included; return the bodies and shapes of the copies.
 
     Args:
         builder: The builder.
-        body: A free body with one shape, a ball.
+        body: The body.
         poses: Positions [m] and quaternions x y z w, shape [n, 7].
         velocities: Linear [m/s] and angular velocities [rad/s], world frame, shape [n, 6].
         prefix: Prefix of the labels of the body and its shape.
-        new_prefixes: Prefix of the labels of each copy, in its place.
-
-    Returns:
-        The bodies and the shapes of the copies.
+        prefixes: Prefix of the labels of each copy, in its place.
     """
     (shape,) = builder.body_shapes[body]
     originals, count = {"body": body, "shape": shape}, len(poses)
@@ -133,10 +124,8 @@ def copy_ball(
         kind = name.partition("_")[0]
         if kind in originals and name not in _NOT_COPIED and isinstance(values, list) and len(values) == 1:
             values[0] = getattr(builder, name)[originals[kind]]
-    new = {
-        "body": range(builder.body_count, builder.body_count + count),
-        "shape": range(builder.shape_count, builder.shape_count + count),
-    }
+    copies = _next_balls(builder, count)
+    copied = {"body": copies.bodies, "shape": copies.shapes}
     _add_copies(builder, template, count)
     _place(builder, poses)
     velocities = np.ascontiguousarray(velocities, np.float32)
@@ -146,14 +135,20 @@ def copy_ball(
     for kind, original in originals.items():
         labels = getattr(builder, f"{kind}_label")
         suffix = labels[original].removeprefix(prefix)
-        labels[-count:] = [f"{new_prefix}{suffix}" for new_prefix in new_prefixes]
+        labels[-count:] = [f"{new_prefix}{suffix}" for new_prefix in prefixes]
     builder.articulation_label[-count:] = builder.body_label[-count:]  # the labels of Newton's USD import
     for attribute in builder.custom_attributes.values():
         kind = getattr(attribute.frequency, "name", "").lower()
         values: Any = attribute.values
         if kind in originals and originals[kind] in values:
-            values.update(dict.fromkeys(new[kind], values[originals[kind]]))
-    return Balls(new["body"], new["shape"])
+            values.update(dict.fromkeys(copied[kind], values[originals[kind]]))
+    return copies
+
+
+def _next_balls(builder: newton.ModelBuilder, count: int) -> Balls:
+    """Return the bodies and shapes of the next ``count`` balls that the builder gets."""
+    bodies, shapes = builder.body_count, builder.shape_count
+    return Balls(range(bodies, bodies + count), range(shapes, shapes + count))
 
 
 def _poses(positions, orientations) -> np.ndarray:

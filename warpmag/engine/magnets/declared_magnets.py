@@ -11,19 +11,13 @@ from warpmag.declarations import materials
 from warpmag.declarations.checks import check_vector, check_whole
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import Magnet
-from warpmag.engine.magnets.attributes import check_body, check_index, check_registered, mark_shapes
+from warpmag.engine.magnets.attributes import check_index, check_registered, mark_shapes
 from warpmag.errors import InputError
 
-_SOLID = (
-    newton.GeoType.SPHERE,
-    newton.GeoType.BOX,
-    newton.GeoType.CAPSULE,
-    newton.GeoType.CYLINDER,
-    newton.GeoType.ELLIPSOID,
-    newton.GeoType.CONE,
-    newton.GeoType.MESH,
-    newton.GeoType.CONVEX_MESH,
-)
+_SOLID = [
+    newton.GeoType[name]
+    for name in ("SPHERE", "BOX", "CAPSULE", "CYLINDER", "ELLIPSOID", "CONE", "MESH", "CONVEX_MESH")
+]
 """Types of shapes with a volume."""
 
 
@@ -102,13 +96,8 @@ def add_permanent(
     check_vector("magnetization", magnetization)
     if material is not None:
         magnetization = materials.permanent("material", material, magnetization)
-    magnet = Magnet(
-        "permanent",
-        magnetization=magnetization,
-        recoil_permeability=recoil_permeability,
-        moment_spacing=moment_spacing,
-        conductivity=conductivity,
-    )
+    values = {"moment_spacing": moment_spacing, "conductivity": conductivity}
+    magnet = Magnet("permanent", magnetization=magnetization, recoil_permeability=recoil_permeability, **values)
     for index in magnet_shapes(builder, body, shape):
         rotation = wp.quat_identity()
         if builder.shape_body[index] >= 0:
@@ -120,34 +109,22 @@ def add_permanent(
 
 
 def in_shape_frame(magnet: Magnet, rotation: wp.quat) -> Magnet:
-    """Return ``magnet`` with its magnetization in the frame of a shape.
-
-    Args:
-        magnet: The magnet, in the frame of its body or prim.
-        rotation: Rotation from the shape's frame to that frame.
-    """
+    """Return a magnet in the frame of a shape; ``rotation`` is from this frame to that of the magnet's body or prim."""
     if not np.any(magnet.magnetization):
         return magnet
     return replace(magnet, magnetization=tuple(wp.quat_rotate_inv(rotation, wp.vec3(*magnet.magnetization))))
 
 
 def axis_rotation(axis: str | None) -> Any:
-    """Return the rotation from a shape's frame to the frame of its prim.
+    """Return the rotation from a shape's frame to that of its prim with an axis token, None for other shapes.
 
     Newton's capsules, cylinders and cones have their axis along z.
-
-    Args:
-        axis: Token of the prim's axis, None for other shapes.
     """
     return newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.from_any(axis)) if axis else wp.quat_identity()
 
 
 def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
-    """Return the shapes of a magnet on ``body``, or on ``shape`` alone.
-
-    Raises:
-        InputError: Body or shape do not exist, or there is no colliding shape with a volume.
-    """
+    """Return the shapes of a magnet on ``body``, or on ``shape`` alone; raise :class:`InputError` without a solid."""
     check_registered(builder)
     if shape is not None:
         check_index("shape", shape, builder.shape_count, "shapes")
@@ -158,7 +135,7 @@ def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = N
             kind = newton.GeoType(builder.shape_type[shape]).name.lower()
             raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
         return [shape]
-    check_body(builder, body)
+    check_index("body", body, builder.body_count, "bodies")
     shapes = [
         index
         for index in builder.body_shapes[body]

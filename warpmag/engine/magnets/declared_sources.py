@@ -14,7 +14,7 @@ import warp as wp
 from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, SourceRecord, checked_vectors
-from warpmag.engine.magnets.attributes import check_body, check_registered
+from warpmag.engine.magnets.attributes import check_index, check_registered
 from warpmag.errors import InputError
 from warpmag.moments.arrays import host_array
 
@@ -68,7 +68,7 @@ def add_coil(
         corners = checked_vectors("add_coil: points", host_array("add_coil: points", points), LARGEST_POINT)
     coil = Coil(shape, radius, length, tuple(map(tuple, corners)), closed, wire_radius, ampere_turns)
     coil.check("add_coil")
-    return _add_source(builder, body, coil.record(), ampere_turns, xform, _label(builder, "coil", label))
+    return _add_source(builder, body, coil.record(), ampere_turns, xform, "coil", label)
 
 
 def add_field_map(
@@ -111,46 +111,37 @@ def add_field_map(
         tuple(np.atleast_1d(first)), tuple(np.resize(steps, 3) if steps.ndim == 0 else steps), nodes, factor
     )
     field_map.check(name)
-    return _add_source(builder, body, field_map.record(), factor, xform, _label(builder, "field_map", label))
+    return _add_source(builder, body, field_map.record(), factor, xform, "field_map", label)
 
 
 def add_placed_source(
     builder: newton.ModelBuilder, placed: Any, body: int, frame: wp.transform, current_keys: str = ""
 ) -> int:
-    """Add a coil or a field map of a stage to a body or to the world.
+    """Add a coil or a field map of a stage to a body or, for -1, to the world; return the site that represents it.
 
     Args:
         builder: The builder.
         placed: The source, a ``usd.read.coils.PlacedSource``; the path of its prim becomes the label.
-        body: The body, -1 for none.
+        body: The body.
         frame: Frame of the source in the world.
-        current_keys: Keys of its current as text, for :class:`KeyedCurrents`; empty if another object sets the
-            current.
-
-    Returns:
-        The shape that represents the source, a site.
+        current_keys: Keys of its current as text, for :class:`KeyedCurrents`; empty if they are set elsewhere.
     """
     source = placed.source
     strength = source.ampere_turns if isinstance(source, Coil) else source.factor
     if body >= 0:
         frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
-    return _add_source(builder, body, source.record(), strength, frame, placed.prim, current_keys)
-
-
-def _label(builder: newton.ModelBuilder, kind: str, label: str | None) -> str:
-    """Return the label of a new source, a default one for None."""
-    check_registered(builder)
-    return f"{kind}_{builder.shape_count}" if label is None else label
+    return _add_source(builder, body, source.record(), strength, frame, "", placed.prim, current_keys)
 
 
 def _add_source(
-    builder: newton.ModelBuilder, body: int, record: SourceRecord, strength: float, xform, label: str, keys: str = ""
+    builder: newton.ModelBuilder, body: int, record: SourceRecord, strength: float, xform, kind: str, label, keys=""
 ) -> int:
-    """Add a source to a body or to the world; return the site that represents it."""
+    """Add a source to a body or to the world; return its site. Without a label it gets one of ``kind`` and number."""
     check_registered(builder)
+    label = f"{kind}_{builder.shape_count}" if label is None else label
     check_whole("body", body)
     if body != -1:
-        check_body(builder, body)
+        check_index("body", body, builder.body_count, "bodies")
     if not isinstance(label, str):
         raise InputError(f"label: must be text, got {short_repr(label)}")
     frame = wp.transform() if xform is None else _checked_frame("xform", xform)

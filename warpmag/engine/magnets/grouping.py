@@ -14,32 +14,19 @@ from warpmag.errors import InputError
 
 @dataclass(frozen=True)
 class BodyMagnet:
-    """One magnet: shapes of one body with the same material and magnetization.
+    """One magnet: shapes of one body with the same material and magnetization."""
 
-    Attributes:
-        magnet: Material and magnetization, in the frame of the body.
-        body: The body, -1 for a magnet fixed in the world.
-        shapes: The shapes; their union is the volume of the magnet.
-        world: Index of the world among the worlds with magnets.
-        lattice: The sampled moments in the frame of the body, grouped by shape.
-    """
-
-    magnet: Magnet
-    body: int
-    shapes: tuple[int, ...]
-    world: int
+    magnet: Magnet  # material and magnetization, in the frame of the body
+    body: int  # -1 for a magnet fixed in the world
+    shapes: tuple[int, ...]  # their union is the volume of the magnet
+    world: int  # index among the worlds with magnets
     lattice: BodyLattice
 
 
 def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
-    """Group the shapes of ``model`` that carry magnets, and sample the groups.
+    """Return the magnets of a model, and the Newton worlds with magnets, [-1] for a model without worlds.
 
-    Args:
-        model: The model.
-
-    Returns:
-        The magnets, sorted by world, then solved before fixed magnetizations, then by body. And the Newton worlds with
-        magnets, [-1] for a model without worlds.
+    Magnets are sorted by world, then solved before fixed magnetizations, then by body.
     """
     magnet_of_shape = marked_shapes(model)
     shapes, stored = np.array(list(magnet_of_shape)), list(magnet_of_shape.values())
@@ -59,7 +46,7 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
         np.stack([pair_index[first_rows], kinds]), axis=1, return_index=True, return_inverse=True
     )
     lattices = [
-        _sampled(sampler, shapes[groups[group]].tolist(), magnets[pair_index[first_rows[group]]]) for group in first
+        sampler.sample(shapes[groups[group]].tolist(), magnets[pair_index[groups[group][0]]]) for group in first
     ]
     fixed = np.array([magnet.fixed for magnet in magnets])[pair_index[first_rows]]
     order = np.lexsort((shapes[first_rows], shape_bodies[first_rows], fixed, worlds))
@@ -73,12 +60,9 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
 
 
 def _group(bodies: np.ndarray, magnet_of: np.ndarray, magnets: list[Magnet]) -> list[list[int]]:
-    """Return groups of rows: the shapes of one body with the same material and magnetization.
+    """Return groups of rows: the shapes of one body with the same magnet. A shape without a body is its own group.
 
-    Args:
-        bodies: Body of each shape, shape [n]; a shape without a body is a group of its own.
-        magnet_of: Index into ``magnets`` of each shape, shape [n].
-        magnets: Magnets, magnetizations in the frame of the body.
+    ``bodies`` and ``magnet_of`` hold the body and the index of the magnet of each shape, shape [n].
     """
     _, body, sizes = np.unique(bodies, return_inverse=True, return_counts=True)
     alone = (bodies < 0) | (sizes[body] == 1)
@@ -92,11 +76,6 @@ def _group(bodies: np.ndarray, magnet_of: np.ndarray, magnets: list[Magnet]) -> 
             own_groups.append(group := [])
         group.append(row)
     return groups + [group for own_groups in groups_of_body.values() for group in own_groups]
-
-
-def _sampled(sampler: ShapeSampler, shapes: list[int], magnet: Magnet) -> BodyLattice:
-    """Return the sampled moments of shapes that are one magnet."""
-    return sampler.sample(shapes, magnet.moment_spacing, magnet.fixed, magnet.kind == "permanent")
 
 
 def _in_body_frame(magnet: Magnet, rotation: list[float]) -> Magnet:

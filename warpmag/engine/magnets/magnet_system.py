@@ -22,19 +22,10 @@ def make_system(
     method,
     max_evaluations,
 ) -> tuple[MomentSystem, list[int], list[int]]:
-    """Build the system of the moments of all magnets of a model.
+    """Return the system of the moments of all magnets of a model, and the bodies of its couplings and of its solids.
 
-    Args:
-        model: The model.
-        magnets: The magnets, in the order of the system.
-        settings: Force law, dynamics, contact model, tolerance, external field.
-        curve: Magnetization curve of all inducible magnets; None for each magnet's own curve.
-        sources: Coils and field maps, as :class:`MomentSystem` takes them.
-        method: Summation method of :class:`SolverSettings`.
-        max_evaluations: Largest number of field evaluations of a solve.
-
-    Returns:
-        The system, the body of each of its couplings, and the body of each of its solids.
+    ``curve`` replaces the curves of all inducible magnets; None keeps them. :class:`MomentSystem` and
+    :class:`SolverSettings` describe the other arguments.
     """
     counts = [len(magnet.lattice.volumes) for magnet in magnets]
 
@@ -65,12 +56,7 @@ def make_system(
         movable=moments_move,
         material=MomentMaterial(
             per_moment([material.saturation for material in materials]),
-            per_moment(
-                [
-                    material.recoil_permeability - 1.0 if material.recoils else material.susceptibility
-                    for material in materials
-                ]
-            ),
+            per_moment([m.recoil_permeability - 1.0 if m.recoils else m.susceptibility for m in materials]),
             [own for own, count in zip(curves, counts, strict=True) for _ in range(count)],
         ),
         external_field=settings.external_field,

@@ -12,7 +12,7 @@ from warpmag.declarations.checks import check_positive
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
-from warpmag.engine.magnets.eddy import BodyEddies
+from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
@@ -29,14 +29,7 @@ from warpmag.kernels.rigid.bodies import (
     set_magnetization,
     sum_moments,
 )
-from warpmag.moments.arrays import (
-    CallContext,
-    Numbers,
-    host_array,
-    largest_coordinate,
-    restore_snapshot,
-    take_snapshot,
-)
+from warpmag.moments.arrays import CallContext, Numbers, host_array, largest_coordinate, restore_snapshot, take_snapshot
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.ranks import current_ranks
 from warpmag.terminal import collection_paused
@@ -120,7 +113,7 @@ class Magnetics:
         )
         self._sources.bind(self.system)
         self._map_bodies()
-        self._eddies = BodyEddies(model, self.magnets, self._body_moments, self._sources, self.system, step)
+        set_conductivities(model, self.magnets, self.system, step)
 
     @property
     def device(self) -> wp.Device:
@@ -232,15 +225,15 @@ class Magnetics:
             values.changed,
         )
         values.check(wait=False)
-        if self.system.rotations is not None:
-            gather_rotations(state.body_q, self._coupled_bodies, self.system.rotations)
+        if system.rotations is not None:
+            gather_rotations(state.body_q, self._coupled_bodies, system.rotations)
         self._sources.gather(state.body_q)
         if len(self._solid_bodies):
-            gather_frames(state.body_q, self._solid_bodies, self.system.sources.solid_frames)
+            gather_frames(state.body_q, self._solid_bodies, system.sources.solid_frames)
         if len(self._recoiling):
-            gather_bias(state.body_q, self._body_moments, self._recoiling, self._bias_factors, self.system.bias)
-        self._eddies.gather(state)
-        self.system.solve()
+            gather_bias(state.body_q, self._body_moments, self._recoiling, self._bias_factors, system.bias)
+        gather_velocities(self._model, state, self._body_moments, self._sources, system)
+        system.solve()
 
     def add_forces(self, state: newton.State) -> None:
         """Add the forces on the present moments to ``state.body_f``: the second half of :meth:`apply`."""

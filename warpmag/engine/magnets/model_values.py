@@ -30,31 +30,21 @@ _MODEL_ARRAYS = (
 
 def magnetic_arrays(model: newton.Model) -> dict[str, Any]:
     """Return the arrays that determine the magnets of ``model`` and their forces, by name for messages."""
-    attributes = {
-        name: values for name, values in vars(getattr(model, NAMESPACE)).items() if isinstance(values, wp.array)
-    }
     meshes = [getattr(mesh, "vertices", None) for mesh in model.shape_source]
     arrays = {name: getattr(model, name) for name in _MODEL_ARRAYS} | {"shape_source": meshes}
-    arrays |= {f"{NAMESPACE}.{name}": values for name, values in attributes.items()}
+    attributes = vars(getattr(model, NAMESPACE)).items()
+    arrays |= {f"{NAMESPACE}.{name}": values for name, values in attributes if isinstance(values, wp.array)}
     return {f"model.{name}": values for name, values in arrays.items()}
 
 
 class ModelValues:
-    """The attributes of a model's magnets, and copies as ``Magnetics`` last read them.
+    """The attributes of a model's magnets, ``now``, and copies as ``Magnetics`` last read them, ``then``.
 
-    Attributes:
-        now: Arrays of the model, for the kernels.
-        then: Copies of these arrays when ``Magnetics`` last read them.
-        changed: 1 + the index of a changed shape, or 0, on the device, shape [1].
+    On the device, ``changed`` is 1 + the index of a changed shape, or 0, shape [1].
     """
 
     def __init__(self, model: newton.Model, *, measured: bool):
-        """Copy the values of ``model``.
-
-        Args:
-            model: The model.
-            measured: True if one measured curve replaces the curves of all magnets.
-        """
+        """Copy the values of ``model``; ``measured`` means that one measured curve replaces those of all magnets."""
         self._model, self._measured = model, measured
         self.now, self.then = ShapeMagnets(), ShapeMagnets()
         for name in _COMPARED:
@@ -67,11 +57,7 @@ class ModelValues:
             self._changed_on_host = wp.zeros(1, dtype=wp.int32, device="cpu", pinned=True)
 
     def check(self, *, wait: bool) -> None:
-        """Raise :class:`InputError` if the model has changed.
-
-        Args:
-            wait: Wait for the device. Otherwise a later call may raise the error.
-        """
+        """Raise :class:`InputError` if the model has changed. Without ``wait`` a later call may raise the error."""
         device = self.changed.device
         if self._changed_on_host is not self.changed:
             if device.is_capturing:  # the host cannot read here; the flag stays set on the device
@@ -93,11 +79,7 @@ class ModelValues:
         return np.flatnonzero((now != then) & is_magnet)
 
     def changed_materials(self) -> np.ndarray:
-        """Return the shapes with a changed material.
-
-        Raises:
-            InputError: A material is out of range, or an attribute changed that must stay constant.
-        """
+        """Return the shapes with a changed material; raise :class:`InputError` if the change is not possible."""
         labels = self._model.shape_label
         for name, row in _COMPARED.items():
             for shape in self._differing(name).tolist():

@@ -7,6 +7,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import unique_rows
 from warpmag.errors import InputError
 from warpmag.moments.arrays import RADIUS_RANGE
@@ -18,43 +19,37 @@ from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0
 """Distance up to which the closed form of a magnet replaces its lattice of cells, in cell sizes."""
+_SOLIDS = {
+    newton.GeoType.SPHERE: (lattice.sphere, 1),
+    newton.GeoType.CAPSULE: (lattice.capsule, 2),
+    newton.GeoType.CYLINDER: (lattice.cylinder, 2),
+    newton.GeoType.CONE: (lattice.cone, 2),
+    newton.GeoType.BOX: (lattice.box, 3),
+    newton.GeoType.ELLIPSOID: (lattice.ellipsoid, 3),
+}
+"""Solid of each type of shapes without a mesh, and the number of its lengths in the scale of the shape."""
 
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """A shape of a permanent magnet with a closed form of its near field.
+    """A shape of a permanent magnet with a closed form of its near field."""
 
-    Attributes:
-        first, count: First moment of the shape in its magnet, and number of moments.
-        shape: Surface of the shape, in the frame of the body.
-        reach: Distance up to which the closed form is used [m].
-    """
-
-    first: int
-    count: int
-    shape: Polyhedron
-    reach: float
+    first: int  # first moment of the shape in its magnet
+    count: int  # number of moments
+    shape: Polyhedron  # surface, in the frame of the body
+    reach: float  # distance up to which the closed form is used [m]
 
 
 @dataclass(frozen=True)
 class BodyLattice:
-    """Moments of one magnet in the frame of its body, grouped by shape.
+    """Moments of one magnet in the frame of its body, grouped by shape."""
 
-    Attributes:
-        positions: Positions [m], shape [n, 3].
-        volumes: Volumes [m³], shape [n].
-        radii: Radii of the balls over which the fields of moments are averaged [m], shape [n].
-        counts: Number of moments of each shape.
-        coupling: Interaction of inducible cells minus that of balls; None for permanent magnets and separate balls.
-        solids: Closed forms of the near field of a permanent magnet; empty for inducible magnets and balls.
-    """
-
-    positions: np.ndarray
-    volumes: np.ndarray
-    radii: np.ndarray
-    counts: np.ndarray
-    coupling: Coupling | None = None
-    solids: tuple[ClosedForm, ...] = ()
+    positions: np.ndarray  # [m], shape [n, 3]
+    volumes: np.ndarray  # [m³], shape [n]
+    radii: np.ndarray  # of the balls over which the fields of moments are averaged [m], shape [n]
+    counts: np.ndarray  # number of moments of each shape
+    coupling: Coupling | None = None  # tensors between inducible cells minus those of balls
+    solids: tuple[ClosedForm, ...] = ()  # closed forms of the near field of a permanent magnet
 
 
 class ShapeSampler:
@@ -63,34 +58,29 @@ class ShapeSampler:
     def __init__(self, model: newton.Model):
         """Read the geometry of ``model``."""
         self._labels, self._sources = model.shape_label, model.shape_source
-        self._bodies = model.shape_body.numpy()
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
         self._frames = model.shape_transform.numpy().astype(float)
         numbers = np.column_stack([self._types, _number_sources(self._sources), self._scales, self._frames])
         self.kinds = unique_rows(numbers)[1]
         self._lattices: dict[tuple, BodyLattice] = {}
 
-    def sample(self, shapes: list[int], spacing: float, permanent: bool, closed: bool) -> BodyLattice:
-        """Return the moments of one magnet.
+    def sample(self, shapes: list[int], magnet: Magnet) -> BodyLattice:
+        """Return the moments of a magnet of shapes of one body, or of one static shape.
 
-        Separate balls are one moment each if ``spacing`` is 0. All other shapes are filled with moments as one solid:
-        the common volume of overlapping shapes belongs to the first of them.
-
-        Args:
-            shapes: Shapes of one body, or one static shape.
-            spacing: Distance between moments [m]; 0 for automatic.
-            permanent: The moments are fixed. Their fields are averaged over balls inside their cells.
-            closed: Use closed forms of the near field, where the shapes have them.
+        At automatic spacing, separate balls are one moment each. All other shapes are filled with moments as one solid:
+        the common volume of overlapping shapes belongs to the first of them. The fields of fixed moments are averaged
+        over balls inside their cells. Permanent magnets have closed forms of their near fields, where possible.
         """
-        key = (spacing, permanent, closed, *self.kinds[shapes].tolist())
+        choices = magnet.moment_spacing, magnet.fixed, magnet.kind == "permanent"
+        key = (*choices, *self.kinds[shapes].tolist())
         if key not in self._lattices:
             try:
-                self._lattices[key] = _within_range(self._sample(shapes, spacing, permanent, closed))
+                self._lattices[key] = _within_range(self._sample(shapes, *choices))
             except InputError as error:
                 raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
         return self._lattices[key]
 
-    def _sample(self, shapes: list[int], spacing: float, permanent: bool, closed: bool) -> BodyLattice:
+    def _sample(self, shapes: list[int], spacing: float, fixed: bool, closed: bool) -> BodyLattice:
         if spacing == 0.0 and self._are_balls_apart(shapes):
             balls = [lattice.ball(self._scales[shape, 0]) for shape in shapes]
             return BodyLattice(
@@ -99,19 +89,21 @@ class ShapeSampler:
                 np.concatenate([ball.radii for ball in balls]),
                 np.ones(len(shapes), dtype=int),
             )
-        solids = [self._solid(shape).posed(self._frames[shape, :3], self._frames[shape, 3:]) for shape in shapes]
+        solids = [
+            solid_of(self._types[shape], self._scales[shape], self._sources[shape]).posed(frame[:3], frame[3:])
+            for shape, frame in zip(shapes, self._frames[shapes], strict=True)
+        ]
         surfaces = self._polyhedra(shapes, solids) if closed else []
-        if surfaces and permanent and spacing == 0.0:
+        if surfaces and fixed and spacing == 0.0:
             return self._sample_closed_forms(shapes, solids, surfaces)
-        across = 1 if permanent else lattice.LEAST_ACROSS
-        filled = lattice.fill(solids, spacing, across, together=not permanent)
+        filled = lattice.fill(solids, spacing, 1 if fixed else lattice.LEAST_ACROSS, together=not fixed)
         counts = np.bincount(filled.owners, minlength=len(solids))
-        ends, grids = np.cumsum(counts), filled.pieces if permanent else filled.pieces * len(solids)
+        ends, grids = np.cumsum(counts), filled.pieces if fixed else filled.pieces * len(solids)
         parts = tuple(
             ClosedForm(int(end - count), int(count), shape, _REACH * float(grid.sides.max()))
             for end, count, shape, grid in zip(ends, counts, surfaces, grids, strict=bool(surfaces))
         )
-        if permanent:
+        if fixed:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
         cells = with_surface_response(coupling(filled, filled.radii), filled, solids)
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts)
@@ -155,24 +147,15 @@ class ShapeSampler:
         distances = np.linalg.norm(centers[:, None] - centers, axis=2) + 3.0 * np.diag(radii)
         return bool((distances >= (radii[:, None] + radii) * (1.0 - 1e-5)).all())
 
-    def _solid(self, shape: int) -> lattice.Solid:
-        kinds, kind, scale = newton.GeoType, self._types[shape], self._scales[shape]
-        if kind == kinds.SPHERE:
-            return lattice.sphere(scale[0])
-        if kind == kinds.BOX:
-            return lattice.box(scale)
-        if kind == kinds.ELLIPSOID:
-            return lattice.ellipsoid(scale)
-        if kind == kinds.CAPSULE:
-            return lattice.capsule(scale[0], scale[1])
-        if kind == kinds.CYLINDER and scale[2] == 0.0:
-            return lattice.cylinder(scale[0], scale[1])
-        if kind == kinds.CONE:
-            return lattice.cone(scale[0], scale[1])
-        if kind in (kinds.MESH, kinds.CONVEX_MESH):
-            source: Any = self._sources[shape]
-            return lattice.mesh(np.asarray(source.vertices, float) * scale, np.asarray(source.indices).reshape(-1, 3))
+
+def solid_of(kind: int, scale: np.ndarray, source: Any) -> lattice.Solid:
+    """Return the solid of a Newton shape, from its type, its scale [m], shape [3], and its mesh or None."""
+    if kind in (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH):
+        return lattice.mesh(np.asarray(source.vertices, float) * scale, np.asarray(source.indices).reshape(-1, 3))
+    if kind == newton.GeoType.CYLINDER and scale[2] != 0.0:
         raise InputError("a cylinder with a barrel-shaped side cannot be magnetized")
+    make, lengths = _SOLIDS[newton.GeoType(kind)]
+    return make(scale) if lengths == 3 else make(*scale[:lengths])
 
 
 def _number_sources(sources: list) -> list[int]:

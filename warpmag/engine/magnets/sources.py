@@ -10,6 +10,7 @@ import warp as wp
 from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import SourceRecord, check_strength
+from warpmag.engine.magnets.magnet_system import KINEMATIC
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.rigid.sources import (
@@ -22,15 +23,9 @@ from warpmag.kernels.rigid.sources import (
 from warpmag.moments.arrays import host_array
 from warpmag.moments.system import MomentSystem
 
-_KINEMATIC = int(newton.BodyFlags.KINEMATIC)
-
 
 class ModelSources:
     """The field sources of a model.
-
-    Args:
-        model: The model.
-        magnet_worlds: Worlds with magnets, [-1] for a model without worlds.
 
     Attributes:
         shapes: Shapes that represent sources, in the order of ``applied``.
@@ -38,11 +33,7 @@ class ModelSources:
     """
 
     def __init__(self, model: newton.Model, magnet_worlds: np.ndarray):
-        """Read the sources from the attributes of the model.
-
-        Raises:
-            InputError: A source is on a body outside all worlds, and several worlds would act on it.
-        """
+        """Read the sources from the attributes of the model; ``magnet_worlds`` are the worlds of ``find_magnets``."""
         self._model, self._matches = model, {}
         texts = getattr(getattr(model, NAMESPACE, None), "source", ())
         self.shapes, self.applied = [], []
@@ -54,7 +45,7 @@ class ModelSources:
                 continue
             record = records.setdefault(texts[shape], SourceRecord.from_text(texts[shape]))
             body = int(bodies[shape])
-            pushed = body >= 0 and not flags.numpy()[body] & _KINEMATIC
+            pushed = body >= 0 and not flags.numpy()[body] & KINEMATIC
             kind = SourceKind[record.kind.upper()]
             self.shapes.append(shape)
             self.applied.append(AppliedSource(kind, record.parameters, record.table, world, body, pushed))
@@ -74,7 +65,7 @@ class ModelSources:
         shapes.strengths = getattr(model, NAMESPACE).strength
         shapes.body_list, shapes.run_start = on_device(bodies), on_device([*starts, len(pushed)])
         shapes.order = on_device([index for _, index in pushed])
-        shapes.kinematic_flag = _KINEMATIC
+        shapes.kinematic_flag = KINEMATIC
 
     def gather(self, body_q) -> None:
         """Write the frames and the strengths of the sources to the system."""
@@ -93,12 +84,10 @@ class ModelSources:
             add_reactions(self._shapes, self._model, state, frames, wrenches)
 
     def set_strength(self, name: str, selector: int | str, value) -> None:
-        """Set the strengths of some sources.
+        """Set the strengths of the sources that match a shape index or a shell pattern of labels.
 
-        Args:
-            name: Name of the argument, for messages.
-            selector: A shape index, or a shell pattern of labels.
-            value: One strength for all matching sources, or one for each, in the order of their shapes.
+        ``value`` is one strength for all of them, or one for each, in the order of their shapes. Messages begin with
+        ``name``.
         """
         if not isinstance(selector, str):
             check_whole(name, selector)
@@ -122,10 +111,9 @@ class ModelSources:
 
     def _matching(self, name: str, selector: int | str) -> wp.array:
         """Return the shapes of the matching sources, on the device."""
-        labels = self._model.shape_label
         if isinstance(selector, str):
             matches = re.compile(fnmatch.translate(selector)).match
-            shapes = [shape for shape in self.shapes if matches(labels[shape])]
+            shapes = [shape for shape in self.shapes if matches(self._model.shape_label[shape])]
         else:
             shapes = [shape for shape in self.shapes if shape == selector]
         if not shapes:

@@ -72,14 +72,7 @@ def _is_source(prim: Any, _) -> bool:
 
 
 def _add_sources(prim: Any, context: dict[str, Any]) -> Iterable[dict[str, Any]]:
-    """Add the coil and the field map of a prim to the builder.
-
-    Returns:
-        No attribute rows, since the sources are sites.
-
-    Raises:
-        InputError: A source is invalid, or on a body that Newton has not imported.
-    """
+    """Add the coil and the field map of a prim to the builder; return no attribute rows, since sources are sites."""
     from warpmag.usd import placed_sources, world_matrix_at  # noqa: PLC0415 - a builder can do without USD
 
     builder, imported = context["builder"], context["result"]

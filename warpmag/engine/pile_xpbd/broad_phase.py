@@ -12,34 +12,29 @@ _TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, n
 """Newton's types of shapes, in the order of ``PARTNERS``."""
 
 
+def are_colliding(model: newton.Model) -> np.ndarray:
+    """Return true for each shape that collides with other shapes, shape [shape_count]."""
+    return (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
+
+
 class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
     """Broad phase of a ``CollisionPipeline``: lists the pairs of shapes that may touch.
 
     After :meth:`write_contacts` it also writes the contacts of balls, and lists no pairs for them. See
-    ``kernels.contacts.broad_phase`` for the method and for the pairs of balls that are never listed.
-
-    Attributes:
-        leaves_pairs: True if the narrow phase of the pipeline may have pairs to process.
+    ``kernels.contacts.broad_phase`` for the method and for the pairs of balls that are never listed. Unless
+    ``leaves_pairs``, the narrow phase of the pipeline has no pairs to process.
     """
 
     def __init__(self, model: newton.Model, farthest: float):
         """Allocate the search, or set up Newton's sweep where the sweep is faster.
 
-        Args:
-            model: The model.
-            farthest: ``speculative_contact_gap_max`` of the pipeline [m].
+        ``farthest`` is ``speculative_contact_gap_max`` of the pipeline [m].
         """
-        colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
         spheres = model.shape_type.numpy() == newton.GeoType.SPHERE
         reach = model.shape_scale.numpy()[:, 0] + model.shape_margin.numpy() + model.shape_gap.numpy()
-        self._search = allocate(
-            model.shape_world.numpy(),
-            model.shape_body.numpy(),
-            colliding,
-            np.where(spheres, reach, np.nan),
-            farthest=farthest,
-            device=wp.get_device(model.device),
-        )
+        radii, device = np.where(spheres, reach, np.nan), wp.get_device(model.device)
+        worlds, bodies = model.shape_world.numpy(), model.shape_body.numpy()
+        self._search = allocate(worlds, bodies, are_colliding(model), radii, farthest=farthest, device=device)
         self._model = model
         self.leaves_pairs = True
         if self._search is None:
@@ -50,12 +45,7 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         a.scale, a.margin, a.gap = model.shape_scale, model.shape_margin, model.shape_gap
 
     def write_contacts(self, pipeline: newton.CollisionPipeline, contacts: newton.Contacts) -> None:
-        """Also write the contacts of balls in every later :meth:`launch`.
-
-        Args:
-            pipeline: The pipeline that uses this broad phase.
-            contacts: Contact buffer of the pipeline.
-        """
+        """Also write the contacts of balls to the buffer of the pipeline in every later :meth:`launch`."""
         if self._search is None:
             return
         types = self._model.shape_type.numpy()
@@ -69,11 +59,10 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
     def _may_leave_pairs(self, kinds: np.ndarray) -> bool:
         """Return true if a moving shape is not a ball, or if Newton has to find contacts of balls with some shape."""
         model, kinematic = self._model, newton.BodyFlags.KINEMATIC
-        colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
         flags = np.append(model.body_flags.numpy(), kinematic)  # the last entry is for shapes without a body, -1
         body: np.ndarray = model.shape_body.numpy()
         moving = (flags[body] & kinematic) == 0
-        others = colliding & (kinds != PARTNERS.index("ball"))
+        others = are_colliding(model) & (kinds != PARTNERS.index("ball"))
         return bool((others & (moving | (kinds == len(PARTNERS)))).any())
 
     def set_motion(self, state: newton.State, dt: float) -> None:
@@ -100,10 +89,8 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
             return
         a = self._search.arrays
         a.lower, a.upper, a.displacement = shape_lower, shape_upper, options.get("shape_displacement")
-        a.group, a.world, a.body, a.body_flags = (
-            *(shape_collision_group, shape_world),
-            *(options["shape_body"], options["body_flags"]),
-        )
+        a.group, a.world = shape_collision_group, shape_world
+        a.body, a.body_flags = options["shape_body"], options["body_flags"]
         a.excluded, a.excluded_count = options["filter_pairs"], options["num_filter_pairs"] or 0
         a.fixed_pairs = int(options["include_static_kinematic_pairs"])
         a.pairs, a.pair_count = candidate_pair, candidate_pair_count

@@ -15,10 +15,7 @@ from warpmag.kernels.shared.scan import launch_scan
 
 
 class Workspace:
-    """An allocator for Warp that reuses the memory of temporary arrays.
-
-    The first run of a step allocates the blocks. A later capture uses the same ones and allocates nothing.
-    """
+    """An allocator for Warp that reuses the memory of the first run of a step, so that a capture allocates nothing."""
 
     def __init__(self, device):
         """Make an empty workspace on ``device``, a CUDA device."""

@@ -11,7 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase
+from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase, are_colliding
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
 from warpmag.errors import InputError, extra
@@ -35,44 +35,39 @@ _KINDS = ("contact", "pair", "triangle")
 
 @dataclass(frozen=True)
 class BodySizes:
-    """Lengths of bodies and shapes, the scales of motions and penetrations.
+    """Lengths of bodies [m], the scales of motions and penetrations, shape [body_count].
 
     Attributes:
-        thickness: Half of the smallest dimension of the body's colliding shapes [m], for a ball its radius. Infinite
-            for bodies that forces do not move. Shape [body_count].
-        reach: Distance from the center of mass to the farthest point of a colliding shape [m], zero for a ball around
-            its center of mass. Shape [body_count].
-        shape_thickness: Half of the smallest dimension of each shape [m], infinite for planes and height fields.
-            Shape [shape_count].
+        thickness: Half of the smallest dimension of the body's colliding shapes, for a ball its radius. Infinite for
+            bodies that forces do not move.
+        reach: Distance from the center of mass to the farthest point of a colliding shape, zero for a ball around its
+            center of mass.
     """
 
     thickness: np.ndarray
     reach: np.ndarray
-    shape_thickness: np.ndarray
 
 
 def body_sizes(model: newton.Model) -> BodySizes:
     """Return the sizes of the bodies of ``model``, from their colliding shapes."""
     shape_body: np.ndarray = model.shape_body.numpy()
-    colliding = model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES
     types, scales, radii = model.shape_type.numpy(), model.shape_scale.numpy(), model.shape_collision_radius.numpy()
-    shape_thickness = _thicknesses(types, scales, model.shape_source)
     thickness, reach = np.full(model.body_count, np.inf), np.zeros(model.body_count)
     moving = model.body_inv_mass.numpy() > 0.0
     moving &= (model.body_flags.numpy() & newton.BodyFlags.KINEMATIC) == 0
     centers, frames = model.body_com.numpy(), model.shape_transform.numpy()
-    shapes = np.flatnonzero((shape_body >= 0) & (colliding != 0))
+    shapes = np.flatnonzero((shape_body >= 0) & are_colliding(model))
     shapes = shapes[moving[shape_body[shapes]]]
     bodies = shape_body[shapes]
-    np.minimum.at(thickness, bodies, shape_thickness[shapes])
+    np.minimum.at(thickness, bodies, _thicknesses(types, scales, model.shape_source)[shapes])
     arms = np.linalg.norm(frames[shapes, :3] - centers[bodies], axis=1)
     reaching = (arms > 1e-3 * radii[shapes]) | (types[shapes] != newton.GeoType.SPHERE)
     np.maximum.at(reach, bodies[reaching], (arms + radii[shapes])[reaching])
-    return BodySizes(thickness, reach, shape_thickness)
+    return BodySizes(thickness, reach)
 
 
 def _thicknesses(types: np.ndarray, scales: np.ndarray, sources: list) -> np.ndarray:
-    """Return half of the smallest dimension [m] of each shape, shape [n]."""
+    """Return half of the smallest dimension [m] of each shape, infinite for planes and height fields, shape [n]."""
     kinds = newton.GeoType
     thickness = np.full(len(types), np.inf)
     for sized_kinds, columns in (
@@ -90,18 +85,11 @@ def _thicknesses(types: np.ndarray, scales: np.ndarray, sources: list) -> np.nda
 
 @dataclass(frozen=True)
 class Buffer:
-    """A buffer of fixed size that can overflow.
+    """A buffer of fixed size that can overflow; entries beyond its limit are dropped."""
 
-    Attributes:
-        kind: ``pair``, ``contact`` or ``triangle``.
-        fill: Number of entries to store, on the device, shape [1]; entries beyond ``limit`` were dropped. Or flags,
-            true where entries were dropped, shape [n].
-        limit: Number of entries that fit; 0 for flags.
-    """
-
-    kind: str
-    fill: wp.array
-    limit: int
+    kind: str  # one of ``_KINDS``
+    fill: wp.array  # number of entries to store, shape [1], or flags, true where entries were dropped, shape [n]
+    limit: int  # number of entries that fit; 0 for flags
 
 
 def scale_gaps(model: newton.Model, sizes: BodySizes) -> None:
@@ -131,31 +119,18 @@ class RigidSolver:
         buffers: The buffers that can overflow.
     """
 
-    def __init__(
-        self,
-        model: newton.Model,
-        sizes: BodySizes,
-        *,
-        solver: str = "xpbd",
-        capacity: float = 1.0,
-    ):
-        """Set up collision and solver.
+    def __init__(self, model: newton.Model, sizes: BodySizes, *, solver: str = "xpbd", capacity: float = 1.0):
+        """Set up collision and one of ``SOLVERS``, and scale the contact gaps of the model.
 
-        Args:
-            model: The model; contact gaps of its shapes are changed by :func:`scale_gaps`.
-            sizes: Sizes of its bodies.
-            solver: Name of the solver, from ``SOLVERS``.
-            capacity: Factor on the initial sizes of the contact and pair buffers.
-
-        Raises:
-            InputError: The solver is unknown, is not installed, or cannot run this model.
+        ``capacity`` is a factor on the initial sizes of the contact and pair buffers. A solver that is unknown, is not
+        installed, or cannot run this model raises :class:`InputError`.
         """
         check_solver(solver)
         self._model, self._name = model, solver
         scale_gaps(model, sizes)
         finite = sizes.thickness[np.isfinite(sizes.thickness)]
         self._speculation = float(2.0 * finite.max()) if len(finite) else 0.0
-        types = model.shape_type.numpy()[(model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0]
+        types = model.shape_type.numpy()[are_colliding(model)]
         contacts = np.where(types == newton.GeoType.SPHERE, _CONTACTS_PER_BALL, _CONTACTS_PER_SHAPE).sum()
         self._limits = {
             "contact": max(16, int(capacity * contacts)),
@@ -190,8 +165,7 @@ class RigidSolver:
             try:
                 self._solver = SOLVERS[self._name].make(self._model, self._limits["contact"])
             except ImportError as error:
-                reason = f"needs {extra('sim')}: {error.__cause__ or error}"
-                raise InputError(f"solver {self._name}: {reason}") from None
+                raise InputError(f"solver {self._name}: needs {extra('sim')}: {error.__cause__ or error}") from None
             except (NotImplementedError, TypeError, ValueError, RuntimeError) as error:
                 raise InputError(f"solver {self._name}: {' '.join(str(error).split())}") from None
         narrow = self._pipeline.narrow_phase
@@ -204,18 +178,15 @@ class RigidSolver:
                 Buffer("triangle", narrow.triangle_pairs_count, narrow.triangle_pairs.shape[0]),
                 Buffer("triangle", self.contacts.contact_counters[2:3], 0),  # contacts lost during reduction
             ]
-        overflow_flags = getattr(self._solver, "constraint_overflow", None)
-        if overflow_flags is not None:
+        if (overflow_flags := getattr(self._solver, "constraint_overflow", None)) is not None:
             self.buffers.append(Buffer("contact", overflow_flags, 0))
 
     def _sorts_contacts(self) -> bool:
         """Return true if Newton has to sort contacts: with meshes on a GPU, so that every run has the same contacts.
 
-        Contacts of other shapes arrive in any order; the solver sorts them. Newton sorts at most
-        ``_MAX_SORTED_PAIRS`` pairs of triangles.
+        Contacts of other shapes arrive in any order; the solver sorts them.
         """
-        colliding = (self._model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
-        kinds = self._model.shape_type.numpy()[colliding]
+        kinds = self._model.shape_type.numpy()[are_colliding(self._model)]
         meshes = np.isin(kinds, (newton.GeoType.MESH, newton.GeoType.HFIELD)).any()
         on_gpu = wp.get_device(self._model.device).is_cuda
         return bool(on_gpu and meshes and (self._limits["triangle"] or 0) < _MAX_SORTED_PAIRS)
@@ -251,14 +222,10 @@ class RigidSolver:
         return np.array([0 if fill.dtype is wp.bool else fill.ptr for fill in fills], np.uint64)
 
     def watch(self, watched: Monitor, state: newton.State, *, substep: int, longest: float, threshold: float) -> None:
-        """Write the overlaps at ``state`` and the fills of the buffers to the monitor; capturable in a graph.
+        """Write the overlaps at the state of the last :meth:`collide` and the fills of the buffers to a monitor.
 
-        Args:
-            watched: Arrays of the monitor, with the :meth:`fills` of this solver.
-            state: State of the last :meth:`collide`.
-            substep: Number of substeps since the monitor updated its count, or its ``NEXT``.
-            longest: Length of the substeps of the first level [s].
-            threshold: Overlap above which a contact is counted, over the thickness of the thinner body.
+        The monitor has the :meth:`fills` of this solver; see :func:`watch` for the other arguments. Capturable in a
+        graph.
         """
         bodies = view_bodies(self._model, state)
         watch(watched, self._contact_view, bodies, self.overlaps, substep=substep, longest=longest, threshold=threshold)
@@ -267,13 +234,9 @@ class RigidSolver:
                 watch_flags(buffer.fill, COUNT_CAPACITIES + index, watched.counts)
 
     def grow(self, fills: np.ndarray) -> bool:
-        """Enlarge the buffers that overflowed; contacts and captured graphs become invalid.
+        """Enlarge the buffers that overflowed; return true if there are any. Contacts and graphs become invalid.
 
-        Args:
-            fills: Number of entries that each of :attr:`buffers` had to store.
-
-        Returns:
-            True if a buffer grew.
+        ``fills`` are the numbers of entries that each of :attr:`buffers` had to store.
         """
         grown = {}
         for buffer, fill in zip(self.buffers, fills, strict=True):

@@ -40,18 +40,9 @@ class JointSolve:
         contact_relaxation: float,
         joint_relaxation: float,
     ):
-        """Allocate all buffers.
-
-        Args:
-            model: The model.
-            contact_max: Capacity of the contact buffer.
-            iterations: Iterations over joints and contacts.
-            contact_relaxation: Factor of each contact's correction.
-            joint_relaxation: Factor of each joint's correction.
-        """
-        self._model, self._iterations = model, iterations
+        """Allocate all buffers. The relaxations are factors of the corrections of each contact and each joint."""
+        self._model, self._iterations, device = model, iterations, model.device
         self._relaxations = contact_relaxation, joint_relaxation
-        device = model.device
         self._deltas = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         self._impulses = wp.zeros(model.joint_count, dtype=wp.spatial_vector, device=device)
         self._forces = wp.zeros_like(self._deltas)
@@ -89,16 +80,10 @@ class JointSolve:
         return view
 
     def step(self, before: BodyView, after: BodyView, contact_masses: Callable, control, contacts, dt: float) -> None:
-        """Advance by ``dt`` [s].
+        """Advance the bodies ``before``, with masses that are not split, by ``dt`` [s], and write them to ``after``.
 
-        Args:
-            before: The bodies at the start, with masses that are not split among contacts.
-            after: Output, the bodies at the end.
-            contact_masses: Function that returns the inverse masses and inertias for contacts. It is called once
-                ``after`` has the velocities without contacts and joints.
-            control: Forces and targets of the joints.
-            contacts: Newton's contacts.
-            dt: Length of the substep [s].
+        ``contact_masses`` returns the inverse masses and inertias for contacts. It is called once ``after`` has the
+        velocities without contacts and joints.
         """
         model, joints = self._model, self._view()
         wp.copy(self._forces, before.f)
@@ -134,15 +119,13 @@ class JointSolve:
         """Correct the lever arms of Newton's joint impulses, and add drives."""
         kernels.launch_correct_lever_arms(joints, bodies, self._q, self._impulses, self._deltas)
         targets, impulses = (control.joint_target_q, control.joint_target_qd), self._drive_impulses
-        kernels.launch_add_drives(
-            joints, bodies, targets, impulses, self._deltas, relaxation=self._relaxations[1], dt=dt
-        )
+        relaxation = self._relaxations[1]
+        kernels.launch_add_drives(joints, bodies, targets, impulses, self._deltas, relaxation=relaxation, dt=dt)
         launch_apply_impulses(bodies, self._deltas)
 
     def _add_joint_forces(self, body_q, joint_f, dt: float) -> None:
-        outputs = {"body_f": self._forces, "joint_impulse": None}
-        count = self._model.joint_count
-        self._bind(newton_kernels.apply_joint_forces, count, body_q=body_q, joint_f=joint_f, dt=dt, **outputs)()
+        arrays = {"body_q": body_q, "joint_f": joint_f, "body_f": self._forces, "joint_impulse": None}
+        self._bind(newton_kernels.apply_joint_forces, self._model.joint_count, dt=dt, **arrays)()
 
     def _contact_solve(self, masses, contacts, dt: float) -> Callable:
         names = ("count", "point0", "point1", "surface_velocity", "offset0", "offset1", "normal", "shape0", "shape1")
@@ -208,11 +191,10 @@ def are_pins(model: newton.Model) -> np.ndarray:
 
 
 def _drive_rows(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
-    """List the axes whose drives ``kernels.contacts.joints`` evaluates.
+    """Return the axes with drives that ``kernels.contacts.joints`` evaluates, and a mask of the others, shape [dofs].
 
-    Returns:
-        Joint, degree of freedom, index of the target, and 1 for an angular axis, shape [rows, 4]. And true for each
-        degree of freedom with a drive that Newton evaluates, shape [dofs]: axes of joints with several angular axes.
+    A row is the joint, the degree of freedom, the index of the target, and 1 for an angular axis, shape [rows, 4].
+    Newton evaluates the drives of the others: the axes of joints with several angular axes.
     """
     rows, newton_dofs = [], np.ones(model.joint_dof_count, dtype=bool)
     types, counts = model.joint_type.numpy(), _axis_counts(model)

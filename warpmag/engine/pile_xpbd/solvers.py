@@ -11,21 +11,13 @@ from warpmag.declarations.checks import check_token
 
 @dataclass(frozen=True)
 class SolverKind:
-    """One kind of rigid-body solver.
+    """One kind of rigid-body solver."""
 
-    Attributes:
-        make: Function of a model and the capacity of its contact buffer that returns the solver.
-        maximal: The solver uses maximal coordinates, the poses of bodies, so that joints need no articulation.
-        resumable: The solver has no hidden state between steps, so that a checkpoint is complete.
-        contacts_at_end: The solver evaluates contacts at the end of a step, and needs kinematic bodies posed there.
-        warning: Known weakness, in one line for the user; empty if there is none.
-    """
-
-    make: Callable
-    maximal: bool = False
-    resumable: bool = True
-    contacts_at_end: bool = False
-    warning: str = ""
+    make: Callable  # function of a model and the capacity of its contact buffer that returns the solver
+    maximal: bool = False  # maximal coordinates, the poses of bodies, so that joints need no articulation
+    resumable: bool = True  # no hidden state between steps, so that a checkpoint is complete
+    contacts_at_end: bool = False  # contacts at the end of a step, so that kinematic bodies must be posed there
+    warning: str = ""  # known weakness, in one line for the user
 
 
 def _xpbd(model, contact_max: int):
@@ -36,8 +28,8 @@ def _xpbd(model, contact_max: int):
     # 0.5 and 10 at Newton's 0.8. Averaging over the contacts of a body would need far more iterations.
     # ``kernels.contacts.solve`` accelerates its iterations: on Balls Up after 5 s, 30 of them leave the same speeds as
     # 60, and an overlap of 0.5 % of the radius instead of 0.2 %.
-    settings = {"iterations": 60, "rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
-    settings["contact_iterations"] = 30
+    settings = {"iterations": 60, "contact_iterations": 30}
+    settings |= {"rigid_contact_relaxation": 0.35, "rigid_contact_con_weighting": False}
     # Linear and angular joint relaxation are equal. With Newton's 0.7 and 0.4 hinged bodies swing as if they were
     # heavier: a quarter swing ends at 84.9 instead of 90 degrees. Two joints at the same place are stable up to 0.5.
     settings |= {"joint_linear_relaxation": 0.4, "joint_angular_relaxation": 0.4}

@@ -21,6 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.pile_xpbd.broad_phase import are_colliding
 from warpmag.engine.pile_xpbd.joints import JointSolve
 from warpmag.kernels.contacts import solve as contact_solve
 from warpmag.kernels.contacts.free_motion import launch_accelerate, launch_apply_corrections, launch_move
@@ -43,13 +44,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
     """
 
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
-        """Set up the solver.
+        """Set up Newton's solver with ``settings``, for contact buffers of ``contact_max`` entries.
 
-        Args:
-            model: The model.
-            contact_max: Capacity of the contact buffer.
-            contact_iterations: Iterations of ``kernels.contacts.solve``; by default Newton's ``iterations``.
-            settings: Settings of Newton's solver.
+        ``kernels.contacts.solve`` runs ``contact_iterations``; by default Newton's ``iterations``.
         """
         super().__init__(model, **settings)
         splits = _splits(model, self.body_inv_mass_effective.numpy())
@@ -69,13 +66,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
             if model.joint_count:
                 self._free_dofs = wp.array(free_dofs, dtype=wp.int32, device=model.device)
         elif plain and not self._has_joint_mimics:
-            self._joints = JointSolve(
-                model,
-                contact_max,
-                iterations=self.iterations,
-                contact_relaxation=self.rigid_contact_relaxation,
-                joint_relaxation=self.joint_linear_relaxation,
-            )
+            relaxations = {"contact_relaxation": self.rigid_contact_relaxation}
+            relaxations["joint_relaxation"] = self.joint_linear_relaxation
+            self._joints = JointSolve(model, contact_max, iterations=self.iterations, **relaxations)
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; takes the arguments of Newton's solver."""
@@ -103,7 +96,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             self._solve,
             view_contacts(self.model, contacts),
             after,
-            self._shares if self._splits is not None else None,
+            None if self._splits is None else self._shares,
             iterations=self._contact_iterations,
             relaxation=self.rigid_contact_relaxation,
             dt=dt,
@@ -111,17 +104,9 @@ class PileXPBD(newton.solvers.SolverXPBD):
         launch_move(after, _KINEMATIC, dt)
 
     def _find_shares(self, bodies: BodyView, contacts, dt: float) -> None:
-        if self._splits is None:
-            return
-        launch_find_shares(
-            view_contacts(self.model, contacts),
-            bodies,
-            self._splits,
-            self._entries,
-            self._shares,
-            relaxation=self.rigid_contact_relaxation,
-            dt=dt,
-        )
+        if self._splits is not None:
+            buffers, relaxation = (self._splits, self._entries, self._shares), self.rigid_contact_relaxation
+            launch_find_shares(view_contacts(self.model, contacts), bodies, *buffers, relaxation=relaxation, dt=dt)
 
     def _step_joints(self, state_in, state_out, control, contacts, dt) -> None:
         assert self._joints is not None
@@ -188,9 +173,8 @@ def _splits(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:
 
     If all balls are similar, their masses are not split: two similar balls share each correction equally.
     """
-    colliding = (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
     shape_body, types = model.shape_body.numpy(), model.shape_type.numpy()
-    on_body = colliding & (shape_body >= 0)
+    on_body = are_colliding(model) & (shape_body >= 0)
     shapes = np.bincount(shape_body[on_body], minlength=model.body_count)
     is_ball = on_body & (types == newton.GeoType.SPHERE)
     balls = (shapes == 1) & (np.bincount(shape_body[is_ball], minlength=model.body_count) == 1) & (inv_mass > 0.0)

@@ -20,18 +20,13 @@ from warpmag.moments.arrays import host_array
 class KeyedModelValues:
     """Sets the keyed values of one model. Every method only launches kernels.
 
-    Attributes:
-        time: Time [s] on the device, float64, shape [1]; the stepper sets it.
+    The stepper sets ``time`` [s] on the device, float64, shape [1].
     """
 
     def __init__(self, model: newton.Model, magnetics: Magnetics, keys: SceneKeys, *, contacts_at_end: bool):
-        """Copy the keys to the device.
+        """Copy the keys of bodies and shapes to the device.
 
-        Args:
-            model: The model.
-            magnetics: Its magnets.
-            keys: Keys by body and by shape.
-            contacts_at_end: The solver needs kinematic bodies at their poses at the end of a substep.
+        ``contacts_at_end`` means that the solver needs kinematic bodies at their poses at the end of a substep.
         """
         self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
         self._magnetics, self._contacts_at_end = magnetics, contacts_at_end
@@ -39,27 +34,20 @@ class KeyedModelValues:
         if keys.motions:
             operations = {body: motion.operations for body, motion in keys.motions.items()}
             self._bodies = pose_bodies(operations, _free_joints(model, list(operations)), model, self.time)
-        curves, targets = [], []
-        for shape, curve in keys.magnetizations.items():
-            curves.append(curve)
-            targets.append(getattr(model, NAMESPACE).magnetization[shape : shape + 1])
-        for shape, curve in keys.currents.items():
-            curves.append(curve)
-            targets.append(getattr(model, NAMESPACE).strength[shape : shape + 1])
+        attributes = getattr(model, NAMESPACE)
+        curves = [*keys.magnetizations.values(), *keys.currents.values()]
+        targets = [attributes.magnetization[shape : shape + 1] for shape in keys.magnetizations]
+        targets += [attributes.strength[shape : shape + 1] for shape in keys.currents]
         self._field = None
         if keys.field is not None:
             self._field = wp.zeros(1, dtype=wp.vec3, device=model.device)
-            curves.append(keys.field)
-            targets.append(self._field)
+            curves, targets = [*curves, keys.field], [*targets, self._field]
         self._followers = follow(curves, targets, self.time) if curves else None
 
     def set_values(self, offset: float, *, shared: wp.array | None = None, substep: float = 0.0) -> None:
-        """Set magnetizations, currents and the field to their values ``offset`` after :attr:`time`.
+        """Set magnetizations, currents and the field to their values ``offset`` [s] after :attr:`time`.
 
-        Args:
-            offset: Time after :attr:`time` [s].
-            shared: Number of substeps that share these values, see ``kernels.rigid.keys.launch_follow``.
-            substep: Length of these substeps [s].
+        ``shared`` is the number of substeps of ``substep`` [s] that share these values (``kernels.rigid.keys``).
         """
         if self._followers is not None:
             launch_follow(self._followers, offset, shared=shared, substep=substep)

@@ -8,7 +8,7 @@ import warp as wp
 
 from warpmag.declarations.checks import joint_ends_apart, joint_gap_message, short_repr
 from warpmag.engine.pile_xpbd.joints import are_pins
-from warpmag.engine.pile_xpbd.solvers import MAXIMAL, SOLVERS
+from warpmag.engine.pile_xpbd.solvers import MAXIMAL
 from warpmag.errors import InputError
 
 SPRING_STIFFNESS = 1e4
@@ -18,8 +18,7 @@ SPRING_STIFFNESS = 1e4
 def articulate(builder: newton.ModelBuilder, solver: str) -> None:
     """Make an articulation of each joint between a body and the world, for solvers that move articulations only.
 
-    Raises:
-        InputError: Another joint is outside all articulations.
+    Another joint outside all articulations raises :class:`InputError`.
     """
     if solver in MAXIMAL:
         return
@@ -48,9 +47,10 @@ def check_model(model: newton.Model, solver: str, dt: float) -> None:
 
 def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
     """Raise :class:`InputError` if the springs of the semi-implicit solver are too stiff for a body and ``dt`` [s]."""
-    kinds = model.joint_type.numpy() if model.joint_count else np.zeros(0, int)
-    constrained = np.flatnonzero((kinds != newton.JointType.FREE) & (kinds != newton.JointType.DISTANCE))
-    if solver != "semi-implicit" or not len(constrained):
+    if solver != "semi-implicit" or not model.joint_count:
+        return
+    constrained = np.flatnonzero(~np.isin(model.joint_type.numpy(), (newton.JointType.FREE, newton.JointType.DISTANCE)))
+    if not len(constrained):
         return
     spins = np.linalg.eigvalsh(np.asarray(model.body_inv_inertia.numpy(), dtype=float)).max(axis=1)
     gains = np.maximum(model.body_inv_mass.numpy(), spins) * SPRING_STIFFNESS * dt**2
@@ -63,21 +63,14 @@ def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
             )
 
 
-def solver_warnings(solver: str) -> list[str]:
-    """Return the known weakness of the solver as a list of at most one line."""
-    return list(filter(None, [SOLVERS[solver].warning]))
-
-
 def check_control(control: newton.Control, model: newton.Model) -> None:
     """Raise :class:`InputError` unless ``control`` fits ``model``."""
     if not isinstance(control, newton.Control):
         raise InputError(f"control: must be a newton.Control, got {short_repr(control)}")
     for name, model_array in vars(model.control()).items():
         if isinstance(model_array, wp.array):
-            array = getattr(control, name, None)
-            if not (
-                isinstance(array, wp.array) and (array.shape, array.dtype) == (model_array.shape, model_array.dtype)
-            ):
+            array, kind = getattr(control, name, None), (model_array.shape, model_array.dtype)
+            if not isinstance(array, wp.array) or (array.shape, array.dtype) != kind:
                 raise InputError(f"control: {name} does not fit the model, make one with simulation.model.control()")
             if array.device != model_array.device:
                 raise InputError(f"control: {name} is on {array.device}, the model is on {model_array.device}")

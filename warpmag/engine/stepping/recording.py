@@ -28,8 +28,7 @@ class Recorder:
     Frames are written one by one. With a GPU a frame is written while the next steps run. Signals that end the process
     are delayed until a frame is complete.
 
-    Attributes:
-        written: Time of the last written frame since the start of the stage [s]; None before the first.
+    ``written`` is the time of the last written frame since the start of the stage [s], None before the first.
     """
 
     def __init__(
@@ -40,25 +39,13 @@ class Recorder:
         statistics: Statistics,
         output: str | os.PathLike,
         *,
-        copy_scene: bool,
-        frames: int,
-        options: dict[str, str],
         resumable: bool,
         ranks: Ranks | None,
+        **writer_options,
     ):
-        """Open the writer, a :class:`warpmag.usd.CacheWriter`.
+        """Open a :class:`warpmag.usd.CacheWriter` with ``writer_options``; of several ``ranks`` only the first writes.
 
-        Args:
-            scene: The scene.
-            magnetics: Its magnets.
-            stepper: Its stepper.
-            statistics: Statistics of the run, saved with checkpoints.
-            output: File of the root layer.
-            copy_scene: Copy the scene beside the output.
-            frames: Expected number of frames.
-            options: Options of the run; a resumed run needs equal ones.
-            resumable: Write checkpoints.
-            ranks: Processes of the run; the first one writes. None for a single process.
+        If ``resumable``, it writes checkpoints, which include the statistics.
         """
         shapes = list(scene.magnet_shapes.values())
         row_of_shape = {shape: row for row, shape in enumerate(magnetics.shapes.tolist())}
@@ -76,30 +63,14 @@ class Recorder:
         self._writer: CacheWriter | _NoWriter = _NoWriter()
         with errors_on_all_ranks(ranks):
             if is_first_rank(ranks):
-                self._writer = CacheWriter(
-                    scene.stage,
-                    output,
-                    list(recorded),
-                    list(scene.magnet_shapes),
-                    instancers=scene.swarms,
-                    copy_scene=copy_scene,
-                    frames=frames,
-                    options=options,
-                )
+                prims = list(recorded), list(scene.magnet_shapes)
+                self._writer = CacheWriter(scene.stage, output, *prims, instancers=scene.swarms, **writer_options)
 
     def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
-        """Continue the run at the output.
+        """Continue the run at the output, of ``frames`` and ``steps`` of ``step_size`` [s].
 
-        Args:
-            frames: Number of frames of the whole run.
-            steps: Number of steps of the whole run.
-            step_size: Time step [s].
-
-        Returns:
-            True if there was a run, and true if it is complete.
-
-        Raises:
-            InputError: The run at the output cannot be resumed.
+        Return true if there was a run, and true if it is complete. A run that cannot be resumed raises
+        :class:`InputError`.
         """
         with _signals_delayed():
             earlier = on_first_rank(self._writer.resume, self._ranks)
@@ -123,13 +94,9 @@ class Recorder:
         return True, earlier.state is None
 
     def add_frame(self, time: float, state) -> None:
-        """Record a frame. With a GPU it is written by the next :meth:`write`, while steps run.
+        """Record a frame ``time`` [s] after the start. With a GPU the next :meth:`write` writes it, while steps run.
 
         The moments are those of the last substep. Before the first step they are solved, without effect on later steps.
-
-        Args:
-            time: Time since the start [s].
-            state: Newton's state between two steps.
         """
         self.write()
         if time > 0.0:
@@ -138,14 +105,13 @@ class Recorder:
             self._magnetics.moments_at(state)
         self._host_copies.copy()
         due = self._writer.save_due
-        self._pending = time, due, self._save() if due and self._resumable else None
+        checkpoint = None
+        if due and self._resumable:
+            statistics = {f"{_STATISTICS}{name}": value for name, value in self._statistics.save().items()}
+            checkpoint = self._stepper.save() | statistics
+        self._pending = time, due, checkpoint
         if not self._magnetics.device.is_cuda:
             self.write()
-
-    def _save(self) -> dict[str, np.ndarray]:
-        """Return the arrays of a checkpoint of the present state."""
-        statistics = {f"{_STATISTICS}{name}": value for name, value in self._statistics.save().items()}
-        return self._stepper.save() | statistics
 
     def write(self) -> None:
         """Write the pending frame, if there is one, and a checkpoint if one is due."""

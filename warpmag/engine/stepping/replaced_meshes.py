@@ -1,44 +1,32 @@
 """Keeps the meshes of a stage that Newton replaces by simpler colliders (``physics:approximation``)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import newton
 import numpy as np
 
+from warpmag.engine.magnets.sampling import solid_of
 from warpmag.errors import InputError
-from warpmag.shapes import lattice
 
 _REPLACING = ("coacd", "vhacd", "convex_hull", "bounding_box", "bounding_sphere")
 """Newton's names of approximations that change the volume of a mesh; the others simplify its surface."""
-
 _SAME_VOLUME = 1e-4
 """Relative difference up to which a collider and the mesh have equal volumes, in single precision."""
 
 
 @dataclass
 class ReplacedMesh:
-    """A mesh that other shapes replace.
-
-    Attributes:
-        mesh: The mesh.
-        scale: Scale of the mesh.
-        frame: Pose of the mesh in the frame of its body.
-        colliders: Shapes that collide in place of the mesh.
-    """
+    """A mesh that other shapes replace."""
 
     mesh: newton.Mesh
     scale: tuple[float, float, float]
-    frame: Any
-    colliders: list[int] = field(default_factory=list)
+    frame: Any  # pose of the mesh in the frame of its body
+    colliders: list[int]  # shapes that collide in place of the mesh
 
 
 class StageBuilder(newton.ModelBuilder):
-    """A builder that keeps the meshes that an import replaces.
-
-    Attributes:
-        replaced: The replaced meshes by shape.
-    """
+    """A builder that keeps the meshes that an import replaces, in ``replaced`` by shape."""
 
     def __init__(self):
         """Make an empty builder."""
@@ -56,18 +44,13 @@ class StageBuilder(newton.ModelBuilder):
         new_colliders = super().approximate_meshes(method, shape_indices, *args, **options)
         for shape in new_colliders & meshes.keys():
             self.replaced[shape] = meshes[shape]
-            label = f"{self.shape_label[shape]}_convex_"
+            label, body = f"{self.shape_label[shape]}_convex_", self.shape_body[shape]
             parts = [part for part in range(before, self.shape_count) if self.shape_label[part].startswith(label)]
-            self.replaced[shape].colliders += [
-                part for part in parts if self.shape_body[part] == self.shape_body[shape]
-            ]
+            self.replaced[shape].colliders += [part for part in parts if self.shape_body[part] == body]
         return new_colliders
 
     def with_original_meshes(self, shapes: list[int]) -> list[int]:
-        """Return ``shapes`` with the original meshes in place of colliders of another volume.
-
-        Only closed meshes count. They are added to the builder without collision.
-        """
+        """Return ``shapes`` with closed original meshes, added without collision, for colliders of another volume."""
         result = list(shapes)
         for shape in shapes:
             original = self.replaced.get(shape)
@@ -79,34 +62,20 @@ class StageBuilder(newton.ModelBuilder):
 
     def _changes_volume(self, original: ReplacedMesh) -> bool:
         try:
-            volume = _solid(original.mesh, original.scale).volume
+            volume = solid_of(newton.GeoType.MESH, original.scale, original.mesh).volume
         except InputError:  # an open mesh; ``warpmag.usd`` warns about it
             return False
         if len(original.colliders) > 1:
             return True
         (shape,) = original.colliders
-        kind, scale = self.shape_type[shape], np.asarray(self.shape_scale[shape], float)
-        if kind == newton.GeoType.SPHERE:
-            collider = lattice.sphere(scale[0])
-        elif kind == newton.GeoType.BOX:
-            collider = lattice.box(scale)
-        else:
-            collider = _solid(self.shape_source[shape], scale)
+        scale = np.asarray(self.shape_scale[shape], float)
+        collider = solid_of(self.shape_type[shape], scale, self.shape_source[shape])
         return abs(volume - collider.volume) > _SAME_VOLUME * collider.volume
 
     def _add(self, shape: int, original: ReplacedMesh) -> int:
-        invisible = newton.ModelBuilder.ShapeConfig(
+        """Add a replaced mesh without mass and collision; return its shape."""
+        config = newton.ModelBuilder.ShapeConfig(
             density=0.0, has_shape_collision=False, has_particle_collision=False, is_visible=False
         )
-        return self.add_shape_mesh(
-            self.shape_body[shape],
-            xform=original.frame,
-            mesh=original.mesh,
-            scale=original.scale,
-            cfg=invisible,
-            label=f"{self.shape_label[shape]}_drawn",
-        )
-
-
-def _solid(mesh: newton.Mesh, scale) -> lattice.Solid:
-    return lattice.mesh(np.asarray(mesh.vertices, float) * scale, np.asarray(mesh.indices).reshape(-1, 3))
+        pose, label = {"xform": original.frame, "scale": original.scale}, f"{self.shape_label[shape]}_drawn"
+        return self.add_shape_mesh(self.shape_body[shape], mesh=original.mesh, cfg=config, label=label, **pose)

@@ -41,29 +41,17 @@ from warpmag.usd import (
 
 @dataclass(frozen=True)
 class ImportedScene:
-    """An imported stage.
+    """An imported stage."""
 
-    Attributes:
-        opened: The open stage, without prims for instances of identical balls.
-        identical_balls: The instances of identical balls.
-        builder: Bodies, shapes and joints, in the world frame and the units of the stage.
-        clock: Times, frame rate and physics step of the stage.
-        magnets: Magnets and magnetic settings of the stage.
-        bodies: Body of each rigid-body prim.
-        magnet_shapes: Shapes of each magnet prim.
-        keys: Keys from time samples.
-        warnings: Warnings about the stage, one line each.
-    """
-
-    opened: Any
+    opened: Any  # the open stage, without prims for instances of identical balls
     identical_balls: list[IdenticalBalls]
-    builder: newton.ModelBuilder
+    builder: newton.ModelBuilder  # in the world frame and the units of the stage
     clock: StageClock
     magnets: StageMagnets
-    bodies: dict[str, int]
-    magnet_shapes: dict[str, list[int]]
-    keys: SceneKeys
-    warnings: tuple[str, ...]
+    bodies: dict[str, int]  # by rigid-body prim
+    magnet_shapes: dict[str, list[int]]  # shapes of each magnet prim
+    keys: SceneKeys  # from time samples
+    warnings: tuple[str, ...]  # about the stage, one line each
 
     @cached_property
     def stage(self) -> Any:
@@ -78,11 +66,7 @@ class ImportedScene:
 
 
 def import_scene(
-    path: str | os.PathLike,
-    *,
-    visuals: bool = False,
-    time_code: float | None = None,
-    articulations: bool = False,
+    path: str | os.PathLike, *, visuals: bool = False, time_code: float | None = None, articulations: bool = False
 ) -> ImportedScene:
     """Import a stage with its magnets.
 
@@ -110,16 +94,19 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     give_densities(stage, contents.magnets)
     builder = StageBuilder()
     declare_attributes(builder)
-    imported = _add_stage(builder, stage, path, visuals)
+    with newton_errors(str(path), "import"):
+        imported = builder.add_usd(
+            stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals, only_load_enabled_rigid_bodies=True
+        )
     _remove_default_rolling_friction(builder)
     bodies, shapes, joints = (imported[f"path_{kind}_map"] for kind in ("body", "shape", "joint"))
     for prim in contents.bodies:
         if prim not in bodies:
             raise InputError(f"{prim}: Newton does not import this body")
     _check_masses(builder, stage, contents, bodies)
-    for joint_path in enabled_joint_paths(stage):
-        if joint_path not in joints:
-            raise InputError(f"{joint_path}: Newton does not import this joint")
+    for prim in enabled_joint_paths(stage):
+        if prim not in joints:
+            raise InputError(f"{prim}: Newton does not import this joint")
     for joint in grounded:
         _correct_grounded_joint(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     shapes_of_magnets = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
@@ -149,21 +136,8 @@ def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[st
             raise InputError(f"{path}: its colliders have no mass: close their meshes, or author physics:mass")
 
 
-def _add_stage(builder: newton.ModelBuilder, stage, path: str | os.PathLike, visuals: bool) -> dict[str, Any]:
-    """Import ``stage`` with Newton; return the indices of bodies, shapes and joints by prim path."""
-    with newton_errors(str(path), "import"):
-        return builder.add_usd(
-            stage, apply_up_axis_from_stage=True, load_visual_shapes=visuals, only_load_enabled_rigid_bodies=True
-        )
-
-
 def _copy_balls(
-    builder: newton.ModelBuilder,
-    stage,
-    balls: IdenticalBalls,
-    bodies: dict[str, int],
-    shapes_of_magnets: dict[str, list[int]],
-    magnets: StageMagnets,
+    builder: newton.ModelBuilder, stage, balls: IdenticalBalls, bodies, shapes_of_magnets, magnets: StageMagnets
 ) -> None:
     """Copy the body, the shapes and the magnet of the first of identical balls for the other balls."""
     first, others = balls.bodies()
@@ -178,12 +152,8 @@ def _copy_balls(
         shapes_of_magnets |= zip(copies, ([shape] for shape in added.shapes), strict=True)
         magnets.magnets.update(dict.fromkeys(copies, magnets.magnets[prim]))
         if prim in magnets.initial_moments:
-            copied_moments = (
-                moments[1:].astype(float).tolist() if len(moments) else [magnets.initial_moments[prim]] * len(copies)
-            )
-            magnets.initial_moments.update(
-                {path: (x, y, z) for path, (x, y, z) in zip(copies, copied_moments, strict=True)}
-            )
+            own = moments[1:].astype(float).tolist() if len(moments) else [magnets.initial_moments[prim]] * len(copies)
+            magnets.initial_moments.update((path, (x, y, z)) for path, (x, y, z) in zip(copies, own, strict=True))
 
 
 def _correct_grounded_joint(
@@ -257,11 +227,7 @@ def _shape_rotation(builder, stage, prim: str, shape: int, bodies: dict[str, int
 
 
 def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> dict[int, Keys]:
-    """Add the coils and field maps of a stage to the builder, with the paths of their prims as labels.
-
-    Returns:
-        Keys of currents, by the shape of the coil.
-    """
+    """Add the coils and field maps of a stage to the builder; return the keys of currents by the shape of the coil."""
     currents = {}
     for source in (source for placed in sources.values() for source in placed):
         body = -1 if source.body is None else bodies[source.body]

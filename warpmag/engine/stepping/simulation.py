@@ -25,7 +25,6 @@ from warpmag.engine.stepping.model_checks import (
     check_model,
     joint_gap_warnings,
     joint_gaps,
-    solver_warnings,
 )
 from warpmag.engine.stepping.statistics import Statistics, find_held
 from warpmag.engine.stepping.stepper import Stepper
@@ -120,10 +119,11 @@ class Simulation:
         overrides = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
         solve_options = {"curve": curve, "max_evaluations": max_evaluations, "method": method}
         with errors_on_all_ranks(self._ranks):
-            builder, settings, scene_step = self._open(
-                scene, visuals=visuals, articulations=not SOLVERS[solver].maximal
-            )
-            self.step_size = _time_step(step, scene_step)
+            articulations = not SOLVERS[solver].maximal
+            builder, settings, scene_step = self._open(scene, visuals=visuals, articulations=articulations)
+            time_step = next(value for value in (step, scene_step, DEFAULT_STEP) if value is not None)
+            check_positive("step", time_step)
+            self.step_size = float(time_step)
             self.model = self._finalize(builder, solver, scene)
             settings = settings.replaced(external_field=external_field, **overrides)
             self._magnetics = Magnetics(self.model, step=LONGEST_SUBSTEP, **solve_options, **vars(settings))
@@ -165,7 +165,12 @@ class Simulation:
             builder = extended
         if solver == "vbd":
             builder.color()  # VBD moves bodies of one color at once
-        with wp.ScopedDevice(self.device), self._newton_errors(scene):
+        errors = contextlib.nullcontext()
+        if self._scene is not None:
+            from warpmag.usd import newton_errors  # noqa: PLC0415 - a builder can do without USD
+
+            errors = newton_errors(str(scene), "use")
+        with wp.ScopedDevice(self.device), errors:
             model = builder.finalize(device=self.device, skip_validation_joints=SOLVERS[solver].maximal)
         check_model(model, solver, LONGEST_SUBSTEP)
         self._joint_gaps = joint_gaps(model) if SOLVERS[solver].maximal else {}
@@ -184,44 +189,20 @@ class Simulation:
         """Set up solver and stepper, and measure overlaps at the start."""
         self._sizes = sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver)
-        self._stepper = Stepper(
-            self.model,
-            self._magnetics,
-            self._solver,
-            sizes,
-            step=self.step_size,
-            longest_substep=LONGEST_SUBSTEP,
-            graphs=graphs,
-            keyed_values=keyed_values,
-        )
-        bodies = {magnet.body for magnet in self._magnetics.magnets}
-        self._moving = np.array(sorted(body for body in bodies if self._moves(body)), dtype=int)
+        options = {"step": self.step_size, "longest_substep": LONGEST_SUBSTEP, "graphs": graphs}
+        options["keyed_values"] = keyed_values
+        self._stepper = Stepper(self.model, self._magnetics, self._solver, sizes, **options)
+        bodies = {magnet.body for magnet in self._magnetics.magnets if magnet.body >= 0}
+        self._moving = np.array(sorted(body for body in bodies if math.isfinite(sizes.thickness[body])), dtype=int)
         self._statistics = Statistics(magnets=len(self._moving))
         if self._scene:
             self._start_from_stage()
         self._center = self._positions(self.state).mean(axis=0) if len(self._moving) else np.zeros(3)
         overlap, _, self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)
         self._stepper.set_initial_overlap(overlap)
-        self._statistics.coarseness = self._coarseness()
-
-    def _newton_errors(self, scene):
-        """Return a context that shortens Newton's errors about a stage to one line; for a builder it does nothing."""
-        if self._scene is None:
-            return contextlib.nullcontext()
-        from warpmag.usd import newton_errors  # noqa: PLC0415 - a builder can do without USD
-
-        return newton_errors(str(scene), "use")
-
-    def _moves(self, body: int) -> bool:
-        return body >= 0 and math.isfinite(self._sizes.thickness[body])
-
-    def _coarseness(self) -> float:
-        """Return the spacing of single-precision positions over the thickness of the thinnest body."""
-        moving = np.isfinite(self._sizes.thickness)
-        if not moving.any():
-            return 0.0
-        farthest = np.abs(self.state.body_q.numpy()[moving, :3]).max()
-        return float(np.spacing(farthest) / self._sizes.thickness[moving].min())
+        if (moving := np.isfinite(sizes.thickness)).any():
+            farthest = np.abs(self.state.body_q.numpy()[moving, :3]).max()
+            self._statistics.coarseness = float(np.spacing(farthest) / sizes.thickness[moving].min())
 
     def _start_from_stage(self) -> None:
         """Start the induction from the moments of the stage, for example the result of an earlier run."""
@@ -229,8 +210,7 @@ class Simulation:
         volumes = dict(zip(self._magnetics.shapes.tolist(), self._magnetics.shape_volumes.tolist(), strict=True))
         for prim, moment in self._scene.magnets.initial_moments.items():
             shapes = self._scene.magnet_shapes[prim]
-            volume = sum(volumes[shape] for shape in shapes)
-            magnetizations |= dict.fromkeys(shapes, np.array(moment) / volume)
+            magnetizations |= dict.fromkeys(shapes, np.array(moment) / sum(volumes[shape] for shape in shapes))
         if magnetizations:
             self._magnetics.start_from(magnetizations)
 
@@ -274,14 +254,14 @@ class Simulation:
 
     def warnings(self) -> list[str]:
         """Return the warnings about the scene and the run so far, one line each; waits for the device."""
-        scene_warnings = self._scene.warnings if self._scene else tuple(joint_gap_warnings(self._joint_gaps))
-        scene_warnings += tuple(solver_warnings(self._options["solver"]))
-        lines, statistics, rtol = [], self.statistics, self._magnetics.rtol
-        if statistics.field_error > rtol:
-            lines = [
-                f"fields by multipoles have an error of {statistics.field_error:.2g} > rtol {rtol:g}; use method direct"
-            ]
-        return [*scene_warnings, *statistics.warnings(), *lines]
+        lines = list(self._scene.warnings) if self._scene else joint_gap_warnings(self._joint_gaps)
+        if weakness := SOLVERS[self._options["solver"]].warning:
+            lines.append(weakness)
+        lines += self.statistics.warnings()
+        error, rtol = self._statistics.field_error, self._magnetics.rtol
+        if error > rtol:
+            lines.append(f"fields by multipoles have an error of {error:.2g} > rtol {rtol:g}; use method direct")
+        return lines
 
     @property
     def capture_failure(self) -> str:
@@ -407,7 +387,9 @@ class Simulation:
                     if recorder and self._stepper.steps == ahead:
                         recorder.write()
                 state = self.state
-                self._update_farthest(state)
+                if len(self._moving):
+                    distance = np.linalg.norm(self._positions(state) - self._center, axis=1).max()
+                    statistics.farthest = max(statistics.farthest, float(distance))
                 statistics.wall_seconds = before + time.perf_counter() - began
                 if recorder:
                     recorder.add_frame(self.time, state)
@@ -434,44 +416,28 @@ class Simulation:
             raise InputError(f"{Path(output)}: only a scene from a stage can be written to a stage")
         from warpmag.engine.stepping.recording import Recorder  # noqa: PLC0415 - a builder can do without USD
 
-        return Recorder(
-            self._scene,
-            self._magnetics,
-            self._stepper,
-            self._statistics,
-            output,
-            copy_scene=copy_scene,
-            frames=frames + 1,
-            options=self._options,
-            resumable=SOLVERS[self._options["solver"]].resumable,
-            ranks=self._ranks,
-        )
+        options = {"copy_scene": copy_scene, "frames": frames + 1, "options": self._options, "ranks": self._ranks}
+        options["resumable"] = SOLVERS[self._options["solver"]].resumable
+        return Recorder(self._scene, self._magnetics, self._stepper, self._statistics, output, **options)
 
     def _steps_at(self, frame: int) -> int:
         """Return the number of steps before a frame."""
         return round(frame / (self.frame_rate * self.step_size))
-
-    def _update_farthest(self, state: newton.State) -> None:
-        """Update the largest distance of a magnet from the mean initial position."""
-        if len(self._moving):
-            distance = np.linalg.norm(self._positions(state) - self._center, axis=1).max()
-            self._statistics.farthest = max(self._statistics.farthest, float(distance))
 
     def finish(self) -> Statistics:
         """Return the statistics, complete with those of the final state; waits for the device."""
         statistics = self.statistics
         statistics.field_error = self._magnetics.field_error()
         statistics.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
-        statistics.overlap, statistics.depth = (
-            max(statistics.overlap, statistics.final_overlap),
-            max(statistics.depth, depth),
-        )
+        statistics.overlap = max(statistics.overlap, statistics.final_overlap)
+        statistics.depth = max(statistics.depth, depth)
         speeds = np.linalg.norm(self.state.body_qd.numpy()[:, :3], axis=1)
         held = np.intersect1d(np.flatnonzero(self._held_bodies()), self._moving)
         statistics.held = len(held)
-        statistics.held_rms_speed = float(np.sqrt(np.mean(speeds[held] ** 2))) if len(held) else 0.0
+        statistics.held_rms_speed, statistics.rms_speed = (
+            float(np.sqrt(np.mean(speeds[bodies] ** 2))) if len(bodies) else 0.0 for bodies in (held, self._moving)
+        )
         statistics.held_median_speed = float(np.median(speeds[held])) if len(held) else 0.0
-        statistics.rms_speed = float(np.sqrt(np.mean(speeds[self._moving] ** 2))) if len(self._moving) else 0.0
         return statistics
 
     def _held_bodies(self) -> np.ndarray:
@@ -491,10 +457,3 @@ class Simulation:
         pairs = node[np.stack(sides, axis=1)]
         touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
         return find_held(pairs[touching], holds, fixed)[: model.body_count]
-
-
-def _time_step(argument: float | None, scene_step: float | None) -> float:
-    """Return the time step [s]: the argument, else the step of the scene, else the default."""
-    step = next(value for value in (argument, scene_step, DEFAULT_STEP) if value is not None)
-    check_positive("step", step)
-    return float(step)

@@ -117,10 +117,8 @@ class Statistics:
             plural = self.overlapping > 1
             lines.append(f"{self.overlapping} pair{'s' * plural} of bodies overlap{'s' * (not plural)} at the start")
         if self.coarseness > _COARSE:
-            percent = 100.0 * self.coarseness
-            lines.append(
-                f"bodies are far from the origin: positions in single precision are {percent:.2g} % of a radius apart"
-            )
+            spacing = f"{100.0 * self.coarseness:.2g} % of a radius"
+            lines.append(f"bodies are far from the origin: positions in single precision are {spacing} apart")
         if self.unconverged:
             lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
         if self.final_overlap > _DEEP:
@@ -155,14 +153,10 @@ class Statistics:
 
 
 def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Return true for each body that a magnet holds.
+    """Return true for each body that a magnet holds, from the bodies that touch, shape [n, 2].
 
-    A held body touches a holder, or it touches a held body and does not stand on the ground.
-
-    Args:
-        pairs: Bodies that touch, shape [n, 2].
-        holders: True for permanent or fixed magnets, shape [bodies].
-        fixed: True for bodies fixed in the world, shape [bodies]. Fixed bodies without magnets are the ground.
+    A held body touches a holder, a permanent or fixed magnet. Or it touches a held body and does not stand on the
+    ground: bodies without magnets that are fixed in the world.
     """
 
     def neighbors(bodies: np.ndarray) -> np.ndarray:

@@ -48,35 +48,20 @@ _RECORDS = 64
 
 @dataclass(frozen=True)
 class StepReport:
-    """Outcome of one step.
-
-    Attributes:
-        substeps: Number of substeps.
-        attempts: Number of attempts, 1 if the first one was accepted.
-        capped: A body moved farther than allowed even in the shortest substep.
-        regrown: Buffers were enlarged.
-        travel: Largest motion in a substep over the thickness of the body, see ``kernels.rigid.monitor``.
-        speed: Highest speed of a body [m/s].
-        overlap: Deepest penetration over the thickness of the thinner body.
-        depth: Deepest penetration [m].
-        error: Largest magnetization error of a substep.
-        evaluations: Field evaluations of all substeps.
-        unconverged: Substeps whose induction did not converge.
-        seconds: Times of induction, forces and rigid bodies [s], summed over attempts; None if kernels were compiled.
-    """
+    """Outcome of one step."""
 
     substeps: int
-    attempts: int
-    capped: bool
-    regrown: bool
-    travel: float
-    speed: float
-    overlap: float
-    depth: float
-    error: float
-    evaluations: int
-    unconverged: int
-    seconds: tuple[float, float, float] | None
+    attempts: int  # 1 if the first one was accepted
+    capped: bool  # a body moved farther than allowed even in the shortest substep
+    regrown: bool  # buffers were enlarged
+    travel: float  # largest motion in a substep over the thickness of the body (``kernels.rigid.monitor``)
+    speed: float  # highest speed of a body [m/s]
+    overlap: float  # deepest penetration over the thickness of the thinner body
+    depth: float  # deepest penetration [m]
+    error: float  # largest magnetization error of a substep
+    evaluations: int  # field evaluations of all substeps
+    unconverged: int  # substeps without convergence of the induction
+    seconds: tuple[float, float, float] | None  # of induction, forces, rigid bodies, all attempts; None while compiling
 
 
 class Stepper:
@@ -99,22 +84,12 @@ class Stepper:
         graphs: bool = True,
         keyed_values: KeyedModelValues | None = None,
     ):
-        """Allocate states and the state machine.
+        """Allocate states and the state machine, for time steps and substeps of at most ``longest_substep`` [s].
 
-        Args:
-            model: The model.
-            magnetics: Its magnets.
-            solver: Its collision pipeline and solver.
-            sizes: Sizes of its bodies.
-            step: Time step [s].
-            longest_substep: Upper limit of a substep [s].
-            graphs: Capture a step in a graph where the device and the solver allow it.
-            keyed_values: Keyed values of the model.
+        ``graphs`` captures a step in a graph where the device and the solver allow it.
         """
         self._model, self._magnetics, self._solver = model, magnetics, solver
-        self._keyed_values = keyed_values
-        self._device = wp.get_device(model.device)
-        self._step = step
+        self._keyed_values, self._device, self._step = keyed_values, wp.get_device(model.device), step
         # an even number, so that a step ends in the same state object as it begins
         self._min_substeps = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
         self._longest = step / self._min_substeps
@@ -135,7 +110,10 @@ class Stepper:
         self._machine.set_state_arrays(_arrays(self._state), _arrays(self._saved))
         self._arrays = self._machine.arrays
         self._watched = self._machine.make_monitor(sizes.thickness, sizes.reach)
-        self._mirrors = self._make_mirrors()
+        self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
+        if self._device.is_cuda:
+            copies = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in self._mirrors.items()}
+            self._mirrors = copies
         self._clock = _Clock(self._device)
         self._workspace = Workspace(self._device) if self._device.is_cuda else None
         self._capture, self._graph = graphs, None
@@ -146,23 +124,12 @@ class Stepper:
             keyed_values.pose_for_contacts(self._state, 0.0, self._longest)
         self._prepare()
 
-    def _make_mirrors(self) -> dict[str, wp.array]:
-        """Return the host's copies of the state machine's buffers, by name."""
-        mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
-        if self._device.is_cuda:
-            mirrors = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in mirrors.items()}
-        return mirrors
-
     def _prepare(self) -> None:
         """Update the sizes of the solver's buffers, and discard the graph. The number of buffers is constant."""
         self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
         self._watched.fills.assign(self._solver.fills())
         self._machine.invalidate_contacts()
         self._graph, self._warm = None, False
-
-    # -----------------------------------------------------------------------------------------------------------------
-    # On the host
-    # -----------------------------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> newton.State:
@@ -186,24 +153,17 @@ class Stepper:
         return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
 
     def advance(self) -> None:
-        """Advance :attr:`state` by one step; does not wait for a GPU.
-
-        Raises:
-            RuntimeError: Too many steps since the last :meth:`read_reports`.
-        """
+        """Advance :attr:`state` by one step; does not wait for a GPU."""
         if self.steps - self._reported >= _RECORDS:
             raise RuntimeError(f"read_reports() must be called every {_RECORDS} steps")
         self.steps += 1
         self._launch()
 
     def read_reports(self) -> Iterator[StepReport]:
-        """Wait for all steps so far, and act on overflows and states that are not finite.
+        """Wait for all steps so far, and yield a report of each step since the last call.
 
-        Yields:
-            A report of each step since the last call.
-
-        Raises:
-            SimulationError: A step led to a state that is not finite. The state is that of the last accepted step.
+        Buffers that overflowed are enlarged. A step that leads to a state that is not finite raises
+        :class:`SimulationError`; the state is that of the last accepted step.
         """
         while self.steps > self._reported:
             status = self._read("status")
@@ -299,11 +259,7 @@ class Stepper:
         return numbers | snapshot_views(self._carried())
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
-        """Continue a run of the same model from the arrays that :meth:`save` returned.
-
-        Raises:
-            InputError: The arrays belong to another model.
-        """
+        """Continue from the arrays that :meth:`save` returned; raise :class:`InputError` for those of another model."""
         self._solver.set_limits(saved["buffers"])
         self._prepare()
         restore_snapshot(self._carried(), saved)
@@ -320,9 +276,8 @@ class Stepper:
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
         """Find the contacts of the present state; call :meth:`read_reports` first.
 
-        Returns:
-            Deepest penetration over the thickness of the thinner body, deepest penetration [m], and number of contacts
-            deeper than ``overlap_threshold`` over the thickness.
+        Return the deepest penetration over the thickness of the thinner body, the deepest penetration [m], and the
+        number of contacts deeper than ``overlap_threshold`` over the thickness.
         """
         a = self._arrays
         while True:
@@ -342,9 +297,7 @@ class Stepper:
         """Set the deepest penetration at the start over the thickness; steps do not press bodies deeper."""
         self._arrays.last_overlap.assign(np.array([overlap, math.inf], np.float32))
 
-    # -----------------------------------------------------------------------------------------------------------------
-    # On the device: the following methods only launch kernels
-    # -----------------------------------------------------------------------------------------------------------------
+    # The following methods only launch kernels.
 
     def _run_step(self) -> None:
         self._machine.begin_step()
@@ -439,11 +392,7 @@ def _arrays(state: newton.State | newton.Control) -> list[wp.array]:
 
 
 class _Clock:
-    """Measures the tick of the device's clock.
-
-    Attributes:
-        seconds_per_tick: Length of a tick [s], after :meth:`calibrate`.
-    """
+    """Measures the tick of the device's clock, ``seconds_per_tick`` after :meth:`calibrate`."""
 
     def __init__(self, device):
         self._time = wp.zeros(1, dtype=wp.uint64, device=device)
