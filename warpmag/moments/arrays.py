@@ -32,11 +32,8 @@ LEAST_FORCE_MOMENT = {wp.float32: 1e-18, wp.float64: 1e-150}
 """Lower limit [A·m²] of the largest moment component for forces, by Warp scalar type: smaller products underflow."""
 GRID_REACH = 1e9
 """Largest coordinate that the grid of the neighbor search can index, in contact distances of the largest balls."""
-
 _INTEGERS = (wp.int8, wp.uint8, wp.int16, wp.uint16, wp.int32, wp.uint32, wp.int64, wp.uint64)
 _NUMBERS = (wp.float16, wp.float32, wp.float64, *_INTEGERS)
-
-
 MOST_BODIES = {wp.float32: 2**24, wp.float64: 2**31 - 1}
 """Largest number of bodies by Warp scalar type: kernels store a body's number as a scalar beside its moments."""
 
@@ -64,12 +61,9 @@ def range_message(name: str, unit: str, value: float, limits: tuple[float, float
 
 
 def largest_coordinate(dtype, reach: float, *, reference: bool = False) -> float:
-    """Return the largest coordinate [m] that positions may have.
+    """Return the largest coordinate [m] of positions, for balls with a largest contact distance ``reach`` [m].
 
-    Args:
-        dtype: Warp scalar type.
-        reach: Contact distance of the largest balls [m]; 0 for points.
-        reference: True for the method ``reference``.
+    ``reference`` means the method ``reference``.
     """
     most = (REFERENCE_FARTHEST if reference else FARTHEST)[dtype]
     return min(most, GRID_REACH * reach) if reach > 0.0 else most
@@ -92,12 +86,9 @@ def resolve_dtype(dtype: str):
 
 
 def resolve_device(device):
-    """Return the Warp device of a name, a device or None.
+    """Return the Warp device of a name, a device or None, Warp's default.
 
-    None means Warp's default device. Under ``mpirun``, each rank on a host gets another GPU.
-
-    Raises:
-        InputError: The device does not exist.
+    Under ``mpirun``, each rank on a host gets another GPU.
     """
     if device is None and wp.is_cuda_available() and (all_ranks := launched_ranks()) is not None:
         wp.set_device(f"cuda:{all_ranks.local_rank % wp.get_cuda_device_count()}")
@@ -109,11 +100,7 @@ def resolve_device(device):
 
 
 def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
-    """Return real numbers as a NumPy float64 array; ``single`` keeps float32 as it is.
-
-    Raises:
-        InputError: The value holds anything but real numbers, or masked entries.
-    """
+    """Return real numbers, without masked entries, as a NumPy float64 array; ``single`` keeps float32 as it is."""
     if isinstance(value, (wp.array, wp.indexedarray)):
         value = value.numpy()
     try:
@@ -204,17 +191,11 @@ def first_not_finite(array, count: int) -> int | None:
 
 @dataclass(frozen=True)
 class CallContext:
-    """Device and scalar type of a call on arrays, and the library of the arrays that it returns.
-
-    Attributes:
-        device: Warp device.
-        dtype: Warp scalar type.
-        warp_out: True if results are Warp arrays, False if they are NumPy arrays.
-    """
+    """Device and scalar type of a call on arrays, and the library of the arrays that it returns."""
 
     device: Any
-    dtype: type
-    warp_out: bool
+    dtype: type  # Warp scalar type
+    warp_out: bool  # results are Warp arrays, else NumPy arrays
 
     def result(self, array, count=None):
         """Return the first ``count`` entries of a Warp array, or all, as an array of the caller's library."""
@@ -235,9 +216,6 @@ class CallContext:
             farthest: Largest coordinate [m], for positions; None accepts any.
             least: Lower limit of the largest component, by Warp scalar type; all zeros are always accepted.
             shared: True if the result may share the caller's memory, because the call only reads it.
-
-        Raises:
-            InputError: Wrong shape, type or device, a value that is not finite, or out of range.
         """
         least = 0.0 if least is None else least[self.dtype]
         if isinstance(value, (wp.array, wp.indexedarray)):
@@ -337,11 +315,7 @@ def take_snapshot(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
 
 
 def restore_snapshot(arrays: dict[str, wp.array], saved: dict[str, np.ndarray]) -> None:
-    """Write the bytes that :func:`take_snapshot` returned back into the arrays.
-
-    Raises:
-        InputError: The snapshot lacks an array, or has one of another size.
-    """
+    """Write the bytes that :func:`take_snapshot` returned back into the arrays, which must be of the same sizes."""
     for name, array in arrays.items():
         if array.size:
             memory, data = _memory(array), saved.get(name)

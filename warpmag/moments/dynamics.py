@@ -65,9 +65,7 @@ class ThetaFlow:
 class SubmagnetizationPairs:
     """Explicit dynamics of pairs of submagnetizations (Kim and Han 2022, Eqs. 6, 8, 9).
 
-    Attributes:
-        first: Directions M1/Ms, shape [n].
-        second: Directions M2/Ms, shape [n].
+    ``first`` and ``second`` are the directions M1/Ms and M2/Ms, shape [n].
     """
 
     def __init__(self, state, law: str, step: float, damping: float):
@@ -103,17 +101,10 @@ class SubmagnetizationPairs:
 
 
 def make_dynamics(name: str, state, *, responses=None, step: float | None = None, damping: float | None = None):
-    """Return a magnetization dynamics.
+    """Return the dynamics ``theta``, ``theta-euler``, ``llg`` or ``llg-damping`` of the moments of ``state``.
 
-    Args:
-        name: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``.
-        state: State of the solve, bound to its moments.
-        responses: Bodies with a collective response (``BodyResponses``), or None; only ``theta`` uses them.
-        step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means :data:`STEP`.
-        damping: Damping α [dimensionless] of ``llg``; None means :data:`DAMPING`.
-
-    Raises:
-        InputError: A setting is out of range, or the dynamics has no such setting.
+    Only ``theta`` uses ``responses``, bodies with a collective response. A ``step`` or a ``damping`` of None means
+    :data:`STEP` or :data:`DAMPING`; one that the dynamics does not have raises ``InputError``.
     """
     if step is not None and name == "theta":
         raise InputError("step: the dynamics 'theta' has an automatic step")

@@ -82,15 +82,10 @@ def check_fast(rtol: float):
 
 
 def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device, launched: bool = False) -> bool:
-    """Return True if the method reaches ``rtol`` and is faster than direct sums.
+    """Return True if the method reaches ``rtol`` and is faster than direct sums of ``FIELD`` or ``WRENCH``.
 
-    Args:
-        pairs: Number of pairs of a target and a moment.
-        count: Number of moments and targets.
-        quantity: ``FIELD`` or ``WRENCH``.
-        rtol: Relative error.
-        device: Warp device.
-        launched: True if Python launches the kernels, False if a graph does; matters on a GPU.
+    ``pairs`` counts pairs of a target and a moment, ``count`` moments and targets. On a GPU it matters whether Python
+    launches the kernels, ``launched``, or a graph.
     """
     if rtol < LEAST_RTOL:
         return False
@@ -105,18 +100,13 @@ def choose_degree(rtol: float) -> tuple[int, int]:
 
 
 class FastSums:
-    """Octree of boxes that hold moments, and sums over pairs for ``pairs.evaluate.PairEvaluation``.
-
-    Args:
-        moments: Packed moments (``pairs.packing.PackedMoments``), at least one.
-        rtol: Relative error, at least ``LEAST_RTOL``.
-        targets: Packed targets; None means the moments themselves.
-        worlds: Number of worlds.
-        extent: Distance [m] up to which all pairs are summed one by one; overlapping pairs always are.
-    """
+    """Octree of boxes that hold moments, and sums over pairs for ``pairs.evaluate.PairEvaluation``."""
 
     def __init__(self, moments, rtol: float, targets=None, worlds: int = 1, extent: float = 0.0):
-        """Allocate the boxes."""
+        """Allocate the boxes of packed moments, at least one, and targets; None means the moments themselves.
+
+        Overlapping pairs, and all pairs up to a distance ``extent`` [m], are summed one by one.
+        """
         degree, occupancy = choose_degree(rtol)
         packed, groups, self._first = moments.packed, moments.groups, 0
         reach = moments.largest_radius + (moments if targets is None else targets).largest_radius
@@ -139,19 +129,13 @@ class FastSums:
 
 
 class SystemSums(FastSums):
-    """Sums over pairs of a system's moments, by multipoles where that is faster.
-
-    Args:
-        moments: Packed moments, at least one.
-        rtol: Relative error.
-        worlds: Number of worlds.
-        extent: Distance [m] up to which all pairs are summed one by one.
-        crowding: Moments of a leaf box over the optimal number.
-        always_from: Smallest number of pairs that multipoles sum even if they are slower.
-    """
+    """Sums over pairs of a system's moments, by multipoles where that is faster."""
 
     def __init__(self, moments, rtol: float, worlds: int, extent: float, crowding: float, always_from: float):
-        """Allocate the boxes."""
+        """Allocate the boxes, of ``crowding`` times the optimal number of moments.
+
+        ``always_from`` is the smallest number of pairs that multipoles sum even if they are slower.
+        """
         super().__init__(moments, rtol, worlds=worlds, extent=extent)
         self._costs = moments.count, rtol, moments.device
         self._crowding, self._always_from = crowding, always_from
@@ -189,17 +173,8 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
     """Return the sums of an induction solve and of its forces.
 
     Moments of a body exert no force on each other, but expansions cannot distinguish bodies. The moments of a movable
-    body must therefore be in neighboring boxes, because pairs of neighboring boxes are summed one by one.
-
-    Args:
-        method: One of ``magnets.METHODS``.
-        moments: Packed moments.
-        layout: Layout of the moments.
-        extent: Largest distance between two moments of a movable body [m]; None means unknown.
-        rtol: Relative error of the magnetization.
-
-    Raises:
-        InputError: ``fmm`` is given, but ``rtol`` is too small, or the extent of a body is unknown.
+    body must therefore be in neighboring boxes, because pairs of neighboring boxes are summed one by one. ``extent`` is
+    the largest distance between two of them [m], None if unknown; ``rtol`` is that of the magnetization.
     """
     check_token("method", method, METHODS)
     share_body, rtol = layout.movable & ~layout.single, _FIELD_SHARE * rtol

@@ -48,15 +48,7 @@ def parity(degree: int) -> np.ndarray:
 
 
 def regular(degree: int, points) -> np.ndarray:
-    """Return the regular harmonics R, polynomials of degree n.
-
-    Args:
-        degree: Highest degree.
-        points: Positions, shape [n, 3].
-
-    Returns:
-        Shape [n, K].
-    """
+    """Return the regular harmonics R, polynomials of degree n, shape [n, K], at points [n, 3]."""
     x, y, z = np.asarray(points, np.float64).T
     r2 = x * x + y * y + z * z
     values = np.zeros((count(degree), len(x)))
@@ -93,35 +85,6 @@ def derivatives(degree: int) -> np.ndarray:
     return np.real(np.stack([(above + below) / 2, (above - below) / 2j, along]))
 
 
-def regular_gradients(degree: int, points) -> np.ndarray:
-    """Return the gradients of the regular harmonics at points [n, 3], shape [n, K, 3]."""
-    index, factor = _derivative_terms(degree)
-    values = regular(degree, points)
-    return (values[:, index] * factor).sum(axis=-1).transpose(0, 2, 1)
-
-
-@cache
-def _derivative_terms(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the at most two nonzero columns of each row of ``derivatives``, and their values, shapes [3, K, 2]."""
-    matrices = derivatives(degree)
-    index = np.argsort(-np.abs(matrices), axis=2, kind="stable")[..., :2]
-    return index, np.take_along_axis(matrices, index, axis=2)
-
-
-def dipole_to_multipole(degree: int, points, moments) -> np.ndarray:
-    """Return the multipole of the dipoles in a box.
-
-    Args:
-        degree: Highest degree.
-        points: Positions relative to the box's center, in units of its edge, shape [n, 3].
-        moments: Magnetic moments [A·m²], shape [n, 3].
-
-    Returns:
-        Coefficients q [A·m²], shape [K].
-    """
-    return np.einsum("nic,nc->i", regular_gradients(degree, points), np.asarray(moments, np.float64))
-
-
 def octant_offset(octant: int) -> np.ndarray:
     """Return the vector from a box's center to its child's, in units of the child's edge; octant = x + 2 y + 4 z."""
     return np.array([octant & 1, octant >> 1 & 1, octant >> 2 & 1]) - 0.5
@@ -136,12 +99,8 @@ def multipole_to_multipole(degree: int, octant: int) -> np.ndarray:
 def multipole_to_local(degree: int, offsets) -> np.ndarray:
     """Return the matrices from a box's multipole to the local expansion of another box of the same size.
 
-    Args:
-        degree: Highest degree of both.
-        offsets: Vectors from the multipole's center to the local expansion's, in edges, shape [3] or [n, 3].
-
-    Returns:
-        Shape [K, K] or [n, K, K]; rows belong to the local expansion.
+    ``offsets`` are vectors from the multipole's center to the local expansion's, in edges, shape [3] or [n, 3]. Rows of
+    the matrices belong to the local expansion, shape [K, K] or [n, K, K].
     """
     offsets = np.asarray(offsets, np.float64)
     values = irregular(2 * degree, offsets.reshape(-1, 3))
@@ -179,20 +138,6 @@ def local_to_local(degree: int, octant: int) -> np.ndarray:
     """Return the matrix from a parent's local expansion to a child's, shape [K, K]."""
     shrink = 2.0 ** (-2 - degrees(degree))
     return (shrink[:, None] * _regular_shift(degree, octant_offset(octant))).T.copy()
-
-
-def local_to_field(local, points) -> np.ndarray:
-    """Return 4π h³ times the field H of a local expansion.
-
-    Args:
-        local: Coefficients L [A·m²], shape [K].
-        points: Positions relative to the box's center, in units of its edge h, shape [n, 3].
-
-    Returns:
-        Shape [n, 3] [A·m²].
-    """
-    degree = int(np.sqrt(len(local))) - 1
-    return -np.einsum("nic,i->nc", regular_gradients(degree, points), np.asarray(local, np.float64))
 
 
 def _mirrored(degree: int) -> np.ndarray:

@@ -179,36 +179,24 @@ def solve_induction(
     )  # fmt: skip
     system = balls.make_system(context, material, settings, initial)
     system.solve()
-    permanent_positions, permanent_moments = (None, None) if permanent is None else permanent
-    arguments = {
-        "positions": positions,
-        "radii": balls.radii,
-        "saturation": system.material.saturation.numpy()[: balls.count],
-        "external_field": external_field,
-        "permanent: positions": permanent_positions,
-        "permanent: moments": permanent_moments,
-        "initial": initial,
-    }
+    saturations = system.material.saturation.numpy()[: balls.count]
+    arguments = {"positions": positions, "radii": balls.radii, "saturation": saturations}
+    arguments["external_field"] = external_field
+    if permanent is not None:
+        arguments["permanent: positions"], arguments["permanent: moments"] = permanent
+    arguments["initial"] = initial
     return _read_result(context, system, balls.count, arguments)
 
 
 @dataclass(frozen=True)
 class _Balls:
-    """n inducible balls in an applied field, and k permanent point dipoles.
+    """n inducible balls in an applied field, and k permanent point dipoles."""
 
-    Attributes:
-        positions: Centers [m], Warp, shape [n].
-        radii: Radii [m], NumPy, shape [n].
-        external_field: Applied field [A/m], Warp, shape [n].
-        permanent_positions: Positions of the permanent dipoles [m], Warp, shape [k].
-        permanent_moments: Their moments [A·m²], Warp, shape [k].
-    """
-
-    positions: wp.array
-    radii: np.ndarray
-    external_field: wp.array
-    permanent_positions: wp.array
-    permanent_moments: wp.array
+    positions: wp.array  # centers [m], shape [n]
+    radii: np.ndarray  # [m], shape [n]
+    external_field: wp.array  # applied field [A/m], shape [n]
+    permanent_positions: wp.array  # of the permanent dipoles [m], shape [k]
+    permanent_moments: wp.array  # [A·m²], shape [k]
 
     @property
     def count(self) -> int:
@@ -248,7 +236,7 @@ class _Balls:
 
 
 def _read_balls(context: CallContext, positions, radii, external_field, permanent) -> _Balls:
-    """Return the arrays of :func:`solve_induction`; raises ``InputError`` for invalid arguments."""
+    """Return the checked arrays of :func:`solve_induction`."""
     radii = host_radii("radii", radii, context.dtype)
     farthest = largest_coordinate(context.dtype, 2.0 * float(radii.max(initial=0.0)))
     x = context.vectors("positions", positions, farthest=farthest)
@@ -286,11 +274,7 @@ def _read_material(count: int, saturation, susceptibility, curve) -> MomentMater
 
 
 def _read_result(context: CallContext, system: MomentSystem, n: int, arguments: dict) -> InductionResult:
-    """Return the result of a solve of n balls, and warn if it did not converge.
-
-    Raises:
-        InputError: The result is not finite, or the field is too weak or strong for ``dtype``.
-    """
+    """Return the result of a solve of n balls, checked to be finite, and warn if it did not converge."""
     m, h = (context.result(array, n) for array in (system.magnetizations(), system.h))
     _check_finite(context.dtype, n, arguments, magnetization=m, field=h)
     error = float(system.error.numpy().max(initial=0.0))

@@ -17,25 +17,15 @@ from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host
 
 @dataclass(frozen=True)
 class MomentLayout:
-    """Geometry, world and body of each moment: NumPy arrays of shape [n].
+    """Geometry, world and body of each moment: NumPy arrays of shape [n]."""
 
-    Attributes:
-        radii: Radius of the moment's ball [m].
-        worlds: World of the moment.
-        permanent: True for a permanent moment.
-        bodies: Body of the moment.
-        movable: True if the force on the moment is computed.
-        single: True if the body has no other moment.
-        aligned: True for an inducible ball of a single moment, which is parallel to the field, so that its torque is 0.
-    """
-
-    radii: np.ndarray
+    radii: np.ndarray  # of the moment's ball [m]
     worlds: np.ndarray
     permanent: np.ndarray
     bodies: np.ndarray
-    movable: np.ndarray
-    single: np.ndarray
-    aligned: np.ndarray
+    movable: np.ndarray  # the force on the moment is computed
+    single: np.ndarray  # the body has no other moment
+    aligned: np.ndarray  # inducible ball of a single moment, which is parallel to the field, so that its torque is 0
 
     @property
     def balls(self) -> np.ndarray:
@@ -46,9 +36,7 @@ class MomentLayout:
         """Return (first moment, first permanent moment, end) of each world."""
         edges = self._edges()
         permanent = np.concatenate([[0], np.cumsum(self.permanent)])[edges]
-        return list(
-            zip(edges[:-1].tolist(), (edges[1:] - np.diff(permanent)).tolist(), edges[1:].tolist(), strict=True)
-        )
+        return _rows(edges[:-1], edges[1:] - np.diff(permanent), edges[1:])
 
     def runs(self, selected: np.ndarray) -> list[tuple[int, int, int, int]]:
         """Return (first, end, first of its world, end of its world) of each run of selected moments within a world."""
@@ -59,12 +47,16 @@ class MomentLayout:
         first = np.flatnonzero(selected & ~(padded[:-2] & continues[:-1]))
         last = np.flatnonzero(selected & ~(padded[2:] & continues[1:])) + 1
         world = self.worlds[first]
-        columns = (first, last, edges[world], edges[world + 1])
-        return list(zip(*(column.tolist() for column in columns), strict=True))
+        return _rows(first, last, edges[world], edges[world + 1])
 
     def _edges(self) -> np.ndarray:
         """Return the first moment of each world, and the end of the last world."""
         return np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))
+
+
+def _rows(*columns: np.ndarray) -> list[tuple]:
+    """Return the rows of columns as tuples of whole numbers."""
+    return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayout:
@@ -107,29 +99,17 @@ def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
 class MomentMaterial:
     """Magnetic material of n moments. The values of permanent moments are ignored.
 
-    Attributes:
-        saturation: Saturation magnetization Ms [A/m], scalar or [n].
-        susceptibility: Susceptibility [dimensionless], scalar or [n]; may be infinite.
-        curve: Magnetization curve: one of ``magnets.CURVES``, or a measured ``MagnetizationCurve``, which has its own
-            saturation and susceptibility. A tuple or list gives each moment its own curve. ``magnets.LINEAR_CURVE`` is
-            the response of a permanent magnet of recoil permeability 1 + χ.
+    A curve is one of ``magnets.CURVES``, or a measured ``MagnetizationCurve``, which has its own saturation and
+    susceptibility. A tuple or list gives each moment its own curve. ``magnets.LINEAR_CURVE`` is the response of a
+    permanent magnet of recoil permeability 1 + χ.
     """
 
-    saturation: Any = 1.0
-    susceptibility: Any = math.inf
+    saturation: Any = 1.0  # saturation magnetization Ms [A/m], scalar or [n]
+    susceptibility: Any = math.inf  # [dimensionless], scalar or [n]
     curve: Any = "tanh"
 
     def parameters(self, permanent: np.ndarray, dtype, device) -> tuple[CurveParameters, np.ndarray]:
-        """Return the material for kernels, and the susceptibility of each moment, 1 for a permanent one, shape [n].
-
-        Args:
-            permanent: True for a permanent moment, shape [n].
-            dtype: Warp scalar type.
-            device: Warp device.
-
-        Raises:
-            InputError: A value is out of range, or a curve unknown.
-        """
+        """Return the material for kernels, and the susceptibility of each moment, 1 for a permanent one, shape [n]."""
         n = len(permanent)
         ids, measured = _curve_ids(self.curve, n)
         saturation = np.where(permanent, 1.0, host_scalars("saturation", self.saturation, n))

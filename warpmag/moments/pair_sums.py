@@ -27,29 +27,17 @@ _cache: "OrderedDict[SumsShape, PairSums]" = OrderedDict()
 
 @dataclass(frozen=True)
 class SumsShape:
-    """Shape and options of sums, the key of the cache.
+    """Shape and options of sums, the key of the cache."""
 
-    Attributes:
-        quantity: Summed quantity, ``FIELD`` or ``WRENCH``.
-        device: Alias of the Warp device.
-        dtype: Warp scalar type.
-        count: Number of moments.
-        radius: Largest radius of the moments [m].
-        target_count: Number of targets; None means the moments themselves.
-        target_radius: Largest radius of the targets [m].
-        reference: True for the plain loop.
-        smoothing: Smoothing length [m] of Kim and Han 2022, section 5.
-    """
-
-    quantity: Quantity
-    device: str
-    dtype: type
-    count: int
-    radius: float
-    target_count: int | None = None
-    target_radius: float = 0.0
-    reference: bool = False
-    smoothing: float = 0.0
+    quantity: Quantity  # ``FIELD`` or ``WRENCH``
+    device: str  # alias of the Warp device
+    dtype: type  # Warp scalar type
+    count: int  # number of moments
+    radius: float  # largest radius of the moments [m]
+    target_count: int | None = None  # number of targets; None means the moments themselves
+    target_radius: float = 0.0  # largest radius of the targets [m]
+    reference: bool = False  # the plain loop computes the sums
+    smoothing: float = 0.0  # smoothing length [m] of Kim and Han 2022, section 5
 
 
 class PairSums:
@@ -83,11 +71,7 @@ class PairSums:
         self._turned, self._shape, self._all_pairs = turned, shape, None
 
     def launch(self, fmm_rtol: float | None = None) -> None:
-        """Launch the sums of the packed moments at the packed targets.
-
-        Args:
-            fmm_rtol: Relative error of the fast multipole method; None means sums over all pairs.
-        """
+        """Launch the sums at the targets, by multipoles with the relative error ``fmm_rtol``; None means all pairs."""
         others = None if self.targets is self.moments else self.targets
         if not self._shape.reference:  # the plain loop finds overlapping pairs itself
             self.targets.find_overlaps(None if others is None else self.moments)

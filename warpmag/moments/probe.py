@@ -82,20 +82,14 @@ class FieldProbe:
 
     def _derivative(self, axis: int, segments) -> PairEvaluation:
         """Return the derivative of H along an axis: the force μ0 (e·∇)H on a moment e of 1/μ0 along the axis."""
-        count = self._targets.count
+        count, device = self._targets.count, self._system.device
         unit = np.zeros((3, count))
         unit[axis] = 1.0 / MU0
         return PairEvaluation(
-            Quantity.FORCE,
-            segments,
-            self._targets,
-            self._moments,
-            self._base,
-            self._rows[axis],
-            effective=wp.array(unit, dtype=self._system.dtype, device=self._system.device),
-            with_torque=wp.zeros(count, dtype=wp.int32, device=self._system.device),
-            torques=self._zeros,
-        )
+            Quantity.FORCE, segments, self._targets, self._moments, self._base, self._rows[axis],
+            effective=wp.array(unit, dtype=self._system.dtype, device=device),
+            with_torque=wp.zeros(count, dtype=wp.int32, device=device), torques=self._zeros,
+        )  # fmt: skip
 
     def measure(self) -> None:
         """Launch the computation of the fields at :attr:`points`, from the moments of the last solve."""

@@ -47,11 +47,7 @@ _disabled = 0
 
 @cache
 def launched_ranks() -> "Ranks | None":
-    """Return the ranks that a launcher started, or None in a single process.
-
-    Raises:
-        InputError: A launcher has started several processes, but ``mpi4py`` is not installed.
-    """
+    """Return the ranks that a launcher started, which need ``mpi4py``, or None in a single process."""
     if all(os.environ.get(name, "1") == "1" for name in _COUNTS):
         return None
     try:
@@ -211,11 +207,7 @@ class Ranks:
         return count * self.rank // self.size, count * (self.rank + 1) // self.size
 
     def merge(self, array) -> None:
-        """Add a contiguous Warp array over all ranks. Each 32-bit word may be nonzero on one rank only.
-
-        Raises:
-            InputError: A graph is being captured on a CPU, and such a graph cannot contain the exchange.
-        """
+        """Add a contiguous Warp array over all ranks. Each 32-bit word may be nonzero on one rank only."""
         if array.device.is_cuda:
             self._gpus = self._gpus or _Nccl(self, array.device)
             self._gpus.merge(array)
@@ -251,28 +243,18 @@ class Ranks:
         return self._failures.iprobe()
 
     def check_equal(self, values: dict[str, Any], prefix: str = "") -> None:
-        """Raise ``InputError`` on all ranks if a value differs between them.
-
-        Args:
-            values: Values by their names in messages.
-            prefix: Beginning of the message.
-        """
+        """Raise ``InputError`` on all ranks if a value differs. Messages begin with ``prefix`` and the value's name."""
         each = self.exchange({name: _checksum(value) for name, value in values.items()})
         for rank, other in enumerate(each):
             for name in (*each[0], *other):
                 if each[0].get(name) != other.get(name):
-                    reason = (
-                        f"differs between rank {rank} and rank 0; the ranks of one calculation need equal arguments"
-                    )
-                    raise InputError(f"{prefix}{name}: {reason}")
+                    text = f"{prefix}{name}: differs between rank {rank} and rank 0"
+                    raise InputError(f"{text}; the ranks of one calculation need equal arguments")
 
     def fail(self, line: str, code: int, show) -> None:
-        """Report a failure once. If all ranks fail, rank 0 reports it. Otherwise this rank does, and aborts the others.
+        """Report a failure once by ``show(line)``: on rank 0 if all ranks fail.
 
-        Args:
-            line: Message.
-            code: Exit code.
-            show: Function that prints a line.
+        Otherwise this rank reports it, and aborts the others with the exit code.
         """
         barrier, until = self._failures.Ibarrier(), time.monotonic() + _ABORT_DELAY
         while not barrier.Test():

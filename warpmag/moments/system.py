@@ -36,32 +36,20 @@ from warpmag.shapes.demagnetization import Coupling
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Settings of the induction solve and of the forces.
+    """Settings of the induction solve and of the forces, most of them as in :func:`warpmag.solve_induction`.
 
-    Attributes:
-        force: Force law, ``kelvin`` or ``zeeman``.
-        dynamics: ``theta``, the accelerated exact flow, or explicit steps of pairs of submagnetizations:
-            ``theta-euler``, ``llg``, ``llg-damping`` (see ``kernels.induction.submagnetization``).
-        contact_model: ``dipole``; ``multipole`` adds the higher multipoles of inducible balls that nearly touch (see
-            ``kernels.near_contact``).
-        method: Summation of pairs: ``direct``, over all pairs; ``fmm``, the fast multipole method with errors that
-            ``rtol`` allows; ``auto``, the faster of the two.
-        rtol: Relative error of the inducible moments' magnetization at which a solve ends.
-        max_evaluations: Field evaluations after which a solve ends with ``converged`` 0.
-        step: Step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default.
-        damping: Damping α [dimensionless] of ``llg``; None means its default.
-        single_torque: True to compute the torque m × H also of an inducible ball of a single moment. It is 0 in
-            equilibrium, where m is parallel to H, and measures how far the solve is from it.
+    ``single_torque`` computes the torque m × H also of an inducible ball of a single moment. It is 0 in equilibrium,
+    where m is parallel to H, and measures how far the solve is from it.
     """
 
-    force: str = "kelvin"
+    force: str = "kelvin"  # or ``zeeman``
     dynamics: str = "theta"
     contact_model: str = "dipole"
     method: str = "direct"
-    rtol: float = 1e-3
-    max_evaluations: int = 1000
-    step: float | None = None
-    damping: float | None = None
+    rtol: float = 1e-3  # relative error of the inducible moments' magnetization at which a solve ends
+    max_evaluations: int = 1000  # field evaluations after which a solve ends with ``converged`` 0
+    step: float | None = None  # step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default
+    damping: float | None = None  # damping α [dimensionless] of ``llg``; None means its default
     single_torque: bool = False
 
     def check(self, dtype: str) -> None:
@@ -98,9 +86,6 @@ class MomentSystem:
         solids: Permanent bodies with a closed-form near field, ordered by world.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
-
-    Raises:
-        InputError: An argument is out of range.
 
     Attributes:
         settings: As given.
@@ -191,12 +176,8 @@ class MomentSystem:
         if field.shape not in ((3,), (n, 3)):
             raise InputError(shape_message("external_field", f"[3] or [{n}, 3]", field))
         self.external_field = wp.array(np.broadcast_to(field, (n, 3)), dtype=vec3, device=self.device)
-        self._packed = PackedMoments(
-            wp.array(layout.radii, dtype=self.dtype, device=self.device),
-            largest_radius=float(layout.radii.max(initial=0.0)),
-            labels=layout.bodies,
-            groups=layout.worlds,
-        )
+        radii, most = wp.array(layout.radii, dtype=self.dtype, device=self.device), layout.radii.max(initial=0.0)
+        self._packed = PackedMoments(radii, largest_radius=float(most), labels=layout.bodies, groups=layout.worlds)
         self._effective = self._packed.vectors()
         self._induction = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
         self.h, self.residual, self.error = self._induction.h, self._induction.residual, self._induction.error
@@ -323,26 +304,18 @@ class MomentSystem:
         self.dynamics.start_from(magnetizations)
 
     def set_material(self, moments, saturation, susceptibility):
-        """Change saturation and susceptibility of inducible moments, but not their curves. Waits for the device.
+        """Change the saturation Ms [A/m] and the susceptibility of inducible moments with indices ``moments``.
 
-        Args:
-            moments: Indices of the moments.
-            saturation: Their saturation magnetization Ms [A/m].
-            susceptibility: Their susceptibility [dimensionless], may be infinite.
-
-        Raises:
-            InputError: The contact model is ``multipole``, or a value is out of range.
+        Their curves stay. Waits for the device.
         """
         if len(moments) and self._near is not None:
             raise InputError("contact_model: multipole has tables of the materials, which cannot be changed")
         change_material(self.material, moments, saturation, susceptibility, self.dtype)
 
     def set_conductivity(self, conductivity, step: float):
-        """Start computing eddy currents in the balls of single moments.
+        """Start computing eddy currents in the balls of single moments, of ``conductivity`` [S/m], shape [n].
 
-        Args:
-            conductivity: Conductivity of each ball [S/m], shape [n].
-            step: Longest time for which computed forces act [s].
+        Computed forces act for at most ``step`` [s].
         """
         turned, ranges = self._turned.numpy() == 0, [(first, last) for first, _, last in self.world_ranges]
         self.eddy = EddyCurrents(self._packed, ranges, conductivity, turned, self.material, step)
@@ -456,9 +429,6 @@ class MomentSystem:
 
         It is the energy of all fields and of the magnetization curves. The negative gradient by the positions is the
         Kelvin force. Permanent moments of one body add a constant. Waits for the device.
-
-        Raises:
-            InputError: The contact model is not ``dipole``.
         """
         if self.settings.contact_model != "dipole":
             raise InputError("contact_model: the energy can be computed for dipole only, not for multipole")

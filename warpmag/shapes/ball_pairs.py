@@ -13,15 +13,9 @@ import numpy as np
 
 
 def radial_factors(distance: np.ndarray, radius_i: np.ndarray, radius_j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radial factors g1 [1/m³] and g2 [1/m⁵] of the pair law.
+    """Return the radial factors g1 [1/m³] and g2 [1/m⁵] of the pair law, for distances d and radii [m], broadcast.
 
-    Args:
-        distance: Distances d between the centers [m], any shape. Both factors are 0 for point dipoles at distance 0.
-        radius_i: Target radii [m], broadcastable; 0 for a point.
-        radius_j: Source radii [m], broadcastable.
-
-    Returns:
-        g1 and g2, shaped like the broadcast arguments.
+    A point has the radius 0. Both factors are 0 for point dipoles at distance 0.
     """
     d, a, b = np.broadcast_arrays(np.asarray(distance, float), np.asarray(radius_i, float), np.asarray(radius_j, float))
     safe = np.where(d > 0.0, d, 1.0)

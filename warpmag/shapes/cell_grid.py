@@ -9,61 +9,39 @@ from warpmag.shapes.solids import Solid, boxes_meet, grid
 
 _FINE_POINTS = 32
 """Smallest number of test points along each axis of a shape, unless ``_MOST_SPLITS`` limits it."""
-
 _MOST_SPLITS = 8
 """Largest number of test points along each axis of a cell, if several shapes share a grid."""
-
 _FLATTEST = 4.0
 """Largest ratio of spacing to cell side in a shared grid, where thin shapes get several cells across."""
-
 _SMALL = 0.1
 """Shapes below this share of the largest shape's volume do not make the cells of a shared grid narrower."""
-
 _CHUNK = 1 << 18
 """Test points evaluated at a time (some tens of MB)."""
 
 
 @dataclass(frozen=True)
 class Filled:
-    """Part of each cell that a shape fills, excluding overlap with earlier shapes.
+    """Part of each cell that a shape fills, excluding overlap with earlier shapes."""
 
-    Attributes:
-        index: Index in the grid of each cell that the shape reaches into, shape [m, 3].
-        shares: Filled share of each subcell, shape [m, a, b, c].
-        weights: Number of test points of each cell in the filled part, shape [m].
-        sums: Sum of the positions of these points [m], frame of the grid, shape [m, 3].
-        whole: Number of test points in the shape, including overlap with earlier shapes.
-    """
-
-    index: np.ndarray
-    shares: np.ndarray
-    weights: np.ndarray
-    sums: np.ndarray
-    whole: float
+    index: np.ndarray  # index in the grid of each cell that the shape reaches into, shape [m, 3]
+    shares: np.ndarray  # filled share of each subcell, shape [m, a, b, c]
+    weights: np.ndarray  # number of test points of each cell in the filled part, shape [m]
+    sums: np.ndarray  # sum of the positions of these points [m], frame of the grid, shape [m, 3]
+    whole: float  # number of test points in the shape, including overlap with earlier shapes
 
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Equal cells over shapes, in the frame of the largest. On each axis, cells fit exactly across the thinnest shape.
+    """Equal cells over shapes, in the frame of the largest. Along each axis they fit the thinnest shape exactly."""
 
-    Attributes:
-        solids: Shapes posed in the frame of the grid. The first ``earlier`` ones only remove overlap.
-        earlier: Number of shapes that have no cells in the grid.
-        lower: Lower corner [m], shape [3].
-        sides: Sides of a cell [m], shape [3].
-        counts: Cells along each axis, shape [3].
-        splits: Test points across a cell along each axis, shape [3].
-        position, rotation: Pose of the grid in the body's frame: origin [m], shape [3], and rotation, shape [3, 3].
-    """
-
-    solids: list[Solid]
-    earlier: int
-    lower: np.ndarray
-    sides: np.ndarray
-    counts: np.ndarray
-    splits: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
+    solids: list[Solid]  # shapes posed in the frame of the grid
+    earlier: int  # number of the first shapes, which have no cells in the grid, but remove overlap
+    lower: np.ndarray  # lower corner [m], shape [3]
+    sides: np.ndarray  # sides of a cell [m], shape [3]
+    counts: np.ndarray  # cells along each axis, shape [3]
+    splits: np.ndarray  # test points across a cell along each axis, shape [3]
+    position: np.ndarray  # origin of the grid in the body's frame [m], shape [3]
+    rotation: np.ndarray  # from the frame of the grid to the body's, shape [3, 3]
 
     def filled(self, k: int) -> Filled:
         """Return the part of each cell that shape ``k`` fills."""
@@ -92,8 +70,7 @@ class CellGrid:
         """Return the sorted indices of the cells that the rotated bounding box of a shape reaches into."""
         rotation, extent = np.abs(part.rotation), part.upper - part.lower
         steps = (0.5 * self.sides[:, None] / np.maximum(rotation, 1e-9)).min(axis=0)  # along each axis of the shape
-        counts = np.ceil(extent / steps).astype(int)
-        points = part.to_body(part.lower + (grid(counts) + 0.5) * (extent / counts))
+        points = part.test_points(np.ceil(extent / steps).astype(int))
         index = np.unique(np.floor((points - self.lower) / self.sides).astype(int), axis=0)
         index = np.unique((index[:, None] + grid(np.full(3, 3)) - 1).reshape(-1, 3), axis=0)  # with their neighbors
         index = index[((index >= 0) & (index < self.counts)).all(axis=1)]
@@ -103,9 +80,7 @@ class CellGrid:
 
     def _filled_by_thin_shape(self, part: Solid, others: list[Solid], pitch: np.ndarray) -> Filled:
         """Return :meth:`filled` of a thin shape from its own test points, because the grid's points may miss it."""
-        extent = part.upper - part.lower
-        counts = np.maximum(np.ceil(extent / pitch).astype(int), _MOST_SPLITS)
-        points = part.to_body(part.lower + (grid(counts) + 0.5) * (extent / counts))
+        points = part.test_points(np.maximum(np.ceil((part.upper - part.lower) / pitch).astype(int), _MOST_SPLITS))
         whole, free = _inside(part, others, points)
         points = points[free]
         places = (points - self.lower) / self.sides
@@ -123,19 +98,14 @@ class CellGrid:
 
 
 def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float, across: int) -> CellGrid:
-    """Return a grid of cells over shapes of a body.
+    """Return a grid of cells, with sides of about ``spacing`` [m], over shapes of a body, without overlap with others.
 
-    Args:
-        parts: Shapes, posed in the frame of the body.
-        earlier: Other shapes of the body; overlap with them is removed.
-        spacing: Approximate side of a cell [m].
-        across: Smallest number of cells across a shape. In a shared grid ``_FLATTEST`` limits it.
+    ``across`` is the smallest number of cells across a shape. In a shared grid ``_FLATTEST`` limits it.
     """
     largest = max(parts, key=lambda part: part.volume)
     solids = [_in_frame_of(largest, part) for part in (*earlier, *parts)]
     posed = solids[len(earlier) :]
-    half = np.array([np.abs(part.rotation) @ (0.5 * (part.upper - part.lower)) for part in posed])
-    middle = np.array([part.to_body(0.5 * (part.lower + part.upper)) for part in posed])
+    middle, half = np.array([part.bounds() for part in posed]).swapaxes(0, 1)
     lower, upper = (middle - half).min(axis=0), (middle + half).max(axis=0)
     spacing = min(spacing, (upper - lower).max())  # larger cells would have fewer test points in the shapes
     large = np.array([part.volume >= _SMALL * largest.volume for part in parts])

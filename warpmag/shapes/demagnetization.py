@@ -21,30 +21,24 @@ from functools import cached_property
 import numpy as np
 
 from warpmag.shapes.ball_pairs import radial_factors
-from warpmag.shapes.lattice import Lattice, Pieces, grid
+from warpmag.shapes.lattice import Lattice, Pieces
+from warpmag.shapes.solids import grid
 
 EXACT_REACH = 3.0
 """Distance up to which pairs of cells are corrected, in longest sides of a cell (see ``tests/test_cells.py``)."""
-
 _SUBCELLS = 8
 """Largest number of subcells along each axis of a cell that the surface cuts, for cells that touch."""
-
 _DISTANT_SUBCELLS = 4
 """Largest number of subcells along each axis, for cells that do not touch."""
-
 _FAR_REACH = 4.0
 """Distance up to which quadrupoles of cells are corrected, in :data:`EXACT_REACH`."""
-
 _LARGEST_SPREAD = 0.15
 """Bound on the norm of a moment's traceless second moments, in squares of a cell's longest side. Two joined cubic cells
 have 0.2."""
-
 COMPONENTS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 """Rows and columns of the six components of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
-
 _LANCZOS_STEPS = 20
 """Largest number of Lanczos steps; they give the largest eigenvalue to 3 %."""
-
 _BATCH = 1 << 22
 """Largest number of entries of a temporary array (tens of MB)."""
 
@@ -53,22 +47,15 @@ _BATCH = 1 << 22
 class Coupling:
     """Correction of the pair sums between the moments of one body, in its frame: H_i += Σ T_ij m_j.
 
-    Attributes:
-        start: First entry of each moment, and the end, shape [n + 1].
-        other: Moment j of each entry, ascending, shape [entries].
-        tensor: T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6].
-        common: Matrix C [1/m³] between the common fields E of all moments (``uniform_response.py``), which adds
-            H_i += E_i C Σ_j E_jᵀ m_j, shape [8, 8].
-        positions: Positions of the moments [m], shape [n, 3].
-        radii: Radii of the moments' balls [m], shape [n].
+    The common fields E of all moments (``uniform_response.py``) add H_i += E_i C Σ_j E_jᵀ m_j.
     """
 
-    start: np.ndarray
-    other: np.ndarray
-    tensor: np.ndarray
-    common: np.ndarray
-    positions: np.ndarray
-    radii: np.ndarray
+    start: np.ndarray  # first entry of each moment, and the end, shape [n + 1]
+    other: np.ndarray  # moment j of each entry, ascending, shape [entries]
+    tensor: np.ndarray  # T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6]
+    common: np.ndarray  # C [1/m³], shape [8, 8]
+    positions: np.ndarray  # of the moments [m], shape [n, 3]
+    radii: np.ndarray  # of the moments' balls [m], shape [n]
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -130,14 +117,9 @@ class Coupling:
 
 
 def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return the demagnetizing tensors between equal cuboids on a grid (Newell, Williams and Dunlop 1993).
+    """Return the demagnetizing tensors N, H = −N M, between equal cuboids on a grid, xx, yy, zz, xy, xz, yz, [n, 6].
 
-    Args:
-        offsets: Vectors between the centers in sides, whole numbers, shape [n, 3].
-        sides: Sides of the cuboids, shape [3].
-
-    Returns:
-        N of the averaged field H = −N M as xx, yy, zz, xy, xz, yz, shape [n, 6].
+    ``offsets`` are the vectors between their centers in ``sides``, whole numbers, shape [n, 3].
     """
     offsets = np.asarray(offsets).astype(int)
     signs, places = np.where(offsets < 0, -1.0, 1.0), np.abs(offsets)
@@ -150,15 +132,8 @@ def _tensor_table(counts: np.ndarray, sides: np.ndarray) -> np.ndarray:
     """Return :func:`cuboid_tensors` for all offsets below ``counts`` along each axis, shape [a, b, c, 6]."""
     unit = np.asarray(sides, float) / np.max(sides)
     x, y, z = np.ix_(*(step * np.arange(-1, count + 1) for step, count in zip(unit, counts, strict=True)))
-    parts = (
-        _diagonal(x, y, z),
-        _diagonal(y, x, z),
-        _diagonal(z, y, x),
-        _off_diagonal(x, y, z),
-        _off_diagonal(x, z, y),
-        _off_diagonal(y, z, x),
-    )
-    total = np.stack(parts)
+    diagonal = [_diagonal(x, y, z), _diagonal(y, x, z), _diagonal(z, y, x)]
+    total = np.stack([*diagonal, _off_diagonal(x, y, z), _off_diagonal(x, z, y), _off_diagonal(y, z, x)])
     for _ in range(3):  # second differences along each axis
         total = np.moveaxis(2.0 * total[:, 1:-1] - total[:, :-2] - total[:, 2:], 1, 3)
     return np.moveaxis(total, 0, 3) / (4.0 * np.pi * unit.prod())
@@ -169,8 +144,8 @@ def _diagonal(x, y, z):
     x, y, z = np.abs(x), np.abs(y), np.abs(z)
     r = np.sqrt(x * x + y * y + z * z)
     return (
-        0.5 * y * (z * z - x * x) * _arsinh(y, np.hypot(x, z))
-        + 0.5 * z * (y * y - x * x) * _arsinh(z, np.hypot(x, y))
+        0.5 * y * (z * z - x * x) * np.arcsinh(_quotient(y, np.hypot(x, z)))
+        + 0.5 * z * (y * y - x * x) * np.arcsinh(_quotient(z, np.hypot(x, y)))
         - x * y * z * np.arctan2(y * z, x * r)
         + (2.0 * x * x - y * y - z * z) * r / 6.0
     )
@@ -180,33 +155,25 @@ def _off_diagonal(x, y, z):
     """Return g of Newell, Williams and Dunlop, Eq. 32."""
     r = np.sqrt(x * x + y * y + z * z)
     return (
-        x * y * z * _arsinh(z, np.hypot(x, y))
-        + y * (3.0 * z * z - y * y) / 6.0 * _arsinh(x, np.hypot(y, z))
-        + x * (3.0 * z * z - x * x) / 6.0 * _arsinh(y, np.hypot(x, z))
-        - z**3 / 6.0 * _arctan(x * y, z * r)
-        - 0.5 * z * y * y * _arctan(x * z, y * r)
-        - 0.5 * z * x * x * _arctan(y * z, x * r)
+        x * y * z * np.arcsinh(_quotient(z, np.hypot(x, y)))
+        + y * (3.0 * z * z - y * y) / 6.0 * np.arcsinh(_quotient(x, np.hypot(y, z)))
+        + x * (3.0 * z * z - x * x) / 6.0 * np.arcsinh(_quotient(y, np.hypot(x, z)))
+        - z**3 / 6.0 * np.arctan(_quotient(x * y, z * r))
+        - 0.5 * z * y * y * np.arctan(_quotient(x * z, y * r))
+        - 0.5 * z * x * x * np.arctan(_quotient(y * z, x * r))
         - x * y * r / 3.0
     )
 
 
-def _arsinh(a, b):
-    """Return arsinh(a/b), or 0 where b = 0, because the factor before it is 0 there."""
-    return np.where(b > 0.0, np.arcsinh(a / np.where(b > 0.0, b, 1.0)), 0.0)
-
-
-def _arctan(a, b):
-    """Return arctan(a/b), or 0 where b = 0, because the factor before it is 0 there."""
-    return np.where(b != 0.0, np.arctan(a / np.where(b != 0.0, b, 1.0)), 0.0)
+def _quotient(a, b):
+    """Return a/b, or 0 where b = 0, because the factor before the term is 0 there."""
+    return np.where(b != 0.0, a / np.where(b != 0.0, b, 1.0), 0.0)
 
 
 def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) -> Coupling:
-    """Return the correction of the pair sums between the moments of one body.
+    """Return the correction of the pair sums between the moments of one body, up to ``reach`` longest sides of a cell.
 
-    Args:
-        lattice: Moments with their cells. Pairs of cells of different grids are not corrected.
-        radii: Radii of the balls in the pair sums [m], shape [n].
-        reach: Distance up to which pairs are corrected, in longest sides of the cells.
+    ``radii`` are those of the balls in the pair sums [m], shape [n]. Cells of different grids are not corrected.
     """
     x, volumes = lattice.positions, lattice.volumes
     entries, tensors = [np.empty((2, 0), int)], [np.empty((0, 6))]
@@ -230,10 +197,7 @@ def _pair_law(r, a, b, same):
 
 
 def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs (i, j) of near moments of one grid, shape [2, pairs], and N_ij √(V_i V_j)/V, shape [pairs, 6].
-
-    V is the volume of a cell.
-    """
+    """Return near pairs of one grid, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     reach = reach * float(part.sides.max())
@@ -394,10 +358,7 @@ def _coarsened(filled: np.ndarray, most: int) -> np.ndarray:
 
 
 def common_fields(points: np.ndarray) -> np.ndarray:
-    """Return the common fields at scaled positions: three uniform and five linear ones, shape [n, 3, 8].
-
-    They are the gradients of ``uniform_response.common_potentials``.
-    """
+    """Return the gradients of ``uniform_response.common_potentials`` at scaled positions, shape [n, 3, 8]."""
     x, y, z = points.T
     zero, unit = np.zeros_like(x), np.ones_like(x)
     rows = (

@@ -12,7 +12,6 @@ from warpmag.shapes.solids import Solid
 
 _LEAST_PER_SIDE = 3
 """Smallest number of facets along a side of a box."""
-
 _TEST_OFFSET = 1e-4
 """Distance of the test points on both sides of a facet from its center, in square roots of its area."""
 

@@ -34,7 +34,7 @@ The moments of an inducible body act on each other as parts of cells (``demagnet
 describe. A thin body gets flat cells, so that it has :data:`LEAST_ACROSS` across its thickness.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -44,66 +44,46 @@ from warpmag.errors import InputError
 from warpmag.shapes import facets
 from warpmag.shapes.cell_grid import CellGrid, Filled, cells_over
 from warpmag.shapes.closed_mesh import check_closed, welded, winding_number
-from warpmag.shapes.solids import Solid, Values, grid
+from warpmag.shapes.solids import Solid, Values
 
 AUTOMATIC_COUNT = 729
 """Largest number of moments of a body at automatic spacing: 9³, see the table above."""
-
 LEAST_ACROSS = 3
 """Smallest number of cells across an inducible shape at automatic spacing. The test case is a ferrite cube of 20 mm at
 0.5 mm from a plate of 40:40:5 mm. The force is 4 % too small with 3 cells across, and 6 % with 2. More cells are
 flatter and slower."""
-
 LARGEST_COUNT = 20_000
 """Largest number of moments of a body at any spacing; a smaller spacing raises an error."""
-
 _FINE_POINTS = 32
 """Test points along each axis of a mesh's bounding box."""
-
 _CHUNK = 1 << 18
 """Pairs of cells evaluated at a time (some tens of MB)."""
-
 _NO_MOMENTS = np.empty((0, 3)), np.empty(0), (np.empty(0, int), np.empty(0, int), np.empty(0))
 """Moments of a shape that lies inside others: positions, weights and joined cells."""
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """Parts of shapes in the cells of a grid, one piece per shape and cell, and the moments that represent them.
+    """Parts of shapes in the cells of a grid, one piece per shape and cell, and the moments that represent them."""
 
-    Attributes:
-        sides: Sides of a cell [m], shape [3].
-        index: Index of each piece's cell in the grid, shape [p, 3].
-        filled: Filled share of each subcell, shape [p, a, b, c].
-        piece, moment, share: Piece, moment, and the share of the piece that belongs to the moment, shape [entries].
-        position, rotation: Pose of the grid in the body's frame: origin [m], shape [3], and rotation, shape [3, 3].
-    """
-
-    sides: np.ndarray
-    index: np.ndarray
-    filled: np.ndarray
-    piece: np.ndarray
-    moment: np.ndarray
-    share: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
+    sides: np.ndarray  # sides of a cell [m], shape [3]
+    index: np.ndarray  # index of each piece's cell in the grid, shape [p, 3]
+    filled: np.ndarray  # filled share of each subcell, shape [p, a, b, c]
+    piece: np.ndarray  # shape [entries]
+    moment: np.ndarray  # shape [entries]
+    share: np.ndarray  # share of the piece that belongs to the moment, shape [entries]
+    position: np.ndarray  # origin of the grid in the body's frame [m], shape [3]
+    rotation: np.ndarray  # from the frame of the grid to the body's, shape [3, 3]
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Moments that represent one solid body.
+    """Moments that represent one solid body."""
 
-    Attributes:
-        positions: Positions of the moments [m], body frame, shape [n, 3].
-        volumes: Volumes of the moments [m³], shape [n]; their sum is the volume of the body.
-        owners: Index of each moment's shape, non-decreasing, shape [n].
-        pieces: Parts of cells that the moments represent, one entry per grid; empty for a ball.
-    """
-
-    positions: np.ndarray
-    volumes: np.ndarray
-    owners: np.ndarray
-    pieces: tuple[Pieces, ...] = ()
+    positions: np.ndarray  # of the moments [m], body frame, shape [n, 3]
+    volumes: np.ndarray  # [m³], shape [n]; their sum is the volume of the body
+    owners: np.ndarray  # index of each moment's shape, non-decreasing, shape [n]
+    pieces: tuple[Pieces, ...] = ()  # parts of cells that the moments represent, one entry per grid; empty for a ball
 
     @property
     def radii(self) -> np.ndarray:
@@ -179,13 +159,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
 
     Vertices at the same position are joined first. The triangles must then pass every edge equally often in both
     directions; either orientation of the whole mesh is accepted. Shells may intersect; shared volume counts once.
-
-    Args:
-        vertices: Vertices [m], shape [n, 3].
-        faces: Indices of each triangle's vertices, shape [m, 3] or flat.
-
-    Raises:
-        InputError: The mesh is not closed or encloses no volume.
+    Vertices [m] have the shape [n, 3], triples of their indices [m, 3] or flat.
     """
     points, triangles = welded(vertices, faces)
     check_closed(triangles)
@@ -200,7 +174,8 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     winding = winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
     surface = partial(facets.mesh, corners if volume > 0.0 else corners[:, ::-1])
     solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda p: winding(p) != 0, surface)
-    windings, samples = _sampled_windings(solid, winding)
+    samples = solid.test_points(np.full(3, _FINE_POINTS))
+    windings = winding(samples)
     if np.isin(windings, (0, 1)).all():
         return solid
     inside = windings != 0  # intersecting shells: the integrals above count shared volume repeatedly
@@ -222,7 +197,7 @@ def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
 
 
 def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1, *, together: bool = False) -> Lattice:
-    """Fill a body with moments.
+    """Fill a body with moments. Their volume is exact, or to about 1 %, that of the test grid, where shapes overlap.
 
     Args:
         solids: Shapes of one body, posed in its frame. Overlap belongs to the earlier shape.
@@ -231,12 +206,6 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
         across: Smallest number of cells across a shape at automatic spacing, with flatter cells where necessary.
         together: True if all shapes share one grid, in the frame of the largest, which tensors between them require. A
             cell in several shapes then gives a moment of each shape.
-
-    Returns:
-        The lattice. Its volume is exact if shapes do not overlap, else it has the error of the test grid, about 1 %.
-
-    Raises:
-        InputError: There is no shape, the spacing is too small or negative, or a shape is too thin.
     """
     parts = [solids] if isinstance(solids, Solid) else list(solids)
     if not parts:
@@ -258,7 +227,10 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
 
 def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -> Lattice:
     """Return the lattice of shapes at a spacing [m]."""
-    grids = _grids(parts, spacing, across, together)
+    if together:
+        grids = [cells_over(parts, [], spacing, across)]
+    else:
+        grids = [cells_over([part], parts[:k], spacing, across) for k, part in enumerate(parts)]
     filled = [_fill_part(cells, k) for cells in grids for k in range(cells.earlier, len(cells.solids))]
     counts = [len(volumes) for _, volumes, _ in filled]
     firsts = np.cumsum(counts) - counts
@@ -272,24 +244,12 @@ def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -
     )
 
 
-def _grids(parts: Sequence[Solid], spacing: float, across: int, together: bool) -> list[CellGrid]:
-    """Return one grid for all shapes, or one for each shape."""
-    if together:
-        return [cells_over(parts, [], spacing, across)]
-    return [cells_over([part], parts[:k], spacing, across) for k, part in enumerate(parts)]
-
-
 def _concatenated(pieces: list[Pieces]) -> Pieces:
     """Return the pieces of several shapes in one grid as one record."""
     before = np.cumsum([0, *(len(p.index) for p in pieces)])
-    return replace(
-        pieces[0],
-        index=np.concatenate([p.index for p in pieces]),
-        filled=np.concatenate([p.filled for p in pieces]),
-        piece=np.concatenate([p.piece + first for p, first in zip(pieces, before, strict=False)]),
-        moment=np.concatenate([p.moment for p in pieces]),
-        share=np.concatenate([p.share for p in pieces]),
-    )
+    pieces = [replace(p, piece=p.piece + first) for p, first in zip(pieces, before, strict=False)]
+    columns = ("index", "filled", "piece", "moment", "share")
+    return replace(pieces[0], **{name: np.concatenate([getattr(p, name) for p in pieces]) for name in columns})
 
 
 def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]:
@@ -336,10 +296,3 @@ def _lengths(name: str, values: Values, count: int) -> np.ndarray:
         got = values if count > 1 else values[0]
         raise InputError(f"{name}: must be positive and finite{', three lengths' if count == 3 else ''}, got {got}")
     return array
-
-
-def _sampled_windings(solid: Solid, winding: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return winding numbers at a grid of points in the bounding box, and the points."""
-    counts = np.full(3, _FINE_POINTS)
-    points = solid.lower + (grid(counts) + 0.5) * ((solid.upper - solid.lower) / counts)
-    return winding(points), points

@@ -18,13 +18,11 @@ import numpy as np
 
 CYLINDER_SIDES = 32
 """Number of sides of the prism that replaces a cylinder."""
-
 _LEAST_POINTS, _EDGE_POINTS, _FACE_POINTS, _FINE_FACE_POINTS = 4, 16, 8, 32
 """Numbers of Gauss points: at least on an edge; on the longest edge; across a face as long as that edge; and across it
 for energies. Forces between touching boxes then have an error of 2e-3 at any offset. Only torques and energies use
 points on faces. The potential has a kink on a face near an edge of the other body. For two boxes half a millimeter
 apart, 8 points give the force to 1e-5, but the slope of the energy only to 3 %; energies therefore use more."""
-
 _REACH, _REMAINDER, _MOST_MOMENTS = 1.5, 1e-5, 256
 """For the moments that replace a body at a distance: smallest distance, in halves of the body's smallest side; relative
 error of the field there from the Gauss points along one axis; largest number of moments. If more moments were needed,
@@ -33,15 +31,10 @@ the distance is increased."""
 
 @dataclass(frozen=True)
 class Polyhedron:
-    """A convex polyhedron.
+    """A convex polyhedron."""
 
-    Attributes:
-        corners: Corners [m], shape [c, 3].
-        faces: Indices of each face's corners, counterclockwise seen from outside.
-    """
-
-    corners: np.ndarray
-    faces: tuple[tuple[int, ...], ...]
+    corners: np.ndarray  # [m], shape [c, 3]
+    faces: tuple[tuple[int, ...], ...]  # indices of each face's corners, counterclockwise seen from outside
 
     def posed(self, position, rotation) -> "Polyhedron":
         """Return the polyhedron rotated by a matrix and then moved by ``position`` [m]."""
@@ -51,7 +44,8 @@ class Polyhedron:
     def normals(self) -> np.ndarray:
         """Outward unit normals of the faces, shape [f, 3]."""
         a, b, c = (self.corners[[face[k] for face in self.faces]] for k in range(3))
-        return _unit(np.cross(b - a, c - b))
+        normals = np.cross(b - a, c - b)
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     @cached_property
     def edges(self) -> np.ndarray:
@@ -95,18 +89,12 @@ class Moments:
     """Moments at Gauss points that replace a body at a distance; there, gradients of their field have an error of 1e-3.
 
     Lattice cells that are not cubes, or that a surface cuts, have an error of 1e-2 at any distance.
-
-    Attributes:
-        places: Positions [m], shape [n, 3].
-        volumes: Volumes [m³], shape [n].
-        depths: Depths below the surface of the body [m], shape [n].
-        reach: Smallest distance from the surface at which the moments replace the body [m].
     """
 
-    places: np.ndarray
-    volumes: np.ndarray
-    depths: np.ndarray
-    reach: float
+    places: np.ndarray  # [m], shape [n, 3]
+    volumes: np.ndarray  # [m³], shape [n]
+    depths: np.ndarray  # below the surface of the body [m], shape [n]
+    reach: float  # smallest distance from the surface at which the moments replace the body [m]
 
 
 def box(half_extents) -> Polyhedron:
@@ -151,9 +139,9 @@ def cylinder_moments(radius: float, half_height: float) -> Moments:
 
 
 def _planned(half: float, plan):
-    """Return ``plan(distance)``, (panels, points) per axis, and the smallest distance [m] for a plan of few moments.
+    """Return ``plan(distance)``, (panels, points) per axis, and the distance, at least ``_REACH * half`` [m].
 
-    Few means at most :data:`_MOST_MOMENTS`. The search starts at ``_REACH * half``.
+    The distance is the smallest one for a plan of at most :data:`_MOST_MOMENTS` moments.
     """
     distance = _REACH * half
     while np.prod(plan(distance)) > _MOST_MOMENTS:
@@ -204,7 +192,3 @@ def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (nodes + 1.0), 0.5 * weights
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -12,30 +12,17 @@ Values = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True)
 class Solid:
-    """A solid shape, posed in the frame of its body.
+    """A solid shape, posed in the frame of its body. All values but the pose are in the frame of the shape."""
 
-    Attributes:
-        name: Name in error messages.
-        lower: Lower corner of the bounding box [m], frame of the shape, shape [3].
-        upper: Upper corner of the bounding box [m], frame of the shape, shape [3].
-        volume: Volume [m³].
-        centroid: Centroid [m], frame of the shape, shape [3].
-        inside: Function of points [m], frame of the shape, shape [n, 3], that returns True for points inside.
-        facets: Function of a count that returns about ``count`` facets of the surface [m], frame of the shape, shape
-            [m, 4, 3] (``facets.py``).
-        position: Origin of the shape in the body's frame [m], shape [3].
-        rotation: Rotation from the frame of the shape to the body's, shape [3, 3].
-    """
-
-    name: str
-    lower: np.ndarray
-    upper: np.ndarray
-    volume: float
-    centroid: np.ndarray
-    inside: Callable[[np.ndarray], np.ndarray]
-    facets: Callable[[int], np.ndarray]
-    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    name: str  # in error messages
+    lower: np.ndarray  # lower corner of the bounding box [m], shape [3]
+    upper: np.ndarray  # upper corner of the bounding box [m], shape [3]
+    volume: float  # [m³]
+    centroid: np.ndarray  # [m], shape [3]
+    inside: Callable[[np.ndarray], np.ndarray]  # returns True for points inside, of points [m], shape [n, 3]
+    facets: Callable[[int], np.ndarray]  # returns about a count of facets of the surface [m], shape [m, 4, 3]
+    position: np.ndarray = field(default_factory=lambda: np.zeros(3))  # origin in the body's frame [m], shape [3]
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # from its frame to the body's, shape [3, 3]
 
     def posed(self, position: Values, quaternion: Values = (0.0, 0.0, 0.0, 1.0)) -> "Solid":
         """Return the shape at ``position`` [m], rotated by ``quaternion`` (x, y, z, w), both in the body's frame."""
@@ -52,6 +39,14 @@ class Solid:
         """Transform points [m], shape [n, 3], from the frame of the shape to the body's."""
         return points @ self.rotation.T + self.position
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return center and half sides [m] of the bounding box along the axes of the body, shape [3] each."""
+        return self.to_body(0.5 * (self.lower + self.upper)), np.abs(self.rotation) @ (0.5 * (self.upper - self.lower))
+
+    def test_points(self, counts: np.ndarray) -> np.ndarray:
+        """Return points [m], body frame, that fill the bounding box with ``counts`` along each axis, shape [n, 3]."""
+        return self.to_body(self.lower + (grid(counts) + 0.5) * ((self.upper - self.lower) / counts))
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return True for the points [m], body frame, shape [n, 3], that lie inside, shape [n]."""
         local = (points - self.position) @ self.rotation
@@ -62,10 +57,9 @@ class Solid:
 
 
 def boxes_meet(a: Solid, b: Solid) -> bool:
-    """Return True if the bounding boxes of two posed shapes, aligned with the body's axes, overlap beyond rounding."""
-    reach = sum(np.abs(solid.rotation) @ (0.5 * (solid.upper - solid.lower)) for solid in (a, b))
-    middle_a, middle_b = (solid.to_body(0.5 * (solid.lower + solid.upper)) for solid in (a, b))
-    return bool((np.abs(middle_a - middle_b) < reach * (1.0 - 1e-6)).all())
+    """Return True if the :meth:`Solid.bounds` of two shapes overlap beyond rounding."""
+    (middle_a, half_a), (middle_b, half_b) = a.bounds(), b.bounds()
+    return bool((np.abs(middle_a - middle_b) < (half_a + half_b) * (1.0 - 1e-6)).all())
 
 
 def grid(counts: np.ndarray) -> np.ndarray:

@@ -30,40 +30,29 @@ from warpmag.shapes.solids import Solid
 
 FIELD_COUNT = 8
 """Largest number of fields that the cells of a body have in common: three uniform and five linear ones."""
-
 _LINEAR_FIELD_CELLS = 65, 2500
 """Smallest and largest number of cells of bodies that get the linear fields, too. Bodies of fewer cells may respond as
 wholes (``kernels.induction.body_response``), which needs symmetric tensors; with linear fields they are not symmetric.
 Bodies of more cells need little correction, and its time is proportional to their number."""
-
 FACETS = 600
 """Approximate number of facets of a body. Extrapolation from it and a quarter of it gives a cube's moment to 0.3 %."""
-
 _FACETS_PER_SHAPE = 150
 """Smallest number of facets per shape: a quarter of it is the smallest number that ``facets.py`` makes."""
-
 MOST_FACETS = 1500
 """Largest number of facets. Bodies of more facets, such as meshes of many triangles, are not corrected."""
-
 MOST_MOMENTS = 6200
 """Largest number of moments of a corrected body: arrays over its pairs take 0.6 GB."""
-
 _POLARIZABILITY_RATIOS = 0.9, 4.0
 """Smallest and largest plausible ratio of the surface's polarizability to that of the cells. Ratios outside come from
 nearly touching surfaces, which facets do not resolve."""
-
 _NEAR_DISTANCE = 6.0
 """Distance up to which a facet's potential is integrated, in distances from its center to its farthest corner."""
-
 _ON_EDGE = 1e-15
 """Relative rounding error of r1 + r2 − l on an edge of length l. It bounds a logarithm multiplied by 0 there."""
-
 _RESIDUAL = 1e-3
 """Relative residual of the cells' magnetization. The moment's error is its square over the smallest eigenvalue."""
-
 _MOST_STEPS = 1000
 """Largest number of steps of conjugate gradients; rods of 1:10 take about 60."""
-
 _CHUNK = 1 << 18
 """Pairs of facets evaluated at a time (some tens of MB)."""
 
@@ -109,11 +98,8 @@ def extrapolated_polarizability(coupling: Coupling, coarse: np.ndarray, fine: np
 def surface_polarizability(coupling: Coupling, surface: np.ndarray) -> np.ndarray:
     """Return the polarizability matrix Q_kl [m³] of an ideally permeable body for its common fields, shape [k, k].
 
-    The entries of the uniform fields are the moments in uniform fields.
-
-    Args:
-        coupling: Coupling of the body's cells; their number decides which fields are used.
-        surface: Facets of the body [m], shape [m, 4, 3].
+    ``surface`` are the facets of the body [m], shape [m, 4, 3]. The entries of the uniform fields are the moments in
+    uniform fields.
     """
     centroids, (_, areas) = facets.centroids(surface), facets.normals_and_areas(surface)
     count = _field_count(coupling)
