@@ -46,10 +46,10 @@ def dtype_name(dtype) -> str:
 def check_bodies(text: str, count: int, dtype) -> None:
     """Raise ``InputError``, beginning with ``text``, if ``count`` bodies are too many for the scalar type ``dtype``."""
     if count > MOST_BODIES[dtype]:
-        raise InputError(f"{text}, at most {MOST_BODIES[dtype]} {hint(dtype)}")
+        raise InputError(f"{text}, at most {MOST_BODIES[dtype]} {precision_hint(dtype)}")
 
 
-def hint(dtype) -> str:
+def precision_hint(dtype) -> str:
     """Return the end of a message about a number out of range of the Warp scalar type ``dtype``."""
     return "in float32; use float64" if dtype is wp.float32 else "in float64"
 
@@ -253,14 +253,14 @@ class CallContext:
         if np.isnan(size):
             raise InputError(f"{name}: contains NaN (row {int(np.argwhere(np.isnan(array))[0, 0])})")
         if size < least:
-            raise InputError(f"{name}: all below {least:g}, the largest is {size:g}, {hint(self.dtype)}")
+            raise InputError(f"{name}: all below {least:g}, the largest is {size:g}, {precision_hint(self.dtype)}")
         row = int(np.argwhere(np.abs(array) == size)[0, 0])
         if size > self._most(None):
             raise InputError(f"{name}: not finite in {dtype_name(self.dtype)} (row {row})")
         text = f"{name}: {size:g} m from the origin (row {row})"
         if farthest not in (FARTHEST[self.dtype], REFERENCE_FARTHEST[self.dtype]):
             raise InputError(f"{text}, with balls of this size at most {farthest:g} m; shift the origin")
-        raise InputError(f"{text}, at most {farthest:g} m {hint(self.dtype)}")
+        raise InputError(f"{text}, at most {farthest:g} m {precision_hint(self.dtype)}")
 
     def _from_warp(self, name, array, warp_type, count):
         """Return a contiguous Warp array of a type, from one that may be strided, indexed or of another scalar type."""

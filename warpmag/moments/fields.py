@@ -17,9 +17,9 @@ from warpmag.moments.arrays import (
     Numbers,
     check_bodies,
     first_not_finite,
-    hint,
     host_radii,
     largest_coordinate,
+    precision_hint,
     range_message,
     resolve_context,
 )
@@ -224,5 +224,5 @@ def _check_finite(name, context: CallContext, results, positions, moments, targe
     nearest = distances[distances > 0.0].min(initial=np.inf)
     raise InputError(
         f"positions, moments{more}: the {name} at row {row} is not finite, with the nearest moment at {nearest:.3g} m "
-        f"and moments up to {np.abs(m).max():.3g} A·m², {hint(context.dtype)}"
+        f"and moments up to {np.abs(m).max():.3g} A·m², {precision_hint(context.dtype)}"
     )

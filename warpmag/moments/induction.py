@@ -19,11 +19,11 @@ from warpmag.moments.arrays import (
     Numbers,
     dtype_name,
     first_not_finite,
-    hint,
     host_radii,
     host_scalars,
     largest,
     largest_coordinate,
+    precision_hint,
     real_array,
     resolve_context,
 )
@@ -95,7 +95,7 @@ class InductionResult:
         if 0.0 < strongest < LEAST_FORCE_MOMENT[dtype]:
             raise InputError(
                 f"radii, saturation, external_field: moments of at most {strongest:.3g} A·m² are too small for forces "
-                f"{hint(dtype)}"
+                f"{precision_hint(dtype)}"
             )
         forces, torques = (self._context.result(array, self._count) for array in (system.forces, system.torques))
         _check_finite(dtype, self._count, self._arguments, force=forces, torque=torques)
@@ -275,13 +275,14 @@ def _read_material(count: int, saturation, susceptibility, curve) -> MomentMater
 
 def _read_result(context: CallContext, system: MomentSystem, n: int, arguments: dict) -> InductionResult:
     """Return the result of a solve of n balls, checked to be finite, and warn if it did not converge."""
+    dtype = context.dtype
     m, h = (context.result(array, n) for array in (system.magnetizations(), system.h))
-    _check_finite(context.dtype, n, arguments, magnetization=m, field=h)
+    _check_finite(dtype, n, arguments, magnetization=m, field=h)
     error = float(system.error.numpy().max(initial=0.0))
     if not math.isfinite(error):
-        raise InputError(f"external_field, permanent, saturation: the error is not finite {hint(context.dtype)}")
+        raise InputError(f"external_field, permanent, saturation: the error is not finite {precision_hint(dtype)}")
     strongest = float(np.abs(h if isinstance(h, np.ndarray) else h.numpy()).max(initial=0.0))
-    _check_strength(context.dtype, strongest, arguments["saturation"])
+    _check_strength(dtype, strongest, arguments["saturation"])
     converged = bool(system.converged.numpy().all())
     if not converged:
         limit = system.settings.max_evaluations
@@ -291,18 +292,8 @@ def _read_result(context: CallContext, system: MomentSystem, n: int, arguments: 
     if field_error > system.rtol:
         text = f"solve_induction: fields have an error of {field_error:.2g} > rtol {system.rtol:g}; use method direct"
         warnings.warn(text, ConvergenceWarning, stacklevel=4)
-    return InductionResult(
-        magnetizations=m,
-        h_field=h,
-        error=error,
-        evaluations=int(system.evaluations.numpy().max(initial=0)),
-        converged=converged,
-        field_error=field_error,
-        _system=system,
-        _context=context,
-        _arguments=arguments,
-        _count=n,
-    )
+    evaluations = int(system.evaluations.numpy().max(initial=0))
+    return InductionResult(m, h, error, evaluations, converged, field_error, system, context, arguments, n)
 
 
 def _check_strength(dtype, strongest: float, saturation):
@@ -314,7 +305,7 @@ def _check_strength(dtype, strongest: float, saturation):
         adjective, limit = ("weak", saturation.max()) if weak else ("strong", saturation.min())
         raise InputError(
             f"external_field, permanent, saturation: a field of {strongest:.3g} A/m is too {adjective} for a "
-            f"saturation of {limit:.3g} A/m {hint(dtype)}"
+            f"saturation of {limit:.3g} A/m {precision_hint(dtype)}"
         )
 
 
@@ -330,4 +321,4 @@ def _check_finite(dtype, count: int, arguments: dict, **results):
     least, most = _PLAUSIBLE[dtype]
     sizes = {name: np.abs(real_array(name, value)) for name, value in arguments.items() if value is not None}
     unusual = [name for name, size in sizes.items() if ((size > 0.0) & ~((size > least) & (size < most))).any()]
-    raise InputError(f"{', '.join(unusual or sizes)}: {failures[0]} is not finite {hint(dtype)}")
+    raise InputError(f"{', '.join(unusual or sizes)}: {failures[0]} is not finite {precision_hint(dtype)}")

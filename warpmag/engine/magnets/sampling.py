@@ -80,7 +80,7 @@ class ShapeSampler:
                 raise InputError(f"{self._labels[shapes[0]]}: {error}") from None
         return self._lattices[key]
 
-    def _sample(self, shapes: list[int], spacing: float, fixed: bool, closed: bool) -> BodyLattice:
+    def _sample(self, shapes: list[int], spacing: float, fixed: bool, permanent: bool) -> BodyLattice:
         if spacing == 0.0 and self._are_balls_apart(shapes):
             balls = [lattice.ball(self._scales[shape, 0]) for shape in shapes]
             return BodyLattice(
@@ -93,7 +93,7 @@ class ShapeSampler:
             solid_of(self._types[shape], self._scales[shape], self._sources[shape]).posed(frame[:3], frame[3:])
             for shape, frame in zip(shapes, self._frames[shapes], strict=True)
         ]
-        surfaces = self._polyhedra(shapes, solids) if closed else []
+        surfaces = self._polyhedra(shapes, solids) if permanent else []
         if surfaces and fixed and spacing == 0.0:
             return self._sample_closed_forms(shapes, solids, surfaces)
         filled = lattice.fill(solids, spacing, 1 if fixed else lattice.LEAST_ACROSS, together=not fixed)

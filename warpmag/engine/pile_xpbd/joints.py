@@ -130,47 +130,26 @@ class JointSolve:
     def _contact_solve(self, masses, contacts, dt: float) -> Callable:
         names = ("count", "point0", "point1", "surface_velocity", "offset0", "offset1", "normal", "shape0", "shape1")
         return self._bind(
-            newton_kernels.solve_body_contact_positions,
-            contacts.rigid_contact_max,
+            newton_kernels.solve_body_contact_positions, contacts.rigid_contact_max,
             **{f"contact_{name}": getattr(contacts, f"rigid_contact_{name}") for name in names},
-            contact_thickness0=self._margin,
-            contact_thickness1=contacts.rigid_contact_margin1,
-            body_q=self._q,
-            body_qd=self._qd,
-            body_m_inv=masses[0],
-            body_I_inv=masses[1],
-            relaxation=self._relaxations[0],
-            dt=dt,
-            deltas=self._deltas,
-            contact_inv_weight=None,
-            contact_impulse=None,
-        )
+            contact_thickness0=self._margin, contact_thickness1=contacts.rigid_contact_margin1,
+            body_q=self._q, body_qd=self._qd, body_m_inv=masses[0], body_I_inv=masses[1],
+            relaxation=self._relaxations[0], dt=dt,
+            deltas=self._deltas, contact_inv_weight=None, contact_impulse=None,
+        )  # fmt: skip
 
     def _joint_solve(self, bodies: BodyView, control, dt: float) -> Callable:
         return self._bind(
-            newton_kernels.solve_body_joints,
-            self._model.joint_count,
-            body_q=self._q,
-            body_qd=self._qd,
-            body_inv_m=bodies.inv_mass,
-            body_inv_I=bodies.inv_inertia,
-            joint_X_p=self._frames[0],
-            joint_X_c=self._frames[1],
-            joint_axis=self._axes,
-            joint_limit_lower=self._limits[0],
-            joint_limit_upper=self._limits[1],
-            joint_target_q=control.joint_target_q,
-            joint_target_qd=control.joint_target_qd,
-            joint_target_ke=self._gains[0],
-            joint_target_kd=self._gains[1],
-            joint_linear_compliance=0.0,
-            joint_angular_compliance=0.0,
-            linear_relaxation=self._relaxations[1],
-            angular_relaxation=self._relaxations[1],
-            dt=dt,
-            deltas=self._deltas,
-            joint_impulse=self._impulses,
-        )
+            newton_kernels.solve_body_joints, self._model.joint_count,
+            body_q=self._q, body_qd=self._qd, body_inv_m=bodies.inv_mass, body_inv_I=bodies.inv_inertia,
+            joint_X_p=self._frames[0], joint_X_c=self._frames[1], joint_axis=self._axes,
+            joint_limit_lower=self._limits[0], joint_limit_upper=self._limits[1],
+            joint_target_q=control.joint_target_q, joint_target_qd=control.joint_target_qd,
+            joint_target_ke=self._gains[0], joint_target_kd=self._gains[1],
+            joint_linear_compliance=0.0, joint_angular_compliance=0.0,
+            linear_relaxation=self._relaxations[1], angular_relaxation=self._relaxations[1], dt=dt,
+            deltas=self._deltas, joint_impulse=self._impulses,
+        )  # fmt: skip
 
     def _bind(self, kernel, dim: int, **arguments) -> Callable:
         """Return a launch of a Newton kernel. Arguments that are not given are the model's arrays of the same names."""

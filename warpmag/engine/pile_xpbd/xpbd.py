@@ -49,13 +49,13 @@ class PileXPBD(newton.solvers.SolverXPBD):
         ``kernels.contacts.solve`` runs ``contact_iterations``; by default Newton's ``iterations``.
         """
         super().__init__(model, **settings)
-        splits = _splits(model, self.body_inv_mass_effective.numpy())
-        self._splits = None
-        if splits.any():
-            self._splits = wp.array(splits, dtype=wp.int32, device=model.device)
+        split_bodies = _find_split_bodies(model, self.body_inv_mass_effective.numpy())
+        self._split_bodies = None
+        if split_bodies.any():
+            self._split_bodies = wp.array(split_bodies, dtype=wp.int32, device=model.device)
             self._entries = wp.zeros((ENTRIES, model.body_count), dtype=wp.int32, device=model.device)
             self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
-            self._split = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
+            self._split_masses = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         self._contact_iterations = contact_iterations or self.iterations
         newton_only = model.particle_count, model.tendon_segment_count, self.enable_restitution
         self._solve = self._joints = self._free_dofs = None
@@ -96,7 +96,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             self._solve,
             view_contacts(self.model, contacts),
             after,
-            None if self._splits is None else self._shares,
+            None if self._split_bodies is None else self._shares,
             iterations=self._contact_iterations,
             relaxation=self.rigid_contact_relaxation,
             dt=dt,
@@ -104,8 +104,8 @@ class PileXPBD(newton.solvers.SolverXPBD):
         launch_move(after, _KINEMATIC, dt)
 
     def _find_shares(self, bodies: BodyView, contacts, dt: float) -> None:
-        if self._splits is not None:
-            buffers, relaxation = (self._splits, self._entries, self._shares), self.rigid_contact_relaxation
+        if self._split_bodies is not None:
+            buffers, relaxation = (self._split_bodies, self._entries, self._shares), self.rigid_contact_relaxation
             launch_find_shares(view_contacts(self.model, contacts), bodies, *buffers, relaxation=relaxation, dt=dt)
 
     def _step_joints(self, state_in, state_out, control, contacts, dt) -> None:
@@ -128,20 +128,20 @@ class PileXPBD(newton.solvers.SolverXPBD):
     @contextlib.contextmanager
     def _splitting(self) -> Iterator[None]:
         """Replace the masses in Newton's contacts by the split masses within the context."""
-        self._whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
+        self._whole_masses = self.body_inv_mass_effective, self.body_inv_inertia_effective
         self.body_inv_mass_effective, self.body_inv_inertia_effective = self._contact_masses()
         try:
             yield
         finally:
-            self.body_inv_mass_effective, self.body_inv_inertia_effective = self._whole
+            self.body_inv_mass_effective, self.body_inv_inertia_effective = self._whole_masses
 
     def _contact_masses(self) -> tuple[wp.array, wp.array]:
         """Return the inverse masses and inertias for contacts, split where bodies are split."""
         whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
-        if self._splits is None:
+        if self._split_bodies is None:
             return whole
-        launch_split_masses(self._shares, whole, self._split)
-        return self._split
+        launch_split_masses(self._shares, whole, self._split_masses)
+        return self._split_masses
 
     def _apply_body_deltas(self, model, state_in, state_out, body_deltas, dt, rigid_contact_inv_weight=None):
         """Apply the impulses of an iteration to the unsplit bodies. Newton's version stops slow bodies."""
@@ -149,7 +149,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
         source, target = (state_in, state_out) if self._body_delta_counter else (state_out, state_in)
         self._body_delta_counter = 1 - self._body_delta_counter
         bodies = view_bodies(model, source)
-        bodies.inv_mass, bodies.inv_inertia = self._whole
+        bodies.inv_mass, bodies.inv_inertia = self._whole_masses
         launch_apply_corrections(bodies, body_deltas, rigid_contact_inv_weight, dt, target.body_q, target.body_qd)
         return target.body_q, target.body_qd
 
@@ -168,7 +168,7 @@ def _free_dofs(model: newton.Model) -> np.ndarray | None:
     return dofs
 
 
-def _splits(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:
+def _find_split_bodies(model: newton.Model, inv_mass: np.ndarray) -> np.ndarray:
     """Return 1 for each body with a mass to split among contacts, else 0, shape [body_count].
 
     If all balls are similar, their masses are not split: two similar balls share each correction equally.

@@ -115,17 +115,8 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     keys = _scene_keys(builder, stage, contents, clock, bodies, shapes_of_magnets, currents)
     for balls in identical_balls:
         _copy_balls(builder, stage, balls, bodies, shapes_of_magnets, magnets)
-    return ImportedScene(
-        opened=stage,
-        identical_balls=identical_balls,
-        builder=builder,
-        clock=clock,
-        magnets=magnets,
-        bodies=bodies,
-        magnet_shapes=shapes_of_magnets,
-        keys=keys,
-        warnings=tuple(map(str, report.warnings)),
-    )
+    warnings = tuple(map(str, report.warnings))
+    return ImportedScene(stage, identical_balls, builder, clock, magnets, bodies, shapes_of_magnets, keys, warnings)
 
 
 def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[str, int]) -> None:

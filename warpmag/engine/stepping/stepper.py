@@ -97,16 +97,10 @@ class Stepper:
         self._control = model.control()
         self._shared = model.state()  # predicted poses, and forces that several substeps share
         self._machine = stepping.StepMachine(
-            _RECORDS,
-            len(solver.buffers),
-            self._device,
-            travel=TRAVEL_LIMIT,
-            shared_travel=_SHARED_TRAVEL_LIMIT,
-            overlap=OVERLAP_LIMIT,
-            growth_margin=_GROWTH_MARGIN,
-            futile_ratio=_FUTILE_RATIO,
-            first_level_substeps=self._min_substeps,
-        )
+            _RECORDS, len(solver.buffers), self._device, first_level_substeps=self._min_substeps,
+            travel=TRAVEL_LIMIT, shared_travel=_SHARED_TRAVEL_LIMIT, overlap=OVERLAP_LIMIT,
+            growth_margin=_GROWTH_MARGIN, futile_ratio=_FUTILE_RATIO,
+        )  # fmt: skip
         self._machine.set_state_arrays(_arrays(self._state), _arrays(self._saved))
         self._arrays = self._machine.arrays
         self._watched = self._machine.make_monitor(sizes.thickness, sizes.reach)
@@ -189,8 +183,7 @@ class Stepper:
 
     def _report(self, record: np.ndarray, timed: bool) -> StepReport:
         """Return the report of a record of the device's log."""
-        peaks = record[stepping.LOG_PEAKS :]
-        ticks = record[stepping.LOG_TICKS :]
+        peaks, ticks = record[stepping.LOG_PEAKS :], record[stepping.LOG_TICKS :]
         return StepReport(
             substeps=int(record[stepping.LOG_SUBSTEPS]),
             attempts=int(record[stepping.LOG_ATTEMPTS]),
