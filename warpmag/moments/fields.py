@@ -49,7 +49,7 @@ def h_field(
     """Return the field H of magnetic moments (Kim and Han 2022, Eq. 1).
 
     Moments with a radius are uniformly magnetized balls. If a ball overlaps the target's ball, the field is averaged
-    over the target. The field excludes a moment's own, and that of a point dipole at the target itself: at a distance
+    over the target. The field excludes a moment's own field, and point dipoles at the target itself: at a distance
     of zero, or of less than about 1e-19 m in float32.
 
     Args:
@@ -65,7 +65,7 @@ def h_field(
         rtol: Largest relative error ‖H − H_exact‖/‖H_exact‖ over all targets. None means 1e-3 with ``fmm``, else
             rounding.
         dtype: ``float32`` or ``float64``.
-        device: Warp device; None means that of the arrays, or Warp's default.
+        device: Warp device; None means the device of the arrays, or Warp's default.
 
     Returns:
         H [A/m], shape [t, 3], as NumPy array, or as Warp array of vectors if ``positions`` is a Warp array.
@@ -132,7 +132,7 @@ def wrench(
         method: As in :func:`h_field`.
         rtol: Largest relative error of forces and of torques, see :func:`h_field`.
         dtype: ``float32`` or ``float64``.
-        device: Warp device; None means that of the arrays, or Warp's default.
+        device: Warp device; None means the device of the arrays, or Warp's default.
 
     Returns:
         Forces [N] and torques about each moment's position [N·m], each of shape [n, 3], NumPy or Warp as ``positions``.

@@ -21,7 +21,7 @@ _DEGREES = (
 )  # fmt: skip
 """Relative error, degree of the expansions, and moments of a leaf box. The largest measured errors of fields and forces
 are a third to four fifths of the relative error. The cases are random and aligned moments in boxes and balls, in
-equilibrium and near saturation, and in a shell, a chain and two distant clumps."""
+equilibrium and near saturation. Others are moments in a shell, a chain and two distant clumps."""
 DEFAULT_RTOL = 1e-3
 """Relative error of the method ``fmm`` if the caller gives none."""
 LEAST_RTOL = _DEGREES[-1][0]
@@ -174,7 +174,7 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
 
     Moments of a body exert no force on each other, but expansions cannot distinguish bodies. The moments of a movable
     body must therefore be in neighboring boxes, because pairs of neighboring boxes are summed one by one. ``extent`` is
-    the largest distance between two of them [m], None if unknown; ``rtol`` is that of the magnetization.
+    the largest distance between two of them [m], None if unknown; ``rtol`` is the error of the magnetization.
     """
     check_token("method", method, METHODS)
     share_body, rtol = layout.movable & ~layout.single, _FIELD_SHARE * rtol

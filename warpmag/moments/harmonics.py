@@ -1,9 +1,9 @@
 """Real solid harmonics and their translations in float64, for the expansions of the fast multipole method.
 
 Harmonics are Schmidt semi-normalized: at a unit vector the squares of one degree sum to 1, so that coefficients stay
-near 1 up to high degrees. They satisfy
+near 1 up to high degrees. With i = n² + n + m, m > 0 for cos mφ and m < 0 for sin |m|φ, they satisfy
 
-    1/|y − x| = Σ R_i(x) I_i(y) for |x| < |y|,    i = n² + n + m, m > 0 for cos mφ, m < 0 for sin |m|φ.
+    1/|y − x| = Σ R_i(x) I_i(y) for |x| < |y|.
 
 There are K = (degree + 1)² harmonics. Each is even or odd under x → −x, y → −y and z → −z (``parity``). If two offsets
 differ in signs only, so do the entries of their translations.

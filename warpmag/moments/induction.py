@@ -147,7 +147,7 @@ def solve_induction(
         max_evaluations: Field evaluations after which the solve ends unconverged.
         initial: Magnetizations to start from [A/m], shape [n, 3].
         dtype: ``float32`` or ``float64``.
-        device: Warp device; None means that of the arrays, or Warp's default.
+        device: Warp device; None means the device of the arrays, or Warp's default.
         sources: Deprecated name of ``permanent``.
 
     Returns:
@@ -312,7 +312,7 @@ def _check_strength(dtype, strongest: float, saturation):
 def _check_finite(dtype, count: int, arguments: dict, **results):
     """Raise ``InputError`` if one of the first ``count`` rows of a result is not finite.
 
-    The message names the arguments with unusually large or small values, or all arguments if there are none.
+    The message names the arguments with unusually large or small values, or else all arguments.
     """
     rows = {name: first_not_finite(array, count) for name, array in results.items()}
     failures = [f"the {name} of ball {row}" for name, row in rows.items() if row is not None]

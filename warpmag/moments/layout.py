@@ -99,8 +99,8 @@ def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
 class MomentMaterial:
     """Magnetic material of n moments. The values of permanent moments are ignored.
 
-    A curve is one of ``magnets.CURVES``, or a measured ``MagnetizationCurve``, which has its own saturation and
-    susceptibility. A tuple or list gives each moment its own curve. ``magnets.LINEAR_CURVE`` is the response of a
+    A curve is one of ``magnets.CURVES``, or a measured ``MagnetizationCurve``, which also determines saturation and
+    susceptibility. A tuple or list holds one curve for each moment. ``magnets.LINEAR_CURVE`` is the response of a
     permanent magnet of recoil permeability 1 + χ.
     """
 

@@ -1,12 +1,12 @@
 """Ranks: processes started by ``mpirun`` that share the sums over pairs of one simulation.
 
-Each rank holds all moments, and on a host with GPUs uses one of them. It computes its share of the list of pairs and
-then receives the sums of the other ranks. Every rank does all other work itself. The list of pairs is that of a single
-process, so that results are bitwise the same. A single process imports neither MPI nor NCCL.
+Each rank holds all moments, and uses one GPU if the host has GPUs. It computes its share of the list of pairs and
+then receives the sums of the other ranks. Every rank does all other work itself. The list of pairs does not depend on
+the number of ranks, so that results are bitwise the same. A single process imports neither MPI nor NCCL.
 
-Sums are merged as integers: each rank stores its own sums and zeros elsewhere, and adding zeros to the bits of a number
-keeps them in any order. ``mpi4py`` merges arrays of CPUs and across hosts. NVIDIA's NCCL merges arrays of GPUs. Python
-calls the NCCL library directly, so that a CUDA graph captures it between kernels.
+Sums are merged as integers. Each rank stores its own sums, and zeros elsewhere. Adding zeros to the bits of a number
+does not change them, in any order. ``mpi4py`` merges arrays of CPUs and across hosts. NVIDIA's NCCL merges arrays of
+GPUs. Python calls the NCCL library directly, so that a CUDA graph captures it between kernels.
 
 An error of one rank is exchanged before any rank waits for sums: for the arguments of calls, for work that the first
 rank does for all, and at the end of a sweep. All ranks then raise the same message.
@@ -35,7 +35,7 @@ from warpmag.errors import InputError, SimulationError, extra, one_line
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")
 """Environment variables of launchers with the number of processes."""
 _ABORT_DELAY = 5.0
-"""Time [s] for which a failed rank waits for the other ranks to fail, too, before it aborts them."""
+"""Time [s] that a failed rank waits for the others to fail, too, before it aborts them."""
 _ID_BYTES, _INT32, _SUM = 128, 2, 0
 """NCCL's size of a unique identifier [bytes], type ``ncclInt32`` and operation ``ncclSum`` (``nccl.h``)."""
 
@@ -190,7 +190,7 @@ class Ranks:
     Attributes:
         size: Number of processes.
         rank: Number of this process, from 0.
-        local_rank: Number of this process among those of its host, from 0.
+        local_rank: Number of this process on its host, from 0.
     """
 
     def __init__(self, mpi):

@@ -62,14 +62,14 @@ class SolverSettings:
 
 
 class MomentSystem:
-    """Moments with buffers, allocated once, in which magnetic equilibrium and forces are computed repeatedly.
+    """Moments of a simulation, with their magnetic equilibrium and their forces, in buffers that are allocated once.
 
-    Moments are ordered by world, and within a world the inducible ones come first. Moments of different worlds do not
-    interact. :meth:`solve` and :meth:`apply_forces` only launch kernels. They neither allocate nor wait for the device,
-    so that a graph can capture them. Results stay on the device.
+    Moments are ordered by world, inducible moments of a world before permanent moments. Moments of different worlds do
+    not interact. :meth:`solve` and :meth:`apply_forces` only launch kernels. They neither allocate nor wait for the
+    device, so that a graph can capture them. Results stay on the device.
 
     Args:
-        radii: Radii of the moments' balls [m], shape [n]. The volume of a moment is that of its ball.
+        radii: Radii of the moments' balls [m], shape [n]. A moment has the volume of its ball.
         worlds: World of each moment, non-decreasing from 0, shape [n]; None means one world.
         permanent: True for a permanent moment, shape [n]; None means that all are inducible.
         bodies: Body of each moment, shape [n]; moments of one body exert no force on each other. None means that each
@@ -82,7 +82,7 @@ class MomentSystem:
         settings: Settings of the solve and of the forces.
         couplings: First moment of each body that consists of cells, and the correction of the pair sums between the
             cells (``shapes.demagnetization.Coupling``).
-        sources: Coils and field maps; their bodies are numbered like those of the moments.
+        sources: Coils and field maps; their bodies have the same numbers as in ``bodies``.
         solids: Permanent bodies with a closed-form near field, ordered by world.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
@@ -91,7 +91,7 @@ class MomentSystem:
         settings: As given.
         device, dtype: Warp device and Warp scalar type.
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
-        moments: Moments [A·m²], shape [n]. The caller writes the permanent ones, :meth:`solve` the inducible ones.
+        moments: Moments [A·m²], shape [n]. The caller writes permanent moments, :meth:`solve` inducible moments.
         external_field: Applied field [A/m], shape [n]; the caller may change it.
         rotations: Rotation of each body of ``couplings`` from its frame to the world's (x, y, z, w), shape [bodies];
             written by the caller before :meth:`solve`. None without ``couplings``.
@@ -208,7 +208,7 @@ class MomentSystem:
             self._acting_field = self.source_interaction.acting
 
     def _make_field(self, layout: MomentLayout, near: bool):
-        """Prepare the field of permanent moments at inducible ones, and that of inducible ones at each other."""
+        """Prepare the fields of permanent and of inducible moments at inducible moments."""
         self.worlds, self.world_ranges = layout.worlds, layout.ranges()
         ranges, packed, state = np.reshape(self.world_ranges, (-1, 3)), self._packed, self._induction
         of_permanent, of_inducible = ranges[:, [0, 1, 1, 2]], ranges[:, [0, 1, 0, 1]]

@@ -5,7 +5,7 @@ with the potential U = 1/d. Overlapping balls of radii a and b have
 
     U = 1/d + (a+b−d)⁴ (5a² − 20ab + 5b² − 4(a+b)d − d²) / (160 a³b³d),
 
-and a ball inside a larger one of radius A has g1 = −1/A³, g2 = 0. The factors are g1 = U'/d and g2 = g1'/d.
+and a ball inside a larger ball of radius A has g1 = −1/A³, g2 = 0. The factors are g1 = U'/d and g2 = g1'/d.
 ``kernels/pairs/pair_law.h`` evaluates the same law on a device.
 """
 

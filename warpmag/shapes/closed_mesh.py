@@ -49,7 +49,7 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.nd
     The function counts the triangles that a ray along +z crosses. A ray through an edge or a vertex counts exactly
     once: the side of an edge is computed from its end points in the order of their indices, and is thus the same for
     both triangles.
-    Triangles are sorted into rectangular columns along z, so that a point tests only the triangles of its own column.
+    Triangles are sorted into rectangular columns along z, so that a point tests only the triangles of its column.
     """
     corners = points[triangles]
     flat = corners[:, :, :2]

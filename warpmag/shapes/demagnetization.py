@@ -11,8 +11,8 @@ and the tensors of its filled subcells are added. Without subcells, a sphere of 
 moment 10 % too large.
 
 The sums over all pairs treat each cell as a ball (``kernels/pairs/pair_law.py``). A :class:`Coupling` holds the
-correction: for cells nearer than :data:`EXACT_REACH`, the exact tensor minus that of the balls. For a cell itself,
-the 1/3 that the magnetization curve of a ball contains is subtracted instead.
+correction: for cells nearer than :data:`EXACT_REACH`, the exact tensor minus the tensor of two balls. For a cell
+itself, the 1/3 that the magnetization curve of a ball contains is subtracted instead.
 """
 
 from dataclasses import dataclass
@@ -102,7 +102,7 @@ class Coupling:
 
     @cached_property
     def dense(self) -> np.ndarray:
-        """Tensors between all moments [1/m³]: the corrected ones, then those of the pair sums, shape [2, n, n, 6].
+        """Tensors between all moments [1/m³]: corrected, then uncorrected, shape [2, n, n, 6].
 
         Valid for uniform common fields only: with linear fields the tensors are not symmetric.
         """
@@ -173,7 +173,7 @@ def _quotient(a, b):
 def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) -> Coupling:
     """Return the correction of the pair sums between the moments of one body, up to ``reach`` longest sides of a cell.
 
-    ``radii`` are those of the balls in the pair sums [m], shape [n]. Cells of different grids are not corrected.
+    ``radii`` are the radii of the balls in the pair sums [m], shape [n]. Cells of different grids are not corrected.
     """
     x, volumes = lattice.positions, lattice.volumes
     entries, tensors = [np.empty((2, 0), int)], [np.empty((0, 6))]
@@ -189,7 +189,7 @@ def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) ->
 
 
 def _pair_law(r, a, b, same):
-    """Return T of the pair sums' field H = T m [1/m³], shape [n, 6]; for a moment itself that of a ball, H = −M/3."""
+    """Return T of the pair sums' field H = T m [1/m³], shape [n, 6]; for a moment itself H = −M/3."""
     g1, g2 = radial_factors(np.linalg.norm(r, axis=1), a, b)
     g1, g2 = np.where(same, -1.0 / a**3, g1), np.where(same, 0.0, g2)
     products = r[:, COMPONENTS[0]] * r[:, COMPONENTS[1]]
@@ -254,7 +254,7 @@ def _far_corrections(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarra
     are set to 0. With them, the operator of thin plates with flat cells would not stay positive.
     """
     total = np.zeros((6, len(points)))
-    if np.abs(spreads).max() < 1e-9 * reach * reach:  # cubes have none
+    if np.abs(spreads).max() < 1e-9 * reach * reach:  # cubes have no quadrupole
         return total.T
     pairs = np.stack(_near_pairs(points, _FAR_REACH * reach))
     step = _BATCH // 64

@@ -7,8 +7,8 @@ curved surface has neither steps nor slivers. The filled part is found from a fi
 a body overlap, each test point counts once.
 
 The accuracy determines :data:`AUTOMATIC_COUNT`. The table lists errors of a uniformly magnetized cube of side L as n³
-point dipoles: the relative L2 error of the field over all points at distance d from the surface, and the error of the
-force on an iron ball of radius L/8 in contact (5 mm at a cube of 40 mm). It is the same for linear and saturated balls.
+point dipoles. The field's error is a relative L2 norm over all points at distance d from the surface. The force acts on
+an iron ball of radius L/8 in contact (5 mm at a cube of 40 mm), with the same error for linear and saturated balls.
 
 ====  =====  ==============  ============  ==============  ============
 n     n³     field, d=0.2 L  field, d=L/8  force, d=0.2 L  force, d=L/8
@@ -197,7 +197,7 @@ def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
 
 
 def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1, *, together: bool = False) -> Lattice:
-    """Fill a body with moments. Their volume is exact, or to about 1 %, that of the test grid, where shapes overlap.
+    """Fill a body with moments. Their total volume is exact, or to about 1 % if shapes overlap.
 
     Args:
         solids: Shapes of one body, posed in its frame. Overlap belongs to the earlier shape.

@@ -7,13 +7,13 @@ and the moment is ∫ σ x dA. The charge σ is taken as constant on facets (``f
 closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the cells is computed by
 conjugate gradients.
 
-Let P be the polarizability of the cells, Q that of the surface, and N the operator of the cells. The correction
-replaces N by N − E C Eᵀ, where C = P⁻¹ − Q⁻¹ and the columns of E are uniform fields. It adds a field of C times the
-moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is positive,
-the operator stays positive. A change of the cells' own tensors would not ensure that.
+Let P be the polarizability of the cells, Q the polarizability of the surface, and N the operator of the cells. The
+correction replaces N by N − E C Eᵀ, where C = P⁻¹ − Q⁻¹ and the columns of E are uniform fields. It adds a field of C
+times the moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is
+positive, the operator stays positive. A change of the cells' own tensors would not ensure that.
 
 The same holds for more fields. The columns of E are gradients of harmonic polynomials ψ_k, and P and Q are matrices,
-Q_kl = ∫ σ_k ψ_l dA. Three uniform fields and five linear ones are used. A nearby magnet excites mostly these: without
+Q_kl = ∫ σ_k ψ_l dA. Three uniform and five linear fields are used. A nearby magnet excites mostly these: without
 the linear fields, the force on a plate below a magnet is 2 to 4 % too small.
 """
 
@@ -29,11 +29,11 @@ from warpmag.shapes.lattice import Lattice
 from warpmag.shapes.solids import Solid
 
 FIELD_COUNT = 8
-"""Largest number of fields that the cells of a body have in common: three uniform and five linear ones."""
+"""Largest number of fields that the cells of a body have in common: three uniform and five linear fields."""
 _LINEAR_FIELD_CELLS = 65, 2500
-"""Smallest and largest number of cells of bodies that get the linear fields, too. Bodies of fewer cells may respond as
-wholes (``kernels.induction.body_response``), which needs symmetric tensors; with linear fields they are not symmetric.
-Bodies of more cells need little correction, and its time is proportional to their number."""
+"""Smallest and largest number of cells of bodies that get the linear fields, too. Bodies of fewer cells may respond
+collectively (``kernels.induction.body_response``), which needs symmetric tensors; with linear fields they are not
+symmetric. Bodies of more cells need little correction, and its time is proportional to their number."""
 FACETS = 600
 """Approximate number of facets of a body. Extrapolation from it and a quarter of it gives a cube's moment to 0.3 %."""
 _FACETS_PER_SHAPE = 150
@@ -43,7 +43,7 @@ MOST_FACETS = 1500
 MOST_MOMENTS = 6200
 """Largest number of moments of a corrected body: arrays over its pairs take 0.6 GB."""
 _POLARIZABILITY_RATIOS = 0.9, 4.0
-"""Smallest and largest plausible ratio of the surface's polarizability to that of the cells. Ratios outside come from
+"""Smallest and largest plausible ratio of the polarizabilities of surface and cells. Ratios outside come from
 nearly touching surfaces, which facets do not resolve."""
 _NEAR_DISTANCE = 6.0
 """Distance up to which a facet's potential is integrated, in distances from its center to its farthest corner."""
@@ -60,8 +60,8 @@ _CHUNK = 1 << 18
 def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
     """Return the coupling with a matrix of the common fields that gives the body the response of its surface.
 
-    The coupling is returned unchanged if the body has separate parts, or too many facets or cells. So it is if shapes
-    coincide, because their facets then coincide, too.
+    The coupling is returned unchanged if the body has separate parts, or too many facets or cells, or if facets of
+    different shapes coincide.
     """
     if len(lattice.volumes) > MOST_MOMENTS or not _is_connected(coupling):
         return coupling
@@ -71,7 +71,7 @@ def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence
         return coupling
     surface_matrix = extrapolated_polarizability(coupling, coarse, fine)
     cell_matrix = cell_polarizability(coupling, lattice)
-    for count in range(len(cell_matrix), 0, -FIELD_COUNT + 3):  # with linear fields if any, else uniform ones only
+    for count in range(len(cell_matrix), 0, -FIELD_COUNT + 3):  # all fields, else the uniform fields
         cells, surface = cell_matrix[:count, :count], surface_matrix[:count, :count]
         ratios = np.linalg.eigvals(np.linalg.solve(surface, cells)).real
         if ratios.min() > 1.0 / _POLARIZABILITY_RATIOS[1] and ratios.max() < 1.0 / _POLARIZABILITY_RATIOS[0]:

@@ -21,7 +21,7 @@ from warpmag.terminal import collection_paused
 _SUFFIXES = {"body": "", "joint": "_free_joint", "articulation": "_articulation", "shape": "_shape"}
 """Label suffixes of the objects of a body. Newton's ``add_body`` appends the first three, warpmag the last."""
 _NOT_COPIED = ("body_q", "body_qd", "body_world", "body_label", "shape_body", "shape_world", "shape_label")
-"""Lists of a builder whose entries differ between copies of a ball."""
+"""Lists of a builder that differ between copies of a ball."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def add_balls(
 ) -> Balls:
     """Add many free balls, each one a magnet.
 
-    The model equals that of ``add_body``, ``add_shape_sphere`` and :func:`add_inducible` or :func:`add_permanent` for
+    The result equals calls of ``add_body``, ``add_shape_sphere`` and :func:`add_inducible` or :func:`add_permanent` for
     each ball, and takes a few microseconds per ball. ``builder.default_shape_cfg`` sets all other shape properties.
 
     Args:

@@ -109,14 +109,14 @@ def add_permanent(
 
 
 def in_shape_frame(magnet: Magnet, rotation: wp.quat) -> Magnet:
-    """Return a magnet in the frame of a shape; ``rotation`` is from this frame to that of the magnet's body or prim."""
+    """Return a magnet in the frame of a shape, with the rotation from there to the frame of its body or prim."""
     if not np.any(magnet.magnetization):
         return magnet
     return replace(magnet, magnetization=tuple(wp.quat_rotate_inv(rotation, wp.vec3(*magnet.magnetization))))
 
 
 def axis_rotation(axis: str | None) -> Any:
-    """Return the rotation from a shape's frame to that of its prim with an axis token, None for other shapes.
+    """Return the rotation from a shape's frame to its prim's; ``axis`` is the prim's token, None for shapes without.
 
     Newton's capsules, cylinders and cones have their axis along z.
     """

@@ -60,7 +60,7 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
 
 
 def _group(bodies: np.ndarray, magnet_of: np.ndarray, magnets: list[Magnet]) -> list[list[int]]:
-    """Return groups of rows: the shapes of one body with the same magnet. A shape without a body is its own group.
+    """Return groups of rows: the shapes of one body with the same magnet. A shape without a body is a group.
 
     ``bodies`` and ``magnet_of`` hold the body and the index of the magnet of each shape, shape [n].
     """

@@ -251,7 +251,7 @@ class Magnetics:
             flags: Kinds of changes, as for Newton's solvers. Nothing happens without ``SHAPE_PROPERTIES``.
 
         Raises:
-            InputError: A value is out of range, the contact model has tables for the old value, or another attribute
+            InputError: A value is out of range, or the contact model has tables for the old value. Or another attribute
                 was changed, such as the kind, the curve or the moment spacing of a magnet.
         """
         if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
@@ -309,7 +309,7 @@ class Magnetics:
                 model's device; its values are not checked.
 
         Raises:
-            InputError: No coil matches, the number of values differs from that of coils, or a value is not finite.
+            InputError: No coil matches, the numbers of values and coils differ, or a value is not finite.
         """
         self._sources.set_strength("set_current", coil, ampere_turns)
 

@@ -77,7 +77,7 @@ class SensorMagnetometer:
         """Read the sensors at the poses of ``state``; capturable in a graph.
 
         Args:
-            state: State with poses ``body_q``. The magnetizations are those of the last :meth:`Magnetics.apply`.
+            state: State with poses ``body_q``. The last :meth:`Magnetics.apply` has set the magnetizations.
         """
         find_sites(state.body_q, self._sites, self._probe.points)
         self._probe.measure()

@@ -18,7 +18,7 @@ from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import ShapeMagnets
 
 _COMPARED = {row.field: row for row in MAGNET_ATTRIBUTES if row.model_change != "substep"}
-"""Attributes whose changes are detected, the fields of ``ShapeMagnets``."""
+"""Attributes with changes that are detected, the fields of ``ShapeMagnets``."""
 _MATERIAL = [name for name, row in _COMPARED.items() if row.model_change == "notified"]
 """Attributes that may change after a notification; the others determine the moments and their solver."""
 _MODEL_ARRAYS = (
@@ -44,7 +44,7 @@ class ModelValues:
     """
 
     def __init__(self, model: newton.Model, *, measured: bool):
-        """Copy the values of ``model``; ``measured`` means that one measured curve replaces those of all magnets."""
+        """Copy the values of ``model``; ``measured`` means that one measured curve replaces all curves."""
         self._model, self._measured = model, measured
         self.now, self.then = ShapeMagnets(), ShapeMagnets()
         for name in _COMPARED:

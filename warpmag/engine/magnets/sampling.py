@@ -48,7 +48,7 @@ class BodyLattice:
     volumes: np.ndarray  # [m³], shape [n]
     radii: np.ndarray  # of the balls over which the fields of moments are averaged [m], shape [n]
     counts: np.ndarray  # number of moments of each shape
-    coupling: Coupling | None = None  # tensors between inducible cells minus those of balls
+    coupling: Coupling | None = None  # tensors between inducible cells, minus the pair law of balls
     solids: tuple[ClosedForm, ...] = ()  # closed forms of the near field of a permanent magnet
 
 

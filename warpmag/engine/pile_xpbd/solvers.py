@@ -74,7 +74,7 @@ SOLVERS = {
 }
 """Rigid-body solvers by name. The first is the default, and piles are tested with it."""
 MAXIMAL = tuple(name for name, kind in SOLVERS.items() if kind.maximal)
-"""Names of the solvers whose joints need no articulation."""
+"""Names of the solvers in maximal coordinates."""
 
 
 def check_solver(solver: str) -> None:

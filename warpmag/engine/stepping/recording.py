@@ -96,7 +96,7 @@ class Recorder:
     def add_frame(self, time: float, state) -> None:
         """Record a frame ``time`` [s] after the start. With a GPU the next :meth:`write` writes it, while steps run.
 
-        The moments are those of the last substep. Before the first step they are solved, without effect on later steps.
+        The last substep has computed the moments. Before the first step they are solved, without effect on later steps.
         """
         self.write()
         if time > 0.0:

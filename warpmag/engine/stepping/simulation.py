@@ -219,14 +219,14 @@ class Simulation:
         """The present state; waits for the device.
 
         Raises:
-            SimulationError: A step led to a state that is not finite. The state is that of the last accepted step.
+            SimulationError: A step led to a state that is not finite. The last accepted state remains.
         """
         self._read_reports()
         return self._stepper.state
 
     @property
     def control(self) -> newton.Control:
-        """Forces and targets of joints, initially those of the scene.
+        """Forces and targets of joints, initially from the scene.
 
         Change its arrays between steps, by ``simulation.control.joint_target_q.assign(...)`` or by kernels; captured
         steps read them, too. Assigning another control of this model captures the step again.
@@ -248,7 +248,7 @@ class Simulation:
 
     @property
     def statistics(self) -> Statistics:
-        """Statistics of the run so far; :meth:`finish` adds those of the end. Waits for the device."""
+        """Statistics of the run so far; :meth:`finish` adds the final values. Waits for the device."""
         self._read_reports()
         return self._statistics
 
@@ -332,7 +332,7 @@ class Simulation:
         survive an interruption.
 
         Args:
-            frames: Output frames after the first; by default those of the stage, else one second.
+            frames: Output frames after the first; by default the whole stage, else one second.
             output: USD file to write; only for a scene from a stage.
             copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always
                 copied.
@@ -400,7 +400,7 @@ class Simulation:
             statistics.wall_seconds = before + time.perf_counter() - began
 
     def frames_of(self, frames: int | None) -> int:
-        """Return the number of frames of a run, by default that of the scene.
+        """Return the number of frames of a run, by default of the scene.
 
         Raises:
             InputError: ``frames`` is not a positive whole number.
@@ -425,7 +425,7 @@ class Simulation:
         return round(frame / (self.frame_rate * self.step_size))
 
     def finish(self) -> Statistics:
-        """Return the statistics, complete with those of the final state; waits for the device."""
+        """Return the statistics, with the values of the final state; waits for the device."""
         statistics = self.statistics
         statistics.field_error = self._magnetics.field_error()
         statistics.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)

@@ -23,10 +23,10 @@ class Statistics:
     Attributes:
         magnets: Movable bodies with magnets.
         steps: Number of steps.
-        substeps: Number of substeps, without those of rejected attempts.
+        substeps: Number of substeps, without rejected attempts.
         repeated: Number of rejected attempts at a step.
-        capped: Number of steps in which a body moved farther than allowed even in the shortest substep.
-        regrown: Number of steps in which contact or pair buffers were enlarged.
+        capped: Number of steps where a body moved farther than allowed even in the shortest substep.
+        regrown: Number of steps that enlarged contact or pair buffers.
         unconverged: Number of substeps without convergence of the induction.
         error: Largest magnetization error of any substep.
         field_error: Relative error of the last field by the fast multipole method at 256 random magnets, compared with

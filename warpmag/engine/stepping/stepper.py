@@ -5,9 +5,9 @@ Substeps shorter than the maximum share forces: several use one evaluation.
 
 A step is attempted and then checked. If a body moved too far in a substep, or contacts became too deep, the state is
 restored and the step repeated with shorter substeps. The device makes these decisions (``kernels.rigid.stepping``), so
-that a step is one graph that the host launches without waiting. The host reads the reports of several steps at once. If
-a buffer overflows or the state is not finite, the device halts, and later steps do nothing until the host enlarges the
-buffer or raises an error.
+that a step is one graph that the host launches without waiting. The host reads the reports of several steps at once.
+The device halts if a buffer overflows or the state is not finite. Later steps then do nothing, until the host enlarges
+the buffer or raises an error.
 
 Steps that cannot be captured in a graph are launched from Python by the same code.
 """
@@ -41,7 +41,7 @@ OVERLAP_LIMIT = 0.008
 _GROWTH_MARGIN = 0.8
 """The substep doubles when the predicted motion stays below this fraction of the limit."""
 _FUTILE_RATIO = 0.8
-"""If halved substeps leave more than this fraction of a penetration, even shorter ones are not tried."""
+"""If halved substeps leave more than this fraction of a penetration, shorter substeps are not tried."""
 _RECORDS = 64
 """Largest number of steps without :meth:`Stepper.read_reports`. On a CPU the host reads them after each step."""
 
@@ -157,7 +157,7 @@ class Stepper:
         """Wait for all steps so far, and yield a report of each step since the last call.
 
         Buffers that overflowed are enlarged. A step that leads to a state that is not finite raises
-        :class:`SimulationError`; the state is that of the last accepted step.
+        :class:`SimulationError`; the last accepted state remains.
         """
         while self.steps > self._reported:
             status = self._read("status")
@@ -252,7 +252,7 @@ class Stepper:
         return numbers | snapshot_views(self._carried())
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
-        """Continue from the arrays that :meth:`save` returned; raise :class:`InputError` for those of another model."""
+        """Continue from the arrays that :meth:`save` returned; another model's arrays raise :class:`InputError`."""
         self._solver.set_limits(saved["buffers"])
         self._prepare()
         restore_snapshot(self._carried(), saved)
@@ -269,8 +269,8 @@ class Stepper:
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
         """Find the contacts of the present state; call :meth:`read_reports` first.
 
-        Return the deepest penetration over the thickness of the thinner body, the deepest penetration [m], and the
-        number of contacts deeper than ``overlap_threshold`` over the thickness.
+        Return the deepest penetration, over the thickness of the thinner body and in meters, and the number of contacts
+        deeper than ``overlap_threshold`` over the thickness.
         """
         a = self._arrays
         while True:
