@@ -112,23 +112,18 @@ class ShapeSampler:
         """Return the surfaces of separate boxes and cylinders, in the frame of the body; empty for other shapes."""
         kinds, surfaces = newton.GeoType, []
         for shape, solid in zip(shapes, solids, strict=True):
-            kind, scale = self._types[shape], self._scales[shape]
-            if kind not in (kinds.BOX, kinds.CYLINDER) or any(
-                boxes_meet(solid, other) for other in solids[: len(surfaces)]
-            ):
+            kind, scale, earlier = self._types[shape], self._scales[shape], solids[: len(surfaces)]
+            if kind not in (kinds.BOX, kinds.CYLINDER) or any(boxes_meet(solid, other) for other in earlier):
                 return []
             surface = polyhedra.box(scale) if kind == kinds.BOX else polyhedra.cylinder(scale[0], scale[1])
             surfaces.append(surface.posed(solid.position, solid.rotation))
         return surfaces
 
-    def _sample_closed_forms(
-        self, shapes: list[int], solids: list[lattice.Solid], surfaces: list[Polyhedron]
-    ) -> BodyLattice:
+    def _sample_closed_forms(self, shapes: list[int], solids, surfaces: list[Polyhedron]) -> BodyLattice:
         """Return the moments of permanent boxes and cylinders, with closed forms of their near fields."""
         positions, volumes, radii, parts, first = [], [], [], [], 0
         for shape, solid, surface in zip(shapes, solids, surfaces, strict=True):
-            scale = self._scales[shape]
-            box = self._types[shape] == newton.GeoType.BOX
+            scale, box = self._scales[shape], self._types[shape] == newton.GeoType.BOX
             moments = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
             positions.append(solid.to_body(moments.places))
             volumes.append(moments.volumes)

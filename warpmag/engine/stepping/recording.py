@@ -67,7 +67,7 @@ class Recorder:
                 self._writer = CacheWriter(scene.stage, output, *prims, instancers=scene.swarms, **writer_options)
 
     def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
-        """Continue the run at the output, of ``frames`` and ``steps`` of ``step_size`` [s].
+        """Continue the run at the output; the whole run has ``frames``, and ``steps`` of ``step_size`` [s].
 
         Return true if there was a run, and true if it is complete. A run that cannot be resumed raises
         :class:`InputError`.
