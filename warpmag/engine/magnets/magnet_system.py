@@ -13,19 +13,12 @@ KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 
 def make_system(
-    model: newton.Model,
-    magnets: list[BodyMagnet],
-    settings: MagneticSettings,
-    *,
-    curve,
-    sources,
-    method,
-    max_evaluations,
+    model: newton.Model, magnets: list[BodyMagnet], settings: MagneticSettings, *, curve, sources, **options
 ) -> tuple[MomentSystem, list[int], list[int]]:
     """Return the system of the moments of all magnets of a model, and the bodies of its couplings and of its solids.
 
-    ``curve`` replaces the curves of all inducible magnets; None keeps them. :class:`MomentSystem` and
-    :class:`SolverSettings` describe the other arguments.
+    ``curve`` replaces the curves of all inducible magnets; None keeps them. See :class:`MomentSystem` for
+    ``sources``, and :class:`SolverSettings` for further ``options``.
     """
     counts = [len(magnet.lattice.volumes) for magnet in magnets]
 
@@ -61,7 +54,7 @@ def make_system(
         ),
         external_field=settings.external_field,
         settings=SolverSettings(
-            settings.force, settings.dynamics, settings.contact_model, method, settings.rtol, max_evaluations
+            settings.force, settings.dynamics, settings.contact_model, rtol=settings.rtol, **options
         ),
         couplings=[(k, magnet.lattice.coupling) for k, magnet in coupled],
         solids=[solid for _, solid in solids],
