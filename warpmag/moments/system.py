@@ -71,9 +71,9 @@ class MomentSystem:
     Args:
         radii: Radii of the moments' balls [m], shape [n]. A moment has the volume of its ball.
         worlds: World of each moment, non-decreasing from 0, shape [n]; None means one world.
-        permanent: True for a permanent moment, shape [n]; None means that all are inducible.
+        permanent: True for a permanent moment, shape [n]; None means that all moments are inducible.
         bodies: Body of each moment, shape [n]; moments of one body exert no force on each other. None means that each
-            is a body.
+            moment is a body.
         movable: True for a moment that needs a force, shape [n]; None means all.
         body_extent: Largest distance [m] between two moments of a movable body. The method ``fmm`` needs it if such a
             body has several moments, because it sums their pairs one by one. None means unknown.
@@ -108,8 +108,8 @@ class MomentSystem:
         is_fast: True if the fast multipole method sums the pairs.
         worlds: World of each moment, NumPy, shape [n].
         world_ranges: (First moment, first permanent moment, end) of each world.
-        h: Field at the inducible moments [A/m], without a moment's own, with the bias, shape [n]. The dynamics
-            ``theta`` ends with M = f(H) in this field.
+        h: Field at the inducible moments [A/m], without a moment's own field, with the bias, shape [n]. The
+            dynamics ``theta`` ends with M = f(H) in this field.
         forces: Forces [N] on movable moments, shape [n], written by :meth:`apply_forces`.
         torques: Torques about each moment's position [N·m], shape [n], written by :meth:`apply_forces`; 0 for an
             inducible ball of a single moment, unless ``single_torque``.
