@@ -40,9 +40,9 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         if self._search is None:
             super().__init__(model.shape_world, shape_flags=model.shape_flags, sort_type="auto", device=model.device)
             return
-        a = self._search.arrays
-        a.kind = wp.full(model.shape_count, len(PARTNERS), dtype=int, device=model.device)
-        a.scale, a.margin, a.gap = model.shape_scale, model.shape_margin, model.shape_gap
+        arrays = self._search.arrays
+        arrays.kind = wp.full(model.shape_count, len(PARTNERS), dtype=int, device=model.device)
+        arrays.scale, arrays.margin, arrays.gap = model.shape_scale, model.shape_margin, model.shape_gap
 
     def write_contacts(self, pipeline: newton.CollisionPipeline, contacts: newton.Contacts) -> None:
         """Also write the contacts of balls to the buffer of the pipeline in every later :meth:`launch`."""
@@ -50,11 +50,11 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
             return
         types = self._model.shape_type.numpy()
         kinds = np.select([types == kind for kind in _TYPES], np.arange(len(PARTNERS)), len(PARTNERS))
-        a = self._search.arrays
-        a.kind.assign(kinds.astype(np.int32))
+        arrays = self._search.arrays
+        arrays.kind.assign(kinds.astype(np.int32))
         self.leaves_pairs = self._may_leave_pairs(kinds)
-        a.placement, a.frame = self._model.shape_transform, pipeline.geom_transform
-        a.contacts = view_contacts(self._model, contacts)
+        arrays.placement, arrays.frame = self._model.shape_transform, pipeline.geom_transform
+        arrays.contacts = view_contacts(self._model, contacts)
 
     def _may_leave_pairs(self, kinds: np.ndarray) -> bool:
         """Return true if a moving shape is not a ball, or if Newton has to find contacts of balls with some shape."""
@@ -87,11 +87,11 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
                 **options,
             )
             return
-        a = self._search.arrays
-        a.lower, a.upper, a.displacement = shape_lower, shape_upper, options.get("shape_displacement")
-        a.group, a.world = shape_collision_group, shape_world
-        a.body, a.body_flags = options["shape_body"], options["body_flags"]
-        a.excluded, a.excluded_count = options["filter_pairs"], options["num_filter_pairs"] or 0
-        a.fixed_pairs = int(options["include_static_kinematic_pairs"])
-        a.pairs, a.pair_count = candidate_pair, candidate_pair_count
+        arrays = self._search.arrays
+        arrays.lower, arrays.upper, arrays.displacement = shape_lower, shape_upper, options.get("shape_displacement")
+        arrays.group, arrays.world = shape_collision_group, shape_world
+        arrays.body, arrays.body_flags = options["shape_body"], options["body_flags"]
+        arrays.excluded, arrays.excluded_count = options["filter_pairs"], options["num_filter_pairs"] or 0
+        arrays.fixed_pairs = int(options["include_static_kinematic_pairs"])
+        arrays.pairs, arrays.pair_count = candidate_pair, candidate_pair_count
         launch_find_shape_pairs(self._search)

@@ -272,10 +272,9 @@ class Stepper:
         Return the deepest penetration, over the thickness of the thinner body and in meters, and the number of contacts
         deeper than ``overlap_threshold`` over the thickness.
         """
-        a = self._arrays
         while True:
-            a.peaks.zero_()
-            a.counts.zero_()
+            self._arrays.peaks.zero_()
+            self._arrays.counts.zero_()
             self._solver.collide(self._state, 0.0)
             self._solver.watch(self._watched, self._state, substep=0, longest=0.0, threshold=overlap_threshold)
             if not self._solver.grow(self._fills()):
